@@ -93,7 +93,7 @@ def steady(every_minute: Sequence[MemorySample]) -> bool:
 def open_together(page: Page, machine: Machine, ids: Sequence[str]) -> None:
     """All on one page, each of them heard and drawn."""
     page.goto(f"{machine.url}/#/operate/{','.join(ids)}")
-    expect(page.get_by_test_id("station")).to_have_count(len(ids), timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("robot-panel")).to_have_count(len(ids), timeout=PATIENCE_MS)
     wait_until(
         lambda: [frames > 0 for frames in page.evaluate(DRAWN)] == [True] * len(ids),
         "every twin",

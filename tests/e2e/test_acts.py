@@ -30,7 +30,7 @@ def ask(page: Page, button: str) -> None:
 
 def assert_done(page: Page, kind: str, *, seen: str = "motion", nth: int = 0) -> None:
     """The newest command is done, and its line tells of every step, one after the other."""
-    row = page.get_by_test_id("evidence-row").nth(nth)
+    row = page.get_by_test_id("command-trace-row").nth(nth)
     expect(row).to_have_attribute("data-kind", kind, timeout=PATIENCE_MS)
     expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "done", timeout=PATIENCE_MS)
     expect(row).to_have_attribute("data-seen", seen, timeout=PATIENCE_MS)
@@ -69,7 +69,7 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
         expect(page.get_by_test_id("poses").locator("tbody tr")).to_have_count(6)
         assert frame(page, 1) == pytest.approx(told, abs=0.002)
         assert_good_page(page, "arm")
-        assert_good_page(page, "times", part="evidence")
+        assert_good_page(page, "latency", part="command-trace")
         page.set_viewport_size({"width": 1440, "height": 900})
 
         ask(page, "back")

@@ -224,7 +224,7 @@ def test_two_robots_have_a_page_with_a_control_each_and_one_stop(browser: Browse
         for name in ("UR5", "Qbo"):
             page.get_by_test_id("device-row").filter(has_text=name).get_by_test_id("pick").check()
         page.get_by_test_id("operate-together").click()
-        stations = page.get_by_test_id("station")
+        stations = page.get_by_test_id("robot-panel")
         expect(stations).to_have_count(2, timeout=PATIENCE_MS)
         arm = stations.filter(has=page.get_by_role("heading", name="UR5"))
         qbo = stations.filter(has=page.get_by_role("heading", name="Qbo"))

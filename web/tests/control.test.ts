@@ -1,7 +1,7 @@
 /** The lease's life on a clock that the test turns, with the server's answers in the test's hands. */
 import { signal } from "@preact/signals-core";
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
-import { Api, type Device, type Granted, type Lease } from "../src/shared/api/client";
+import { Api, type Device, type GrantedLease, type Lease } from "../src/shared/api/client";
 import { ApiError } from "../src/shared/api/http";
 import { Control, LEASE_MS } from "../src/features/control/model/lease";
 import { DeviceStore } from "../src/features/devices/model/device-store";
@@ -49,14 +49,14 @@ class Wire implements Link {
 class Desk extends Api {
   renewals = 0;
   released: number[] = [];
-  renewal: () => Promise<Granted> = () => Promise.resolve(grant(5));
-  taking: () => Promise<Granted> = () => Promise.resolve(grant(5));
+  renewal: () => Promise<GrantedLease> = () => Promise.resolve(grant(5));
+  taking: () => Promise<GrantedLease> = () => Promise.resolve(grant(5));
 
-  override takeLease(): Promise<Granted> {
+  override takeLease(): Promise<GrantedLease> {
     return this.taking();
   }
 
-  override renewLease(): Promise<Granted> {
+  override renewLease(): Promise<GrantedLease> {
     this.renewals += 1;
     return this.renewal();
   }
@@ -71,7 +71,7 @@ class Desk extends Api {
   }
 }
 
-function grant(epoch: number): Granted {
+function grant(epoch: number): GrantedLease {
   return { epoch, holder: "Demo", expires_at: "2030-01-01T00:00:00.000Z", lease_ms: LEASE_MS, confirmed: true };
 }
 

@@ -1,12 +1,12 @@
 /** Control from hand to hand, as each of the two pages lives it, with the server's answers in the test's hands. */
 import { signal } from "@preact/signals-core";
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
-import { Api, type ControlRequest, type Device, type Granted, type Lease, type Watcher } from "../src/shared/api/client";
+import { Api, type ControlRequestInfo, type Device, type GrantedLease, type Lease, type Watcher } from "../src/shared/api/client";
 import { Control, LEASE_MS } from "../src/features/control/model/lease";
 import { DeviceStore } from "../src/features/devices/model/device-store";
 import { ApiError } from "../src/shared/api/http";
 import type { Link, LinkStatus, Receiver } from "../src/shared/mqtt/mqtt-link";
-import { Watching } from "../src/features/control/model/watchers";
+import { Watchers } from "../src/features/control/model/watchers";
 import { description } from "./support/arm";
 
 const TOPIC = "ts/v1/lab/a1/arm";
@@ -43,7 +43,7 @@ class Wire implements Link {
   }
 }
 
-const opened = (outcome: ControlRequest["outcome"] = "open"): ControlRequest => ({
+const opened = (outcome: ControlRequestInfo["outcome"] = "open"): ControlRequestInfo => ({
   id: "r1",
   requester: "Bob",
   epoch: 5,
@@ -54,23 +54,23 @@ const opened = (outcome: ControlRequest["outcome"] = "open"): ControlRequest => 
 });
 
 class Desk extends Api {
-  outcome: ControlRequest["outcome"] = "open";
+  outcome: ControlRequestInfo["outcome"] = "open";
   /** Answers what is asked about a request in the place of `outcome`. */
   trouble: ApiError | null = null;
   readonly calls: string[] = [];
   current: Lease | null = null;
   taken: string[] = [];
 
-  override takeLease(): Promise<Granted> {
+  override takeLease(): Promise<GrantedLease> {
     return Promise.resolve(grant(5));
   }
 
-  override renewLease(_: string, __: number, epoch: number): Promise<Granted> {
+  override renewLease(_: string, __: number, epoch: number): Promise<GrantedLease> {
     this.calls.push(`renew ${epoch}`);
     return Promise.resolve(grant(epoch));
   }
 
-  override takeOver(_: string, __: number, reason: string): Promise<Granted> {
+  override takeOver(_: string, __: number, reason: string): Promise<GrantedLease> {
     this.calls.push(`over ${reason}`);
     return Promise.resolve(grant(6));
   }
@@ -84,12 +84,12 @@ class Desk extends Api {
     return Promise.resolve(this.current);
   }
 
-  override askForControl(): Promise<{ request: ControlRequest; confirmed: boolean }> {
+  override requestControl(): Promise<{ request: ControlRequestInfo; confirmed: boolean }> {
     if (this.trouble !== null) return Promise.reject(this.trouble);
     return Promise.resolve({ request: opened(), confirmed: true });
   }
 
-  override controlRequest(): Promise<ControlRequest> {
+  override controlRequest(): Promise<ControlRequestInfo> {
     return this.trouble === null ? Promise.resolve(opened(this.outcome)) : Promise.reject(this.trouble);
   }
 
@@ -104,7 +104,7 @@ class Desk extends Api {
   }
 }
 
-function grant(epoch: number): Granted {
+function grant(epoch: number): GrantedLease {
   return { epoch, holder: "Ann", expires_at: "2030-01-01T00:00:00.000Z", lease_ms: LEASE_MS, confirmed: true };
 }
 
@@ -291,7 +291,7 @@ describe("who else watches", () => {
         return Promise.resolve();
       }
     }
-    const watching = new Watching(new Door(), "a1-arm");
+    const watching = new Watchers(new Door(), "a1-arm");
     watching.seen(true);
     watching.seen(true);
     await vi.advanceTimersByTimeAsync(25_000);

@@ -1,6 +1,6 @@
 /** What the health page says where the device and the cloud do not agree, and what is measured of what. */
 import { describe, expect, it } from "vitest";
-import { around, healthNow, openCount, standings, watchedQuantity, worstFirst, type Fault, type Watched } from "../src/features/health/model/health";
+import { intervalAround, healthNow, openCount, standings, watchedQuantity, worstFirst, type Fault, type Watched } from "../src/features/health/model/health";
 
 const fault = (code: string, more: Partial<Fault> = {}): Fault => ({
   id: code,
@@ -62,8 +62,8 @@ describe("a fault that is open", () => {
 
   it("has no end to what happened around it while it lasts", () => {
     const at = Date.parse("2026-01-01T12:00:00Z");
-    expect(around(fault("a"))).toEqual([at - 60_000, Infinity]);
-    expect(around(fault("a", { cleared_at: "2026-01-01T12:10:00Z" }))[1]).toBe(at + 11 * 60_000);
+    expect(intervalAround(fault("a"))).toEqual([at - 60_000, Infinity]);
+    expect(intervalAround(fault("a", { cleared_at: "2026-01-01T12:10:00Z" }))[1]).toBe(at + 11 * 60_000);
   });
 });
 

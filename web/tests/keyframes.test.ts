@@ -9,15 +9,15 @@ import {
   remove,
   setPosition,
   setTime,
-  slowedAll,
-  tidy,
+  stretchAll,
+  normalize,
   type Keyframe,
   type Movement,
   type Problem,
 } from "../src/features/keyframes/model/keyframes";
 import { readMovement, readScript, writeScript } from "../src/features/keyframes/model/script-codec";
-import { Recorder, kept, keyframesOf, trim, type Sample } from "../src/features/keyframes/model/recording";
-import { Undoable } from "../src/shared/lib/undo-history";
+import { Recorder, trimmedGaps, keyframesOf, trim, type Sample } from "../src/features/keyframes/model/recording";
+import { UndoHistory } from "../src/shared/lib/undo-history";
 import type { KnownTelemetry } from "../src/shared/mqtt/parse-messages";
 import { head } from "./support/robots";
 
@@ -69,12 +69,12 @@ describe("edits", () => {
     expect(made.keyframes[1]?.position_rad).toEqual({ yaw: 0.5, left: -0.2 });
     expect(setPosition(three, 1, joint("yaw"), 99, robot).keyframes[1]?.position_rad).toEqual({ yaw: 2 });
     expect(setPosition(three, 1, joint("yaw"), null, robot).keyframes[1]?.position_rad).toEqual({});
-    expect(tidy(2.085669, -2, 2.085669)).toBe(2.0856);
-    expect(tidy(-2.085669, -2.085669, 2)).toBe(-2.0856);
+    expect(normalize(2.085669, -2, 2.085669)).toBe(2.0856);
+    expect(normalize(-2.085669, -2.085669, 2)).toBe(-2.0856);
   });
 
   test("every change can be taken back, and a drag is one change", () => {
-    const history = new Undoable(0);
+    const history = new UndoHistory(0);
     history.change(1, "slider");
     history.change(2, "slider");
     history.change(3);
@@ -137,7 +137,7 @@ describe("checks", () => {
 
   test("all that is too fast can be mended at once", () => {
     const fast = movement(...[0, 1, 1.8, -1, 1].map((yaw, index) => frame(index / 10, { yaw, left: yaw / 4 })));
-    expect(problems(slowedAll(fast, robot), robot)).toEqual([]);
+    expect(problems(stretchAll(fast, robot), robot)).toEqual([]);
   });
 
   test("times that do not rise are the first thing to mend", () => {
@@ -248,15 +248,15 @@ describe("a recording", () => {
       const time_s = index / 20;
       return { time_s, position_rad: [Math.min(time_s, 5 - time_s) / 5, 0.3, 0, 0] };
     });
-    expect(kept(samples, 0.01, new Set())).toEqual([0, 50, 100]);
+    expect(trimmedGaps(samples, 0.01, new Set())).toEqual([0, 50, 100]);
     const made = keyframesOf({ samples, gaps: [], said: [] }, 0.01, robot);
     expect(made.map(({ time_s }) => time_s)).toEqual([0, 2.5, 5]);
     expect(made[0]?.position_rad).toEqual({ yaw: 0, pitch: 0.3, left: 0 });
     expect(made[1]?.position_rad).toEqual({ yaw: 0.5 });
     expect(problems({ description: "", keyframes: made }, robot)).toEqual([]);
     const wobbly = samples.map((one, index) => ({ ...one, position_rad: [Math.sin(index / 8), 0, 0, 0] }));
-    const few = kept(wobbly, 0.1, new Set()).length;
-    expect(few).toBeLessThan(kept(wobbly, 0.01, new Set()).length);
+    const few = trimmedGaps(wobbly, 0.1, new Set()).length;
+    expect(few).toBeLessThan(trimmedGaps(wobbly, 0.01, new Set()).length);
     expect(keyframesOf({ samples: [], gaps: [], said: [] }, 0.01, robot)).toEqual([]);
   });
 });

@@ -1,8 +1,8 @@
 import { beforeEach, describe, expect, test } from "vitest";
 import { ApiError, type Http } from "../src/shared/api/http";
-import { Kept, keptDraft, type Draft } from "../src/shared/lib/local-storage";
+import { StoredValue, storedDraft, type Draft } from "../src/shared/lib/local-storage";
 import { Library, type MovementSource } from "../src/features/movements/model/movement-library";
-import { Manuscript } from "../src/features/movements/model/script-draft";
+import { ScriptDraft } from "../src/features/movements/model/script-draft";
 import { failureMark, placed } from "../src/shared/lib/text-offsets";
 
 /** The movements of one account, as the back end keeps them. */
@@ -30,8 +30,8 @@ class Shelf {
 let shelf: Shelf;
 let known: Map<string, string>;
 
-function kept(): Kept<Draft> {
-  return keptDraft(
+function kept(): StoredValue<Draft> {
+  return storedDraft(
     {
       getItem: (key) => known.get(key) ?? null,
       setItem: (key, value) => void known.set(key, value),
@@ -43,8 +43,8 @@ function kept(): Kept<Draft> {
   );
 }
 
-async function open(): Promise<Manuscript> {
-  const manuscript = new Manuscript(shelf.library, "ur5", "wave", kept(), "template");
+async function open(): Promise<ScriptDraft> {
+  const manuscript = new ScriptDraft(shelf.library, "ur5", "wave", kept(), "template");
   await manuscript.load();
   return manuscript;
 }

@@ -6,7 +6,7 @@ import { ApiError } from "../src/shared/api/http";
 import { startClock } from "../src/shared/lib/clock";
 import { Control } from "../src/features/control/model/lease";
 import type { DeviceStore } from "../src/features/devices/model/device-store";
-import { Evidence } from "../src/features/control/model/command-trace";
+import { CommandTrace } from "../src/features/control/model/command-trace";
 import { Fleet } from "../src/features/devices/model/device-list";
 import { RoundTrip } from "../src/features/latency/model/round-trip";
 import { LatencySamples } from "../src/features/latency/model/sample-upload";
@@ -354,8 +354,8 @@ describe("a movement", () => {
 });
 
 describe("what became of a command", () => {
-  function evidence(control: Control, actions: ActionRunner): Evidence {
-    const made = new Evidence(device, control, actions);
+  function evidence(control: Control, actions: ActionRunner): CommandTrace {
+    const made = new CommandTrace(device, control, actions);
     ends.push(() => made.dispose(), () => actions.dispose());
     return made;
   }

@@ -8,11 +8,11 @@ const route = await import("../src/app/routes");
 describe("the table of pages", () => {
   it("reads each address as the page that it was written for", () => {
     const written = {
-      fleet: route.fleetAddress,
+      fleet: route.deviceListAddress,
       device: route.deviceAddress("a-b"),
       keyframes: route.keyframesAddress("a-b", "wave"),
       typeKeyframes: route.typeKeyframesAddress("ur5"),
-      together: route.togetherAddress(["a-b", "c_d"]),
+      together: route.multiRobotAddress(["a-b", "c_d"]),
       space: route.spaceAddress("lab"),
       pair: route.pairAddress,
       movements: route.movementsAddress,
@@ -24,9 +24,9 @@ describe("the table of pages", () => {
       deviceHealth: route.healthAddressOf("device", "a-b"),
       spaceHealth: route.healthAddressOf("space", "lab"),
       times: PAGES.times.pattern,
-      deviceTimes: route.timesAddressOf("a-b"),
+      deviceTimes: route.latencyAddressOf("a-b"),
       account: route.accountAddress,
-      activity: route.activityAddress,
+      activity: route.auditLogAddress,
       invitation: route.invitationAddress,
     } satisfies Record<keyof typeof PAGES, string>;
     for (const [page, address] of Object.entries(written)) expect(route.read(address).page, address).toBe(page);

@@ -1,5 +1,5 @@
 import { describe, expect, test } from "vitest";
-import { keptDraft, keptParameters } from "../src/shared/lib/local-storage";
+import { storedDraft, storedParameters } from "../src/shared/lib/local-storage";
 import type { ObjectSchema } from "../src/features/movements/model/movement-library";
 import { fieldsOf, fill, read } from "../src/features/movements/model/parameter-form";
 
@@ -80,20 +80,20 @@ describe("what the browser keeps", () => {
 
   test("is found again by the same account and movement only", () => {
     const there = store();
-    expect(keptDraft(there, "ann", "ur5", "wave").write({ source: "x", basedOn: 2, at: 1 })).toBe(true);
-    expect(keptDraft(there, "ann", "ur5", "wave").read()).toEqual({ source: "x", basedOn: 2, at: 1 });
-    expect(keptDraft(there, "bob", "ur5", "wave").read()).toBeNull();
-    expect(keptParameters(there, "ann", "ur5", "wave").read()).toBeNull();
-    keptDraft(there, "ann", "ur5", "wave").drop();
-    expect(keptDraft(there, "ann", "ur5", "wave").read()).toBeNull();
+    expect(storedDraft(there, "ann", "ur5", "wave").write({ source: "x", basedOn: 2, at: 1 })).toBe(true);
+    expect(storedDraft(there, "ann", "ur5", "wave").read()).toEqual({ source: "x", basedOn: 2, at: 1 });
+    expect(storedDraft(there, "bob", "ur5", "wave").read()).toBeNull();
+    expect(storedParameters(there, "ann", "ur5", "wave").read()).toBeNull();
+    storedDraft(there, "ann", "ur5", "wave").drop();
+    expect(storedDraft(there, "ann", "ur5", "wave").read()).toBeNull();
   });
 
   test("is nothing where it was written by something else, or storage is refused", () => {
     const there = store();
     there.setItem("telescope.draft.ann.ur5.wave", "{");
-    expect(keptDraft(there, "ann", "ur5", "wave").read()).toBeNull();
+    expect(storedDraft(there, "ann", "ur5", "wave").read()).toBeNull();
     there.setItem("telescope.draft.ann.ur5.wave", '{"source": 1}');
-    expect(keptDraft(there, "ann", "ur5", "wave").read()).toBeNull();
-    expect(keptDraft(null, "ann", "ur5", "wave").write({ source: "x", basedOn: 0, at: 1 })).toBe(false);
+    expect(storedDraft(there, "ann", "ur5", "wave").read()).toBeNull();
+    expect(storedDraft(null, "ann", "ur5", "wave").write({ source: "x", basedOn: 0, at: 1 })).toBe(false);
   });
 });

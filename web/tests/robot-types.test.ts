@@ -2,15 +2,15 @@ import { describe, expect, it } from "vitest";
 import { readFinding, readFindings } from "../src/features/robot-types/model/parse-findings";
 import { ApiError } from "../src/shared/api/http";
 import type { Look, RobotType, RobotTypes, TypeFolder, TypeModel } from "../src/features/robot-types/model/robot-types";
-import { TypeDraft } from "../src/features/robot-types/model/upload-draft";
-import { choose, pack } from "../src/features/robot-types/model/upload-files";
+import { UploadDraft } from "../src/features/robot-types/model/upload-draft";
+import { selectFiles, packFiles } from "../src/features/robot-types/model/upload-files";
 
 const bytes = (text: string): Uint8Array => new TextEncoder().encode(text);
 const folder = (...names: string[]): Map<string, Uint8Array> => new Map(names.map((name) => [name, bytes(name)]));
 
 describe("a folder", () => {
   it("is what lies beside its manifest, wherever that is", () => {
-    const { files, left } = choose(
+    const { files, left } = selectFiles(
       folder("my/robots/lever/robot.toml", "my/robots/lever/lever.xml", "my/robots/lever/movements/up.py",
         "my/robots/lever/meshes/hand.stl", "my/robots/lever/README.md", "my/notes.txt", "__MACOSX/lever/robot.toml",
         "my/robots/lever/.DS_Store", "my/robots/lever/"),
@@ -20,18 +20,18 @@ describe("a folder", () => {
   });
 
   it("without a manifest keeps its files, without the folder around them all", () => {
-    expect([...choose(folder("lever/lever.xml", "lever/scene.xml")).files.keys()]).toEqual(["lever.xml", "scene.xml"]);
-    expect([...choose(folder("movements/up.py")).files.keys()]).toEqual(["movements/up.py"]);
+    expect([...selectFiles(folder("lever/lever.xml", "lever/scene.xml")).files.keys()]).toEqual(["lever.xml", "scene.xml"]);
+    expect([...selectFiles(folder("movements/up.py")).files.keys()]).toEqual(["movements/up.py"]);
   });
 
   it("is sent as text where it is text, else as base64", () => {
     const large = new Uint8Array(100_000).map((_, index) => index % 256);
-    const packed = pack(new Map([...folder("robot.toml", "lever.xml", "movements/up.py"), ["hand.stl", large]]));
+    const packed = packFiles(new Map([...folder("robot.toml", "lever.xml", "movements/up.py"), ["hand.stl", large]]));
     expect(packed?.manifest).toBe("robot.toml");
     expect(packed?.files["lever.xml"]).toBe("lever.xml");
     expect(packed?.movements).toEqual({ up: "movements/up.py" });
     expect(Buffer.from(packed?.files["hand.stl"] ?? "", "base64")).toEqual(Buffer.from(large));
-    expect(pack(folder("lever.xml"))).toBeNull();
+    expect(packFiles(folder("lever.xml"))).toBeNull();
   });
 });
 
@@ -114,9 +114,9 @@ class Checker {
 }
 
 describe("a draft", () => {
-  const made = (): [TypeDraft, Checker] => {
+  const made = (): [UploadDraft, Checker] => {
     const checker = new Checker();
-    return [new TypeDraft(checker as unknown as RobotTypes), checker];
+    return [new UploadDraft(checker as unknown as RobotTypes), checker];
   };
   const whole = folder("lever/robot.toml", "lever/lever.xml", "lever/movements/up.py", "lever/movements/bad.py");
 

@@ -1,13 +1,13 @@
 /** Sharing, invitations and the record of what was done, against the API's shapes. */
 import { afterEach, beforeEach, describe, expect, it } from "vitest";
 import { Api } from "../src/shared/api/client";
-import { aboutWhat, accountsIn, AuditReader, EVERYTHING } from "../src/features/account/model/audit-log";
+import { subjectOf, accountIdsOf, AuditReader, ALL_ENTRIES } from "../src/features/account/model/audit-log";
 import { Fleet } from "../src/features/devices/model/device-list";
 import { FollowedInvitation, invitationSecret } from "../src/features/sharing/model/invitation-link";
 import type { AuditRecord, Share } from "../src/features/sharing/model/wire-types";
 import { Session } from "../src/features/account/model/session";
-import { secondsLeft, Sharing } from "../src/features/sharing/model/shares";
-import { line, type Names } from "../src/features/account/audit-entry-text";
+import { secondsLeft, ShareList } from "../src/features/sharing/model/shares";
+import { entryText, type Names } from "../src/features/account/audit-entry-text";
 import { seconds } from "../src/shared/ui/duration-picker";
 import { Cloud, DEVICE, problem, type Call } from "./support/cloud";
 import { until } from "./support/until";
@@ -41,7 +41,7 @@ function bob(part: Partial<Share> = {}): Share {
 
 describe("sharing", () => {
   let shares: Share[];
-  let sharing: Sharing;
+  let sharing: ShareList;
 
   beforeEach(async () => {
     shares = [bob()];
@@ -58,7 +58,7 @@ describe("sharing", () => {
       shares = [];
       return { status: 204, body: null };
     });
-    sharing = new Sharing(api, { kind: "device", id: DEVICE });
+    sharing = new ShareList(api, { kind: "device", id: DEVICE });
     await sharing.refresh();
   });
 
@@ -217,7 +217,7 @@ describe("the record of what was done", () => {
     ];
     cloud.instead.set(`GET ${AUDIT}`, () => ({ status: 200, body: pages.shift() }));
     const reader = new AuditReader(api);
-    await reader.ask({ ...EVERYTHING, event: "signed-in" });
+    await reader.ask({ ...ALL_ENTRIES, event: "signed-in" });
     expect(reader.records.value.map(({ seq }) => seq)).toEqual([90]);
     expect(reader.more.value).toBe(true);
     const last = cloud.instead.get(`GET ${AUDIT}`);
@@ -234,15 +234,15 @@ describe("the record of what was done", () => {
   it("forgets what a filter that was left has still to bring", async () => {
     const reader = new AuditReader(api);
     cloud.instead.set(`GET ${AUDIT}`, () => ({ status: 200, body: { items: [record({ seq: 1 })], cursor: null } }));
-    const first = reader.ask(EVERYTHING);
-    const second = reader.ask({ ...EVERYTHING, event: "shared" });
+    const first = reader.ask(ALL_ENTRIES);
+    const second = reader.ask({ ...ALL_ENTRIES, event: "shared" });
     await Promise.all([first, second]);
     expect(reader.records.value).toHaveLength(1);
     expect(reader.busy.value).toBe(false);
   });
 
   it("names accounts that acted or were shared with, and no API key for an account", () => {
-    const names = accountsIn([
+    const names = accountIdsOf([
       record({ account: "a1", actor: "Ann" }),
       record({ account: "a1", actor: "Ann (dashboard)", key: "k1" }),
       record({ account: "", actor: "", data: { with: "b2", name: "Bob" } }),
@@ -251,8 +251,8 @@ describe("the record of what was done", () => {
       ["a1", "Ann"],
       ["b2", "Bob"],
     ]);
-    expect(aboutWhat("device:abc-arm")).toEqual(["device", "abc-arm"]);
-    expect(aboutWhat("abc-arm")).toEqual(["", "abc-arm"]);
+    expect(subjectOf("device:abc-arm")).toEqual(["device", "abc-arm"]);
+    expect(subjectOf("abc-arm")).toEqual(["", "abc-arm"]);
   });
 
   it("says in plain words who did what to what", () => {
@@ -264,7 +264,7 @@ describe("the record of what was done", () => {
       ]),
       keys: new Map([["k1", "dashboard"]]),
     };
-    const say = (event: string, part: Partial<AuditRecord> = {}): string => line(record({ event, ...part }), names);
+    const say = (event: string, part: Partial<AuditRecord> = {}): string => entryText(record({ event, ...part }), names);
     const never = { role: "operator", expires_ms: 2 ** 53 };
     expect(say("signed-in", { data: { how: "link" } })).toBe("Ann signed in with a link.");
     expect(say("shared", { target: "device:abc-arm", data: { with: "b2", ...never } })).toBe(

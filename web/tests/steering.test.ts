@@ -1,9 +1,9 @@
 import { describe, expect, it } from "vitest";
 import { DEAD_ZONE, readPad, type Pad } from "../src/features/steering/model/gamepad-mapping";
-import { Held } from "../src/features/steering/model/held-inputs";
+import { HeldInputs } from "../src/features/steering/model/held-inputs";
 import { DRIVE_KEYS, JOG_KEYS, jointOfKey } from "../src/features/steering/model/keymap";
 import type { KnownDescription } from "../src/shared/mqtt/parse-messages";
-import { direction, driveOf, jogOf, pushed, restOf, sumOf, waysOf } from "../src/features/steering/model/steerable-parts";
+import { direction, driveOf, jogOf, pushed, restOf, sumOf, steeringModesOf } from "../src/features/steering/model/steerable-parts";
 import { description } from "./support/arm";
 
 const LIMITS = { forward_m_s: 0.3, left_m_s: 0, turn_rad_s: 1.5 };
@@ -11,11 +11,11 @@ const known = description as unknown as KnownDescription;
 
 describe("the ways to steer", () => {
   it("are those that the description names", () => {
-    expect(waysOf(null)).toEqual([]);
-    expect(waysOf({ ...known, actions: [], base: null })).toEqual(["joints"]);
-    expect(waysOf({ ...known, actions: ["move_pose"], base: LIMITS })).toEqual(["joints", "jog", "drive"]);
-    expect(waysOf({ ...known, actions: ["move_pose"], frames: [], base: null })).toEqual(["joints"]);
-    expect(waysOf({ ...known, joints: [], actions: [], base: null })).toEqual([]);
+    expect(steeringModesOf(null)).toEqual([]);
+    expect(steeringModesOf({ ...known, actions: [], base: null })).toEqual(["joints"]);
+    expect(steeringModesOf({ ...known, actions: ["move_pose"], base: LIMITS })).toEqual(["joints", "jog", "drive"]);
+    expect(steeringModesOf({ ...known, actions: ["move_pose"], frames: [], base: null })).toEqual(["joints"]);
+    expect(steeringModesOf({ ...known, joints: [], actions: [], base: null })).toEqual([]);
   });
 
   it("never ask a base for more than it can do", () => {
@@ -42,9 +42,9 @@ describe("the ways to steer", () => {
 });
 
 describe("what is held", () => {
-  const made = (): [Held<number>, (readonly number[])[]] => {
+  const made = (): [HeldInputs<number>, (readonly number[])[]] => {
     const told: (readonly number[])[] = [];
-    return [new Held<number>((parts) => told.push(parts)), told];
+    return [new HeldInputs<number>((parts) => told.push(parts)), told];
   };
 
   it("is the sum of all that is pressed, and nothing when the last is let go", () => {

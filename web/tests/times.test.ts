@@ -5,11 +5,11 @@ import { Api, type Action, type LatencyBatch } from "../src/shared/api/client";
 import type { DeviceStore } from "../src/features/devices/model/device-store";
 import { ApiError, Http } from "../src/shared/api/http";
 import type { Link } from "../src/shared/mqtt/mqtt-link";
-import { Measure, TIMES, waysOf } from "../src/features/latency/model/probe";
+import { LatencyProbe, TIMES, probeKindsOf } from "../src/features/latency/model/probe";
 import { PUBLISHED, publishedFor, UR5_TABLE_2 } from "../src/features/latency/model/published-figures";
-import { csv, figuresOf, linesOf, shares, TimesApi, type Line, type Sample, type StoredTimes } from "../src/features/latency/model/latency-stats";
+import { csv, figuresOf, linesOf, distribution, LatencyApi, type Line, type Sample, type StoredLatency } from "../src/features/latency/model/latency-stats";
 
-const stored = (more: Partial<StoredTimes> = {}): StoredTimes => ({
+const stored = (more: Partial<StoredLatency> = {}): StoredLatency => ({
   transport: "mqtt",
   path: "command-started",
   count: 3,
@@ -56,7 +56,7 @@ describe("figures", () => {
   });
 
   it("of shares rise to one, equal times together", () => {
-    expect(shares(samples(2, 1, 2, 4))).toEqual([
+    expect(distribution(samples(2, 1, 2, 4))).toEqual([
       [1, 2, 4],
       [0.25, 0.75, 1],
     ]);
@@ -93,7 +93,7 @@ class Desk extends Api {
   readonly asked: string[] = [];
   readonly sent: { path: string; count: number; key: string }[] = [];
   full = false;
-  override readonly times = new (class extends TimesApi {
+  override readonly latency = new (class extends LatencyApi {
     readonly desk: Desk;
     constructor(desk: Desk) {
       super(new Http(""));
@@ -109,7 +109,7 @@ class Desk extends Api {
     this.sent.push({ path, count: all.length, key });
     return Promise.resolve();
   }
-  override ask(): Promise<Action> {
+  override startAction(): Promise<Action> {
     this.asked.push("shoot");
     return Promise.resolve({ status: "done" } as Action);
   }
@@ -123,7 +123,7 @@ describe("measuring here", () => {
   it("asks each way twenty times, one after the other, and stores each once", async () => {
     const desk = new Desk();
     let pings = 0;
-    const measure = new Measure(desk, link(() => Promise.resolve(void (pings += 1))), device("owner", ["shoot"]), () => null, 1);
+    const measure = new LatencyProbe(desk, link(() => Promise.resolve(void (pings += 1))), device("owner", ["shoot"]), () => null, 1);
     await measure.run(["cloud", "broker", "device"]);
     expect([desk.asked.length, pings]).toEqual([2 * TIMES, TIMES]);
     expect(desk.sent.map(({ path, count }) => [path, count])).toEqual([
@@ -141,7 +141,7 @@ describe("measuring here", () => {
     desk.full = true;
     let pings = 0;
     const failing = (): Promise<void> => ((pings += 1) > 3 ? Promise.reject(new Error("gone")) : Promise.resolve());
-    const measure = new Measure(desk, link(failing), device("owner", []), () => null, 1);
+    const measure = new LatencyProbe(desk, link(failing), device("owner", []), () => null, 1);
     await measure.run(["broker"]);
     expect([measure.lines[0]?.samples.length, measure.unstored, measure.why.value]).toEqual([3, true, "Later, please."]);
     desk.full = false;
@@ -152,8 +152,8 @@ describe("measuring here", () => {
   it("stores nothing for who only watches, and asks nothing of the device", async () => {
     const desk = new Desk();
     const watching = device("viewer", ["shoot"]);
-    expect(waysOf(watching)).toEqual(["cloud", "broker"]);
-    const measure = new Measure(desk, link(() => Promise.resolve()), watching, () => null, 1);
+    expect(probeKindsOf(watching)).toEqual(["cloud", "broker"]);
+    const measure = new LatencyProbe(desk, link(() => Promise.resolve()), watching, () => null, 1);
     await measure.run(["broker"]);
     expect([measure.lines[0]?.samples.length, desk.sent.length]).toEqual([TIMES, 0]);
   });

@@ -1,5 +1,5 @@
 import { afterEach, beforeEach, expect, it, vi } from "vitest";
-import { Turn } from "../src/shared/hooks/draw-scheduler";
+import { DrawSlot } from "../src/shared/hooks/draw-scheduler";
 
 const COST_MS = 40;
 
@@ -17,7 +17,7 @@ it("lets every view draw in its turn, one a frame, and together a quarter of the
   const drawn = [0, 0, 0];
   const turns = drawn.map(
     (_, index) =>
-      new Turn(() => {
+      new DrawSlot(() => {
         drawn[index] = (drawn[index] ?? 0) + 1;
         vi.setSystemTime(Date.now() + COST_MS);
         vi.advanceTimersByTime(COST_MS);

@@ -8,13 +8,13 @@ import type { FollowedCode } from "../features/pairing/model/claim-code";
 import type { Session } from "../features/account/model/session";
 import { common } from "../shared/i18n/common";
 import { texts } from "./texts";
-import { later } from "./lazy-page";
+import { lazyPage } from "./lazy-page";
 import { Navigation } from "./navigation-bar";
 import { type At, type PageProps, ROWS } from "./page-registry";
 import { route } from "./routes";
-import { SignIn } from "../features/account/sign-in-page";
+import { SignInPage } from "../features/account/sign-in-page";
 
-const LATER = new Map([...ROWS].map(([name, { load }]) => [name, later(load)]));
+const LATER = new Map([...ROWS].map(([name, { load }]) => [name, lazyPage(load)]));
 
 /** Fetch what the address names and what must not be waited for, while it is still being asked who this is. */
 export function fetchEarly(): void {
@@ -43,7 +43,7 @@ export function App({ api, session, followed, pairing }: AppProps) {
         </main>
       );
     case "out":
-      return <SignIn api={api} session={session} followed={followed} pairing={pairing.code.value !== null} why={state.why} />;
+      return <SignInPage api={api} session={session} followed={followed} pairing={pairing.code.value !== null} why={state.why} />;
     case "in":
       return (
         <SignedIn

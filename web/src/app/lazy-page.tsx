@@ -3,14 +3,14 @@ import type { ComponentType } from "preact";
 import { useEffect, useState } from "preact/hooks";
 import { common } from "../shared/i18n/common";
 
-export interface Later<Props> {
+export interface LazyPage<Props> {
   /** The page; it says so while it is still being loaded, and offers another try where that fails. */
   Page: ComponentType<Props>;
   /** Load it before it is opened. */
   fetch: () => Promise<void>;
 }
 
-export function later<Props extends object>(load: () => Promise<ComponentType<Props>>): Later<Props> {
+export function lazyPage<Props extends object>(load: () => Promise<ComponentType<Props>>): LazyPage<Props> {
   let known: ComponentType<Props> | null = null;
   const fetch = async (): Promise<void> => {
     known = await load();

@@ -3,7 +3,7 @@ import type { Account } from "../shared/api/client";
 import type { Session } from "../features/account/model/session";
 import { texts } from "./texts";
 import { PAGES, ROWS } from "./page-registry";
-import { accountAddress, fleetAddress, route } from "./routes";
+import { accountAddress, deviceListAddress, route } from "./routes";
 
 const LINKS = [...ROWS.values()].flatMap(({ link, pattern, part }) => (link === undefined ? [] : [{ link, pattern, part }]));
 
@@ -11,7 +11,7 @@ export function Navigation({ account, session }: { account: Account; session: Se
   const { part: here } = PAGES[route.value.page];
   return (
     <header class="top">
-      <a class="brand" href={fleetAddress}>
+      <a class="brand" href={deviceListAddress}>
         {texts.product}
       </a>
       <nav aria-label={texts.sections.title}>

@@ -40,7 +40,7 @@ interface Page {
 
 const device = (id: string, fleet: Fleet): string => fleet.devices.value?.get(id)?.info.value.label ?? texts.sections.devices;
 const health = async (): Loaded => (await import("../features/health/list-page")).HealthPage;
-const times = async (): Loaded => (await import("../features/latency/page")).TimesPage;
+const times = async (): Loaded => (await import("../features/latency/page")).LatencyPage;
 
 export const PAGES = {
   fleet: {
@@ -49,7 +49,7 @@ export const PAGES = {
     part: "fleet",
     link: texts.sections.devices,
     early: true,
-    load: async (): Loaded => (await import("../features/devices/list-page")).FleetPage,
+    load: async (): Loaded => (await import("../features/devices/list-page")).DeviceListPage,
   },
   device: {
     pattern: "#/devices/:id",
@@ -68,7 +68,7 @@ export const PAGES = {
     pattern: "#/operate/:ids",
     title: ({ ids }: At): string => texts.pages.multiRobot(ids.split(",").length),
     part: "fleet",
-    load: async (): Loaded => (await import("../features/steering/multi-robot-page")).TogetherPage,
+    load: async (): Loaded => (await import("../features/steering/multi-robot-page")).MultiRobotPage,
   },
   space: {
     pattern: "#/spaces/:id",
@@ -151,7 +151,7 @@ export const PAGES = {
     pattern: "#/account/activity",
     title: texts.pages.audit,
     part: "account",
-    load: async (): Loaded => (await import("../features/account/audit-page")).ActivityPage,
+    load: async (): Loaded => (await import("../features/account/audit-page")).AuditLogPage,
   },
   invitation: {
     pattern: "#/invitation",

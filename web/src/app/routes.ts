@@ -38,9 +38,9 @@ const current = signal(read(location.hash));
 export const route: ReadonlySignal<Route> = current;
 
 export const accountAddress = address("account");
-export const activityAddress = address("activity");
+export const auditLogAddress = address("activity");
 export const addRobotTypeAddress = address("addRobotType");
-export const fleetAddress = address("fleet");
+export const deviceListAddress = address("fleet");
 export const healthAddress = address("health");
 export const invitationAddress = address("invitation");
 export const movementsAddress = address("movements");
@@ -66,7 +66,7 @@ export function spaceAddress(id: string): string {
 }
 
 /** Several devices on one page. */
-export function togetherAddress(ids: readonly string[]): string {
+export function multiRobotAddress(ids: readonly string[]): string {
   return address("together", { ids: ids.join(",") });
 }
 
@@ -78,7 +78,7 @@ export function healthAddressOf(kind: "device" | "space", id: string): string {
   return kind === "device" ? address("deviceHealth", { device: id }) : address("spaceHealth", { space: id });
 }
 
-export function timesAddressOf(device: string): string {
+export function latencyAddressOf(device: string): string {
   return address("deviceTimes", { device });
 }
 

@@ -9,7 +9,7 @@ import type { AddressInfo } from "node:net";
 import { extname, join } from "node:path";
 import { Aedes, type AedesPublishPacket, type Client } from "aedes";
 import { createWebSocketStream, WebSocketServer } from "ws";
-import type { Action, Device, Granted, Lease } from "../../src/shared/api/client";
+import type { Action, Device, GrantedLease, Lease } from "../../src/shared/api/client";
 import type { Presence, Setpoint, Stop } from "../../src/shared/mqtt/protocol.generated";
 import { matches } from "../../src/shared/mqtt/topics";
 import { Arm, description } from "./arm";
@@ -318,7 +318,7 @@ export class Cloud {
     const expires = new Date(Date.now() + leaseMs).toISOString();
     this.lease = { holder: "Demo", epoch: this.epoch, expires_at: expires, mine: true, session: "s1" };
     this.arm?.grant(this.epoch, "Demo");
-    const granted: Granted = { epoch: this.epoch, holder: "Demo", expires_at: expires, lease_ms: leaseMs, confirmed: true };
+    const granted: GrantedLease = { epoch: this.epoch, holder: "Demo", expires_at: expires, lease_ms: leaseMs, confirmed: true };
     return ok(granted);
   }
 

@@ -5,12 +5,12 @@ import type { Fleet } from "../devices/model/device-list";
 import type { ApiKey, ApiKeyMade, SharedRole } from "../sharing/model/wire-types";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { AskedForm } from "../../shared/ui/inline-form";
-import { Confirm } from "../../shared/ui/confirm-button";
-import { useFocusBack } from "../../shared/hooks/use-return-focus";
+import { InlineForm } from "../../shared/ui/inline-form";
+import { ConfirmButton } from "../../shared/ui/confirm-button";
+import { useReturnFocus } from "../../shared/hooks/use-return-focus";
 import { MAY } from "../sharing/invite-form";
 import { Card, Choice } from "../../shared/ui/parts";
-import { Secret } from "../../shared/ui/copy-once";
+import { CopyOnce } from "../../shared/ui/copy-once";
 import "../sharing/sharing.css";
 
 /** What a key may be kept to, by the name it has in `only`. */
@@ -47,7 +47,7 @@ export function ApiKeys({ api, fleet }: { api: Api; fleet: Fleet }) {
     ...devices.map(({ id, info }) => [id, info.value.label] as const),
   ]);
   const busy = making || made !== null;
-  const opener = useFocusBack(busy);
+  const opener = useReturnFocus(busy);
   const open = busy ? null : (
     <button type="button" ref={opener} data-testid="new-key" onClick={() => setMaking(true)}>
       {texts.keys.new}
@@ -99,7 +99,7 @@ function KeyRow({ of: key, names, onRevoke }: { of: ApiKey; names: Names; onRevo
       </span>
       {key.expired && <span class="chip bad">{texts.keys.expiredChip}</span>}
       <span class={`chip role-${key.role}`}>{common.role[key.role]}</span>
-      <Confirm
+      <ConfirmButton
         label={texts.keys.revoke}
         description={texts.keys.revokeOf(key.name)}
         question={texts.keys.revokeSure(key.name)}
@@ -121,7 +121,7 @@ function MadeKey({ made, onDone }: { made: ApiKeyMade; onDone: () => void }) {
       <p>
         <strong>{texts.keys.made(made.api_key.name)}</strong>
       </p>
-      <Secret id="api-key-token" label={texts.keys.token} value={made.token} />
+      <CopyOnce id="api-key-token" label={texts.keys.token} value={made.token} />
       <p class="quiet small">
         {texts.keys.use} <code>Authorization: Bearer {made.token.slice(0, 3)}…</code>
       </p>
@@ -178,7 +178,7 @@ function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
   };
 
   return (
-    <AskedForm
+    <InlineForm
       label={texts.keys.new}
       todo={texts.keys.make}
       doing={texts.keys.making}
@@ -227,7 +227,7 @@ function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
         <Choice label={texts.keys.only} value={reach} options={REACH} onChange={setReach} />
       </div>
       {reach === "some" && <Which names={names} chosen={only} onChange={choose} />}
-    </AskedForm>
+    </InlineForm>
   );
 }
 

@@ -1,5 +1,5 @@
 /** One record of the audit list in plain English. */
-import { aboutWhat } from "./model/audit-log";
+import { subjectOf } from "./model/audit-log";
 import type { AuditRecord, Role } from "../sharing/model/wire-types";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
@@ -16,7 +16,7 @@ export interface Names {
 const says = texts.audit.says;
 const ID_SHOWN = 8;
 
-export function line(record: AuditRecord, names: Names): string {
+export function entryText(record: AuditRecord, names: Names): string {
   const { event, data } = record;
   const message = data["message"];
   // What is told of control over a device says so itself.
@@ -37,7 +37,7 @@ export function line(record: AuditRecord, names: Names): string {
     case "api-key-made":
       return says.keyMade(who, text(data, "name"), role(data), kept(data["only"], names));
     case "api-key-revoked":
-      return says.keyRevoked(who, names.keys.get(aboutWhat(record.target)[1]) ?? "");
+      return says.keyRevoked(who, names.keys.get(subjectOf(record.target)[1]) ?? "");
     case "space-made":
       return says.spaceMade(who, text(data, "name"));
     case "agent-claimed":
@@ -85,7 +85,7 @@ function whoDid({ actor, account }: AuditRecord): string {
 }
 
 function thing(on: string, names: Names): string {
-  const [, id] = aboutWhat(on);
+  const [, id] = subjectOf(on);
   return names.things.get(id) ?? id;
 }
 

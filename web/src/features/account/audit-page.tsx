@@ -1,12 +1,12 @@
 import { useEffect, useMemo, useState } from "preact/hooks";
 import type { Api, Space } from "../../shared/api/client";
-import { accountsIn, AuditReader, EVERYTHING } from "./model/audit-log";
+import { accountIdsOf, AuditReader, ALL_ENTRIES } from "./model/audit-log";
 import type { Fleet } from "../devices/model/device-list";
 import type { ApiKey, AuditQuery, AuditRecord } from "../sharing/model/wire-types";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { line, type Names } from "./audit-entry-text";
+import { entryText, type Names } from "./audit-entry-text";
 import { accountAddress } from "../../app/routes";
 import "../sharing/sharing.css";
 
@@ -25,7 +25,7 @@ const ALL: Filter = { what: "", on: "", from: "", to: "" };
 function query({ what, on, from, to }: Filter): AuditQuery {
   const start = (date: string): number => new Date(`${date}T00:00`).getTime();
   return {
-    ...EVERYTHING,
+    ...ALL_ENTRIES,
     event: what,
     target: on,
     sinceMs: from === "" ? null : start(from),
@@ -34,7 +34,7 @@ function query({ what, on, from, to }: Filter): AuditQuery {
 }
 
 /** Who did what in one's account. */
-export function ActivityPage({ api, fleet }: { api: Api; fleet: Fleet }) {
+export function AuditLogPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const reader = useMemo(() => new AuditReader(api), [api]);
   const [filter, setFilter] = useState(ALL);
   const [spaces, setSpaces] = useState<readonly Space[]>([]);
@@ -50,7 +50,7 @@ export function ActivityPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const devices = [...(fleet.devices.value?.values() ?? [])].map(({ info }) => info.value);
   const names: Names = useMemo(
     () => ({
-      accounts: accountsIn(records),
+      accounts: accountIdsOf(records),
       things: new Map([...spaces.map(({ id, name }) => [id, name] as const), ...devices.map(({ id, label }) => [id, label] as const)]),
       keys: keyNames(keys, records),
     }),
@@ -210,7 +210,7 @@ function Line({ record, names }: { record: AuditRecord; names: Names }) {
         <summary>
           <time dateTime={at}>{format.dateTime(at)}</time>
           <span class="said">
-            {line(record, names)}
+            {entryText(record, names)}
             {key !== "" && <span class="quiet"> ({texts.audit.byKey})</span>}{" "}
             {outcome !== "done" && (
               <span class={`chip ${outcome === "unknown" ? "" : "bad"}`} title={outcome === "unknown" ? texts.audit.unknownExplained : undefined}>

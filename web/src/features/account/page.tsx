@@ -6,17 +6,17 @@ import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { ApiKeys } from "./api-keys";
 import { Card } from "../../shared/ui/parts";
-import { activityAddress, fleetAddress } from "../../app/routes";
+import { auditLogAddress, deviceListAddress } from "../../app/routes";
 
 /** One's own account: its password, where else one is signed in, its API keys, and what was done in it. */
 export function AccountPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const [changes, setChanges] = useState(0);
   return (
     <main class="page fleet" id="content">
-      <a href={fleetAddress}>← {common.allDevices}</a>
+      <a href={deviceListAddress}>← {common.allDevices}</a>
       <h1>{texts.account.title}</h1>
       <p>
-        <a href={activityAddress}>{texts.audit.link}</a>
+        <a href={auditLogAddress}>{texts.audit.link}</a>
       </p>
       <ApiKeys api={api} fleet={fleet} />
       <PasswordForm api={api} onDone={() => setChanges((count) => count + 1)} />

@@ -1,5 +1,5 @@
 import { useEffect, useState } from "preact/hooks";
-import type { Api, Methods } from "../../shared/api/client";
+import type { Api, SignInMethods } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { FollowedInvitation } from "../sharing/model/invitation-link";
 import { signInToken, type Session } from "./model/session";
@@ -16,11 +16,11 @@ interface SignInProps {
   why: string;
 }
 
-export function SignIn({ api, session, followed, pairing, why }: SignInProps) {
-  const [methods, setMethods] = useState<Methods | null>(null);
+export function SignInPage({ api, session, followed, pairing, why }: SignInProps) {
+  const [methods, setMethods] = useState<SignInMethods | null>(null);
   useEffect(() => {
     // Where that cannot be read, what always works is offered.
-    api.methods().then(setMethods, () => setMethods({ password: true, oidc: null }));
+    api.signInMethods().then(setMethods, () => setMethods({ password: true, oidc: null }));
   }, [api]);
   const elsewhere = methods?.oidc ?? null;
   const invited = followed.state.value;
@@ -78,7 +78,7 @@ function InvitedElsewhere({ api, followed, secret, name }: InvitedElsewhereProps
     setBusy(true);
     setWrong("");
     try {
-      const address = await api.beginElsewhere(secret);
+      const address = await api.startOpenIdSignIn(secret);
       followed.leave();
       location.assign(address);
     } catch (error) {

@@ -12,7 +12,7 @@ interface ShareProps {
 }
 
 /** A share, in percent. */
-export function Share({ label, value, least, onChange, testid }: ShareProps) {
+export function ShareField({ label, value, least, onChange, testid }: ShareProps) {
   const id = useId();
   const percent = format.percent(value);
   return (

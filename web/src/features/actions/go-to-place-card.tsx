@@ -4,16 +4,16 @@ import { degrees, radians } from "../../shared/lib/angles";
 import type { Fleet } from "../devices/model/device-list";
 import type { GoTo } from "../../shared/mqtt/protocol.generated";
 import { texts } from "./texts";
-import { Drawing, usePlan } from "../spaces/floor-plan";
-import { ask, type ActProps } from "./action-cards";
+import { Drawing, useFloorPlan } from "../spaces/floor-plan";
+import { startAction, type ActionCardProps } from "./action-cards";
 import { NumberField, numberOf } from "./action-form-fields";
 
 const STEP_M = 0.1;
 
-export function Place({ station, no, fleet }: ActProps & { fleet: Fleet }) {
-  const { device } = station;
+export function GoToPlaceCard({ session, no, fleet }: ActionCardProps & { fleet: Fleet }) {
+  const { device } = session;
   const { space, agent, name } = device.info.value;
-  const plan = usePlan(fleet, space, agent);
+  const plan = useFloorPlan(fleet, space, agent);
   const [x, setX] = useState("");
   const [y, setY] = useState("");
   const [heading, setHeading] = useState("");
@@ -38,8 +38,8 @@ export function Place({ station, no, fleet }: ActProps & { fleet: Fleet }) {
     event.preventDefault();
     if (target === null || no !== "" || headless) return;
     const to: GoTo = { kind: "go_to", x_m: target.xM, y_m: target.yM, yaw_rad: target.yawRad };
-    if (mine === null) ask(station, to);
-    else ask(station, to, { kind: "go_to", x_m: mine.xM, y_m: mine.yM, yaw_rad: mine.yawRad });
+    if (mine === null) startAction(session, to);
+    else startAction(session, to, { kind: "go_to", x_m: mine.xM, y_m: mine.yM, yaw_rad: mine.yawRad });
   };
   return (
     <form class="act-form" onSubmit={go}>

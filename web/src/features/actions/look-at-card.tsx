@@ -1,10 +1,10 @@
 import { useState } from "preact/hooks";
 import { texts } from "./texts";
-import { ask, type ActProps } from "./action-cards";
+import { startAction, type ActionCardProps } from "./action-cards";
 import { NumberField, numbersOf } from "./action-form-fields";
 
 /** Turn the gaze to a point, in the robot's own frame: x ahead, y to its left, z up. */
-export function Look({ station, no }: ActProps) {
+export function LookAtCard({ session, no }: ActionCardProps) {
   const [point, setPoint] = useState(["1.0", "0.0", "0.5"]);
   const [x, y, z] = numbersOf(point) ?? [];
   const known = x !== undefined && y !== undefined && z !== undefined;
@@ -13,7 +13,7 @@ export function Look({ station, no }: ActProps) {
       class="act-form"
       onSubmit={(event) => {
         event.preventDefault();
-        if (known && no === "") ask(station, { kind: "look_at", position_m: [x, y, z] });
+        if (known && no === "") startAction(session, { kind: "look_at", position_m: [x, y, z] });
       }}
     >
       <div class="act-numbers">

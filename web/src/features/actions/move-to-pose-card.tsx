@@ -5,14 +5,14 @@ import { rollPitchYaw, unit } from "../twin/model/forward-kinematics";
 import type { Vector3 } from "../../shared/lib/vectors";
 import { texts } from "./texts";
 import { Choice } from "../../shared/ui/parts";
-import { ask, type ActProps } from "./action-cards";
-import { NumberField, numbersOf, Share } from "./action-form-fields";
+import { startAction, type ActionCardProps } from "./action-cards";
+import { NumberField, numbersOf, ShareField } from "./action-form-fields";
 
 type Way = "direct" | "straight" | "plan";
 
 /** Bring a frame to a pose in the robot's base: metres, and turns about the base's x, y and z in degrees. */
-export function Pose({ station, description, no }: ActProps) {
-  const { device } = station;
+export function MoveToPoseCard({ session, description, no }: ActionCardProps) {
+  const { device } = session;
   const frames = description.frames;
   const [frame, setFrame] = useState(frames.at(-1) ?? "");
   const [fields, setFields] = useState<readonly string[]>(["", "", "", "", "", ""]);
@@ -31,7 +31,7 @@ export function Pose({ station, description, no }: ActProps) {
   const go = (event: SubmitEvent): void => {
     event.preventDefault();
     if (values === null || no !== "") return;
-    ask(station, {
+    startAction(session, {
       kind: "move_pose",
       position_m: values.slice(0, 3) as Vector3,
       rpy_rad: values.slice(3).map(radians) as Vector3,
@@ -69,7 +69,7 @@ export function Pose({ station, description, no }: ActProps) {
         ))}
       </div>
       <Choice label={texts.way} value={way} onChange={setWay} options={Object.entries(texts.ways) as [Way, string][]} />
-      <Share label={texts.speed} value={speed} least={0.05} onChange={setSpeed} />
+      <ShareField label={texts.speed} value={speed} least={0.05} onChange={setSpeed} />
       <button
         type="submit"
         class="primary"

@@ -2,16 +2,16 @@
 import { useState } from "preact/hooks";
 import type { AnyRequest } from "../../shared/api/action-requests";
 import { texts } from "./texts";
-import { ask, type ActProps } from "./action-cards";
-import { Share } from "./action-form-fields";
+import { startAction, type ActionCardProps } from "./action-cards";
+import { ShareField } from "./action-form-fields";
 
-interface ButtonsProps extends ActProps {
+interface ButtonsProps extends ActionCardProps {
   names: readonly string[];
   testid: string;
   request: (name: string) => AnyRequest;
 }
 
-function Buttons({ station, no, names, testid, request }: ButtonsProps) {
+function Buttons({ session, no, names, testid, request }: ButtonsProps) {
   return (
     <div class="act-buttons">
       {names.map((name) => (
@@ -21,7 +21,7 @@ function Buttons({ station, no, names, testid, request }: ButtonsProps) {
           data-testid={`${testid}-${name}`}
           disabled={no !== ""}
           title={no === "" ? undefined : no}
-          onClick={() => ask(station, request(name))}
+          onClick={() => startAction(session, request(name))}
         >
           {name}
         </button>
@@ -30,7 +30,7 @@ function Buttons({ station, no, names, testid, request }: ButtonsProps) {
   );
 }
 
-export function Postures(props: ActProps) {
+export function PosturesCard(props: ActionCardProps) {
   const [speed, setSpeed] = useState(0.5);
   return (
     <>
@@ -40,12 +40,12 @@ export function Postures(props: ActProps) {
         testid="posture"
         request={(name) => ({ kind: "take_posture", name, speed })}
       />
-      <Share label={texts.speed} value={speed} least={0.1} onChange={setSpeed} />
+      <ShareField label={texts.speed} value={speed} least={0.1} onChange={setSpeed} />
     </>
   );
 }
 
-export function Behaviours(props: ActProps) {
+export function BehavioursCard(props: ActionCardProps) {
   return (
     <Buttons
       {...props}
@@ -56,7 +56,7 @@ export function Behaviours(props: ActProps) {
   );
 }
 
-export function Expressions(props: ActProps) {
+export function ExpressionsCard(props: ActionCardProps) {
   const [strength, setStrength] = useState(1);
   return (
     <>
@@ -66,7 +66,7 @@ export function Expressions(props: ActProps) {
         testid="expression"
         request={(name) => ({ kind: "express", name, strength })}
       />
-      <Share label={texts.strength} value={strength} least={0} onChange={setStrength} testid="strength" />
+      <ShareField label={texts.strength} value={strength} least={0} onChange={setStrength} testid="strength" />
     </>
   );
 }

@@ -5,7 +5,7 @@ import type { Control } from "../control/model/lease";
 import type { DeviceStore } from "../devices/model/device-store";
 import { format } from "../../shared/i18n/format";
 import { describeRequest, texts } from "./texts";
-import { whyNotAct } from "../devices/availability";
+import { actionUnavailableReason } from "../devices/availability";
 import "./run-status.css";
 
 interface RunStatusProps {
@@ -14,7 +14,7 @@ interface RunStatusProps {
   actions: ActionRunner;
 }
 
-export function RunStatus({ device, control, actions }: RunStatusProps) {
+export function RunStatusPanel({ device, control, actions }: RunStatusProps) {
   const [dismissed, setDismissed] = useState("");
   const [problem, setProblem] = useState("");
   const newest = actions.run.value;
@@ -27,7 +27,7 @@ export function RunStatus({ device, control, actions }: RunStatusProps) {
   return (
     <div class={`doing ${mineRuns || others !== null ? "running" : ""} ${shown ? "" : "nothing"}`}>
       <div class={`run run-${run?.status ?? "none"}`} role="status" data-testid="action-status" data-status={run?.status ?? ""}>
-        {run !== null && <Told run={run} />}
+        {run !== null && <RunSteps run={run} />}
         {others !== null && <p>{texts.running(others.kind, others.name ?? "")}</p>}
         {problem !== "" && <p class="field-error">{problem}</p>}
       </div>
@@ -39,7 +39,7 @@ export function RunStatus({ device, control, actions }: RunStatusProps) {
         )}
         {run !== null && ended(run) && (
           <>
-            <Back device={device} control={control} actions={actions} run={run} />
+            <UndoButton device={device} control={control} actions={actions} run={run} />
             <button type="button" class="plain" onClick={() => setDismissed(run.key)}>
               {texts.dismiss}
             </button>
@@ -59,7 +59,7 @@ export function RunStatus({ device, control, actions }: RunStatusProps) {
 }
 
 /** What was asked, the steps it has made, how far it is. */
-export function Told({ run }: { run: Run }) {
+export function RunSteps({ run }: { run: Run }) {
   const name = describeRequest(run.request);
   return (
     <>
@@ -80,11 +80,11 @@ export function Told({ run }: { run: Run }) {
 }
 
 /** Undoes what has ended, also where it ended half way; not what was never begun. */
-function Back({ device, control, actions, run }: RunStatusProps & { run: Run }) {
+function UndoButton({ device, control, actions, run }: RunStatusProps & { run: Run }) {
   const { back } = run;
   const begun = run.steps.some(({ status }) => status === "started");
   if (back === null || !begun) return null;
-  const no = whyNotAct(device, control);
+  const no = actionUnavailableReason(device, control);
   return (
     <button
       type="button"

@@ -1,24 +1,24 @@
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { ActionRunner } from "./model/action-runner";
 import { texts } from "./texts";
-import { ask, type ActProps } from "./action-cards";
+import { startAction, type ActionCardProps } from "./action-cards";
 
 const LONGEST = 2000;
 /** As in BCP 47: `en`, `sk`, `en-GB`; or nothing. */
 const LANGUAGE = /^([A-Za-z]{1,8}(-[A-Za-z0-9]{1,8})*)?$/;
 
 /** Enter says it; Shift and Enter begin a new line. What was said goes, what was not stays. */
-export function Speech({ station, no }: ActProps) {
+export function SpeechCard({ session, no }: ActionCardProps) {
   const [text, setText] = useState("");
   const [language, setLanguage] = useState("");
   const asked = useRef("");
-  useSaid(station.actions, asked, (said) => setText((now) => (now === said ? "" : now)));
+  useSaid(session.actions, asked, (said) => setText((now) => (now === said ? "" : now)));
   const good = LANGUAGE.test(language.trim());
   const ready = no === "" && text.trim() !== "" && good;
   const say = (): void => {
     if (!ready) return;
     asked.current = text;
-    ask(station, { kind: "say", text: text.trim(), language: language.trim() });
+    startAction(session, { kind: "say", text: text.trim(), language: language.trim() });
   };
   return (
     <form

@@ -1,19 +1,19 @@
 import { useState } from "preact/hooks";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { ask, type ActProps } from "./action-cards";
-import { Share } from "./action-form-fields";
+import { startAction, type ActionCardProps } from "./action-cards";
+import { ShareField } from "./action-form-fields";
 
 const ALL = "";
 
 /** How strongly joints hold. What they hold with now is shown as the device tells it. */
-export function StiffnessCard({ station, description, no }: ActProps) {
+export function StiffnessCard({ session, description, no }: ActionCardProps) {
   const [joint, setJoint] = useState(ALL);
   const [value, setValue] = useState(1);
-  const { device } = station;
+  const { device } = session;
   const stands = description.postures.some((name) => name.startsWith("Stand"));
   const set = (share: number): void =>
-    ask(station, { kind: "set_stiffness", value: share, joints: joint === ALL ? [] : [joint] });
+    startAction(session, { kind: "set_stiffness", value: share, joints: joint === ALL ? [] : [joint] });
   return (
     <div class="act-form">
       <label>
@@ -27,7 +27,7 @@ export function StiffnessCard({ station, description, no }: ActProps) {
           ))}
         </select>
       </label>
-      <Share label={texts.stiffness} value={value} least={0} onChange={setValue} testid="stiffness-value" />
+      <ShareField label={texts.stiffness} value={value} least={0} onChange={setValue} testid="stiffness-value" />
       {stands && value < 0.3 && <p class="notice warn">{texts.limpWarning}</p>}
       <div class="row">
         <button

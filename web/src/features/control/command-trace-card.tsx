@@ -1,28 +1,28 @@
 /** How long things take, and what became of the last commands: nothing here is guessed. */
-import type { Station } from "../devices/model/device-session";
+import type { DeviceSession } from "../devices/model/device-session";
 import type { Step } from "../actions/model/action-runner";
 import { clock } from "../../shared/lib/clock";
-import type { Line, LineStatus } from "./model/command-trace";
+import type { TraceLine, TraceStatus } from "./model/command-trace";
 import { format } from "../../shared/i18n/format";
 import { describeRequest, texts as actionTexts } from "../actions/texts";
 import { texts as steeringTexts } from "../steering/texts";
 import { texts } from "./texts";
-import { Latency } from "../latency/live-latency-card";
+import { LiveLatency } from "../latency/live-latency-card";
 import { Card } from "../../shared/ui/parts";
 
 const COLUMNS = ["accepted", "started", "observed"] as const;
-const FIRST: ReadonlySet<LineStatus> = new Set(["sent", ...COLUMNS]);
+const FIRST: ReadonlySet<TraceStatus> = new Set(["sent", ...COLUMNS]);
 
-export function Times({ station }: { station: Station }) {
-  const lines = station.evidence.lines.value;
+export function CommandTraceCard({ session }: { session: DeviceSession }) {
+  const lines = session.commandTrace.lines.value;
   return (
     <Card title={texts.trace.latency} class="latency">
-      <Latency device={station.device} control={station.control} />
+      <LiveLatency device={session.device} control={session.control} />
       <h3>{texts.trace.title}</h3>
       {lines.length === 0 ? (
         <p class="quiet">{texts.trace.none}</p>
       ) : (
-        <div class="scroll evidence" data-testid="evidence" tabIndex={0} role="region" aria-label={texts.trace.title}>
+        <div class="scroll command-trace" data-testid="command-trace" tabIndex={0} role="region" aria-label={texts.trace.title}>
           <table>
             <thead>
               <tr>
@@ -48,18 +48,18 @@ export function Times({ station }: { station: Station }) {
   );
 }
 
-function endText({ status, request, why }: Line): string {
+function endText({ status, request, why }: TraceLine): string {
   const reason = (steeringTexts.joints.ended as Readonly<Record<string, string>>)[why];
   return request.kind === "stream" && reason !== undefined ? reason : actionTexts.status[status];
 }
 
-function Row({ line }: { line: Line }) {
-  const of = (status: LineStatus): Step<LineStatus> | undefined => line.steps.find((step) => step.status === status);
+function Row({ line }: { line: TraceLine }) {
+  const of = (status: TraceStatus): Step<TraceStatus> | undefined => line.steps.find((step) => step.status === status);
   const end = line.steps.find(({ status }) => !FIRST.has(status));
   const data = Object.fromEntries(COLUMNS.map((column) => [`data-${column}`, of(column)?.afterMs.toFixed(1) ?? ""]));
   return (
     <tr
-      data-testid="evidence-row"
+      data-testid="command-trace-row"
       data-kind={line.request.kind}
       data-status={line.status}
       data-seen={line.seenBy ?? ""}
@@ -79,7 +79,7 @@ function Row({ line }: { line: Line }) {
 }
 
 /** When, and by which way it was heard. */
-function Cell({ step, note, bad = false }: { step: Step<LineStatus> | undefined; note: string; bad?: boolean }) {
+function Cell({ step, note, bad = false }: { step: Step<TraceStatus> | undefined; note: string; bad?: boolean }) {
   if (step === undefined) return <td class="quiet">{format.unknown}</td>;
   const said = [note, note === "" || note === actionTexts.status.done ? texts.trace.heard[step.heard] : ""];
   return (

@@ -2,11 +2,11 @@ import { useId, useState } from "preact/hooks";
 import type { Control } from "./model/lease";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { StopSwitch } from "./model/stop";
-import type { Watching } from "./model/watchers";
+import type { Watchers } from "./model/watchers";
 import { texts } from "./texts";
 import "./control-bar.css";
-import { useFocusBack } from "../../shared/hooks/use-return-focus";
-import { Answer, AskButton, Asked, TakeOver } from "./handover-rows";
+import { useReturnFocus } from "../../shared/hooks/use-return-focus";
+import { AnswerRequest, RequestControlButton, PendingRequest, TakeOverForm } from "./handover-rows";
 import { WatcherNames, WatchersButton } from "./watcher-list";
 
 interface ControlBarProps {
@@ -14,7 +14,7 @@ interface ControlBarProps {
   control: Control;
   stop: StopSwitch;
   /** Who else looks at it, where that is asked. */
-  watching?: Watching;
+  watching?: Watchers;
 }
 
 /** Always in sight: who has control, taking, asking for it and giving it back, who else watches, and Stop. */
@@ -22,7 +22,7 @@ export function ControlBar({ device, control, stop, watching }: ControlBarProps)
   const names = useId();
   const [open, setOpen] = useState(false);
   const [takingOver, setTakingOver] = useState(false);
-  const opener = useFocusBack(takingOver);
+  const opener = useReturnFocus(takingOver);
   const watches = device.info.value.role === "viewer";
   return (
     <div class="control-bar" role="region" aria-label={texts.control.title}>
@@ -49,10 +49,10 @@ export function ControlBar({ device, control, stop, watching }: ControlBarProps)
         {texts.stop.press} <kbd>{texts.stop.key}</kbd>
       </button>
       {takingOver && mayTakeOver(device, control) && (
-        <TakeOver device={device} control={control} onClose={() => setTakingOver(false)} />
+        <TakeOverForm device={device} control={control} onClose={() => setTakingOver(false)} />
       )}
-      <Asked control={control} />
-      <Answer control={control} />
+      <PendingRequest control={control} />
+      <AnswerRequest control={control} />
       {watching !== undefined && open && <WatcherNames watching={watching} id={names} />}
     </div>
   );
@@ -83,7 +83,7 @@ function HoldButton({ device, control }: { device: DeviceStore; control: Control
   }
   const asking = control.asking.state.value.kind;
   // Where asking fails nobody may hold it any more, though the robot has not said so: then it can be taken.
-  if (anothers(device, control) && !watches && asking !== "failed") return <AskButton control={control} />;
+  if (anothers(device, control) && !watches && asking !== "failed") return <RequestControlButton control={control} />;
   const resumable = device.holder.value?.mine === true;
   return (
     <button

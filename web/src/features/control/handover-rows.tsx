@@ -1,7 +1,7 @@
 /** Asking for control, answering who asks, taking over: rows of the control bar, which they make higher and never cover. */
 import { useComputed } from "@preact/signals";
 import { useEffect, useId, useRef, useState } from "preact/hooks";
-import type { AskState } from "./model/control-request";
+import type { ControlRequestState } from "./model/control-request";
 import { clock } from "../../shared/lib/clock";
 import type { Control } from "./model/lease";
 import type { DeviceStore } from "../devices/model/device-store";
@@ -17,7 +17,7 @@ function Left({ until, as }: { until: number; as: (s: number) => string }) {
   );
 }
 
-export function AskButton({ control }: { control: Control }) {
+export function RequestControlButton({ control }: { control: Control }) {
   const { kind } = control.asking.state.value;
   if (kind === "open") {
     return (
@@ -40,7 +40,7 @@ export function AskButton({ control }: { control: Control }) {
 }
 
 /** What has become of asking. */
-export function Asked({ control }: { control: Control }) {
+export function PendingRequest({ control }: { control: Control }) {
   const state = control.asking.state.value;
   return (
     <div role="status" class={state.kind === "none" || state.kind === "sending" ? undefined : "bar-row"} data-testid="asked">
@@ -59,7 +59,7 @@ export function Asked({ control }: { control: Control }) {
   );
 }
 
-function became(state: Extract<AskState, { kind: "over" | "failed" }>): string {
+function became(state: Extract<ControlRequestState, { kind: "over" | "failed" }>): string {
   if (state.kind === "failed") return texts.handover.failed(state.why);
   return texts.handover.over[state.how](state.of || texts.handover.somebody);
 }
@@ -76,7 +76,7 @@ function Read({ text, control, wrong = false }: { text: string; control: Control
 }
 
 /** Who asks, how long there is to answer, and both answers. The focus stays where it was: hands are on a robot. */
-export function Answer({ control }: { control: Control }) {
+export function AnswerRequest({ control }: { control: Control }) {
   const asked = control.asked.value;
   const answered = control.answered.value;
   const sending = answered.kind === "sending";
@@ -128,7 +128,7 @@ interface TakeOverProps {
 }
 
 /** Not to be undone, and somebody is in the middle of something: it wants a reason, which they read. */
-export function TakeOver({ device, control, onClose }: TakeOverProps) {
+export function TakeOverForm({ device, control, onClose }: TakeOverProps) {
   const id = useId();
   const [reason, setReason] = useState("");
   const field = useRef<HTMLInputElement>(null);

@@ -1,12 +1,12 @@
 /** How many others look at a device, and who they are: as the server tells, for as long as it is heard. */
 import { onThisClock } from "../../shared/lib/clock";
-import type { Watching } from "./model/watchers";
+import type { Watchers } from "./model/watchers";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { Age } from "../../shared/ui/parts";
 
 interface WatchersButtonProps {
-  watching: Watching;
+  watching: Watchers;
   open: boolean;
   /** The id of their names. */
   names: string;
@@ -31,7 +31,7 @@ export function WatchersButton({ watching, open, names, onToggle }: WatchersButt
   );
 }
 
-export function WatcherNames({ watching, id }: { watching: Watching; id: string }) {
+export function WatcherNames({ watching, id }: { watching: Watchers; id: string }) {
   const others = watching.others.value ?? [];
   if (others.length === 0) return null;
   return (

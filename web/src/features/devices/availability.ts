@@ -4,7 +4,7 @@ import type { DeviceStore } from "./model/device-store";
 import { texts } from "./texts";
 
 /** Empty where it may. */
-export function whyNot(device: DeviceStore): string {
+export function unavailableReason(device: DeviceStore): string {
   if (device.info.value.role === "viewer") return texts.unavailable.viewer;
   if (device.reach.value === "offline" || device.reach.value === "unknown") return texts.unavailable.offline;
   if (device.stopped.value) return texts.unavailable.stopped;
@@ -12,8 +12,8 @@ export function whyNot(device: DeviceStore): string {
 }
 
 /** The same of what only one can ask, and one thing at a time: of a robot. Empty where it may. */
-export function whyNotAct(device: DeviceStore, control: Control): string {
-  const no = whyNot(device);
+export function actionUnavailableReason(device: DeviceStore, control: Control): string {
+  const no = unavailableReason(device);
   if (no !== "") return no;
   const mode = device.live.value ? device.mode.value : undefined;
   // First of all: an action that nobody had control for brings a lease of its own, and that says nothing here.

@@ -6,9 +6,9 @@ import { isRoomDevice } from "./model/filter";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { HeardAge, ReachChip } from "../../shared/ui/parts";
+import { LastSeenAge, ReachChip } from "../../shared/ui/parts";
 import { deviceAddress } from "../../app/routes";
-import { PickForTogether } from "../steering/multi-select";
+import { MultiRobotCheckbox } from "../steering/multi-select";
 
 interface DeviceListsProps {
   devices: readonly DeviceStore[];
@@ -44,7 +44,7 @@ function RobotRow({ device, fleet, line }: { device: DeviceStore; fleet: Fleet; 
   const info = device.info.value;
   return (
     <li class="card device-row" data-testid="device-row" data-device={device.id}>
-      <PickForTogether device={device} />
+      <MultiRobotCheckbox device={device} />
       <a class="device-name" href={deviceAddress(device.id)}>
         {info.label}
         <span class="quiet">
@@ -61,7 +61,7 @@ function RobotRow({ device, fleet, line }: { device: DeviceStore; fleet: Fleet; 
         <div>
           <dt>{texts.list.heard}</dt>
           <dd>
-            <HeardAge device={device} />
+            <LastSeenAge device={device} />
           </dd>
         </div>
         <div>
@@ -93,7 +93,7 @@ function SensorTile({ device, line }: { device: DeviceStore; line: HealthLine | 
       <ReachChip device={device} data-testid="online" />
       {device.reach.value !== "online" && (
         <span class="quiet small">
-          <HeardAge device={device} />
+          <LastSeenAge device={device} />
         </span>
       )}
       {state !== null && (state.mode !== "idle" || faultsOf(device, line) > 0) && <Doing device={device} line={line} />}

@@ -3,32 +3,32 @@ import { useEffect, useState } from "preact/hooks";
 import type { Account, Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
-import { Station } from "./model/device-session";
+import { DeviceSession } from "./model/device-session";
 
-/** One station for each device, in their order; none before the page is there. One key stops them all. */
-export function useStations(
+/** One session for each device, in their order; none before the page is there. One key stops them all. */
+export function useDeviceSessions(
   api: Api,
   fleet: Fleet,
   devices: readonly DeviceStore[],
   account: Account,
-): readonly Station[] {
-  const [stations, setStations] = useState<readonly Station[]>([]);
+): readonly DeviceSession[] {
+  const [sessions, setStations] = useState<readonly DeviceSession[]>([]);
   const ids = devices.map(({ id }) => id).join(" ");
 
   useEffect(() => {
     // Without a device the key is anybody's.
     if (devices.length === 0) return undefined;
-    const made = devices.map((device) => new Station(api, fleet.link, device, account.name));
+    const made = devices.map((device) => new DeviceSession(api, fleet.link, device, account.name));
     setStations(made);
     const look = (): void => {
-      for (const { watching } of made) watching.seen(document.visibilityState === "visible");
+      for (const { watchers: watching } of made) watching.seen(document.visibilityState === "visible");
     };
     look();
 
     const press = (event: KeyboardEvent): void => {
       if (event.key !== "Escape" || event.repeat) return;
       event.preventDefault();
-      for (const station of made) station.stopNow();
+      for (const session of made) session.stopNow();
     };
     const visibility = (): void => {
       look();
@@ -40,7 +40,7 @@ export function useStations(
       for (const { control } of made) control.streamer.value?.letGo();
     };
     const leave = (): void => {
-      for (const { control, watching } of made) {
+      for (const { control, watchers: watching } of made) {
         void control.release(true);
         watching.seen(false);
       }
@@ -55,11 +55,11 @@ export function useStations(
       document.removeEventListener("visibilitychange", visibility);
       removeEventListener("blur", blur);
       removeEventListener("pagehide", leave);
-      for (const station of made) station.dispose();
+      for (const session of made) session.dispose();
       setStations([]);
     };
     // Devices are the same as long as their ids are.
   }, [api, fleet, ids, account]);
 
-  return stations;
+  return sessions;
 }

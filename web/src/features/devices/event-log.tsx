@@ -5,7 +5,7 @@ import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 
 /** What lasts (faults) and what happened (events), newest first. */
-export function Events({ device }: { device: DeviceStore }) {
+export function EventLog({ device }: { device: DeviceStore }) {
   const events = device.events.value;
   const faults = device.state.value?.faults ?? [];
   const age = (atMs: number): string => format.age(Math.max(0, clock.value - onThisClock(atMs)));

@@ -2,32 +2,32 @@ import { useMemo, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
-import { fits, type Kinds, type Wanted, type Whose } from "./model/filter";
+import { matchesFilter, type KindFilter, type DeviceFilter, type OwnerFilter } from "./model/filter";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { DeviceLists, faultsOf } from "./device-list";
 import "./list.css";
 import { Choice } from "../../shared/ui/parts";
-import { usePolled } from "../../shared/hooks/use-polling";
+import { usePolling } from "../../shared/hooks/use-polling";
 import { pairAddress, spaceAddress } from "../../app/routes";
-import { Spaces } from "../spaces/space-list";
+import { SpaceList } from "../spaces/space-list";
 import { FirstSteps } from "../help/first-steps";
-import { OperateTogether } from "../steering/multi-select";
+import { OperateSelected } from "../steering/multi-select";
 
-const EVERYTHING: Wanted = { search: "", kinds: "all", whose: "all", onlyTrouble: false };
+const EVERYTHING: DeviceFilter = { search: "", kinds: "all", whose: "all", onlyTrouble: false };
 /** Fewer devices than this are seen at a glance. */
 const SEARCH_FROM = 5;
 /** Of each device the cloud reads what is open: seldom, for what the device says itself comes without asking. */
 const HEALTH_EVERY_MS = 30_000;
 
-export function FleetPage({ api, fleet }: { api: Api; fleet: Fleet }) {
+export function DeviceListPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const devices = fleet.devices.value;
   const [wanted, setWanted] = useState(EVERYTHING);
-  const lines = usePolled(() => api.health.all(null), HEALTH_EVERY_MS, [api]).value;
+  const lines = usePolling(() => api.health.all(null), HEALTH_EVERY_MS, [api]).value;
   const health = useMemo(() => new Map(lines?.map((line) => [line.device, line])), [lines]);
   const all = [...(devices?.values() ?? [])];
   const shown = all.filter((device) =>
-    fits(device, fleet.spaceName(device.info.value.space), faultsOf(device, health.get(device.id)), wanted),
+    matchesFilter(device, fleet.spaceName(device.info.value.space), faultsOf(device, health.get(device.id)), wanted),
   );
   const shared = all.some((device) => device.info.value.role !== "owner");
   return (
@@ -49,7 +49,7 @@ export function FleetPage({ api, fleet }: { api: Api; fleet: Fleet }) {
           </button>
         </p>
       )}
-      <OperateTogether devices={all} />
+      <OperateSelected devices={all} />
       {bySpace(shown, fleet).map(([space, found]) => (
         <section key={space} class="space-group" aria-label={fleet.spaceName(space)} data-testid="space">
           <header class="space-head">
@@ -61,7 +61,7 @@ export function FleetPage({ api, fleet }: { api: Api; fleet: Fleet }) {
           <DeviceLists devices={found} fleet={fleet} found={health} />
         </section>
       ))}
-      <Spaces api={api} fleet={fleet} />
+      <SpaceList api={api} fleet={fleet} />
     </main>
   );
 }
@@ -77,8 +77,8 @@ function bySpace(devices: readonly DeviceStore[], fleet: Fleet): [string, Device
 }
 
 interface SearchProps {
-  wanted: Wanted;
-  change: (wanted: Wanted) => void;
+  wanted: DeviceFilter;
+  change: (wanted: DeviceFilter) => void;
   /** Some devices are other people's. */
   shared: boolean;
   shown: number;
@@ -105,14 +105,14 @@ function Search({ wanted, change, shared, shown, all }: SearchProps) {
         label={texts.list.show}
         value={wanted.kinds}
         onChange={(kinds) => change({ ...wanted, kinds })}
-        options={Object.entries(texts.list.kinds) as [Kinds, string][]}
+        options={Object.entries(texts.list.kinds) as [KindFilter, string][]}
       />
       {shared && (
         <Choice
           label={texts.list.whose}
           value={wanted.whose}
           onChange={(whose) => change({ ...wanted, whose })}
-          options={Object.entries(texts.list.whoses) as [Whose, string][]}
+          options={Object.entries(texts.list.whoses) as [OwnerFilter, string][]}
         />
       )}
       <label class="check">

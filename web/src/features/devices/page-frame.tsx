@@ -3,13 +3,13 @@ import type { ComponentChildren } from "preact";
 import type { Account, Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
-import type { Station } from "./model/device-session";
+import type { DeviceSession } from "./model/device-session";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { ControlBar } from "../control/control-bar";
-import { HeardAge, ReachChip } from "../../shared/ui/parts";
-import { deviceAddress, fleetAddress, healthAddressOf, timesAddressOf } from "../../app/routes";
-import { useStations } from "./device-sessions";
+import { LastSeenAge, ReachChip } from "../../shared/ui/parts";
+import { deviceAddress, deviceListAddress, healthAddressOf, latencyAddressOf } from "../../app/routes";
+import { useDeviceSessions } from "./device-sessions";
 import { StopBanner } from "../control/stop-button";
 
 interface DeviceFrameProps {
@@ -18,17 +18,17 @@ interface DeviceFrameProps {
   account: Account;
   id: string;
   page: "health" | "times";
-  children: (station: Station) => ComponentChildren;
+  children: (session: DeviceSession) => ComponentChildren;
 }
 
-export function DeviceFrame({ id, ...rest }: DeviceFrameProps) {
+export function DevicePageFrame({ id, ...rest }: DeviceFrameProps) {
   const devices = rest.fleet.devices.value;
   const device = devices?.get(id);
   if (device !== undefined) return <Framed key={id} device={device} {...rest} />;
   return (
     <main class="narrow" id="content">
       <p role="status">{devices === null ? common.loading : common.deviceMissing}</p>
-      <a href={fleetAddress}>{common.allDevices}</a>
+      <a href={deviceListAddress}>{common.allDevices}</a>
     </main>
   );
 }
@@ -38,25 +38,25 @@ interface FramedProps extends Omit<DeviceFrameProps, "id"> {
 }
 
 function Framed({ api, fleet, account, device, page, children }: FramedProps) {
-  const [station] = useStations(api, fleet, [device], account);
-  if (station === undefined) return null;
+  const [session] = useDeviceSessions(api, fleet, [device], account);
+  if (session === undefined) return null;
   const { label } = device.info.value;
   const pages = [
     [texts.pages.device, deviceAddress(device.id), false],
     [texts.pages.health, healthAddressOf("device", device.id), page === "health"],
-    [texts.pages.latency, timesAddressOf(device.id), page === "times"],
+    [texts.pages.latency, latencyAddressOf(device.id), page === "times"],
   ] as const;
   return (
     <>
-      <ControlBar device={device} control={station.control} stop={station.stop} />
+      <ControlBar device={device} control={session.control} stop={session.stop} />
       <main class="page operate care" id="content">
         <div class="heading">
-          <a href={fleetAddress}>← {common.allDevices}</a>
+          <a href={deviceListAddress}>← {common.allDevices}</a>
           <h1>{texts.pages.title[page](label)}</h1>
           <p class="reach">
             <ReachChip device={device} data-testid="online" />
             <span class="quiet">
-              {texts.list.heard}: <HeardAge device={device} />
+              {texts.list.heard}: <LastSeenAge device={device} />
             </span>
           </p>
           <nav class="care-pages" aria-label={texts.pages.of(label)}>
@@ -67,8 +67,8 @@ function Framed({ api, fleet, account, device, page, children }: FramedProps) {
             ))}
           </nav>
         </div>
-        <StopBanner device={device} stop={station.stop} />
-        {children(station)}
+        <StopBanner device={device} stop={session.stop} />
+        {children(session)}
       </main>
     </>
   );

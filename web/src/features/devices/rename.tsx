@@ -4,16 +4,16 @@ import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import { sentence } from "../../shared/api/http";
 import { texts } from "./texts";
-import { useFocusBack } from "../../shared/hooks/use-return-focus";
+import { useReturnFocus } from "../../shared/hooks/use-return-focus";
 
-export function Naming({ api, device }: { api: Api; device: DeviceStore }) {
+export function RenameDevice({ api, device }: { api: Api; device: DeviceStore }) {
   const { label, role } = device.info.value;
   const [typed, setTyped] = useState<string | null>(null);
   const [busy, setBusy] = useState(false);
   const [wrong, setWrong] = useState("");
   /** What it was called before the last change. */
   const [before, setBefore] = useState<string | null>(null);
-  const opener = useFocusBack(typed !== null);
+  const opener = useReturnFocus(typed !== null);
   const field = useRef<HTMLInputElement>(null);
   useEffect(() => field.current?.select(), [typed === null]);
   if (role !== "owner") return null;

@@ -3,31 +3,31 @@ import { useRef } from "preact/hooks";
 import type { Account, Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
-import type { Station } from "./model/device-session";
+import type { DeviceSession } from "./model/device-session";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { Access, goToAccess } from "../sharing/access-list";
-import { Acts } from "../actions/action-cards";
-import { RunStatus } from "../actions/run-status";
+import { AccessList, goToAccess } from "../sharing/access-list";
+import { ActionCards } from "../actions/action-cards";
+import { RunStatusPanel } from "../actions/run-status";
 import { ControlBar } from "../control/control-bar";
 import "./robot-page.css";
-import { Events } from "./event-log";
-import { Times } from "../control/command-trace-card";
-import { Foldable } from "../../shared/ui/collapsible-card";
-import { WhatDoISee } from "../help/page-explainer";
+import { EventLog } from "./event-log";
+import { CommandTraceCard } from "../control/command-trace-card";
+import { CollapsibleCard } from "../../shared/ui/collapsible-card";
+import { PageExplainer } from "../help/page-explainer";
 import { HealthChip } from "../health/health-chip";
-import { Movements } from "../movements/movements-card";
-import { Naming } from "./rename";
-import { HeardAge, ReachChip } from "../../shared/ui/parts";
-import { Plot } from "../twin/telemetry-plot";
-import { PoseTable } from "../twin/joint-pose-table";
-import { RoomDesk } from "../sensors/room-device-page";
-import { fleetAddress, keyframesAddress, replaceWith, spaceAddress, timesAddressOf } from "../../app/routes";
-import { useStations } from "./device-sessions";
-import { SteerCard } from "../steering/steering-card";
+import { MovementsCard } from "../movements/movements-card";
+import { RenameDevice } from "./rename";
+import { LastSeenAge, ReachChip } from "../../shared/ui/parts";
+import { TelemetryPlot } from "../twin/telemetry-plot";
+import { JointPoseTable } from "../twin/joint-pose-table";
+import { RoomDevicePage } from "../sensors/room-device-page";
+import { deviceListAddress, keyframesAddress, replaceWith, spaceAddress, latencyAddressOf } from "../../app/routes";
+import { useDeviceSessions } from "./device-sessions";
+import { SteeringCard } from "../steering/steering-card";
 import { StopBanner } from "../control/stop-button";
-import { View3D } from "../twin/twin-view";
-import { useViews, Watching } from "../sensors/camera-switcher";
+import { TwinView } from "../twin/twin-view";
+import { useCameraSources, CameraSwitcher } from "../sensors/camera-switcher";
 
 interface DevicePageProps {
   api: Api;
@@ -60,7 +60,7 @@ export function DevicePage({ api, fleet, id, account }: DevicePageProps) {
           </div>
         )}
         <p>
-          <a class="elsewhere" href={fleetAddress}>
+          <a class="elsewhere" href={deviceListAddress}>
             {common.allDevices}
           </a>
         </p>
@@ -78,23 +78,23 @@ interface OperateProps {
 }
 
 function Operate({ api, fleet, device, account }: OperateProps) {
-  const [station] = useStations(api, fleet, [device], account);
-  if (station === undefined) return null;
-  const { control, stop } = station;
+  const [session] = useDeviceSessions(api, fleet, [device], account);
+  if (session === undefined) return null;
+  const { control, stop } = session;
   const robot = device.description.value?.joints.length !== 0;
   const access = <DeviceAccess api={api} fleet={fleet} device={device} account={account} />;
   return (
     <>
-      <ControlBar device={device} control={control} stop={stop} watching={station.watching} />
+      <ControlBar device={device} control={control} stop={stop} watching={session.watchers} />
       <main class="page operate" id="content">
         <Heading api={api} device={device} fleet={fleet} />
         <StopBanner device={device} stop={stop} />
-        <WhatDoISee page={robot ? "device" : "roomDevice"} />
-        {robot && <RunStatus device={device} control={control} actions={station.actions} />}
+        <PageExplainer page={robot ? "device" : "roomDevice"} />
+        {robot && <RunStatusPanel device={device} control={control} actions={session.actions} />}
         {robot ? (
-          <Desk api={api} fleet={fleet} station={station} account={account} access={access} />
+          <Desk api={api} fleet={fleet} session={session} account={account} access={access} />
         ) : (
-          <RoomDesk api={api} fleet={fleet} station={station} access={access} />
+          <RoomDevicePage api={api} fleet={fleet} session={session} access={access} />
         )}
       </main>
     </>
@@ -104,50 +104,50 @@ function Operate({ api, fleet, device, account }: OperateProps) {
 interface DeskProps {
   api: Api;
   fleet: Fleet;
-  station: Station;
+  session: DeviceSession;
   account: Account;
   access: ComponentChildren;
 }
 
 /** What is seen of a robot, what steers it, and what it is asked to do: three columns, on a phone one below the other. */
-function Desk({ api, fleet, station, account, access }: DeskProps) {
-  const { device, control, actions } = station;
-  const views = useViews(fleet, device);
+function Desk({ api, fleet, session, account, access }: DeskProps) {
+  const { device, control, actions } = session;
+  const views = useCameraSources(fleet, device);
   const type = device.info.value.robot_type;
   return (
     <div class="desk robot">
       <div class="column">
-        <Foldable name="view" title={texts.cards.view} type={type} always>
-          <View3D device={device} control={control} />
-        </Foldable>
+        <CollapsibleCard name="view" title={texts.cards.view} type={type} always>
+          <TwinView device={device} control={control} />
+        </CollapsibleCard>
         {views.length > 0 && (
-          <Foldable name="camera" title={texts.cards.camera} type={type}>
-            <Watching device={device} views={views} />
-          </Foldable>
+          <CollapsibleCard name="camera" title={texts.cards.camera} type={type}>
+            <CameraSwitcher device={device} views={views} />
+          </CollapsibleCard>
         )}
-        <Foldable name="plot" title={texts.cards.plot} type={type}>
-          <Plot device={device} />
-        </Foldable>
-        <Foldable name="poses" title={texts.cards.poses} type={type}>
-          <PoseTable device={device} />
-        </Foldable>
+        <CollapsibleCard name="plot" title={texts.cards.plot} type={type}>
+          <TelemetryPlot device={device} />
+        </CollapsibleCard>
+        <CollapsibleCard name="poses" title={texts.cards.poses} type={type}>
+          <JointPoseTable device={device} />
+        </CollapsibleCard>
       </div>
       <div class="column">
-        <Foldable name="steer" title={texts.cards.steering} type={type} always>
-          <SteerCard station={station} onStop={() => station.stopNow()} />
-        </Foldable>
-        <Foldable name="times" title={texts.cards.latency} type={type}>
-          <Times station={station} />
-        </Foldable>
+        <CollapsibleCard name="steer" title={texts.cards.steering} type={type} always>
+          <SteeringCard session={session} onStop={() => session.stopNow()} />
+        </CollapsibleCard>
+        <CollapsibleCard name="times" title={texts.cards.latency} type={type}>
+          <CommandTraceCard session={session} />
+        </CollapsibleCard>
       </div>
       <div class="column">
-        <Acts fleet={fleet} station={station} />
-        <Foldable name="movements" title={texts.cards.movements} type={type}>
-          <Movements api={api} device={device} control={control} actions={actions} account={account.id} />
-        </Foldable>
-        <Foldable name="events" title={texts.cards.events} type={type}>
-          <Events device={device} />
-        </Foldable>
+        <ActionCards fleet={fleet} session={session} />
+        <CollapsibleCard name="movements" title={texts.cards.movements} type={type}>
+          <MovementsCard api={api} device={device} control={control} actions={actions} account={account.id} />
+        </CollapsibleCard>
+        <CollapsibleCard name="events" title={texts.cards.events} type={type}>
+          <EventLog device={device} />
+        </CollapsibleCard>
         {access}
       </div>
     </div>
@@ -158,7 +158,7 @@ function DeviceAccess({ api, fleet, device, account }: OperateProps) {
   const { agent, id, owner, role, space } = device.info.value;
   const behindIt = [...(fleet.devices.value?.values() ?? [])].filter(({ info }) => info.value.agent === agent);
   return (
-    <Access
+    <AccessList
       api={api}
       account={account}
       target={{ kind: "device", id }}
@@ -169,7 +169,7 @@ function DeviceAccess({ api, fleet, device, account }: OperateProps) {
       space={{ id: space, name: fleet.spaceName(space) }}
       onLeft={() => {
         void fleet.refresh();
-        replaceWith(fleetAddress);
+        replaceWith(deviceListAddress);
       }}
     />
   );
@@ -180,7 +180,7 @@ function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet:
   const trouble = device.trouble.value;
   return (
     <div class="heading">
-      <a href={fleetAddress}>← {common.allDevices}</a>
+      <a href={deviceListAddress}>← {common.allDevices}</a>
       <h1>{info.label}</h1>
       <p class="quiet">
         {info.robot_type.replaceAll("_", " ")} · <a href={spaceAddress(info.space)}>{fleet.spaceName(info.space)}</a>
@@ -189,18 +189,18 @@ function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet:
       <p class="reach">
         <ReachChip device={device} data-testid="online" />
         <HealthChip api={api} device={device} />
-        <a class="chip" href={timesAddressOf(device.id)}>
+        <a class="chip" href={latencyAddressOf(device.id)}>
           {texts.pages.latency}
         </a>
         <span class="quiet">
-          {texts.list.heard}: <HeardAge device={device} />
+          {texts.list.heard}: <LastSeenAge device={device} />
         </span>
         {(device.description.value?.joints.length ?? 0) > 0 && (
           <a href={keyframesAddress(info.id)} data-testid="to-keyframes">
             {texts.cards.keyframes}
           </a>
         )}
-        <Naming api={api} device={device} />
+        <RenameDevice api={api} device={device} />
         <button type="button" class="plain" onClick={goToAccess}>
           {texts.cards.access}
         </button>

@@ -7,7 +7,7 @@ import {
   newestOf,
   openCount,
   standings,
-  toldBy,
+  reportedFaults,
   watchedQuantity,
   worstFirst,
   type DeviceHealth,
@@ -22,9 +22,9 @@ import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { FaultItem } from "./fault-item";
-import { codes, HealthWord, useTold } from "./health-chip";
+import { codes, HealthLabel, useReportedFaults } from "./health-chip";
 import { Card, Choice } from "../../shared/ui/parts";
-import { usePolled } from "../../shared/hooks/use-polling";
+import { usePolling } from "../../shared/hooks/use-polling";
 import { shown } from "../sensors/readings-card";
 import { Trend } from "./trend-chart";
 
@@ -37,9 +37,9 @@ interface Chosen {
 }
 
 export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStore }) {
-  const { value, trouble, again } = usePolled(() => api.health.of(device.id), EVERY_MS, [api, device]);
-  const told = toldBy(device);
-  useTold(codes(told), again);
+  const { value, trouble, again } = usePolling(() => api.health.of(device.id), EVERY_MS, [api, device]);
+  const told = reportedFaults(device);
+  useReportedFaults(codes(told), again);
   const past = usePast(api, device, value?.faults.map(({ id }) => id).join(" ") ?? "");
   const [chosen, setChosen] = useState<Chosen | null>(null);
   const trend = useRef<HTMLDivElement>(null);
@@ -75,11 +75,11 @@ export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStor
 }
 
 function Now({ device, value, trouble }: { device: DeviceStore; value: DeviceHealth | null; trouble: string }) {
-  const told = toldBy(device);
+  const told = reportedFaults(device);
   const count = openCount(value?.faults ?? null, told);
   return (
     <div class="row care-sum">
-      {value !== null && <HealthWord health={healthNow(value.health, told, device.reach.value)} />}
+      {value !== null && <HealthLabel health={healthNow(value.health, told, device.reach.value)} />}
       <p role="status" data-testid="open-faults" data-count={count}>
         {value === null && trouble === "" ? common.loading : texts.health.open(count)}
       </p>
@@ -136,7 +136,7 @@ interface FaultsProps {
 
 function Faults({ api, device, open, past, again, show }: FaultsProps) {
   const [which, setWhich] = useState<Which>("open");
-  const listed = which === "open" ? standings(open ?? [], toldBy(device)) : standings(past.items, []).map((one) => ({ ...one, agreement: "same" as const }));
+  const listed = which === "open" ? standings(open ?? [], reportedFaults(device)) : standings(past.items, []).map((one) => ({ ...one, agreement: "same" as const }));
   return (
     <Card
       title={texts.health.faults}

@@ -1,7 +1,7 @@
 /** One fault, from its first report to its end, and what happened around it. */
 import { useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import { around, type Fault, type Standing, type StoredEvent } from "./model/health";
+import { intervalAround, type Fault, type Standing, type StoredEvent } from "./model/health";
 import { onThisClock } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import { sentence } from "../../shared/api/http";
@@ -146,7 +146,7 @@ function Around({ api, device, fault }: Pick<FaultItemProps, "api" | "device"> &
   const [why, setWhy] = useState("");
   const open = (): void => {
     setWhy("");
-    eventsAround(api, device.id, fault).then(setEvents, (error: unknown) => setWhy(sentence(error)));
+    loadEventsAround(api, device.id, fault).then(setEvents, (error: unknown) => setWhy(sentence(error)));
   };
   return (
     <details class="around no-print" onToggle={(event) => event.currentTarget.open && open()}>
@@ -170,8 +170,8 @@ function Around({ api, device, fault }: Pick<FaultItemProps, "api" | "device"> &
   );
 }
 
-async function eventsAround(api: Api, device: string, fault: Fault): Promise<StoredEvent[]> {
-  const [from, to] = around(fault);
+async function loadEventsAround(api: Api, device: string, fault: Fault): Promise<StoredEvent[]> {
+  const [from, to] = intervalAround(fault);
   const found: StoredEvent[] = [];
   let cursor: string | null = null;
   for (let page = 0; page < PAGES; page += 1) {

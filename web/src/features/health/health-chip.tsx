@@ -2,9 +2,9 @@
 import { useEffect } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "../devices/model/device-store";
-import { openCount, toldBy, type HealthState } from "./model/health";
+import { openCount, reportedFaults, type HealthState } from "./model/health";
 import { texts } from "./texts";
-import { usePolled, type Polled } from "../../shared/hooks/use-polling";
+import { usePolling, type Polled } from "../../shared/hooks/use-polling";
 import { healthAddressOf } from "../../app/routes";
 
 const EVERY_MS = 15_000;
@@ -13,7 +13,7 @@ const STORED_AFTER_MS = 1_500;
 
 const KIND: Readonly<Record<HealthState, string>> = { ok: "reach-online", unknown: "", warning: "reach-stale", fault: "bad" };
 
-export function HealthWord({ health }: { health: HealthState }) {
+export function HealthLabel({ health }: { health: HealthState }) {
   return (
     <span class={`chip ${KIND[health]}`} data-testid="health" data-health={health}>
       {texts.health.state[health]}
@@ -22,7 +22,7 @@ export function HealthWord({ health }: { health: HealthState }) {
 }
 
 /** Ask again when the device itself says something else about its faults: at once, and when that is stored. */
-export function useTold(told: string, again: Polled<unknown>["again"]): void {
+export function useReportedFaults(told: string, again: Polled<unknown>["again"]): void {
   useEffect(() => {
     again();
     const timer = setTimeout(again, STORED_AFTER_MS);
@@ -32,9 +32,9 @@ export function useTold(told: string, again: Polled<unknown>["again"]): void {
 
 /** The number of open faults, as the way to the health page. */
 export function HealthChip({ api, device }: { api: Api; device: DeviceStore }) {
-  const told = toldBy(device);
-  const { value, again } = usePolled(() => api.health.of(device.id), EVERY_MS, [api, device]);
-  useTold(codes(told), again);
+  const told = reportedFaults(device);
+  const { value, again } = usePolling(() => api.health.of(device.id), EVERY_MS, [api, device]);
+  useReportedFaults(codes(told), again);
   if (value === null && told === null) return null;
   const count = openCount(value?.faults ?? null, told);
   const bad = (told?.length ?? 0) > 0 || value?.health === "fault";

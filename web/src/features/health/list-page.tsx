@@ -2,18 +2,18 @@
 import { useComputed } from "@preact/signals";
 import { useState } from "preact/hooks";
 import type { Account, Api } from "../../shared/api/client";
-import { healthNow, RANK, toldBy, type HealthLine, type HealthState } from "./model/health";
+import { healthNow, RANK, reportedFaults, type HealthLine, type HealthState } from "./model/health";
 import { onThisClock } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Fleet } from "../devices/model/device-list";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { DeviceFrame } from "../devices/page-frame";
+import { DevicePageFrame } from "../devices/page-frame";
 import { DeviceHealthView } from "./device-page";
-import { codes, HealthWord, useTold } from "./health-chip";
-import { Age, Choice, HeardAge, ReachChip } from "../../shared/ui/parts";
-import { usePolled } from "../../shared/hooks/use-polling";
+import { codes, HealthLabel, useReportedFaults } from "./health-chip";
+import { Age, Choice, LastSeenAge, ReachChip } from "../../shared/ui/parts";
+import { usePolling } from "../../shared/hooks/use-polling";
 import { healthAddress, healthAddressOf, spaceAddress } from "../../app/routes";
 import "./health.css";
 
@@ -32,9 +32,9 @@ interface HealthPageProps {
 export function HealthPage({ device, space, ...rest }: HealthPageProps) {
   if (device === "") return <HealthList api={rest.api} fleet={rest.fleet} space={space} />;
   return (
-    <DeviceFrame {...rest} id={device} page="health">
-      {(station) => <DeviceHealthView api={rest.api} device={station.device} />}
-    </DeviceFrame>
+    <DevicePageFrame {...rest} id={device} page="health">
+      {(session) => <DeviceHealthView api={rest.api} device={session.device} />}
+    </DevicePageFrame>
   );
 }
 
@@ -48,16 +48,16 @@ interface Shown {
 type Which = "all" | "look";
 
 function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: string }) {
-  const { value, trouble, again } = usePolled(() => api.health.all(space === "" ? null : space), EVERY_MS, [api, space]);
+  const { value, trouble, again } = usePolling(() => api.health.all(space === "" ? null : space), EVERY_MS, [api, space]);
   const [which, setWhich] = useState<Which>("all");
   const devices = fleet.devices.value;
   const told = useComputed(() =>
-    [...(fleet.devices.value?.values() ?? [])].map((device) => `${device.id} ${codes(toldBy(device))}`).join(" "),
+    [...(fleet.devices.value?.values() ?? [])].map((device) => `${device.id} ${codes(reportedFaults(device))}`).join(" "),
   );
-  useTold(told.value, again);
+  useReportedFaults(told.value, again);
   const lines = (value ?? []).map((line): Shown => {
     const device = devices?.get(line.device) ?? null;
-    const health = device === null ? line.health : healthNow(line.health, toldBy(device), device.reach.value);
+    const health = device === null ? line.health : healthNow(line.health, reportedFaults(device), device.reach.value);
     return { line, device, health };
   });
   lines.sort((one, other) => RANK[other.health] - RANK[one.health]);
@@ -102,7 +102,7 @@ function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: stri
 }
 
 function Line({ shown: { line, device, health }, fleet }: { shown: Shown; fleet: Fleet }) {
-  const told = device === null ? null : toldBy(device);
+  const told = device === null ? null : reportedFaults(device);
   const { worst, counts } = line;
   // The list names the worst of what is stored; what the device says besides is said by it.
   const news = (told ?? []).filter(({ code }) => code !== worst?.code);
@@ -117,11 +117,11 @@ function Line({ shown: { line, device, health }, fleet }: { shown: Shown; fleet:
         </span>
       </a>
       <span class="health-words">
-        <HealthWord health={health} />
+        <HealthLabel health={health} />
         {device !== null && <ReachChip device={device} />}
         {device !== null && device.reach.value !== "online" && (
           <span class="quiet small">
-            {texts.health.lastSeen}: <HeardAge device={device} />
+            {texts.health.lastSeen}: <LastSeenAge device={device} />
           </span>
         )}
       </span>

@@ -9,7 +9,7 @@ import type { Recording } from "../sensors/model/stored-series";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { History, useRecording } from "../sensors/history-card";
+import { HistoryCard, useRecording } from "../sensors/history-card";
 import { Card, Choice } from "../../shared/ui/parts";
 import { Figure, Limits, shown } from "../sensors/readings-card";
 
@@ -67,7 +67,7 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
         <Choice label={texts.trend.view} value={view} onChange={setView} options={Object.entries(texts.trend.views) as ["chart" | "table", string][]} />
       </div>
       {view === "chart" ? (
-        <History recording={recording} quantity={quantity} spanMs={spanMs} binary={false} old={late} marks={marks} />
+        <HistoryCard recording={recording} quantity={quantity} spanMs={spanMs} binary={false} old={late} marks={marks} />
       ) : (
         <Rows recording={recording} quantity={quantity} spanMs={spanMs} />
       )}

@@ -1,6 +1,6 @@
 /** The commands that make an agent and run it, to be copied: items of a list of steps. */
 import { texts } from "./texts";
-import { Secret } from "../../shared/ui/copy-once";
+import { CopyOnce } from "../../shared/ui/copy-once";
 import "../sharing/sharing.css";
 import "./help.css";
 
@@ -17,14 +17,14 @@ export function AgentCommands({ name, type }: AgentCommandsProps) {
   return (
     <>
       <li>
-        <Secret
+        <CopyOnce
           id="command-enroll"
           label={words.enroll}
           value={`${agent} enroll --home ${home} --server ${location.origin} --device ${name}=${type} --no-wait`}
         />
       </li>
       <li>
-        <Secret id="command-run" label={words.run} value={`${agent} run --home ${home}`} />
+        <CopyOnce id="command-run" label={words.run} value={`${agent} run --home ${home}`} />
       </li>
     </>
   );

@@ -3,7 +3,7 @@ import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { robotTypesAddress } from "../../app/routes";
 import { AgentCommands } from "./agent-commands";
-import { WhatDoISee } from "./page-explainer";
+import { PageExplainer } from "./page-explainer";
 
 /** Comes with every installation, and is simulated unless somebody names a real one. */
 const EXAMPLE = { name: "arm", type: "ur5" };
@@ -21,7 +21,7 @@ export function FirstSteps() {
         {words.simulated} <a href={robotTypesAddress}>{words.types}</a>
       </p>
       <p class="quiet">{words.shared}</p>
-      <WhatDoISee page="devices" />
+      <PageExplainer page="devices" />
     </Card>
   );
 }

@@ -2,7 +2,7 @@
 import { texts } from "./texts";
 import "./help.css";
 
-export function WhatDoISee({ page }: { page: keyof typeof texts.pages }) {
+export function PageExplainer({ page }: { page: keyof typeof texts.pages }) {
   return (
     <details class="what-do-i-see" data-testid="what-do-i-see">
       <summary>{texts.title}</summary>

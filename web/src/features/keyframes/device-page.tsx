@@ -6,11 +6,11 @@ import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { ControlBar } from "../control/control-bar";
 import { ReachChip } from "../../shared/ui/parts";
-import { deviceAddress, fleetAddress, keyframesAddress } from "../../app/routes";
-import { useStations } from "../devices/device-sessions";
+import { deviceAddress, deviceListAddress, keyframesAddress } from "../../app/routes";
+import { useDeviceSessions } from "../devices/device-sessions";
 import { StopBanner } from "../control/stop-button";
-import { Desk } from "./editor";
-import { Loaded, useSource } from "./load-movement";
+import { KeyframeEditor } from "./editor";
+import { LoadMovement, useMovementSource } from "./load-movement";
 import { measuredPose } from "./preview-twin";
 
 interface KeyframesPageProps {
@@ -29,7 +29,7 @@ export function KeyframesPage({ api, fleet, account, id, name }: KeyframesPagePr
     return (
       <main class="page" id="content">
         <p class="quiet">{devices === null ? common.loading : common.deviceMissing}</p>
-        {devices !== null && <a href={fleetAddress}>{common.allDevices}</a>}
+        {devices !== null && <a href={deviceListAddress}>{common.allDevices}</a>}
       </main>
     );
   }
@@ -45,13 +45,13 @@ interface OfDeviceProps {
 }
 
 function OfDevice({ api, fleet, account, device, name }: OfDeviceProps) {
-  const [station] = useStations(api, fleet, [device], account);
+  const [session] = useDeviceSessions(api, fleet, [device], account);
   const { robot_type: robotType, label } = device.info.value;
-  const loaded = useSource(api, robotType, name);
-  if (station === undefined) return null;
+  const loaded = useMovementSource(api, robotType, name);
+  if (session === undefined) return null;
   return (
     <>
-      <ControlBar device={device} control={station.control} stop={station.stop} />
+      <ControlBar device={device} control={session.control} stop={session.stop} />
       <main class="page operate kf-page" id="content">
         <div class="heading">
           <a href={deviceAddress(device.id)}>← {label}</a>
@@ -64,10 +64,10 @@ function OfDevice({ api, fleet, account, device, name }: OfDeviceProps) {
             <ReachChip device={device} data-testid="online" />
           </p>
         </div>
-        <StopBanner device={device} stop={station.stop} />
-        <Loaded robotType={robotType} name={name} {...loaded}>
+        <StopBanner device={device} stop={session.stop} />
+        <LoadMovement robotType={robotType} name={name} {...loaded}>
           {(source) => (
-            <Desk
+            <KeyframeEditor
               api={api}
               name={name}
               source={source}
@@ -77,11 +77,11 @@ function OfDevice({ api, fleet, account, device, name }: OfDeviceProps) {
               measured={measuredPose(device)}
               // A new movement begins where the robot is: its first word is waited for, where it is there to say one.
               waits={measuredPose(device) === null && device.reach.value !== "offline"}
-              station={station}
+              session={session}
               address={(saved) => keyframesAddress(device.id, saved)}
             />
           )}
-        </Loaded>
+        </LoadMovement>
       </main>
     </>
   );

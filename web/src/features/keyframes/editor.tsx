@@ -4,21 +4,21 @@ import type { Api } from "../../shared/api/client";
 import { begun, Drafts, Editor } from "./model/editor";
 import type { Positions, Robot } from "./model/keyframes";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
-import type { Station } from "../devices/model/device-session";
+import type { DeviceSession } from "../devices/model/device-session";
 import { texts } from "./texts";
-import { KeyframeCard } from "./keyframe-inspector";
+import { KeyframeInspector } from "./keyframe-inspector";
 import "./keyframes.css";
-import { Record } from "./record-panel";
-import { Save } from "./save-panel";
-import type { There } from "./load-movement";
-import { Problems, Timeline } from "./timeline";
-import { Twin } from "./preview-twin";
+import { RecordPanel } from "./record-panel";
+import { SavePanel } from "./save-panel";
+import type { MovementReference } from "./load-movement";
+import { ProblemList, Timeline } from "./timeline";
+import { PreviewTwin } from "./preview-twin";
 
 interface DeskProps {
   api: Api;
   /** Of the movement; empty: a new one. */
   name: string;
-  source: There;
+  source: MovementReference;
   robotType: string;
   /** `null` until it has been heard of. */
   robot: Robot | null;
@@ -30,15 +30,15 @@ interface DeskProps {
   /** A new movement must not begin yet. */
   waits: boolean;
   /** `null`: there is no robot, and nothing can be recorded or run. */
-  station: Station | null;
+  session: DeviceSession | null;
   /** Where a movement of this name is edited. */
   address: (name: string) => string;
 }
 
 const drafts = new Drafts(localStorage);
 
-export function Desk(props: DeskProps) {
-  const { api, station, name: first, source, robotType, robot, twin, measured, waits, address } = props;
+export function KeyframeEditor(props: DeskProps) {
+  const { api, session, name: first, source, robotType, robot, twin, measured, waits, address } = props;
   const begin = measured ?? props.home ?? null;
   const [name, setName] = useState(first);
   const [version, setVersion] = useState(source.version);
@@ -88,14 +88,14 @@ export function Desk(props: DeskProps) {
       {unkept && <p class="notice warn">{texts.unkept}</p>}
       <div class="desk kf-desk">
         <div class="column">
-          <Twin twin={twin} device={station?.device ?? null} editor={editor} />
+          <PreviewTwin twin={twin} device={session?.device ?? null} editor={editor} />
           <Timeline editor={editor} measured={measured} />
-          {station !== null && <Record device={station.device} editor={editor} />}
+          {session !== null && <RecordPanel device={session.device} editor={editor} />}
         </div>
         <div class="column">
-          <Save api={api} station={station} editor={editor} robotType={robotType} name={name} version={version} onSaved={onSaved} />
-          <Problems editor={editor} />
-          <KeyframeCard editor={editor} measured={measured} />
+          <SavePanel api={api} session={session} editor={editor} robotType={robotType} name={name} version={version} onSaved={onSaved} />
+          <ProblemList editor={editor} />
+          <KeyframeInspector editor={editor} measured={measured} />
         </div>
       </div>
     </>

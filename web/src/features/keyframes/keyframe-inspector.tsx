@@ -3,27 +3,27 @@ import { useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
 import type { Editor } from "./model/editor";
 import {
-  can,
-  setDeed,
+  supports,
+  setAction,
   setPose,
   setPosition,
   setTime,
-  type Deed,
-  type Deeds,
+  type ActionKind,
+  type KeyframeActions,
   type Keyframe,
   type Positions,
 } from "./model/keyframes";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
 import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
-import { JointRow } from "../steering/joint-slider";
+import { JointSlider } from "../steering/joint-slider";
 
 interface KeyframeCardProps {
   editor: Editor;
   measured: Positions | null;
 }
 
-export function KeyframeCard({ editor, measured }: KeyframeCardProps) {
+export function KeyframeInspector({ editor, measured }: KeyframeCardProps) {
   const index = editor.chosen.value;
   const movement = editor.movement.value;
   const keyframe = movement.keyframes[index];
@@ -155,7 +155,7 @@ function JointOf({ editor, index, joint, here, target, measured, wrong }: JointO
   const start = (joint.lower_rad + joint.upper_rad) / 2;
   return (
     <div class={`kf-joint ${here ? "" : "passes"} ${wrong ? "wrong" : ""}`}>
-      <JointRow joint={joint} targetRad={target ?? start} measuredRad={measured} onSet={set} />
+      <JointSlider joint={joint} targetRad={target ?? start} measuredRad={measured} onSet={set} />
       <label class="check small quiet">
         <input
           type="checkbox"
@@ -173,22 +173,22 @@ function JointOf({ editor, index, joint, here, target, measured, wrong }: JointO
 /** What else is done there: only what the robot says that it can do. */
 function DeedFields({ editor, index, keyframe }: PartProps) {
   const { robot } = editor;
-  const set = <D extends Deed>(deed: D, value: Deeds[D] | undefined): void =>
-    editor.change(setDeed(editor.movement.value, index, deed, value), `${index}-${deed}`);
+  const set = <D extends ActionKind>(deed: D, value: KeyframeActions[D] | undefined): void =>
+    editor.change(setAction(editor.movement.value, index, deed, value), `${index}-${deed}`);
   const named = [
     ["posture", robot.postures],
     ["behaviour", robot.behaviours],
     ["express", robot.expressions],
   ] as const;
   const { say, drive, go_to: place } = keyframe;
-  if (!Object.keys(texts.deeds).some((deed) => can(robot, deed as Deed))) return null;
+  if (!Object.keys(texts.deeds).some((deed) => supports(robot, deed as ActionKind))) return null;
   return (
     <fieldset class="kf-deeds" onFocusOut={() => editor.settle()}>
       <legend>{texts.deedsTitle}</legend>
       <p class="quiet small">{texts.deedsNote}</p>
       {named.map(
         ([deed, names]) =>
-          can(robot, deed) && (
+          supports(robot, deed) && (
             <div class="field" key={deed}>
               <label for={`kf-${deed}`}>{texts.deeds[deed]}</label>
               <select
@@ -205,7 +205,7 @@ function DeedFields({ editor, index, keyframe }: PartProps) {
             </div>
           ),
       )}
-      {can(robot, "say") && (
+      {supports(robot, "say") && (
         <div class="field">
           <label for="kf-say">{texts.deeds.say}</label>
           <input
@@ -218,7 +218,7 @@ function DeedFields({ editor, index, keyframe }: PartProps) {
           />
         </div>
       )}
-      {can(robot, "drive") && (
+      {supports(robot, "drive") && (
         <Toggle
           deed="drive"
           on={drive !== undefined}
@@ -251,7 +251,7 @@ function DeedFields({ editor, index, keyframe }: PartProps) {
           )}
         </Toggle>
       )}
-      {can(robot, "go_to") && (
+      {supports(robot, "go_to") && (
         <Toggle deed="go_to" on={place !== undefined} onToggle={(on) => set("go_to", on ? { x_m: 0, y_m: 0 } : undefined)}>
           {place !== undefined && (
             <div class="row">

@@ -10,20 +10,20 @@ import { texts } from "./texts";
 import { movementAddress } from "../../app/routes";
 
 /** `saved` `null`: it is yet to be made. */
-export interface There {
+export interface MovementReference {
   kind: "there";
   saved: Movement | null;
   version: number;
 }
 
-type Source = { kind: "loading" } | There | { kind: "by-hand" } | { kind: "failed"; why: string };
+type Source = { kind: "loading" } | MovementReference | { kind: "by-hand" } | { kind: "failed"; why: string };
 
 interface Reading {
   source: Source;
   again: () => void;
 }
 
-export function useSource(api: Api, robotType: string, name: string): Reading {
+export function useMovementSource(api: Api, robotType: string, name: string): Reading {
   const [source, setSource] = useState<Source>(name === "" ? { kind: "there", saved: null, version: 0 } : { kind: "loading" });
   const [tries, setTries] = useState(0);
   useEffect(() => {
@@ -40,10 +40,10 @@ export function useSource(api: Api, robotType: string, name: string): Reading {
 interface LoadedProps extends Reading {
   robotType: string;
   name: string;
-  children: (source: There) => ComponentChildren;
+  children: (source: MovementReference) => ComponentChildren;
 }
 
-export function Loaded({ source, again, robotType, name, children }: LoadedProps) {
+export function LoadMovement({ source, again, robotType, name, children }: LoadedProps) {
   switch (source.kind) {
     case "loading":
       return <p class="quiet">{common.loading}</p>;

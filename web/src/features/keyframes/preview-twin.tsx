@@ -25,7 +25,7 @@ interface TwinProps {
   editor: Editor;
 }
 
-export function Twin({ twin, device, editor }: TwinProps) {
+export function PreviewTwin({ twin, device, editor }: TwinProps) {
   const { canvas, box, scene, said } = useScene(twin);
   usePreviewClock(editor);
   const playing = editor.playing.value;

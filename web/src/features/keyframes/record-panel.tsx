@@ -5,7 +5,7 @@ import { degrees, radians } from "../../shared/lib/angles";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Editor } from "./model/editor";
 import type { Keyframe } from "./model/keyframes";
-import { keyframesOf, Recorder, trim, type Take } from "./model/recording";
+import { keyframesOf, Recorder, trim, type Recording } from "./model/recording";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
@@ -18,7 +18,7 @@ interface RecordProps {
 const [WIDTH, HEIGHT] = [600, 120];
 const MOST_POINTS = 300;
 
-export function Record({ device, editor }: RecordProps) {
+export function RecordPanel({ device, editor }: RecordProps) {
   const recorder = useMemo(() => new Recorder(), []);
   const running = recorder.running.value;
   const take = recorder.take.value;
@@ -63,7 +63,7 @@ export function Record({ device, editor }: RecordProps) {
 }
 
 interface TrimProps {
-  take: Take;
+  take: Recording;
   lasts: number;
   editor: Editor;
   onDone: () => void;
@@ -144,7 +144,7 @@ function Handle({ id, label, value, most, onSet }: HandleProps) {
 }
 
 interface CurvesProps {
-  take: Take;
+  take: Recording;
   lasts: number;
   from: number;
   to: number;

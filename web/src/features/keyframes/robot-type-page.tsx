@@ -4,10 +4,10 @@ import type { Api } from "../../shared/api/client";
 import { robotOf } from "../robot-types/model/robot-types";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { useLoaded } from "../../shared/hooks/use-resource";
+import { useResource } from "../../shared/hooks/use-resource";
 import { movementAddress, movementsAddress, typeKeyframesAddress } from "../../app/routes";
-import { Desk } from "./editor";
-import { Loaded, useSource } from "./load-movement";
+import { KeyframeEditor } from "./editor";
+import { LoadMovement, useMovementSource } from "./load-movement";
 
 interface TypeKeyframesPageProps {
   api: Api;
@@ -17,10 +17,10 @@ interface TypeKeyframesPageProps {
 }
 
 export function TypeKeyframesPage({ api, robotType, name }: TypeKeyframesPageProps) {
-  const type = useLoaded(useCallback(() => api.robotTypes.get(robotType), [api, robotType]));
-  const model = useLoaded(useCallback(() => api.robotTypes.model(robotType), [api, robotType]));
+  const type = useResource(useCallback(() => api.robotTypes.get(robotType), [api, robotType]));
+  const model = useResource(useCallback(() => api.robotTypes.model(robotType), [api, robotType]));
   const robot = useMemo(() => (type.value === null ? null : robotOf(type.value)), [type.value]);
-  const loaded = useSource(api, robotType, name);
+  const loaded = useMovementSource(api, robotType, name);
   const trouble = type.trouble !== "" ? type : model;
   return (
     <main class="page kf-page" id="content">
@@ -40,9 +40,9 @@ export function TypeKeyframesPage({ api, robotType, name }: TypeKeyframesPagePro
           </button>
         </p>
       )}
-      <Loaded robotType={robotType} name={name} {...loaded}>
+      <LoadMovement robotType={robotType} name={name} {...loaded}>
         {(source) => (
-          <Desk
+          <KeyframeEditor
             api={api}
             name={name}
             source={source}
@@ -52,11 +52,11 @@ export function TypeKeyframesPage({ api, robotType, name }: TypeKeyframesPagePro
             measured={null}
             home={type.value?.home_rad}
             waits={type.value === null}
-            station={null}
+            session={null}
             address={(saved) => typeKeyframesAddress(robotType, saved)}
           />
         )}
-      </Loaded>
+      </LoadMovement>
     </main>
   );
 }

@@ -5,17 +5,17 @@ import { sentence } from "../../shared/api/http";
 import type { Editor } from "./model/editor";
 import { LONGEST_SCRIPT, writeScript } from "./model/script-codec";
 import { MovementChanged } from "../movements/model/movement-library";
-import type { Station } from "../devices/model/device-session";
+import type { DeviceSession } from "../devices/model/device-session";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { RunStatus } from "../actions/run-status";
+import { RunStatusPanel } from "../actions/run-status";
 import { Card } from "../../shared/ui/parts";
-import { whyNotAct } from "../devices/availability";
+import { actionUnavailableReason } from "../devices/availability";
 
 interface SaveProps {
   api: Api;
   /** `null`: there is no robot that it could run on. */
-  station: Station | null;
+  session: DeviceSession | null;
   editor: Editor;
   robotType: string;
   /** As the cloud knows it; empty: not yet. */
@@ -25,7 +25,7 @@ interface SaveProps {
   onSaved: (name: string, version: number) => void;
 }
 
-export function Save({ api, station, editor, robotType, name, version, onSaved }: SaveProps) {
+export function SavePanel({ api, session, editor, robotType, name, version, onSaved }: SaveProps) {
   const [wanted, setWanted] = useState(name);
   const [busy, setBusy] = useState(false);
   const [said, setSaid] = useState("");
@@ -93,11 +93,11 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
         <button type="button" data-testid="kf-save" disabled={busy || !named || !changed || tooLong} onClick={() => void save()}>
           {busy ? texts.saving : texts.save}
         </button>
-        {station !== null && (
-          <Run station={station} name={wanted} changed={changed} blocked={busy || !named || tooLong} errors={errors} save={save} />
+        {session !== null && (
+          <Run session={session} name={wanted} changed={changed} blocked={busy || !named || tooLong} errors={errors} save={save} />
         )}
       </div>
-      {station === null && <p class="quiet small">{texts.runsOnDevice}</p>}
+      {session === null && <p class="quiet small">{texts.runsOnDevice}</p>}
       {tooLong && <p class="field-error">{texts.tooLong}</p>}
       <p role="status" data-testid="kf-said" data-version={version}>
         {said}
@@ -110,7 +110,7 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
           </button>
         </p>
       )}
-      {station !== null && <RunStatus device={station.device} control={station.control} actions={station.actions} />}
+      {session !== null && <RunStatusPanel device={session.device} control={session.control} actions={session.actions} />}
       <details>
         <summary>{texts.seeScript}</summary>
         <pre class="output kf-source" tabIndex={0} data-testid="kf-source">
@@ -122,7 +122,7 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
 }
 
 interface RunProps {
-  station: Station;
+  session: DeviceSession;
   name: string;
   /** It is not saved as it stands: that is done first. */
   changed: boolean;
@@ -131,12 +131,12 @@ interface RunProps {
   save: () => Promise<boolean>;
 }
 
-function Run({ station, name, changed, blocked, errors, save }: RunProps) {
+function Run({ session, name, changed, blocked, errors, save }: RunProps) {
   const [speed, setSpeed] = useState(1);
-  const why = whyNotAct(station.device, station.control);
+  const why = actionUnavailableReason(session.device, session.control);
   const run = async (): Promise<void> => {
     if (changed && !(await save())) return;
-    await station.actions.start({ kind: "run_movement", name, parameters: { speed } }, station.control.epoch);
+    await session.actions.start({ kind: "run_movement", name, parameters: { speed } }, session.control.epoch);
   };
   return (
     <>

@@ -1,4 +1,4 @@
-import type { Deed, Problem } from "./model/keyframes";
+import type { ActionKind, Problem } from "./model/keyframes";
 import { format } from "../../shared/i18n/format";
 
 export const texts = {
@@ -105,7 +105,7 @@ export const texts = {
     say: "Speak",
     drive: "Drive",
     go_to: "Go to a position in the room",
-  } satisfies Record<Deed, string>,
+  } satisfies Record<ActionKind, string>,
   forward: "forward [m/s]",
   turn: "turn [°/s]",
   duration: "duration [s]",

@@ -1,7 +1,7 @@
 /** Keyframes in time: markers that are dragged or moved by keys, and the preview's playhead above them. */
 import { useRef } from "preact/hooks";
 import type { Editor } from "./model/editor";
-import { DEEDS, setTime, SHORTEST_S, slowedAll, type Keyframe, type Positions } from "./model/keyframes";
+import { ACTION_KINDS, setTime, SHORTEST_S, stretchAll, type Keyframe, type Positions } from "./model/keyframes";
 import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 
@@ -155,7 +155,7 @@ interface MarkerProps {
 function Marker({ editor, index, one, wrong, style, timeAt }: MarkerProps) {
   const dragged = useRef(false);
   const chosen = editor.chosen.value === index;
-  const done = DEEDS.filter((deed) => one[deed] !== undefined);
+  const done = ACTION_KINDS.filter((deed) => one[deed] !== undefined);
   const move = (time: number, gesture = ""): void => editor.change(setTime(editor.movement.value, index, time, false), gesture);
   return (
     <div
@@ -220,7 +220,7 @@ function stepOf(event: KeyboardEvent): number | null {
 }
 
 /** What is wrong, each with what mends it. */
-export function Problems({ editor }: { editor: Editor }) {
+export function ProblemList({ editor }: { editor: Editor }) {
   const found = editor.problems.value;
   const fast = found.filter(({ what }) => what.kind === "too-fast").length;
   const labels = new Map(editor.robot.joints.map(({ name, label }) => [name, label]));
@@ -258,7 +258,7 @@ export function Problems({ editor }: { editor: Editor }) {
         <button
           type="button"
           data-testid="kf-mend-all"
-          onClick={() => editor.change(slowedAll(editor.movement.value, editor.robot))}
+          onClick={() => editor.change(stretchAll(editor.movement.value, editor.robot))}
         >
           {texts.mendAll}
         </button>

@@ -9,7 +9,7 @@ interface LatencyProps {
 }
 
 /** The round trip of what is streamed, and how fresh what comes back is. */
-export function Latency({ device, control }: LatencyProps) {
+export function LiveLatency({ device, control }: LatencyProps) {
   const figures = control.roundTrip.figures.value;
   const telemetry = device.telemetry.value;
   const age = device.telemetryAgeMs.value;

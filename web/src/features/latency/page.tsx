@@ -4,18 +4,18 @@ import type { Account, Api } from "../../shared/api/client";
 import { serverNow } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Fleet } from "../devices/model/device-list";
-import { Measure } from "./model/probe";
+import { LatencyProbe } from "./model/probe";
 import { publishedFor, SOURCES, type Published } from "./model/published-figures";
-import type { Station } from "../devices/model/device-session";
-import { csv, figuresOf, lineKey, linesOf, PATHS, TRANSPORTS, type Line, type Path, type StoredTimes, type Transport } from "./model/latency-stats";
+import type { DeviceSession } from "../devices/model/device-session";
+import { csv, figuresOf, lineKey, linesOf, PATHS, TRANSPORTS, type Line, type Path, type StoredLatency, type Transport } from "./model/latency-stats";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { DeviceFrame } from "../devices/page-frame";
-import { MeasureNow } from "./probe-panel";
+import { DevicePageFrame } from "../devices/page-frame";
+import { ProbePanel } from "./probe-panel";
 import { Card, Choice } from "../../shared/ui/parts";
-import { usePolled } from "../../shared/hooks/use-polling";
-import { TimesPlots, type Axis, type Scale } from "./plots";
+import { usePolling } from "../../shared/hooks/use-polling";
+import { LatencyPlots, type Axis, type Scale } from "./plots";
 import "../health/health.css";
 
 const EVERY_MS = 10_000;
@@ -33,13 +33,13 @@ interface TimesPageProps {
   device: string;
 }
 
-export function TimesPage({ device, ...rest }: TimesPageProps) {
+export function LatencyPage({ device, ...rest }: TimesPageProps) {
   const devices = rest.fleet.devices.value;
   if (device !== "") {
     return (
-      <DeviceFrame {...rest} id={device} page="times">
-        {(station) => <OfDevice api={rest.api} fleet={rest.fleet} station={station} />}
-      </DeviceFrame>
+      <DevicePageFrame {...rest} id={device} page="times">
+        {(session) => <OfDevice api={rest.api} fleet={rest.fleet} session={session} />}
+      </DevicePageFrame>
     );
   }
   return (
@@ -53,13 +53,13 @@ export function TimesPage({ device, ...rest }: TimesPageProps) {
 
 const NONE: readonly Line[] = [];
 
-function OfDevice({ api, fleet, station }: { api: Api; fleet: Fleet; station: Station }) {
-  const { device, control } = station;
-  const measure = useMemo(() => new Measure(api, fleet.link, device, () => control.epoch), [api, fleet, device, control]);
+function OfDevice({ api, fleet, session }: { api: Api; fleet: Fleet; session: DeviceSession }) {
+  const { device, control } = session;
+  const measure = useMemo(() => new LatencyProbe(api, fleet.link, device, () => control.epoch), [api, fleet, device, control]);
   return (
     <div class="care-times">
       <p class="quiet">{texts.explained}</p>
-      <MeasureNow device={device} measure={measure} />
+      <ProbePanel device={device} measure={measure} />
       <Times api={api} devices={[device]} fresh={measure.lines} />
     </div>
   );
@@ -79,12 +79,12 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
   const [scale, setScale] = useState<Scale>("log");
   const sinceMs = serverNow() - SPAN_MS[filter.span];
   const ids = devices.map(({ id }) => id);
-  const { value, trouble } = usePolled(
+  const { value, trouble } = usePolling(
     () => readAll(api, ids, serverNow() - SPAN_MS[filter.span]),
     EVERY_MS,
     [api, ids.join(" "), filter.span, fresh.length],
   );
-  const all = linesOf(value ?? new Map<string, StoredTimes[]>(), fresh, { device: filter.device, transport: filter.transport, path: null, sinceMs });
+  const all = linesOf(value ?? new Map<string, StoredLatency[]>(), fresh, { device: filter.device, transport: filter.transport, path: null, sinceMs });
   const path = filter.path === undefined ? mostOf(all) : filter.path;
   const lines = path === null ? all : all.filter((line) => line.path === path);
   const published = publishedFor(path);
@@ -133,7 +133,7 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
           {texts.none} {texts.how}
         </p>
       )}
-      <TimesPlots lines={lines} name={name} published={published} axis={axis} scale={scale} />
+      <LatencyPlots lines={lines} name={name} published={published} axis={axis} scale={scale} />
       <FiguresCard lines={lines} name={name} save={() => save(csv(lines, label))} />
       <PublishedCard published={published} />
     </>
@@ -147,11 +147,11 @@ function mostOf(lines: readonly Line[]): Path | null {
   return most === 0 ? null : path;
 }
 
-async function readAll(api: Api, ids: readonly string[], fromMs: number): Promise<Map<string, StoredTimes[]>> {
-  const found = new Map<string, StoredTimes[]>();
+async function readAll(api: Api, ids: readonly string[], fromMs: number): Promise<Map<string, StoredLatency[]>> {
+  const found = new Map<string, StoredLatency[]>();
   for (let first = 0; first < ids.length; first += AT_ONCE) {
     const part = ids.slice(first, first + AT_ONCE);
-    const read = await Promise.all(part.map((id) => api.times.of(id, fromMs)));
+    const read = await Promise.all(part.map((id) => api.latency.of(id, fromMs)));
     part.forEach((id, index) => found.set(id, read[index] ?? []));
   }
   return found;

@@ -6,7 +6,7 @@ import { texts } from "./texts";
 import { colour } from "../../shared/ui/canvas-theme";
 
 /** One line: along x and along y, each in its own order. */
-export interface Drawn {
+export interface PlotSeries {
   label: string;
   colour: string;
   x: number[];
@@ -18,8 +18,8 @@ export interface Reference {
   ms: number;
 }
 
-export interface TimesChart {
-  draw(lines: readonly Drawn[], references: readonly Reference[]): void;
+export interface LatencyChart {
+  draw(lines: readonly PlotSeries[], references: readonly Reference[]): void;
   dispose(): void;
 }
 
@@ -37,7 +37,7 @@ interface Options {
 const LOG: uPlot.Scale.Distr = 3;
 const LABEL_PX = 11;
 
-export function createTimesChart(box: HTMLElement, { along, log }: Options): TimesChart {
+export function createLatencyChart(box: HTMLElement, { along, log }: Options): LatencyChart {
   let references: readonly Reference[] = [];
   let plot: uPlot | null = null;
   let drawn = "";
@@ -47,7 +47,7 @@ export function createTimesChart(box: HTMLElement, { along, log }: Options): Tim
     const [least, most] = [Math.min(...all), Math.max(...all)];
     return log ? [least / 1.4, most * 1.6] : [0, most * 1.1];
   };
-  const build = (lines: readonly Drawn[]): uPlot => {
+  const build = (lines: readonly PlotSeries[]): uPlot => {
     const axis = { stroke: colour("--quiet"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line"), width: 1 } };
     // The end of a logarithmic axis is no round number.
     const inMs = (ticks: (number | null)[]): string[] =>
@@ -109,7 +109,7 @@ export function createTimesChart(box: HTMLElement, { along, log }: Options): Tim
   };
 }
 
-function aligned(lines: readonly Drawn[]): uPlot.AlignedData {
+function aligned(lines: readonly PlotSeries[]): uPlot.AlignedData {
   if (lines.length === 0) return [[]];
   return uPlot.join(lines.map(({ x, y }) => [x, y] as uPlot.AlignedData));
 }

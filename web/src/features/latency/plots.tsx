@@ -1,12 +1,12 @@
 /** The papers' plots: response times over samples, and beside them the share that was no slower. */
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Published } from "./model/published-figures";
-import { shares, type Line } from "./model/latency-stats";
+import { distribution, type Line } from "./model/latency-stats";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { onColourChange, seriesColour } from "../../shared/ui/canvas-theme";
-import type { Along, Drawn, Reference, TimesChart } from "./plot-canvas";
+import type { Along, PlotSeries, Reference, LatencyChart } from "./plot-canvas";
 
 export type Axis = keyof typeof texts.axes;
 export type Scale = keyof typeof texts.scales;
@@ -19,14 +19,14 @@ interface TimesPlotsProps {
   scale: Scale;
 }
 
-export function TimesPlots({ lines, name, published, axis, scale }: TimesPlotsProps) {
+export function LatencyPlots({ lines, name, published, axis, scale }: TimesPlotsProps) {
   const references = published.map(({ id, ms }) => ({ label: texts.published[id] ?? id, ms }));
-  const over = lines.map((line, index): Drawn => {
+  const over = lines.map((line, index): PlotSeries => {
     const x = line.samples.map(({ atMs }, place) => (axis === "time" ? atMs / 1000 + place / 1e6 : place + 1));
     return { label: name(line), colour: seriesColour(index), x, y: line.samples.map(({ ms }) => ms) };
   });
-  const share = lines.map((line, index): Drawn => {
-    const [x, y] = shares(line.samples);
+  const share = lines.map((line, index): PlotSeries => {
+    const [x, y] = distribution(line.samples);
     return { label: name(line), colour: seriesColour(index), x, y: y.map((one) => one * 100) };
   });
   return (
@@ -41,13 +41,13 @@ interface TimesCardProps {
   title: string;
   along: Along;
   scale: Scale;
-  lines: readonly Drawn[];
+  lines: readonly PlotSeries[];
   references: readonly Reference[];
 }
 
 function TimesCard({ title, along, scale, lines, references }: TimesCardProps) {
   const box = useRef<HTMLDivElement>(null);
-  const chart = useRef<TimesChart | null>(null);
+  const chart = useRef<LatencyChart | null>(null);
   const [failed, setFailed] = useState(false);
   const [repaint, setRepaint] = useState(0);
   const wanted = useRef({ lines, references });
@@ -58,9 +58,9 @@ function TimesCard({ title, along, scale, lines, references }: TimesCardProps) {
     const element = box.current;
     let alive = true;
     import("./plot-canvas").then(
-      ({ createTimesChart }) => {
+      ({ createLatencyChart }) => {
         if (!alive) return;
-        chart.current = createTimesChart(element, { along, log: scale === "log" });
+        chart.current = createLatencyChart(element, { along, log: scale === "log" });
         chart.current.draw(wanted.current.lines, wanted.current.references);
       },
       () => setFailed(true),

@@ -1,13 +1,13 @@
 /** Measuring here and now, by what moves nothing. */
-import { TIMES, waysOf, type Measure } from "./model/probe";
+import { TIMES, probeKindsOf, type LatencyProbe } from "./model/probe";
 import type { DeviceStore } from "../devices/model/device-store";
 import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 
-export function MeasureNow({ device, measure }: { device: DeviceStore; measure: Measure }) {
+export function ProbePanel({ device, measure }: { device: DeviceStore; measure: LatencyProbe }) {
   const progress = measure.progress.value;
   const why = measure.why.value;
-  const ways = waysOf(device);
+  const ways = probeKindsOf(device);
   const count = measure.lines.reduce((sum, { samples }) => sum + samples.length, 0);
   const watches = device.info.value.role === "viewer";
   const done = progress === null ? 0 : ways.indexOf(progress.way) * TIMES + progress.done;

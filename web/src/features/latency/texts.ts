@@ -1,5 +1,5 @@
 import type { Path, Transport } from "./model/latency-stats";
-import type { Way } from "./model/probe";
+import type { ProbeKind } from "./model/probe";
 
 export const texts = {
   title: "Latency",
@@ -79,7 +79,7 @@ export const texts = {
     cloud: "HTTP health check of the server",
     broker: "ping of the broker over this page's connection",
     device: "single measurement by the device, until its values arrive",
-  } satisfies Record<Way, string>,
+  } satisfies Record<ProbeKind, string>,
   measuring: (way: string, done: number, total: number): string => `${done} of ${total}: ${way}`,
   stop: "Cancel measurement",
   measureDone: (count: number): string => `${count} samples measured.`,

@@ -6,20 +6,20 @@ import { now } from "../../shared/lib/clock";
 import type { Fleet } from "../devices/model/device-list";
 import { sentence } from "../../shared/api/http";
 import { readScript } from "../keyframes/model/script-codec";
-import { keptDraft } from "../../shared/lib/local-storage";
+import { storedDraft } from "../../shared/lib/local-storage";
 import type { Checked, Scripting } from "./model/movement-library";
-import { Manuscript } from "./model/script-draft";
+import { ScriptDraft } from "./model/script-draft";
 import { failureMark, placed, type Place } from "../../shared/lib/text-offsets";
-import type { Station } from "../devices/model/device-session";
+import type { DeviceSession } from "../devices/model/device-session";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { Age, Card } from "../../shared/ui/parts";
 import { movementsAddress, typeKeyframesAddress } from "../../app/routes";
-import { useStations } from "../devices/device-sessions";
+import { useDeviceSessions } from "../devices/device-sessions";
 import { CodeEditor } from "./code-editor";
-import { ManyBar, RunPanel, robotsOf } from "./run-on-many";
+import { RunOnManyBar, RunPanel, robotsOf } from "./run-on-many";
 import { storage } from "../../shared/hooks/browser-storage";
-import { Difference, Versions } from "./version-list";
+import { ScriptDiff, VersionList } from "./version-list";
 import "./movements.css";
 
 interface EditorPageProps {
@@ -32,17 +32,17 @@ interface EditorPageProps {
 
 export function EditorPage({ api, fleet, account, robotType, name }: EditorPageProps) {
   const script = useMemo(
-    () => new Manuscript(api.library, robotType, name, keptDraft(storage(), account.id, robotType, name), texts.library.template),
+    () => new ScriptDraft(api.library, robotType, name, storedDraft(storage(), account.id, robotType, name), texts.library.template),
     [api, account, robotType, name],
   );
   const [chosen, setChosen] = useState<readonly string[]>([]);
   const devices = robotsOf(fleet, robotType, account.id).own.filter(({ id }) => chosen.includes(id));
-  const stations = useStations(api, fleet, devices, account);
+  const sessions = useDeviceSessions(api, fleet, devices, account);
   const loading = script.loading.value;
   useEffect(() => void script.load(), [script]);
   return (
     <>
-      {stations.length > 0 && <ManyBar stations={stations} />}
+      {sessions.length > 0 && <RunOnManyBar sessions={sessions} />}
       <main class="page operate movement-page" id="content">
         <div class="heading">
           <a href={movementsAddress}>← {texts.library.title}</a>
@@ -71,7 +71,7 @@ export function EditorPage({ api, fleet, account, robotType, name }: EditorPageP
             fleet={fleet}
             account={account}
             script={script}
-            stations={stations}
+            sessions={sessions}
             chosen={chosen}
             onChoose={setChosen}
           />
@@ -82,7 +82,7 @@ export function EditorPage({ api, fleet, account, robotType, name }: EditorPageP
 }
 
 /** Offered as long as its script is exactly what the keyframe editor would write. */
-function AsKeyframes({ script }: { script: Manuscript }) {
+function AsKeyframes({ script }: { script: ScriptDraft }) {
   const saved = script.base.value?.source;
   if (saved === undefined || script.changed.value || readScript(saved).kind !== "keyframes") return null;
   return (
@@ -99,13 +99,13 @@ interface DeskProps {
   api: Api;
   fleet: Fleet;
   account: Account;
-  script: Manuscript;
-  stations: readonly Station[];
+  script: ScriptDraft;
+  sessions: readonly DeviceSession[];
   chosen: readonly string[];
   onChoose: (chosen: readonly string[]) => void;
 }
 
-function Desk({ api, fleet, account, script, stations, chosen, onChoose }: DeskProps) {
+function Desk({ api, fleet, account, script, sessions, chosen, onChoose }: DeskProps) {
   const { robotType, name } = script;
   const [checked, setChecked] = useState<{ of: string; found: Checked } | null>(null);
   const base = script.base.value;
@@ -115,7 +115,7 @@ function Desk({ api, fleet, account, script, stations, chosen, onChoose }: DeskP
   return (
     <div class="desk">
       <div class="column">
-        <Code api={api} fleet={fleet} script={script} stations={stations} checked={checked} onChecked={setChecked} />
+        <Code api={api} fleet={fleet} script={script} sessions={sessions} checked={checked} onChecked={setChecked} />
       </div>
       <div class="column">
         <RunPanel
@@ -125,13 +125,13 @@ function Desk({ api, fleet, account, script, stations, chosen, onChoose }: DeskP
           robotType={robotType}
           movement={name}
           schema={schema}
-          stations={stations}
+          sessions={sessions}
           chosen={chosen}
           onChoose={onChoose}
           unsaved={unsaved}
           beforeRun={() => script.save()}
         />
-        <Versions
+        <VersionList
           api={api}
           robotType={robotType}
           name={name}
@@ -150,13 +150,13 @@ function Desk({ api, fleet, account, script, stations, chosen, onChoose }: DeskP
 interface CodeProps {
   api: Api;
   fleet: Fleet;
-  script: Manuscript;
-  stations: readonly Station[];
+  script: ScriptDraft;
+  sessions: readonly DeviceSession[];
   checked: { of: string; found: Checked } | null;
   onChecked: (checked: { of: string; found: Checked }) => void;
 }
 
-function Code({ api, fleet, script, stations, checked, onChecked }: CodeProps) {
+function Code({ api, fleet, script, sessions, checked, onChecked }: CodeProps) {
   const host = useRef<HTMLDivElement>(null);
   const editor = useRef<CodeEditor | null>(null);
   const saveButton = useRef<HTMLButtonElement>(null);
@@ -208,7 +208,7 @@ function Code({ api, fleet, script, stations, checked, onChecked }: CodeProps) {
     if (editor.current !== null && editor.current.text !== text) editor.current.replace(text);
   });
 
-  const why = stations.map(({ actions }) => actions.run.value).find((run) => run?.status === "failed")?.why ?? "";
+  const why = sessions.map(({ actions }) => actions.run.value).find((run) => run?.status === "failed")?.why ?? "";
   useEffect(() => {
     const mark = failureMark(why);
     const text = script.text.peek();
@@ -252,7 +252,7 @@ function deviceNames(fleet: Fleet): string[] {
   return [...new Set([...(fleet.devices.value?.values() ?? [])].map(({ info }) => info.value.name))].sort();
 }
 
-function SaveState({ script }: { script: Manuscript }) {
+function SaveState({ script }: { script: ScriptDraft }) {
   const base = script.base.value;
   const text =
     base === null
@@ -268,7 +268,7 @@ function SaveState({ script }: { script: Manuscript }) {
 }
 
 /** The text that this browser has kept is shown again; going back from it can be undone in turn. */
-function Restored({ script }: { script: Manuscript }) {
+function Restored({ script }: { script: ScriptDraft }) {
   const [given, setGiven] = useState<string | null>(null);
   const at = script.restored.value;
   if (given !== null && !script.changed.value) {
@@ -298,7 +298,7 @@ function Restored({ script }: { script: Manuscript }) {
   );
 }
 
-function ConflictNotice({ script }: { script: Manuscript }) {
+function ConflictNotice({ script }: { script: ScriptDraft }) {
   const conflict = script.conflict.value;
   if (conflict === null) return null;
   const { theirs } = conflict;
@@ -306,7 +306,7 @@ function ConflictNotice({ script }: { script: Manuscript }) {
     <div class="notice warn conflict" data-testid="conflict">
       <p>{theirs === null ? texts.editor.deleted : texts.editor.conflict(theirs.version, theirs.updated_at)}</p>
       {theirs !== null && (
-        <Difference before={theirs.source} after={script.text.value} label={texts.editor.bothLabel(theirs.version)} />
+        <ScriptDiff before={theirs.source} after={script.text.value} label={texts.editor.bothLabel(theirs.version)} />
       )}
       <div class="row">
         <button type="button" data-testid="save-over" onClick={() => void script.saveOver()}>

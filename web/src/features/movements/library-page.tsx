@@ -6,7 +6,7 @@ import { sentence } from "../../shared/api/http";
 import type { Movement, RobotTypeEntry } from "./model/movement-library";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { Confirm } from "../../shared/ui/confirm-button";
+import { ConfirmButton } from "../../shared/ui/confirm-button";
 import { Card } from "../../shared/ui/parts";
 import { movementAddress, typeKeyframesAddress } from "../../app/routes";
 import "./movements.css";
@@ -132,7 +132,7 @@ function TypeShelf({ api, shelf, onRemoved }: TypeShelfProps) {
               </span>
             </span>
             {!movement.built_in && (
-              <Confirm
+              <ConfirmButton
                 label={texts.library.remove}
                 description={texts.library.removeOf(movement.name)}
                 question={texts.library.removeSure(movement.name)}

@@ -24,7 +24,7 @@ interface MovementsProps {
 
 type Library = { kind: "loading" } | { kind: "there"; items: readonly Movement[] } | { kind: "failed"; why: string };
 
-export function Movements({ api, device, control, actions, account }: MovementsProps) {
+export function MovementsCard({ api, device, control, actions, account }: MovementsProps) {
   const [library, setLibrary] = useState<Library>({ kind: "loading" });
   const [tries, setTries] = useState(0);
   const [open, setOpen] = useState("");

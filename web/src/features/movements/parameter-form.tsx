@@ -1,6 +1,6 @@
 /** What an operator may set for a movement, as fields; what is wrong stands beside each. */
 import { useId, useMemo, useState } from "preact/hooks";
-import { keptParameters } from "../../shared/lib/local-storage";
+import { storedParameters } from "../../shared/lib/local-storage";
 import type { ObjectSchema, Parameters } from "./model/movement-library";
 import { fieldsOf, fill, read, type Field, type Filled, type Wrong } from "./model/parameter-form";
 import { texts } from "./texts";
@@ -26,7 +26,7 @@ export function useParameters(
 ): ParameterValues {
   const shape = JSON.stringify(schema);
   const fields = useMemo(() => fieldsOf(JSON.parse(shape) as ObjectSchema | null), [shape]);
-  const kept = useMemo(() => keptParameters(storage(), account, robotType, movement), [account, robotType, movement]);
+  const kept = useMemo(() => storedParameters(storage(), account, robotType, movement), [account, robotType, movement]);
   const [typed, setTyped] = useState<Filled>({});
   const [asked, setAsked] = useState(false);
   const start = useMemo(() => fill(fields, kept.read() ?? {}), [fields, kept]);

@@ -7,13 +7,13 @@ import type { Fleet } from "../devices/model/device-list";
 import { ApiError } from "../../shared/api/http";
 import { newId } from "../../shared/lib/ids";
 import type { ObjectSchema, Parameters } from "./model/movement-library";
-import type { Station } from "../devices/model/device-session";
+import type { DeviceSession } from "../devices/model/device-session";
 import { texts } from "./texts";
-import { Told } from "../actions/run-status";
+import { RunSteps } from "../actions/run-status";
 import { Card, ReachChip } from "../../shared/ui/parts";
 import { deviceAddress } from "../../app/routes";
 import { StopBanner } from "../control/stop-button";
-import { whyNotAct } from "../devices/availability";
+import { actionUnavailableReason } from "../devices/availability";
 import { ParameterFields, useParameters } from "./parameter-form";
 
 /** The account's robots of a type: what its library has runs on them. On others' robots their owners' movements run. */
@@ -26,13 +26,13 @@ export function robotsOf(fleet: Fleet, robotType: string, account: string): { ow
 }
 
 /** Always in sight while robots are chosen: whatever runs, one button stops all of it, and so does one key. */
-export function ManyBar({ stations }: { stations: readonly Station[] }) {
-  const running = stations.filter(({ actions }) => isRunning(actions.run.value));
+export function RunOnManyBar({ sessions }: { sessions: readonly DeviceSession[] }) {
+  const running = sessions.filter(({ actions }) => isRunning(actions.run.value));
   return (
     <div class="control-bar" role="region" aria-label={texts.many.bar}>
       <p class="control-state" role="status" data-testid="many-state">
         <span class="dot" aria-hidden="true" />
-        {running.length === 0 ? texts.many.chosen(stations.length) : texts.many.running(running.length, stations.length)}
+        {running.length === 0 ? texts.many.chosen(sessions.length) : texts.many.running(running.length, sessions.length)}
       </p>
       {running.length > 0 && (
         <button
@@ -52,10 +52,10 @@ export function ManyBar({ stations }: { stations: readonly Station[] }) {
         title={texts.many.stopKeyExplained}
         aria-keyshortcuts="Escape"
         onClick={() => {
-          for (const station of stations) station.stopNow();
+          for (const session of sessions) session.stopNow();
         }}
       >
-        {stations.length === 1 ? texts.many.stop : texts.many.stopAll} <kbd>{texts.many.stopKey}</kbd>
+        {sessions.length === 1 ? texts.many.stop : texts.many.stopAll} <kbd>{texts.many.stopKey}</kbd>
       </button>
     </div>
   );
@@ -68,7 +68,7 @@ interface RunPanelProps {
   robotType: string;
   movement: string;
   schema: ObjectSchema | null;
-  stations: readonly Station[];
+  sessions: readonly DeviceSession[];
   chosen: readonly string[];
   onChoose: (chosen: readonly string[]) => void;
   /** Whether the text has to be saved first; it says why it cannot be run otherwise. */
@@ -78,12 +78,12 @@ interface RunPanelProps {
 }
 
 export function RunPanel(props: RunPanelProps) {
-  const { api, fleet, account, robotType, movement, schema, stations, chosen, onChoose, unsaved, beforeRun } = props;
+  const { api, fleet, account, robotType, movement, schema, sessions, chosen, onChoose, unsaved, beforeRun } = props;
   const [asking, setAsking] = useState(false);
   const [why, setWhy] = useState("");
   const values = useParameters(account.id, robotType, movement, schema);
   const { own, others } = robotsOf(fleet, robotType, account.id);
-  const running = asking || stations.some(({ actions }) => isRunning(actions.run.value));
+  const running = asking || sessions.some(({ actions }) => isRunning(actions.run.value));
   const here = own.map(({ id }) => id).join(" ");
 
   // One that is gone is chosen no more. None is chosen by itself: from then on Escape is a Stop, also while one writes.
@@ -99,7 +99,7 @@ export function RunPanel(props: RunPanelProps) {
     if (parameters === null) return;
     setAsking(true);
     try {
-      if (!unsaved || (await beforeRun())) await start(api, stations, movement, parameters);
+      if (!unsaved || (await beforeRun())) await start(api, sessions, movement, parameters);
     } finally {
       setAsking(false);
     }
@@ -143,8 +143,8 @@ export function RunPanel(props: RunPanelProps) {
         <h3>{texts.parameters.title}</h3>
         <ParameterFields values={values} disabled={running} />
         <div class="row">
-          <button type="submit" class="primary" data-testid="run-many" disabled={running || stations.length === 0}>
-            {asking ? texts.many.asking : unsaved ? texts.many.saveAndRun(stations.length) : texts.many.run(stations.length)}
+          <button type="submit" class="primary" data-testid="run-many" disabled={running || sessions.length === 0}>
+            {asking ? texts.many.asking : unsaved ? texts.many.saveAndRun(sessions.length) : texts.many.run(sessions.length)}
           </button>
           {values.fields.length > 0 && (
             <button type="button" class="plain" disabled={running} onClick={values.reset}>
@@ -157,24 +157,24 @@ export function RunPanel(props: RunPanelProps) {
         </p>
       </form>
       <ul class="run-rows" aria-label={texts.many.rows}>
-        {stations.map((station) => (
-          <RunRow key={station.device.id} station={station} />
+        {sessions.map((session) => (
+          <RunRow key={session.device.id} session={session} />
         ))}
       </ul>
     </Card>
   );
 }
 
-/** One call for all of them; each station follows its own action. */
-async function start(api: Api, stations: readonly Station[], movement: string, parameters: Parameters): Promise<void> {
+/** One call for all of them; each session follows its own action. */
+async function start(api: Api, sessions: readonly DeviceSession[], movement: string, parameters: Parameters): Promise<void> {
   const request = { kind: "run_movement", name: movement, parameters } as const;
   const epochs = Object.fromEntries(
-    stations.flatMap(({ device, control }) => (control.epoch === null ? [] : [[device.id, control.epoch]])),
+    sessions.flatMap(({ device, control }) => (control.epoch === null ? [] : [[device.id, control.epoch]])),
   );
-  const ids = stations.map(({ device }) => device.id);
+  const ids = sessions.map(({ device }) => device.id);
   const asked = api.library.runOnMany(ids, movement, parameters, epochs, newId());
   await Promise.all(
-    stations.map(({ device, actions }) =>
+    sessions.map(({ device, actions }) =>
       actions.follow(
         request,
         asked.then((items) => {
@@ -189,11 +189,11 @@ async function start(api: Api, stations: readonly Station[], movement: string, p
   );
 }
 
-function RunRow({ station }: { station: Station }) {
-  const { device, control, stop, actions } = station;
+function RunRow({ session }: { session: DeviceSession }) {
+  const { device, control, stop, actions } = session;
   const run = actions.run.value;
   const { label, name } = device.info.value;
-  const no = isRunning(run) ? "" : whyNotAct(device, control);
+  const no = isRunning(run) ? "" : actionUnavailableReason(device, control);
   return (
     <li class="run-row" data-testid={`run-${name}`} data-status={run?.status ?? ""}>
       <div class="row">
@@ -206,12 +206,12 @@ function RunRow({ station }: { station: Station }) {
             {texts.movements.cancel}
           </button>
         )}
-        <button type="button" class="stop" aria-label={texts.many.stopOf(`${label} ${name}`)} onClick={() => station.stopNow()}>
+        <button type="button" class="stop" aria-label={texts.many.stopOf(`${label} ${name}`)} onClick={() => session.stopNow()}>
           {texts.many.stop}
         </button>
       </div>
       <div class={`run run-${run?.status ?? "none"}`} role="status">
-        {run !== null && <Told run={run} />}
+        {run !== null && <RunSteps run={run} />}
         {run === null && no !== "" && <p class="quiet">{no}</p>}
       </div>
       {run !== null && run.output !== "" && (
@@ -224,6 +224,6 @@ function RunRow({ station }: { station: Station }) {
   );
 }
 
-function isRunning(run: Station["actions"]["run"]["value"]): boolean {
+function isRunning(run: DeviceSession["actions"]["run"]["value"]): boolean {
   return run !== null && !ended(run);
 }

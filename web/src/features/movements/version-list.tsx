@@ -9,7 +9,7 @@ import { Card } from "../../shared/ui/parts";
 import { Comparison } from "./code-editor";
 
 /** Two texts, the newer with what has changed in it. */
-export function Difference({ before, after, label }: { before: string; after: string; label: string }) {
+export function ScriptDiff({ before, after, label }: { before: string; after: string; label: string }) {
   const host = useRef<HTMLDivElement>(null);
   useEffect(() => {
     if (host.current === null) return undefined;
@@ -29,7 +29,7 @@ interface VersionsProps {
   onRestore: (source: string) => Promise<void>;
 }
 
-export function Versions({ api, robotType, name, newest, text, onRestore }: VersionsProps) {
+export function VersionList({ api, robotType, name, newest, text, onRestore }: VersionsProps) {
   const [versions, setVersions] = useState<readonly Movement[]>([]);
   const [looked, setLooked] = useState<{ version: number; source: string } | null>(null);
   const [why, setWhy] = useState("");
@@ -96,7 +96,7 @@ export function Versions({ api, robotType, name, newest, text, onRestore }: Vers
           <p class="quiet small">
             {looked.source === text ? texts.versions.same(looked.version) : texts.versions.explain(looked.version)}
           </p>
-          <Difference before={looked.source} after={text} label={texts.versions.label(looked.version)} />
+          <ScriptDiff before={looked.source} after={text} label={texts.versions.label(looked.version)} />
           {looked.source !== text && (
             <button
               type="button"

@@ -6,10 +6,10 @@ import { ApiError, sentence } from "../../shared/api/http";
 import { readCode, type FollowedCode } from "./model/claim-code";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { Naming } from "../devices/rename";
+import { RenameDevice } from "../devices/rename";
 import "./pairing.css";
-import { Card, HeardAge, ReachChip } from "../../shared/ui/parts";
-import { deviceAddress, fleetAddress } from "../../app/routes";
+import { Card, LastSeenAge, ReachChip } from "../../shared/ui/parts";
+import { deviceAddress, deviceListAddress } from "../../app/routes";
 
 interface PairingPageProps {
   api: Api;
@@ -22,7 +22,7 @@ export function PairingPage({ api, fleet, pairing }: PairingPageProps) {
   return (
     <main class="page pairing" id="content">
       <p>
-        <a href={fleetAddress}>← {common.allDevices}</a>
+        <a href={deviceListAddress}>← {common.allDevices}</a>
       </p>
       <h1>{texts.title}</h1>
       {paired === null ? (
@@ -226,18 +226,18 @@ function PairedDevice({ api, fleet, info }: { api: Api; fleet: Fleet; info: Devi
         {called.robot_type.replaceAll("_", " ")} · {fleet.spaceName(called.space)}
       </span>
       <span role="status">
-        {device === undefined || device.heardAt.value === null ? (
+        {device === undefined || device.lastSeenAt.value === null ? (
           <span class="quiet small">{texts.waiting}</span>
         ) : (
           <>
             <ReachChip device={device} data-testid="online" />{" "}
             <span class="quiet small" aria-hidden="true">
-              <HeardAge device={device} />
+              <LastSeenAge device={device} />
             </span>
           </>
         )}
       </span>
-      {device !== undefined && <Naming api={api} device={device} />}
+      {device !== undefined && <RenameDevice api={api} device={device} />}
     </li>
   );
 }

@@ -2,22 +2,22 @@
 import { useEffect, useMemo } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { clock } from "../../shared/lib/clock";
-import { TypeDraft } from "./model/upload-draft";
+import { UploadDraft } from "./model/upload-draft";
 import { MANIFEST } from "./model/upload-files";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { robotTypeAddress, robotTypesAddress } from "../../app/routes";
-import { ChooseFiles, ChosenFiles } from "./file-picker";
-import { Findings } from "./findings-list";
-import { Found } from "./upload-findings";
-import { ModelView } from "./model-viewer";
+import { FilePicker, SelectedFiles } from "./file-picker";
+import { FindingsList } from "./findings-list";
+import { UploadSummary } from "./upload-findings";
+import { ModelViewer } from "./model-viewer";
 import { StartAgent } from "./start-agent";
 import "./robot-types.css";
 
 export function AddRobotTypePage({ api }: { api: Api }) {
-  const draft = useMemo(() => new TypeDraft(api.robotTypes), [api]);
+  const draft = useMemo(() => new UploadDraft(api.robotTypes), [api]);
   useEffect(() => () => draft.dispose(), [draft]);
   const words = texts.adding;
   return (
@@ -30,11 +30,11 @@ export function AddRobotTypePage({ api }: { api: Api }) {
         <>
           <Card title={words.files}>
             <p class="quiet">{words.explained}</p>
-            <ChooseFiles draft={draft} />
+            <FilePicker draft={draft} />
           </Card>
           <Progress draft={draft} />
           <Outcome draft={draft} />
-          <ChosenFiles draft={draft} />
+          <SelectedFiles draft={draft} />
         </>
       )}
     </main>
@@ -42,7 +42,7 @@ export function AddRobotTypePage({ api }: { api: Api }) {
 }
 
 /** What is under way, with how long it has taken. */
-function Progress({ draft }: { draft: TypeDraft }) {
+function Progress({ draft }: { draft: UploadDraft }) {
   const step = draft.step.value;
   const words = texts.adding;
   const fault = draft.fault.value;
@@ -71,7 +71,7 @@ function Progress({ draft }: { draft: TypeDraft }) {
   );
 }
 
-function Outcome({ draft }: { draft: TypeDraft }) {
+function Outcome({ draft }: { draft: UploadDraft }) {
   const words = texts.adding;
   const look = draft.look.value;
   const model = draft.model.value;
@@ -79,8 +79,8 @@ function Outcome({ draft }: { draft: TypeDraft }) {
   const good = look !== null && (step === "good" || step === "saving");
   return (
     <>
-      <Findings findings={draft.errors.value} level="error" />
-      <Findings findings={draft.warnings.value} level="warning" />
+      <FindingsList findings={draft.errors.value} level="error" />
+      <FindingsList findings={draft.warnings.value} level="warning" />
       {good && (
         <>
           <Card title={words.good(look.robot_type.label)} class="save-type">
@@ -102,9 +102,9 @@ function Outcome({ draft }: { draft: TypeDraft }) {
             {model === null ? (
               <p class="quiet">{texts.model.none}</p>
             ) : (
-              <ModelView twin={model.twin} joints={look.robot_type.joints} />
+              <ModelViewer twin={model.twin} joints={look.robot_type.joints} />
             )}
-            <Found type={look.robot_type} model={model} files={draft.files.value} />
+            <UploadSummary type={look.robot_type} model={model} files={draft.files.value} />
           </div>
         </>
       )}
@@ -112,7 +112,7 @@ function Outcome({ draft }: { draft: TypeDraft }) {
   );
 }
 
-function Saved({ draft }: { draft: TypeDraft }) {
+function Saved({ draft }: { draft: UploadDraft }) {
   const type = draft.saved.value;
   const words = texts.adding;
   if (type === null) return null;

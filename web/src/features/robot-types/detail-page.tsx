@@ -9,15 +9,15 @@ import type { RobotType, TypeModel } from "./model/robot-types";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Confirm } from "../../shared/ui/confirm-button";
+import { ConfirmButton } from "../../shared/ui/confirm-button";
 import { Card } from "../../shared/ui/parts";
 import { addRobotTypeAddress, deviceAddress, replaceWith, robotTypesAddress } from "../../app/routes";
-import { Findings } from "./findings-list";
-import { ModelView } from "./model-viewer";
+import { FindingsList } from "./findings-list";
+import { ModelViewer } from "./model-viewer";
 import { StartAgent } from "./start-agent";
-import { StateChip } from "./status-chip";
-import { Trouble } from "../../shared/ui/load-error";
-import { useLoaded } from "../../shared/hooks/use-resource";
+import { StatusChip } from "./status-chip";
+import { LoadError } from "../../shared/ui/load-error";
+import { useResource } from "../../shared/hooks/use-resource";
 import "./robot-types.css";
 
 interface TypePageProps {
@@ -27,7 +27,7 @@ interface TypePageProps {
 }
 
 export function RobotTypePage({ api, fleet, id }: TypePageProps) {
-  const { value: type, trouble, again } = useLoaded(useCallback(() => api.robotTypes.get(id), [api, id]));
+  const { value: type, trouble, again } = useResource(useCallback(() => api.robotTypes.get(id), [api, id]));
   const devices = [...(fleet.devices.value?.values() ?? [])]
     .map(({ info }) => info.value)
     .filter(({ robot_type: used }) => used === id);
@@ -39,7 +39,7 @@ export function RobotTypePage({ api, fleet, id }: TypePageProps) {
           {common.loading}
         </p>
       )}
-      <Trouble said={trouble} again={again} />
+      <LoadError said={trouble} again={again} />
       {type !== null && <Loaded api={api} type={type} devices={devices} />}
     </main>
   );
@@ -52,11 +52,11 @@ function Loaded({ api, type, devices }: { api: Api; type: RobotType; devices: re
     <>
       <header class="title-row">
         <h1>{type.label}</h1>
-        <StateChip type={type} />
+        <StatusChip type={type} />
       </header>
       <p>{type.description}</p>
-      {upload?.state === "rejected" && <Findings findings={readFindings(upload.errors)} level="error" />}
-      {upload !== null && <Findings findings={readFindings(upload.warnings)} level="warning" />}
+      {upload?.state === "rejected" && <FindingsList findings={readFindings(upload.errors)} level="error" />}
+      {upload !== null && <FindingsList findings={readFindings(upload.warnings)} level="warning" />}
       <div class="two">
         {type.state === "ready" ? <Model api={api} type={type} /> : <p class="quiet">{words.model.notReady}</p>}
         <Facts type={type} devices={devices} />
@@ -81,11 +81,11 @@ function Model({ api, type }: { api: Api; type: RobotType }) {
       throw error;
     }
   }, [api, type]);
-  const { value, trouble, again } = useLoaded(load);
-  if (trouble !== "") return <Trouble said={trouble} again={again} />;
+  const { value, trouble, again } = useResource(load);
+  if (trouble !== "") return <LoadError said={trouble} again={again} />;
   if (value === null) return <p class="quiet">{common.loading}</p>;
   if (value === "none") return <p class="quiet">{texts.model.none}</p>;
-  return <ModelView twin={value.twin} joints={type.joints} />;
+  return <ModelViewer twin={value.twin} joints={type.joints} />;
 }
 
 function Facts({ type, devices }: { type: RobotType; devices: readonly Device[] }) {
@@ -174,10 +174,10 @@ function Joints({ type }: { type: RobotType }) {
 function Movements({ api, type }: { api: Api; type: RobotType }) {
   const ready = type.state === "ready";
   const load = useCallback(() => (ready ? api.robotTypes.movements(type.type) : Promise.resolve([])), [api, type, ready]);
-  const { value, trouble, again } = useLoaded(load);
+  const { value, trouble, again } = useResource(load);
   return (
     <Card title={texts.movements.title}>
-      <Trouble said={trouble} again={again} />
+      <LoadError said={trouble} again={again} />
       {value === null && trouble === "" && <p class="quiet">{common.loading}</p>}
       {value?.length === 0 && <p class="quiet">{texts.movements.none}</p>}
       {value !== null && value.length > 0 && (
@@ -232,7 +232,7 @@ function Own({ api, type }: { api: Api; type: RobotType }) {
       <p>
         <a href={addRobotTypeAddress}>{words.next}</a>
       </p>
-      <Confirm
+      <ConfirmButton
         label={words.remove}
         question={words.question(type.label)}
         yes={words.yes}

@@ -1,14 +1,14 @@
 /** Files of a robot type: dropped, or chosen as a folder, an archive or one by one. They stay until it is saved. */
 import { useRef, useState } from "preact/hooks";
-import type { TypeDraft } from "./model/upload-draft";
+import type { UploadDraft } from "./model/upload-draft";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
-import { ArchiveError, dropped, picked, readFiles } from "./read-archive";
+import { ArchiveError, filesFromDrop, filesFromPicker, readFiles } from "./read-archive";
 
 const WANTED = ".zip,.toml,.xml,.stl,.obj,.png,.py";
 
-export function ChooseFiles({ draft }: { draft: TypeDraft }) {
+export function FilePicker({ draft }: { draft: UploadDraft }) {
   const [over, setOver] = useState(false);
   const [reading, setReading] = useState(false);
   const [wrong, setWrong] = useState("");
@@ -30,7 +30,7 @@ export function ChooseFiles({ draft }: { draft: TypeDraft }) {
     }
   };
   const input = (event: { currentTarget: HTMLInputElement }): void => {
-    void take(Promise.resolve(picked(event.currentTarget.files)));
+    void take(Promise.resolve(filesFromPicker(event.currentTarget.files)));
     // The same file may be chosen again once it has been mended.
     event.currentTarget.value = "";
   };
@@ -46,7 +46,7 @@ export function ChooseFiles({ draft }: { draft: TypeDraft }) {
       onDrop={(event) => {
         event.preventDefault();
         setOver(false);
-        if (event.dataTransfer !== null) void take(dropped(event.dataTransfer));
+        if (event.dataTransfer !== null) void take(filesFromDrop(event.dataTransfer));
       }}
     >
       <p>{words.drop}</p>
@@ -89,7 +89,7 @@ export function ChooseFiles({ draft }: { draft: TypeDraft }) {
   );
 }
 
-export function ChosenFiles({ draft }: { draft: TypeDraft }) {
+export function SelectedFiles({ draft }: { draft: UploadDraft }) {
   const names = [...draft.files.value.keys()].sort();
   const left = draft.left.value;
   const words = texts.adding;
@@ -116,7 +116,7 @@ export function ChosenFiles({ draft }: { draft: TypeDraft }) {
   );
 }
 
-function FileRow({ draft, name, wrong }: { draft: TypeDraft; name: string; wrong: boolean }) {
+function FileRow({ draft, name, wrong }: { draft: UploadDraft; name: string; wrong: boolean }) {
   const input = useRef<HTMLInputElement>(null);
   const words = texts.adding;
   return (

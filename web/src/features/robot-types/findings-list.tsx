@@ -9,7 +9,7 @@ interface FindingsProps {
   level: "error" | "warning";
 }
 
-export function Findings({ findings, level }: FindingsProps) {
+export function FindingsList({ findings, level }: FindingsProps) {
   if (findings.length === 0) return null;
   const words = texts.findings;
   return (

@@ -5,15 +5,15 @@ import type { Fleet } from "../devices/model/device-list";
 import type { RobotType } from "./model/robot-types";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { WhatDoISee } from "../help/page-explainer";
+import { PageExplainer } from "../help/page-explainer";
 import { addRobotTypeAddress, robotTypeAddress } from "../../app/routes";
-import { Trouble } from "../../shared/ui/load-error";
-import { StateChip } from "./status-chip";
-import { useLoaded } from "../../shared/hooks/use-resource";
+import { LoadError } from "../../shared/ui/load-error";
+import { StatusChip } from "./status-chip";
+import { useResource } from "../../shared/hooks/use-resource";
 import "./robot-types.css";
 
 export function RobotTypesPage({ api, fleet }: { api: Api; fleet: Fleet }) {
-  const { value: types, trouble, again } = useLoaded(useCallback(() => api.robotTypes.list(), [api]));
+  const { value: types, trouble, again } = useResource(useCallback(() => api.robotTypes.list(), [api]));
   const words = texts;
   const own = types?.filter((type) => !type.built_in) ?? [];
   const builtIn = types?.filter((type) => type.built_in) ?? [];
@@ -26,13 +26,13 @@ export function RobotTypesPage({ api, fleet }: { api: Api; fleet: Fleet }) {
         </a>
       </header>
       <p class="quiet">{words.explained}</p>
-      <WhatDoISee page="robotTypes" />
+      <PageExplainer page="robotTypes" />
       {types === null && trouble === "" && (
         <p class="quiet" role="status">
           {common.loading}
         </p>
       )}
-      <Trouble said={trouble} again={again} />
+      <LoadError said={trouble} again={again} />
       {types !== null && (
         <>
           <section aria-label={words.own}>
@@ -78,7 +78,7 @@ function Types({ types, fleet, name }: { types: readonly RobotType[]; fleet: Fle
             <div>
               <dt>{words.column.state}</dt>
               <dd>
-                <StateChip type={type} />
+                <StatusChip type={type} />
               </dd>
             </div>
           </dl>

@@ -18,7 +18,7 @@ function atRest(joint: Joint): number {
   return Math.min(joint.upper_rad, Math.max(joint.lower_rad, 0));
 }
 
-export function ModelView({ twin, joints }: ModelViewProps) {
+export function ModelViewer({ twin, joints }: ModelViewProps) {
   const rest = Object.fromEntries(joints.map((joint) => [joint.name, atRest(joint)]));
   const [pose, setPose] = useState<Readonly<Record<string, number>>>(rest);
   const { canvas, box, scene, said } = useScene(twin);

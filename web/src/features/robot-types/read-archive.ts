@@ -22,14 +22,14 @@ export async function readFiles(chosen: readonly (readonly [string, File])[]): P
 }
 
 /** Of an `<input>`: a folder's files have a path. */
-export function picked(list: FileList | null): [string, File][] {
+export function filesFromPicker(list: FileList | null): [string, File][] {
   return [...(list ?? [])].map((file) => [file.webkitRelativePath === "" ? file.name : file.webkitRelativePath, file]);
 }
 
 /** What was dropped, folders with all that is in them. */
-export async function dropped(data: DataTransfer): Promise<[string, File][]> {
+export async function filesFromDrop(data: DataTransfer): Promise<[string, File][]> {
   const entries = [...data.items].map((item) => item.webkitGetAsEntry()).filter((entry) => entry !== null);
-  if (entries.length === 0) return picked(data.files);
+  if (entries.length === 0) return filesFromPicker(data.files);
   return (await Promise.all(entries.map((entry) => inside(entry)))).flat();
 }
 

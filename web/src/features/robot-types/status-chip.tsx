@@ -2,7 +2,7 @@ import type { RobotType } from "./model/robot-types";
 import { texts } from "./texts";
 
 /** Whether a type can be used, and how its newest upload fares. */
-export function StateChip({ type }: { type: RobotType }) {
+export function StatusChip({ type }: { type: RobotType }) {
   const newer = type.upload !== null && type.upload.version !== type.version ? type.upload : null;
   return (
     <span class="row">

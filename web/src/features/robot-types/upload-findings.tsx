@@ -1,7 +1,7 @@
 /** What the checkers have found in an upload. */
 import { degrees } from "../../shared/lib/angles";
 import type { RobotType, TypeModel } from "./model/robot-types";
-import { pack, type Files } from "./model/upload-files";
+import { packFiles, type Files } from "./model/upload-files";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
@@ -12,10 +12,10 @@ interface FoundProps {
   files: Files;
 }
 
-export function Found({ type, model, files }: FoundProps) {
+export function UploadSummary({ type, model, files }: FoundProps) {
   const words = texts.found;
   const { wholeDegrees } = format;
-  const movements = Object.keys(pack(files)?.movements ?? {});
+  const movements = Object.keys(packFiles(files)?.movements ?? {});
   const lists: [string, string[]][] = [
     [
       words.joints,

@@ -4,12 +4,12 @@ import { sentence } from "../../shared/api/http";
 import { clock, now } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { CameraFrame } from "../../shared/mqtt/camera-frame";
-import type { Instrument } from "./model/room-device-action";
+import type { RoomDeviceAction } from "./model/room-device-action";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
 import { Age, Card } from "../../shared/ui/parts";
-import { whyNot } from "../devices/availability";
+import { unavailableReason } from "../devices/availability";
 import "./sensors.css";
 
 /** Without a picture for this long, what is shown is not live [ms]; a slow camera has three of its periods. */
@@ -29,14 +29,14 @@ interface CameraCardProps {
   device: DeviceStore;
   name: string;
   /** What takes a single picture; `null` where the device cannot. */
-  instrument: Instrument | null;
+  roomAction: RoomDeviceAction | null;
   /** Instead of the camera's name; `aside`: beside it. */
   title?: string;
   aside?: ComponentChildren;
 }
 
 /** Pictures as they come, on a canvas. The broker sends them only while somebody watches. */
-export function CameraCard({ device, name, instrument, title, aside }: CameraCardProps) {
+export function CameraCard({ device, name, roomAction, title, aside }: CameraCardProps) {
   const canvas = useRef<HTMLCanvasElement>(null);
   const [running, setRunning] = useState(false);
   const [shown, setShown] = useState<Shown | null>(null);
@@ -58,7 +58,7 @@ export function CameraCard({ device, name, instrument, title, aside }: CameraCar
   }, [device, name, running]);
 
   const once = async (): Promise<void> => {
-    const taken = await instrument?.capture("image");
+    const taken = await roomAction?.capture("image");
     if (taken === null || taken === undefined || canvas.current === null) return;
     try {
       const image = await createImageBitmap(new Blob([await contentOf(taken)], { type: taken.upload.content_type }));
@@ -76,7 +76,7 @@ export function CameraCard({ device, name, instrument, title, aside }: CameraCar
   const silentMs = shown === null ? 0 : clock.value - shown.at;
   const stalled = running && shown?.kind === "live" && silentMs > Math.max(STALLED_MS, 3000 / rateHz);
   const old = stalled || (shown?.kind === "live" && !running) || !device.live.value;
-  const no = whyNot(device);
+  const no = unavailableReason(device);
   return (
     <Card title={title ?? texts.camera.title(name)} class="picture" aside={aside}>
       <div class="canvas-box image-box">
@@ -106,20 +106,20 @@ export function CameraCard({ device, name, instrument, title, aside }: CameraCar
         >
           {running ? texts.camera.stop : texts.camera.start}
         </button>
-        {instrument !== null && (
+        {roomAction !== null && (
           <button
             type="button"
             data-testid="camera-shot"
-            disabled={no !== "" || instrument.busy.value !== null}
+            disabled={no !== "" || roomAction.busy.value !== null}
             title={no}
             onClick={() => void once()}
           >
-            {instrument.busy.value === "capture" ? texts.camera.taking : texts.camera.shot}
+            {roomAction.busy.value === "capture" ? texts.camera.taking : texts.camera.shot}
           </button>
         )}
         <span class="quiet small">{shown !== null && <Caption shown={shown} running={running} rate={rate} />}</span>
       </div>
-      {instrument !== null && instrument.why.value !== "" && <p class="notice bad">{instrument.why.value}</p>}
+      {roomAction !== null && roomAction.why.value !== "" && <p class="notice bad">{roomAction.why.value}</p>}
       {trouble !== "" && <p class="notice bad">{trouble}</p>}
     </Card>
   );

@@ -17,7 +17,7 @@ interface WatchingProps {
 }
 
 /** The robot's own cameras first, then those of its space. */
-export function useViews(fleet: Fleet, device: DeviceStore): readonly View[] {
+export function useCameraSources(fleet: Fleet, device: DeviceStore): readonly View[] {
   const all = fleet.devices.value;
   const space = device.info.value.space;
   const others = [...(all?.values() ?? [])].filter(({ id, info }) => id !== device.id && info.value.space === space);
@@ -31,7 +31,7 @@ export function useViews(fleet: Fleet, device: DeviceStore): readonly View[] {
   );
 }
 
-export function Watching({ device, views }: WatchingProps) {
+export function CameraSwitcher({ device, views }: WatchingProps) {
   const [chosen, setChosen] = useState("");
   const view = views.find(({ key }) => key === chosen) ?? views[0];
   if (view === undefined) return null;
@@ -52,6 +52,6 @@ export function Watching({ device, views }: WatchingProps) {
     </select>
   );
   return (
-    <CameraCard key={view.key} device={view.device} name={view.camera} instrument={null} title={texts.cameraSource.title} aside={choice} />
+    <CameraCard key={view.key} device={view.device} name={view.camera} roomAction={null} title={texts.cameraSource.title} aside={choice} />
   );
 }

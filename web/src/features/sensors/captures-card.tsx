@@ -2,30 +2,30 @@ import { useState } from "preact/hooks";
 import type { Upload } from "../../shared/api/client";
 import { onThisClock } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
-import type { Instrument } from "./model/room-device-action";
+import type { RoomDeviceAction } from "./model/room-device-action";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { Age, Card } from "../../shared/ui/parts";
-import { whyNot } from "../devices/availability";
+import { unavailableReason } from "../devices/availability";
 
 /** Captures that are taken and shown by a card of their own. */
 const SHOWN_ELSEWHERE = ["image", "depth", "scan"];
 
 interface FilesProps {
   device: DeviceStore;
-  instrument: Instrument;
+  roomAction: RoomDeviceAction;
 }
 
 /** What was captured, by whomever, to take home. */
-export function Files({ device, instrument }: FilesProps) {
-  const uploads = instrument.uploads.value;
+export function CapturesCard({ device, roomAction }: FilesProps) {
+  const uploads = roomAction.uploads.value;
   const more = (device.description.value?.captures ?? []).filter((name) => !SHOWN_ELSEWHERE.includes(name));
-  const no = whyNot(device);
+  const no = unavailableReason(device);
   const [taking, setTaking] = useState("");
   const take = async (name: string): Promise<void> => {
     setTaking(name);
-    await instrument.capture(name);
+    await roomAction.capture(name);
     setTaking("");
   };
   return (
@@ -37,7 +37,7 @@ export function Files({ device, instrument }: FilesProps) {
               key={name}
               type="button"
               data-testid={`capture-${name}`}
-              disabled={no !== "" || instrument.busy.value !== null}
+              disabled={no !== "" || roomAction.busy.value !== null}
               title={no}
               onClick={() => void take(name)}
             >
@@ -51,7 +51,7 @@ export function Files({ device, instrument }: FilesProps) {
       {uploads !== null && uploads.length > 0 && (
         <ul class="file-list" data-testid="files">
           {uploads.map((upload) => (
-            <File key={upload.id} upload={upload} instrument={instrument} />
+            <File key={upload.id} upload={upload} roomAction={roomAction} />
           ))}
         </ul>
       )}
@@ -59,11 +59,11 @@ export function Files({ device, instrument }: FilesProps) {
   );
 }
 
-function File({ upload, instrument }: { upload: Upload; instrument: Instrument }) {
+function File({ upload, roomAction }: { upload: Upload; roomAction: RoomDeviceAction }) {
   const name = upload.name === "" ? upload.stream : upload.name;
   const download = async (): Promise<void> => {
     // Its address lasts for an hour, so it is made when it is wanted.
-    const found = await instrument.find(upload.id);
+    const found = await roomAction.find(upload.id);
     if (found === null) return;
     const link = document.createElement("a");
     link.href = found.url;

@@ -2,14 +2,14 @@ import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
 import { now } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
-import type { Instrument } from "./model/room-device-action";
+import type { RoomDeviceAction } from "./model/room-device-action";
 import { readDepth, type DepthPicture } from "../../shared/lib/png";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
 import { falseColour, NOTHING } from "../../shared/ui/colour-map";
 import { Age, Card } from "../../shared/ui/parts";
-import { whyNot } from "../devices/availability";
+import { unavailableReason } from "../devices/availability";
 
 interface Drawn extends DepthPicture {
   nearM: number;
@@ -23,7 +23,7 @@ interface Point {
 }
 
 /** How far everything is: near is dark, far is light, what is out of reach is grey. Any point can be read. */
-export function DepthCard({ device, instrument }: { device: DeviceStore; instrument: Instrument }) {
+export function DepthCard({ device, roomAction }: { device: DeviceStore; roomAction: RoomDeviceAction }) {
   const canvas = useRef<HTMLCanvasElement>(null);
   const scale = useRef<HTMLCanvasElement>(null);
   const [drawn, setDrawn] = useState<Drawn | null>(null);
@@ -31,7 +31,7 @@ export function DepthCard({ device, instrument }: { device: DeviceStore; instrum
   const [trouble, setTrouble] = useState("");
 
   const take = async (): Promise<void> => {
-    const taken = await instrument.capture("depth");
+    const taken = await roomAction.capture("depth");
     if (taken === null) return;
     try {
       const picture = await readDepth(await contentOf(taken));
@@ -71,8 +71,8 @@ export function DepthCard({ device, instrument }: { device: DeviceStore; instrum
     });
   };
 
-  const no = whyNot(device);
-  const busy = instrument.busy.value !== null;
+  const no = unavailableReason(device);
+  const busy = roomAction.busy.value !== null;
   return (
     <Card title={texts.depth.title} class="picture">
       <div class={`depth-box ${device.live.value ? "" : "old"}`}>
@@ -118,7 +118,7 @@ export function DepthCard({ device, instrument }: { device: DeviceStore; instrum
           {drawn !== null && <Age at={drawn.at} as={(age) => texts.depth.taken(drawn.width, drawn.height, age)} />}
         </span>
       </div>
-      {instrument.why.value !== "" && <p class="notice bad">{instrument.why.value}</p>}
+      {roomAction.why.value !== "" && <p class="notice bad">{roomAction.why.value}</p>}
       {trouble !== "" && <p class="notice bad">{trouble}</p>}
     </Card>
   );

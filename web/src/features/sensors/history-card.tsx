@@ -72,7 +72,7 @@ interface HistoryProps {
 
 type Columns = [number[], (number | null)[], (number | null)[], (number | null)[]];
 
-export function History({ recording, quantity, spanMs, binary, old, marks }: HistoryProps) {
+export function HistoryCard({ recording, quantity, spanMs, binary, old, marks }: HistoryProps) {
   const box = useRef<HTMLDivElement>(null);
   const [failed, setFailed] = useState(false);
   const [repaint, setRepaint] = useState(0);

@@ -2,7 +2,7 @@ import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
 import { now } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
-import type { Instrument } from "./model/room-device-action";
+import type { RoomDeviceAction } from "./model/room-device-action";
 import { readScan, type LidarScan } from "../../shared/mqtt/parse-messages";
 import type { Values } from "../spaces/model/room-perception";
 import { texts } from "./texts";
@@ -10,7 +10,7 @@ import { canvasBox } from "../../shared/ui/hidpi-canvas";
 import { contentOf } from "./use-capture-content";
 import { Age, Card } from "../../shared/ui/parts";
 import { colour, onColourChange } from "../../shared/ui/canvas-theme";
-import { whyNot } from "../devices/availability";
+import { unavailableReason } from "../devices/availability";
 
 const RANGE = "range";
 const LABEL_PX = 12;
@@ -21,7 +21,7 @@ interface Taken {
 }
 
 /** What a lidar sees, round it and to scale: its nearest things live, and every beam of a scan that was taken. */
-export function ScanCard({ device, instrument }: { device: DeviceStore; instrument: Instrument | null }) {
+export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAction: RoomDeviceAction | null }) {
   const canvas = useRef<HTMLCanvasElement>(null);
   const [taken, setTaken] = useState<Taken | null>(null);
   const [trouble, setTrouble] = useState("");
@@ -37,7 +37,7 @@ export function ScanCard({ device, instrument }: { device: DeviceStore; instrume
   }, [newest, taken, repaint]);
 
   const take = async (): Promise<void> => {
-    const found = await instrument?.capture("scan");
+    const found = await roomAction?.capture("scan");
     if (found === null || found === undefined) return;
     try {
       const scan = readScan(new TextDecoder().decode(await contentOf(found)));
@@ -49,7 +49,7 @@ export function ScanCard({ device, instrument }: { device: DeviceStore; instrume
   };
 
   const nearest = sectors.length === 0 ? null : Math.min(...sectors);
-  const no = whyNot(device);
+  const no = unavailableReason(device);
   return (
     <Card
       title={texts.scan.title}
@@ -74,27 +74,27 @@ export function ScanCard({ device, instrument }: { device: DeviceStore; instrume
       <p class="quiet small">
         {sectors.length > 0 && `${texts.scan.live} `}
         {taken === null ? (
-          instrument !== null && texts.scan.noPoints
+          roomAction !== null && texts.scan.noPoints
         ) : (
           <Age at={taken.at} as={(age) => texts.scan.points(taken.scan.range_m.length, age)} />
         )}
         {late && newest !== null && <Age at={newest.receivedAt} as={(age) => ` ${texts.room.late(age)}`} />}
       </p>
-      {instrument !== null && (
+      {roomAction !== null && (
         <div class="row">
           <button
             type="button"
             class="primary"
             data-testid="scan-shot"
-            disabled={no !== "" || instrument.busy.value !== null}
+            disabled={no !== "" || roomAction.busy.value !== null}
             title={no}
             onClick={() => void take()}
           >
-            {instrument.busy.value === "capture" ? texts.camera.taking : texts.scan.shot}
+            {roomAction.busy.value === "capture" ? texts.camera.taking : texts.scan.shot}
           </button>
         </div>
       )}
-      {instrument !== null && instrument.why.value !== "" && <p class="notice bad">{instrument.why.value}</p>}
+      {roomAction !== null && roomAction.why.value !== "" && <p class="notice bad">{roomAction.why.value}</p>}
       {trouble !== "" && <p class="notice bad">{trouble}</p>}
     </Card>
   );

@@ -1,13 +1,13 @@
 import { useState } from "preact/hooks";
 import type { DeviceStore } from "../devices/model/device-store";
-import type { Instrument } from "./model/room-device-action";
+import type { RoomDeviceAction } from "./model/room-device-action";
 import { quantityOf } from "./model/quantities";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { Age, Card, Choice } from "../../shared/ui/parts";
 import { shown } from "./readings-card";
-import { whyNot } from "../devices/availability";
+import { unavailableReason } from "../devices/availability";
 
 const LEAST_HZ = 0.001;
 const MOST_HZ = 50;
@@ -18,11 +18,11 @@ type Time = keyof typeof texts.collect.times;
 
 interface GatherProps {
   device: DeviceStore;
-  instrument: Instrument;
+  roomAction: RoomDeviceAction;
 }
 
 /** Measuring at another rate for a while, and measuring once. */
-export function Gather({ device, instrument }: GatherProps) {
+export function CollectDataCard({ device, roomAction }: GatherProps) {
   const own = Math.max(...(device.description.value?.streams ?? []).map(({ rate_hz: rate }) => rate), LEAST_HZ);
   const [rate, setRate] = useState(String(Math.min(MOST_HZ, Math.max(1, own * 2))));
   const [time, setTime] = useState<Time>("60");
@@ -30,13 +30,13 @@ export function Gather({ device, instrument }: GatherProps) {
   const running = action?.kind === "gather";
   const rateHz = Number(rate);
   const valid = rate.trim() !== "" && rateHz >= LEAST_HZ && rateHz <= MOST_HZ;
-  const no = whyNot(device);
-  const busy = instrument.busy.value;
+  const no = unavailableReason(device);
+  const busy = roomAction.busy.value;
 
   const submit = (event: SubmitEvent): void => {
     event.preventDefault();
-    if (running) void instrument.stopGathering();
-    else if (valid && no === "" && busy === null) void instrument.gather([], rateHz, Number(time));
+    if (running) void roomAction.stopGathering();
+    else if (valid && no === "" && busy === null) void roomAction.gather([], rateHz, Number(time));
   };
 
   return (
@@ -77,7 +77,7 @@ export function Gather({ device, instrument }: GatherProps) {
           data-testid="shoot"
           disabled={no !== "" || busy !== null || action !== null}
           title={no}
-          onClick={() => void instrument.shoot()}
+          onClick={() => void roomAction.shoot()}
         >
           {texts.collect.once}
         </button>
@@ -95,8 +95,8 @@ export function Gather({ device, instrument }: GatherProps) {
         )}
       </div>
       <Paces device={device} />
-      {instrument.why.value !== "" && <p class="notice bad">{instrument.why.value}</p>}
-      <Once device={device} instrument={instrument} />
+      {roomAction.why.value !== "" && <p class="notice bad">{roomAction.why.value}</p>}
+      <Once device={device} roomAction={roomAction} />
     </Card>
   );
 }
@@ -114,8 +114,8 @@ function pace(hz: number): string {
   return hz < 1 ? hz.toFixed(2) : format.oneDigit(hz);
 }
 
-function Once({ device, instrument }: GatherProps) {
-  const shot = instrument.shot.value;
+function Once({ device, roomAction }: GatherProps) {
+  const shot = roomAction.shot.value;
   const description = device.description.value;
   if (shot === null || description === null) return null;
   const rows = Object.entries(shot.streams).flatMap(([stream, values]) =>

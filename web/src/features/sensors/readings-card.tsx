@@ -8,7 +8,7 @@ import type { Recording } from "./model/stored-series";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { History, useRecording } from "./history-card";
+import { HistoryCard, useRecording } from "./history-card";
 import { Age, Card, Choice } from "../../shared/ui/parts";
 import "./sensors.css";
 
@@ -26,7 +26,7 @@ interface ReadingsProps {
   stream: string;
 }
 
-export function Readings({ api, device, stream }: ReadingsProps) {
+export function ReadingsCard({ api, device, stream }: ReadingsProps) {
   const values = device.measured(stream).value?.message.values ?? {};
   const description = device.description.value;
   const fields = Object.keys(values);
@@ -97,7 +97,7 @@ function Reading({ api, device, quantity }: ReadingProps) {
           </span>
         )}
       </p>
-      <History recording={recording} quantity={quantity} spanMs={SPAN_MS[span]} binary={binary} old={late} />
+      <HistoryCard recording={recording} quantity={quantity} spanMs={SPAN_MS[span]} binary={binary} old={late} />
       {quantity.judged !== null && !binary && <Limits quantity={quantity} />}
       {trouble !== "" && <p class="quiet small">{texts.room.noHistory(trouble)}</p>}
     </Card>

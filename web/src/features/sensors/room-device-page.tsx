@@ -4,18 +4,18 @@ import type { ComponentChildren } from "preact";
 import { useEffect, useMemo } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import type { Fleet } from "../devices/model/device-list";
-import { Instrument } from "./model/room-device-action";
+import { RoomDeviceAction } from "./model/room-device-action";
 import type { KnownDescription } from "../../shared/mqtt/parse-messages";
-import type { Station } from "../devices/model/device-session";
+import type { DeviceSession } from "../devices/model/device-session";
 import { CameraCard } from "./camera-card";
 import { DepthCard } from "./depth-card";
-import { Events } from "../devices/event-log";
-import { Files } from "./captures-card";
-import { Gather } from "./measure-card";
-import { Plan } from "../spaces/floor-plan";
-import { Readings } from "./readings-card";
-import { ScanCard } from "./lidar-card";
-import { Settings } from "./settings-card";
+import { EventLog } from "../devices/event-log";
+import { CapturesCard } from "./captures-card";
+import { CollectDataCard } from "./measure-card";
+import { FloorPlan } from "../spaces/floor-plan";
+import { ReadingsCard } from "./readings-card";
+import { LidarCard } from "./lidar-card";
+import { SettingsCard } from "./settings-card";
 import "./sensors.css";
 
 /** What has a card of its own. */
@@ -30,49 +30,49 @@ const OCCUPANCY = "occupancy";
 interface RoomDeskProps {
   api: Api;
   fleet: Fleet;
-  station: Station;
+  session: DeviceSession;
   /** Who has access to it. */
   access: ComponentChildren;
 }
 
-export function RoomDesk({ api, fleet, station, access }: RoomDeskProps) {
-  const { device, control, actions } = station;
-  const instrument = useMemo(() => new Instrument(api, device, actions, () => control.epoch), [api, device, actions, control]);
-  useEffect(() => void instrument.list(), [instrument]);
+export function RoomDevicePage({ api, fleet, session, access }: RoomDeskProps) {
+  const { device, control, actions } = session;
+  const roomAction = useMemo(() => new RoomDeviceAction(api, device, actions, () => control.epoch), [api, device, actions, control]);
+  useEffect(() => void roomAction.list(), [roomAction]);
   // Somebody else may have captured something: the list is asked for anew whenever an action has ended.
   const action = useComputed(() => device.state.value?.action?.id ?? null);
   useSignalEffect(() => {
-    if (action.value === null) void instrument.list();
+    if (action.value === null) void roomAction.list();
   });
   const description = device.description.value;
   if (description === null) return null;
   const pictured = description.cameras.length > 0;
-  const settings = description.controls.length > 0 && <Settings device={device} instrument={instrument} />;
+  const settings = description.controls.length > 0 && <SettingsCard device={device} roomAction={roomAction} />;
   const has = (name: string): boolean => description.captures.includes(name);
   return (
     <div class="desk room">
       <div class="column">
         {description.cameras.map(({ name }) => (
-          <CameraCard key={name} device={device} name={name} instrument={has(IMAGE) ? instrument : null} />
+          <CameraCard key={name} device={device} name={name} roomAction={has(IMAGE) ? roomAction : null} />
         ))}
         {/* Beside the picture that they change; without one they are what the page is for. */}
         {!pictured && settings}
-        {has(DEPTH) && <DepthCard device={device} instrument={instrument} />}
+        {has(DEPTH) && <DepthCard device={device} roomAction={roomAction} />}
         {(has(SCAN) || measures(description, RANGE)) && (
-          <ScanCard device={device} instrument={has(SCAN) ? instrument : null} />
+          <LidarCard device={device} roomAction={has(SCAN) ? roomAction : null} />
         )}
-        {measures(description, POSITIONS) && <Plan fleet={fleet} space={device.info.value.space} agent={device.info.value.agent} />}
+        {measures(description, POSITIONS) && <FloorPlan fleet={fleet} space={device.info.value.space} agent={device.info.value.agent} />}
         {description.streams
           .filter(({ name }) => !drawnElsewhere(description, name))
           .map(({ name }) => (
-            <Readings key={name} api={api} device={device} stream={name} />
+            <ReadingsCard key={name} api={api} device={device} stream={name} />
           ))}
       </div>
       <div class="column">
         {pictured && settings}
-        {description.actions.includes("gather") && <Gather device={device} instrument={instrument} />}
-        {description.captures.length > 0 && <Files device={device} instrument={instrument} />}
-        <Events device={device} />
+        {description.actions.includes("gather") && <CollectDataCard device={device} roomAction={roomAction} />}
+        {description.captures.length > 0 && <CapturesCard device={device} roomAction={roomAction} />}
+        <EventLog device={device} />
         {access}
       </div>
     </div>

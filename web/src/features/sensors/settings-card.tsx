@@ -1,26 +1,26 @@
 import { useState } from "preact/hooks";
 import { clamp } from "../../shared/lib/angles";
 import type { DeviceStore } from "../devices/model/device-store";
-import type { Instrument } from "./model/room-device-action";
+import type { RoomDeviceAction } from "./model/room-device-action";
 import { quantityOf, type Quantity } from "./model/quantities";
 import type { Control } from "../../shared/mqtt/protocol.generated";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
-import { whyNot } from "../devices/availability";
+import { unavailableReason } from "../devices/availability";
 
 const STREAM = "settings";
 const STEPS = 100;
 
 interface SettingsProps {
   device: DeviceStore;
-  instrument: Instrument;
+  roomAction: RoomDeviceAction;
 }
 
 /** What can be set, within the limits of the device's own description, and what it is now. */
-export function Settings({ device, instrument }: SettingsProps) {
+export function SettingsCard({ device, roomAction }: SettingsProps) {
   const description = device.description.value;
-  const no = whyNot(device);
+  const no = unavailableReason(device);
   if (description === null) return null;
   return (
     <Card title={texts.settings.title} aside={no !== "" && <span class="quiet">{no}</span>}>
@@ -28,7 +28,7 @@ export function Settings({ device, instrument }: SettingsProps) {
         <Setting
           key={control.name}
           device={device}
-          instrument={instrument}
+          roomAction={roomAction}
           control={control}
           text={textOf(control, quantityOf(description, STREAM, control.name))}
           disabled={no !== ""}
@@ -52,17 +52,17 @@ interface SettingProps extends SettingsProps {
   disabled: boolean;
 }
 
-function Setting({ device, instrument, control, text, disabled }: SettingProps) {
+function Setting({ device, roomAction, control, text, disabled }: SettingProps) {
   /** While a hand is on it. */
   const [held, setHeld] = useState<number | null>(null);
   const measured = device.measured(STREAM).value?.message.values[control.name];
   const late = device.late(STREAM);
-  const setting = instrument.settings.value.get(control.name);
+  const setting = roomAction.settings.value.get(control.name);
   const now = typeof measured === "number" ? measured : null;
   const asked = held ?? setting?.asked ?? now ?? control.lower;
   const send = (value: number): void => {
     setHeld(null);
-    void instrument.set(control.name, clamp(value, control.lower, control.upper));
+    void roomAction.set(control.name, clamp(value, control.lower, control.upper));
   };
   const ends = texts.settings.ends[control.name];
   const share = now === null ? null : (now - control.lower) / (control.upper - control.lower);

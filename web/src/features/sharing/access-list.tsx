@@ -2,19 +2,19 @@ import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Account, Api } from "../../shared/api/client";
 import { ApiError, sentence } from "../../shared/api/http";
 import type { Invitation, Person, Role, Share, SharedRole, Target } from "./model/wire-types";
-import { secondsLeft, Sharing } from "./model/shares";
+import { secondsLeft, ShareList } from "./model/shares";
 import type { Whole } from "./model/transfers";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { AskedForm } from "../../shared/ui/inline-form";
-import { Confirm } from "../../shared/ui/confirm-button";
-import { useFocusBack } from "../../shared/hooks/use-return-focus";
+import { InlineForm } from "../../shared/ui/inline-form";
+import { ConfirmButton } from "../../shared/ui/confirm-button";
+import { useReturnFocus } from "../../shared/hooks/use-return-focus";
 import { InviteForm, MAY } from "./invite-form";
-import { AS_IT_IS, LastingField, seconds } from "../../shared/ui/duration-picker";
+import { AS_IT_IS, DurationPicker, seconds } from "../../shared/ui/duration-picker";
 import { Card, Choice } from "../../shared/ui/parts";
 import { spaceAddress } from "../../app/routes";
-import { Transfer } from "./transfer-panel";
+import { TransferPanel } from "./transfer-panel";
 import "./sharing.css";
 
 /** While a link is out somebody may use it at any moment. */
@@ -48,11 +48,11 @@ export function goToAccess(): void {
 }
 
 /** Who has access to a device or a space, and for its owner all that changes it. */
-export function Access({ role, whole, goes, ...rest }: AccessProps) {
+export function AccessList({ role, whole, goes, ...rest }: AccessProps) {
   return (
     <div id={ID} class="access" data-testid="access">
       {role === "owner" ? <OwnersAccess {...rest} /> : <OwnPart role={role} {...rest} />}
-      {role === "owner" && <Transfer api={rest.api} of={whole} goes={goes} />}
+      {role === "owner" && <TransferPanel api={rest.api} of={whole} goes={goes} />}
     </div>
   );
 }
@@ -70,7 +70,7 @@ function OwnPart({ api, account, target, owner, role, onLeft }: PartProps & { ro
   return (
     <Card title={texts.access.title}>
       <p>{texts.access.owned(owner.name, common.role[role])}</p>
-      <Confirm
+      <ConfirmButton
         label={texts.access.leave}
         question={texts.access.leaveSure}
         yes={texts.access.leaveYes}
@@ -84,7 +84,7 @@ function OwnPart({ api, account, target, owner, role, onLeft }: PartProps & { ro
 
 function OwnersAccess({ api, target, owner, space }: PartProps) {
   const { kind, id } = target;
-  const sharing = useMemo(() => new Sharing(api, { kind, id }), [api, kind, id]);
+  const sharing = useMemo(() => new ShareList(api, { kind, id }), [api, kind, id]);
   const [inviting, setInviting] = useState(false);
   useEffect(() => {
     void sharing.refresh();
@@ -96,7 +96,7 @@ function OwnersAccess({ api, target, owner, space }: PartProps) {
 
   const shares = sharing.shares.value;
   const trouble = sharing.trouble.value;
-  const opener = useFocusBack(inviting);
+  const opener = useReturnFocus(inviting);
   const open = inviting ? null : (
     <button type="button" ref={opener} data-testid="invite" onClick={() => setInviting(true)}>
       {texts.invite.open}
@@ -135,7 +135,7 @@ function OwnersAccess({ api, target, owner, space }: PartProps) {
 }
 
 /** What was taken away last, and the way back. */
-function Undo({ sharing }: { sharing: Sharing }) {
+function Undo({ sharing }: { sharing: ShareList }) {
   const ended = sharing.ended.value;
   const [busy, setBusy] = useState(false);
   const [said, setSaid] = useState<{ text: string; wrong: boolean } | null>(null);
@@ -173,12 +173,12 @@ function Undo({ sharing }: { sharing: Sharing }) {
   );
 }
 
-function PersonRow({ share, sharing }: { share: Share; sharing: Sharing }) {
+function PersonRow({ share, sharing }: { share: Share; sharing: ShareList }) {
   const { name } = share.account;
   const [changing, setChanging] = useState(false);
   const [busy, setBusy] = useState(false);
   const [said, setSaid] = useState({ text: "", wrong: false });
-  const opener = useFocusBack(changing);
+  const opener = useReturnFocus(changing);
   const remove = async (): Promise<void> => {
     setBusy(true);
     try {
@@ -240,7 +240,7 @@ function PersonRow({ share, sharing }: { share: Share; sharing: Sharing }) {
 
 interface ChangeFormProps {
   share: Share;
-  sharing: Sharing;
+  sharing: ShareList;
   /** With what there is to say; empty: nothing was changed. */
   onDone: (text: string) => void;
 }
@@ -267,7 +267,7 @@ function ChangeForm({ share, sharing, onDone }: ChangeFormProps) {
     }
   };
   return (
-    <AskedForm
+    <InlineForm
       label={texts.access.changeOf(share.account.name)}
       todo={texts.access.save}
       doing={texts.access.saving}
@@ -280,18 +280,18 @@ function ChangeForm({ share, sharing, onDone }: ChangeFormProps) {
         <span class="label">{texts.invite.role}</span>
         <Choice label={texts.invite.role} value={role} options={MAY} onChange={setRole} />
       </div>
-      <LastingField
+      <DurationPicker
         id={`lasts-${share.account.id}`}
         label={texts.invite.lasts}
         value={lasts}
         choices={LASTS}
         onChange={setLasts}
       />
-    </AskedForm>
+    </InlineForm>
   );
 }
 
-function OpenLinks({ sharing }: { sharing: Sharing }) {
+function OpenLinks({ sharing }: { sharing: ShareList }) {
   const invitations = sharing.invitations.value;
   if (invitations.length === 0) return null;
   return (
@@ -306,7 +306,7 @@ function OpenLinks({ sharing }: { sharing: Sharing }) {
   );
 }
 
-function OpenLink({ invitation, sharing }: { invitation: Invitation; sharing: Sharing }) {
+function OpenLink({ invitation, sharing }: { invitation: Invitation; sharing: ShareList }) {
   const { role, uses, share_s: shareS } = invitation;
   const terms = [texts.access.uses(uses), texts.access.lasts(shareS)];
   return (
@@ -315,7 +315,7 @@ function OpenLink({ invitation, sharing }: { invitation: Invitation; sharing: Sh
         {texts.access.linkFor[role]}
         <span class="quiet small">{[...terms, format.until(invitation.expires_at)].join(" · ")}</span>
       </span>
-      <Confirm
+      <ConfirmButton
         label={texts.access.withdraw}
         description={`${texts.access.withdraw}: ${texts.access.linkFor[role]}`}
         question={texts.access.withdrawSure}

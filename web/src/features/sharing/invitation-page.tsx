@@ -6,9 +6,9 @@ import type { FollowedInvitation } from "./model/invitation-link";
 import type { Invitation } from "./model/wire-types";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { Confirm } from "../../shared/ui/confirm-button";
+import { ConfirmButton } from "../../shared/ui/confirm-button";
 import { Card } from "../../shared/ui/parts";
-import { deviceAddress, fleetAddress, replaceWith, spaceAddress } from "../../app/routes";
+import { deviceAddress, deviceListAddress, replaceWith, spaceAddress } from "../../app/routes";
 
 interface InvitationPageProps {
   api: Api;
@@ -31,7 +31,7 @@ export function InvitationPage(props: InvitationPageProps) {
         <Joined {...props} />
       ) : (
         <p>
-          <a href={fleetAddress}>{texts.invitation.toDevices}</a>
+          <a href={deviceListAddress}>{texts.invitation.toDevices}</a>
         </p>
       )}
     </main>
@@ -60,7 +60,7 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
   const look = async (): Promise<void> => {
     setWrong(null);
     try {
-      const found = await api.lookAtInvitation(secret);
+      const found = await api.previewInvitation(secret);
       if (found.kind === "agent") setOwn((await api.spaces()).filter(({ role }) => role === "owner"));
       setOffer(found);
     } catch (error) {
@@ -84,7 +84,7 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
   };
   const refuse = (): void => {
     followed.drop();
-    replaceWith(fleetAddress);
+    replaceWith(deviceListAddress);
   };
 
   const hands = offer?.role === "owner";
@@ -119,7 +119,7 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
       <div role="alert">{wrong !== null && <p class="notice bad">{wrong.text}</p>}</div>
       <div class="row">
         {offer !== null && hands && wrong?.final !== true && (
-          <Confirm
+          <ConfirmButton
             label={texts.invitation.acceptTransfer}
             question={texts.invitation.handsSure(offer.label)}
             yes={texts.invitation.handsYes}
@@ -167,7 +167,7 @@ function Terms({ offer: { role, kind, share_s: shareS } }: { offer: Invitation }
 }
 
 function Accepted({ invitation: { kind, target, label, role } }: { invitation: Invitation }) {
-  const address = kind === "device" ? deviceAddress(target) : kind === "space" ? spaceAddress(target) : fleetAddress;
+  const address = kind === "device" ? deviceAddress(target) : kind === "space" ? spaceAddress(target) : deviceListAddress;
   const next = useRef<HTMLAnchorElement>(null);
   useEffect(() => next.current?.focus(), []);
   return (

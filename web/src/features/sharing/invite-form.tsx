@@ -1,13 +1,13 @@
 import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
 import type { InvitationMade, SharedRole } from "./model/wire-types";
-import type { Sharing } from "./model/shares";
+import type { ShareList } from "./model/shares";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { AccountNameField, AskedForm } from "../../shared/ui/inline-form";
-import { FOR_GOOD, LastingField, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
-import { MadeLink } from "../../shared/ui/link-once";
+import { AccountNameField, InlineForm } from "../../shared/ui/inline-form";
+import { FOR_GOOD, DurationPicker, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
+import { LinkOnce } from "../../shared/ui/link-once";
 import { Choice } from "../../shared/ui/parts";
 
 const HOW = [
@@ -22,7 +22,7 @@ const LASTS = ["never", "hour", "workday", "day", "week", "month", "date"] as co
 const VALID = ["hour", "day", "week", "month"] as const;
 
 interface InviteFormProps {
-  sharing: Sharing;
+  sharing: ShareList;
   onClose: () => void;
 }
 
@@ -68,10 +68,10 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
 
   if (made !== null) {
     const note = texts.invite.madeNote(common.role[made.role], made.uses, format.until(made.expires_at));
-    return <MadeLink link={made.link} note={note} onDone={onClose} />;
+    return <LinkOnce link={made.link} note={note} onDone={onClose} />;
   }
   return (
-    <AskedForm
+    <InlineForm
       label={texts.invite.title}
       todo={how === "name" ? texts.invite.share : texts.invite.make}
       doing={how === "name" ? texts.invite.sharing : texts.invite.making}
@@ -95,10 +95,10 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
         <Choice label={texts.invite.role} value={role} options={MAY} onChange={setRole} />
         <p class="quiet small">{texts.roleExplained[role]}</p>
       </div>
-      <LastingField id="invite-lasts" label={texts.invite.lasts} value={lasts} choices={LASTS} onChange={setLasts} />
+      <DurationPicker id="invite-lasts" label={texts.invite.lasts} value={lasts} choices={LASTS} onChange={setLasts} />
       {how === "link" && (
         <>
-          <LastingField id="invite-valid" label={texts.invite.valid} value={valid} choices={VALID} onChange={setValid} />
+          <DurationPicker id="invite-valid" label={texts.invite.valid} value={valid} choices={VALID} onChange={setValid} />
           <div class="field">
             <label for="invite-uses">{texts.invite.uses}</label>
             <input
@@ -117,6 +117,6 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
           </div>
         </>
       )}
-    </AskedForm>
+    </InlineForm>
   );
 }

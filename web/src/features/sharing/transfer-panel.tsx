@@ -6,13 +6,13 @@ import type { Invitation, InvitationMade } from "./model/wire-types";
 import type { Whole } from "./model/transfers";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { AccountNameField, AskedForm } from "../../shared/ui/inline-form";
-import { Confirm } from "../../shared/ui/confirm-button";
-import { useFocusBack } from "../../shared/hooks/use-return-focus";
-import { LastingField, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
-import { MadeLink } from "../../shared/ui/link-once";
+import { AccountNameField, InlineForm } from "../../shared/ui/inline-form";
+import { ConfirmButton } from "../../shared/ui/confirm-button";
+import { useReturnFocus } from "../../shared/hooks/use-return-focus";
+import { DurationPicker, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
+import { LinkOnce } from "../../shared/ui/link-once";
 import { Card, Choice } from "../../shared/ui/parts";
-import { usePolled } from "../../shared/hooks/use-polling";
+import { usePolling } from "../../shared/hooks/use-polling";
 import "./sharing.css";
 
 /** While an offer is out somebody may accept it at any moment. */
@@ -30,10 +30,10 @@ interface TransferProps {
   goes: readonly string[];
 }
 
-export function Transfer({ api, of, goes }: TransferProps) {
-  const { value: offers, trouble, again } = usePolled(() => api.transfers.open(of), LOOK_AGAIN_MS, [api, of.kind, of.id]);
+export function TransferPanel({ api, of, goes }: TransferProps) {
+  const { value: offers, trouble, again } = usePolling(() => api.transfers.open(of), LOOK_AGAIN_MS, [api, of.kind, of.id]);
   const [step, setStep] = useState<"closed" | "asking" | InvitationMade>("closed");
-  const opener = useFocusBack(step !== "closed");
+  const opener = useReturnFocus(step !== "closed");
   const open = step !== "closed" ? null : (
     <button type="button" ref={opener} data-testid="transfer" onClick={() => setStep("asking")}>
       {texts.transfer.open}
@@ -55,7 +55,7 @@ export function Transfer({ api, of, goes }: TransferProps) {
           />
         )}
         {typeof step === "object" && (
-          <MadeLink link={step.link} note={texts.transfer.madeNote(format.until(step.expires_at))} onDone={() => setStep("closed")} />
+          <LinkOnce link={step.link} note={texts.transfer.madeNote(format.until(step.expires_at))} onDone={() => setStep("closed")} />
         )}
         {trouble !== "" && (
           <p class="notice bad" role="alert">
@@ -89,7 +89,7 @@ function OpenOffer({ offer: { account, expires_at: until }, withdraw, onGone }: 
         {name}
         <span class="quiet small">{texts.transfer.waits(format.until(until))}</span>
       </span>
-      <Confirm
+      <ConfirmButton
         label={texts.access.withdraw}
         description={`${texts.access.withdraw}: ${name}`}
         question={texts.transfer.withdrawSure}
@@ -132,7 +132,7 @@ function OfferForm({ api, of, goes, onMade, onClose }: OfferFormProps) {
   const { todo, doing, title } = texts.transfer;
   const asked = { label: title, todo, doing, busy, wrong, form, answerId: "transfer-answer", sendTestId: "transfer-send" };
   return (
-    <AskedForm {...asked} onSend={send} onClose={onClose}>
+    <InlineForm {...asked} onSend={send} onClose={onClose}>
       <ul class="terms" data-testid="transfer-terms">
         <li>{texts.transfer.goes[of.kind](goes)}</li>
         {texts.transfer.terms.map((line) => (
@@ -143,7 +143,7 @@ function OfferForm({ api, of, goes, onMade, onClose }: OfferFormProps) {
       {to === "name" && (
         <AccountNameField id="transfer-name" answerId="transfer-answer" value={name} wrong={wrong !== ""} onInput={setName} />
       )}
-      <LastingField id="transfer-valid" label={texts.transfer.valid} value={valid} choices={VALID} onChange={setValid} />
-    </AskedForm>
+      <DurationPicker id="transfer-valid" label={texts.transfer.valid} value={valid} choices={VALID} onChange={setValid} />
+    </InlineForm>
   );
 }

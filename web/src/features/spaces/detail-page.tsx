@@ -4,10 +4,10 @@ import { sentence } from "../../shared/api/http";
 import type { Fleet } from "../devices/model/device-list";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { Access } from "../sharing/access-list";
-import { WhatDoISee } from "../help/page-explainer";
-import { Room } from "./room-view";
-import { fleetAddress, healthAddressOf, replaceWith } from "../../app/routes";
+import { AccessList } from "../sharing/access-list";
+import { PageExplainer } from "../help/page-explainer";
+import { RoomView } from "./room-view";
+import { deviceListAddress, healthAddressOf, replaceWith } from "../../app/routes";
 
 interface SpacePageProps {
   api: Api;
@@ -40,7 +40,7 @@ export function SpacePage({ api, fleet, account, id }: SpacePageProps) {
   const inIt = [...(devices?.values() ?? [])].filter(({ info }) => info.value.space === id);
   return (
     <main class="page space" id="content">
-      <a href={fleetAddress}>← {common.allDevices}</a>
+      <a href={deviceListAddress}>← {common.allDevices}</a>
       {wrong !== "" && <p class="notice bad">{wrong}</p>}
       {space === undefined && wrong === "" && <p class="quiet">{common.loading}</p>}
       {space === null && <p role="status">{texts.spaces.missing}</p>}
@@ -50,9 +50,9 @@ export function SpacePage({ api, fleet, account, id }: SpacePageProps) {
           <p>
             <a href={healthAddressOf("space", id)}>{texts.spaces.healthOf(space.name)}</a>
           </p>
-          {inIt.length === 0 ? <p class="quiet">{texts.spaces.empty}</p> : <Room fleet={fleet} id={id} />}
-          <WhatDoISee page="space" />
-          <Access
+          {inIt.length === 0 ? <p class="quiet">{texts.spaces.empty}</p> : <RoomView fleet={fleet} id={id} />}
+          <PageExplainer page="space" />
+          <AccessList
             api={api}
             account={account}
             target={{ kind: "space", id }}
@@ -62,7 +62,7 @@ export function SpacePage({ api, fleet, account, id }: SpacePageProps) {
             role={space.role}
             onLeft={() => {
               void fleet.refresh();
-              replaceWith(fleetAddress);
+              replaceWith(deviceListAddress);
             }}
           />
         </>

@@ -7,7 +7,7 @@ import { type Box, placeLabels, type Placed } from "./model/label-placement";
 const MARK_PX = 24;
 
 /** `marks` and `pins`: middles in pixels of the box; the marks' elements have the class `who`, in the same order. */
-export function useNames(
+export function useFloorPlanLabels(
   box: RefObject<HTMLElement | null>,
   marks: readonly (readonly [number, number])[],
   pins: readonly (readonly [number, number])[],

@@ -12,7 +12,7 @@ import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { canvasBox } from "../../shared/ui/hidpi-canvas";
 import { Age, Card } from "../../shared/ui/parts";
-import { useNames } from "./floor-plan-labels";
+import { useFloorPlanLabels } from "./floor-plan-labels";
 import { shown } from "../sensors/readings-card";
 import { deviceAddress } from "../../app/routes";
 import { colour, onColourChange } from "../../shared/ui/canvas-theme";
@@ -52,7 +52,7 @@ export interface Known {
   receivedAt: number | null;
 }
 
-export function usePlan(fleet: Fleet, space: string, agent: string): Known {
+export function useFloorPlan(fleet: Fleet, space: string, agent: string): Known {
   const all = fleet.devices.value;
   const devices = useMemo(
     () => [...(all?.values() ?? [])].filter(({ info }) => info.value.space === space && info.value.agent === agent),
@@ -73,8 +73,8 @@ export function usePlan(fleet: Fleet, space: string, agent: string): Known {
   return { devices, perception, hung, places, floor, extent: shownExtent, old, receivedAt: newest?.receivedAt ?? null };
 }
 
-export function Plan({ fleet, space, agent }: PlanProps) {
-  const { devices, perception, hung, places, floor, extent: shownExtent, old, receivedAt } = usePlan(fleet, space, agent);
+export function FloorPlan({ fleet, space, agent }: PlanProps) {
+  const { devices, perception, hung, places, floor, extent: shownExtent, old, receivedAt } = useFloorPlan(fleet, space, agent);
   const late = perception?.late(POSITIONS) === true;
   const waiting = receivedAt === null && floor === null;
   return (
@@ -182,7 +182,7 @@ export function Drawing({ extent: room, floor, places, hung, devices, trails, ol
     return apart(within, PIN_PX + 1, [width, high * scale]).map(([atX, atY]) => [atX / width, atY / (high * scale)] as const);
   }, [room, width, hung.map(({ device }) => device.id).join()]);
   const px = (share: number, of: number): number => (share * of * width) / wide;
-  useNames(
+  useFloorPlanLabels(
     box,
     places.map(({ xM, yM }) => [px((xM - room.lowX) / wide, wide), px((room.highY - yM) / high, high)]),
     pins.map(([left, top]) => [px(left, wide), px(top, high)]),

@@ -2,10 +2,10 @@ import { useEffect } from "preact/hooks";
 import type { Fleet } from "../devices/model/device-list";
 import { texts } from "./texts";
 import { DeviceLists } from "../devices/device-list";
-import { Plan } from "./floor-plan";
+import { FloorPlan } from "./floor-plan";
 
 /** A room: its plan, and its devices. */
-export function Room({ fleet, id }: { fleet: Fleet; id: string }) {
+export function RoomView({ fleet, id }: { fleet: Fleet; id: string }) {
   const all = fleet.devices.value;
   const devices = [...(all?.values() ?? [])].filter(({ info }) => info.value.space === id);
   const ids = devices.map((device) => device.id).join();
@@ -27,7 +27,7 @@ export function Room({ fleet, id }: { fleet: Fleet; id: string }) {
     <>
       {drawn.length === 0 && <p class="quiet">{texts.plan.empty}</p>}
       {drawn.map((agent) => (
-        <Plan key={agent} fleet={fleet} space={id} agent={agent} />
+        <FloorPlan key={agent} fleet={fleet} space={id} agent={agent} />
       ))}
       <DeviceLists devices={devices} fleet={fleet} />
     </>

@@ -9,7 +9,7 @@ import { spaceAddress } from "../../app/routes";
 import "../sharing/sharing.css";
 
 /** The spaces that one may see, and making one. */
-export function Spaces({ api, fleet }: { api: Api; fleet: Fleet }) {
+export function SpaceList({ api, fleet }: { api: Api; fleet: Fleet }) {
   const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
   const [wrong, setWrong] = useState("");
   const devices = fleet.devices.value;

@@ -5,7 +5,7 @@ import type { SetpointStreamer } from "./model/setpoint-streamer";
 import { texts } from "./texts";
 
 /** Why nothing here can move the robot now; `null` when it can. */
-export function whyBlocked(device: DeviceStore, control: Control): string | null {
+export function blockedReason(device: DeviceStore, control: Control): string | null {
   if (control.streamer.value === null) return texts.joints.takeFirst;
   const mode = device.mode.value;
   if (device.stopped.value) return texts.joints.stopped;
@@ -21,7 +21,7 @@ interface StreamNoteProps {
   blocked: string | null;
 }
 
-export function StreamNote({ device, streamer, blocked }: StreamNoteProps) {
+export function BlockedNotice({ device, streamer, blocked }: StreamNoteProps) {
   const [state, text] = streamText(device, streamer, blocked);
   const limited = state === "streaming" && device.limited.value !== "";
   return (

@@ -7,12 +7,12 @@ import { direction, jogOf, sumOf, type Direction } from "./model/steerable-parts
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { Choice } from "../../shared/ui/parts";
-import { useHeldPad } from "./use-gamepad";
-import { useHeld } from "./use-held-inputs";
+import { useGamepadInputs } from "./use-gamepad";
+import { useHeldInputs } from "./use-held-inputs";
 import { HoldButton } from "./hold-button";
 import { useHeldKeys } from "./keyboard-help";
 import type { PanelProps } from "./panel-props";
-import { SpeedField } from "../../shared/ui/number-with-unit";
+import { NumberWithUnit } from "../../shared/ui/number-with-unit";
 
 /** What a hand may ask for beside a robot [mm/s], as ISO 10218-1 bounds it where people are near; and turning [°/s]. */
 const LINEAR_MM_S = { least: 5, most: 250, step: 5, first: 60 };
@@ -25,7 +25,7 @@ const SIGNS = [1, -1] as const;
 type Axes = "base" | "tool";
 
 /** A frame moved along and about axes while a pad, a key or a stick is held. */
-export function JogPanel({ device, streamer, active, pad }: PanelProps) {
+export function CartesianPanel({ device, streamer, active, pad }: PanelProps) {
   const frames = device.description.value?.frames ?? [];
   const [picked, setPicked] = useState<string | null>(null);
   const [axes, setAxes] = useState<Axes>("base");
@@ -33,9 +33,9 @@ export function JogPanel({ device, streamer, active, pad }: PanelProps) {
   const [angular, setAngular] = useState(ANGULAR_DEG_S.first);
   const frame = picked !== null && frames.includes(picked) ? picked : (frames.at(-1) ?? "");
   const speed = { linear_m_s: linear / 1000, angular_rad_s: radians(angular) };
-  const held = useHeld<Direction>(streamer, (parts) => jogOf(sumOf(parts), speed, frame, axes === "tool"));
+  const held = useHeldInputs<Direction>(streamer, (parts) => jogOf(sumOf(parts), speed, frame, axes === "tool"));
   useHeldKeys(active && streamer !== null, held, JOG_KEYS);
-  useHeldPad(pad, held, ({ left, right, lift, cross }): Direction => ({
+  useGamepadInputs(pad, held, ({ left, right, lift, cross }): Direction => ({
     along: [left[1], -left[0], lift],
     about: [right[0], right[1], -cross[0]],
   }));
@@ -87,7 +87,7 @@ export function JogPanel({ device, streamer, active, pad }: PanelProps) {
           </div>
         ))}
       </div>
-      <SpeedField
+      <NumberWithUnit
         label={texts.steer.linear}
         name="linear"
         range={LINEAR_MM_S}
@@ -95,7 +95,7 @@ export function JogPanel({ device, streamer, active, pad }: PanelProps) {
         shown={texts.steer.millimetres(linear)}
         onChange={setLinear}
       />
-      <SpeedField
+      <NumberWithUnit
         label={texts.steer.angular}
         name="angular"
         range={ANGULAR_DEG_S}

@@ -1,9 +1,9 @@
 import type { ComponentChildren } from "preact";
 import { useEffect } from "preact/hooks";
-import type { Held } from "./model/held-inputs";
+import type { HeldInputs } from "./model/held-inputs";
 
 interface HoldButtonProps<T> {
-  held: Held<T>;
+  held: HeldInputs<T>;
   name: string;
   part: T;
   label: string;

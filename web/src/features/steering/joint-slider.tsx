@@ -19,7 +19,7 @@ interface JointRowProps {
   chosen?: boolean;
 }
 
-export function JointRow({ joint, targetRad, measuredRad, onSet, old = false, chosen = false }: JointRowProps) {
+export function JointSlider({ joint, targetRad, measuredRad, onSet, old = false, chosen = false }: JointRowProps) {
   const measured = measuredRad === undefined ? undefined : degrees(measuredRad);
   const target = targetRad === undefined ? undefined : degrees(targetRad);
   const lower = degrees(joint.lower_rad);

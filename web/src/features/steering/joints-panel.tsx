@@ -2,15 +2,15 @@ import { effect, type ReadonlySignal, useComputed, useSignalEffect } from "@prea
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { clamp, radians } from "../../shared/lib/angles";
 import type { DeviceStore } from "../devices/model/device-store";
-import { Held } from "./model/held-inputs";
+import { HeldInputs } from "./model/held-inputs";
 import { JOINT_KEYS, jointOfKey } from "./model/keymap";
 import type { KnownTelemetry } from "../../shared/mqtt/parse-messages";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
 import { texts } from "./texts";
-import { useDrawn } from "../../shared/hooks/use-frame-signal";
-import { useHeldPad } from "./use-gamepad";
-import { JointRow } from "./joint-slider";
+import { useFrameSignal } from "../../shared/hooks/use-frame-signal";
+import { useGamepadInputs } from "./use-gamepad";
+import { JointSlider } from "./joint-slider";
 import { useHeldKeys, useKey } from "./keyboard-help";
 import type { PanelProps } from "./panel-props";
 
@@ -27,7 +27,7 @@ export function JointsPanel({ device, streamer, active, pad }: PanelProps) {
   const [chosen, setChosen] = useState(0);
   const rows = useRef<HTMLDivElement>(null);
   useTurning({ device, streamer, active, pad }, chosen);
-  const telemetry = useDrawn(device.telemetry);
+  const telemetry = useFrameSignal(device.telemetry);
 
   const choose = (index: number): void => {
     const next = clamp(index, 0, joints.length - 1);
@@ -87,7 +87,7 @@ function LiveJoint({ joint, index, device, telemetry, streamer, chosen }: LiveJo
   const measured = useShown(telemetry, (message) => message.position_rad[index]);
   const commanded = useShown(telemetry, (message) => message.commanded_rad[index]);
   return (
-    <JointRow
+    <JointSlider
       joint={joint}
       targetRad={streamer?.targets.value[joint.name] ?? commanded.value}
       measuredRad={measured.value}
@@ -114,7 +114,7 @@ function useTurning({ device, streamer, active, pad }: PanelProps, chosen: numbe
   const amount = useRef(0);
   const held = useMemo(
     () =>
-      new Held<number>((parts) => {
+      new HeldInputs<number>((parts) => {
         amount.current = clamp(
           parts.reduce((sum, part) => sum + part, 0),
           -1,
@@ -125,7 +125,7 @@ function useTurning({ device, streamer, active, pad }: PanelProps, chosen: numbe
   );
   // Without control arrows scroll the page, as ever.
   useHeldKeys(active && streamer !== null, held, JOINT_KEYS);
-  useHeldPad(pad, held, ({ left }) => left[1]);
+  useGamepadInputs(pad, held, ({ left }) => left[1]);
   useEffect(
     () =>
       effect(() => {

@@ -1,8 +1,8 @@
 /** The keys that move a robot: what they are, and who hears them. */
 import { signal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
-import type { Held } from "./model/held-inputs";
-import type { Way } from "./model/steerable-parts";
+import type { HeldInputs } from "./model/held-inputs";
+import type { SteeringMode } from "./model/steerable-parts";
 import { texts } from "./texts";
 
 const STORED = "telescope-keys";
@@ -38,7 +38,7 @@ export function useKey(active: boolean, onKey: (event: KeyboardEvent) => boolean
 }
 
 /** Hold what a key stands for while it is down. A key that comes up is heard wherever the focus has gone. */
-export function useHeldKeys<T>(active: boolean, held: Held<T>, map: Readonly<Record<string, T>>): void {
+export function useHeldKeys<T>(active: boolean, held: HeldInputs<T>, map: Readonly<Record<string, T>>): void {
   useKey(active, (event) => {
     const part = map[event.code];
     if (part === undefined) return false;
@@ -59,7 +59,7 @@ export function useHeldKeys<T>(active: boolean, held: Held<T>, map: Readonly<Rec
 }
 
 /** The keys of what is shown, in place: nothing may lie over Stop. */
-export function Keys({ way }: { way: Way }) {
+export function KeyboardHelp({ way }: { way: SteeringMode }) {
   const rows = [...texts.steer.keys[way], ...texts.steer.keys.always];
   return (
     <div class="keys" data-testid="keys">

@@ -3,17 +3,17 @@ import { useMemo, useState } from "preact/hooks";
 import type { Account, Api } from "../../shared/api/client";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Fleet } from "../devices/model/device-list";
-import type { Station } from "../devices/model/device-session";
+import type { DeviceSession } from "../devices/model/device-session";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { ControlBar } from "../control/control-bar";
-import { HeardAge, ReachChip } from "../../shared/ui/parts";
-import { deviceAddress, fleetAddress } from "../../app/routes";
-import { useStations } from "../devices/device-sessions";
+import { LastSeenAge, ReachChip } from "../../shared/ui/parts";
+import { deviceAddress, deviceListAddress } from "../../app/routes";
+import { useDeviceSessions } from "../devices/device-sessions";
 import { StopBanner } from "../control/stop-button";
-import { View3D } from "../twin/twin-view";
-import { SteerCard } from "./steering-card";
+import { TwinView } from "../twin/twin-view";
+import { SteeringCard } from "./steering-card";
 import "./multi-robot.css";
 
 interface TogetherPageProps {
@@ -24,15 +24,15 @@ interface TogetherPageProps {
   account: Account;
 }
 
-export function TogetherPage({ api, fleet, ids: asked, account }: TogetherPageProps) {
+export function MultiRobotPage({ api, fleet, ids: asked, account }: TogetherPageProps) {
   const ids = useMemo(() => [...new Set(asked.split(","))], [asked]);
   const all = fleet.devices.value;
   const devices = ids.map((id) => all?.get(id)).filter((device) => device !== undefined);
-  const stations = useStations(api, fleet, devices, account);
+  const sessions = useDeviceSessions(api, fleet, devices, account);
   const [chosen, setChosen] = useState<string | null>(null);
-  const active = stations.find(({ device }) => device.id === chosen) ?? stations[0];
+  const active = sessions.find(({ device }) => device.id === chosen) ?? sessions[0];
   const stopAll = (): void => {
-    for (const station of stations) station.stopNow();
+    for (const session of sessions) session.stopNow();
   };
   const stoppable = devices.some(({ info }) => info.value.role !== "viewer");
   return (
@@ -55,18 +55,18 @@ export function TogetherPage({ api, fleet, ids: asked, account }: TogetherPagePr
       </div>
       <main class="page operate together" id="content">
         <div class="heading">
-          <a href={fleetAddress}>← {common.allDevices}</a>
+          <a href={deviceListAddress}>← {common.allDevices}</a>
           <h1>{texts.multiRobot.title(devices.length)}</h1>
         </div>
         {all === null && <p class="quiet">{common.loading}</p>}
         {all !== null && devices.length < ids.length && <p class="notice warn">{texts.multiRobot.missing}</p>}
-        <div class="stations">
-          {stations.map((station) => (
-            <StationPanel
-              key={station.device.id}
-              station={station}
-              active={station === active}
-              onChoose={() => setChosen(station.device.id)}
+        <div class="robot-panels">
+          {sessions.map((session) => (
+            <RobotPanel
+              key={session.device.id}
+              session={session}
+              active={session === active}
+              onChoose={() => setChosen(session.device.id)}
               onStop={stopAll}
             />
           ))}
@@ -76,28 +76,28 @@ export function TogetherPage({ api, fleet, ids: asked, account }: TogetherPagePr
   );
 }
 
-interface StationPanelProps {
-  station: Station;
+interface RobotPanelProps {
+  session: DeviceSession;
   active: boolean;
   onChoose: () => void;
   onStop: () => void;
 }
 
 /** One robot: who touches it chooses it for keys and gamepad. */
-function StationPanel({ station, active, onChoose, onStop }: StationPanelProps) {
-  const { device, control, stop } = station;
+function RobotPanel({ session, active, onChoose, onStop }: RobotPanelProps) {
+  const { device, control, stop } = session;
   const { label } = device.info.value;
   return (
     <section
-      class={`station ${active ? "chosen" : ""}`}
+      class={`robot-panel ${active ? "chosen" : ""}`}
       aria-label={label}
-      data-testid="station"
+      data-testid="robot-panel"
       data-device={device.id}
       data-chosen={active}
       onPointerDownCapture={onChoose}
       onFocusCapture={onChoose}
     >
-      <header class="station-head">
+      <header class="robot-panel-head">
         <h2>
           <a href={deviceAddress(device.id)}>{label}</a>
         </h2>
@@ -108,10 +108,10 @@ function StationPanel({ station, active, onChoose, onStop }: StationPanelProps) 
           {texts.multiRobot.keysHere}
         </button>
       </header>
-      <ControlBar device={device} control={control} stop={stop} watching={station.watching} />
+      <ControlBar device={device} control={control} stop={stop} watching={session.watchers} />
       <StopBanner device={device} stop={stop} />
-      <View3D device={device} control={control} />
-      <SteerCard station={station} active={active} onStop={onStop} />
+      <TwinView device={device} control={control} />
+      <SteeringCard session={session} active={active} onStop={onStop} />
     </section>
   );
 }
@@ -120,7 +120,7 @@ function Doing({ device }: { device: DeviceStore }) {
   const state = device.state.value;
   return (
     <span class={`quiet small ${device.live.value ? "" : "old"}`}>
-      {state === null ? format.unknown : common.mode[state.mode]} · <HeardAge device={device} />
+      {state === null ? format.unknown : common.mode[state.mode]} · <LastSeenAge device={device} />
     </span>
   );
 }

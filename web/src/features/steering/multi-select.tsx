@@ -2,11 +2,11 @@
 import { signal } from "@preact/signals";
 import type { DeviceStore } from "../devices/model/device-store";
 import { texts } from "./texts";
-import { togetherAddress } from "../../app/routes";
+import { multiRobotAddress } from "../../app/routes";
 
 const ticked = signal<readonly string[]>([]);
 
-export function PickForTogether({ device }: { device: DeviceStore }) {
+export function MultiRobotCheckbox({ device }: { device: DeviceStore }) {
   const { id } = device;
   return (
     <input
@@ -24,7 +24,7 @@ export function PickForTogether({ device }: { device: DeviceStore }) {
 }
 
 /** `devices`: all that there are. What is ticked and has gone since does not count. */
-export function OperateTogether({ devices }: { devices: readonly DeviceStore[] }) {
+export function OperateSelected({ devices }: { devices: readonly DeviceStore[] }) {
   const ids = ticked.value.filter((id) => devices.some((device) => device.id === id));
   return (
     <div role="status">
@@ -32,7 +32,7 @@ export function OperateTogether({ devices }: { devices: readonly DeviceStore[] }
         <p class="row together-offer">
           {texts.multiRobot.picked(ids.length)}
           {ids.length > 1 && (
-            <a class="elsewhere" href={togetherAddress(ids)} data-testid="operate-together">
+            <a class="elsewhere" href={multiRobotAddress(ids)} data-testid="operate-together">
               {texts.multiRobot.open}
             </a>
           )}

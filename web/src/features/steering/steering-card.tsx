@@ -1,47 +1,47 @@
 /** What moves a robot by hand, in the ways that its description names: joints, a frame, the base. */
 import { useId, useRef, useState } from "preact/hooks";
 import type { ComponentType } from "preact";
-import type { Station } from "../devices/model/device-session";
-import { waysOf, type Way } from "./model/steerable-parts";
+import type { DeviceSession } from "../devices/model/device-session";
+import { steeringModesOf, type SteeringMode } from "./model/steerable-parts";
 import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
-import { StreamNote, whyBlocked } from "./blocked-notice";
+import { BlockedNotice, blockedReason } from "./blocked-notice";
 import { DrivePanel } from "./drive-panel";
-import { usePad, type PadNews } from "./use-gamepad";
-import { JogPanel } from "./cartesian-panel";
+import { useGamepad, type PadNews } from "./use-gamepad";
+import { CartesianPanel } from "./cartesian-panel";
 import { JointsPanel } from "./joints-panel";
-import { Keys, useKey } from "./keyboard-help";
+import { KeyboardHelp, useKey } from "./keyboard-help";
 import type { PanelProps } from "./panel-props";
 import "./steering.css";
 
-const PANELS: Readonly<Record<Way, ComponentType<PanelProps>>> = {
+const PANELS: Readonly<Record<SteeringMode, ComponentType<PanelProps>>> = {
   joints: JointsPanel,
-  jog: JogPanel,
+  jog: CartesianPanel,
   drive: DrivePanel,
 };
 
 interface SteerCardProps {
-  station: Station;
+  session: DeviceSession;
   /** Whether keys and gamepad are this robot's: of several, one. */
   active?: boolean;
   /** What the gamepad's button for it stops. */
   onStop: () => void;
 }
 
-export function SteerCard({ station, active = true, onStop }: SteerCardProps) {
-  const { device, control } = station;
-  const ways = waysOf(device.description.value);
-  const [picked, setPicked] = useState<Way>("joints");
+export function SteeringCard({ session, active = true, onStop }: SteerCardProps) {
+  const { device, control } = session;
+  const ways = steeringModesOf(device.description.value);
+  const [picked, setPicked] = useState<SteeringMode>("joints");
   const [keysShown, setKeysShown] = useState(false);
   const id = useId();
   const way = ways.includes(picked) ? picked : (ways[0] ?? "joints");
-  const blocked = whyBlocked(device, control);
+  const blocked = blockedReason(device, control);
   const streamer = blocked === null ? control.streamer.value : null;
-  const pad = usePad(active, onStop);
+  const pad = useGamepad(active, onStop);
   useKey(active, (event) => {
     if (event.repeat) return false;
     if (event.key === "?") setKeysShown(!keysShown);
-    else if (event.code === "KeyT") takeOrRelease(station);
+    else if (event.code === "KeyT") takeOrRelease(session);
     else return false;
     return true;
   });
@@ -51,7 +51,7 @@ export function SteerCard({ station, active = true, onStop }: SteerCardProps) {
       title={ways.length > 1 ? texts.steer.title : texts.joints.title}
       class="joints steer"
       data-testid="steer-card"
-      aside={<StreamNote device={device} streamer={control.streamer.value} blocked={blocked} />}
+      aside={<BlockedNotice device={device} streamer={control.streamer.value} blocked={blocked} />}
     >
       <div class="steer-top">
         {ways.length > 1 && <Tabs ways={ways} way={way} id={id} onChange={setPicked} />}
@@ -68,7 +68,7 @@ export function SteerCard({ station, active = true, onStop }: SteerCardProps) {
       <p class="pad-news small quiet" role="status" data-testid="gamepad">
         {news(pad.news.value)}
       </p>
-      {keysShown && <Keys way={way} />}
+      {keysShown && <KeyboardHelp way={way} />}
       <div
         {...(ways.length > 1 ? { role: "tabpanel", id: `${id}-panel`, "aria-labelledby": `${id}-${way}` } : {})}
         class="steer-panel"
@@ -81,7 +81,7 @@ export function SteerCard({ station, active = true, onStop }: SteerCardProps) {
 }
 
 /** As the button does it, and where it would. */
-function takeOrRelease({ device, control }: Station): void {
+function takeOrRelease({ device, control }: DeviceSession): void {
   if (control.streamer.value !== null) void control.release();
   else if (device.description.value !== null && device.info.value.role !== "viewer") void control.take();
 }
@@ -91,10 +91,10 @@ function news(what: PadNews | null): string {
 }
 
 interface TabsProps {
-  ways: readonly Way[];
-  way: Way;
+  ways: readonly SteeringMode[];
+  way: SteeringMode;
   id: string;
-  onChange: (way: Way) => void;
+  onChange: (way: SteeringMode) => void;
 }
 
 function Tabs({ ways, way, id, onChange }: TabsProps) {

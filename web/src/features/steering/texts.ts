@@ -1,5 +1,5 @@
 import type { EndedBecause } from "./model/setpoint-streamer";
-import type { Way } from "./model/steerable-parts";
+import type { SteeringMode } from "./model/steerable-parts";
 
 export const texts = {
   joints: {
@@ -32,7 +32,7 @@ export const texts = {
   steer: {
     title: "Steering",
     ways: "Steering mode",
-    way: { joints: "Joints", jog: "Cartesian", drive: "Drive" } satisfies Record<Way, string>,
+    way: { joints: "Joints", jog: "Cartesian", drive: "Drive" } satisfies Record<SteeringMode, string>,
     holding: "Moves while you hold",
     showKeys: "Keyboard shortcuts",
     everywhere: "These keys work everywhere on this page, except in text fields",
@@ -82,13 +82,13 @@ export const texts = {
         [["?"], "show or hide keyboard shortcuts"],
         [["Esc"], "stop"],
       ],
-    } satisfies Record<Way | "always", [string[], string][]>,
+    } satisfies Record<SteeringMode | "always", [string[], string][]>,
     padKeys: {
       joints:
         "Gamepad: hold a shoulder button (LB or RB). The left stick moves the selected joint; the D-pad selects a joint. B stops.",
       jog: "Gamepad: hold a shoulder button (LB or RB). Left stick: x and y. Triggers: z. Right stick: roll and pitch. D-pad: yaw. B stops.",
       drive: "Gamepad: hold a shoulder button (LB or RB). The left stick drives; the right stick moves sideways if the robot supports it. B stops.",
-    } satisfies Record<Way, string>,
+    } satisfies Record<SteeringMode, string>,
     pads: {
       connected: (id: string): string => `Gamepad connected: ${id}. Hold a shoulder button to move the robot.`,
       gone: (id: string): string => `Gamepad disconnected: ${id}.`,

@@ -2,7 +2,7 @@
 import { useSignal, useSignalEffect, type ReadonlySignal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
 import { readPad, type PadReading } from "./model/gamepad-mapping";
-import type { Held } from "./model/held-inputs";
+import type { HeldInputs } from "./model/held-inputs";
 
 /** Not with the page's frames: those wait where drawing is slow, and a button that was let go must not [ms]. */
 const LOOK_EVERY_MS = 20;
@@ -17,7 +17,7 @@ export interface PadWatch {
 export type PadNews = { kind: "connected" | "gone"; id: string } | { kind: "unknown"; id: string };
 
 /** Look at gamepads while `active`; `onStop` hears of every press of the button that stops. */
-export function usePad(active: boolean, onStop: () => void): PadWatch {
+export function useGamepad(active: boolean, onStop: () => void): PadWatch {
   const reading = useSignal<PadReading | null>(null);
   const news = useSignal<PadNews | null>(null);
   const stop = useRef(onStop);
@@ -50,7 +50,7 @@ export function usePad(active: boolean, onStop: () => void): PadWatch {
 }
 
 /** Hold what a gamepad's sticks say while its dead-man button is held; `null` from `part`: nothing for this panel. */
-export function useHeldPad<T>(watch: PadWatch, held: Held<T>, part: (reading: PadReading) => T): void {
+export function useGamepadInputs<T>(watch: PadWatch, held: HeldInputs<T>, part: (reading: PadReading) => T): void {
   const was = useRef(false);
   const newest = useRef(part);
   newest.current = part;

@@ -1,7 +1,7 @@
 /** Ties what hands hold to a stream: one let-go, whatever kind, ends it. */
 import { effect } from "@preact/signals";
 import { useEffect, useMemo, useRef } from "preact/hooks";
-import { Held } from "./model/held-inputs";
+import { HeldInputs } from "./model/held-inputs";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
 import type { Velocity } from "./model/steerable-parts";
 
@@ -10,12 +10,12 @@ import type { Velocity } from "./model/steerable-parts";
  *
  * @param streamer There while this page may move the robot.
  */
-export function useHeld<T>(streamer: SetpointStreamer | null, asked: (parts: readonly T[]) => Velocity): Held<T> {
+export function useHeldInputs<T>(streamer: SetpointStreamer | null, asked: (parts: readonly T[]) => Velocity): HeldInputs<T> {
   const newest = useRef({ streamer, asked });
   newest.current = { streamer, asked };
   const held = useMemo(
     () =>
-      new Held<T>((parts) => {
+      new HeldInputs<T>((parts) => {
         const { streamer: to, asked: ask } = newest.current;
         if (parts.length === 0) to?.letGo();
         else to?.hold(ask(parts));

@@ -1,6 +1,6 @@
 import { useEffect, useState } from "preact/hooks";
 import { clamp } from "../../shared/lib/angles";
-import type { Held } from "./model/held-inputs";
+import type { HeldInputs } from "./model/held-inputs";
 import type { Push } from "./model/steerable-parts";
 import { texts } from "./texts";
 
@@ -9,12 +9,12 @@ const MIDDLE = 0.1;
 const NAME = "stick";
 
 interface StickProps {
-  held: Held<Push>;
+  held: HeldInputs<Push>;
   disabled: boolean;
 }
 
 /** A round stick: up is forward, to a side turns. It springs back when it is let go, or its pointer is lost. */
-export function Stick({ held, disabled }: StickProps) {
+export function VirtualStick({ held, disabled }: StickProps) {
   const [at, setAt] = useState<[number, number]>([0, 0]);
   const letGo = (): void => {
     setAt([0, 0]);

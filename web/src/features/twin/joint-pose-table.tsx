@@ -16,7 +16,7 @@ interface Frame {
 }
 
 /** Position and rotation of every joint's frame in the robot's base, as the paper's application shows them. */
-export function PoseTable({ device }: { device: DeviceStore }) {
+export function JointPoseTable({ device }: { device: DeviceStore }) {
   const [form, setForm] = useState<Form>("degrees");
   const [which, setWhich] = useState<Which>("told");
   const frames = which === "told" ? told(device) : reckoned(device);

@@ -24,13 +24,13 @@ import {
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { radians } from "../../shared/lib/angles";
-import { canBeSeen } from "./model/visible-change";
+import { isVisibleChange } from "./model/visible-change";
 import { add, forward, placed, rotate, standing } from "./model/forward-kinematics";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import type { Geometry } from "../../shared/mqtt/protocol.generated";
 import type { Targets } from "../steering/model/setpoint-streamer";
 import type { Vector3 as Vector } from "../../shared/lib/vectors";
-import { Turn } from "../../shared/hooks/draw-scheduler";
+import { DrawSlot } from "../../shared/hooks/draw-scheduler";
 
 /** No WebGL in this browser. */
 export class NoWebglError extends Error {
@@ -69,7 +69,7 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
   let wanted: Shown = { measured: {}, target: null };
   let drawn: Shown | null = null;
   let inSight = true;
-  const turn = new Turn(() => {
+  const turn = new DrawSlot(() => {
     robots.pose(wanted);
     renderer.render(scene, camera);
     drawn = wanted;
@@ -108,7 +108,7 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
     show(measured, target) {
       wanted = { measured, target: target !== null && differs(measured, target) ? target : null };
       const pxPerM = canvas.height / (2 * Math.tan(radians(camera.fov) / 2)) / nearest(camera, controls.target, home.reach);
-      const seen = (next: Targets | null, last: Targets | null): boolean => canBeSeen(last, next, home.reach, pxPerM);
+      const seen = (next: Targets | null, last: Targets | null): boolean => isVisibleChange(last, next, home.reach, pxPerM);
       if (drawn === null || seen(measured, drawn.measured) || seen(wanted.target, drawn.target)) drawSoon();
     },
     recolour() {

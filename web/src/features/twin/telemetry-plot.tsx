@@ -14,7 +14,7 @@ const QUANTITIES: readonly Quantity[] = ["position_rad", "velocity_rad_s", "effo
 /** Often enough to look alive, seldom enough to leave the sliders their time [ms]. */
 const DRAW_EVERY_MS = 66;
 
-export function Plot({ device }: { device: DeviceStore }) {
+export function TelemetryPlot({ device }: { device: DeviceStore }) {
   const joints = device.description.value?.joints ?? [];
   const [quantity, setQuantity] = useState<Quantity>("position_rad");
   const [hidden, setHidden] = useState<ReadonlySet<string>>(new Set());

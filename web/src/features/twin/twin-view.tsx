@@ -6,12 +6,12 @@ import { Card } from "../../shared/ui/parts";
 import type { LiveScene } from "./scene";
 import { useScene } from "./use-scene";
 
-interface View3DProps {
+interface TwinViewProps {
   device: DeviceStore;
   control: Control;
 }
 
-export function View3D({ device, control }: View3DProps) {
+export function TwinView({ device, control }: TwinViewProps) {
   const twin = device.twin.value;
   const { canvas, box, scene, trouble, said } = useScene(twin);
 
@@ -45,7 +45,7 @@ export function View3D({ device, control }: View3DProps) {
 }
 
 /** Hands telemetry and targets to the scene, without drawing anything itself. */
-function Follow({ scene, device, control }: View3DProps & { scene: LiveScene }) {
+function Follow({ scene, device, control }: TwinViewProps & { scene: LiveScene }) {
   useSignalEffect(() => {
     const message = device.telemetry.value?.message;
     const joints = device.description.value?.joints;

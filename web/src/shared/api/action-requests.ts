@@ -17,14 +17,14 @@ import type {
 } from "../mqtt/protocol.generated";
 
 /** A movement by its name: the cloud adds the script, in its newest version. */
-export interface AskMovement {
+export interface RunMovementByName {
   kind: "run_movement";
   name: string;
   parameters?: Record<string, unknown>;
 }
 
 export type RobotRequest =
-  | AskMovement
+  | RunMovementByName
   | MoveJoints
   | MovePose
   | Say

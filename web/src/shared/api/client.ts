@@ -2,7 +2,7 @@
 import { HealthApi } from "../../features/health/model/health";
 import { Http, type Page } from "./http";
 import { Library, type Movement } from "../../features/movements/model/movement-library";
-import type { Asking } from "../../features/actions/model/action-runner";
+import type { ActionOptions } from "../../features/actions/model/action-runner";
 import type { AckStatus, Reason } from "../mqtt/protocol.generated";
 import type { AnyRequest } from "./action-requests";
 import type {
@@ -22,7 +22,7 @@ import type {
 } from "../../features/sharing/model/wire-types";
 import { RobotTypes } from "../../features/robot-types/model/robot-types";
 import { Transfers } from "../../features/sharing/model/transfers";
-import { TimesApi } from "../../features/latency/model/latency-stats";
+import { LatencyApi } from "../../features/latency/model/latency-stats";
 
 export interface Account {
   id: string;
@@ -31,7 +31,7 @@ export interface Account {
 }
 
 /** How one may sign in here; `oidc`: at an OpenID Connect provider. */
-export interface Methods {
+export interface SignInMethods {
   password: boolean;
   oidc: { name: string; url: string } | null;
 }
@@ -46,7 +46,7 @@ export interface SignInSession {
 }
 
 /** Somebody asks for control. `ended`: the lease that it asked for has ended otherwise. */
-export interface ControlRequest {
+export interface ControlRequestInfo {
   id: string;
   requester: string;
   epoch: number;
@@ -64,7 +64,7 @@ export interface Lease {
   /** Why it was taken from somebody else. */
   reason?: string;
   /** The open one. */
-  request?: ControlRequest | null;
+  request?: ControlRequestInfo | null;
 }
 
 /** Somebody else who looks at a device. `mine`: this very account, signed in elsewhere. */
@@ -92,7 +92,7 @@ export interface Device {
   lease: Lease | null;
 }
 
-export interface Granted {
+export interface GrantedLease {
   epoch: number;
   holder: string;
   expires_at: string;
@@ -175,7 +175,7 @@ export class Api {
   readonly library: Library;
   readonly robotTypes: RobotTypes;
   /** How long things take. */
-  readonly times: TimesApi;
+  readonly latency: LatencyApi;
   readonly transfers: Transfers;
 
   constructor(base = "/api/v1") {
@@ -183,7 +183,7 @@ export class Api {
     this.health = new HealthApi(this.#http);
     this.library = new Library(this.#http);
     this.robotTypes = new RobotTypes(this.#http);
-    this.times = new TimesApi(this.#http);
+    this.latency = new LatencyApi(this.#http);
     this.transfers = new Transfers(this.#http);
   }
 
@@ -201,12 +201,12 @@ export class Api {
   }
 
   /** Where a browser goes on to sign in elsewhere, with an invitation for who has no account yet. */
-  async beginElsewhere(invitation: string): Promise<string> {
+  async startOpenIdSignIn(invitation: string): Promise<string> {
     const begun = await this.#http.call<{ url: string }>("POST", "/auth/oidc/start", { body: { invitation } });
     return begun.url;
   }
 
-  methods(): Promise<Methods> {
+  signInMethods(): Promise<SignInMethods> {
     return this.#http.call("GET", "/auth/methods");
   }
 
@@ -276,7 +276,7 @@ export class Api {
     await this.#http.call("DELETE", `${at(target)}/invitations/${id}`);
   }
 
-  lookAtInvitation(secret: string): Promise<Invitation> {
+  previewInvitation(secret: string): Promise<Invitation> {
     return this.#http.call("POST", "/invitations/lookup", { body: { secret } });
   }
 
@@ -314,12 +314,12 @@ export class Api {
     return answer.devices;
   }
 
-  takeLease(device: string, leaseMs: number): Promise<Granted> {
+  takeLease(device: string, leaseMs: number): Promise<GrantedLease> {
     const waitMs = 1000;
     return this.#http.call("POST", `/devices/${device}/lease`, { body: { lease_ms: leaseMs, wait_ms: waitMs }, waitMs });
   }
 
-  renewLease(device: string, leaseMs: number, epoch: number): Promise<Granted> {
+  renewLease(device: string, leaseMs: number, epoch: number): Promise<GrantedLease> {
     return this.#http.call("POST", `/devices/${device}/lease`, { body: { lease_ms: leaseMs, epoch } });
   }
 
@@ -332,19 +332,19 @@ export class Api {
   }
 
   /** Take control from whoever has it, who reads the reason. For owners. */
-  takeOver(device: string, leaseMs: number, reason: string): Promise<Granted> {
+  takeOver(device: string, leaseMs: number, reason: string): Promise<GrantedLease> {
     const waitMs = 1000;
     const body = { lease_ms: leaseMs, wait_ms: waitMs, take_over: true, reason };
     return this.#http.call("POST", `/devices/${device}/lease`, { body, waitMs });
   }
 
   /** Ask the holder for control; `confirmed`: the device shows it. */
-  askForControl(device: string, withinMs: number): Promise<{ request: ControlRequest; confirmed: boolean }> {
+  requestControl(device: string, withinMs: number): Promise<{ request: ControlRequestInfo; confirmed: boolean }> {
     const waitMs = 1000;
     return this.#http.call("POST", requests(device), { body: { within_ms: withinMs, wait_ms: waitMs }, waitMs });
   }
 
-  controlRequest(device: string, id: string): Promise<ControlRequest> {
+  controlRequest(device: string, id: string): Promise<ControlRequestInfo> {
     return this.#http.call("GET", `${requests(device)}/${id}`);
   }
 
@@ -377,7 +377,7 @@ export class Api {
   }
 
   /** Ask something of a device; the answer comes when it has got as far as wanted, or after some seconds. */
-  ask(device: string, request: AnyRequest, { epoch, waitFor, timeoutMs }: Asking, key: string): Promise<Action> {
+  startAction(device: string, request: AnyRequest, { epoch, waitFor, timeoutMs }: ActionOptions, key: string): Promise<Action> {
     const waitMs = waitFor === "done" ? 10_000 : 3_000;
     const body = {
       request,

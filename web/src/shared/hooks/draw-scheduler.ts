@@ -11,10 +11,10 @@ const LONGEST_WAIT_MS = 400;
 const FREE_MS = 6;
 
 /** Those that want to draw, in the order in which they asked. */
-const waiting = new Set<Turn>();
+const waiting = new Set<DrawSlot>();
 let asked = false;
 
-export class Turn {
+export class DrawSlot {
   readonly #draw: () => void;
 
   /** `draw`: called in an animation frame. */
@@ -45,7 +45,7 @@ function next(): void {
   asked = true;
   requestAnimationFrame(() => {
     const startedAt = now();
-    do Turn.next();
+    do DrawSlot.next();
     while (waiting.size > 0 && now() - startedAt < FREE_MS / 2);
     // Without a graphics card a frame can cost the page more than its share; then the next one waits.
     setTimeout(() => {

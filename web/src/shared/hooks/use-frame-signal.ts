@@ -8,7 +8,7 @@ import { batch, type ReadonlySignal, type Signal, useSignal, useSignalEffect } f
 const next = new Map<Signal<unknown>, unknown>();
 
 /** `source`, as it was at the newest frame. */
-export function useDrawn<T>(source: ReadonlySignal<T>): ReadonlySignal<T> {
+export function useFrameSignal<T>(source: ReadonlySignal<T>): ReadonlySignal<T> {
   const drawn = useSignal(source.peek());
   useSignalEffect(() => {
     if (next.size === 0) requestAnimationFrame(draw);

@@ -12,7 +12,7 @@ export interface Polled<T> {
 }
 
 /** Ask every so often, and whenever one of `keys` changes, which also forgets what was known. */
-export function usePolled<T>(load: () => Promise<T>, everyMs: number, keys: readonly unknown[]): Polled<T> {
+export function usePolling<T>(load: () => Promise<T>, everyMs: number, keys: readonly unknown[]): Polled<T> {
   const [value, setValue] = useState<T | null>(null);
   const [trouble, setTrouble] = useState("");
   const asked = useRef(0);

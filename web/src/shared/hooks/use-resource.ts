@@ -10,7 +10,7 @@ interface Loaded<T> {
 }
 
 /** What a call brings, asked for when the page opens. `load` has to be the same as long as the same is wanted. */
-export function useLoaded<T>(load: () => Promise<T>): Loaded<T> {
+export function useResource<T>(load: () => Promise<T>): Loaded<T> {
   const [value, setValue] = useState<T | null>(null);
   const [trouble, setTrouble] = useState("");
   const [tries, setTries] = useState(0);

@@ -3,7 +3,7 @@
 /** As `localStorage` is. A browser may refuse it, and may be full: nothing is kept then, and nothing else happens. */
 export type Store = Pick<Storage, "getItem" | "setItem" | "removeItem">;
 
-export class Kept<T> {
+export class StoredValue<T> {
   readonly #store: Store | null;
   readonly #key: string;
   readonly #fits: (value: unknown) => value is T;
@@ -52,17 +52,17 @@ export interface Draft {
   at: number;
 }
 
-export function keptDraft(store: Store | null, account: string, robotType: string, name: string): Kept<Draft> {
-  return new Kept(store, `draft.${account}.${robotType}.${name}`, isDraft);
+export function storedDraft(store: Store | null, account: string, robotType: string, name: string): StoredValue<Draft> {
+  return new StoredValue(store, `draft.${account}.${robotType}.${name}`, isDraft);
 }
 
-export function keptParameters(
+export function storedParameters(
   store: Store | null,
   account: string,
   robotType: string,
   name: string,
-): Kept<Record<string, unknown>> {
-  return new Kept(store, `parameters.${account}.${robotType}.${name}`, isRecord);
+): StoredValue<Record<string, unknown>> {
+  return new StoredValue(store, `parameters.${account}.${robotType}.${name}`, isRecord);
 }
 
 function isRecord(value: unknown): value is Record<string, unknown> {

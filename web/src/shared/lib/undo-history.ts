@@ -3,7 +3,7 @@ import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-co
 
 const KEPT = 200;
 
-export class Undoable<T> {
+export class UndoHistory<T> {
   readonly #now;
   readonly #before = signal<readonly T[]>([]);
   readonly #after = signal<readonly T[]>([]);

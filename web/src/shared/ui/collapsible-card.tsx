@@ -8,7 +8,7 @@ interface Fold {
 }
 
 /** Of the card that is folded by the button in its head; `null` where it is none. */
-export const FoldContext = createContext<Fold | null>(null);
+export const CollapseContext = createContext<Fold | null>(null);
 
 /** There is no room for everything on a phone: what one may live without is folded there at first. */
 const NARROW = "(max-width: 48rem)";
@@ -23,7 +23,7 @@ interface FoldableProps {
   children: ComponentChildren;
 }
 
-export function Foldable({ name, type, title, always = false, children }: FoldableProps) {
+export function CollapsibleCard({ name, type, title, always = false, children }: FoldableProps) {
   const key = `telescope:fold:${type}:${name}`;
   const [open, setOpen] = useState(() => remembered(key) ?? (always || !matchMedia(NARROW).matches));
   const id = useId();
@@ -50,12 +50,12 @@ export function Foldable({ name, type, title, always = false, children }: Foldab
       </section>
     );
   }
-  return <FoldContext.Provider value={fold}>{children}</FoldContext.Provider>;
+  return <CollapseContext.Provider value={fold}>{children}</CollapseContext.Provider>;
 }
 
 /** A card's title: a button where the card can be folded. */
-export function FoldTitle({ title }: { title: string }) {
-  const fold = useContext(FoldContext);
+export function CollapsibleTitle({ title }: { title: string }) {
+  const fold = useContext(CollapseContext);
   if (fold === null) return <>{title}</>;
   return (
     <button type="button" class="fold" id={fold.id} aria-expanded="true" onClick={fold.close}>

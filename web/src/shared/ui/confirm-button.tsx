@@ -1,6 +1,6 @@
 import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../api/http";
-import { useFocusBack } from "../hooks/use-return-focus";
+import { useReturnFocus } from "../hooks/use-return-focus";
 
 interface ConfirmProps {
   label: string;
@@ -15,11 +15,11 @@ interface ConfirmProps {
 }
 
 /** A button for what cannot be undone: it asks, in its own place, and says there what went wrong. */
-export function Confirm({ label, description, question, yes, busy, keep, onYes, ...rest }: ConfirmProps) {
+export function ConfirmButton({ label, description, question, yes, busy, keep, onYes, ...rest }: ConfirmProps) {
   const [asking, setAsking] = useState(false);
   const [working, setWorking] = useState(false);
   const [wrong, setWrong] = useState("");
-  const ask = useFocusBack(asking);
+  const ask = useReturnFocus(asking);
   const safe = useRef<HTMLButtonElement>(null);
 
   // The button that had the focus is gone: it goes to the harmless one.

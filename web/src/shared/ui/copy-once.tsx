@@ -8,7 +8,7 @@ interface SecretProps {
 }
 
 /** What is shown once, with a button that copies it. */
-export function Secret({ id, label, value }: SecretProps) {
+export function CopyOnce({ id, label, value }: SecretProps) {
   const field = useRef<HTMLInputElement>(null);
   const [said, setSaid] = useState("");
   const copy = async (): Promise<void> => {

@@ -3,18 +3,18 @@ import { common } from "../i18n/common";
 
 const LENGTHS = { hour: 3600, workday: 8 * 3600, day: 86_400, week: 7 * 86_400, month: 30 * 86_400 } as const;
 
-export interface Lasting {
+export interface DurationChoice {
   choice: keyof typeof LENGTHS | "never" | "date" | "keep";
   /** Of a date input, in the reader's own time. */
   date: string;
 }
 
-export const FOR_GOOD: Lasting = { choice: "never", date: "" };
-export const AS_IT_IS: Lasting = { choice: "keep", date: "" };
-export const ONE_DAY: Lasting = { choice: "day", date: "" };
+export const FOR_GOOD: DurationChoice = { choice: "never", date: "" };
+export const AS_IT_IS: DurationChoice = { choice: "keep", date: "" };
+export const ONE_DAY: DurationChoice = { choice: "day", date: "" };
 
 /** In seconds from now; `null`: no end, `undefined`: nothing that can be. `kept`: what was left of it before. */
-export function seconds({ choice, date }: Lasting, kept: number | null = null): number | null | undefined {
+export function seconds({ choice, date }: DurationChoice, kept: number | null = null): number | null | undefined {
   if (choice === "never") return null;
   if (choice === "keep") return kept;
   if (choice !== "date") return LENGTHS[choice];
@@ -25,12 +25,12 @@ export function seconds({ choice, date }: Lasting, kept: number | null = null): 
 interface LastingFieldProps {
   id: string;
   label: string;
-  value: Lasting;
-  choices: readonly Lasting["choice"][];
-  onChange: (value: Lasting) => void;
+  value: DurationChoice;
+  choices: readonly DurationChoice["choice"][];
+  onChange: (value: DurationChoice) => void;
 }
 
-export function LastingField({ id, label, value, choices, onChange }: LastingFieldProps) {
+export function DurationPicker({ id, label, value, choices, onChange }: LastingFieldProps) {
   return (
     <div class="field">
       <label for={id}>{label}</label>

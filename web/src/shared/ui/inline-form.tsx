@@ -21,7 +21,7 @@ interface AskedFormProps {
   children: ComponentChildren;
 }
 
-export function AskedForm({ label, todo, doing, busy, wrong, done = "", onSend, onClose, children, ...rest }: AskedFormProps) {
+export function InlineForm({ label, todo, doing, busy, wrong, done = "", onSend, onClose, children, ...rest }: AskedFormProps) {
   return (
     <form
       class="panel fields"

@@ -1,7 +1,7 @@
 /** A link that is shown this once. */
 import { useEffect, useRef } from "preact/hooks";
 import { common } from "../i18n/common";
-import { Secret } from "./copy-once";
+import { CopyOnce } from "./copy-once";
 
 interface MadeLinkProps {
   link: string;
@@ -10,7 +10,7 @@ interface MadeLinkProps {
   onDone: () => void;
 }
 
-export function MadeLink({ link, note, onDone }: MadeLinkProps) {
+export function LinkOnce({ link, note, onDone }: MadeLinkProps) {
   const box = useRef<HTMLDivElement>(null);
   useEffect(() => box.current?.querySelector("input")?.focus(), []);
   return (
@@ -18,7 +18,7 @@ export function MadeLink({ link, note, onDone }: MadeLinkProps) {
       <p>
         <strong>{common.createdLink.created}</strong>
       </p>
-      <Secret id="invitation-link" label={common.createdLink.label} value={link} />
+      <CopyOnce id="invitation-link" label={common.createdLink.label} value={link} />
       <p class="quiet small">{note}</p>
       <div class="row">
         <button type="button" onClick={onDone}>

@@ -1,7 +1,7 @@
 import { common } from "../i18n/common";
 
 /** Why something did not come, with another try; nothing where all is well. */
-export function Trouble({ said, again }: { said: string; again: () => void }) {
+export function LoadError({ said, again }: { said: string; again: () => void }) {
   if (said === "") return null;
   return (
     <p class="notice bad row" role="alert">

@@ -8,7 +8,7 @@ interface SpeedFieldProps {
   onChange: (value: number) => void;
 }
 
-export function SpeedField({ label, name, range, value, shown, onChange }: SpeedFieldProps) {
+export function NumberWithUnit({ label, name, range, value, shown, onChange }: SpeedFieldProps) {
   return (
     <label class="speed">
       <span>{label}</span>

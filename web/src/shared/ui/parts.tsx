@@ -6,7 +6,7 @@ import { clock } from "../lib/clock";
 import type { DeviceStore } from "../../features/devices/model/device-store";
 import { common } from "../i18n/common";
 import { format } from "../i18n/format";
-import { FoldTitle } from "./collapsible-card";
+import { CollapsibleTitle } from "./collapsible-card";
 
 interface CardProps {
   title: string;
@@ -23,7 +23,7 @@ export function Card({ title, aside, children, ...rest }: CardProps) {
     <section class={`card ${rest.class ?? ""}`} aria-labelledby={id} data-testid={rest["data-testid"]}>
       <header class="card-head">
         <h2 id={id}>
-          <FoldTitle title={title} />
+          <CollapsibleTitle title={title} />
         </h2>
         {aside}
       </header>
@@ -44,10 +44,10 @@ export function ReachChip({ device, ...rest }: { device: DeviceStore; "data-test
 }
 
 /** The age of the device's last word; it grows by itself. */
-export function HeardAge({ device }: { device: DeviceStore }) {
+export function LastSeenAge({ device }: { device: DeviceStore }) {
   // A signal in the text: with two hundred devices on a page only the words that change are touched.
   const text = useComputed(() => {
-    const heardAt = device.heardAt.value;
+    const heardAt = device.lastSeenAt.value;
     return heardAt === null ? common.never : format.age(Math.max(0, clock.value - heardAt));
   });
   return <>{text}</>;

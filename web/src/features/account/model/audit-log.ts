@@ -8,7 +8,7 @@ const PAGE = 50;
 /** Where a filter lets little through, pages come empty: so many are asked for before the reader is asked. */
 const PAGES_AT_ONCE = 5;
 
-export const EVERYTHING: AuditQuery = { event: "", target: "", sinceMs: null, untilMs: null };
+export const ALL_ENTRIES: AuditQuery = { event: "", target: "", sinceMs: null, untilMs: null };
 
 export class AuditReader {
   readonly #api: Api;
@@ -16,7 +16,7 @@ export class AuditReader {
   readonly #busy = signal(false);
   readonly #trouble = signal("");
   readonly #more = signal(true);
-  #query = EVERYTHING;
+  #query = ALL_ENTRIES;
   #cursor: string | null = null;
   #asked = 0;
 
@@ -62,7 +62,7 @@ export class AuditReader {
 }
 
 /** Names of accounts, as far as these records tell them. */
-export function accountsIn(records: readonly AuditRecord[]): ReadonlyMap<string, string> {
+export function accountIdsOf(records: readonly AuditRecord[]): ReadonlyMap<string, string> {
   const names = new Map<string, string>();
   for (const { account: id, actor, key, data } of records) {
     // With a key the name says the key's too.
@@ -74,7 +74,7 @@ export function accountsIn(records: readonly AuditRecord[]): ReadonlyMap<string,
 }
 
 /** What a record is about: `device:abc-arm` → `["device", "abc-arm"]`; what names no kind has an empty one. */
-export function aboutWhat(on: string): [kind: string, id: string] {
+export function subjectOf(on: string): [kind: string, id: string] {
   const found = /^(device|space|agent|key):(.+)$/.exec(on);
   return found?.[1] === undefined || found[2] === undefined ? ["", on] : [found[1], found[2]];
 }

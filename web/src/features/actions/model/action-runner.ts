@@ -9,7 +9,7 @@ import type { DeviceStore } from "../../devices/model/device-store";
 import { ApiError, sentence } from "../../../shared/api/http";
 import { newId } from "../../../shared/lib/ids";
 import type { KnownAck } from "../../../shared/mqtt/parse-messages";
-import { wayBack } from "./undo-request";
+import { undoRequestOf } from "./undo-request";
 import type { AnyRequest } from "../../../shared/api/action-requests";
 
 /**
@@ -55,7 +55,7 @@ export interface Run {
   back: AnyRequest | null;
 }
 
-export interface Asking {
+export interface ActionOptions {
   /** Of the lease held here; `null`: the cloud takes one for the time of the action. */
   epoch: number | null;
   waitFor?: "started" | "done";
@@ -121,7 +121,7 @@ export class ActionRunner {
   }
 
   /** Ask, and wait until it is as far as wanted, or has ended otherwise. */
-  async ask(request: AnyRequest, asking: Asking): Promise<Run> {
+  async ask(request: AnyRequest, asking: ActionOptions): Promise<Run> {
     return this.#begin(request, asking).reached(asking.waitFor ?? "done");
   }
 
@@ -143,7 +143,7 @@ export class ActionRunner {
     for (const pursuit of this.#pursuits.value) pursuit.dispose();
   }
 
-  #begin(request: AnyRequest, asking: Asking): Pursuit {
+  #begin(request: AnyRequest, asking: ActionOptions): Pursuit {
     const pursuit = new Pursuit(this.#api, this.#device, request, asking);
     for (const old of this.#pursuits.value.slice(KEPT - 1)) old.dispose();
     this.#pursuits.value = [pursuit, ...this.#pursuits.value].slice(0, KEPT);
@@ -163,7 +163,7 @@ class Pursuit {
   /** The run after the first answer of the cloud. */
   readonly begun: Promise<Run>;
 
-  constructor(api: Api, device: DeviceStore, request: AnyRequest, asking: Asking) {
+  constructor(api: Api, device: DeviceStore, request: AnyRequest, asking: ActionOptions) {
     this.#api = api;
     this.#device = device;
     this.#run = signal<Run>({
@@ -177,7 +177,7 @@ class Pursuit {
       output: "",
       progress: null,
       result: {},
-      back: asking.back ?? wayBack(device, request),
+      back: asking.back ?? undoRequestOf(device, request),
     });
     this.run = this.#run;
     this.begun = this.#begin(asking);
@@ -212,7 +212,7 @@ class Pursuit {
     this.#run.value = { ...this.#run.value };
   }
 
-  async #begin(asking: Asking): Promise<Run> {
+  async #begin(asking: ActionOptions): Promise<Run> {
     try {
       const action = await this.#post(asking);
       if (this.#disposed) return this.#run.value;
@@ -228,15 +228,15 @@ class Pursuit {
     return this.#run.value;
   }
 
-  async #post(asking: Asking): Promise<Action> {
+  async #post(asking: ActionOptions): Promise<Action> {
     if (asking.asked !== undefined) return asking.asked;
     const { request, key, clickedAt } = this.#run.value;
     try {
-      return await this.#api.ask(this.#device.id, request, asking, key);
+      return await this.#api.startAction(this.#device.id, request, asking, key);
     } catch (error) {
       const again = error instanceof ApiError && error.status === 0 && now() - clickedAt < AGAIN_WITHIN_MS;
       if (!again) throw error;
-      return this.#api.ask(this.#device.id, request, asking, key);
+      return this.#api.startAction(this.#device.id, request, asking, key);
     }
   }
 

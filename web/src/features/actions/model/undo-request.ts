@@ -15,7 +15,7 @@ const JOINTS: ReadonlySet<AnyRequest["kind"]> = new Set([
 ]);
 
 /** `null`: nothing undoes it, or nobody knows where the device is. */
-export function wayBack(device: DeviceStore, request: AnyRequest): AnyRequest | null {
+export function undoRequestOf(device: DeviceStore, request: AnyRequest): AnyRequest | null {
   if (request.kind === "set_stiffness") return stiffnessBefore(device, request.joints ?? []);
   const { telemetry, description } = { telemetry: device.telemetry.value, description: device.description.value };
   const known = JOINTS.has(request.kind) && description?.actions.includes("move_joints") === true;

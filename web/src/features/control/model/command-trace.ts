@@ -11,18 +11,18 @@ import { newId } from "../../../shared/lib/ids";
 import { moves, type AnyRequest } from "../../../shared/api/action-requests";
 import type { SetpointStreamer } from "../../steering/model/setpoint-streamer";
 
-export type LineStatus = RunStatus | "observed";
+export type TraceStatus = RunStatus | "observed";
 
 /** How it was seen: something moved, or the device says of itself that it does what was asked. */
 export type SeenBy = "motion" | "state";
 
-export interface Line {
+export interface TraceLine {
   key: string;
   request: AnyRequest | { kind: "stream" };
   /** On the page's clock [ms]. */
   clickedAt: number;
   status: RunStatus;
-  steps: readonly Step<LineStatus>[];
+  steps: readonly Step<TraceStatus>[];
   /** `null` while nothing was observed. */
   seenBy: SeenBy | null;
   /** Of an action a sentence; of a stream why it ended, as the streamer names it. */
@@ -39,15 +39,15 @@ const GRACE_MS = 400;
 const ODOMETRY = "odometry";
 const PLACE = ["x_m", "y_m", "yaw_rad"] as const;
 
-export class Evidence {
+export class CommandTrace {
   readonly #device: DeviceStore;
   readonly #watches = new Map<string, Watch>();
   readonly #seen = signal<ReadonlyMap<string, Seen>>(new Map());
-  readonly #streams = signal<readonly Line[]>([]);
+  readonly #streams = signal<readonly TraceLine[]>([]);
   readonly #ends: (() => void)[];
 
   /** The newest first. */
-  readonly lines: ReadonlySignal<readonly Line[]>;
+  readonly lines: ReadonlySignal<readonly TraceLine[]>;
 
   constructor(device: DeviceStore, control: Control, actions: ActionRunner) {
     this.#device = device;
@@ -96,7 +96,7 @@ export class Evidence {
     const [newest] = this.#streams.value;
     const open = newest?.status === "sent" || newest?.status === "accepted" || newest?.status === "started";
     if (running && !open) {
-      const line: Line = {
+      const line: TraceLine = {
         key: newId(),
         request: { kind: "stream" },
         clickedAt: now(),
@@ -221,11 +221,11 @@ function placeOf(device: DeviceStore): readonly number[] | null {
   return PLACE.map((name) => Number(values[name] ?? 0));
 }
 
-function lineOf({ key, request, clickedAt, status, steps, why }: Run): Line {
+function lineOf({ key, request, clickedAt, status, steps, why }: Run): TraceLine {
   return { key, request, clickedAt, status, steps, why, seenBy: null };
 }
 
-function withSeen(line: Line, seen: Seen | undefined): Line {
+function withSeen(line: TraceLine, seen: Seen | undefined): TraceLine {
   if (seen === undefined) return line;
   // Its place is before the end, whichever this page happened to hear first.
   const at = line.steps.findIndex(({ status }) => !["sent", "accepted", "started"].includes(status));

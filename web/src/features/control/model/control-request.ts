@@ -1,6 +1,6 @@
 /** Asking whoever has control of a device for it, until there is an answer; and what it comes to. */
 import { effect, signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Api, ControlRequest } from "../../../shared/api/client";
+import type { Api, ControlRequestInfo } from "../../../shared/api/client";
 import { now, onThisClock } from "../../../shared/lib/clock";
 import type { DeviceStore } from "../../devices/model/device-store";
 import { ApiError, sentence } from "../../../shared/api/http";
@@ -11,9 +11,9 @@ const LOOK_MS = 1_000;
 /** What was not heard of so long after its end is not waited for any longer [ms]. */
 const AFTER_MS = 5_000;
 
-export type Ended = Exclude<ControlRequest["outcome"], "open">;
+export type Ended = Exclude<ControlRequestInfo["outcome"], "open">;
 
-export type AskState =
+export type ControlRequestState =
   | { kind: "none" }
   | { kind: "sending" }
   /** `until`: on the page's clock. `shown`: the device shows it to everybody, so the holder sees it at once. */
@@ -21,16 +21,16 @@ export type AskState =
   | { kind: "over"; how: Ended; of: string }
   | { kind: "failed"; why: string };
 
-export class Asking {
+export class ControlRequest {
   readonly #api: Api;
   readonly #device: DeviceStore;
   readonly #accepted: (epoch: number) => void;
-  readonly #state = signal<AskState>({ kind: "none" });
+  readonly #state = signal<ControlRequestState>({ kind: "none" });
   #timer: ReturnType<typeof setTimeout> | undefined;
   readonly #forget: () => void;
   #disposed = false;
 
-  readonly state: ReadonlySignal<AskState> = this.#state;
+  readonly state: ReadonlySignal<ControlRequestState> = this.#state;
 
   /** `accepted` is told the epoch that was handed to this session. */
   constructor(api: Api, device: DeviceStore, accepted: (epoch: number) => void) {
@@ -50,7 +50,7 @@ export class Asking {
     const of = this.#device.holder.value?.name ?? "";
     this.#state.value = { kind: "sending" };
     try {
-      const { request, confirmed } = await this.#api.askForControl(this.#device.id, ANSWER_WITHIN_MS);
+      const { request, confirmed } = await this.#api.requestControl(this.#device.id, ANSWER_WITHIN_MS);
       if (this.#disposed) {
         this.#takeBack(request.id);
         return;
@@ -96,7 +96,7 @@ export class Asking {
     void this.#api.withdrawRequest(this.#device.id, id, true).catch(() => undefined);
   }
 
-  #end(state: AskState): void {
+  #end(state: ControlRequestState): void {
     clearTimeout(this.#timer);
     this.#state.value = state;
   }
@@ -109,7 +109,7 @@ export class Asking {
   async #look(): Promise<void> {
     const asked = this.#state.value;
     if (asked.kind !== "open") return;
-    let outcome: ControlRequest["outcome"];
+    let outcome: ControlRequestInfo["outcome"];
     try {
       outcome = (await this.#api.controlRequest(this.#device.id, asked.id)).outcome;
     } catch (error) {

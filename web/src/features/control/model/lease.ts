@@ -1,7 +1,7 @@
 /** Control of one device from this page: the lease, its renewal, its loss, and the stream of setpoints it allows. */
 import { batch, computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Api, Granted } from "../../../shared/api/client";
-import { Asking } from "./control-request";
+import type { Api, GrantedLease } from "../../../shared/api/client";
+import { ControlRequest } from "./control-request";
 import { ApiError, sentence } from "../../../shared/api/http";
 import { now } from "../../../shared/lib/clock";
 import type { DeviceStore, OpenRequestHere } from "../../devices/model/device-store";
@@ -49,7 +49,7 @@ export class Control {
   readonly #answer = signal<AnswerState>({ kind: "none" });
 
   /** Asking somebody else for it. */
-  readonly asking: Asking;
+  readonly asking: ControlRequest;
   /** Answering somebody who asks for it. */
   readonly answered: ReadonlySignal<AnswerState> = this.#answer;
   readonly state: ReadonlySignal<ControlState> = this.#state;
@@ -64,7 +64,7 @@ export class Control {
     this.#openLink =
       openLink ?? ((id, epoch) => new MqttLink(() => api.credentials({ purpose: "control", device: id, epoch })));
     // What was accepted is this session's already: to renew it is all there is to do.
-    this.asking = new Asking(api, device, (epoch) => {
+    this.asking = new ControlRequest(api, device, (epoch) => {
       void this.#begin(() => api.renewLease(device.id, LEASE_MS, epoch));
     });
   }
@@ -115,7 +115,7 @@ export class Control {
     }
   }
 
-  async #begin(grant: () => Promise<Granted>): Promise<void> {
+  async #begin(grant: () => Promise<GrantedLease>): Promise<void> {
     if (this.#state.value.kind === "taking" || this.#state.value.kind === "held") return;
     this.#state.value = { kind: "taking" };
     const askedAt = now();
@@ -159,7 +159,7 @@ export class Control {
     this.#letGo({ kind: "none" });
   }
 
-  #hold(granted: Granted, askedAt: number): void {
+  #hold(granted: GrantedLease, askedAt: number): void {
     const { epoch } = granted;
     this.#obeyed = false;
     this.#answer.value = { kind: "none" };
@@ -220,7 +220,7 @@ export class Control {
     });
   }
 
-  #renewed(granted: Granted, askedAt: number): void {
+  #renewed(granted: GrantedLease, askedAt: number): void {
     clearTimeout(this.#expiry);
     this.#expiry = setTimeout(
       () => this.#lose("Control ran out: the server could not be reached in time to renew it."),

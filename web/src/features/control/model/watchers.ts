@@ -6,7 +6,7 @@ const AGAIN_MS = 10_000;
 /** What the server says itself is taken within these bounds [ms]. */
 const BOUNDS_MS = [2_000, 60_000] as const;
 
-export class Watching {
+export class Watchers {
   readonly #api: Api;
   readonly #id: string;
   readonly #others = signal<readonly Watcher[] | null>(null);

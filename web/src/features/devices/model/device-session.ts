@@ -3,20 +3,20 @@ import type { Api } from "../../../shared/api/client";
 import { ActionRunner } from "../../actions/model/action-runner";
 import { Control } from "../../control/model/lease";
 import type { DeviceStore } from "./device-store";
-import { Evidence } from "../../control/model/command-trace";
+import { CommandTrace } from "../../control/model/command-trace";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
 import { LatencySamples } from "../../latency/model/sample-upload";
 import { StopSwitch } from "../../control/model/stop";
-import { Watching } from "../../control/model/watchers";
+import { Watchers } from "../../control/model/watchers";
 
-export class Station {
+export class DeviceSession {
   readonly device: DeviceStore;
   readonly control: Control;
   readonly stop: StopSwitch;
   readonly actions: ActionRunner;
-  readonly evidence: Evidence;
+  readonly commandTrace: CommandTrace;
   readonly #samples: LatencySamples;
-  readonly watching: Watching;
+  readonly watchers: Watchers;
   readonly #unwatch: () => void;
 
   /** `by`: who is told to have pressed Stop. */
@@ -26,9 +26,9 @@ export class Station {
     this.control = new Control(api, device);
     this.stop = new StopSwitch(api, device, link, by);
     this.actions = new ActionRunner(api, device);
-    this.evidence = new Evidence(device, this.control, this.actions);
+    this.commandTrace = new CommandTrace(device, this.control, this.actions);
     this.#samples = new LatencySamples(api, device.id, this.control.roundTrip);
-    this.watching = new Watching(api, device.id);
+    this.watchers = new Watchers(api, device.id);
   }
 
   /** Stop the device, and send nothing more. */
@@ -38,10 +38,10 @@ export class Station {
   }
 
   dispose(): void {
-    this.evidence.dispose();
+    this.commandTrace.dispose();
     this.#samples.dispose();
     this.control.dispose();
-    this.watching.seen(false);
+    this.watchers.seen(false);
     this.stop.dispose();
     this.actions.dispose();
     this.#unwatch();

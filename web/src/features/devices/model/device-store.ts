@@ -3,7 +3,7 @@ import { computed, signal, type ReadonlySignal, type Signal } from "@preact/sign
 import type { Api, Device, Lease } from "../../../shared/api/client";
 import { ApiError } from "../../../shared/api/http";
 import { clock, now, onThisClock } from "../../../shared/lib/clock";
-import { History } from "../../twin/model/recent-telemetry";
+import { RecentTelemetry } from "../../twin/model/recent-telemetry";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
 import {
   MessageError,
@@ -45,7 +45,7 @@ export interface Timed<T> {
 export type AckReceiver = (ack: KnownAck, receivedAt: number) => void;
 
 /** The newest of one stream; `everyMs`: how long after the one before it came, `null` for the first. */
-export interface Measured extends Timed<Measurements> {
+export interface MeasuredValues extends Timed<Measurements> {
   everyMs: number | null;
 }
 
@@ -62,7 +62,7 @@ const PERIODS = 3;
 export class DeviceStore {
   readonly id: string;
   readonly topics: DeviceTopics;
-  readonly history = new History();
+  readonly history = new RecentTelemetry();
   readonly #api: Api;
   readonly #link: Link;
   readonly #info;
@@ -72,7 +72,7 @@ export class DeviceStore {
   readonly #state = signal<KnownState | null>(null);
   #stateAt = 0;
   readonly #telemetry = signal<Timed<KnownTelemetry> | null>(null);
-  readonly #measured = new Map<string, Signal<Measured | null>>();
+  readonly #measured = new Map<string, Signal<MeasuredValues | null>>();
   readonly #events = signal<readonly KnownEvent[]>([]);
   readonly #lease;
   readonly #heardAt = signal<number | null>(null);
@@ -95,7 +95,7 @@ export class DeviceStore {
   readonly trouble = computed<string | null>(() => [...this.#troubles.value.values()].at(-1) ?? null);
 
   /** When the device, or the cloud for it, last said anything, on the page's clock [ms]. */
-  readonly heardAt = computed(() => {
+  readonly lastSeenAt = computed(() => {
     const at = this.#info.value.last_seen_at;
     const told = at === null ? null : onThisClock(Date.parse(at));
     const heard = this.#heardAt.value;
@@ -117,7 +117,7 @@ export class DeviceStore {
       const age = this.telemetryAgeMs.value;
       return age === null || age > STALE_MS ? "stale" : "online";
     }
-    const heardAt = this.heardAt.value;
+    const heardAt = this.lastSeenAt.value;
     return heardAt === null || clock.value - heardAt > LIST_STALE_MS ? "stale" : "online";
   });
 
@@ -234,7 +234,7 @@ export class DeviceStore {
   }
 
   /** The newest measurements of a stream other than the joints'; `null` before the first. */
-  measured(stream: string): ReadonlySignal<Measured | null> {
+  measured(stream: string): ReadonlySignal<MeasuredValues | null> {
     return this.#measuredOf(stream);
   }
 
@@ -344,7 +344,7 @@ export class DeviceStore {
     this.history.add(message, at);
   }
 
-  #measuredOf(stream: string): Signal<Measured | null> {
+  #measuredOf(stream: string): Signal<MeasuredValues | null> {
     let found = this.#measured.get(stream);
     if (found === undefined) {
       found = signal(null);

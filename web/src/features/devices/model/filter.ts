@@ -2,14 +2,14 @@
 import type { Device } from "../../../shared/api/client";
 import type { DeviceStore } from "./device-store";
 
-export type Kinds = "all" | "robots" | "sensors";
-export type Whose = "all" | "mine" | "shared";
+export type KindFilter = "all" | "robots" | "sensors";
+export type OwnerFilter = "all" | "mine" | "shared";
 
-export interface Wanted {
+export interface DeviceFilter {
   /** Words, all of which have to be somewhere in label, name, type, kind or room. */
   search: string;
-  kinds: Kinds;
-  whose: Whose;
+  kinds: KindFilter;
+  whose: OwnerFilter;
   onlyTrouble: boolean;
 }
 
@@ -19,7 +19,7 @@ export function isRoomDevice({ kind, robot_type: type }: Pick<Device, "kind" | "
 }
 
 /** `faults`: how many the device tells of, or the cloud has found. */
-export function fits(device: DeviceStore, space: string, faults: number, wanted: Wanted): boolean {
+export function matchesFilter(device: DeviceStore, space: string, faults: number, wanted: DeviceFilter): boolean {
   const { search, kinds, whose, onlyTrouble } = wanted;
   const info = device.info.value;
   if (whose !== "all" && (info.role === "owner") !== (whose === "mine")) return false;

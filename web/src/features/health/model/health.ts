@@ -167,7 +167,7 @@ export function standings(open: readonly Fault[], told: readonly ReportedFault[]
 }
 
 /** What the device says of its own faults now; `null` where it cannot be heard. */
-export function toldBy(device: DeviceStore): readonly ReportedFault[] | null {
+export function reportedFaults(device: DeviceStore): readonly ReportedFault[] | null {
   return device.live.value ? (device.state.value?.faults ?? null) : null;
 }
 
@@ -239,7 +239,7 @@ export function worstFirst(fields: readonly Watched[]): Watched[] {
 }
 
 /** What happened in the time around a fault [ms since 1970]. */
-export function around(fault: Fault, marginMs = 60_000): [fromMs: number, toMs: number] {
+export function intervalAround(fault: Fault, marginMs = 60_000): [fromMs: number, toMs: number] {
   const end = fault.cleared_at === null ? Infinity : Date.parse(fault.cleared_at) + marginMs;
   return [Date.parse(fault.raised_at) - marginMs, end];
 }

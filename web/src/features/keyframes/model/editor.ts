@@ -13,14 +13,14 @@ import {
   type Robot,
 } from "./keyframes";
 import { readMovement } from "./script-codec";
-import { Undoable } from "../../../shared/lib/undo-history";
+import { UndoHistory } from "../../../shared/lib/undo-history";
 
 /** What keeps drafts: a browser's storage. */
 export type Storage = Pick<globalThis.Storage, "getItem" | "setItem" | "removeItem">;
 
 export class Editor {
   readonly robot: Robot;
-  readonly #history: Undoable<Movement>;
+  readonly #history: UndoHistory<Movement>;
   readonly #chosen = signal(0);
   readonly #at = signal(0);
   readonly #playing = signal(false);
@@ -50,7 +50,7 @@ export class Editor {
   ) {
     const { saved, draft, fresh } = from;
     this.robot = robot;
-    const history = new Undoable(draft ?? saved ?? fresh);
+    const history = new UndoHistory(draft ?? saved ?? fresh);
     this.#history = history;
     this.#saved = signal(saved);
     this.movement = history.now;

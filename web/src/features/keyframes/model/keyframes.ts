@@ -22,7 +22,7 @@ export interface Place {
 }
 
 /** What is done where a keyframe is reached, one after the other in this order, while time stands still. */
-export interface Deeds {
+export interface KeyframeActions {
   posture?: string;
   behaviour?: string;
   express?: string;
@@ -31,10 +31,10 @@ export interface Deeds {
   go_to?: Place;
 }
 
-export const DEEDS = ["posture", "behaviour", "express", "say", "drive", "go_to"] as const;
-export type Deed = (typeof DEEDS)[number];
+export const ACTION_KINDS = ["posture", "behaviour", "express", "say", "drive", "go_to"] as const;
+export type ActionKind = (typeof ACTION_KINDS)[number];
 
-export interface Keyframe extends Deeds {
+export interface Keyframe extends KeyframeActions {
   time_s: number;
   /** Joints that are not named are on their way to where the next keyframe names them. */
   position_rad: Positions;
@@ -66,7 +66,7 @@ const SAME_RAD = 1e-6;
 // ---------------------------------------------------------------- edits
 
 /** A position as it is written down: in whole steps, and inside of a range. */
-export function tidy(value: number, lower: number, upper: number): number {
+export function normalize(value: number, lower: number, upper: number): number {
   const inside = clamp(value, lower, upper);
   const steps = Math.round(inside / STEP_RAD);
   const rounded = steps * STEP_RAD > upper ? Math.floor(upper / STEP_RAD) : steps * STEP_RAD < lower ? Math.ceil(lower / STEP_RAD) : steps;
@@ -92,7 +92,7 @@ export function setPosition(movement: Movement, index: number, joint: Joint, pos
   return withKeyframe(movement, index, (old) => {
     const all = { ...old.position_rad };
     if (position === null) Reflect.deleteProperty(all, joint.name);
-    else all[joint.name] = tidy(position, joint.lower_rad, joint.upper_rad);
+    else all[joint.name] = normalize(position, joint.lower_rad, joint.upper_rad);
     return { ...old, position_rad: inOrder(all, robot) };
   });
 }
@@ -107,29 +107,29 @@ export function poseOf(positions: Positions, robot: Robot): Positions {
   const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));
   const counted = robot.joints.flatMap(({ name, lower_rad, upper_rad }) => {
     const value = positions[name];
-    return value === undefined || followers.has(name) ? [] : [[name, tidy(value, lower_rad, upper_rad)] as const];
+    return value === undefined || followers.has(name) ? [] : [[name, normalize(value, lower_rad, upper_rad)] as const];
   });
   return Object.fromEntries(counted);
 }
 
 /** Set or take away (`undefined`) what is done at a keyframe. */
-export function setDeed<D extends Deed>(movement: Movement, index: number, deed: D, value: Deeds[D] | undefined): Movement {
+export function setAction<D extends ActionKind>(movement: Movement, index: number, deed: D, value: KeyframeActions[D] | undefined): Movement {
   return withKeyframe(movement, index, (old) => {
     const { time_s, position_rad, ...deeds } = old;
-    const next: Deeds = { ...deeds };
+    const next: KeyframeActions = { ...deeds };
     if (value === undefined) Reflect.deleteProperty(next, deed);
     else next[deed] = value;
-    return { time_s, position_rad, ...deedsOf(next) };
+    return { time_s, position_rad, ...actionsOf(next) };
   });
 }
 
 /** What is done there, in the order of doing. */
-export function deedsOf(keyframe: Deeds): Deeds {
-  return Object.fromEntries(DEEDS.filter((deed) => keyframe[deed] !== undefined).map((deed) => [deed, keyframe[deed]]));
+export function actionsOf(keyframe: KeyframeActions): KeyframeActions {
+  return Object.fromEntries(ACTION_KINDS.filter((deed) => keyframe[deed] !== undefined).map((deed) => [deed, keyframe[deed]]));
 }
 
-export function doesSomething(keyframe: Deeds): boolean {
-  return DEEDS.some((deed) => keyframe[deed] !== undefined);
+export function hasAction(keyframe: KeyframeActions): boolean {
+  return ACTION_KINDS.some((deed) => keyframe[deed] !== undefined);
 }
 
 /** A keyframe in time: between its neighbours, or with all that follows (`shifting`). The first one is at 0. */
@@ -174,11 +174,11 @@ export function duplicate(movement: Movement, index: number): Movement {
 /** Without a keyframe; there is always one. */
 export function remove(movement: Movement, index: number): Movement {
   if (movement.keyframes.length < 2) return movement;
-  return fromZero({ ...movement, keyframes: movement.keyframes.toSpliced(index, 1) });
+  return startAtZero({ ...movement, keyframes: movement.keyframes.toSpliced(index, 1) });
 }
 
 /** The first keyframe at 0. */
-export function fromZero(movement: Movement): Movement {
+export function startAtZero(movement: Movement): Movement {
   const begin = movement.keyframes[0]?.time_s ?? 0;
   return {
     ...movement,
@@ -220,7 +220,7 @@ function pieces(keyframes: readonly Keyframe[], robot: Robot): Piece[] {
   }
   for (let first = 0; first < keyframes.length - 1; ) {
     let last = first + 1;
-    while (last < keyframes.length - 1 && !doesSomething(keyframes[last] ?? {})) last += 1;
+    while (last < keyframes.length - 1 && !hasAction(keyframes[last] ?? {})) last += 1;
     const stretch = keyframes.slice(first, last + 1);
     const gaps = stretch.slice(1).map(({ time_s }, index) => Math.max(time_s - (stretch[index]?.time_s ?? 0), 1e-3));
     const tracks = robot.joints.flatMap((joint) => {
@@ -258,7 +258,7 @@ export function plan({ keyframes }: Movement, robot: Robot): Plan {
   /** The two scales side by side: where something is done one of them stands still. */
   const scale: [played: number, asked: number][] = [[0, 0]];
   const parts: { begin: number; end: number; curves: [string, Curve][] }[] = [];
-  let begin = doesSomething(keyframes[0] ?? {}) ? DEED_S : 0;
+  let begin = hasAction(keyframes[0] ?? {}) ? DEED_S : 0;
   for (const piece of pieces(keyframes, robot)) {
     const times = moments(fitted(piece.gaps, piece.tracks));
     parts.push({
@@ -271,7 +271,7 @@ export function plan({ keyframes }: Movement, robot: Robot): Plan {
       reached.push(begin + time);
       scale.push([begin + time, keyframes[piece.first + 1 + index]?.time_s ?? 0]);
     });
-    begin += (times.at(-1) ?? 0) + (doesSomething(keyframes[piece.last] ?? {}) ? DEED_S : 0);
+    begin += (times.at(-1) ?? 0) + (hasAction(keyframes[piece.last] ?? {}) ? DEED_S : 0);
   }
   const only = poseAt(keyframes[0]?.position_rad ?? {}, robot);
   const played = scale.map(([one]) => one);
@@ -333,8 +333,8 @@ export interface Problem {
     | { kind: "narrowed"; lower_rad: number; upper_rad: number; by: string }
     | { kind: "mirrored"; of: string }
     | { kind: "unknown-joint" }
-    | { kind: "unknown-name"; deed: Deed; name: string }
-    | { kind: "cannot"; deed: Deed }
+    | { kind: "unknown-name"; deed: ActionKind; name: string }
+    | { kind: "cannot"; deed: ActionKind }
     | { kind: "too-fast"; by: Limiting; needs_s: number }
     | { kind: "times" }
     | { kind: "late-joint" }
@@ -363,7 +363,7 @@ function timeProblems({ keyframes }: Movement, index: number): Problem[] {
 
 function rising(movement: Movement): Movement {
   let reached = -SHORTEST_S;
-  return fromZero({
+  return startAtZero({
     ...movement,
     keyframes: movement.keyframes.map((one) => {
       reached = Math.max(one.time_s, reached + SHORTEST_S);
@@ -389,7 +389,7 @@ function placeProblems(movement: Movement, index: number, robot: Robot): Problem
   const inside = (name: string, lower: number, upper: number) => (old: Movement) =>
     withKeyframe(old, index, (one) => ({
       ...one,
-      position_rad: { ...one.position_rad, [name]: tidy(one.position_rad[name] ?? 0, lower, upper) },
+      position_rad: { ...one.position_rad, [name]: normalize(one.position_rad[name] ?? 0, lower, upper) },
     }));
   return Object.entries(positions).flatMap(([name, place]): Problem[] => {
     const joint = robot.joints.find((one) => one.name === name);
@@ -432,12 +432,12 @@ const NAMES = { posture: "postures", behaviour: "behaviours", express: "expressi
 
 function deedProblems(movement: Movement, index: number, robot: Robot): Problem[] {
   const keyframe = movement.keyframes[index] ?? { time_s: 0, position_rad: {} };
-  return DEEDS.flatMap((deed): Problem[] => {
+  return ACTION_KINDS.flatMap((deed): Problem[] => {
     const value = keyframe[deed];
     if (value === undefined) return [];
     const base = { severity: "error", keyframe: index, joint: null } as const;
-    const mend = (old: Movement): Movement => setDeed(old, index, deed, undefined);
-    if (!can(robot, deed)) return [{ ...base, what: { kind: "cannot", deed }, mend }];
+    const mend = (old: Movement): Movement => setAction(old, index, deed, undefined);
+    if (!supports(robot, deed)) return [{ ...base, what: { kind: "cannot", deed }, mend }];
     if ((deed === "posture" || deed === "behaviour" || deed === "express") && typeof value === "string") {
       if (!robot[NAMES[deed]].includes(value)) return [{ ...base, what: { kind: "unknown-name", deed, name: value }, mend }];
     }
@@ -446,7 +446,7 @@ function deedProblems(movement: Movement, index: number, robot: Robot): Problem[
   });
 }
 
-const ACTIONS: Readonly<Record<Deed, string>> = {
+const ACTIONS: Readonly<Record<ActionKind, string>> = {
   posture: "take_posture",
   behaviour: "run_behaviour",
   express: "express",
@@ -456,7 +456,7 @@ const ACTIONS: Readonly<Record<Deed, string>> = {
 };
 
 /** Whether a robot can do such a thing at a keyframe, by its own description. */
-export function can(robot: Robot, deed: Deed): boolean {
+export function supports(robot: Robot, deed: ActionKind): boolean {
   return robot.actions.includes(ACTIONS[deed]);
 }
 
@@ -529,7 +529,7 @@ function slowed(movement: Movement, keyframe: number, robot: Robot): Movement {
 }
 
 /** With as much time everywhere as the robot's limits ask for. */
-export function slowedAll(movement: Movement, robot: Robot): Movement {
+export function stretchAll(movement: Movement, robot: Robot): Movement {
   let now = movement;
   for (let tries = 0; tries < 20; tries += 1) {
     const all = [...fastest(now, robot).keys()].sort((a, b) => a - b);

@@ -1,6 +1,6 @@
 /** What a robot did, as its telemetry told it, and as few keyframes that come near enough to it. */
 import { signal, type ReadonlySignal } from "@preact/signals-core";
-import { fromZero, poseOf, tidy, type Keyframe, type Movement, type Positions, type Robot } from "./keyframes";
+import { startAtZero, poseOf, normalize, type Keyframe, type Movement, type Positions, type Robot } from "./keyframes";
 import type { KnownEvent, KnownTelemetry } from "../../../shared/mqtt/parse-messages";
 
 export interface Sample {
@@ -15,27 +15,27 @@ export interface Gap {
   to_s: number;
 }
 
-export interface Take {
+export interface Recording {
   samples: readonly Sample[];
   gaps: readonly Gap[];
   said: readonly { time_s: number; text: string }[];
 }
 
-const NOTHING: Take = { samples: [], gaps: [], said: [] };
+const NOTHING: Recording = { samples: [], gaps: [], said: [] };
 /** Five samples of 20 a second. */
 const GAP_S = 0.25;
 /** Twenty minutes of 20 a second. */
 const MOST = 24_000;
 
 export class Recorder {
-  readonly #take = signal<Take>(NOTHING);
+  readonly #take = signal<Recording>(NOTHING);
   readonly #running = signal(false);
   #samples: Sample[] = [];
   #gaps: Gap[] = [];
   #said: { time_s: number; text: string }[] = [];
   #last: KnownTelemetry | null = null;
 
-  readonly take: ReadonlySignal<Take> = this.#take;
+  readonly take: ReadonlySignal<Recording> = this.#take;
   readonly running: ReadonlySignal<boolean> = this.#running;
 
   start(): void {
@@ -74,7 +74,7 @@ export class Recorder {
   }
 
   /** Of an earlier page. */
-  restore(take: Take): void {
+  restore(take: Recording): void {
     this.#take.value = take;
   }
 
@@ -88,7 +88,7 @@ export class Recorder {
 }
 
 /** Between two times; they count from the first. */
-export function trim(take: Take, from_s: number, to_s: number): Take {
+export function trim(take: Recording, from_s: number, to_s: number): Recording {
   const within = (time: number): boolean => time >= from_s && time <= to_s;
   return {
     samples: take.samples.filter(({ time_s }) => within(time_s)),
@@ -98,7 +98,7 @@ export function trim(take: Take, from_s: number, to_s: number): Take {
 }
 
 /** Indices of the samples that are kept, so that none is further from the lines between them (Ramer–Douglas–Peucker). */
-export function kept(samples: readonly Sample[], toleranceRad: number, always: ReadonlySet<number>): number[] {
+export function trimmedGaps(samples: readonly Sample[], toleranceRad: number, always: ReadonlySet<number>): number[] {
   const found = new Set([0, samples.length - 1, ...always]);
   const open = pairs([...found].sort((a, b) => a - b));
   for (let pair = open.pop(); pair !== undefined; pair = open.pop()) {
@@ -131,12 +131,12 @@ function offLine(samples: readonly Sample[], begin: number, end: number, index: 
 }
 
 /** Keyframes that come as near as `toleranceRad` to what was recorded. Joints that did not move are named once. */
-export function keyframesOf(take: Take, toleranceRad: number, robot: Robot): Keyframe[] {
+export function keyframesOf(take: Recording, toleranceRad: number, robot: Robot): Keyframe[] {
   const { samples } = take;
   if (samples.length === 0) return [];
   const edges = new Set(take.gaps.flatMap(({ from_s, to_s }) => [indexAt(samples, from_s), indexAt(samples, to_s)]));
   const words = new Map(take.said.map(({ time_s, text }) => [indexAt(samples, time_s), text]));
-  const indices = kept(samples, toleranceRad, new Set([...edges, ...words.keys()]));
+  const indices = trimmedGaps(samples, toleranceRad, new Set([...edges, ...words.keys()]));
   const moved = robot.joints.filter((_, joint) => {
     const places = samples.map(({ position_rad }) => position_rad[joint] ?? 0);
     return Math.max(...places) - Math.min(...places) > toleranceRad;
@@ -148,13 +148,13 @@ export function keyframesOf(take: Take, toleranceRad: number, robot: Robot): Key
     const named = moved.map(({ name }) => name);
     const say = words.get(index);
     return {
-      time_s: tidy(sample?.time_s ?? 0, 0, Infinity),
+      time_s: normalize(sample?.time_s ?? 0, 0, Infinity),
       position_rad: number === 0 ? pose : Object.fromEntries(Object.entries(pose).filter(([name]) => named.includes(name))),
       ...(say === undefined ? {} : { say }),
     };
   });
   const movement: Movement = { description: "", keyframes: made };
-  return [...fromZero(movement).keyframes];
+  return [...startAtZero(movement).keyframes];
 }
 
 function indexAt(samples: readonly Sample[], time: number): number {

@@ -2,7 +2,7 @@
  * Keyframes as a plain movement script, and back. A script is read back only when it is exactly what would be written
  * from the keyframes in it: what somebody has changed by hand belongs into the code editor, and is never lost here.
  */
-import { DEEDS, deedsOf, type Deed, type Deeds, type Keyframe, type Movement } from "./keyframes";
+import { ACTION_KINDS, actionsOf, type ActionKind, type KeyframeActions, type Keyframe, type Movement } from "./keyframes";
 
 /** As the cloud takes a script [characters]. */
 export const LONGEST_SCRIPT = 65_536;
@@ -47,13 +47,13 @@ function literal({ time_s, position_rad, ...deeds }: Keyframe): string {
       .map(([key, one]) => `${JSON.stringify(key)}: ${spaced(one)}`)
       .join(", ")}}`;
   };
-  return spaced({ time_s, position_rad, ...deedsOf(deeds) });
+  return spaced({ time_s, position_rad, ...actionsOf(deeds) });
 }
 
-export type ReadBack = { kind: "keyframes"; movement: Movement } | { kind: "changed" } | { kind: "other" };
+export type ParsedScript = { kind: "keyframes"; movement: Movement } | { kind: "changed" } | { kind: "other" };
 
 /** `changed`: it has keyframes and more than the editor writes. `other`: it never was the editor's. */
-export function readScript(source: string): ReadBack {
+export function readScript(source: string): ParsedScript {
   const lines = source.split("\n");
   const begin = lines.indexOf(OPENS);
   if (begin < 0 || !source.startsWith(QUOTES)) return { kind: "other" };
@@ -81,13 +81,13 @@ export function readMovement(value: unknown): Movement | null {
 }
 
 function keyframe(value: unknown): Keyframe {
-  const { time_s, position_rad, ...deeds } = object(value, "time_s", "position_rad", ...DEEDS);
+  const { time_s, position_rad, ...deeds } = object(value, "time_s", "position_rad", ...ACTION_KINDS);
   const positions = Object.entries(object(position_rad)).map(([name, place]) => [name, number(place)] as const);
-  const done = Object.entries(deeds).map(([deed, how]) => [deed, deedOf(deed as Deed, how)] as const);
-  return { time_s: number(time_s), position_rad: Object.fromEntries(positions), ...(Object.fromEntries(done) as Deeds) };
+  const done = Object.entries(deeds).map(([deed, how]) => [deed, deedOf(deed as ActionKind, how)] as const);
+  return { time_s: number(time_s), position_rad: Object.fromEntries(positions), ...(Object.fromEntries(done) as KeyframeActions) };
 }
 
-function deedOf(deed: Deed, how: unknown): Deeds[Deed] {
+function deedOf(deed: ActionKind, how: unknown): KeyframeActions[ActionKind] {
   switch (deed) {
     case "drive": {
       const { forward_m_s, turn_rad_s, duration_s } = object(how, "forward_m_s", "turn_rad_s", "duration_s");

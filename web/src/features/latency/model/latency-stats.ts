@@ -24,7 +24,7 @@ export interface Sample {
 }
 
 /** One transport and path, as the cloud tells it. */
-export interface StoredTimes {
+export interface StoredLatency {
   transport: Transport;
   path: Path;
   /** Of the whole span, and so are the figures: there may be more than samples are kept. */
@@ -39,15 +39,15 @@ export interface StoredTimes {
   ms: number[];
 }
 
-export class TimesApi {
+export class LatencyApi {
   readonly #http: Http;
 
   constructor(http: Http) {
     this.#http = http;
   }
 
-  async of(device: string, fromMs: number): Promise<StoredTimes[]> {
-    const { items } = await this.#http.call<{ items: StoredTimes[] }>("GET", `/devices/${device}/latency?from=${Math.round(fromMs)}`);
+  async of(device: string, fromMs: number): Promise<StoredLatency[]> {
+    const { items } = await this.#http.call<{ items: StoredLatency[] }>("GET", `/devices/${device}/latency?from=${Math.round(fromMs)}`);
     return items;
   }
 
@@ -68,7 +68,7 @@ export interface Line {
   stored: number;
 }
 
-export interface Wanted {
+export interface LatencyQuery {
   /** `null`: all of them. */
   device: string | null;
   transport: Transport | null;
@@ -87,7 +87,7 @@ export function lineKey({ device, transport, path }: Pick<Line, "device" | "tran
  * @param stored By device.
  * @param fresh Measured on this page; a sample that has come back from the cloud counts once.
  */
-export function linesOf(stored: ReadonlyMap<string, readonly StoredTimes[]>, fresh: readonly Line[], wanted: Wanted): Line[] {
+export function linesOf(stored: ReadonlyMap<string, readonly StoredLatency[]>, fresh: readonly Line[], wanted: LatencyQuery): Line[] {
   const found = new Map<string, Line>();
   for (const [device, items] of stored) {
     for (const { transport, path, at_ms, ms, count } of items) {
@@ -133,7 +133,7 @@ export function figuresOf(samples: readonly Sample[]): Figures {
 }
 
 /** For each time the share of samples that took no longer, 0…1. */
-export function shares(samples: readonly Sample[]): [ms: number[], share: number[]] {
+export function distribution(samples: readonly Sample[]): [ms: number[], share: number[]] {
   const sorted = samples.map(({ ms }) => ms).sort((one, other) => one - other);
   const ends = [...new Set(sorted)];
   return [ends, ends.map((ms) => (sorted.findLastIndex((one) => one <= ms) + 1) / sorted.length)];

@@ -16,24 +16,24 @@ const BETWEEN_MS = 100;
 const SHOT_TIMEOUT_MS = 10_000;
 
 /** `cloud`: the server by HTTP; `broker`: the broker over this page's own connection; `device`: a room device measures once. */
-export type Way = "cloud" | "broker" | "device";
+export type ProbeKind = "cloud" | "broker" | "device";
 
 type Kind = Pick<LatencyBatch, "transport" | "path">;
 
-export const KINDS: Readonly<Record<Way, Kind>> = {
+export const KINDS: Readonly<Record<ProbeKind, Kind>> = {
   cloud: { transport: "http", path: "operator-cloud" },
   broker: { transport: "websocket", path: "operator-cloud" },
   device: { transport: "http", path: "operator-device" },
 };
 
 export interface Progress {
-  way: Way;
+  way: ProbeKind;
   done: number;
   of: number;
 }
 
 interface Batch {
-  way: Way;
+  way: ProbeKind;
   key: string;
   samples: readonly Sample[];
   stored: boolean;
@@ -42,12 +42,12 @@ interface Batch {
 const SHOOT = "shoot";
 
 /** What can be asked of a device so that nothing moves. */
-export function waysOf(device: DeviceStore): Way[] {
+export function probeKindsOf(device: DeviceStore): ProbeKind[] {
   const canShoot = device.description.value?.actions.includes(SHOOT) === true;
   return canShoot && device.info.value.role !== "viewer" ? ["cloud", "broker", "device"] : ["cloud", "broker"];
 }
 
-export class Measure {
+export class LatencyProbe {
   readonly #api: Api;
   readonly #link: Link;
   readonly #device: DeviceStore;
@@ -83,7 +83,7 @@ export class Measure {
   }
 
   /** Measure each way in turn, and store it. Until its end, or until `stop`. */
-  async run(ways: readonly Way[]): Promise<void> {
+  async run(ways: readonly ProbeKind[]): Promise<void> {
     if (this.#progress.value !== null) return;
     this.#ended = new AbortController();
     const { signal: ended } = this.#ended;
@@ -118,7 +118,7 @@ export class Measure {
     if (this.#batches.value.every(({ stored }) => stored) && !this.#ended.signal.aborted) this.#why.value = "";
   }
 
-  async #measure(way: Way, ended: AbortSignal): Promise<void> {
+  async #measure(way: ProbeKind, ended: AbortSignal): Promise<void> {
     let batch: Batch = { way, key: newId(), samples: [], stored: false };
     for (let done = 0; done < TIMES; done += 1) {
       if (ended.aborted) return;
@@ -137,11 +137,11 @@ export class Measure {
     }
   }
 
-  async #once(way: Way): Promise<void> {
-    if (way === "cloud") return this.#api.times.ask();
+  async #once(way: ProbeKind): Promise<void> {
+    if (way === "cloud") return this.#api.latency.ask();
     if (way === "broker") return this.#link.ping();
     const asked = { epoch: this.#epoch(), waitFor: "done", timeoutMs: SHOT_TIMEOUT_MS } as const;
-    const action = await this.#api.ask(this.#device.id, { kind: SHOOT, streams: [] }, asked, newId());
+    const action = await this.#api.startAction(this.#device.id, { kind: SHOOT, streams: [] }, asked, newId());
     if (action.status !== "done") throw new Error(action.reason?.message ?? action.status);
   }
 

@@ -1,7 +1,7 @@
 /** A script while somebody writes it: from which version, what is not saved yet, and what others have saved meanwhile. */
 import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import { ApiError, sentence } from "../../../shared/api/http";
-import type { Draft, Kept } from "../../../shared/lib/local-storage";
+import type { Draft, StoredValue } from "../../../shared/lib/local-storage";
 import { MovementChanged, type Library, type Movement, type MovementSource } from "./movement-library";
 
 export type Loading = { kind: "loading" } | { kind: "there" } | { kind: "failed"; why: string };
@@ -11,11 +11,11 @@ export interface Conflict {
   theirs: MovementSource | null;
 }
 
-export class Manuscript {
+export class ScriptDraft {
   readonly robotType: string;
   readonly name: string;
   readonly #library: Library;
-  readonly #kept: Kept<Draft>;
+  readonly #kept: StoredValue<Draft>;
   readonly #template: string;
   readonly #loading = signal<Loading>({ kind: "loading" });
   readonly #base = signal<MovementSource | null>(null);
@@ -40,7 +40,7 @@ export class Manuscript {
   readonly changed = computed(() => this.#base.value === null || this.#text.value !== this.#base.value.source);
 
   /** `template`: what a movement begins with that there is not yet. */
-  constructor(library: Library, robotType: string, name: string, kept: Kept<Draft>, template: string) {
+  constructor(library: Library, robotType: string, name: string, kept: StoredValue<Draft>, template: string) {
     this.#library = library;
     this.robotType = robotType;
     this.name = name;

@@ -4,7 +4,7 @@ import { now } from "../../../shared/lib/clock";
 import { readFindings, type Finding } from "./parse-findings";
 import { ApiError, sentence } from "../../../shared/api/http";
 import type { Look, RobotType, RobotTypes, TypeModel } from "./robot-types";
-import { choose, MANIFEST, MAX_BYTES, pack, size, type Files } from "./upload-files";
+import { selectFiles, MANIFEST, MAX_BYTES, packFiles, size, type Files } from "./upload-files";
 
 export type DraftStep = "empty" | "sending" | "checking" | "good" | "wrong" | "unsent" | "saving" | "saved";
 
@@ -21,7 +21,7 @@ export type LocalFault = "no-manifest" | "too-large" | null;
 const ASK_EVERY_MS = 500;
 
 /** Files may be exchanged at any time: what is under way for the ones before is forgotten. */
-export class TypeDraft {
+export class UploadDraft {
   readonly #types: RobotTypes;
   readonly #files = signal<Files>(new Map());
   readonly #left = signal<readonly string[]>([]);
@@ -66,7 +66,7 @@ export class TypeDraft {
 
   /** Files that come beside those that are there, in the place of those of the same name; then all is checked. */
   async add(entries: Files): Promise<void> {
-    const { files, left } = choose(entries);
+    const { files, left } = selectFiles(entries);
     // A single file is exchanged by its own name, wherever it lies in the folder.
     for (const [name, content] of [...files]) {
       const known = [...this.#files.value.keys()].filter((each) => each.endsWith(`/${name}`));
@@ -93,7 +93,7 @@ export class TypeDraft {
   /** Send all files, and wait for what the checkers say. */
   async check(): Promise<void> {
     const round = this.#begin("sending");
-    const folder = pack(this.#files.value);
+    const folder = packFiles(this.#files.value);
     if (folder === null || this.fault.value !== null) {
       this.#step.value = this.#files.value.size === 0 ? "empty" : "wrong";
       return;
@@ -176,7 +176,7 @@ export class TypeDraft {
 
   async #saveMovements(type: string): Promise<SavedMovement[]> {
     const saved: SavedMovement[] = [];
-    for (const [name, source] of Object.entries(pack(this.#files.value)?.movements ?? {})) {
+    for (const [name, source] of Object.entries(packFiles(this.#files.value)?.movements ?? {})) {
       try {
         await this.#types.putMovement(type, name, source);
         saved.push({ name, why: "" });

@@ -10,7 +10,7 @@ const CHUNK = 0x8000;
 
 export type Files = ReadonlyMap<string, Uint8Array>;
 
-export interface Chosen {
+export interface SelectedUpload {
   files: Map<string, Uint8Array>;
   /** What was chosen and is of no use to a robot type. */
   left: string[];
@@ -20,7 +20,7 @@ export interface Chosen {
  * The files below the folder that holds `robot.toml`, by their names in it. Without a manifest among them: below the
  * folder that all of them are in.
  */
-export function choose(entries: Files): Chosen {
+export function selectFiles(entries: Files): SelectedUpload {
   const files = new Map<string, Uint8Array>();
   const left: string[] = [];
   const names = [...entries.keys()].filter((name) => !name.endsWith("/") && !hidden(name));
@@ -36,7 +36,7 @@ export function choose(entries: Files): Chosen {
 }
 
 /** What a folder holds, as the server wants it; `null` without a manifest. */
-export function pack(files: Files): TypeFolder | null {
+export function packFiles(files: Files): TypeFolder | null {
   const text = new TextDecoder();
   const manifest = files.get(MANIFEST);
   if (manifest === undefined) return null;

@@ -1,6 +1,6 @@
 /** What this page asks of one room device: one thing at a time, and what became of it. */
 import { signal, type ReadonlySignal } from "@preact/signals-core";
-import { type ActionRunner, type Asking, type Run } from "../../actions/model/action-runner";
+import { type ActionRunner, type ActionOptions, type Run } from "../../actions/model/action-runner";
 import type { Api, Upload } from "../../../shared/api/client";
 import { sentence } from "../../../shared/api/http";
 import { now } from "../../../shared/lib/clock";
@@ -34,7 +34,7 @@ export interface Setting {
   why: string;
 }
 
-export class Instrument {
+export class RoomDeviceAction {
   readonly #api: Api;
   readonly #device: DeviceStore;
   readonly #actions: ActionRunner;
@@ -149,7 +149,7 @@ export class Instrument {
   }
 
   /** The run once it has come as far as wanted; `null` where it did not, which `why` says. */
-  async #ask(request: RoomRequest, waitFor: Required<Asking>["waitFor"], timeoutMs: number): Promise<Run | null> {
+  async #ask(request: RoomRequest, waitFor: Required<ActionOptions>["waitFor"], timeoutMs: number): Promise<Run | null> {
     this.#busy.value = request.kind;
     this.#why.value = "";
     const run = await this.#actions.ask(request, { epoch: this.#epoch(), waitFor, timeoutMs });

@@ -14,7 +14,7 @@ export function secondsLeft(expiresAt: string | null): number | null {
 }
 
 /** All methods that change something throw `ApiError`; then nothing has changed here. */
-export class Sharing {
+export class ShareList {
   readonly #api: Api;
   readonly #target: Target;
   readonly #shares = signal<readonly Share[] | null>(null);

@@ -9,7 +9,7 @@ import { clamp, radians } from "../../../shared/lib/angles";
 import { now } from "../../../shared/lib/clock";
 import type { KnownTelemetry } from "../../../shared/mqtt/parse-messages";
 import type { Joint, Setpoint } from "../../../shared/mqtt/protocol.generated";
-import { restOf, type Velocity, type Way } from "./steerable-parts";
+import { restOf, type Velocity, type SteeringMode } from "./steerable-parts";
 
 export const PERIOD_MS = 25;
 /** Telemetry older than this is not fresh: the agent would refuse a setpoint that echoes it [ms]. */
@@ -73,7 +73,7 @@ export class SetpointStreamer {
   /** Why the last stream ended. */
   readonly ended: ReadonlySignal<EndedBecause> = this.#ended;
   /** What is streamed; `null`: nothing. */
-  readonly way = computed<Way | null>(() => {
+  readonly way = computed<SteeringMode | null>(() => {
     if (this.#state.value === "idle") return null;
     return this.#held.value?.velocity.kind ?? "joints";
   });
@@ -200,7 +200,7 @@ export class SetpointStreamer {
   }
 
   /** Another way of steering begins: what was asked before must not go on beside it. */
-  #leaveFor(next: Way): void {
+  #leaveFor(next: SteeringMode): void {
     const way = this.way.value;
     if (way === next) return;
     if (this.#held.value !== null) {

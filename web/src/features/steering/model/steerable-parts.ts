@@ -4,14 +4,14 @@ import type { KnownDescription } from "../../../shared/mqtt/parse-messages";
 import type { BaseLimits, DriveTarget, JogTarget } from "../../../shared/mqtt/protocol.generated";
 import type { Vector3 } from "../../../shared/lib/vectors";
 
-export type Way = "joints" | "jog" | "drive";
+export type SteeringMode = "joints" | "jog" | "drive";
 /** A velocity: it counts only while it is held. */
 export type Velocity = JogTarget | DriveTarget;
 
 /** The kinds of setpoint that this device follows. */
-export function waysOf(description: KnownDescription | null): Way[] {
+export function steeringModesOf(description: KnownDescription | null): SteeringMode[] {
   if (description === null) return [];
-  const ways: Way[] = [];
+  const ways: SteeringMode[] = [];
   if (description.joints.length > 0) ways.push("joints");
   // Whoever brings a frame to a pose can also move it along: both need the robot's shape.
   if (description.actions.includes("move_pose") && description.frames.length > 0) ways.push("jog");

@@ -12,7 +12,7 @@ interface Sample {
   message: KnownTelemetry | null;
 }
 
-export class History {
+export class RecentTelemetry {
   readonly #samples: Sample[] = [];
 
   add(message: KnownTelemetry, at: number): void {
