@@ -245,7 +245,7 @@ describe("a recording", () => {
 });
 
 describe("the colours of the page", () => {
-  const style = readFileSync(new URL("../src/shared/ui/style.css", import.meta.url), "utf8");
+  const style = readFileSync(new URL("../src/shared/ui/styles/tokens.css", import.meta.url), "utf8");
   const luminance = (hex: string): number => {
     const [red = 0, green = 0, blue = 0] = [1, 3, 5]
       .map((at) => parseInt(hex.slice(at, at + 2), 16) / 255)
