@@ -60,7 +60,7 @@ def functions(arguments: Sequence[str]) -> int:
     from function_app.entrypoints.hosts import uvicorn
     from function_app.entrypoints.http.framework.authentication import Caller
     from function_app.services.actions import acks
-    from function_app.services.messaging.command_sender import CommandSender
+    from function_app.services.messaging.delivery import Delivery
     from function_app.services.storage import records
 
     tell = TimestampSender().tell
@@ -72,7 +72,7 @@ def functions(arguments: Sequence[str]) -> int:
     _wrap(Caller, "account", _told_after(lambda *_: tell("identified")))
     _wrap(SqliteTables, "batch", _told_first(to_control("writing")))
     _wrap(SqliteTables, "batch", _told_after(to_control("written")))
-    _wrap(CommandSender, "publish", _told_first(lambda *_: tell("publishing")))
+    _wrap(Delivery, "send", _told_first(lambda *_: tell("publishing")))
     _wrap(acks, "report", _told_first(lambda ack, *_: tell(f"ack-heard:{ack.status.value}")))
     return program.main(arguments)
 

@@ -37,17 +37,20 @@ def check_batch(writes: Sequence[Write]) -> tuple[bytes, ...]:
     """
     if not 1 <= len(writes) <= MAX_BATCH:
         raise ValueError(f"a batch has 1 to {MAX_BATCH} writes, not {len(writes)}")
-    if len({write.row.partition for write in writes}) != 1:
-        raise ValueError("all writes of a batch are in one partition")
-    if len({write.row.key for write in writes}) != len(writes):
-        raise ValueError("a batch writes each key once")
+    keys: set[str] = set()
+    texts: list[bytes] = []
     for write in writes:
+        if write.row.partition != writes[0].row.partition:
+            raise ValueError("all writes of a batch are in one partition")
+        if write.row.key in keys:
+            raise ValueError("a batch writes each key once")
+        keys.add(write.row.key)
         check(write.row)
-    texts = tuple(b"" if write.kind == "delete" else encode(write.row.data) for write in writes)
+        texts.append(b"" if write.kind == "delete" else encode(write.row.data))
     size = sum(map(len, texts))
     if size > MAX_BATCH_BYTES:
         raise ValueError(f"a batch writes at most {MAX_BATCH_BYTES} bytes, not {size}; make it smaller")
-    return texts
+    return tuple(texts)
 
 
 def check_limit(limit: int) -> None:

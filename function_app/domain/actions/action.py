@@ -6,41 +6,45 @@ stays, whoever reports another one later.
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, Self
+
+_TERMINAL_RANK = 5
 
 
 class Status(StrEnum):
-    """How far an action has come. The last four are terminal."""
+    """The progress of an action. The last four values are terminal.
 
-    QUEUED = "queued"
-    CREATED = "created"
-    PUBLISHED = "published"
-    RECEIVED = "received"
-    ACCEPTED = "accepted"
-    STARTED = "started"
-    DONE = "done"
-    FAILED = "failed"
-    EXPIRED = "expired"
-    CANCELLED = "cancelled"
+    Attributes:
+        rank: Position in the order; all terminal states share the last one.
+        terminal: No other status follows.
+    """
 
-    @property
-    def terminal(self) -> bool:
-        """Whether nothing follows."""
-        return self in TERMINAL
+    rank: int
+    terminal: bool
 
-    @property
-    def rank(self) -> int:
-        """Place in the order; all terminal states share the last."""
-        return _RANK[self]
+    def __new__(cls, value: str, rank: int = 0) -> Self:  # noqa: D102 (attributes instead of properties: read per ack)
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.rank = rank
+        member.terminal = rank == _TERMINAL_RANK
+        return member
+
+    QUEUED = "queued", -1
+    CREATED = "created", 0
+    PUBLISHED = "published", 1
+    RECEIVED = "received", 2
+    ACCEPTED = "accepted", 3
+    STARTED = "started", 4
+    DONE = "done", _TERMINAL_RANK
+    FAILED = "failed", _TERMINAL_RANK
+    EXPIRED = "expired", _TERMINAL_RANK
+    CANCELLED = "cancelled", _TERMINAL_RANK
 
 
-TERMINAL = frozenset({Status.DONE, Status.FAILED, Status.EXPIRED, Status.CANCELLED})
 RETRY_MS = 1_000
 """A command that nobody has answered is published again after this time."""
 GRACE_MS = 3_000
 """An ack may be this late: until then a command whose time ran out is not called expired."""
-
-_RANK = {status: min(place, 5) for place, status in enumerate(Status, start=-1)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +134,10 @@ def apply_report(action: Action, report: AckReport) -> Action:
     if action.status.terminal or action.status is Status.QUEUED:
         return action  # a queued one was never sent: whoever reports about it makes it up
     times = action.times if report.status.value in action.times else {**action.times, report.status.value: report.at_ms}
-    heard = _heard(action, report)
+    heard, first_ms = action.heard, action.heard.get(report.status.value)
+    if report.heard_ms and (first_ms is None or report.heard_ms < first_ms):
+        # Several processes may receive the same ack: the earliest time counts.
+        heard = {**heard, report.status.value: report.heard_ms}
     if report.sequence <= action.sequence and report.status.rank <= action.status.rank:
         same = times is action.times and heard is action.heard
         return action if same else replace(action, times=times, heard=heard)
@@ -146,14 +153,6 @@ def apply_report(action: Action, report: AckReport) -> Action:
         result=(newest and report.result) or action.result,
         reason=(newest and report.reason) or action.reason,
     )
-
-
-def _heard(action: Action, report: AckReport) -> dict[str, int]:
-    """When each status was first heard: of several that hear the same ack, by whoever was soonest."""
-    existing = action.heard.get(report.status.value)
-    if not report.heard_ms or (existing is not None and existing <= report.heard_ms):
-        return action.heard
-    return {**action.heard, report.status.value: report.heard_ms}
 
 
 def mark_published(action: Action, now_ms: int) -> Action:

@@ -48,10 +48,14 @@ def split_device(device: str) -> tuple[str, str] | None:
 
 
 def new_suffix(now_ms: int) -> str:
-    """Last part of a command's id: counts down with time, so that newest sorts first; then 55 random bits."""
-    left = _TIME_END - now_ms
-    time = "".join(_SORTABLE32[(left >> shift) & 31] for shift in range(5 * (_TIME_LENGTH - 1), -5, -5))
-    return time + "".join(secrets.choice(_SORTABLE32) for _ in range(SUFFIX_LENGTH - _TIME_LENGTH))
+    """The last part of a command id: decreases with time, so that the newest sorts first; then 55 random bits."""
+    random_length = SUFFIX_LENGTH - _TIME_LENGTH
+    value = (_TIME_END - now_ms) << 5 * random_length | secrets.randbits(5 * random_length)
+    text = ""
+    for _ in range(SUFFIX_LENGTH):
+        text = _SORTABLE32[value & 31] + text
+        value >>= 5
+    return text
 
 
 def oldest_first(suffix: str) -> str:

@@ -86,6 +86,8 @@ def permissions(caller: Identity, agent: Agent, name: str, shares: Iterable[Shar
     """
     if agent.account is None:
         return None
+    if agent.account == caller.account and not caller.only and caller.most is Role.OWNER:
+        return Permissions(Role.OWNER, caller.until_ms, Role.OWNER)
     device, space = device_target(device_id(agent.id, name)), space_target(agent.space or "")
     if agent.account == caller.account:
         result: Permissions | None = OWNER_PERMISSIONS

@@ -21,8 +21,8 @@ from function_app.services.telemetry.latency import LatencyStore
 
 _POLL_S = 0.02
 _SLOWEST_POLL_S = 0.2
-_FIRST_LOOK_S = 0.05
-_SLOWEST_LOOK_S = 0.5
+_FIRST_READ_S = 0.05
+_SLOWEST_READ_S = 0.5
 
 
 class ActionAcks:
@@ -89,45 +89,44 @@ class ActionAcks:
             wait_ms: At most this long.
             published: Whether to note that the command was published.
         """
-        published_ms = self._clock.now_ms() if published else None
         end = asyncio.get_running_loop().time() + wait_ms / 1000
+        published_ms = self._clock.now_ms() if published else None
         if acks is None:
             if published:
-                stored = await self._write(stored, (), published_ms)
+                stored = await self._write(stored, (), published_ms, stored.action)
             return await self._poll(stored, wanted, end)
-        stored, reports = await self._hear(stored, acks, wanted, end)
-        return (await self._write(stored, reports, published_ms)).action
-
-    async def _hear(
-        self, stored: StoredAction, acks: AsyncIterator[Ack], wanted: Status, end: float
-    ) -> tuple[StoredAction, list[AckReport]]:
-        """Collect acks, and look into the tables now and then: the ingest may have heard what came before this call."""
-        loop = asyncio.get_running_loop()
         reports: list[AckReport] = []
+        stored, action = await self._receive(stored, acks, wanted, end, reports)
+        return (await self._write(stored, reports, published_ms, action)).action
+
+    async def _receive(
+        self, stored: StoredAction, acks: AsyncIterator[Ack], wanted: Status, end: float, reports: list[AckReport]
+    ) -> tuple[StoredAction, Action]:
+        """Collect acks, and read the row now and then: the ingest may have stored acks from before this call."""
+        loop = asyncio.get_running_loop()
         action = stored.action
-        pause_s = _FIRST_LOOK_S
+        pause_s = _FIRST_READ_S
         while not reached(action, wanted) and (left_s := end - loop.time()) > 0:
             try:
                 async with asyncio.timeout(min(pause_s, left_s)):
                     reports.append(report(await anext(acks), self._clock.now_ms()))
-                if action.status is Status.QUEUED:  # not any more, or nobody would report about it
+                if action.status is Status.QUEUED:  # an ack means that the action has left the queue
                     stored = await self._action_store.get(action.id) or stored
                     action = _applied(stored.action, reports)
                 else:
                     action = apply_report(action, reports[-1])
             except TimeoutError:
-                pause_s = min(2 * pause_s, _SLOWEST_LOOK_S)
+                pause_s = min(2 * pause_s, _SLOWEST_READ_S)
                 stored = await self._action_store.get(stored.action.id) or stored
                 action = _applied(stored.action, reports)
-        return stored, reports
+        return stored, action
 
     async def _write(
-        self, stored: StoredAction, reports: Iterable[AckReport], published_ms: int | None
+        self, stored: StoredAction, reports: Iterable[AckReport], published_ms: int | None, action: Action
     ) -> StoredAction:
-        def changed(action: Action) -> Action:
-            if published_ms is not None:
-                action = mark_published(action, published_ms)
-            return _applied(action, reports)
+        def changed(current: Action) -> Action:
+            after = action if current is stored.action else _applied(current, reports)
+            return after if published_ms is None else mark_published(after, published_ms)
 
         return await self._queues.change(stored.action.id, changed, existing=stored) or stored
 
@@ -157,5 +156,5 @@ def report(ack: Ack, heard_ms: int) -> AckReport:
         reason=None if ack.reason is None else msgspec.to_builtins(ack.reason),
         progress=ack.progress,
         output=ack.output,
-        result={} if too_deep(ack.result) else ack.result,
+        result={} if ack.result and too_deep(ack.result) else ack.result,
     )

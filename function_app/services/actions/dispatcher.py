@@ -88,16 +88,7 @@ class ActionDispatcher:
         """
         action = stored.action
         await self.current_permissions(action)
-        signed = await self._command_sender.sign(
-            device,
-            action.id,
-            await self._command(action),
-            caller=action.who,
-            epoch=action.epoch,
-            issued_ms=action.issued_ms,
-            ttl_ms=action.ttl_ms,
-        )
-        await self._command_sender.publish(device, signed)
+        await self._command_sender.send_action(device, await self._command(action), action)
         now_ms = self._clock.now_ms()
         await self._action_store.change(action.id, lambda existing: mark_published(existing, now_ms), existing=stored)
 

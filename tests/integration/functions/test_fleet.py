@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import AckStatus, MoveJoints
-from function_app.services.actions.start_many import AT_ONCE, MOST
+from function_app.entrypoints.http.actions.schemas import MAX_DEVICES
+from function_app.services.actions.start_many import CONCURRENT_STARTS
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import MOVE, Cloud, Person, paired, problem
 from tests.harness.network.brokers import wait_until
@@ -120,7 +121,7 @@ def test_each_may_wait_for_its_turn(fleet: Pair) -> None:
     [
         {"devices": []},
         {"devices": ["a"] * 2},
-        {"devices": [f"d{number}" for number in range(MOST + 1)]},
+        {"devices": [f"d{number}" for number in range(MAX_DEVICES + 1)]},
         {"devices": ["a/b"]},
         {"devices": "abc"},
         {"epochs": {"b": 1}},
@@ -142,8 +143,8 @@ def test_a_hundred_devices_are_started_in_one_call(cloud: Cloud) -> None:
         paired(cloud, "anna", *(f"b{number}" for number in range(50))) as (_, two),
     ):
         devices = [*one.devices, *two.devices]
-        assert len(devices) == MOST > AT_ONCE
+        assert len(devices) == MAX_DEVICES > CONCURRENT_STARTS
         answer = start(anna, *devices, wait_ms=30_000)
         assert answer.status_code == 200, answer.json()["items"][0]
-        wait_until(lambda: len(one.heard(MoveJoints)) + len(two.heard(MoveJoints)) == MOST, "the commands")
+        wait_until(lambda: len(one.heard(MoveJoints)) + len(two.heard(MoveJoints)) == MAX_DEVICES, "the commands")
         assert {item["action"]["status"] for item in answer.json()["items"]} == {"started"}

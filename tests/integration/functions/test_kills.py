@@ -14,7 +14,7 @@ from device_agent.protocol import Ack, AckStatus, MoveJoints, codec, topics
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
-from function_app.services.actions.start import Start
+from function_app.services.actions.requests import ActionRequest
 from function_app.services.maintenance.scheduler import ORPHAN_MS
 from function_app.services.storage import records
 from function_app.services.storage.reminders import SHARDS
@@ -36,8 +36,10 @@ TERMINAL = {"done", "failed", "expired", "cancelled"}
 MOST_STEPS = 60
 
 
-def asked(**more: Any) -> Start:
-    return Start(asked=MOVE, ttl_ms=1000 * TTL_S, timeout_ms=1000 * TIMEOUT_S, queue_ms=1000 * QUEUE_S, **more)
+def asked(**more: Any) -> ActionRequest:
+    return ActionRequest(
+        request=MOVE, ttl_ms=1000 * TTL_S, timeout_ms=1000 * TIMEOUT_S, queue_ms=1000 * QUEUE_S, **more
+    )
 
 
 @dataclass(frozen=True)
@@ -118,12 +120,12 @@ async def start_refused(functions: Functions, scene: Scene) -> None:
 
 
 async def start_once(functions: Functions, scene: Scene) -> None:
-    await functions.start_action.start(scene.who, scene.device, asked(once="key"))
+    await functions.start_action.start(scene.who, scene.device, asked(), idempotency_key="key")
 
 
 async def join_queue(functions: Functions, scene: Scene) -> None:
     await functions.start_action.start(
-        scene.who, scene.device, asked(policy="queue", epoch=scene.epoch or None, once="key")
+        scene.who, scene.device, asked(policy="queue", epoch=scene.epoch or None), idempotency_key="key"
     )
 
 
@@ -346,7 +348,7 @@ async def anything(functions: Functions, scenes: list[Scene], seed: int) -> None
 async def start_something(functions: Functions, chance: random.Random, who: Two, scene: Scene) -> None:
     key = chance.choice(("", "", f"key {chance.randrange(50)}"))
     policy = chance.choice(("reject", "queue"))
-    await functions.start_action.start(who[0], scene.device, asked(once=key, policy=policy))
+    await functions.start_action.start(who[0], scene.device, asked(policy=policy), idempotency_key=key)
 
 
 async def cancel_some(functions: Functions, chance: random.Random, who: Two, scene: Scene) -> None:

@@ -12,14 +12,14 @@ from device_agent.protocol import MoveJoints
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
-from function_app.services.actions.start import Start
+from function_app.services.actions.requests import ActionRequest
 from tests.harness.processes import PATIENCE_S, PROCESSES, Place, begin, killed, run_here, show_code
 
 RACERS = 8
 DEVICES_OF_AGENT = 20
 WRONG_TRIES = 4
 """So many codes one account may race for; five wrong ones would lock it out."""
-START = Start(asked=MoveJoints(position_rad={"elbow": 1.0}), timeout_ms=60_000)
+START = ActionRequest(request=MoveJoints(position_rad={"elbow": 1.0}), timeout_ms=60_000)
 LOST = {
     "slot": "device-busy",
     "lease": "lease-held",
@@ -75,7 +75,6 @@ async def race(functions: Functions, prizes: Prizes, racer: int, barrier: Any, r
     """One process: tries for each prize as soon as all others are ready to."""
     same = Identity(prizes.owner, "owner", "s")
     own = Identity(prizes.owner, "owner", f"s{racer}")
-    once = Start(asked=START.asked, timeout_ms=60_000, once="one key")
     tries: dict[str, Any] = {
         "slot": lambda n: functions.start_action.start(same, prizes.slots[n], START),
         "lease": lambda n: functions.leases.acquire(own, prizes.leases[n], epoch=None, lease_ms=60_000, wait_ms=0),
@@ -83,7 +82,7 @@ async def race(functions: Functions, prizes: Prizes, racer: int, barrier: Any, r
             Identity(prizes.accounts[racer][n // WRONG_TRIES], "x", "s"), prizes.codes[n], None
         ),
         "link": lambda n: functions.sign_in.redeem(prizes.links[n]),
-        "key": lambda n: functions.start_action.start(same, prizes.keys[n], once),
+        "key": lambda n: functions.start_action.start(same, prizes.keys[n], START, idempotency_key="one key"),
     }
     found: dict[str, list[str]] = {}
     for what, attempt in tries.items():

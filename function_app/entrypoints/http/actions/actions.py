@@ -1,6 +1,5 @@
 """``devices/{id}/actions`` and ``actions``."""
 
-from dataclasses import replace
 from typing import Annotated, Literal
 
 from fastapi import Header, Query, Request, Response
@@ -8,12 +7,11 @@ from fastapi import Header, Query, Request, Response
 from function_app.bootstrap import Functions
 from function_app.domain.actions.action import Action
 from function_app.entrypoints.http.actions import schemas
-from function_app.entrypoints.http.actions.schemas import BatchActionRequest
 from function_app.entrypoints.http.actions.serializers import action_out
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, read
 from function_app.entrypoints.http.framework.routing import PREFIX, Cursor, Limit, Routes
-from function_app.services.actions.start import Start
+from function_app.services.actions.requests import ActionRequest
 
 Key = Annotated[
     str | None,
@@ -34,16 +32,15 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/devices/{device}/actions",
         summary="Start an action",
-        body=schemas.ActionRequest,
+        body=ActionRequest,
         answers={200: schemas.ActionOut, 202: schemas.ActionOut},
         problems=(404, 409),
     )
     async def start_action(request: Request, device: str, once: Key = None) -> Response:
         """200: it has come as far as ``wait_for``, or has ended. 202: it waits or is under way; ask at its address."""
         who = await caller.account(request)
-        asked: schemas.ActionRequest = await read(request, schemas.ActionRequest)
-        start = replace(start_of(asked, once), epoch=asked.epoch)
-        found, there = await functions.start_action.start(who, device, start)
+        asked: ActionRequest = await read(request, ActionRequest)
+        found, there = await functions.start_action.start(who, device, asked, idempotency_key=once or "")
         where = {"Location": f"{PREFIX}/actions/{found.id}"}
         return answer(await shown(found), 200 if there else 202, where)
 
@@ -75,20 +72,6 @@ def router(functions: Functions, caller: Caller) -> Routes:
         return answer(await shown(await functions.actions.cancel(who, action)), 202)
 
     return routes
-
-
-def start_of(asked: schemas.ActionRequest | BatchActionRequest, once: str | None) -> Start:
-    """What is to be started, without the lease."""
-    return Start(
-        asked=asked.request,
-        policy=asked.policy,
-        queue_ms=asked.queue_ms,
-        ttl_ms=asked.ttl_ms,
-        timeout_ms=asked.timeout_ms,
-        wait_ms=asked.wait_ms,
-        wait_for=asked.wait_for,
-        once=once or "",
-    )
 
 
 async def show_action(functions: Functions, found: Action) -> schemas.ActionOut:

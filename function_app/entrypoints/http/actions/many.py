@@ -7,7 +7,7 @@ from fastapi import Request, Response
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem, invalid
 from function_app.entrypoints.http.actions import schemas
-from function_app.entrypoints.http.actions.actions import Key, show_action, start_of
+from function_app.entrypoints.http.actions.actions import Key, show_action
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, problem_type, read
 from function_app.entrypoints.http.framework.routing import Routes
@@ -37,10 +37,11 @@ def router(functions: Functions, caller: Caller) -> Routes:
             raise invalid("A device is named twice.")
         if not asked.epochs.keys() <= set(asked.devices):
             raise invalid("epochs names a device that devices does not.")
-        found = await functions.start_many.start(who, asked.devices, start_of(asked, once), epochs=asked.epochs)
+        requests = {device: asked.for_device(device) for device in asked.devices}
+        found = await functions.start_many.start(who, requests, idempotency_key=once or "")
         items = await asyncio.gather(*(item(each) for each in found))
         refused = any(isinstance(each.result, Problem) for each in found)
-        there = all(each.there for each in found)
+        there = all(each.reached for each in found)
         return answer(schemas.BatchActionOut(items=tuple(items)), 207 if refused else 200 if there else 202)
 
     async def item(found: StartResult) -> schemas.BatchActionItem:
@@ -48,7 +49,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
             why = found.result
             told = Refusal(type=problem_type(why), title=why.title, status=why.status, detail=why.detail)
             return schemas.BatchActionItem(device=found.device, status=why.status, action=None, problem=told)
-        status = 200 if found.there else 202
+        status = 200 if found.reached else 202
         return schemas.BatchActionItem(
             device=found.device, status=status, action=await show_action(functions, found.result), problem=None
         )

@@ -6,27 +6,10 @@ import msgspec
 from msgspec import Meta
 
 from device_agent.protocol import Id, Text
-from function_app.entrypoints.http.framework.schemas import Epoch, Moment, Problem, Request, Response, WaitMs
-from function_app.services.actions.start import Asked
+from function_app.entrypoints.http.framework.schemas import Epoch, Moment, Problem, Request, Response
+from function_app.services.actions.requests import ActionOptions, ActionRequest
 
-
-class ActionRequest(Request, frozen=True, kw_only=True):
-    """What to run. Without ``epoch`` the action brings a lease for its own time.
-
-    While the device is busy, ``policy`` ``reject`` refuses it; with ``queue`` it waits for its turn, at most
-    ``queue_ms``. ``ttl_ms`` and ``timeout_ms`` count from its turn. It starts if ``epoch`` is the caller's lease then,
-    or, without ``epoch``, if nobody else has control. After a Stop or a failed action nothing that waits starts by
-    itself.
-    """
-
-    request: Asked
-    epoch: Epoch | None = None
-    policy: Literal["reject", "queue"] = "reject"
-    queue_ms: Annotated[int, Meta(ge=1_000, le=86_400_000)] = 300_000
-    ttl_ms: Annotated[int, Meta(ge=1, le=86_400_000)] = 10_000
-    timeout_ms: Annotated[int, Meta(ge=1_000, le=86_400_000)] = 300_000
-    wait_ms: WaitMs = 0
-    wait_for: Literal["started", "done"] = "started"
+MAX_DEVICES = 100
 
 
 class ReasonOut(Response, frozen=True, kw_only=True):
@@ -76,18 +59,24 @@ class ActionList(Response, frozen=True, kw_only=True):
     cursor: str | None
 
 
-class BatchActionRequest(Request, frozen=True, kw_only=True):
-    """One action on many devices. As for one device; ``epochs``: device → the epoch of the caller's lease on it."""
+class BatchActionRequest(ActionOptions, frozen=True, kw_only=True):
+    """A request to start one action on many devices. ``epochs``: device → epoch of the caller's lease on the device."""
 
-    devices: Annotated[tuple[Id, ...], Meta(min_length=1, max_length=100)]
-    request: Asked
-    epochs: Annotated[dict[Id, Epoch], Meta(max_length=100)] = msgspec.field(default_factory=dict)
-    policy: Literal["reject", "queue"] = "reject"
-    queue_ms: Annotated[int, Meta(ge=1_000, le=86_400_000)] = 300_000
-    ttl_ms: Annotated[int, Meta(ge=1, le=86_400_000)] = 10_000
-    timeout_ms: Annotated[int, Meta(ge=1_000, le=86_400_000)] = 300_000
-    wait_ms: WaitMs = 0
-    wait_for: Literal["started", "done"] = "started"
+    devices: Annotated[tuple[Id, ...], Meta(min_length=1, max_length=MAX_DEVICES)]
+    epochs: Annotated[dict[Id, Epoch], Meta(max_length=MAX_DEVICES)] = msgspec.field(default_factory=dict)
+
+    def for_device(self, device: str) -> ActionRequest:
+        """The request for one of the devices."""
+        return ActionRequest(
+            request=self.request,
+            policy=self.policy,
+            queue_ms=self.queue_ms,
+            ttl_ms=self.ttl_ms,
+            timeout_ms=self.timeout_ms,
+            wait_ms=self.wait_ms,
+            wait_for=self.wait_for,
+            epoch=self.epochs.get(device),
+        )
 
 
 class BatchActionItem(Response, frozen=True, kw_only=True):

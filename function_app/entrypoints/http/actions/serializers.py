@@ -1,5 +1,7 @@
 """Actions as the API shows them."""
 
+from typing import Any, cast
+
 from function_app.domain.actions.action import Action
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.actions.schemas import ActionOut, ReasonOut
@@ -11,7 +13,7 @@ def action_out(action: Action, position: int | None = None) -> ActionOut:
         id=action.id,
         device=action.device,
         request=action.request,
-        status=action.status.value,
+        status=cast("Any", action.status.value),
         queue_position=position,
         epoch=action.epoch,
         caller=action.who,

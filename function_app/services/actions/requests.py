@@ -1,0 +1,51 @@
+"""The request to start an action, as the HTTP API accepts it."""
+
+import hashlib
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from device_agent.protocol import Id, Task
+
+
+class AskMovement(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="run_movement"):
+    """Run the newest version of a movement of the device's robot type."""
+
+    name: Id
+    parameters: dict[str, Any] = {}
+
+
+class ActionOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What to run, and how long the action may wait and run.
+
+    While the device is busy, policy ``reject`` rejects the action. Policy ``queue`` queues it for at most ``queue_ms``.
+    ``ttl_ms`` and ``timeout_ms`` count from the moment the action leaves the queue.
+    """
+
+    request: AskMovement | Task
+    policy: Literal["reject", "queue"] = "reject"
+    queue_ms: Annotated[int, Meta(ge=1_000, le=86_400_000)] = 300_000
+    ttl_ms: Annotated[int, Meta(ge=1, le=86_400_000)] = 10_000
+    timeout_ms: Annotated[int, Meta(ge=1_000, le=86_400_000)] = 300_000
+    wait_ms: Annotated[int, Meta(ge=0, le=30_000)] = 0
+    wait_for: Literal["started", "done"] = "started"
+
+
+class ActionRequest(ActionOptions, frozen=True, kw_only=True):
+    """A request to start an action on one device.
+
+    With ``epoch``, the caller must hold this lease when the action starts. Without it, the action gets a lease of its
+    own, unless another session holds control. ``policy`` ``reject`` rejects the request while the device is busy;
+    ``queue`` queues the action for at most ``queue_ms``. ``ttl_ms`` and ``timeout_ms`` count from the moment the action
+    leaves the queue. A Stop or a failed action cancels all queued actions.
+    """
+
+    epoch: Annotated[int, Meta(ge=1, le=2**53)] | None = None
+
+    def fingerprint(self) -> str:
+        """A hash that is equal for equal requests."""
+        fields: list[Any] = [self.request, self.epoch, self.ttl_ms, self.timeout_ms, self.wait_ms, self.wait_for]
+        if self.policy == "queue":
+            fields += [self.policy, self.queue_ms]
+        return hashlib.sha256(msgspec.json.encode(fields, order="deterministic")).hexdigest()
