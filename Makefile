@@ -18,7 +18,7 @@ BROWSERS = -n 2 --dist loadscope tests/e2e
 # These tests measure a moving robot or need a response within a deadline, so they run one at a time.
 SERIAL = tests/api tests/faults tests/security/tenants/test_secrets.py
 
-.PHONY: help up link env console test test-fast test-long bench bench-quick coverage fuzz check check-python check-web audit-packages contract requirements \
+.PHONY: docs help up link env console test test-fast test-long bench bench-quick coverage fuzz check check-python check-web audit-packages contract requirements \
 	system-packages test-environment wheels clean
 .DELETE_ON_ERROR:
 
@@ -37,6 +37,7 @@ help:
 	@echo "make contract        regenerate the AsyncAPI document, the script API and the console's message types"
 	@echo "make requirements    regenerate requirements.txt and requirements/*.txt"
 	@echo "make audit-packages  query osv.dev for advisories against the pinned packages (needs a network)"
+	@echo "make docs            build the documentation site in site/"
 	@echo "make clean           remove the environment and all build output"
 
 up: env console
@@ -67,6 +68,11 @@ env: .venv/.local
 	@$(PIP) -r requirements/bench.txt
 	@touch $@
 
+.venv/.docs: requirements/docs.txt | .venv/.local
+	@echo "telescope: installing Python packages for the documentation site" >&2
+	@$(PIP) -r requirements/docs.txt
+	@touch $@
+
 .venv/.node: requirements/node.txt | .venv/.python
 	@{ $(NODE_READY); } 2>/dev/null || { echo "telescope: installing Node.js" >&2; \
 		$(PIP) -r requirements/node.txt; }
@@ -75,6 +81,11 @@ env: .venv/.local
 web/node_modules/.installed: web/package-lock.json | .venv/.node
 	@echo "telescope: installing console packages" >&2
 	@$(NPM) ci --loglevel error --no-fund --no-audit >/dev/null
+	@touch $@
+
+docs/build/node_modules/.installed: docs/build/package-lock.json | .venv/.node
+	@echo "telescope: installing browser packages for the documentation site" >&2
+	@$(NODE) --prefix docs/build ci --ignore-scripts --loglevel error --no-fund --no-audit >/dev/null
 	@touch $@
 
 tests/harness/azurite/node_modules/.installed: tests/harness/azurite/package-lock.json | .venv/.node
@@ -99,6 +110,9 @@ web/dist/index.html: web/node_modules/.installed web/index.html web/package.json
 	@echo "telescope: building the console" >&2
 	@$(NPM) run --silent build -- --logLevel warn
 	@touch $@
+
+docs: .venv/.docs docs/build/node_modules/.installed
+	@NO_MKDOCS_2_WARNING=1 PYTHONPATH=. $(BIN)/mkdocs build --quiet --strict
 
 # System packages come first: a missing program is reported in one line before any test runs.
 system-packages:

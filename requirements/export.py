@@ -17,6 +17,7 @@ EXPORTS = {
     "requirements/local.txt": ("local",),
     "requirements/node.txt": ("node",),
     "requirements/bench.txt": ("bench",),
+    "requirements/docs.txt": ("docs",),
     "requirements/dev.txt": ("dev",),
     "requirements/azure-worker.txt": ("azure-worker",),
 }

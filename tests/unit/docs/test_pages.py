@@ -17,7 +17,9 @@ from tests.harness.paths import ROOT
 
 DOCS = ROOT / "docs"
 ROOT_PAGES = ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CODE_OF_CONDUCT.md")
-PAGES = sorted([*(ROOT / name for name in ROOT_PAGES), *DOCS.rglob("*.md")])
+PAGES = sorted(
+    page for page in [*(ROOT / name for name in ROOT_PAGES), *DOCS.rglob("*.md")] if "node_modules" not in page.parts
+)
 GENERATED = {DOCS / "reference" / "messages.md", DOCS / "reference" / "openapi.md"}
 """Pages that ``make docs`` creates."""
 EXECUTED = {
@@ -137,6 +139,13 @@ def test_ten_questions_are_answered_within_two_clicks_of_the_start_page() -> Non
     assert {(start.parent / link).resolve() for link in questions} <= first
     pages = {page for page in PAGES if page.is_relative_to(DOCS)}
     assert pages - first - second - {start} == set()
+
+
+def test_the_navigation_of_the_site_lists_every_page() -> None:
+    listed = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    pages = {str(page.relative_to(DOCS)) for page in PAGES if page.is_relative_to(DOCS)}
+    decisions = {page for page in pages if page.startswith("decisions/")}  # added by a hook
+    assert pages - decisions == listed - {"reference/messages.md", "reference/openapi.md"}
 
 
 def test_the_asyncapi_document_is_valid_json() -> None:
