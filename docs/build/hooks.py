@@ -22,15 +22,18 @@ ASSETS = {
 }
 _API_PAGE = """# Interactive API reference
 
-Generated from the OpenAPI document ([openapi.json](openapi.json)). A running installation serves its own version at `/api/docs`.
-[HTTP API](http-api.md) describes the conventions.
+Generated from the OpenAPI document ([openapi.json](openapi.json)). A running installation serves its own
+version at `/api/docs`. [HTTP API](http-api.md) describes the conventions.
 
 <link rel="stylesheet" href="../assets/swagger-ui.css">
 <div id="swagger-ui"></div>
 <script src="../assets/openapi.js"></script>
 <script src="../assets/swagger-ui.js"></script>
 <script>
-SwaggerUIBundle({spec: openapi, dom_id: "#swagger-ui", filter: true, docExpansion: "none", supportedSubmitMethods: [], validatorUrl: null});
+SwaggerUIBundle({
+  spec: openapi, dom_id: "#swagger-ui", filter: true, docExpansion: "none",
+  supportedSubmitMethods: [], validatorUrl: null
+});
 </script>
 """
 
@@ -81,7 +84,8 @@ def _messages(document: Mapping[str, Any]) -> Iterator[str]:
         mqtt = operation.get("bindings", {}).get("mqtt", {})
         kinds = ", ".join(_reference(name, document["components"]["schemas"]) for name in channel["messages"])
         retained = "yes" if mqtt.get("retain") else "no"
-        yield f"| `{channel['address']}` | {mqtt.get('qos', '')} | {retained} | {kinds} | {_cell(operation['summary'])} |"
+        purpose = _cell(operation["summary"])
+        yield f"| `{channel['address']}` | {mqtt.get('qos', '')} | {retained} | {kinds} | {purpose} |"
     yield "\n## Types\n"
     schemas = document["components"]["schemas"]
     for name, schema in schemas.items():
