@@ -75,7 +75,7 @@ class SqliteTables:
             found = self._run(_QUERY_OPEN, (table, partition, start, limit + 1)).fetchall()
         else:
             found = self._run(_QUERY_CLOSED, (table, partition, start, last, limit + 1)).fetchall()
-        page = tuple(Row(partition, key, row_codec.decode(data), etag) for key, etag, data in found[:limit])
+        page = tuple([Row(partition, key, row_codec.decode(data), etag) for key, etag, data in found[:limit]])
         return Page(page, row_codec.write_cursor(found[limit][0]) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
@@ -83,7 +83,7 @@ class SqliteTables:
         texts = row_codec.check_batch(writes)
         self._run("BEGIN IMMEDIATE")
         try:
-            written = tuple(self._write(table, *each) for each in zip(writes, texts, strict=True))
+            written = tuple([self._write(table, *each) for each in zip(writes, texts, strict=True)])
             self._run("COMMIT")
         except BaseException:
             self._rollback()
