@@ -174,7 +174,7 @@ class Tls:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OpenIdClient:
+class OidcClient:
     """What we are to an OpenID Connect provider.
 
     Attributes:
@@ -209,7 +209,7 @@ class Settings:
         websocket_url: The broker's address for the page.
         xmpp_domain: The part after the ``@`` of every address at the XMPP server; empty where there is none.
         xmpp_host: The XMPP server's address, for agents and for the program that speaks for the cloud.
-        open_id: Where people may sign in, beside here.
+        oidc: Where people may sign in, beside here.
         robots: Folder of the robot types.
         console: Folder of the built console.
         trusted_proxies: Proxies of one's own in front of the API; the last of ``X-Forwarded-For`` are theirs.
@@ -240,7 +240,7 @@ class Settings:
     xmpp_domain: str = ""
     xmpp_host: str = "127.0.0.1"
     xmpp_port: int = 5222
-    open_id: OpenIdClient | None = None
+    oidc: OidcClient | None = None
     robots: Path = ROBOTS
     console: Path = CONSOLE
     trusted_proxies: int = 0
@@ -298,7 +298,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         xmpp_domain=_matching(given, "TELESCOPE_XMPP_DOMAIN", "", _DOMAIN, "a domain in lower case"),
         xmpp_host=_host(given, "TELESCOPE_XMPP_HOST", host),
         xmpp_port=_port(given, "TELESCOPE_XMPP_PORT", 5222),
-        open_id=_open_id(given),
+        oidc=_oidc(given),
         robots=_folder(given, "TELESCOPE_ROBOTS", ROBOTS),
         console=_folder(given, "TELESCOPE_CONSOLE", CONSOLE),
         trusted_proxies=_number(given, "TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),
@@ -416,7 +416,7 @@ def _with_webhook(given: Mapping[str, str], bus: IotBus | EventGridBus | None) -
     return replace(bus, webhook=webhook)
 
 
-def _open_id(given: Mapping[str, str]) -> OpenIdClient | None:
+def _oidc(given: Mapping[str, str]) -> OidcClient | None:
     names = ("TELESCOPE_OIDC_ISSUER", "TELESCOPE_OIDC_CLIENT_ID")
     issuer, client_id = (given.get(name, "") for name in names)
     if not issuer and not client_id:
@@ -432,7 +432,7 @@ def _open_id(given: Mapping[str, str]) -> OpenIdClient | None:
         raise SettingsError(f"TELESCOPE_OIDC_ACCOUNTS is '{accounts[:_SHOWN]}'; it must be invited or anyone")
     if parts.scheme == "http" and parts.hostname not in _LOOPBACK:
         raise SettingsError(f"{names[0]} is '{issuer[:_SHOWN]}'; it must be an address that begins with https://")
-    return OpenIdClient(
+    return OidcClient(
         issuer=issuer,
         client_id=_matching(given, names[1], "", _CLIENT_ID, "the client id that the provider gave, without spaces"),
         client_secret=given.get("TELESCOPE_OIDC_CLIENT_SECRET", ""),

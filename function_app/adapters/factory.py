@@ -117,14 +117,16 @@ def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:
             return found
 
 
-def open_id(settings: Settings, clock: Clock) -> OidcProvider | None:
+def oidc_provider(settings: Settings, clock: Clock) -> OidcProvider | None:
     """Where people may sign in, beside here."""
-    if settings.open_id is None:
+    if settings.oidc is None:
         return None
-    from function_app.adapters.oidc.provider import HttpOpenId  # noqa: PLC0415 (only where it is in use)
+    from function_app.adapters.oidc.provider import HttpOidcProvider  # noqa: PLC0415 (only where it is in use)
 
-    known = settings.open_id
-    return HttpOpenId(issuer=known.issuer, client_id=known.client_id, client_secret=known.client_secret, clock=clock)
+    known = settings.oidc
+    return HttpOidcProvider(
+        issuer=known.issuer, client_id=known.client_id, client_secret=known.client_secret, clock=clock
+    )
 
 
 def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables, Blobs]:

@@ -39,7 +39,7 @@ _LOOPBACK: Final = frozenset({"127.0.0.1", "::1", "localhost"})
 _ADDRESSES: Final = ("authorization_endpoint", "token_endpoint", "jwks_uri")
 
 
-class HttpOpenId:
+class HttpOidcProvider:
     """``OpenId``.
 
     Args:

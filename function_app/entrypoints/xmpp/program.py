@@ -3,8 +3,8 @@
 import asyncio
 import signal
 
-from function_app import bootstrap
 from function_app.bootstrap import Functions
+from function_app.bootstrap.xmpp import command_feed, xmpp_connection
 from function_app.entrypoints.xmpp.gateway import XmppGateway
 
 
@@ -20,7 +20,7 @@ async def speak(functions: Functions) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ending.set)
     await functions.health.require_tables()
-    speaker = XmppGateway(functions, bootstrap.xmpp_line(functions), bootstrap.orders(functions))
+    speaker = XmppGateway(functions, xmpp_connection(functions), command_feed(functions))
     speaking = asyncio.create_task(speaker.run())
     waiting = asyncio.create_task(ending.wait())
     done, _ = await asyncio.wait((speaking, waiting), return_when=asyncio.FIRST_COMPLETED)

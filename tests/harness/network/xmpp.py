@@ -21,7 +21,7 @@ import uvicorn
 
 from device_agent.protocol.xmpp.stream import Login, Stream
 from device_agent.transports.xmpp import XmppAccess, XmppTransport
-from function_app import bootstrap
+from function_app.bootstrap.xmpp import command_feed, xmpp_connection
 from function_app.entrypoints.xmpp.gateway import XmppGateway
 from function_app.ports.broker_access import Credentials
 from function_app.settings import Settings
@@ -125,9 +125,7 @@ class Speaking:
         self.cloud = cloud
 
         async def start() -> "tuple[XmppGateway, asyncio.Task[None]]":
-            speaker = XmppGateway(
-                cloud.functions, bootstrap.xmpp_line(cloud.functions), bootstrap.orders(cloud.functions)
-            )
+            speaker = XmppGateway(cloud.functions, xmpp_connection(cloud.functions), command_feed(cloud.functions))
             return speaker, asyncio.create_task(speaker.run())
 
         self.speaker, self._task = cloud.run(start())

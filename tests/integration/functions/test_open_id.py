@@ -16,11 +16,11 @@ import httpx
 import jwt
 import pytest
 
-from function_app.adapters.oidc.provider import HttpOpenId
+from function_app.adapters.oidc.provider import HttpOidcProvider
 from function_app.domain.audit.hash_chain import CLOUD
 from function_app.ports.oidc_provider import OidcError, Subject
 from function_app.services.storage import records
-from function_app.settings import OpenIdClient
+from function_app.settings import OidcClient
 from tests.harness.cloud.cloud import API, BASE, Cloud, MovingClock, Person, problem, settings
 from tests.harness.cloud.oidc_provider import (
     CLIENT_ID,
@@ -51,10 +51,10 @@ def provider(key: SigningKey) -> Iterator[str]:
 
 
 def opened(home: Path, issuer: str, *, anyone: bool = True) -> Cloud:
-    client = OpenIdClient(
+    client = OidcClient(
         issuer=issuer, client_id=CLIENT_ID, client_secret=CLIENT_SECRET, name="The lab's", anyone=anyone
     )
-    return Cloud(replace(settings(home), public_url=BASE, open_id=client), clock=MovingClock())
+    return Cloud(replace(settings(home), public_url=BASE, oidc=client), clock=MovingClock())
 
 
 @pytest.fixture
@@ -314,8 +314,8 @@ def liar(key: SigningKey) -> Iterator[Liar]:
         yield liar
 
 
-def client(liar: Liar, *, secret: str = CLIENT_SECRET, clock: MovingClock | None = None) -> HttpOpenId:
-    return HttpOpenId(issuer=liar.issuer, client_id=CLIENT_ID, client_secret=secret, clock=clock or MovingClock())
+def client(liar: Liar, *, secret: str = CLIENT_SECRET, clock: MovingClock | None = None) -> HttpOidcProvider:
+    return HttpOidcProvider(issuer=liar.issuer, client_id=CLIENT_ID, client_secret=secret, clock=clock or MovingClock())
 
 
 def claims(liar: Liar, **changes: Any) -> dict[str, Any]:
@@ -328,7 +328,7 @@ def signed(said: dict[str, Any], key: SigningKey, **header: Any) -> str:
     return jwt.encode(said, key.private, "RS256", headers={"kid": key.name, **header})
 
 
-def redeem(asked: HttpOpenId, issuer: str | None = None) -> Subject:
+def redeem(asked: HttpOidcProvider, issuer: str | None = None) -> Subject:
     return asyncio.run(asked.redeem(code="c", verifier="v", nonce=NONCE, redirect=REDIRECT, issuer=issuer))
 
 

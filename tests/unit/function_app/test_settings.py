@@ -166,18 +166,18 @@ def test_speaking_xmpp_without_a_server_is_one_line(tmp_path: Path) -> None:
 ISSUER = {"TELESCOPE_OIDC_ISSUER": "https://id.example/tenant", "TELESCOPE_OIDC_CLIENT_ID": "app"}
 
 
-def test_an_open_id_provider_is_as_it_calls_itself_and_its_secret_is_not_shown() -> None:
-    found = settings.read({**ISSUER, "TELESCOPE_OIDC_CLIENT_SECRET": "hush"}).open_id
+def test_an_oidc_provider_is_as_it_calls_itself_and_its_secret_is_not_shown() -> None:
+    found = settings.read({**ISSUER, "TELESCOPE_OIDC_CLIENT_SECRET": "hush"}).oidc
     assert found is not None
     assert (found.issuer, found.client_id, found.name) == ("https://id.example/tenant", "app", "id.example")
     assert found.client_secret == "hush"
     assert "hush" not in repr(found)
     assert not found.anyone
     for said, meant in (("anyone", True), ("invited", False)):
-        found = settings.read({**ISSUER, "TELESCOPE_OIDC_ACCOUNTS": said}).open_id
+        found = settings.read({**ISSUER, "TELESCOPE_OIDC_ACCOUNTS": said}).oidc
         assert found is not None
         assert found.anyone is meant
-    assert settings.read({}).open_id is None
+    assert settings.read({}).oidc is None
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_an_open_id_provider_is_as_it_calls_itself_and_its_secret_is_not_shown()
     ],
     ids=str,
 )
-def test_half_an_open_id_provider_is_refused_by_name(changes: dict[str, str], named: str) -> None:
+def test_half_an_oidc_provider_is_refused_by_name(changes: dict[str, str], named: str) -> None:
     with pytest.raises(SettingsError, match=named) as refused:
         settings.read({**ISSUER, **changes})
     assert "hush" not in str(refused.value)

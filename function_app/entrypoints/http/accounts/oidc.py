@@ -30,7 +30,7 @@ def router(functions: Functions) -> Routes:
     )
     async def sign_in_methods(_request: Request) -> Response:
         """For the page. A one-time link works everywhere."""
-        known = settings.open_id
+        known = settings.oidc
         elsewhere = schemas.OidcProviderOut(name=known.name, url=f"{PREFIX}{_PATH}/start") if known else None
         return answer(schemas.SignInMethodsOut(link=True, password=True, oidc=elsewhere))
 
@@ -47,7 +47,7 @@ def router(functions: Functions) -> Routes:
 
         That cookie is ``SameSite=Lax``, for the browser comes back from another site, and is good for that alone.
         """
-        begun = await functions.open_id.begin()
+        begun = await functions.oidc_sign_in.begin()
         return _redirect(begun.address, _mark(settings, begun))
 
     @routes.add(
@@ -67,7 +67,7 @@ def router(functions: Functions) -> Routes:
         """
         refuse_other_sites(request)
         asked: schemas.OidcSignInRequest = await read(request, schemas.OidcSignInRequest)
-        begun = await functions.open_id.begin(asked.invitation)
+        begun = await functions.oidc_sign_in.begin(asked.invitation)
         headers = {"Set-Cookie": _mark(settings, begun), "Cache-Control": "no-store"}
         return answer(schemas.OidcSignInOut(url=begun.address), headers=headers)
 
@@ -90,7 +90,7 @@ def router(functions: Functions) -> Routes:
         """
         returned = OidcCallback(state, code, request.cookies.get(COOKIE, ""), iss, error)
         try:
-            done = await functions.open_id.finish(returned, whence(request, settings))
+            done = await functions.oidc_sign_in.finish(returned, whence(request, settings))
         except Problem as problem:
             if not problem.code.startswith("oidc-") or problem.code == "oidc-unknown":
                 raise

@@ -3,7 +3,7 @@
 import base64
 import json
 from collections.abc import Iterator
-from dataclasses import replace
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +80,9 @@ def without_store(cloud: Cloud) -> Any:
         key_announcer=own.presence._key_announcer,
         clock=cloud.clock,
     )
-    return replace(cloud.functions, presence=presence)
+    functions = copy(cloud.functions)
+    functions.presence = presence
+    return functions
 
 
 class TestEventGrid:

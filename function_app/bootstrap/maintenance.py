@@ -1,0 +1,42 @@
+"""Factories of the maintenance services."""
+
+from functools import cached_property
+
+from function_app.bootstrap.accounts import AccountServices
+from function_app.services.maintenance.readiness import ReadinessCheck
+from function_app.services.maintenance.scheduler import Scheduler
+from function_app.services.robot_types.cleanup import RobotTypeCleanup
+from function_app.services.storage.retention import DAY_MS
+
+
+class MaintenanceServices(AccountServices):
+    """Creates each maintenance service on first use."""
+
+    @cached_property
+    def scheduler(self) -> Scheduler:
+        return Scheduler(
+            tables=self.tables,
+            action_store=self.action_store,
+            reminders=self.reminders,
+            command_sender=self.command_sender,
+            dispatcher=self.dispatcher,
+            queues=self.queues,
+            offboarding=self.offboarding,
+            sharing=self.sharing,
+            invitations=self.invitations,
+            api_keys=self.api_keys,
+            control_events=self.control_events,
+            audit_log=self.audit_log,
+            access=self.access,
+            retention=self.retention,
+            reported_faults=self.reported_faults,
+            telemetry_ingest=self.telemetry_ingest,
+            uploads=self.uploads,
+            robot_types=RobotTypeCleanup(tables=self.tables, blobs=self.blobs, clock=self.clock),
+            keep_actions_ms=self.settings.keep_actions_days * DAY_MS,
+            clock=self.clock,
+        )
+
+    @cached_property
+    def health(self) -> ReadinessCheck:
+        return ReadinessCheck(tables=self.tables, bus=self.bus)

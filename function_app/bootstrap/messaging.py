@@ -1,0 +1,59 @@
+"""Factories of the messaging services."""
+
+from functools import cached_property
+
+from function_app.bootstrap.health import HealthServices
+from function_app.services.messaging.broker_relay import BrokerRelay
+from function_app.services.messaging.command_sender import CommandSender
+from function_app.services.messaging.delivery import Delivery
+from function_app.services.messaging.key_announcer import KeyAnnouncer
+from function_app.services.messaging.mailbox import Mailbox
+from function_app.services.messaging.polling import CommandPolling
+from function_app.services.messaging.presence import PresenceIngest
+from function_app.services.messaging.xmpp_credentials import XmppCredentials
+
+
+class MessagingServices(HealthServices):
+    """Creates each messaging service on first use."""
+
+    @cached_property
+    def mailbox(self) -> Mailbox:
+        return Mailbox(tables=self.tables, retention=self.retention, clock=self.clock)
+
+    @cached_property
+    def relay(self) -> BrokerRelay:
+        return BrokerRelay(bus=self.bus, clock=self.clock)
+
+    @cached_property
+    def delivery(self) -> Delivery:
+        return Delivery(bus=self.bus, mailbox=self.mailbox, relay=self.relay)
+
+    @cached_property
+    def command_sender(self) -> CommandSender:
+        return CommandSender(delivery=self.delivery, keys=self.keys, clock=self.clock)
+
+    @cached_property
+    def xmpp_credentials(self) -> XmppCredentials:
+        return XmppCredentials(
+            tables=self.tables,
+            keys=self.keys,
+            authenticator=self.authenticator,
+            sign_in=self.sign_in,
+            devices=self.devices,
+            clock=self.clock,
+            domain=self.settings.xmpp_domain,
+        )
+
+    @cached_property
+    def polling(self) -> CommandPolling:
+        return CommandPolling(tables=self.tables, mailbox=self.mailbox, clock=self.clock)
+
+    @cached_property
+    def presence(self) -> PresenceIngest:
+        return PresenceIngest(
+            tables=self.tables,
+            events=self.events,
+            reported_faults=self.reported_faults,
+            key_announcer=KeyAnnouncer(keys=self.keys, command_sender=self.command_sender),
+            clock=self.clock,
+        )

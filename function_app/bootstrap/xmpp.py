@@ -1,0 +1,34 @@
+"""Connections of the XMPP gateway."""
+
+from function_app.adapters import factory
+from function_app.adapters.local.command_feed import MqttOrders
+from function_app.bootstrap import Functions
+from function_app.ports.command_feed import CommandFeed
+from function_app.ports.xmpp_connection import XmppConnection
+from function_app.settings import SettingsError
+
+
+def xmpp_connection(functions: Functions) -> XmppConnection:
+    """The gateway's connection to the XMPP server, not yet open.
+
+    Raises:
+        SettingsError: The settings name no XMPP server.
+    """
+    from function_app.adapters.xmpp.connection import SlixmppLine  # noqa: PLC0415 (loads slixmpp only for the gateway)
+
+    settings = functions.settings
+    if not settings.xmpp_domain:
+        raise SettingsError("TELESCOPE_XMPP_DOMAIN is empty. Set it to the domain that the XMPP server serves.")
+
+    async def password() -> str:
+        return (await functions.xmpp_credentials.cloud()).password
+
+    return SlixmppLine(host=settings.xmpp_host, port=settings.xmpp_port, domain=settings.xmpp_domain, password=password)
+
+
+def command_feed(functions: Functions) -> CommandFeed:
+    """The broker's commands for agents that connect through the gateway, not yet subscribed."""
+    settings = functions.settings
+    return MqttOrders(
+        host=settings.mqtt_host, port=settings.mqtt_port, access=functions.access, tls=factory.broker_tls(settings)
+    )
