@@ -1,16 +1,16 @@
-"""The sheet on paper is what its files say, and its arithmetic is right."""
+"""The scale page agrees with its input files, and its arithmetic is correct."""
 
 import pytest
 
 from benchmarks.reporting import cost_model
 
 
-def test_the_page_is_what_the_files_say() -> None:
+def test_the_page_agrees_with_its_inputs() -> None:
     page = cost_model.PAGE.read_text(encoding="utf-8")
     assert page == "\n".join(cost_model.lines()) + "\n", "run `python -m benchmarks.reporting.cost_model`"
 
 
-def test_what_robots_ask_for_grows_with_them() -> None:
+def test_load_grows_with_the_number_of_robots() -> None:
     def value(of: float) -> dict[str, object]:
         return {"value": of, "why": ""}
 
@@ -34,7 +34,7 @@ def test_what_robots_ask_for_grows_with_them() -> None:
     assert found["credentials_per_s"] == pytest.approx(0.2)
 
 
-def test_a_price_that_is_not_known_stays_a_formula() -> None:
+def test_an_unknown_price_is_shown_as_a_formula() -> None:
     assert cost_model.cost({"A": {"value": None}}, "A", 12.0) == "12 x A"
     assert cost_model.cost({"A": {"value": 0.5}}, "A", 12.0) == "6 $"
 
