@@ -1,10 +1,10 @@
-"""What one control period costs, with the robot's shape looked at and without.
+"""Cost of one control period, with and without collision checks.
 
-``python -m benchmarks.agent.control_period [TYPE]`` moves a robot type (``ur5``) for a simulated minute in each way and prints
-percentiles of ``Controller.step`` [ms], in the processor time of its thread: what else the machine does counts little.
+``python -m benchmarks.agent.control_period [TYPE]`` moves a robot type (``ur5``) for one simulated minute per mode. It
+prints percentiles of ``Controller.step`` as processor time of the thread [ms], so other load matters little.
 
-- *setpoints*: a new random target every 2 s, 40 setpoints a second with a loop age of 30 ms;
-- *moves*: full speed, one after another, to random targets with room around them.
+- *setpoints*: a new random target every 2 s, 40 setpoints per second with a loop age of 30 ms;
+- *moves*: consecutive moves at full speed to random collision-free targets.
 """
 
 import random
@@ -38,7 +38,7 @@ def _random_target(kind: RobotType, chance: random.Random) -> dict[str, float]:
 
 
 def setpoints(controller: Controller, kind: RobotType) -> Iterator[None]:
-    """Ask as an operator does, before each period."""
+    """Sends setpoints as an operator does, before each period."""
     chance, sequence, target = random.Random(1), 0, dict(kind.home_rad)
     controller.grant(epoch=1, holder="ann", lease_s=1e6, now_s=0.0)
     for period in range(round(SIMULATED_S * 1000 / kind.period_ms)):
@@ -59,7 +59,7 @@ def setpoints(controller: Controller, kind: RobotType) -> Iterator[None]:
 
 
 def moves(controller: Controller, kind: RobotType) -> Iterator[None]:
-    """Ask as a movement does, before each period."""
+    """Starts moves as a movement script does, before each period."""
     chance = random.Random(2)
     tenure = controller.begin_action(epoch=1, on_lost=lambda _: None)
     move = None
@@ -68,12 +68,12 @@ def moves(controller: Controller, kind: RobotType) -> Iterator[None]:
             try:
                 move = controller.move(tenure, _random_target(kind, chance), speed=1.0)
             except Refused:
-                continue  # no room there: another
+                continue  # the target collides: take another one
         yield
 
 
 def measure(kind: RobotType, shape: RobotGeometry | None, source: Source) -> list[float]:
-    """Processor time of each step in which something moves [ms]."""
+    """Returns the processor time of each step with motion [ms]."""
     controller = Controller(kind, LeaseGate(), geometry=shape)
     controller.start_at([kind.home_rad[joint.name] for joint in kind.joints])
     found = []
@@ -86,7 +86,7 @@ def measure(kind: RobotType, shape: RobotGeometry | None, source: Source) -> lis
 
 
 def main() -> None:
-    """Command line."""
+    """Runs the command line."""
     name = sys.argv[1] if len(sys.argv) > 1 else "ur5"
     kind = robot_type.load(ROBOTS / name)
     shape = geometry.load(kind, ROBOTS / name)

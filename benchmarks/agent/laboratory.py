@@ -1,14 +1,13 @@
-"""The whole laboratory in real time: whether it keeps up, and what each part of the agent costs.
+"""Real-time factor of the simulated laboratory and cost of each part of the agent.
 
-``python -m benchmarks.agent.laboratory [SECONDS] [--broker amqtt]`` starts what ``make up`` starts, in a folder of its own and on
-ports of its own. The robots move all the time, by their own movements, started over the API as an operator would; each
-tells its joints 50 times a second, the two colour cameras film ten pictures of 320x240 a second. After half a minute
-for warming up it measures for ``SECONDS`` (60) and prints
+``python -m benchmarks.agent.laboratory [SECONDS] [--broker amqtt]`` starts the product in its own folder and on its own
+ports. All robots run movements continuously; each publishes joints at 50 Hz, and two colour cameras deliver ten
+pictures of 320x240 per second. After a warm-up of 30 s it measures for ``SECONDS`` (60) and prints
 
-- the real-time factor of the simulation, and how much simulated time was lost;
-- the processor time of each thread of the agent, by part, in per cent of one core (``/proc/self/task``);
-- how late control loops were: the gap between two decisions, less the period;
-- what else the machine did meanwhile.
+- the real-time factor of the simulation and the lost simulated time;
+- the processor time of each part of the agent in per cent of one core (``/proc/self/task``);
+- the lateness of control loops: interval between two decisions minus the period;
+- the load from other programs.
 """
 
 import argparse
@@ -37,7 +36,7 @@ ROOM = "lab"
 TELEMETRY_HZ = 50.0
 WARM_UP_S = 30.0
 MOVEMENTS = {"ur5": "slow_square", "nao": "wave", "qbo": "patrol", "hanson": "look_around"}
-"""What each robot does again and again."""
+"""Movement that each robot repeats."""
 PARTS = (
     ("physics", ("mujoco-world",)),
     ("control loops", ("-loop",)),
@@ -50,7 +49,7 @@ PARTS = (
 )
 OTHER = "else"
 DIVIDER = "--"
-"""Behind it stand the agent's own arguments."""
+"""Separates the options of the benchmark from those of the agent."""
 TOLD_PERCENT = 0.3
 _TICKS_S = os.sysconf("SC_CLK_TCK")
 _MARKS = (0.5, 0.95, 0.99, 1.0)
@@ -60,7 +59,7 @@ _MARKS = (0.5, 0.95, 0.99, 1.0)
 
 
 def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
-    """The agent, with somebody who looks at its threads."""
+    """Runs the agent with an observer of its threads."""
     gaps: dict[str, list[float]] = {}
     last: dict[str, float] = {}
     step = Controller.step
@@ -117,13 +116,13 @@ def _watch(report: Path, for_s: float, gaps: dict[str, list[float]]) -> None:
 
 
 def _threads() -> dict[str, float]:
-    """Processor time of each thread by name [s]; of threads that are not Python's, by what their library calls them."""
+    """Returns the processor time of each thread by name [s]; native threads have the name that their library sets."""
     names = {thread.native_id: thread.name for thread in threading.enumerate()}
     found: dict[str, float] = {}
     for task in Path("/proc/self/task").iterdir():
         try:
             before, _, after = (task / "stat").read_text(encoding="ascii").rpartition(")")
-        except OSError:  # it has ended
+        except OSError:  # the thread has ended
             continue
         spent, name = after.split(), names.get(int(task.name), before.partition("(")[2])
         found[name] = found.get(name, 0.0) + (int(spent[11]) + int(spent[12])) / _TICKS_S
@@ -131,7 +130,7 @@ def _threads() -> dict[str, float]:
 
 
 def _busy_s() -> float:
-    """Processor time of the whole machine that was not idle [s]."""
+    """Returns the non-idle processor time of the machine [s]."""
     spent = [int(each) for each in Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()[1:9]]
     return (sum(spent) - spent[3] - spent[4]) / _TICKS_S
 
@@ -149,7 +148,7 @@ def _at(values: Iterable[float], mark: float) -> float:
 
 
 class Laboratory(local.Machine):
-    """What ``make up`` starts, with the agent watched."""
+    """The product with an observed agent."""
 
     def __init__(self, chosen: settings.Settings, report: Path, for_s: float) -> None:
         super().__init__(chosen)
@@ -171,7 +170,7 @@ class Laboratory(local.Machine):
         return super()._run(name, *arguments)
 
     def operate(self, ending: threading.Event) -> None:
-        """Keep all robots moving."""
+        """Keeps all robots in motion."""
         link = self._sign_in_link().partition("#sign-in=")[2].split()[0]
         signed_in = self._call("POST", "/auth/sign-in", {"link": link})["access_token"]
         wanted = {"name": "benchmark", "role": "operator", "days": 1}
@@ -180,13 +179,13 @@ class Laboratory(local.Machine):
             for device in self._call("GET", "/devices", token=self._token)["items"]:
                 if device["robot_type"] in MOVEMENTS:
                     asked = {"request": {"kind": "run_movement", "name": MOVEMENTS[device["robot_type"]]}}
-                    # Refused while it still moves.
+                    # The server rejects an action while the robot moves.
                     with contextlib.suppress(ValueError, OSError):
                         self._call("POST", f"/devices/{device['id']}/actions", asked, self._token)
 
 
 def show(found: dict[str, Any], for_s: float, broker: str) -> None:
-    """Print what was found."""
+    """Prints the results."""
     print(f"{platform.python_version()}, {os.cpu_count()} cores, {broker}, {for_s:.0f} s")
     print(f"real-time factor {found['factor']:.4f}, {found['lost_ms']:.0f} ms of simulated time lost")
     for part, percent in sorted(found["cost_percent"].items(), key=lambda entry: -entry[1]):
@@ -201,7 +200,7 @@ def show(found: dict[str, Any], for_s: float, broker: str) -> None:
 
 
 def measure(for_s: float, broker: str, port: int) -> None:
-    """Start it all, wait, show, end it all."""
+    """Starts the product, measures and stops it."""
     with tempfile.TemporaryDirectory(prefix="ts-bench-lab-") as folder:
         report = Path(folder) / "report.json"
         chosen = settings.read(
@@ -232,7 +231,7 @@ def measure(for_s: float, broker: str, port: int) -> None:
 
 
 def main() -> int:
-    """Command line."""
+    """Runs the command line."""
     parser = argparse.ArgumentParser(description="The whole laboratory in real time.")
     parser.add_argument("seconds", type=float, nargs="?", default=60.0)
     parser.add_argument("--broker", choices=["amqtt", "mosquitto"], default="amqtt")

@@ -1,9 +1,8 @@
-"""How late control loops are while somebody plans.
+"""Lateness of control loops during motion planning.
 
-``python -m benchmarks.agent.planning [SECONDS]`` runs the control loops of the laboratory's four robots in one process, with
-the agent's own controllers and shapes, while a fifth thread has the arm find one way after the other around a post, as
-an action does. It prints how late the loops were without and with that, how long a plan took, and how much memory the
-program that plans has.
+``python -m benchmarks.agent.planning [SECONDS]`` runs the control loops of the four laboratory robots in one process
+with their controllers and geometry. A fifth thread plans paths of the arm around a post, as an action does. It prints
+the lateness without and with planning, the planning time and the memory of the planner process.
 """
 
 import argparse
@@ -26,12 +25,12 @@ ROBOTS = Path(__file__).resolve().parents[2] / "robots"
 NAMES = ("ur5", "nao", "qbo", "hanson")
 POST_SIZE_M, POST_M = (0.04, 0.35, 0.0), (-0.249, -0.414, 0.35)
 BEYOND_RAD = 1.6
-"""Where the arm's first joint is to go, with the post half way."""
+"""Targets of the arm's first joint; the post is half way."""
 _MARKS = (0.5, 0.95, 0.99, 1.0)
 
 
 class Loop:
-    """One robot's control loop, without a driver: what the arm's takes in each period, and when."""
+    """Control loop of one robot without a driver; records when each period runs and how long it takes."""
 
     def __init__(self, kind: RobotType, shape: MujocoGeometry, ending: threading.Event) -> None:
         self._kind = kind
@@ -59,7 +58,7 @@ class Loop:
 
 
 def scene(folder: Path) -> Path:
-    """The arm's table with a post on it."""
+    """Returns the scene: the arm's table with a post."""
     kind = robot_type.load(folder)
     spec = mujoco.MjSpec.from_file(str(folder / kind.scene))
     spec.worldbody.add_geom(name="post", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=POST_SIZE_M, pos=POST_M)
@@ -69,7 +68,7 @@ def scene(folder: Path) -> Path:
 
 
 def measure(for_s: float, *, planning: bool) -> None:
-    """Run the loops for so long, and print."""
+    """Runs the loops for a time and prints the result."""
     ending = threading.Event()
     loops = {}
     for name in NAMES:
@@ -81,7 +80,7 @@ def measure(for_s: float, *, planning: bool) -> None:
         shape = MujocoGeometry(kind, path)
         home = [kind.home_rad[joint.name] for joint in kind.joints]
         took_s: list[float] = []
-        if planning:  # the first starts the program
+        if planning:  # the first plan starts the planner process
             MotionPlanner(kind, shape).around(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
         for loop in loops.values():
             loop.thread.start()
@@ -99,7 +98,7 @@ def measure(for_s: float, *, planning: bool) -> None:
         path.unlink()
     for loop in loops.values():
         loop.thread.join()
-    print("planning" if planning else "nobody plans")
+    print("with planning" if planning else "without planning")
     for name, loop in loops.items():
         late_ms = " ".join(f"{_at(loop.late_s, mark) * 1000:8.2f}" for mark in _MARKS)
         print(f"  {name:8} {len(loop.late_s):6} periods, late p50, p95, p99, max ms {late_ms}")
@@ -109,7 +108,7 @@ def measure(for_s: float, *, planning: bool) -> None:
 
 
 def _planner_mb() -> float:
-    """Resident memory of this process's children [MB]."""
+    """Returns the resident memory of the child processes [MB]."""
     found = 0.0
     for task in Path("/proc/self/task").iterdir():
         for child in (task / "children").read_text(encoding="ascii").split():
@@ -119,8 +118,8 @@ def _planner_mb() -> float:
 
 
 def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description="How late control loops are while somebody plans.")
+    """Runs the command line."""
+    parser = argparse.ArgumentParser(description="Lateness of control loops during motion planning.")
     parser.add_argument("seconds", type=float, nargs="?", default=30.0)
     seconds = parser.parse_args().seconds
     for planning in (False, True):

@@ -1,10 +1,9 @@
-"""How soon a movement script runs, and how soon a stopped one is dead.
+"""Start and stop times of movement scripts.
 
-``python -m benchmarks.agent.sandbox [RUNS]`` prints percentiles over 300 runs of each kind [ms].
+``python -m benchmarks.agent.sandbox [RUNS]`` prints percentiles over 300 runs per kind [ms].
 
-- *start*: from asking for a process to the script's first line (its first message has arrived). As a rule one is asked
-  for at once after the other, when none is ready yet; where it says so, when one is;
-- *stop*: from the kill to the dead process, its memory taken back.
+- *start*: from the request to the first message of the script, without and with a process that is ready;
+- *stop*: from the kill signal to the end of the process and the release of its memory.
 """
 
 import contextlib
@@ -27,7 +26,7 @@ SCRIPTS = {
 
 
 def first_line(inmate: SandboxProcess, source: str) -> None:
-    """Send the script and wait for what it says first."""
+    """Sends the script and waits for its first message."""
     with inmate.link.makefile("rwb") as lines:
         lines.readline()
         task = {"source": source, "name": "x", "parameters": {}, "joints": [], "frames": [], "can": []}
@@ -40,7 +39,7 @@ def first_line(inmate: SandboxProcess, source: str) -> None:
 def measure(
     jail: SandboxHost, source: str, runs: int, *, stranger: bool, pause_s: float = 0.0
 ) -> tuple[list[float], list[float]]:
-    """Start and stop of each run [ms]."""
+    """Returns the start and stop time of each run [ms]."""
     starts, stops = [], []
     for _ in range(runs):
         time.sleep(pause_s)
@@ -57,21 +56,21 @@ def measure(
 
 
 def percentiles(values: list[float]) -> str:
-    """Median, 95 %, 99 % and the longest."""
+    """Returns p50, p95, p99 and the maximum."""
     values = sorted(values)
     p50, p95, p99 = (values[min(len(values) - 1, int(share * len(values)))] for share in (0.5, 0.95, 0.99))
     return f"p50 {p50:6.1f}   p95 {p95:6.1f}   p99 {p99:6.1f}   max {values[-1]:6.1f}"
 
 
 def main(runs: int = 300) -> None:
-    """Measure all of it."""
+    """Runs all measurements."""
     jail = SandboxHost()
     begun_s = time.perf_counter()
     jail.start()
     print(f"warm parent ready after {(time.perf_counter() - begun_s) * 1000:.0f} ms; {runs} runs each [ms]")
     for stranger in (False, True):
         with contextlib.closing(jail.open(Limits(), stranger=stranger)):
-            pass  # the first starts the warm parent
+            pass  # the first run starts the zygote
         where = "bubblewrap: " if stranger else ""
         for name, source in SCRIPTS.items():
             starts, stops = measure(jail, source, runs, stranger=stranger)

@@ -1,7 +1,6 @@
-"""The list of very many devices: how long it takes to be drawn and to be searched, and what one word of a device costs.
+"""Device list with many devices: time to draw, time to search, and cost of one state message.
 
-The devices are agents as the protocol has them, paired over HTTP and heard through the broker, with nothing behind
-them: what is measured is the page.
+The devices are minimal agents without hardware or physics, so the measurement shows the cost of the page.
 """
 
 import os
@@ -22,18 +21,18 @@ from tests.harness.browser.product import Machine
 from tests.harness.network.brokers import wait_until
 
 OWN: Final = 1
-"""The product's own arm is in the list too."""
+"""The list also contains the product's own arm."""
 DRAWN_WITHIN_MS: Final = 1000.0
 FILTERED_WITHIN_MS: Final = 100.0
-"""From a key to what is found: nobody waits."""
+"""Limit from a key press to the result of the search [ms]."""
 WORD_MS: Final = 5.0
-"""A word costs no more of the page's time: two hundred devices that all say something each second would take it all."""
+"""Limit per state message [ms]: 200 devices with one message per second each would otherwise occupy the page."""
 LISTENS_S: Final = 10.0
 SAID_HZ: Final = 20.0
-"""Words of all devices together: three times as many as they say who change nothing (each 30 s)."""
+"""State messages per second of all devices: three times the rate of devices without changes (one per 30 s)."""
 _SEARCHES: Final = ("7", "ur5", "device 1", "device 13", "nothing like it", "")
 
-# From the address to the last row, laid out and drawn.
+# From navigation to the last row, after layout and paint.
 _OPEN: Final = """(count) => new Promise((resolve) => {
     const began = performance.now();
     const look = () => {
@@ -55,7 +54,7 @@ _ONLINE: Final = "() => document.querySelectorAll('[data-testid=device-row] [dat
 
 
 def speak(robot: Robot, name: str, mode: Mode) -> None:
-    """One device says what it does."""
+    """Publishes the state of one device."""
     state = State(device=name, at_ms=wall_ms(), tick_ms=tick_ms(), mode=mode, epoch=0)
     if robot.link is None:
         raise RuntimeError("the agent has not connected")
@@ -63,7 +62,7 @@ def speak(robot: Robot, name: str, mode: Mode) -> None:
 
 
 def show_list(browser: Browser, machine: Machine, count: int) -> bool:
-    """Look at the list; whether it is there, and is searched, in time."""
+    """Measures the list and returns True if it is drawn and searched within the limits."""
     with pair_minimal_agents(machine, count) as robots, pages(browser, machine) as (page,):
         everyone = [(robot, name) for robot in robots for name in robot.names]
         for robot, name in everyone:
@@ -95,7 +94,7 @@ def show_list(browser: Browser, machine: Machine, count: int) -> bool:
 
 
 def _opened(page: Page, count: int) -> float:
-    """How long the list takes to be drawn, from another page, median of five [ms]."""
+    """Returns the time to draw the list after navigation from another page, median of five [ms]."""
     found: list[float] = []
     for _ in range(5):
         page.evaluate("() => { location.hash = '#/robot-types'; }")
@@ -105,7 +104,7 @@ def _opened(page: Page, count: int) -> float:
 
 
 def _busy_ms(session: CDPSession, what: Callable[[], None]) -> float:
-    """How long the page's main thread is at work while something is done [ms]."""
+    """Returns the time that the page's main thread is busy during a call [ms]."""
 
     def busy() -> float:
         metrics = {each["name"]: each["value"] for each in session.send("Performance.getMetrics")["metrics"]}

@@ -1,7 +1,7 @@
-"""Ten arms on one page, all of them moving: how far apart its frames are, and what its memory does.
+"""Ten moving arms on one page: frame intervals and memory.
 
-What opening the page costs (its code, ten scenes, the shaders' compilation) is printed by itself and is not in the
-minute, which begins ``WARM_UP_S`` after every twin was drawn.
+The cost of opening the page (code, ten scenes, shader compilation) is printed separately. The measured minute starts
+``WARM_UP_S`` after every twin is drawn.
 """
 
 import os
@@ -22,11 +22,11 @@ ROBOTS: Final = 10
 WARM_UP_S: Final = 20.0
 LONGEST_FRAME_MS: Final = 100.0
 GROWS_MB_MIN: Final = 0.2
-"""Memory that grows faster than this after the first minute is a leak."""
+"""Growth rate after the first minute that counts as a leak."""
 MORE: Final = 1.1
-"""So many times the nodes and listeners of the first minute, at the end."""
+"""Allowed ratio of nodes and listeners at the end to those after the first minute."""
 
-# Of each frame when it was, and of the long ones what they were spent on, as the browser has it.
+# Records the time of each frame, and for long frames the browser's attribution.
 WATCH_FRAMES: Final = """() => {
     const frames = (window.benchFrames = {gaps: [], long: []});
     let last = performance.now();
@@ -61,7 +61,7 @@ DRAWN: Final = (
 
 @dataclass(frozen=True)
 class MemorySample:
-    """What a page holds on to, after everything else was collected."""
+    """Memory of a page after garbage collection."""
 
     heap_mb: float
     nodes: int
@@ -72,7 +72,7 @@ class MemorySample:
 
 
 def memory_samples(session: CDPSession) -> MemorySample:
-    """Collect garbage, and look."""
+    """Collects garbage and takes one sample."""
     session.send("HeapProfiler.collectGarbage")
     heap = session.send("Runtime.getHeapUsage")["usedSize"]
     counted = session.send("Memory.getDOMCounters")
@@ -80,7 +80,7 @@ def memory_samples(session: CDPSession) -> MemorySample:
 
 
 def steady(every_minute: Sequence[MemorySample]) -> bool:
-    """Print what memory did since the first minute; whether it stays."""
+    """Prints the memory trend since the first minute and returns True if it is level."""
     first, last = every_minute[0], every_minute[-1]
     slope = 0.0
     if len(every_minute) > 1:
@@ -91,7 +91,7 @@ def steady(every_minute: Sequence[MemorySample]) -> bool:
 
 
 def open_together(page: Page, machine: Machine, ids: Sequence[str]) -> None:
-    """All on one page, each of them heard and drawn."""
+    """Opens one page with all devices and waits until each receives telemetry and is drawn."""
     page.goto(f"{machine.url}/#/operate/{','.join(ids)}")
     expect(page.get_by_test_id("robot-panel")).to_have_count(len(ids), timeout=PATIENCE_MS)
     wait_until(
@@ -101,7 +101,7 @@ def open_together(page: Page, machine: Machine, ids: Sequence[str]) -> None:
 
 
 def show_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:
-    """Look at ten arms; whether frames come in time and memory stays."""
+    """Measures ten arms and returns True if frame intervals and memory are within the limits."""
     with start_kinematic_arms(machine, ROBOTS) as ids, pages(browser, machine) as (page,):
         session = page.context.new_cdp_session(page)
         page.evaluate(WATCH_FRAMES)
@@ -113,7 +113,7 @@ def show_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:
         _show_frames(f"the {WARM_UP_S:.0f} s after, not counted", page.evaluate(TAKE_FRAMES))
         print(f"at the start of the minute: {memory_samples(session)}")
         before = sum(page.evaluate(DRAWN))
-        page.evaluate(TAKE_FRAMES)  # to collect garbage takes its time, and is the benchmark's doing
+        page.evaluate(TAKE_FRAMES)  # the forced collection takes time that does not belong to the page
         time.sleep(60)
         taken = page.evaluate(TAKE_FRAMES)
         drawn = sum(page.evaluate(DRAWN)) - before

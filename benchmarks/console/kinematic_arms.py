@@ -1,6 +1,6 @@
-"""Arms as a page sees them, without physics: the product's own arm describes and draws them, and they swing.
+"""Arms without physics for measurements of the page: the product's own arm supplies description and drawing.
 
-A page is what is measured with them. Ten simulated arms beside it on one small machine would take what it draws with.
+Ten physics simulations on the same small machine would take the processor time that the page needs.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ STATE_EVERY_S: Final = 10.0
 
 @dataclass(frozen=True)
 class _Pattern:
-    """What one arm has said of itself."""
+    """Description and drawing of one arm."""
 
     description: Description
     twin: Twin
@@ -41,7 +41,7 @@ class _Pattern:
 
 @contextlib.contextmanager
 def start_kinematic_arms(machine: Machine, count: int) -> Iterator[list[str]]:
-    """So many arms of the demo account, measured ``RATE_HZ`` times a second; their devices' ids."""
+    """Runs arms of the demo account with telemetry at ``RATE_HZ`` and yields their device ids."""
     over = threading.Event()
     with pair_minimal_agents(machine, count, AGENT_HAS) as robots:
         pattern = _pattern(machine)
@@ -58,7 +58,7 @@ def start_kinematic_arms(machine: Machine, count: int) -> Iterator[list[str]]:
 
 
 def _pattern(machine: Machine) -> _Pattern:
-    """Of the product's own arm."""
+    """Reads description and drawing of the product's own arm."""
     with machine.api() as api:
         topic = api.device()["topic"]
         issued = api.post("/mqtt/credentials", {"purpose": "view"})
@@ -95,7 +95,7 @@ def _tell_state(robot: Robot, name: str) -> None:
 
 
 def _swing(everyone: list[tuple[Robot, str]], pattern: _Pattern, over: threading.Event) -> None:
-    """Tell where they are until it is over, each a little behind the one before."""
+    """Publishes positions until the end; each arm lags slightly behind the previous one."""
     next_s = began_s = time.monotonic()
     for sequence in itertools.count(1):
         for place, (robot, name) in enumerate(everyone):

@@ -1,4 +1,4 @@
-"""Agents as the protocol has them, paired over HTTP and heard through the broker, with nothing behind them."""
+"""Minimal agents that follow the protocol: paired over HTTP, connected to the broker, without hardware or physics."""
 
 import contextlib
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ class _Clock:
 
 
 class _Functions:
-    """The product, asked over HTTP by agents."""
+    """The product's API as the agents use it."""
 
     def __init__(self, machine: Machine) -> None:
         self._http = httpx.Client(base_url=machine.url, timeout=30)
@@ -36,7 +36,7 @@ class _Functions:
 
 
 class _Owner:
-    """Who the agents are paired with."""
+    """The account that the agents are paired with."""
 
     def __init__(self, http: httpx.Client) -> None:
         self._http = http
@@ -47,7 +47,7 @@ class _Owner:
 
 @contextlib.contextmanager
 def pair_minimal_agents(machine: Machine, count: int, each: int = AGENT_HAS) -> Iterator[list[Robot]]:
-    """Agents with so many devices between them, paired with the demo account and connected."""
+    """Runs connected agents with a total number of devices, paired with the demo account."""
     with contextlib.ExitStack() as stack, machine.api() as api:
         functions = _Functions(machine)
         stack.callback(functions.close)

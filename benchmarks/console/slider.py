@@ -1,12 +1,11 @@
-"""How quick the console is, in a real Chromium against the product as ``make up`` starts it.
+"""Latency of the console in Chromium, from a slider press to simulated motion and back.
 
-``python -m benchmarks.console.slider [--samples 40]`` presses a joint's slider and follows what comes of it, all on the
-machine's own clock: the press, the setpoint that leaves the page, the command that the simulation gets, the first
-motion of the simulated joint, the telemetry that tells of it to the page, and the twin that is drawn from it. The
-clock of the page is compared with the machine's at each press.
+``python -m benchmarks.console.slider [--samples 40]`` presses the slider of a joint and takes timestamps on the clock
+of the machine: press, published setpoint, command at the simulation, first motion of the simulated joint, telemetry
+received by the page, and drawn twin. Each press compares the clock of the page with the clock of the machine.
 
-``python -m benchmarks.console.slider --fleet [--minutes 10]`` shows ten simulated arms on one page (``console_fleet.py``),
-``--devices 200`` the list of so many devices (``console_list.py``).
+``--fleet [--minutes 10]`` measures ten arms on one page (``frames.py``); ``--devices 200`` measures the device list
+(``device_list.py``).
 """
 
 import argparse
@@ -30,13 +29,13 @@ from tests.harness.network.brokers import wait_until
 
 JOINT: Final = "elbow"
 PARTS: Final = ("input", "published", "commanded", "moved", "told", "drawn")
-"""In their order: pressed and handled by the page, sent to the broker, at the simulation, moving, heard, drawn."""
+"""Parts in order: handled by the page, published, at the simulation, moving, telemetry received, drawn."""
 MOST_MS: Final = 60.0
-"""From the press to simulated motion, median."""
+"""Target for the median from press to simulated motion [ms]."""
 MOVES_RAD_S: Final = 0.002
-"""A simulated joint that is faster than this moves: a tenth of a degree per second."""
+"""Velocity above which a simulated joint counts as moving: 0.1 °/s."""
 
-# Looks on from outside: what the page sends, hears and draws stays as it is.
+# Observes the page from outside; its messages and drawing stay unchanged.
 WATCH: Final = """() => {
     const at = () => performance.timeOrigin + performance.now();
     const marks = (window.benchMarks = {});
@@ -81,20 +80,20 @@ WATCH: Final = """() => {
 
 @dataclass(frozen=True)
 class Press:
-    """One press of a slider; ``at_ms``: part → when it was done, after the press [ms]."""
+    """One press of a slider; ``at_ms``: part → time after the press [ms]."""
 
     at_ms: dict[str, float]
 
 
 def watch(page: Page) -> None:
-    """Begin to look on: from the page's next load on."""
+    """Installs the observer; it is active from the next page load."""
     page.add_init_script(f"({WATCH.replace('MOVES', str(MOVES_RAD_S))})()")
 
 
 def presses(page: Page, machine: Machine, count: int) -> list[Press]:
-    """Press the slider of an arm that is operated, again and again, and follow what comes of it.
+    """Presses the slider of a controlled arm repeatedly and returns one result per press.
 
-    What the machine was too busy for (a robot that had to hold) is tried again.
+    A press is repeated if the machine was too busy and the robot had to hold.
     """
     trace = machine.trace()
     page.evaluate("() => benchDrawn()")
@@ -108,14 +107,14 @@ def presses(page: Page, machine: Machine, count: int) -> list[Press]:
         wait_until(lambda: _speed(trace) < MOVES_RAD_S, "rest", 20)
         page.wait_for_timeout(
             300 + 37 * (index % 7)
-        )  # telemetry of a robot at rest comes every 50 ms: at any phase of it
+        )  # a robot at rest publishes every 50 ms; sample every phase of that period
         if (press := _press(page, trace, 0.55 if index % 2 else 0.6)) is not None:
             found.append(press)
     return found
 
 
 def _take(page: Page) -> None:
-    """Take control; on a machine so busy that setpoints come late, the robot ends it, as it must: take it again."""
+    """Acquires control again if late setpoints on a busy machine ended the lease."""
     state, slider = page.get_by_test_id("control-state"), page.get_by_test_id(f"slider-{JOINT}")
 
     def may() -> bool:
@@ -163,7 +162,7 @@ def _speed(trace: Trace) -> float:
 
 
 def show(found: Sequence[Press]) -> bool:
-    """Print what was found; whether it is quick enough."""
+    """Prints the result and returns True if the target is met."""
     print(f"{platform.python_version()}, {os.cpu_count()} cores, {len(found)} presses of the {JOINT}'s slider")
     print(f"{'ms':14}{'since the press: p50':>22}{'p95':>8}{'max':>8}{'since the part before: p50':>30}")
     before = "pressed"
@@ -180,7 +179,7 @@ def show(found: Sequence[Press]) -> bool:
 
 
 def main() -> int:
-    """Command line."""
+    """Runs the command line."""
     parser = argparse.ArgumentParser(description="How quick the console is.")
     parser.add_argument("--samples", type=int, default=40)
     parser.add_argument("--fleet", action="store_true", help="ten arms on one page")
@@ -204,7 +203,7 @@ def main() -> int:
 
 
 def measure(page: Page, machine: Machine, count: int) -> list[Press]:
-    """Open the arm's page, look on, press."""
+    """Opens the page of the arm and measures presses."""
     watch(page)
     page.reload()
     page.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()

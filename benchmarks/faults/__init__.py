@@ -1,1 +1,1 @@
-"""Parts of the suite ``faults``: what does the damage, who works meanwhile, and what came of it."""
+"""Parts of the suite ``faults``: fault injection, load during the faults, and evaluation."""

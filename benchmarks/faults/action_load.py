@@ -1,4 +1,4 @@
-"""Somebody who orders one small move after the other, through whatever breaks, and asks again what was not answered."""
+"""A client that requests one small move after another during faults and retries requests without a response."""
 
 import threading
 import time
@@ -11,7 +11,7 @@ import msgspec
 from benchmarks.faults.processes import ORDERED, ProductProcesses
 
 STEP_RAD: Final = 0.002
-"""Order number n brings the wrist to n times this: so the record says whose move it was."""
+"""Action number n moves the wrist to n times this angle, so the simulation's trace identifies the action."""
 _ENDS: Final = ("done", "failed", "expired", "cancelled")
 _TTL_MS: Final = 4000
 _GIVE_UP_S: Final = 20.0
@@ -20,12 +20,12 @@ _REST_S: Final = 0.1
 
 
 class RequestedAction(msgspec.Struct):
-    """One order.
+    """One requested action.
 
     Attributes:
-        fault: What was broken when it was given.
-        status: The last that is known; empty where no function has ever accepted it.
-        done_ms: When the answer came that it is done.
+        fault: Fault that was active at the time of the request.
+        status: Last known status; empty if the API never accepted the request.
+        done_ms: Time of the response with status ``done``.
     """
 
     number: int
@@ -37,11 +37,11 @@ class RequestedAction(msgspec.Struct):
 
 
 class ActionLoad:
-    """Gives them until the end of the ``with``.
+    """Requests actions until the context ends.
 
     Attributes:
-        fault: Now.
-        given: All so far.
+        fault: Fault that is active now.
+        given: All requested actions.
     """
 
     def __init__(self, ground: ProductProcesses) -> None:
@@ -62,12 +62,12 @@ class ActionLoad:
         self._http.close()
 
     def done_since(self, at_ms: float) -> float | None:
-        """When the first order was done that was given after that moment."""
+        """Returns the completion time of the first action requested after a time, or None."""
         found = [each.done_ms for each in list(self.given) if each.given_ms >= at_ms and each.status == "done"]
         return min(found, default=None)
 
     def settle(self) -> None:
-        """Wait for the ends of those that were accepted, as long as one may be expected."""
+        """Waits until all accepted actions have a terminal status or the timeout expires."""
         for order in self.given:
             deadline_s = time.monotonic() + _GIVE_UP_S
             while order.action and order.status not in _ENDS and time.monotonic() < deadline_s:
@@ -83,7 +83,7 @@ class ActionLoad:
             self._ending.wait(_REST_S)
 
     def _give(self, order: RequestedAction) -> None:
-        """With the same key until there is an answer: a client's retry must start nothing twice."""
+        """Repeats the request with the same idempotency key until a response arrives."""
         body = {
             "request": {"kind": "move_joints", "position_rad": {"wrist_3": order.number * STEP_RAD}},
             "ttl_ms": _TTL_MS,
@@ -104,7 +104,7 @@ class ActionLoad:
                 while order.status not in _ENDS and not self._ending.is_set() and time.monotonic() < deadline_s:
                     self._follow(order)
                 return
-            if answer.is_client_error:  # refused: the arm is busy with what has not ended yet, or off line
+            if answer.is_client_error:  # rejected: the previous action has not ended, or the arm is offline
                 return
             self._ending.wait(_AGAIN_S)
 
@@ -125,19 +125,19 @@ class ActionLoad:
 
 
 def lost(orders: list[RequestedAction]) -> list[RequestedAction]:
-    """Those that were accepted and have no end."""
+    """Returns the accepted actions without a terminal status."""
     return [each for each in orders if each.action and each.status not in _ENDS]
 
 
 def duplicated(orders: list[RequestedAction], begun: Mapping[str, int]) -> list[RequestedAction]:
-    """Those that have begun more than once. ``begun``: action → how often."""
+    """Returns the actions that started more than once. ``begun``: action → number of starts."""
     return [each for each in orders if begun.get(each.action, 0) > 1]
 
 
 def went_back(wrist_rad: list[float]) -> int:
-    """How often the record has the wrist at rest at the mark of an order that a later one had left behind.
+    """Counts returns of the wrist to the target of an earlier action, from the simulation's trace.
 
-    A mark counts where the wrist rests for three lines. Back at zero it has been started anew.
+    A target counts if the wrist rests there for three lines. A return to zero is a restart of the simulation.
     """
     newest = found = 0
     for one, two, three in zip(wrist_rad, wrist_rad[1:], wrist_rad[2:], strict=False):

@@ -1,8 +1,8 @@
-"""``device_agent run`` that tells what it decides, period by period, and whose wall clock can be set wrong.
+"""The agent with a report of each control period and an adjustable wall clock.
 
-``python -m benchmarks.faults.agent MQTT_PORT WATCHDOG_S …``, where ``$TELESCOPE_HOME/noted.socket`` listens: each
-period is a datagram (see ``noted.Period``), and so is each action that begins. SIGUSR1 and SIGUSR2 put its wall clock
-an hour ahead and back. Nothing of this is in the product.
+``python -m benchmarks.faults.agent MQTT_PORT WATCHDOG_S …`` sends a datagram per control period (``recorder.Period``)
+and per started action to ``$TELESCOPE_HOME/noted.socket``. SIGUSR1 and SIGUSR2 move its wall clock forward and back by
+one hour. The product contains none of this.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ JUMP_S = 3600.0
 
 
 def main(*arguments: str) -> int:
-    """The agent, until it is ended."""
+    """Runs the agent until it is terminated."""
     _tell(str(Path(os.environ["TELESCOPE_HOME"]) / "noted.socket"))
     _set_clock_by_signals()
     return agent.main(*arguments)
@@ -39,13 +39,13 @@ def _tell(path: str) -> None:
     names: dict[int, str] = {}
 
     def say(text: str) -> None:
-        with contextlib.suppress(OSError):  # nobody listens, or too slowly: the loop must not wait
+        with contextlib.suppress(OSError):  # no receiver, or a slow one: the control loop must not wait
             line.sendto(text.encode(), path)
 
     def stepped(controller: Controller, *given: Any, **named: Any) -> ControlOutput:
         tick = step(controller, *given, **named)
         thread = threading.current_thread().name
-        if thread.endswith("-loop"):  # who brings something may begin a period as well
+        if thread.endswith("-loop"):  # a thread that delivers a message may also start a period
             names[id(controller)] = thread.removesuffix("-loop")
         name = names.get(id(controller), "")
         moved = max(

@@ -1,4 +1,4 @@
-"""One fault after the other: how long an arm in motion goes on, and how long until all works again."""
+"""One fault after another: time until a moving arm rests, and time until recovery."""
 
 import os
 import resource
@@ -20,7 +20,7 @@ from tests.faults.stack import now_ms
 from tests.harness.network.brokers import wait_until
 
 _KILLED: Final = "console killed"
-"""What makes the arm stop where the fault itself does not."""
+"""Additional fault that stops the arm if the fault itself does not."""
 _CUTS: Final = {
     "operator killed": _KILLED,
     "operator's link cut": "operator cut off",
@@ -32,7 +32,7 @@ _CUTS: Final = {
     "functions killed": "functions killed",
 }
 _TOLD: Final = ("agent's link cut", "broker killed")
-"""Of these the agent is told, and no setpoint that comes later counts: from the cut, not from the last setpoint."""
+"""The agent notices these faults itself, so times count from the cut and not from the last setpoint."""
 _SHUFFLED: Final = "all sent twice, out of order"
 _AGENT_KILLED: Final = "agent killed"
 _DISK_FULL: Final = "agent's disk full"
@@ -44,14 +44,14 @@ _LOOK_MS: Final = 400.0
 
 
 class FaultResult(msgspec.Struct, frozen=True, kw_only=True):
-    """One round.
+    """Result of one run.
 
     Attributes:
-        stop_ms: From the last setpoint that reached the agent, or what else let the arm move, to the first line of the
-            record from which on it is commanded to stand still; nothing where the record ends with the agent.
-        recovery_s: From mending until a new lease moves the arm and a new order is done on the other one.
-        moved_again: Whether anything moved between the stop and a new lease.
-        undone: Setpoints that were applied after a newer one.
+        stop_ms: Time from the last setpoint at the agent to the first trace line without commanded motion; None if
+            the trace ends with the agent.
+        recovery_s: Time from the repair until a new lease moves the arm and the other arm completes a new action.
+        moved_again: True if anything moved between the stop and a new lease.
+        undone: Number of setpoints applied after a newer one.
     """
 
     fault: str
@@ -63,7 +63,7 @@ class FaultResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FaultRuns(Bench):
-    """Makes one round of a fault at a time."""
+    """Runs one fault at a time."""
 
     def __init__(self, ground: ProductProcesses, orders: ActionLoad, *, seed: int) -> None:
         super().__init__(ground, seed=seed)
@@ -82,16 +82,16 @@ class FaultRuns(Bench):
 
     @property
     def names(self) -> list[str]:
-        """All faults. The full disk ends the simulation's record, and the killed agent begins a new one."""
+        """Names of all faults. The full disk ends the simulation's trace; the killed agent starts a new one."""
         return [*_CUTS, _SHUFFLED, *self._faults, _AGENT_KILLED]
 
     def close(self) -> None:
-        """End operators, close records."""
+        """Stops the operators and closes the traces."""
         self.arms = [self.arm, self._wrist]
         super().close()
 
     def round(self, fault: str) -> FaultResult:
-        """One of them, to its recovery."""
+        """Runs one fault until recovery."""
         self.orders.fault = fault
         verdict, undone = None, 0
         if fault in _CUTS:
@@ -112,7 +112,7 @@ class FaultRuns(Bench):
         )
 
     def wrist_went_back(self) -> int:
-        """How often the record has the other arm do an order again that a later one had left behind."""
+        """Counts repeated actions of the other arm in the trace."""
         return went_back([row.target_rad[-1] for row in self._wrist.record.read()])
 
     # ------------------------------------------------------------ rounds
@@ -134,7 +134,7 @@ class FaultRuns(Bench):
         return self._timed(super()._cut_all(cut))
 
     def _timed(self, mend: Mend) -> Mend:
-        """Notes when it is called; what mends itself has begun to at once."""
+        """Records the time of the repair; a fault that repairs itself starts to do so at once."""
         self._mended_ms = now_ms()
 
         def timed() -> None:
@@ -145,7 +145,7 @@ class FaultRuns(Bench):
         return timed
 
     def _while_wrong(self, begin: Callable[[], object], mend: Callable[[], object], *, noted: bool) -> Verdict:
-        """Something is wrong, and then the operator dies; ``noted``: the simulation's record has ended."""
+        """Kills the operator while a fault is active; ``noted``: the trace has ended, use the recorded periods."""
         for _ in range(_TRIES):
             while not self.arm.set_in_motion():
                 pass
@@ -168,7 +168,7 @@ class FaultRuns(Bench):
         return found
 
     def _shuffled(self) -> tuple[Verdict, int]:
-        """Setpoints twice and out of order; each order to the other arm again, in pairs the wrong way round."""
+        """Sends setpoints twice and out of order, and repeats commands to the other arm in reversed pairs."""
         self.arm.leave()
         topic = f"{self.ground.topic(ORDERED)}/cmd"
         began_ms = now_ms()
@@ -209,17 +209,17 @@ class FaultRuns(Bench):
         assert done_ms is not None
         return (max(moving_ms, done_ms) - self._mended_ms) / 1000
 
-    # ------------------------------------------------------------ what does the damage
+    # ------------------------------------------------------------ fault injection
 
     def _network(self, *, rtt_ms: float = 0.0, loss: float = 0.0) -> None:
         self.ground.network.set(rtt_ms=rtt_ms, loss=loss)
 
     def _clock(self, number: int) -> None:
-        """Only the agent's own process knows the signal."""
+        """Sends the signal to the agent's own process."""
         os.kill(self.ground.pid(self.ground.agent), number)
 
     def _disk(self, *, full: bool) -> None:
-        """No file of the agent grows any more: each write of it fails, as on a disk that is full."""
+        """Limits the file size of the agent to zero, so each write fails as on a full disk."""
         process = self.ground.pid(self.ground.agent)
         _, hard = resource.prlimit(process, resource.RLIMIT_FSIZE)
         resource.prlimit(process, resource.RLIMIT_FSIZE, (0 if full else hard, hard))

@@ -1,4 +1,4 @@
-"""An operator who streams to one arm: at rest, slowly, or as fast as it may, and if need be twice and out of order."""
+"""An operator that streams to one arm at rest, slowly or at full speed, optionally duplicated and out of order."""
 
 import contextlib
 import threading
@@ -17,16 +17,16 @@ _PERIOD_S: Final = 0.025
 _FAR_RAD: Final = 1.4
 _NEAR_RAD: Final = 0.5
 _MOVES_RAD: Final = 5e-4
-"""In a period of 8 ms: 0.06 rad/s."""
+"""Motion per period of 8 ms that counts as moving; equals 0.06 rad/s."""
 
 
 class FaultOperator:
-    """Has control and streams until the end of the ``with``.
+    """Holds the lease and streams until the context ends.
 
     Args:
         ground: The product.
-        speed_rad_s: Of the first joint, to and fro.
-        shuffled: Whether each setpoint is sent twice, and every second pair the wrong way round.
+        speed_rad_s: Speed of the first joint, alternating.
+        shuffled: Send each setpoint twice and every second pair in reversed order.
     """
 
     def __init__(self, ground: ProductProcesses, speed_rad_s: float, *, shuffled: bool = False) -> None:
@@ -55,7 +55,7 @@ class FaultOperator:
         self._stack.close()
 
     def let_go(self) -> None:
-        """Stream no longer. May be called twice."""
+        """Stops streaming. May be called twice."""
         self._ending.set()
         self._thread.join()
 
@@ -63,7 +63,7 @@ class FaultOperator:
         self._newest = codec.decode(payload, JointTelemetry)
 
     def _stream(self) -> None:
-        """40 times a second, as the page does."""
+        """Streams at 40 Hz, the rate of the console."""
         assert self._newest is not None
         home = list(self._newest.commanded_rad)
         began_s, sequence, sign = time.monotonic(), 0, -1.0 if home[0] > 0 else 1.0
@@ -87,7 +87,7 @@ class FaultOperator:
             held = self._send([*held, codec.encode(setpoint)])
 
     def _send(self, held: list[bytes]) -> list[bytes]:
-        """What is still to be sent with the next one."""
+        """Payloads that are sent with the next setpoint."""
         if self._shuffled and len(held) < 2:  # noqa: PLR2004 (a pair)
             return held
         for payload in [*reversed(held), *held] if self._shuffled else held:
@@ -95,7 +95,7 @@ class FaultOperator:
         return []
 
     def await_motion(self) -> None:
-        """Until the arm is commanded to move as it is asked to."""
+        """Waits until the arm is commanded to move at the requested speed."""
         if self._speed_rad_s:
             wait_until(self._moves, "motion", TIMEOUT_S)
 

@@ -1,4 +1,4 @@
-"""The product in processes that can be killed one by one, with an agent that tells what it decides."""
+"""The product in processes that can be killed separately, with an agent that reports its decisions."""
 
 import contextlib
 import time
@@ -18,17 +18,17 @@ from tests.harness.network.delay import start_delay
 from tests.harness.network.proxy import Proxy
 
 STREAMED, ORDERED = "arm0", "arm1"
-"""Who streams has the one, who orders actions has the other."""
+"""The streaming operator controls one arm, the action load the other."""
 _WATCHDOG_S = 0.3
 
 
 class ProductProcesses(Stack):
-    """As ``Stack``; the agent's link goes through a network as well (`tests.harness.network.delay`).
+    """A ``Stack`` whose agent also connects through a simulated network (``tests.harness.network.delay``).
 
     Attributes:
-        noted: What the agent tells of its periods.
-        network: Between the agent's link and the broker.
-        owner: HTTP of somebody who has signed in, for what an API key may not do.
+        noted: Recorded control periods of the agent.
+        network: Simulated network between the agent and the broker.
+        owner: HTTP client with a sign-in session, for requests that an API key may not make.
     """
 
     AGENT = "benchmarks.faults.agent"
@@ -40,7 +40,7 @@ class ProductProcesses(Stack):
         self._closing.callback(self.noted.close)
 
     def begin(self) -> None:
-        """Start all of it."""
+        """Starts all processes."""
         super().begin()
         self.owner = self._closing.enter_context(httpx.Client(base_url=self.api, timeout=15))
         link = sign_in_link(self._environment, "ann")
@@ -54,16 +54,16 @@ class ProductProcesses(Stack):
         return super()._proxy(self.network.ports[behind], heard)
 
     def device(self, name: str) -> str:
-        """The path of a device's routes."""
+        """Returns the HTTP path of a device."""
         return f"/devices/{self.agent_id}-{name}"
 
     def topic(self, name: str) -> str:
-        """Where a device's topics begin."""
+        """Returns the topic prefix of a device."""
         return f"ts/v1/{self.space}/{self.agent_id}/{name}"
 
     @contextlib.contextmanager
     def issued(self, wanted: dict[str, Any], *topics: str) -> Iterator[MqttClient]:
-        """A client with credentials as people get them."""
+        """Connects a client with credentials from the API."""
         given = self.post("/mqtt/credentials", **wanted)
         who = (given["client_id"], given["username"], given["password"])
         with MqttClient(self.port + 1, *who, subscribe=topics, qos=0) as line:
@@ -73,14 +73,14 @@ class ProductProcesses(Stack):
     def allowed(
         self, name: str, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()
     ) -> Iterator[MqttClient]:
-        """A client with exactly these rights, as nobody gets them."""
+        """Connects a client with exactly these permissions, which the API would not issue."""
         with MqttClient(
             self.port + 1, *broker_credentials(self.cloud, name, publish, subscribe), subscribe=subscribe, qos=1
         ) as line:
             yield line
 
     def restart_agent_without_proxies(self) -> None:
-        """Its link goes straight to the broker from now on."""
+        """Restarts the agent with a direct connection to the broker."""
         self.agent.stop()
         self.agent = self._child("agent", self.AGENT, *self.agent_arguments(self.port + 1))
         self.agent.await_line("running", 60)
@@ -93,7 +93,7 @@ class ProductProcesses(Stack):
 
 @contextlib.contextmanager
 def start(kind: BrokerKind) -> Iterator[ProductProcesses]:
-    """The product with two arms, until the end of the ``with``."""
+    """Runs the product with two arms."""
     ground = ProductProcesses(kind)
     try:
         ground.begin()

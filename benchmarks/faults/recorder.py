@@ -1,4 +1,4 @@
-"""What the bench's agent tells: each period of each control loop, and each action as it begins."""
+"""Records the control periods and started actions that the benchmark's agent reports."""
 
 import contextlib
 import socket
@@ -10,15 +10,15 @@ from typing import NamedTuple
 from tests.faults.judge import Row
 
 _NEWEST = 4000
-"""Half a minute of periods."""
+"""Number of periods in half a minute."""
 
 
 class Period(NamedTuple):
-    """One decision of a control loop.
+    """One period of a control loop.
 
     Attributes:
-        at_ms: On the machine's monotonic clock, as everything of the bench.
-        moved_rad: How far the fastest joint was commanded to move in this period.
+        at_ms: Time on the monotonic clock of the machine.
+        moved_rad: Commanded motion of the fastest joint in this period.
     """
 
     at_ms: float
@@ -29,10 +29,10 @@ class Period(NamedTuple):
 
 
 class Recorder:
-    """Listens until it is closed.
+    """Receives reports until it is closed.
 
     Attributes:
-        begun: Action → how often it has begun; once is right.
+        begun: Action → number of starts; 1 is correct.
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,12 +62,12 @@ class Recorder:
             del kept[:_NEWEST]
 
     def since(self, name: str, at_ms: float) -> list[Period]:
-        """Periods of one device from then on."""
+        """Returns the periods of one device since a time."""
         with self._lock:
             return [each for each in self._periods.get(name, ()) if each.at_ms >= at_ms]
 
     def rows(self, name: str, since_ms: float) -> list[Row]:
-        """The same for a judge, who otherwise reads the simulation's record: one joint that has gone so far."""
+        """Returns the same as trace rows: one joint with the accumulated motion."""
         gone_rad, rows = 0.0, []
         for each in self.since(name, since_ms):
             gone_rad += each.moved_rad
@@ -75,7 +75,7 @@ class Recorder:
         return rows
 
     def close(self) -> None:
-        """Listen no longer."""
+        """Stops receiving."""
         self._line.shutdown(socket.SHUT_RDWR)
         self._thread.join()
         self._line.close()

@@ -1,4 +1,4 @@
-"""Stop: from the operator's message to the first period that brakes, and to the first that commands no motion."""
+"""Stop latency: from the operator's message to the first braking period, and to the first period without motion."""
 
 import contextlib
 import random
@@ -20,12 +20,12 @@ CALL: Final = "POST stop"
 _STILL_RAD: Final = 1e-9
 _RESTS_WITHIN_S: Final = 2.0
 _FULL_S: Final = 0.35
-"""What the arm takes to its full speed, and well before it turns."""
+"""Time to full speed, well before the arm reverses [s]."""
 _PERIODS_S: Final = 0.008
 
 
 class StopResult(msgspec.Struct, frozen=True, kw_only=True):
-    """One Stop. Times from just before it was sent [ms]."""
+    """Result of one Stop. Times count from just before it was sent [ms]."""
 
     broker: str
     way: str
@@ -36,7 +36,7 @@ class StopResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StopRuns:
-    """Makes them, over a link without proxies. ``with`` closes what it has opened."""
+    """Sends Stops over a connection without proxies. Leaving the context closes it."""
 
     def __init__(self, ground: ProductProcesses, *, seed: int) -> None:
         self._ground = ground
@@ -52,7 +52,7 @@ class StopRuns:
         self._stack.close()
 
     def make(self, way: str, speed: str) -> StopResult:
-        """One of them, in motion as it is asked for, and its reset."""
+        """Sends one Stop at the requested speed and resets it."""
         send = self._send if way == MESSAGE else self._call
         with FaultOperator(self._ground, SPEEDS[speed]) as hand:
             hand.await_motion()
@@ -87,7 +87,7 @@ class StopRuns:
 def evaluate(
     before: list[Period], periods: list[Period], *, sent_ms: float, broker: str, way: str, speed: str
 ) -> StopResult:
-    """From the last periods before it was sent, and those after until rest."""
+    """Evaluates the last periods before the Stop and those after it until rest."""
     braking = next(each for each in periods if each.mode == "stopped")
     moving = [each for each in periods if each.at_ms >= braking.at_ms and each.moved_rad > _STILL_RAD]
     after_ms = moving[-1].at_ms if moving else 0.0
@@ -103,7 +103,7 @@ def evaluate(
 
 
 def series(stops: StopRuns, each: int, say: Callable[[str], None]) -> list[StopResult]:
-    """So many of each speed and way, in turns."""
+    """Runs a number of Stops for each speed and method, interleaved."""
     found: list[StopResult] = []
     for number in range(each):
         for speed in SPEEDS:

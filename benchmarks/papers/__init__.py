@@ -1,1 +1,1 @@
-"""What the two papers printed, measured again with Telescope in their place."""
+"""The measurements of the two papers, repeated with Telescope."""

@@ -1,7 +1,7 @@
-"""One message from a sender through a server to a receiver, each way that a robot's command may go.
+"""One message from a sender through a server to a receiver, for each transport of a robot command.
 
-Each function gives an exchange: it sends one setpoint and ends when the receiver has it. Sender and receiver have a
-connection each, and both are in this process, so one clock times them; servers are processes of their own.
+Each function yields an exchange, which sends one setpoint and returns when the receiver has it. Sender and receiver are
+separate connections in this process, so one clock measures both; servers run in their own processes.
 """
 
 import asyncio
@@ -32,17 +32,17 @@ SETPOINT: Final = codec.encode(
         target=JointTarget(position_rad={name: round(0.1 * index + 0.05, 3) for index, name in enumerate(JOINTS)}),
     )
 )
-"""What a console sends while somebody moves six sliders."""
+"""Payload of a console that moves six sliders."""
 Ports = Mapping[int, int]
-"""A server's port → where clients connect: the same port, or a delay before it."""
+"""Maps a server's port to the port for clients: the same one or that of a delay proxy."""
 _TOPIC: Final = "bench/setpoint"
 _CLOUD, _ROBOT = "cloud", "robot"
 
 
 def mqtt(stack: contextlib.ExitStack, ports: Ports, broker: RunningBroker, transport: Transport = "tcp") -> Exchange:
-    """At QoS 0, as setpoints go."""
+    """MQTT with QoS 0, as used for setpoints."""
     port = ports[broker.port(transport)]
-    topic = f"{_TOPIC}/{port}"  # a broker's TCP and its WebSocket are two ways: neither may hear the other
+    topic = f"{_TOPIC}/{port}"  # TCP and WebSocket of one broker are two paths and use separate topics
     heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def line(name: str) -> Client:
@@ -63,7 +63,7 @@ def mqtt(stack: contextlib.ExitStack, ports: Ports, broker: RunningBroker, trans
 
 
 def web_socket(stack: contextlib.ExitStack, ports: Ports, port: int) -> Exchange:
-    """JSON over WebSocket through a relay."""
+    """JSON over WebSocket through a relay server."""
     address = f"ws://{HOST}:{ports[port]}"
     sender, receiver = (stack.enter_context(connect(address, compression=None)) for _ in range(2))
     text = json.dumps({"op": "publish", "topic": _TOPIC, "msg": json.loads(SETPOINT)})
@@ -76,7 +76,7 @@ def web_socket(stack: contextlib.ExitStack, ports: Ports, port: int) -> Exchange
 
 
 def xmpp(stack: contextlib.ExitStack, ports: Ports, port: int) -> Exchange:
-    """A message from one user to another at Prosody."""
+    """An XMPP message between two users of Prosody."""
     heard: queue.SimpleQueue[Any] = queue.SimpleQueue()
     sender = stack.enter_context(_XmppUser(ports[port], _CLOUD, lambda _: None))
     receiver = stack.enter_context(_XmppUser(ports[port], _ROBOT, heard.put))
@@ -96,7 +96,7 @@ def _require_none(heard: "queue.SimpleQueue[Any]") -> None:
 
 
 class _XmppUser:
-    """An XMPP client in a thread of its own. ``with`` ends it."""
+    """An XMPP client in its own thread. Leaving the context stops it."""
 
     def __init__(self, port: int, name: str, hear: Callable[[Any], None]) -> None:
         self.jid = f"{name}@{DOMAIN}/bench"

@@ -1,4 +1,4 @@
-"""Fig. 5 of Telescope v2: from the operator's request to the robot's first motion."""
+"""Fig. 5 of Telescope v2: time from the operator's request to the first motion of the robot."""
 
 import json
 import random
@@ -29,9 +29,9 @@ _SWING_RAD: Final = 0.03
 _WITHIN_S: Final = 10.0
 _WARM_UP: Final = 2
 _MISSES: Final = 2
-"""So many requests of one robot's at most may be refused, as a setpoint is that a busy machine brought too late."""
+"""Allowed number of rejected requests per robot, for example setpoints that a busy machine delivers too late."""
 _KEEPS_ON: Final = 10
-"""Setpoints after the one that is timed: where they end while the joint moves, the watchdog ends the lease."""
+"""Number of setpoints after the measured one; without them the watchdog would end the lease during motion."""
 _SOURCE: Final = '''"""Turn one joint: what a click on a movement does."""
 PARAMETERS = {{"to": {{"type": "number", "default": 0.1, "description": "Where to [rad]"}}}}
 
@@ -41,7 +41,7 @@ robot.move_joints({{"{joint}": float(parameters["to"])}})
 
 @dataclass(frozen=True)
 class Robot:
-    """One of the four. ``joint`` is turned; what ``drives`` is asked to drive as its action, and told by a wheel."""
+    """One of the four robots. ``joint`` is turned; a robot that ``drives`` gets a drive action, measured at a wheel."""
 
     name: str
     label: str
@@ -50,7 +50,7 @@ class Robot:
 
     @property
     def watched(self) -> str:
-        """Joints by which its motion is told."""
+        """Joints whose motion is traced."""
         return f"{self.joint}+{self.drives}" if self.drives else self.joint
 
 
@@ -63,21 +63,21 @@ ROBOTS: Final = (
 
 
 class Sample(NamedTuple):
-    """How long after the request the joint began to move, and was faster than 0.1° a second [ms]."""
+    """Times from the request until the joint starts to move and until it exceeds 0.1 °/s [ms]."""
 
     moves_ms: float
     fast_ms: float
 
 
 Found = dict[tuple[str, str, int], list[Sample]]
-"""Where, request, round trip [ms] → samples. Where: a robot's label, and in the laboratory that, too."""
+"""(robot, request, round trip [ms]) → samples. In the laboratory the robot's label names it."""
 End = Callable[[], None]
 Begin = Callable[[], End]
-"""Ask; gives what waits for the request's end."""
+"""Sends a request and returns a function that waits for its end."""
 
 
 def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
-    """Adds a table, a chart, and claims."""
+    """Adds a table, a chart and targets to the report."""
     found: Found = {}
     distances, count = ((RTT_MS,), 6) if quick else ((0, RTT_MS), 16)
     for robot in ROBOTS:
@@ -92,9 +92,9 @@ def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
 
 
 def _laboratory(count: int, say: Callable[[str], None]) -> Found:
-    """All four in one room with all its sensors, behind one agent: as `make up` starts it.
+    """Measures all four robots in one room with all sensors behind one agent, as ``make up`` starts them.
 
-    Without setpoints: on two cores that are more than busy they come too late to be followed, as they should not be.
+    Setpoints are left out: on two overloaded cores they arrive too late and are correctly rejected.
     """
     found: Found = {}
     joints, room = {robot.name: robot.watched for robot in ROBOTS}, {"TELESCOPE_ROOM": "lab"}
@@ -116,7 +116,7 @@ def _say(say: Callable[[str], None], found: Found, where: str) -> None:
 def _at(
     stand: TracedProduct, robot: Robot, where: str, *, rtt_ms: int, count: int, asks: Sequence[str] = REQUESTS
 ) -> Found:
-    """These requests in turns."""
+    """Runs these requests interleaved."""
     stand.place(rtt_ms=rtt_ms)
     found: Found = {}
     missed = 0
@@ -136,28 +136,28 @@ def _at(
 
 
 def _once(stand: TracedProduct, robot: Robot, begin: Begin) -> Sample:
-    """One request at a robot at rest."""
+    """Measures one request to a robot at rest."""
     stand.marks.drain()
     stand.marks.until(f"rests:{robot.name}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
-    time.sleep(random.uniform(0.0, 0.04))  # at any phase of the control loop
+    time.sleep(random.uniform(0.0, 0.04))  # sample every phase of the control period
     began_ns = time.monotonic_ns()
     end = begin()
     marks = stand.marks.until(f"fast:{robot.name}", since_ns=began_ns, within_s=_WITHIN_S)
     end()
-    at_ns = {mark.name: mark.at_ns for mark in reversed(marks)}  # the first of each name
+    at_ns = {mark.name: mark.at_ns for mark in reversed(marks)}  # the first one of each name
     moves_ns, fast_ns = at_ns[f"moves:{robot.name}"], at_ns[f"fast:{robot.name}"]
     return Sample((moves_ns - began_ns) / 1e6, (fast_ns - began_ns) / 1e6)
 
 
 def _keep_movement(stand: TracedProduct, robot: Robot) -> None:
-    """Store the script, as a person does."""
+    """Stores the script through the API."""
     with stand.machine.api() as person:
         path = f"/robot-types/{robot.name}/movements/{_NAME}"
         person.http.put(path, json={"source": _SOURCE.format(joint=robot.joint)}).raise_for_status()
 
 
 class _Operator:
-    """Who asks one robot, in each of three ways, to turn its joint to and fro."""
+    """Requests alternating motion of one joint in three ways."""
 
     def __init__(self, caller: HttpConnection, hand: StreamingOperator, robot: Robot) -> None:
         self._caller = caller
@@ -209,7 +209,7 @@ def _median(found: Sequence[Sample]) -> float:
 
 
 def show(report: Report, found: Found) -> None:
-    """Beside the printed figures."""
+    """Adds the results beside the published values."""
     rows: list[list[Cell]] = [["printed: NAO, Qbo, Hanson", "a movement", "about 15", None, _PRINTED, *[None] * 4]]
     for (where, what, rtt_ms), each in found.items():
         times = [sample.moves_ms for sample in each]
@@ -261,7 +261,7 @@ Until a locked process was kept ready for the next script, a stored movement too
 
 
 def claims(far: Found) -> Iterator[Claim]:
-    """Of each robot's action, and of the slowest robot's setpoint and stored movement."""
+    """Returns the targets for each robot's action and for the slowest robot's setpoint and stored movement."""
     yield Claim(
         text=f"a setpoint → first simulated motion, median, both sides {RTT_MS} ms from the cloud, slowest robot",
         seen=max(_median(far[robot.label, SETPOINT, RTT_MS]) for robot in ROBOTS),

@@ -1,4 +1,4 @@
-"""Fig. 6 of Telescope v2: a room client tells the cloud who it is and what it has, and gets its answer."""
+"""Fig. 6 of Telescope v2: response time of the server when a room client registers."""
 
 import contextlib
 import statistics
@@ -43,14 +43,14 @@ _ROUNDS: Final = 20
 
 
 def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
-    """Adds a table, a chart and two claims."""
+    """Adds a table, a chart and two targets to the report."""
     say("Fig. 6: starting")
     each, rounds = (5, 10) if quick else (15, 20)
     with tempfile.TemporaryDirectory() as folder:
         wanted = {"TELESCOPE_RATE_KEY": "0", "TELESCOPE_RATE_AGENT": "0", "TELESCOPE_RATE_ACCOUNT": "0"}
         with start(Path(folder), "mosquitto", **wanted) as stand, paths(stand) as found:
             announce = found.pop(ANNOUNCED)
-            # A thousand of the one that is claimed, however quick the run: its worst is of a thousand.
+            # The target is the worst of 1,000 samples, so a quick run takes 1,000 as well.
             taken = measure_interleaved({ANNOUNCED: announce}, rounds=_ROUNDS, each=50)
             taken |= measure_interleaved(found, rounds=rounds, each=each)
     judge(report, taken)
@@ -60,7 +60,7 @@ def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
 
 @contextlib.contextmanager
 def paths(stand: MeasuredProduct) -> Iterator[dict[str, Exchange]]:
-    """All exchanges, warm, with a client that has 15 ms of round trip to the cloud and its broker."""
+    """Yields all exchanges with open connections and a round trip of 15 ms to server and broker."""
     with contextlib.ExitStack() as stack:
         way = stack.enter_context(start_delay(stand.machine.port, stand.mqtt_port, rtt_ms=RTT_MS))
         web, mqtt = way.ports[stand.machine.port], way.ports[stand.mqtt_port]
@@ -83,7 +83,7 @@ def paths(stand: MeasuredProduct) -> Iterator[dict[str, Exchange]]:
 
 
 def _announce(stand: MeasuredProduct, server: str) -> Exchange:
-    """An agent of a room that is paired, as the real one does it: with its own client, and signed by its own key."""
+    """Registers a paired room agent with its own HTTP client and signing key, as the real agent does."""
     api = CloudClient(server, signing.generate(), CloudClock())
 
     def announce() -> None:
@@ -96,7 +96,7 @@ def _announce(stand: MeasuredProduct, server: str) -> Exchange:
 
 
 def judge(report: Report, taken: dict[str, list[float]]) -> None:
-    """Beside the printed figures."""
+    """Adds the results beside the published values."""
     rows: list[list[Cell]] = [["printed for Telescope v2", None, *PRINTED.values(), None, None]]
     for name, found in taken.items():
         marks = (percentile(found, 0.5), percentile(found, 0.99))

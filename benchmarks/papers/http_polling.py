@@ -1,9 +1,9 @@
-"""Over HTTP: a receiver that asks now and then, as the paper's did, and one whose asking is held until there is news.
+"""HTTP receivers: periodic polling as in the paper, and long polling.
 
-The paper does not say how its HTTP receiver worked. Its figures do: 2,711 to 3,298 ms with a message every 3 s is what
-a receiver sees that asks every 3 s in step with the sender, and each time just before the message is there. At any
-other phase it would be 0 to 3,000 ms, 1,500 on average; both are measured. Each request opens a connection of its own,
-as clients of that time do. Many pairs at once, so that 20 samples do not take a minute.
+The paper does not describe its HTTP receiver. Its figures (2,711 to 3,298 ms with one message per 3 s) match a receiver
+that polls every 3 s in phase with the sender, just before each message arrives. At a random phase the delay would be 0
+to 3,000 ms, 1,500 ms on average; both cases are measured. Each request opens a new connection, as clients of that time
+did. Many pairs run at once, so 20 samples take less than a minute.
 """
 
 import contextlib
@@ -30,13 +30,13 @@ _HELD_MS: Final = 5_000
 
 
 def pairs(port: int, count: int, *, in_step: bool, seed: int) -> list[float]:
-    """So many senders and receivers, one message each; how long each took [ms].
+    """Runs pairs of sender and receiver with one message each and returns the durations [ms].
 
     Args:
-        port: Of the web server, or of a delay before it.
-        count: How many.
-        in_step: The message comes as soon as the receiver was told that there is none; else at any time between.
-        seed: Of those times.
+        port: Port of the web server or of its delay proxy.
+        count: Number of pairs.
+        in_step: Send right after an empty poll; otherwise at a random time between two polls.
+        seed: Seed of the random times.
     """
     chance, found, lock = random.Random(seed), list[float](), threading.Lock()
 
@@ -82,7 +82,7 @@ def _ask(port: int, method: str, name: str, body: bytes | None = None) -> Any:
 
 
 class _Receiver(PollingRobot):
-    """As an agent that speaks HTTP alone; it says what it has heard as soon as it has."""
+    """A receiver that uses HTTP only and records each message on arrival."""
 
     def __init__(self, site: Site) -> None:
         super().__init__(site, wait_ms=_HELD_MS)
@@ -95,7 +95,7 @@ class _Receiver(PollingRobot):
 
 
 def long_poll(stack: contextlib.ExitStack, ports: Mapping[int, int], ground: Ground) -> Exchange:
-    """Our own HTTP transport: an account's action through the functions, until the agent that waits for it has it."""
+    """Telescope's HTTP transport: an action through the functions until the long-polling agent receives it."""
     port = ports[ground.endpoints["server"].port]
     robot = _Receiver(Site(f"http://{HOST}:{port}"))
     stack.callback(robot.cloud.close)  # type: ignore[attr-defined]  # a Site's

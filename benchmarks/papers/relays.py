@@ -1,8 +1,8 @@
-"""The servers of other ways, each a process of its own, that prints ``ready`` once it is.
+"""Servers of the other transports, each in its own process, which prints ``ready`` when it accepts requests.
 
-``python -m benchmarks.papers.relays web PORT``: the newest message is put and asked for over HTTP, as a robot that
-polls does it; it also lets everybody in at an XMPP server that asks it. ``… socket PORT``: each JSON message over
-WebSocket is read, and sent to all others.
+``python -m benchmarks.papers.relays web PORT``: stores and returns the newest message over HTTP, for a polling robot;
+it also accepts every user for an XMPP server that asks it. ``… socket PORT``: parses each JSON message over WebSocket
+and sends it to all other clients.
 """
 
 import asyncio
@@ -60,7 +60,7 @@ async def _socket(port: int) -> None:
 
 
 def main(kind: str, port: str) -> None:
-    """Until it is ended."""
+    """Serves until the process is terminated."""
     asyncio.run(_web(int(port)) if kind == "web" else _socket(int(port)))
 
 

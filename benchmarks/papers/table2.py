@@ -1,4 +1,4 @@
-"""Table 2 of the UR5 paper: how long one message takes, over HTTP and XMPP as printed, and over what there is today."""
+"""Table 2 of the UR5 paper: latency of one message over HTTP and XMPP, and over current transports."""
 
 import contextlib
 import statistics
@@ -25,10 +25,10 @@ HTTP: Final = (
 XMPP: Final = (
     800, 855, 890, 815, 854, 761, 800, 894, 809, 802, 879, 821, 820, 782, 795, 894, 842, 808, 759, 805,
 )  # fmt: skip
-"""Both as printed [ms]."""
+"""Published values [ms]."""
 SAMPLES: Final = len(HTTP)
 SHOWN_RTT_MS: Final = 30
-"""Whose samples are shown one by one."""
+"""Transports whose samples are listed individually."""
 LOSS: Final = 0.02
 OURS: Final = "MQTT, mosquitto"
 EMBEDDED: Final = "MQTT, amqtt"
@@ -36,12 +36,12 @@ IN_STEP: Final = "HTTP, polled every 3 s in step"
 ANY_PHASE: Final = "HTTP, polled every 3 s"
 HELD: Final = "HTTP, our long poll"
 ROUNDS: Final = 5
-"""Turns of each way."""
+"""Rounds per transport."""
 
 
 @dataclass(frozen=True)
 class Servers:
-    """All that runs. Ports of ``web`` (polled) and ``relay`` (WebSocket) are peers'."""
+    """All running servers. ``web`` (polling) and ``relay`` (WebSocket) are reference servers."""
 
     ground: Ground
     amqtt: RunningBroker
@@ -51,19 +51,19 @@ class Servers:
 
     @property
     def mosquitto(self) -> RunningBroker:
-        """Ground's."""
+        """Port of the product."""
         return self.ground.broker.now
 
     @property
     def ports(self) -> tuple[int, ...]:
-        """Of all of them."""
+        """Returns the ports of all servers."""
         brokers = (each.port(kind) for each in (self.mosquitto, self.amqtt) for kind in TRANSPORTS)
         return (self.ground.endpoints["server"].port, self.prosody, self.web, self.relay, *brokers)
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A network, and how many samples of each way are worth their time there."""
+    """A network condition and its number of samples per transport."""
 
     rtt_ms: int
     loss: float
@@ -71,12 +71,12 @@ class Condition:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Returns the name for the report."""
         return f"{self.rtt_ms} ms" + (f", {self.loss:.0%} loss" if self.loss else "")
 
 
 def conditions(*, quick: bool) -> list[Condition]:
-    """The networks: four round trips, and in a whole run loss wherever there is a network to lose."""
+    """Returns the network conditions: four round trips, and packet loss in a full run."""
     counts = {0: 40, 15: 16, 30: 8, 100: 2} if quick else {0: 200, 15: 40, 30: 30, 100: 12}
     found = [Condition(rtt_ms, 0.0, each) for rtt_ms, each in counts.items()]
     lossy = {} if quick else {15: 40, 30: 30, 100: 12}
@@ -84,7 +84,7 @@ def conditions(*, quick: bool) -> list[Condition]:
 
 
 def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
-    """Adds tables, charts, and a claim for each round trip."""
+    """Adds tables, charts and one target per round trip to the report."""
     say("Table 2: starting")
     found: dict[Condition, dict[str, list[float]]] = {}
     with tempfile.TemporaryDirectory() as folder, servers(Path(folder)) as there:
@@ -99,7 +99,7 @@ def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
 
 @contextlib.contextmanager
 def servers(folder: Path) -> Iterator[Servers]:
-    """Start them all."""
+    """Starts all servers."""
     unlimited = {"TELESCOPE_RATE_ADDRESS": "0", "TELESCOPE_RATE_KEY": "0", "TELESCOPE_RATE_AGENT": "0"}
     web, relay = free_port(), free_port()
     with contextlib.ExitStack() as stack:
@@ -112,7 +112,7 @@ def servers(folder: Path) -> Iterator[Servers]:
 
 
 def with_condition(there: Servers, condition: Condition, *, quick: bool) -> dict[str, list[float]]:
-    """All ways in turns over one network; who polls waits meanwhile. A quick run leaves MQTT over WebSocket out."""
+    """Measures all transports interleaved over one network. A quick run omits MQTT over WebSocket."""
     with contextlib.ExitStack() as stack:
         ports: Mapping[int, int] = {port: port for port in there.ports}
         if condition.rtt_ms or condition.loss:
@@ -149,7 +149,7 @@ def _poll(stack: contextlib.ExitStack, port: int) -> dict[str, Future[list[float
 
 
 def show(report: Report, found: Mapping[Condition, Mapping[str, list[float]]]) -> None:
-    """What was found, beside what was printed."""
+    """Adds the results beside the published values."""
     shown = next(taken for each, taken in found.items() if each.rtt_ms == SHOWN_RTT_MS and not each.loss)
     report.tables.append(_one_by_one(shown))
     report.tables += [_long(condition, taken) for condition, taken in found.items()]
@@ -158,7 +158,7 @@ def show(report: Report, found: Mapping[Condition, Mapping[str, list[float]]]) -
 
 
 def claim(condition: Condition, taken: Mapping[str, list[float]]) -> Claim:
-    """Ours to the fastest of all that is not MQTT."""
+    """Returns the target: ratio of Telescope to the fastest transport without MQTT."""
     others = {name: median(each) for name, each in taken.items() if not name.startswith("MQTT")}
     best = min(others, key=lambda name: others[name])
     return Claim(
@@ -206,7 +206,7 @@ def _long(condition: Condition, taken: Mapping[str, list[float]]) -> Table:
 
 
 def _why(condition: Condition, taken: Mapping[str, list[float]]) -> str:
-    """What the order of the ways comes from."""
+    """Explains the order of the transports."""
     if condition.loss:
         return "A stall holds up what follows it on the same connection. What polls hardly notices: it waits anyway."
     slower = [name for name in (OURS, EMBEDDED) if median(taken[name]) > claim_best(taken)]
@@ -224,7 +224,7 @@ def _why(condition: Condition, taken: Mapping[str, list[float]]) -> str:
 
 
 def claim_best(taken: Mapping[str, list[float]]) -> float:
-    """The median of the fastest way that is not MQTT [ms]."""
+    """Returns the median of the fastest transport without MQTT [ms]."""
     return min(median(each) for name, each in taken.items() if not name.startswith("MQTT"))
 
 

@@ -1,5 +1,5 @@
-"""The peers' wires at the same work: one setpoint to a simulated UR5, until telemetry says that it is applied.
+"""Comparable protocols with the same task: one setpoint to a simulated UR5 until telemetry reports it as applied.
 
-``arm`` is the robot that all of them have, ``robots`` puts it behind each wire in a process of its own, ``bridge`` is
-what stands between both ends at the rosbridge-style one, and ``operators`` ask.
+``arm`` is the common robot, ``robots`` serves it over each protocol in its own process, ``bridge`` is the server of the
+rosbridge protocol, and ``operators`` contains the clients.
 """

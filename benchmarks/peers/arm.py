@@ -1,4 +1,4 @@
-"""The least robot that is fair: the product's own driver of its simulated UR5, told and asked without any check."""
+"""The common robot: the product's driver of its simulated UR5, used without any checks."""
 
 from typing import Final
 
@@ -15,14 +15,18 @@ HOME_RAD: Final = tuple(KIND.home_rad[name] for name in NAMES)
 
 
 class PeerArm:
-    """What a setpoint asks is applied at once, and told at once. No lease, no limits, no watchdog, no stop."""
+    """Applies each setpoint and reports it at once, without lease, limits, watchdog or Stop."""
 
     def __init__(self) -> None:
         self._driver = mujoco.create(KIND, FOLDER, {}, "ur5")
         self._driver.connect()
 
     def apply(self, setpoint: Setpoint) -> JointTelemetry:
-        """What the arm does with it. Raises: TypeError: It is no target for joints."""
+        """Applies a setpoint.
+
+        Raises:
+            TypeError: The target is not a joint target.
+        """
         if not isinstance(setpoint.target, JointTarget):
             raise TypeError("this arm takes joint targets")
         wanted = setpoint.target.position_rad
@@ -44,17 +48,17 @@ class PeerArm:
         )
 
     def obey(self, payload: bytes) -> bytes:
-        """The same with both as they are on our own wire."""
+        """Applies an encoded setpoint of the Telescope protocol and returns encoded telemetry."""
         return codec.encode(self.apply(codec.decode(payload, Setpoint)))
 
 
 def _told(values: tuple[float, ...]) -> tuple[float, ...]:
-    """With the digits that our own agent tells: longer text would be more to carry."""
+    """Rounds to the digits that the agent publishes; longer text would cost more."""
     return tuple(round(value, 6) for value in values)
 
 
 def setpoint(sequence: int, sent_ms: float) -> Setpoint:
-    """Hold where you are."""
+    """Returns a setpoint that holds the present position."""
     return Setpoint(
         epoch=1,
         sequence=sequence,

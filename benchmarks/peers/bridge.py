@@ -1,7 +1,7 @@
-"""The rosbridge protocol between WebSocket clients, without ROS behind it: ``subscribe`` and ``publish``.
+"""A server of the rosbridge protocol without ROS: ``subscribe`` and ``publish`` between WebSocket clients.
 
-A real rosbridge_server turns each message into ROS's own and passes it on through ROS's own network; that is left out,
-in its favour. As there, the text is parsed and written anew, Nagle's algorithm is off and nothing is compressed.
+A real rosbridge_server also converts each message and sends it through ROS; this cost is omitted in its favour. As in
+the original, messages are parsed and serialized again, Nagle's algorithm is off and compression is disabled.
 """
 
 import asyncio
@@ -15,13 +15,13 @@ from benchmarks.baseline.echo_servers import HOST
 
 
 class Bridge:
-    """Who has subscribed to what."""
+    """Keeps the subscriptions of the clients."""
 
     def __init__(self) -> None:
         self._subscribers: dict[str, set[ServerConnection]] = {}
 
     async def serve(self, client: ServerConnection) -> None:
-        """One client, until it leaves."""
+        """Serves one client until it disconnects."""
         with contextlib.suppress(ConnectionClosed):
             async for text in client:
                 await self._take(client, msgspec.json.decode(text))
@@ -39,12 +39,12 @@ class Bridge:
 
 
 async def run(port: int) -> None:
-    """Until it is ended."""
+    """Serves until the process is terminated."""
     async with serve(Bridge().serve, HOST, port, compression=None) as server:
         print("ready", flush=True)
         await server.serve_forever()
 
 
 def main(port: int) -> None:
-    """Of a process of its own."""
+    """Runs the server as a program."""
     asyncio.run(run(port))

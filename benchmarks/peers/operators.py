@@ -1,4 +1,4 @@
-"""Who asks at each peer's wire: a setpoint, until the answer on the telemetry's channel says that it is applied."""
+"""Operators of each protocol: send a setpoint and wait until telemetry reports it as applied."""
 
 import contextlib
 import json
@@ -18,16 +18,16 @@ from device_agent.protocol import JointTelemetry, codec
 
 _PROGRAM: Final = "benchmarks.peers.robots"
 _OURS: Final = 1
-"""The number of our channel, and of our subscription, in Foxglove's frames."""
+"""Ids of our channel and subscription in Foxglove frames."""
 _DATA: Final = 1
-"""Their first byte, where they bring a message."""
+"""First byte of a Foxglove message frame."""
 
 
 class PeerOperator:
-    """Paces itself as our own page does, and waits for what comes on the other channel.
+    """Sends setpoints at the console's rate and waits for telemetry.
 
     Args:
-        send: Bring one setpoint of this sequence on its way.
+        send: Sends one setpoint with this sequence number.
     """
 
     def __init__(self, send: Callable[[int], None]) -> None:
@@ -38,13 +38,17 @@ class PeerOperator:
         self._next_s = 0.0
 
     def hear(self, applied: int) -> None:
-        """The robot tells the newest setpoint that it has applied. From any thread."""
+        """Records the newest applied setpoint. Thread-safe."""
         with self._seen:
             self._applied = applied
             self._seen.notify()
 
     def exchange(self) -> float:
-        """One round [ms]. Raises: TimeoutError: Nothing came back."""
+        """Runs one exchange and returns its duration [ms].
+
+        Raises:
+            TimeoutError: No telemetry reports the setpoint.
+        """
         time.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = time.monotonic() + PERIOD_S
         began = time.perf_counter()
@@ -56,7 +60,7 @@ class PeerOperator:
         return (time.perf_counter() - began) * 1000
 
     def settle(self) -> Exchange:
-        """The exchange, once it works: a channel may be open before the other end knows of it."""
+        """Returns the exchange after a first success; a channel may open before the other end knows it."""
         ends_s = time.monotonic() + TIMEOUT_S
         while time.monotonic() < ends_s:
             with self._seen:
@@ -77,7 +81,7 @@ def _applied(payload: bytes) -> int:
 
 @contextlib.contextmanager
 def rosbridge() -> Iterator[Exchange]:
-    """Robot and operator are both clients of the bridge, as in ROS."""
+    """rosbridge: robot and operator are both clients of the bridge, as in ROS."""
     import roslibpy
 
     port = free_port()
@@ -100,7 +104,7 @@ def rosbridge() -> Iterator[Exchange]:
 
 @contextlib.contextmanager
 def zenoh() -> Iterator[Exchange]:
-    """Peer to peer over TCP."""
+    """Zenoh, peer to peer over TCP."""
     import zenoh as library
 
     port = free_port()
@@ -113,7 +117,7 @@ def zenoh() -> Iterator[Exchange]:
 
 @contextlib.contextmanager
 def grpc() -> Iterator[Exchange]:
-    """One stream, held open."""
+    """Opens one gRPC stream."""
     import grpc as library
 
     port = free_port()
@@ -123,7 +127,7 @@ def grpc() -> Iterator[Exchange]:
         operator = PeerOperator(lambda sequence: asked.put(_asked(sequence)))
 
         def listen() -> None:
-            with contextlib.suppress(library.RpcError):  # the stream's end
+            with contextlib.suppress(library.RpcError):  # end of the stream
                 for payload in told:
                     operator.hear(_applied(payload))
 
@@ -137,7 +141,7 @@ def grpc() -> Iterator[Exchange]:
 
 @contextlib.contextmanager
 def foxglove() -> Iterator[Exchange]:
-    """A client of its subprotocol: it advertises the channel of its setpoints, and subscribes to the joints'."""
+    """Foxglove WebSocket: advertises a channel for setpoints and subscribes to the joints."""
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect
     from websockets.typing import Subprotocol
@@ -169,7 +173,7 @@ def foxglove() -> Iterator[Exchange]:
 
 
 def _channel(line: Any) -> int:
-    """The number of the joints' channel, which the server advertises of its own accord."""
+    """Returns the id of the joints' channel that the server advertises."""
     while True:
         said = json.loads(line.recv(TIMEOUT_S))
         for each in said.get("channels", ()) if said["op"] == "advertise" else ():

@@ -1,6 +1,6 @@
-"""A robot behind each peer's wire: ``python -m benchmarks.peers.robots rosbridge|zenoh|grpc|foxglove PORT``.
+"""The robot of each protocol: ``python -m benchmarks.peers.robots rosbridge|zenoh|grpc|foxglove PORT``.
 
-``… bridge PORT`` is what stands between the ends of the first. Each prints ``ready`` once it is.
+``… bridge PORT`` is the rosbridge server. Each program prints ``ready`` when it accepts requests.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ METHOD: Final = ("bench.PeerArm", "Drive")
 
 
 def rosbridge(port: int) -> None:
-    """A robot's program with ``roslibpy``; both messages are ``JointState``."""
+    """Serves the robot with ``roslibpy``; both messages are ``JointState``."""
     import roslibpy
 
     arm, ros = PeerArm(), roslibpy.Ros(host=HOST, port=port)
@@ -35,13 +35,13 @@ def rosbridge(port: int) -> None:
 
 
 def from_ros(asked: Mapping[str, Any]) -> Setpoint:
-    """A ``JointState`` that asks."""
+    """Converts a ``JointState`` to a setpoint."""
     wanted = JointTarget(position_rad=dict(zip(asked["name"], asked["position"], strict=True)))
     return Setpoint(epoch=1, sequence=asked["header"]["seq"], echo_tick_ms=0, sent_ms=0.0, target=wanted)
 
 
 def to_ros(told: JointTelemetry) -> dict[str, Any]:
-    """A ``JointState`` that tells."""
+    """Converts telemetry to a ``JointState``."""
     seconds, rest_ms = divmod(told.at_ms, 1000)
     return {
         "header": {"seq": told.setpoint_sequence, "stamp": {"secs": seconds, "nsecs": rest_ms * 1_000_000}},
@@ -53,7 +53,7 @@ def to_ros(told: JointTelemetry) -> dict[str, Any]:
 
 
 def zenoh(port: int) -> None:
-    """A peer that listens: no router between the ends."""
+    """A listening peer; no router in between."""
     import zenoh as library
 
     with library.open(zenoh_peer(listen=port)) as session:
@@ -63,7 +63,7 @@ def zenoh(port: int) -> None:
 
 
 def zenoh_peer(*, listen: int = 0, connect: int = 0) -> Any:
-    """A configuration that speaks TCP on loopback alone, and looks for nobody."""
+    """A configuration with TCP on loopback only and without discovery."""
     import zenoh as library
 
     chosen = library.Config()

@@ -26,5 +26,5 @@ not measured here. – is left to whoever builds on it. Of the figures above, on
 
 
 def table() -> Table:
-    """As the page shows it."""
+    """Returns the row for the results page."""
     return Table(title="And what is in it", columns=COLUMNS, rows=[list(row) for row in _ROWS], note=_NOTE)

@@ -1,7 +1,7 @@
-"""The agent's own program, with one more driver, ``light``, and somebody who looks at its control loops.
+"""The agent with the additional driver ``light`` and an observer of its control loops.
 
-``python -m benchmarks.scale.agent RATE_HZ -- …``: what follows is what ``device_agent`` takes. For each line with
-seconds on standard input it watches for so long, and prints what it has seen as JSON behind ``seen``: ``LoopStatistics``.
+``python -m benchmarks.scale.agent RATE_HZ -- …`` passes the remaining arguments to ``device_agent``. For each line with a
+number of seconds on standard input it observes for that time and prints ``seen`` and ``LoopStatistics`` as JSON.
 """
 
 import sys

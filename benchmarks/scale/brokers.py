@@ -51,7 +51,7 @@ class Run(msgspec.Struct):
         return not self.lost and self.heard.p99_ms <= LATE_MS and self.told.late_ms <= LATE_MS
 
     def row(self) -> list[Cell]:
-        """As the page shows it."""
+        """Returns the row for the results page."""
         told, heard = self.told, self.heard
         percent = [100 * spent / told.took_s for spent in (self.broker_s, told.processor_s, heard.processor_s)]
         return [
@@ -130,7 +130,7 @@ def answer(process: "subprocess.Popen[str]", line: str) -> str:
 
 
 def table(runs: list[Run]) -> Table:
-    """What was found."""
+    """Returns the table of results."""
     size = runs[0].told.message_bytes
     note = f"""{ROBOTS} connections in one program, one subscriber at QoS 0 in another, the broker as the
 product starts it: three programs on two cores. A message is what the simulated UR5 tells, {size:,} bytes with

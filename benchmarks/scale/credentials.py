@@ -20,7 +20,7 @@ WHOLE: Final = 600
 
 
 def measure(most: int) -> list[dict[str, float]]:
-    """Each further hundred agents, until there are so many."""
+    """Adds 100 agents at a time up to a number."""
     found: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as folder, start_broker("mosquitto", Path(folder)) as broker:
         before_s = processor_s(broker.process.pid)
@@ -35,7 +35,7 @@ def measure(most: int) -> list[dict[str, float]]:
 
 
 def table(steps: list[dict[str, float]]) -> Table:
-    """What was found."""
+    """Returns the table of results."""
     note = """Rights for one more agent, after so many: mosquitto's dynamic security writes all of them to its file at
 each of two commands. What that means for a site: [scale.md](scale.md)."""
     rows: list[list[Cell]] = [[int(step["known"]), step["processor_ms_each"]] for step in steps]

@@ -1,4 +1,4 @@
-"""The API by 1, 2 and 4 processes over one store, against a bare FastAPI application under the same clients."""
+"""The API with 1, 2 and 4 processes over one store, compared with a bare FastAPI application."""
 
 import contextlib
 import json
@@ -38,7 +38,7 @@ COLUMNS: Final = [
 
 
 class Load(msgspec.Struct):
-    """One kind of request for some seconds."""
+    """Result of one kind of request over some seconds."""
 
     processes: int
     what: str
@@ -46,7 +46,7 @@ class Load(msgspec.Struct):
     server_s: float
 
     def row(self) -> list[Cell]:
-        """As the page shows it."""
+        """Returns the row for the results page."""
         found = self.answered
         return [
             self.processes, self.what, found.answer_bytes, found.per_s, found.p50_ms, found.p99_ms,
@@ -59,11 +59,11 @@ Ask = Callable[[float], Load]
 
 
 class FunctionsUnderTest:
-    """A started product and more processes of its functions.
+    """A running product with additional processes of its functions.
 
     Args:
         stand: The product.
-        stack: Ends what is started.
+        stack: Stops what is started.
     """
 
     def __init__(self, stand: MeasuredProduct, stack: contextlib.ExitStack) -> None:
@@ -74,7 +74,7 @@ class FunctionsUnderTest:
         self.ports = [stand.machine.port]
 
     def grow(self, count: int) -> None:
-        """Until there are so many processes."""
+        """Starts processes up to a number."""
         while len(self.pids) < count:
             port = free_port()
             process = self._stack.enter_context(_functions(self._stand, port))
@@ -82,17 +82,17 @@ class FunctionsUnderTest:
             self.pids.append(process.pid)
 
     def ask(self, what: str, processes: int, requests: list[Request], stack: contextlib.ExitStack) -> Ask:
-        """Clients of the first so many processes, connected."""
+        """Returns connected clients of the first processes."""
         return clients(stack, what, self.ports[:processes], self.pids[:processes], requests)
 
     def read(self, what: str, processes: int, stack: contextlib.ExitStack) -> Ask:
-        """Those that read."""
+        """Returns clients that read."""
         path = "/api/v1/devices" if what == LIST else f"/api/v1/devices/{self.device['id']}"
         return self.ask(what, processes, [Request("GET", path, self._stand.token)], stack)
 
 
 def clients(stack: contextlib.ExitStack, what: str, ports: list[int], pids: list[int], requests: list[Request]) -> Ask:
-    """Clients of some servers."""
+    """Starts clients for some servers."""
     asker = stack.enter_context(program("askers", HttpLoad(ports, CONNECTIONS, requests)))
 
     def ask(seconds: float) -> Load:
@@ -105,7 +105,7 @@ def clients(stack: contextlib.ExitStack, what: str, ports: list[int], pids: list
 
 @contextlib.contextmanager
 def _functions(stand: MeasuredProduct, port: int) -> Iterator["subprocess.Popen[bytes]"]:
-    """One more process of the functions over the product's store, once it answers."""
+    """Starts one more process of the functions and returns when it responds."""
     first = stand.machine.port
     environment = (
         os.environ
@@ -140,7 +140,7 @@ def _healthy(port: int) -> bool:
 
 
 def measure(site: FunctionsUnderTest, *, quick: bool, say: Callable[[str], None]) -> tuple[list[Load], list[Load]]:
-    """Reads by one process and those of the bare application beside them, in turns; then by more processes."""
+    """Measures reads of one process interleaved with the bare application, then of more processes."""
     seconds, rounds = (1.5, 3) if quick else (2.5, 5)
     with contextlib.ExitStack() as stack:
         turns = {what: site.read(what, 1, stack) for what in (LIST, ONE)}
@@ -165,7 +165,7 @@ def measure(site: FunctionsUnderTest, *, quick: bool, say: Callable[[str], None]
 
 @contextlib.contextmanager
 def started() -> Iterator[tuple[MeasuredProduct, FunctionsUnderTest]]:
-    """The product with one simulated UR5 over mosquitto, as fast as it is asked."""
+    """Runs the product with one simulated UR5 over mosquitto, without rate limits."""
     with contextlib.ExitStack() as stack:
         home = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         stand = stack.enter_context(start(home, "mosquitto", **UNLIMITED))
@@ -173,20 +173,20 @@ def started() -> Iterator[tuple[MeasuredProduct, FunctionsUnderTest]]:
 
 
 def bare(stack: contextlib.ExitStack, length: int) -> Ask:
-    """The bare application: as many bytes of JSON, by the same framework and server."""
+    """Runs the bare application: the same number of JSON bytes, framework and server."""
     port = free_port()
     process = stack.enter_context(start_peer("benchmarks.baseline.echo_servers", "http", str(port)))
     return clients(stack, BARE, [port], [process.pid], [Request("GET", f"/sized/{length}")])
 
 
 def median_of(loads: list[Load]) -> Load:
-    """The run in the middle, by requests a second."""
+    """Returns the median run by requests per second."""
     wanted = statistics.median_low([load.answered.per_s for load in loads])
     return next(load for load in loads if load.answered.per_s == wanted)
 
 
 def table(one: list[Load], more: list[Load]) -> Table:
-    """Of all."""
+    """Returns the table of all runs."""
     note = f"""{CONNECTIONS} connections that ask one request after the other, in one program, spread over the
 processes: p50 and p99 are of a server that is full. Processes and clients share two cores: two processes are no
 faster than what the clients leave of the second allows, and four show what more of them cost. Each reads by an
@@ -196,7 +196,7 @@ as many bytes and looks at nothing. Of one process and the bare one, which took 
 
 
 def chart(one: list[Load], more: list[Load]) -> Chart:
-    """Requests a second, by processes."""
+    """Returns the chart of requests per second by number of processes."""
     per_s = {(load.what, load.processes): load.answered.per_s for load in one + more}
     return Chart(
         title="Authenticated reads over one store, two cores",
@@ -210,7 +210,7 @@ def chart(one: list[Load], more: list[Load]) -> Chart:
 
 
 def actions_table(loads: list[Load]) -> Table:
-    """Of actions that are started."""
+    """Returns the table of started actions."""
     note = """The same clients, each with arms of a swarm of its own, and on to the next action when one is
 done: identity, role, slot and action in one write, signature, publish, the robot's answers, and their writes.
 The arms are where they are asked to be, and notice it at their next measurement, within 50 ms. Swarm, broker
@@ -221,7 +221,7 @@ and the worker that takes in what robots tell run on the same cores."""
 
 
 def claims(one: list[Load]) -> list[Claim]:
-    """Of one process."""
+    """Returns the targets for one process."""
     by_name = {load.what: load.answered.per_s for load in one}
     return [
         Claim(

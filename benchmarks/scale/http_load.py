@@ -1,7 +1,7 @@
-"""HTTP clients that cost little: ``python -m benchmarks.scale.http_load``, a program of its own.
+"""Low-cost HTTP clients: ``python -m benchmarks.scale.http_load``.
 
-Reads one line of JSON, ``HttpLoad``, connects, prints ``ready``. For each further line with seconds, all connections ask
-one request after the other for so long; then it prints what came back as JSON: ``HttpLoadResult``.
+The program reads one line of JSON (``HttpLoad``), connects and prints ``ready``. For each further line with a number of
+seconds, all connections send requests one after another for that time. Then it prints ``HttpLoadResult`` as JSON.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ _STATUS: Final = slice(9, 12)
 
 
 class Request(msgspec.Struct):
-    """What is asked."""
+    """One request."""
 
     method: str
     path: str
@@ -28,7 +28,7 @@ class Request(msgspec.Struct):
     body: str = ""
 
     def encode(self) -> bytes:
-        """As it goes out."""
+        """Returns the encoded request."""
         body = self.body.encode()
         login = f"Authorization: Bearer {self.token}\r\n" if self.token else ""
         kind = f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n" if body else ""
@@ -36,7 +36,7 @@ class Request(msgspec.Struct):
 
 
 class HttpLoad(msgspec.Struct):
-    """So many connections, spread over the ports. Each has its part of the requests, or all where there are fewer."""
+    """Connections spread over the ports. Requests are divided among the connections if there are enough of them."""
 
     ports: list[int]
     connections: int
@@ -44,7 +44,7 @@ class HttpLoad(msgspec.Struct):
 
 
 class HttpLoadResult(msgspec.Struct):
-    """What came back; ``refused`` counts all but 2xx by status, ``refusal`` is the last of them."""
+    """Result; ``refused`` counts responses other than 2xx by status, ``refusal`` is the last of them."""
 
     count: int
     per_s: float
@@ -58,7 +58,7 @@ class HttpLoadResult(msgspec.Struct):
 
 
 class RawHttpConnection(asyncio.Protocol):
-    """One connection, one request at a time."""
+    """One connection with one request at a time."""
 
     def __init__(self, requests: list[bytes]) -> None:
         self._requests = requests
@@ -70,7 +70,7 @@ class RawHttpConnection(asyncio.Protocol):
         self.begin(0.0)
 
     def begin(self, ends_s: float) -> None:
-        """Ask until then; counts begin anew."""
+        """Resets the counts and sends requests until a time."""
         self.taken: list[float] = []
         self.refused: dict[str, int] = {}
         self.refusal = ""
@@ -81,17 +81,17 @@ class RawHttpConnection(asyncio.Protocol):
             self._ask()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """As asyncio wants it."""
+        """Handles the connection (asyncio protocol)."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
 
     def connection_lost(self, _error: Exception | None) -> None:
-        """It counts as the end."""
+        """Treats a lost connection as the end of the run."""
         if not self.done.done():
             self.done.set_exception(ConnectionError("the server has hung up"))
 
     def data_received(self, data: bytes) -> None:
-        """A part of an answer, mostly all of it."""
+        """Handles a part of a response, usually the whole."""
         self._came += data
         head = self._came.find(b"\r\n\r\n")
         if head < 0:
@@ -121,7 +121,7 @@ class RawHttpConnection(asyncio.Protocol):
 
 
 async def send_request(lines: list[RawHttpConnection], seconds: float) -> HttpLoadResult:
-    """All at once, each as fast as it is answered."""
+    """Runs all connections concurrently, each as fast as responses arrive."""
     spent_s, began_s = time.process_time(), time.perf_counter()
     for line in lines:
         line.begin(began_s + seconds)
@@ -146,7 +146,7 @@ async def send_request(lines: list[RawHttpConnection], seconds: float) -> HttpLo
 
 
 async def run() -> None:
-    """Until standard input ends."""
+    """Runs until standard input ends."""
     loop = asyncio.get_running_loop()
     asked = msgspec.json.decode(sys.stdin.readline(), type=HttpLoad)
     requests, lines = [each.encode() for each in asked.requests], []

@@ -1,4 +1,4 @@
-"""A driver without physics: the arm is where it was told to be. What is left is what the agent itself costs."""
+"""A driver without physics: the arm is always at its commanded position. The rest is the cost of the agent."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ _SOMEWHERE: Final[Pose] = (0.123456, 0.234567, 0.345678, 0.707107, 0.0, 0.707107
 
 
 class LightArm:
-    """A ``Driver`` of joints alone."""
+    """A ``Driver`` with joints only."""
 
     simulated = True
 
@@ -22,25 +22,25 @@ class LightArm:
         self._frames = (_SOMEWHERE,) * len(kind.frames)
 
     def connect(self) -> None:
-        """As the port says."""
+        """Implements the port."""
 
     def twin(self) -> Twin | None:
-        """As the port says: there is nothing to draw."""
+        """Implements the port; there is no drawing."""
         return None
 
     def observe(self) -> Observation:
-        """As the port says."""
+        """Implements the port."""
         return Observation(self._position_rad, self._still, self._still, self._frames)
 
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
-        """As the port says."""
+        """Implements the port."""
         self._position_rad = tuple(position_rad)
         return self._position_rad
 
     def close(self) -> None:
-        """As the port says."""
+        """Implements the port."""
 
 
 def create(robot_type: RobotType, _folder: Path, _options: Mapping[str, object], _device: str) -> LightArm:
-    """As ``drivers.load`` wants it."""
+    """Creates the driver for ``drivers.load``."""
     return LightArm(robot_type)

@@ -1,4 +1,4 @@
-"""A swarm through the product: connections, messages, what is lost, actions through the store, and memory."""
+"""Load test of the product with many agents: connections, messages, losses, actions and memory."""
 
 import contextlib
 import json
@@ -27,12 +27,12 @@ from tests.harness.paths import ROOT
 
 QUICK: Final = ((100, 5.0, 0.02),)
 WHOLE: Final = ((100, 5.0, 0.02), (300, 5.0, 0.02), (1000, 2.0, 0.07))
-"""Agents, the measurements of each a second, and the time from one's connecting to the next one's [s]."""
+"""Number of agents, measurements per second and agent, and interval between two connects [s]."""
 EVERY_S: Final = 1.0
 ARMS: Final = 60
-"""Of those that take actions: several for each client."""
+"""Agents that receive actions: several per client."""
 ARMS_HZ: Final = 20.0
-"""They notice at their next measurement that they have arrived."""
+"""An agent notices its arrival at the next measurement."""
 COLUMNS: Final = [
     "agents", "Hz", "made known in s", "connected", "connects/s", "messages/s", "lost", "p50 ms", "p99 ms", "most ms",
     "broker, % of a core", "swarm, %", "broker MB", "functions MB", "swarm kB an agent",
@@ -40,7 +40,7 @@ COLUMNS: Final = [
 
 
 class LoadTestResult(msgspec.Struct):
-    """One run. ``figures`` is what the swarm says of itself."""
+    """Result of one run. ``figures`` is the summary of the load generator."""
 
     known_s: float
     connects_per_s: float
@@ -54,17 +54,17 @@ class LoadTestResult(msgspec.Struct):
 
     @property
     def measured(self) -> int:
-        """Measurements that it sent: all that is not told at QoS 1."""
+        """Sent measurements: all messages with QoS 0."""
         counts: dict[str, int] = self.figures["counts"]
         return counts["out"] - counts["asked"]
 
     @property
     def lost(self) -> int:
-        """Measurements that the subscriber did not get."""
+        """Measurements that the subscriber did not receive."""
         return self.measured - self.heard.count
 
     def row(self) -> list[Cell]:
-        """As the page shows it."""
+        """Returns the row for the results page."""
         told, heard = self.figures, self.heard
         return [
             told["agents"], told["rate_hz"], self.known_s, told["most_connected"], self.connects_per_s,
@@ -74,7 +74,7 @@ class LoadTestResult(msgspec.Struct):
         ]  # fmt: skip
 
     def kept(self) -> dict[str, Any]:
-        """As the sheet on paper reads it."""
+        """Returns the values for the cost model."""
         return {
             "broker": "mosquitto",
             "on": datetime.now(UTC).date().isoformat(),
@@ -88,11 +88,11 @@ class LoadTestResult(msgspec.Struct):
 
 
 class LoadTest:
-    """A swarm that lives for some seconds, with a subscriber beside it.
+    """A load generator that runs for some seconds, with one subscriber.
 
     Args:
         stand: The product.
-        home: Where its keys are: the next one of the same home is known already.
+        home: Folder of the agents' keys; a later run with the same folder uses the same agents.
     """
 
     def __init__(self, stand: MeasuredProduct, home: Path) -> None:
@@ -101,7 +101,7 @@ class LoadTest:
 
     @contextlib.contextmanager
     def living(self, count: int, rate_hz: float, seconds: float, gap_s: float) -> Iterator["subprocess.Popen[str]"]:
-        """It, while it connects and lives."""
+        """Runs the load generator while it connects and publishes."""
         with subprocess.Popen(
             [
                 sys.executable, "-m", "device_agent", "swarm", "--cloud", self._stand.machine.url,
@@ -118,10 +118,10 @@ class LoadTest:
                 yield process
             finally:
                 process.terminate()
-                process.communicate()  # it says goodbye
+                process.communicate()  # it announces its end
 
     def run(self, count: int, rate_hz: float, gap_s: float, seconds: float) -> LoadTestResult:
-        """From the first key to the last word."""
+        """Measures the run from the first key to the last message."""
         everything = topics.device(topics.ANY, topics.ANY, DEVICE, topics.TELE, topics.ANY)
         ear = SubscriberOptions(
             self._stand.mqtt_port, *self._stand.rights(subscribe=(everything,)), everything, wall=True
@@ -151,7 +151,7 @@ class LoadTest:
 
 
 class _Progress:
-    """When the first agents connected, and the last: the swarm says a line a second."""
+    """Times of the first and the last connection; the load generator prints one line per second."""
 
     def __init__(self, process: "subprocess.Popen[str]", count: int) -> None:
         self._process = process
@@ -164,7 +164,7 @@ class _Progress:
         self._look(line)
 
     def wait(self) -> None:
-        """Until all are connected, or it has ended."""
+        """Waits until all agents are connected or the program has ended."""
         while not self.all_s and (line := self._line()):
             self._look(line)
 
@@ -180,7 +180,7 @@ class _Progress:
 def actions(
     site: FunctionsUnderTest, stand: MeasuredProduct, home: Path, *, seconds: float, processes: tuple[int, ...]
 ) -> list[Load]:
-    """As many as are taken, by so many processes, for the arms of a swarm, which are where they are asked to be."""
+    """Measures accepted actions per second for arms that reach each target at once."""
     found = []
     longest_s = len(processes) * (seconds + 1) + TIMEOUT_S
     with contextlib.ExitStack() as stack, LoadTest(stand, home).living(ARMS, ARMS_HZ, longest_s, 0.02) as process:
@@ -198,7 +198,7 @@ def actions(
 
 
 def _there(stand: MeasuredProduct) -> list[str]:
-    """Ids of the arms that are online: others of an earlier swarm are known too."""
+    """Returns the ids of the arms that are online; the list also contains agents of earlier runs."""
     found: list[str] = []
     query: dict[str, Any] = {"limit": 1000}
     with Api(stand.machine) as owner:
@@ -211,7 +211,7 @@ def _there(stand: MeasuredProduct) -> list[str]:
 
 
 def table(runs: list[LoadTestResult]) -> Table:
-    """What was found."""
+    """Returns the table of results."""
     note = """`python -m device_agent swarm`: agents that are real ones on the wire, in one process, without
 physics, at the product over mosquitto; one subscriber to all that they measure. *Made known*: keys, enrolment
 and claim of those that were not known yet, over HTTP. *Connects*: credentials and the connection, at the pace

@@ -1,4 +1,4 @@
-"""What one more connection costs a broker, and the functions."""
+"""Memory of one more connection at a broker and at the functions."""
 
 import contextlib
 import socket
@@ -21,7 +21,7 @@ _ANSWER: Final = 65_536
 
 
 def measure(site: FunctionsUnderTest, *, quick: bool, say: Callable[[str], None]) -> Table:
-    """Connections that do nothing, more and more of them."""
+    """Opens an increasing number of idle connections."""
     steps = (100,) if quick else (100, 200, 400)
     rows: list[list[Cell]] = []
     for kind in BROKERS:
@@ -35,7 +35,7 @@ have each asked once."""
 
 
 def broker(kind: BrokerKind, steps: tuple[int, ...]) -> list[list[Cell]]:
-    """A broker's, as the product starts it."""
+    """Measures a broker with the product's configuration."""
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         running = stack.enter_context(start_broker(kind, folder))
@@ -50,12 +50,12 @@ def broker(kind: BrokerKind, steps: tuple[int, ...]) -> list[list[Cell]]:
                 lines.append(stack.enter_context(line))
                 mqtt_packets.subscribe(line, topic)
 
-        grow(1)  # the functions' own connection, by which rights are given, is there from the first on
+        grow(1)  # the connection of the functions that issues permissions exists from the start
         return _rows(kind, running.process.pid, steps, grow)
 
 
 def functions(site: FunctionsUnderTest, steps: tuple[int, ...]) -> list[list[Cell]]:
-    """One process of the functions."""
+    """Measures one process of the functions."""
     with contextlib.ExitStack() as stack:
         lines: list[socket.socket] = []
         asked = Request("GET", "/api/v1/nothing").encode()

@@ -1,6 +1,6 @@
-"""MQTT 3.1.1 as far as a generator of load needs it. A library's client would be what is measured.
+"""MQTT 3.1.1 packets for the load generator. A library's client would dominate the measurement.
 
-Numbers are those of the standard, chapters 2 and 3.
+Numbers come from chapters 2 and 3 of the standard.
 """
 
 import socket
@@ -19,7 +19,7 @@ _MORE: Final = 0x80
 
 
 def packet(kind: int, body: bytes) -> bytes:
-    """With its length before it."""
+    """Encodes with a length prefix."""
     length, head = len(body), bytearray([kind])
     while True:
         length, low = divmod(length, _MORE)
@@ -29,13 +29,13 @@ def packet(kind: int, body: bytes) -> bytes:
 
 
 def text(value: str) -> bytes:
-    """With its length before it."""
+    """Encodes with a length prefix."""
     encoded = value.encode()
     return struct.pack("!H", len(encoded)) + encoded
 
 
 def packets(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
-    """Those that are whole, as kind and body; they are taken from the buffer."""
+    """Removes the complete packets from the buffer and yields their type and body."""
     while len(buffer) > 1:
         length, shift, at = 0, 0, 1
         while at < len(buffer):
@@ -54,12 +54,16 @@ def packets(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
 
 
 def payload(body: bytes) -> bytes:
-    """Of a PUBLISH at QoS 0."""
+    """Returns the payload of a PUBLISH with QoS 0."""
     return body[2 + int.from_bytes(body[:2]) :]
 
 
 def connect(port: int, client: str, user: str, password: str) -> socket.socket:
-    """A connection that the broker has taken. Raises: ConnectionError: It has not."""
+    """Opens an accepted connection.
+
+    Raises:
+        ConnectionError: The broker rejected the connection.
+    """
     line = socket.create_connection((HOST, port), TIMEOUT_S)
     line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     head = text("MQTT") + struct.pack("!BBH", 4, _CLEAN_WITH_LOGIN, _KEEP_ALIVE_S)
@@ -69,13 +73,17 @@ def connect(port: int, client: str, user: str, password: str) -> socket.socket:
 
 
 def subscribe(line: socket.socket, topic: str) -> None:
-    """At QoS 0. Raises: ConnectionError: Refused."""
+    """Subscribes with QoS 0.
+
+    Raises:
+        ConnectionError: The broker rejected the subscription.
+    """
     line.sendall(packet(_SUBSCRIBE, struct.pack("!H", 1) + text(topic) + b"\0"))
     _expect(line, _SUBACK)
 
 
 def _expect(line: socket.socket, wanted: int) -> None:
-    """The broker's word, which ends with 0 for yes."""
+    """Reads the acknowledgement, which ends with 0 on success."""
     heard = bytearray()
     while True:
         came = line.recv(1024)

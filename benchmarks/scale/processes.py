@@ -1,4 +1,4 @@
-"""What a program costs, with all that it has started, from ``/proc``."""
+"""Processor time and memory of a program and its children, from ``/proc``."""
 
 import os
 from pathlib import Path
@@ -7,12 +7,12 @@ _TICKS_S = os.sysconf("SC_CLK_TCK")
 
 
 def family(process: int) -> list[int]:
-    """A process and what descends from it."""
+    """Returns a process and its descendants."""
     parents: dict[int, int] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
-        except OSError:  # it has ended
+        except OSError:  # the process has ended
             continue
         parents[int(stat.parent.name)] = int(fields[1])
     found = [process]
@@ -22,7 +22,7 @@ def family(process: int) -> list[int]:
 
 
 def processor_s(process: int) -> float:
-    """Processor time that a process and its children have had [s]."""
+    """Returns the processor time of a process and its children [s]."""
     total = 0
     for each in family(process):
         try:
@@ -35,7 +35,7 @@ def processor_s(process: int) -> float:
 
 
 def resident_mb(process: int) -> float:
-    """Memory of a process and its children [MB]; what several share counts once for each of them by its part."""
+    """Returns the proportional memory of a process and its children [MB]."""
     total = 0.0
     for each in family(process):
         try:

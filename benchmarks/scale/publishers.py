@@ -1,7 +1,7 @@
-"""Robots that only tell: ``python -m benchmarks.scale.publishers``, a program of its own for as many connections as asked.
+"""Robots that only publish: ``python -m benchmarks.scale.publishers``.
 
-Reads one line of JSON, ``PublisherOptions``, connects, prints ``ready``. Then for each line with a rate and seconds it publishes,
-and prints what it did as JSON: ``PublisherResult``. A broker that takes nothing any more makes it late.
+The program reads one line of JSON (``PublisherOptions``), connects and prints ``ready``. For each further line with a
+rate and a time it publishes and prints ``PublisherResult`` as JSON. A saturated broker makes it late.
 """
 
 import random
@@ -18,12 +18,12 @@ from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.protocol import JointTelemetry, Mode, Pose, codec
 
 SENT: Final = b'"setpoint_sent_ms":'
-"""Before the moment at which it was sent [ms], of the clock that all processes of a machine share."""
+"""Marks the send time [ms] on the common clock of the machine's processes."""
 _POSES: Final = 7
 
 
 class Robot(msgspec.Struct):
-    """Who publishes where."""
+    """One publisher and its topic."""
 
     client: str
     user: str
@@ -32,14 +32,14 @@ class Robot(msgspec.Struct):
 
 
 class PublisherOptions(msgspec.Struct):
-    """All of them."""
+    """All publishers."""
 
     port: int
     robots: list[Robot]
 
 
 class PublisherResult(msgspec.Struct):
-    """What was done. ``late_ms``: 99 % of the messages went out within this after they were due."""
+    """Result. ``late_ms``: 99 % of the messages were sent within this time after they were due."""
 
     sent: int
     late_ms: float
@@ -49,7 +49,7 @@ class PublisherResult(msgspec.Struct):
 
 
 def telemetry() -> bytes:
-    """As the simulated UR5 tells: six joints, the poses of seven frames."""
+    """Telemetry like that of the simulated UR5: six joints and seven frames."""
     chance = random.Random(1)
 
     def some(count: int) -> tuple[float, ...]:
@@ -72,7 +72,7 @@ def telemetry() -> bytes:
 
 
 def publish(lines: list[tuple[socket.socket, str]], rate_hz: float, seconds: float) -> PublisherResult:
-    """All of them in turn, each ``rate_hz`` times a second."""
+    """Publishes for all robots in turn, each at ``rate_hz``."""
     before, after = telemetry().split(SENT + b"-1.0")
     made = [(line, mqtt_packets.text(topic) + before + SENT) for line, topic in lines]
     count, gap_s = round(len(made) * rate_hz * seconds), 1 / (len(made) * rate_hz)
@@ -100,7 +100,7 @@ def publish(lines: list[tuple[socket.socket, str]], rate_hz: float, seconds: flo
 
 
 def main() -> None:
-    """Until standard input ends."""
+    """Runs until standard input ends."""
     fleet = msgspec.json.decode(sys.stdin.readline(), type=PublisherOptions)
     lines = [
         (mqtt_packets.connect(fleet.port, each.client, each.user, each.password), each.topic) for each in fleet.robots

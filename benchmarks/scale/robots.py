@@ -1,4 +1,4 @@
-"""How many robots one agent serves: processor, memory, and how late its control loops come."""
+"""Number of robots per agent: processor time, memory and lateness of the control loops."""
 
 import contextlib
 import subprocess
@@ -21,7 +21,7 @@ from tests.harness.paths import ROOT
 
 Kind = Literal["light", "simulated"]
 PERIOD_MS: Final = 8.0
-"""The UR5's."""
+"""Control period of the UR5."""
 WHOLE: Final[tuple[tuple[Kind, float, int, tuple[int, ...]], ...]] = (
     ("light", 50.0, 1, (1, 8, 32, 64)),
     ("light", 20.0, 1, (64,)),
@@ -30,7 +30,7 @@ WHOLE: Final[tuple[tuple[Kind, float, int, tuple[int, ...]], ...]] = (
     ("simulated", 20.0, 1, (24,)),
     ("simulated", 50.0, 2, (12,)),
 )
-"""What they are, telemetry's rate [Hz], how many agents, and how many robots each of them has."""
+"""Kind of robot, telemetry rate [Hz], number of agents and robots per agent."""
 QUICK: Final[tuple[tuple[Kind, float, int, tuple[int, ...]], ...]] = (
     ("light", 50.0, 1, (8,)),
     ("simulated", 50.0, 1, (4,)),
@@ -45,7 +45,7 @@ COLUMNS: Final = [
 
 
 class AgentProcess(msgspec.Struct):
-    """Robots of one agent, or of some agents beside each other; what is late is that of the latest of them."""
+    """Robots of one or several agents; the lateness is that of the worst agent."""
 
     kind: Kind
     rate_hz: float
@@ -57,11 +57,11 @@ class AgentProcess(msgspec.Struct):
 
     @property
     def in_time(self) -> bool:
-        """99 of 100 decisions come less than a period late."""
+        """True if 99 % of the decisions are less than one period late."""
         return self.seen.late_p99_ms < PERIOD_MS
 
     def row(self, alone_mb: float | None) -> list[Cell]:
-        """As the page shows it; ``alone_mb`` is what one robot's agent takes."""
+        """Returns the row for the results page; ``alone_mb`` is the memory of an agent with one robot."""
         each = None if alone_mb is None or self.count == 1 else (self.mb - alone_mb) / (self.count - 1)
         return [
             f"{self.agents} × {self.count}", self.kind, self.rate_hz, self.percent,
@@ -71,7 +71,7 @@ class AgentProcess(msgspec.Struct):
 
 
 def measure(stand: MeasuredProduct, *, quick: bool, say: Callable[[str], None]) -> list[AgentProcess]:
-    """More and more robots, until they are late."""
+    """Adds robots until they are late."""
     found: list[AgentProcess] = []
     for kind, rate_hz, agents, counts in QUICK if quick else WHOLE:
         for count in counts:
@@ -86,7 +86,7 @@ def measure(stand: MeasuredProduct, *, quick: bool, say: Callable[[str], None]) 
 
 
 def crew(stand: MeasuredProduct, kind: Kind, rate_hz: float, agents: int, count: int) -> AgentProcess:
-    """Agents with so many each, watched for some seconds."""
+    """Runs agents with a number of robots each and observes them for some seconds."""
     with contextlib.ExitStack() as stack:
         homes = [Path(stack.enter_context(tempfile.TemporaryDirectory())) for _ in range(agents)]
         for home in homes:
@@ -105,7 +105,7 @@ def crew(stand: MeasuredProduct, kind: Kind, rate_hz: float, agents: int, count:
 
 
 def pair(stand: MeasuredProduct, home: Path, kind: Kind, count: int) -> None:
-    """Enrolled, and claimed by the demo account: a key of the API may not."""
+    """Enrols an agent and claims it with the demo account; an API key may not claim."""
     driver = f":{LIGHT}" if kind == "light" else ""
     devices = [word for number in range(count) for word in ("--device", f"arm_{number}=ur5{driver}")]
     server = ("--server", stand.machine.url, "--name", "AgentProcess", "--no-wait", "--no-qr")
@@ -119,13 +119,13 @@ def pair(stand: MeasuredProduct, home: Path, kind: Kind, count: int) -> None:
 
 
 def program(rate_hz: float) -> list[str]:
-    """The agent, watched."""
+    """Returns the command of the observed agent."""
     return [sys.executable, "-m", "benchmarks.scale.agent", str(rate_hz), DIVIDER]
 
 
 @contextlib.contextmanager
 def running(home: Path, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
-    """The agent, once its robots run."""
+    """Starts the agent and returns when its robots run."""
     with (
         (home / "log").open("w") as log,
         subprocess.Popen(
@@ -145,7 +145,7 @@ def running(home: Path, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
 
 
 def watch(process: "subprocess.Popen[str]", seconds: float) -> LoopStatistics:
-    """What its loops do from now on."""
+    """Observes the control loops from now on."""
     assert process.stdin is not None
     process.stdin.write(f"{seconds}\n")
     process.stdin.flush()
@@ -153,7 +153,11 @@ def watch(process: "subprocess.Popen[str]", seconds: float) -> LoopStatistics:
 
 
 def said(process: "subprocess.Popen[str]", beginning: str) -> str:
-    """The next line that begins so. Raises: RuntimeError: It ended."""
+    """Returns the next line with a prefix.
+
+    Raises:
+        RuntimeError: The program ended.
+    """
     assert process.stdout is not None
     for line in process.stdout:
         if line.startswith(beginning):
@@ -162,7 +166,7 @@ def said(process: "subprocess.Popen[str]", beginning: str) -> str:
 
 
 def chart(found: list[AgentProcess]) -> Chart | None:
-    """How late they come, where there is more than one number of them."""
+    """Returns the chart of lateness by number of robots."""
     one = [each for each in found if each.agents == 1 and each.rate_hz == CHARTED_HZ]
     counts = sorted({each.count for each in one})
     kinds = {each.kind for each in one}
@@ -182,7 +186,7 @@ def chart(found: list[AgentProcess]) -> Chart | None:
 
 
 def ceilings(found: list[AgentProcess]) -> list[str]:
-    """Where more than one number of them was tried, the most that were in time."""
+    """Returns the largest number of robots without lateness, per series."""
     tried: dict[tuple[int, Kind, float], list[AgentProcess]] = {}
     for each in found:
         tried.setdefault((each.agents, each.kind, each.rate_hz), []).append(each)
@@ -195,7 +199,7 @@ def ceilings(found: list[AgentProcess]) -> list[str]:
 
 
 def table(found: list[AgentProcess]) -> Table:
-    """What was found."""
+    """Returns the table of results."""
     alone = {each.kind: each.mb for each in found if each.count == 1}
     note = """An agent of the product with so many UR5, none of them moving: *light* ones are where they were
 told to be, so that what is left is what the agent itself costs; *simulated* ones have a world and its physics

@@ -1,7 +1,7 @@
-"""One subscriber: ``python -m benchmarks.scale.subscriber``, a program of its own.
+"""One subscriber: ``python -m benchmarks.scale.subscriber``.
 
-Reads one line of JSON, ``SubscriberOptions``, subscribes, prints ``ready``. For each further line, once nothing more has come for a
-moment, prints what has come since the line before as JSON: ``SubscriberResult``.
+The program reads one line of JSON (``SubscriberOptions``), subscribes and prints ``ready``. For each further line, it
+waits until no messages arrive and prints those since the previous line as JSON (``SubscriberResult``).
 """
 
 import sys
@@ -18,11 +18,11 @@ from benchmarks.scale.publishers import SENT
 _QUIET_S: Final = 0.5
 _AT_ONCE: Final = 262_144
 MEASURED: Final = b'"at_ms":'
-"""Before the moment of a measurement on the wall clock [ms]."""
+"""Marks the time of a measurement on the wall clock [ms]."""
 
 
 class SubscriberOptions(msgspec.Struct):
-    """Who listens to what."""
+    """Options of the subscriber."""
 
     port: int
     client: str
@@ -30,11 +30,11 @@ class SubscriberOptions(msgspec.Struct):
     password: str
     topic: str
     wall: bool = False
-    """Whether messages tell when they were measured, by the wall clock, and not when they were sent, by the other."""
+    """True if messages contain the measurement time (wall clock) instead of the send time (monotonic clock)."""
 
 
 class SubscriberResult(msgspec.Struct):
-    """What has come; ``ms`` from its publisher's clock to here, by share."""
+    """Received messages; ``ms``: percentiles of the time from the publisher's clock."""
 
     count: int
     p50_ms: float
@@ -44,7 +44,7 @@ class SubscriberResult(msgspec.Struct):
 
 
 class Listener:
-    """Takes in what comes, in a thread of its own."""
+    """Receives messages in its own thread."""
 
     def __init__(self, asked: SubscriberOptions) -> None:
         self._clock, self._mark = (time.time, MEASURED) if asked.wall else (time.monotonic, SENT)
@@ -65,7 +65,7 @@ class Listener:
                     self._taken.append(now_ms - said_ms(body, self._mark))
 
     def heard(self) -> SubscriberResult:
-        """Since the last time."""
+        """Returns the result since the last call."""
         known = -1
         while known != len(self._taken):
             known = len(self._taken)
@@ -77,12 +77,12 @@ class Listener:
 
 
 def said_ms(body: bytes, mark: bytes) -> float:
-    """The moment that stands behind a mark in a message [ms]."""
+    """Returns the time behind a marker in a message [ms]."""
     return float(body[body.rindex(mark) + len(mark) :].split(b",", 1)[0])
 
 
 def main() -> None:
-    """Until standard input ends."""
+    """Runs until standard input ends."""
     listener = Listener(msgspec.json.decode(sys.stdin.readline(), type=SubscriberOptions))
     print("ready", flush=True)
     for _ in sys.stdin:

@@ -1,1 +1,1 @@
-"""Parts of the suite ``soak``: the load, who looks at the processes, and what their memory says."""
+"""Parts of the suite ``soak``: load, samples of the processes, and trends."""

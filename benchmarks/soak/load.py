@@ -1,4 +1,4 @@
-"""People at work in the laboratory: who streams, starts movements, stops, watches, and comes and goes."""
+"""Load on the laboratory: clients that stream, start movements, stop robots, view telemetry and sign in."""
 
 import contextlib
 import math
@@ -18,7 +18,7 @@ from tests.harness.paths import ROOT
 
 _MOVEMENTS: Final = {"nao": "wave", "qbo": "look_around", "hanson": "look_around"}
 _STOPPED: Final = "hanson"
-"""Is stopped in the middle of every third movement, and released by somebody who signs in for it."""
+"""Robot that is stopped during every third movement and reset by a signed-in owner."""
 _STOP_EVERY: Final = 3
 _LOOKED_BACK_MS: Final = 60_000
 _PERIOD_S: Final = 0.05
@@ -26,21 +26,21 @@ _SWING_RAD: Final = 0.15
 _SWING_S: Final = 4.0
 _RENEW_S: Final = 5.0
 _AT_ONCE: Final = 8
-"""Filters in one SUBSCRIBE, as the wire contract has it."""
+"""Filters per SUBSCRIBE, a limit of the wire contract."""
 _ENDS: Final = ("done", "failed", "expired", "cancelled")
 _ERROR_LENGTH: Final = 160
 
 
 class Load:
-    """The people, each in a thread of their own, until the end of the ``with``.
+    """Runs the clients, each in its own thread, until the context ends.
 
     Args:
         stand: The product.
-        hold_s: How long somebody streams, or watches, before they go and come back with new credentials.
+        hold_s: Time for which a client streams or views before it reconnects with new credentials [s].
 
     Attributes:
-        done: What was done, by name.
-        errors: What went wrong, by name; nothing is expected to.
+        done: Counts of completed operations by name.
+        errors: Counts of failures by name; none are expected.
     """
 
     def __init__(self, stand: MeasuredProduct, *, hold_s: float) -> None:
@@ -60,7 +60,7 @@ class Load:
         self._threads = [threading.Thread(target=self._again, args=each, name=each[0]) for each in rounds.items()]
 
     def count(self, what: str, times: int = 1) -> None:
-        """Something was done."""
+        """Counts a completed operation."""
         with self._lock:
             self.done[what] += times
 
@@ -75,7 +75,7 @@ class Load:
             each.join(4 * TIMEOUT_S)
 
     def _again(self, name: str, work: Callable[[httpx.Client, int], None]) -> None:
-        """One round after the other; one that goes wrong is counted, and the next one begins a second later."""
+        """Repeats an operation; a failure is counted and followed by a pause of one second."""
         number = 0
         while not self._ending.is_set():
             try:
@@ -83,7 +83,7 @@ class Load:
                     while not self._ending.is_set():
                         work(http, number)
                         number += 1
-            except Exception as error:  # noqa: BLE001 (whatever it is: it is what the suite is there to tell)
+            except Exception as error:  # noqa: BLE001 (the suite reports every error)
                 number += 1
                 with self._lock:
                     self.errors[f"{name}: {type(error).__name__} {error}"[:_ERROR_LENGTH]] += 1
@@ -107,7 +107,7 @@ class Load:
 
     @contextlib.contextmanager
     def _connected(self, http: httpx.Client, wanted: dict[str, Any], *topics: str) -> Iterator[MqttClient]:
-        """A client with credentials of its own, that hears these topics; a watcher without any hears all it may."""
+        """Connects a client with its own credentials to these topics; without topics, to all permitted ones."""
         issued = self._ask(http, "POST", "/mqtt/credentials", wanted)
         filters = topics or tuple(issued["subscribe"])
         who = (issued["client_id"], issued["username"], issued["password"])
@@ -125,10 +125,10 @@ class Load:
         with self._lock:
             self.errors["MQTT: connection lost"] += 1
 
-    # ------------------------------------------------------------ who streams
+    # ------------------------------------------------------------ streaming
 
     def _operate(self, http: httpx.Client, number: int) -> None:
-        """Take the arm, stream, give it back; then have it draw a square by its own movement."""
+        """Acquires the arm, streams, releases it and runs a movement."""
         device = self._device(http, "ur5")
         lease = f"/devices/{device['id']}/lease"
         granted = self._ask(http, "POST", lease, {"lease_ms": LEASE_MS, "wait_ms": 5000})
@@ -157,7 +157,7 @@ class Load:
         if not arm.obeyed():
             raise RuntimeError("setpoints were not applied")
 
-    # ------------------------------------------------------------ who has robots move by themselves
+    # ------------------------------------------------------------ movements
 
     def _mover(self, name: str, movement: str) -> Callable[[httpx.Client, int], None]:
         def work(http: httpx.Client, number: int) -> None:
@@ -185,7 +185,7 @@ class Load:
         return action
 
     def _stop(self, http: httpx.Client, device: dict[str, Any], request: dict[str, Any]) -> None:
-        """In the middle of a movement; it ends, and the latch is released by who has signed in."""
+        """Stops a robot during a movement, waits for the end and resets the latch as a signed-in owner."""
         action = self._begin(http, device, request, "started")
         if not self._ask(http, "POST", f"/devices/{device['id']}/stop", {"reason": "soak"})["confirmed"]:
             raise RuntimeError("a Stop was not confirmed")
@@ -198,10 +198,10 @@ class Load:
             api.post("/auth/sign-out")
         self.count("Stops and resets")
 
-    # ------------------------------------------------------------ who comes and goes
+    # ------------------------------------------------------------ viewers and sign-ins
 
     def _watch(self, http: httpx.Client, _number: int) -> None:
-        """All that robots measure, for a while."""
+        """Views all telemetry for some time."""
         with self._connected(http, {"purpose": "view"}) as line:
             self._ending.wait(self._hold_s)
             heard = line.received.qsize()
@@ -211,14 +211,14 @@ class Load:
                 raise RuntimeError("nothing is heard")
 
     def _visit(self, _http: httpx.Client, _number: int) -> None:
-        """Sign in, look round, sign out."""
+        """Signs in, reads some resources and signs out."""
         with Api(self._stand.machine) as api:
             devices = api.get("/devices")["items"]
             arm = next(each for each in devices if each["name"] == "ur5")
             for path in ("/accounts/me", "/spaces", "/diagnostics"):
                 api.get(path)
             for stream in api.get(f"/devices/{arm['id']}/data")["items"]:
-                # Always as much: an answer that grows with what was stored would look as if something leaked.
+                # Constant size: a response that grows with the stored data would look like a leak.
                 since_ms = round(time.time() * 1000) - _LOOKED_BACK_MS
                 api.get(f"/devices/{arm['id']}/data/{stream['name']}", resolution="10s", **{"from": since_ms})
             assert api.http.put(f"/devices/{arm['id']}/viewers").is_success
@@ -229,7 +229,7 @@ class Load:
 
 
 class StreamingResult:
-    """The arm under one lease, swung gently by one wrist."""
+    """The arm under one lease with slow motion of one wrist."""
 
     def __init__(self, device: dict[str, Any], epoch: int, heard: MqttClient, line: MqttClient) -> None:
         joints = robot_type.load(ROOT / "robots" / device["robot_type"]).joints
@@ -247,7 +247,7 @@ class StreamingResult:
         self._newest = codec.decode(payload, JointTelemetry)
 
     def send(self, now_s: float) -> None:
-        """The next setpoint."""
+        """Sends the next setpoint."""
         self.sequence += 1
         target = dict(zip(self._names, self._home_rad, strict=True))
         target[self._names[-1]] += _SWING_RAD * math.sin((now_s - self._began_s) / _SWING_S * math.tau)
@@ -261,7 +261,7 @@ class StreamingResult:
         self._line.client.publish(self._topic, codec.encode(setpoint))
 
     def obeyed(self) -> bool:
-        """Whether one of the last setpoints has been applied."""
+        """Returns True if one of the last setpoints was applied."""
         patience_s = time.monotonic() + 1.0
         while time.monotonic() < patience_s:
             if self._newest.epoch == self.epoch and self._newest.setpoint_sequence > self.sequence - 20:

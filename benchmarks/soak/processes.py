@@ -1,4 +1,4 @@
-"""What each process of the product holds: memory, descriptors, threads, from ``/proc``; written down as it is seen."""
+"""Memory, descriptors and threads of each process of the product, from ``/proc``."""
 
 import contextlib
 import threading
@@ -24,14 +24,13 @@ _KB: Final = 1024
 
 
 class Sample(msgspec.Struct, frozen=True, kw_only=True):
-    """One part of the product at one moment.
+    """One part of the product at one time.
 
     Attributes:
-        at_s: Since the load began.
-        processes: It consists of so many; the other figures are their sums.
-        rss_mb: Pages in memory, those shared with others counted whole.
-        own_mb: Anonymous pages, which are heaps and stacks: what a leak makes more of. Others that use the same
-            libraries, or a fork, do not change it.
+        at_s: Time since the start of the load.
+        processes: Number of processes; the other values are sums over them.
+        rss_mb: Resident memory, including shared pages.
+        own_mb: Anonymous memory (heap and stack), which a leak increases. Shared libraries and forks do not count.
     """
 
     at_s: float
@@ -45,12 +44,12 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ProcessWatcher:
-    """Samples a product's processes until the end of the ``with``.
+    """Samples the processes of a product until the context ends.
 
     Args:
         root: Process id of the program that starts the others.
-        every_s: From one look to the next.
-        file: Where each sample goes at once, a line of comma-separated values; a run that is killed has left them.
+        every_s: Interval between samples.
+        file: CSV file that receives each sample at once, so a killed run keeps its samples.
     """
 
     def __init__(self, root: int, *, every_s: float, file: Path) -> None:
@@ -82,7 +81,7 @@ class ProcessWatcher:
 
 
 def look(root: int, at_s: float) -> Iterator[Sample]:
-    """All parts at this moment."""
+    """Samples all parts now."""
     members: dict[str, list[int]] = {}
     for process, part in _family(root).items():
         members.setdefault(part, []).append(process)
@@ -103,7 +102,7 @@ def look(root: int, at_s: float) -> Iterator[Sample]:
 
 
 def _family(root: int) -> dict[int, str]:
-    """Process ids of the product and the part that each is of."""
+    """Returns the process ids of the product and the part of each."""
     parents: dict[int, int] = {}
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
@@ -119,7 +118,7 @@ def _family(root: int) -> dict[int, str]:
 
 
 def _part(process: int, above: str) -> str:
-    """By its command line; what is below the agent or the broker is counted with it."""
+    """Derives the part from the command line; children of the agent or the broker count as their parent."""
     try:
         command = Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
     except OSError:
@@ -132,7 +131,7 @@ def _part(process: int, above: str) -> str:
 
 
 def _held(process: int) -> tuple[int, int, int, int, int] | None:
-    """Resident, proportional and anonymous memory [kB], descriptors and threads; None once it has ended."""
+    """Returns resident, proportional and anonymous memory [kB], descriptors and threads; None if it has ended."""
     folder = Path(f"/proc/{process}")
     try:
         rolled = dict(line.split(":", 1) for line in (folder / "smaps_rollup").read_text().splitlines()[1:])

@@ -1,4 +1,4 @@
-"""What a series of samples says: how fast memory grows, and whether descriptors stay what they were."""
+"""Trends of a series of samples: growth of memory and change of descriptors."""
 
 import math
 import statistics
@@ -13,13 +13,13 @@ from benchmarks.soak.processes import CHILDREN, PARTS, TOGETHER, Sample
 
 _Z_95: Final = 1.96
 _POINTS: Final = 60
-"""Samples are drawn together to so many medians at most: neighbours in time are not independent of each other."""
+"""Largest number of medians per series: adjacent samples are not independent, so they are combined."""
 _LEAST_POINTS: Final = 4
 _LEAST: Final = 0.1
 
 
 class Slope(msgspec.Struct, frozen=True):
-    """Growth per hour [% of the median], and between which values it lies with 95 % confidence."""
+    """Growth per hour [% of the median] with its 95 % confidence interval."""
 
     percent_per_h: float
     low: float
@@ -27,9 +27,9 @@ class Slope(msgspec.Struct, frozen=True):
 
 
 class DescriptorTrend(msgspec.Struct, frozen=True, kw_only=True):
-    """One part over the time after warm-up; ``first`` and ``last`` are the lowest tenths of its first and last ones.
+    """Descriptors of one part after warm-up; ``first`` and ``last`` are low percentiles of the first and last samples.
 
-    Low, since a script that runs has descriptors of its own: a leak raises what is there while least runs.
+    A running script has its own descriptors. A leak raises the minimum.
     """
 
     part: str
@@ -45,14 +45,17 @@ class DescriptorTrend(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def more_descriptors(self) -> float:
-        """How many more there are at the end."""
+        """Increase from the first to the last samples."""
         return self.last_descriptors - self.first_descriptors
 
 
 def theil_sen(at_s: Sequence[float], values: Sequence[float]) -> Slope:
-    """The median of the slopes between all pairs of points, and Sen's interval of it.
+    """Returns the Theil-Sen slope (median of all pairwise slopes) and its confidence interval.
 
-    One outlier, or a third of them, moves it little. Raises: ValueError: There are too few points.
+    The estimate is robust to outliers.
+
+    Raises:
+        ValueError: There are too few points.
     """
     count = len(at_s)
     if count < _LEAST_POINTS:
@@ -69,7 +72,7 @@ def theil_sen(at_s: Sequence[float], values: Sequence[float]) -> Slope:
 
 
 def drawn_together(at_s: Sequence[float], values: Sequence[float]) -> tuple[list[float], list[float]]:
-    """Medians of stretches of equal length."""
+    """Returns medians of intervals of equal length."""
     size = max(1, math.ceil(len(at_s) / _POINTS))
     stretches = [slice(begin, begin + size) for begin in range(0, len(at_s), size)]
     return [statistics.median(at_s[each]) for each in stretches], [
@@ -78,7 +81,7 @@ def drawn_together(at_s: Sequence[float], values: Sequence[float]) -> tuple[list
 
 
 def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: float = 0.1) -> list[DescriptorTrend]:
-    """What each part held, and at last all of them together. ``end_share``: of its samples, first and last."""
+    """Returns the values of each part and their total. ``end_share``: share of samples used at both ends."""
     samples = list(samples)
     samples += together(samples)
     found = []
@@ -112,7 +115,7 @@ def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: flo
 
 
 def together(samples: Iterable[Sample]) -> list[Sample]:
-    """The sums of each look at the processes; of the agent's children there are as many as run something."""
+    """Returns the totals of each sampling; the number of the agent's children varies."""
     looks: dict[float, list[Sample]] = {}
     for each in samples:
         if each.part != CHILDREN:

@@ -1,4 +1,4 @@
-"""The suites, each a module with ``run(quick, say) -> Report``. Their order is the page's."""
+"""Benchmark suites, each a module with ``run(quick, say) -> Report``, in the order of the results page."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""What is broken while arms move: how long until they rest, how long until all works again, and what is lost."""
+"""Faults during motion: time until rest, time until recovery, and lost actions."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -21,9 +21,9 @@ _STOPS: Final = 20
 _QUICK_STOPS: Final = 5
 _RECORD: Final = "all orders, by the record"
 _FULL_RAD_S: Final = 1.1
-"""What streaming allows an arm; see the record."""
+"""Maximum streaming speed of the arm."""
 _RAMP_S: Final = 0.01
-"""In which braking reaches its full deceleration (`runtime/motion.py`)."""
+"""Time until braking reaches its full deceleration (``joint_motion.py``)."""
 _WORDS: Final = dict(zip(SPEEDS, ("at rest", "at 0.1 rad/s", "at full speed of 1.1 rad/s"), strict=True))
 _ABOUT: Final = """Two simulated UR5 behind one agent; operators, agent, functions, worker and broker are processes
 of their own, the agent's link and each operator's go through proxies that do the damage. One arm is streamed to and
@@ -59,7 +59,7 @@ just as long as has passed since the one before, so nothing moves faster for it.
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
-    """Both brokers; a quick run breaks half of the things over the one, the others over the other."""
+    """Runs all faults on both brokers; a quick run divides the faults between the brokers."""
     found: list[FaultResult] = []
     stops: list[StopResult] = []
     orders: dict[tuple[str, str], tuple[int, int, int]] = {}
@@ -96,11 +96,11 @@ def _told(found: FaultResult) -> str:
 
 
 Counted = dict[tuple[str, str], tuple[int, int, int]]
-"""Broker and fault → orders that were accepted, lost, doubled."""
+"""(broker, fault) → accepted, lost and duplicated actions."""
 
 
 def faults_table(found: list[FaultResult], orders: Counted) -> Table:
-    """A row for each fault and broker."""
+    """Returns one row per fault and broker."""
     columns = ["fault", "broker", "rounds", "stop ms: most", "recovery s: most", "orders", "lost", "doubled"]
     rows: list[list[Cell]] = []
     for fault in dict.fromkeys(each.fault for each in found):
@@ -123,7 +123,7 @@ def _select(stops: Iterable[StopResult], **wanted: str) -> list[StopResult]:
 
 
 def stops_table(stops: list[StopResult]) -> Table:
-    """A row for each speed, way and broker."""
+    """Returns one row per speed, method and broker."""
     columns = [
         "arm", "way", "broker", "n", "at rad/s", "braking ms: p50", "p99", "most", "zero ms: p50", "p99", "most"
     ]  # fmt: skip
@@ -142,7 +142,7 @@ def stops_table(stops: list[StopResult]) -> Table:
 
 
 def _note() -> str:
-    """With the arm's own limits: a trapezoid of deceleration takes its plateau's time and one ramp."""
+    """Returns the note with the arm's limits: a trapezoidal deceleration takes the plateau and one ramp."""
     arm = robot_type.load(ROOT / "robots" / "ur5")
     least_s = _FULL_RAD_S / arm.braking_rad_s2 + _RAMP_S
     return _STOP_NOTE.format(
@@ -161,7 +161,7 @@ def _chart(stops: list[StopResult]) -> Chart:
 
 
 def claims(found: list[FaultResult], stops: list[StopResult], orders: Counted) -> list[Claim]:
-    """What is promised."""
+    """Returns the targets."""
     made: list[Claim] = []
     for way in (MESSAGE, CALL):
         mine = _select(stops, way=way)

@@ -1,4 +1,4 @@
-"""Our path against what it must contain: bare TCP, a bare MQTT round trip on the same broker, bare HTTP."""
+"""Telescope compared with its lower bounds: TCP, an MQTT round trip on the same broker, and HTTP."""
 
 import contextlib
 import socket
@@ -62,7 +62,7 @@ _TOPICS: Final = ("bench/limit/there", "bench/limit/back")
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
-    """Both brokers, one after the other; on each, all paths take turns."""
+    """Measures both brokers; on each, all paths run interleaved."""
     report = Report(
         suite="limit",
         title="Against the limit",
@@ -102,7 +102,7 @@ def _judge(report: Report, kind: str, taken: dict[str, list[float]]) -> None:
 
 @contextlib.contextmanager
 def paths(stand: MeasuredProduct) -> Iterator[dict[str, Exchange]]:
-    """All exchanges, warm."""
+    """Yields all exchanges with open connections."""
     with contextlib.ExitStack() as stack:
         tcp, web = free_port(), free_port()
         stack.enter_context(start_peer("benchmarks.baseline.echo_servers", "tcp", str(tcp)))
@@ -143,7 +143,7 @@ def _http(stack: contextlib.ExitStack, port: int) -> Exchange:
 def mqtt(
     stack: contextlib.ExitStack, stand: MeasuredProduct, qos: int, payload: bytes = PAYLOAD, answer_bytes: int = 0
 ) -> Exchange:
-    """To another process and back, with clients as bare as ours are; the answer is what was sent, or longer."""
+    """Returns an exchange with another process over MQTT; the reply is the payload, padded if requested."""
     there, back = (f"{topic}/{qos}" for topic in _TOPICS)
     rights = stand.rights(publish=(back,), subscribe=(there,))
     stack.enter_context(

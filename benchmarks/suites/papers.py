@@ -1,4 +1,4 @@
-"""Both papers' own measurements: Table 2 of the UR5 paper, Fig. 5 and 6 of Telescope v2, printed figures beside."""
+"""Measurements of both papers: Table 2 of the UR5 paper, Fig. 5 and 6 of Telescope v2."""
 
 from collections.abc import Callable
 from typing import Final
@@ -13,7 +13,7 @@ it."""
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
-    """One paper's measurement after the other."""
+    """Runs the measurements of both papers."""
     report = Report(suite="papers", title="The papers' figures", quick=quick, about=[_ABOUT])
     table2.measure(report, quick=quick, say=say)
     figure5.measure(report, quick=quick, say=say)

@@ -1,4 +1,4 @@
-"""Where the time goes: a command and a setpoint by parts, each part timed at its hop by one clock."""
+"""Duration of each part of a command and of a setpoint, measured on one clock."""
 
 import json
 import random
@@ -22,7 +22,7 @@ _WITHIN_S: Final = 10.0
 ASKED: Final = "asked"
 ANSWERED: Final = "answered"
 Steps = tuple[tuple[str, str], ...]
-"""What a mark ends: its name, and what was done until then since the mark before."""
+"""(timestamp name, description of the part that ends there)."""
 ACTION: Final[Steps] = (
     ("http-in", "HTTP in"),
     ("identified", "identity"),
@@ -59,7 +59,7 @@ UR5 that the operator holds; an action moves its wrist by a degree. On loopback.
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
-    """Both brokers."""
+    """Measures both brokers."""
     report = Report(suite="path", title="The path by parts", quick=quick, about=[_ABOUT])
     count = 28 if quick else 200
     found: dict[str, dict[str, Parts]] = {}
@@ -73,11 +73,11 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
 
 
 Parts = list[dict[str, float]]
-"""Of each exchange: part → how long it took [ms]."""
+"""One dictionary per exchange: part → duration [ms]."""
 
 
 def take(stand: TracedProduct, count: int) -> dict[str, Parts]:
-    """So many actions and setpoints, in turns; what was too slow to be told in its order is left out."""
+    """Measures actions and setpoints alternately; incomplete exchanges are left out."""
     found: dict[str, Parts] = {"action": [], "first motion": [], "setpoint": []}
     with StreamingOperator(stand, ROBOT) as hand, stand.caller() as caller:
         home_rad = hand.target_rad[JOINT]
@@ -87,8 +87,8 @@ def take(stand: TracedProduct, count: int) -> dict[str, Parts]:
             taken: dict[str, dict[str, float] | None] = {}
             taken["action"], taken["first motion"] = parts(marks, ACTION), parts(marks, MOTION)
             hand.target_rad[JOINT] = to_rad
-            hand.exchange()  # which takes the arm over from the action
-            time.sleep(0.1 + 0.003 * (index % 7))  # at any phase of the control loop
+            hand.exchange()  # streaming resumes after the action
+            time.sleep(0.1 + 0.003 * (index % 7))  # sample every phase of the control period
             taken["setpoint"] = parts(_set(stand, hand), SETPOINT)
             for name, one in taken.items():
                 if one is not None and index >= _WARM_UP:
@@ -100,13 +100,13 @@ def take(stand: TracedProduct, count: int) -> dict[str, Parts]:
 
 
 def _act(stand: TracedProduct, caller: HttpConnection, hand: StreamingOperator, to_rad: float) -> Iterator[Timestamp]:
-    """An action to its end."""
+    """Runs one action and yields its timestamps."""
     request = {"kind": "move_joints", "position_rad": {JOINT: to_rad}}
     asked = {"request": request, "epoch": hand.epoch, "wait_for": "started", "wait_ms": 10_000}
     body = json.dumps(asked).encode()
     stand.marks.drain()
     stand.marks.until(f"rests:{ROBOT}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
-    time.sleep(random.uniform(0.0, 0.01))  # at any phase of the control loop
+    time.sleep(random.uniform(0.0, 0.01))  # sample every phase of the control period
     began_ns = time.monotonic_ns()
     yield Timestamp(ASKED, began_ns)
     started = caller.request("POST", f"/api/v1/devices/{hand.device['id']}/actions", body)
@@ -116,20 +116,20 @@ def _act(stand: TracedProduct, caller: HttpConnection, hand: StreamingOperator, 
 
 
 def _set(stand: TracedProduct, hand: StreamingOperator) -> list[Timestamp]:
-    """One setpoint, until it is seen again."""
+    """Sends one setpoint and returns its timestamps until telemetry reports it."""
     stand.marks.drain()
     began_ns = time.monotonic_ns()
     took_ms = hand.exchange()
     answered = Timestamp(ANSWERED, time.monotonic_ns())
-    # Where the last was a moment ago, `exchange` has waited first.
+    # `exchange` may have waited before it sent the setpoint.
     asked = Timestamp(ASKED, max(began_ns, answered.at_ns - round(took_ms * 1e6)))
     return [asked, *stand.marks.drain(), answered]
 
 
 def parts(marks: Sequence[Timestamp], steps: Steps) -> dict[str, float] | None:
-    """How long each part took [ms]; ``None`` where one of the marks is missing.
+    """Returns the duration of each part [ms], or None if a timestamp is missing.
 
-    Each step's mark is the first of its name after the mark of the step before.
+    The timestamp of a step is the first one of its name after the previous step.
     """
     marks = sorted(marks, key=lambda mark: mark.at_ns)
     at_ns = next(mark.at_ns for mark in marks if mark.name == ASKED)
@@ -144,7 +144,7 @@ def parts(marks: Sequence[Timestamp], steps: Steps) -> dict[str, float] | None:
 
 
 def whole(found: Parts) -> list[float]:
-    """The sum of each exchange's parts [ms]."""
+    """Returns the total duration of each exchange [ms]."""
     return [sum(each.values()) for each in found]
 
 
@@ -156,7 +156,7 @@ _TITLES: Final = {
 
 
 def show(report: Report, found: dict[str, dict[str, Parts]]) -> None:
-    """For each path a table of its parts over each broker, and a chart of both."""
+    """Adds a table per path and broker and a chart per path."""
     for path, title in _TITLES.items():
         for kind in found:
             report.tables.append(_table(f"{title}, over {kind}", found[kind][path]))

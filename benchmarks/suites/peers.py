@@ -1,4 +1,4 @@
-"""The peers' wires at our work: a setpoint, until telemetry says that the driver has applied it."""
+"""Comparable protocols: time from a setpoint until telemetry reports it as applied."""
 
 import contextlib
 import tempfile
@@ -33,7 +33,7 @@ rights, and the robot has to be reachable. Telescope and rosbridge pass a third 
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
-    """All at once, in turns."""
+    """Measures all protocols interleaved."""
     rounds, each = (6, 25) if quick else (14, 50)
     say("starting everything")
     with paths() as found:
@@ -68,7 +68,7 @@ def _chart(taken: dict[str, list[float]]) -> Chart:
 
 @contextlib.contextmanager
 def paths() -> Iterator[dict[str, Exchange]]:
-    """Two products and four peers, all connected."""
+    """Yields the exchanges of two products and four protocols, all connected."""
     with contextlib.ExitStack() as stack:
         found: dict[str, Exchange] = {}
         for kind in reversed(BROKERS):

@@ -1,4 +1,4 @@
-"""How far one machine goes: brokers, the API, actions, robots of one agent, memory, a swarm, rights."""
+"""Capacity of one machine: brokers, API, actions, robots per agent, memory, many agents, permissions."""
 
 import tempfile
 from collections.abc import Callable
@@ -18,7 +18,7 @@ begin and how deep they are. In the application alone, without its server, a dev
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
-    """Part by part; all but the first at one product."""
+    """Runs all parts; all but the first use one product."""
     report = Report(suite="scale", title="Scale", quick=quick, about=[_ABOUT, _BEFORE])
     carried = brokers.measure(quick=quick, say=say)
     report.tables.append(brokers.table(carried))

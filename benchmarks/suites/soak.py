@@ -1,4 +1,4 @@
-"""An hour of the laboratory under load: memory, descriptors, and whatever goes wrong."""
+"""One hour of load on the laboratory: memory, descriptors and errors."""
 
 import os
 import tempfile
@@ -14,14 +14,13 @@ from benchmarks.soak.processes import PARTS, TOGETHER, ProcessWatcher, Sample
 from benchmarks.soak.trends import DescriptorTrend, after_warm_up, drawn_together
 
 MINUTES: Final = "SOAK_MINUTES"
-"""The environment variable for another length of the whole run [min]."""
+"""Environment variable that sets the duration of the full run [min]."""
 SERIES: Final = QUICK / "soak.csv"
-"""All samples, as they come: what a run that was killed has left."""
+"""File of all samples; it remains after a killed run."""
 _SLOPE_MOST: Final = 1.0
 _QUICK_S: Final = 48.0
 _WARM_UP: Final = 1 / 3
-"""Of the run: what fills once, caches and pools, has been filled then. In hours of load the last of them were full
-after 17 to 20 minutes."""
+"""Warm-up share of the run, after which caches and pools are full (17 to 20 minutes of an hour)."""
 _ABOUT: Final = """The laboratory as `make up` starts it over amqtt: four robots and a room in one agent. Somebody
 streams setpoints to the arm under leases that they take, renew and give back, each time with new credentials;
 movements, which are scripts, run on all robots; one robot is stopped in the middle of every third, and released; two
@@ -50,7 +49,7 @@ the broker's grows by are revocations, some 300 bytes each, which it keeps for t
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
-    """The load for an hour, or not quite a minute; then the figures."""
+    """Runs the load for an hour, or for about a minute in a quick run, and evaluates it."""
     for_s = _QUICK_S if quick else 60 * float(os.environ.get(MINUTES, "60"))
     say(f"starting the laboratory, then {for_s / 60:.1f} min of load")
     with (
@@ -75,7 +74,7 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
 
 
 def progress(samples: list[Sample], people: Load) -> str:
-    """One line: what each part holds now, and what has been done."""
+    """Returns one line with the memory of each part and the completed operations."""
     newest = {each.part: each for each in samples[-2 * len(PARTS) :]}
     held = ", ".join(f"{part} {each.rss_mb:.0f} MB {each.descriptors} fd" for part, each in newest.items())
     errors = f"; ERRORS {dict(people.errors)}" if people.errors else ""
@@ -83,7 +82,7 @@ def progress(samples: list[Sample], people: Load) -> str:
 
 
 def claims(held: list[DescriptorTrend], people: Load, for_s: float) -> list[Claim]:
-    """Of a whole run."""
+    """Returns the targets of a full run."""
     (product,) = [each for each in held if each.part == TOGETHER]
     worst = max((each for each in held if each is not product), key=lambda each: each.own.percent_per_h)
     length = f"{for_s / 60:.0f} min of load"
@@ -116,7 +115,7 @@ def claims(held: list[DescriptorTrend], people: Load, for_s: float) -> list[Clai
 
 
 def _quick_claims(held: list[DescriptorTrend], people: Load) -> list[Claim]:
-    """What the last whole run has found, and what not quite a minute can tell."""
+    """Returns the targets of the last full run and those that a quick run can check."""
     whole = load("soak")
     found = []
     if whole is not None:
@@ -169,7 +168,7 @@ def _work(people: Load) -> Table:
 
 
 def charts(samples: list[Sample], warm_up_s: float) -> list[Chart]:
-    """Memory over time: as it is, and in per cent of what it was after warm-up."""
+    """Returns charts of memory over time, absolute and relative to the value after warm-up."""
     series: dict[str, list[float | None]] = {}
     change: dict[str, list[float | None]] = {}
     x: list[str | float] = []
@@ -180,7 +179,7 @@ def charts(samples: list[Sample], warm_up_s: float) -> list[Chart]:
         at_s, own_mb = drawn_together([each.at_s for each in mine], [each.own_mb for each in mine])
         x = x or [round(each / 60, 2) for each in at_s]
         then = next((value for at, value in zip(at_s, own_mb, strict=True) if at >= warm_up_s), own_mb[-1])
-        # A part that came later or went sooner than the first has fewer places.
+        # A part that started later or ended earlier has fewer samples.
         wanted = [*own_mb[: len(x)], *[None] * (len(x) - len(own_mb))]
         series[part] = list(wanted)
         change[part] = [None if value is None else round((value / then - 1) * 100, 3) for value in wanted]

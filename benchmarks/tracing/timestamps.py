@@ -1,8 +1,7 @@
-"""Moments in other programs of this machine, by the one clock that all its processes share (``CLOCK_MONOTONIC``).
+"""Timestamps of events in other processes of this machine, on their common clock (``CLOCK_MONOTONIC``).
 
-Whoever measures opens ``TimestampReceiver`` and names its port in ``TELESCOPE_BENCH_MARKS``; a program that was started by
-``benchmarks.tracing.traced_programs`` tells it what happens. A mark goes as a datagram on loopback: it is there when the sender's next
-line runs, and costs some ten microseconds.
+A benchmark opens a ``TimestampReceiver`` and passes its port in ``TELESCOPE_BENCH_MARKS``. Programs started by
+``benchmarks.tracing.traced_programs`` send a datagram on loopback per event, which costs about ten microseconds.
 """
 
 import os
@@ -18,24 +17,24 @@ _MOST_BYTES: Final = 200
 
 
 class Timestamp(NamedTuple):
-    """Something happened."""
+    """One event and its time."""
 
     name: str
     at_ns: int
 
 
 class TimestampReceiver:
-    """Hears marks. ``with`` closes it."""
+    """Receives timestamps. Leaving the context closes the socket."""
 
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((HOST, 0))
         self._socket.setblocking(False)
         self.settings: dict[str, str] = {VARIABLE: str(self._socket.getsockname()[1])}
-        """For the environment of the program that is to tell."""
+        """Environment variables for the traced program."""
 
     def drain(self) -> list[Timestamp]:
-        """All that were told since the last call, in the order of their times."""
+        """Returns the timestamps received since the last call, ordered by time."""
         found: list[Timestamp] = []
         while True:
             try:
@@ -45,10 +44,10 @@ class TimestampReceiver:
             found.append(Timestamp(name, int(at_ns)))
 
     def until(self, name: str, *, since_ns: int, within_s: float) -> list[Timestamp]:
-        """Wait for this one; all that were told from then on.
+        """Waits for an event and returns all timestamps from then on.
 
         Raises:
-            TimeoutError: It is not told.
+            TimeoutError: The event did not occur in time.
         """
         found: list[Timestamp] = []
         deadline_s = time.monotonic() + within_s
@@ -68,16 +67,16 @@ class TimestampReceiver:
 
 
 class TimestampSender:
-    """Tells marks to who listens at the port in the environment."""
+    """Sends timestamps to the port that the environment names."""
 
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect((HOST, int(os.environ[VARIABLE])))
 
     def tell(self, name: str) -> None:
-        """Now."""
+        """Sends an event with the present time."""
         self._socket.send(f"{name} {time.monotonic_ns()}".encode())
 
     def close(self) -> None:
-        """Let go."""
+        """Closes the socket."""
         self._socket.close()

@@ -1,4 +1,4 @@
-"""The product with one simulated robot, whose programs tell when they do what; operator and agent behind networks."""
+"""The product with one simulated robot and tracing, with simulated networks before the operator and the agent."""
 
 import contextlib
 from collections.abc import Iterator, Mapping
@@ -15,10 +15,10 @@ from tests.harness.network.delay import Way, start_delay
 
 
 class TracedProduct(MeasuredProduct):
-    """As ``MeasuredProduct``. ``start`` gives one.
+    """A ``MeasuredProduct`` with tracing; ``start`` creates it.
 
     Attributes:
-        marks: What its programs tell.
+        marks: Receives the timestamps of its programs.
     """
 
     def __init__(self, machine: Machine, kind: BrokerKind, cloud: Cloud, *, marks: TimestampReceiver, way: Way) -> None:
@@ -28,32 +28,32 @@ class TracedProduct(MeasuredProduct):
         self._far = False
 
     def place(self, *, rtt_ms: float) -> None:
-        """Put operator and agent so far from the cloud, each; the operator's connections from now on go that way."""
+        """Sets the network delay of operator and agent; it applies to connections of the operator from now on."""
         self._way.set(rtt_ms=rtt_ms)
         self._far = rtt_ms > 0
 
     @property
     def mqtt_port(self) -> int:
-        """Where the operator reaches the broker."""
+        """Port at which the operator reaches the broker."""
         return self._way.ports[super().mqtt_port] if self._far else super().mqtt_port
 
     def caller(self) -> HttpConnection:
-        """The operator's warm connection to the API."""
+        """Returns an open connection of the operator to the API."""
         port = self._way.ports[self.machine.port] if self._far else self.machine.port
         return HttpConnection(port, {"Authorization": f"Bearer {self.token}"})
 
 
 @contextlib.contextmanager
 def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) -> Iterator[TracedProduct]:
-    """The product with a robot alone in a scene of its own, or with ``TELESCOPE_ROOM`` in ``more`` all of a room.
+    """Runs the product with one robot in its own scene, or a whole room if ``more`` has ``TELESCOPE_ROOM``.
 
-    The agent reaches cloud and broker through a delay, of no time as long as nobody is ``place``d.
+    The agent reaches server and broker through a delay proxy, which adds no delay before ``place`` is called.
 
     Args:
-        home: Its folder.
-        kind: Its broker.
-        joints: Robot → the joints, with + between them, whose motion is told.
-        more: Settings.
+        home: Folder of the product.
+        kind: Broker.
+        joints: Robot → joints with traced motion, separated by ``+``.
+        more: Further settings.
     """
     port = free_ports()
     with contextlib.ExitStack() as stack:

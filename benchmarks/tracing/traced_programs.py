@@ -1,12 +1,12 @@
-"""The product as ``make up`` starts it, whose functions and agent tell ``benchmarks.tracing.timestamps`` what they do, and when.
+"""The product as ``make up`` starts it, with functions and agent that send timestamps.
 
-``python -m benchmarks.tracing.traced_programs machine`` stands for ``python -m infra.local``; it starts the other two in place of the
-product's own programs. The product has no tracing in it: what is told is told around public functions of its modules.
-One that is gone ends the program with its name.
+``python -m benchmarks.tracing.traced_programs machine`` replaces ``python -m infra.local`` and starts traced variants
+of the functions and the agent. The product contains no tracing: this module wraps public functions. A missing function
+ends the program with its name.
 
-Environment: ``TELESCOPE_BENCH_DEVICE`` (``nao``: where there is no room, the only robot, in a scene of its own),
-``TELESCOPE_BENCH_JOINTS`` (``nao:HeadYaw,qbo:head_pan+left_wheel``: whose motion is told) and ``TELESCOPE_BENCH_WAYS``
-(``8080=9000,8081=9001``: ports that the agent reaches by others).
+Environment: ``TELESCOPE_BENCH_DEVICE`` (``nao``: the only robot, in its own scene), ``TELESCOPE_BENCH_JOINTS``
+(``nao:HeadYaw,qbo:head_pan+left_wheel``: joints with traced motion) and ``TELESCOPE_BENCH_WAYS``
+(``8080=9000,8081=9001``: ports that the agent reaches through other ports).
 """
 
 import os
@@ -23,21 +23,21 @@ DEVICE: Final = "TELESCOPE_BENCH_DEVICE"
 JOINTS: Final = "TELESCOPE_BENCH_JOINTS"
 WAYS: Final = "TELESCOPE_BENCH_WAYS"
 STILL_RAD_S: Final = 5e-5
-"""A simulated joint that is faster than this has begun to move: at rest those of the four robots stay below 2e-5."""
+"""Velocity at which a simulated joint starts to move; at rest, all robots stay below 2e-5."""
 FAST_RAD_S: Final = 0.002
-"""And faster than this it is seen to: 0.1° per second. Motion begins with limited jerk, so it takes time."""
+"""Velocity of visible motion: 0.1 °/s. Motion starts with limited jerk, so this takes time."""
 _RESTS: Final = 25
-"""States of the simulation in a tenth of a second."""
+"""Simulation states per 0.1 s."""
 Tell = Callable[..., object]
 Wrapper = Callable[[Any], Any]
 
 
 def machine() -> int:
-    """As ``make up``."""
+    """Runs the product as ``make up`` does."""
     from infra.local import __main__ as local
 
     class Traced(local.Machine):
-        """Starts the traced programs in place of the product's."""
+        """Starts the traced programs instead of the product's."""
 
         def _run(self, name: str, *arguments: str) -> Any:
             if name in ("functions", "agent"):
@@ -54,7 +54,7 @@ def machine() -> int:
 
 
 def functions(arguments: Sequence[str]) -> int:
-    """As ``python -m function_app``."""
+    """Runs the traced functions."""
     from function_app import __main__ as program
     from function_app.adapters.local.tables import SqliteTables
     from function_app.entrypoints.hosts import uvicorn
@@ -78,7 +78,7 @@ def functions(arguments: Sequence[str]) -> int:
 
 
 class _Door:
-    """The application, with who comes to start an action told, and when the answer is ready."""
+    """Middleware that marks the arrival and the response of requests that start an action."""
 
     def __init__(self, app: Any, tell: Tell) -> None:
         self._app = app
@@ -90,7 +90,7 @@ class _Door:
             return
 
         async def sent(message: Any) -> None:
-            # Before it goes: the caller may have the answer while `send` has still to return.
+            # Marked before sending: the caller may have the response before `send` returns.
             if message["type"] == "http.response.body" and not message.get("more_body"):
                 self._tell("http-out")
             await send(message)
@@ -100,12 +100,16 @@ class _Door:
 
 
 def _wrap(owner: Any, name: str, around: Wrapper) -> None:
-    """Put something around a public function. Raises: AttributeError: It is gone: what was told there is to move."""
+    """Wraps a public function.
+
+    Raises:
+        AttributeError: The function does not exist any more.
+    """
     setattr(owner, name, around(getattr(owner, name)))
 
 
 def _told_first(tell: Tell) -> Wrapper:
-    """Before a call."""
+    """Marks the start of a call."""
 
     def around(call: Any) -> Any:
         @wraps(call)
@@ -119,7 +123,7 @@ def _told_first(tell: Tell) -> Wrapper:
 
 
 def _told_after(tell: Tell) -> Wrapper:
-    """After a coroutine has ended well."""
+    """Marks the successful end of a coroutine."""
 
     def around(call: Any) -> Any:
         @wraps(call)
@@ -137,7 +141,7 @@ def _told_after(tell: Tell) -> Wrapper:
 
 
 def agent(arguments: Sequence[str]) -> int:
-    """As ``python -m device_agent``."""
+    """Runs the traced agent."""
     from device_agent import __main__ as program
 
     tell = TimestampSender().tell
@@ -154,7 +158,7 @@ def _pairs(variable: str, between: str) -> dict[str, str]:
 
 
 def _reroute(ways: Mapping[str, str]) -> None:
-    """Reach the cloud and its broker by other ports."""
+    """Redirects the agent's connections to other ports."""
     from device_agent.transports.http.client import CloudClient
 
     def init(begin: Any) -> Any:
@@ -178,7 +182,7 @@ def _reroute(ways: Mapping[str, str]) -> None:
 
 
 def _tell_messages(tell: Tell) -> None:
-    """What comes for a device, and what it answers."""
+    """Marks messages to a device and its acknowledgements."""
     from device_agent.protocol import topics
     from device_agent.runtime.device import Device
     from device_agent.transports.mqtt.transport import MqttTransport
@@ -196,7 +200,7 @@ def _tell_messages(tell: Tell) -> None:
 
 
 def _tell_control(tell: Tell) -> None:
-    """What the device does with it."""
+    """Marks the processing in the control loop."""
     from device_agent.drivers.mujoco.driver import MujocoDriver
     from device_agent.runtime.actions.executor import ActionExecutor
     from device_agent.runtime.control.controller import Controller
@@ -240,9 +244,9 @@ def _tell_control(tell: Tell) -> None:
 
 
 class Motion:
-    """Tells of one robot when it begins to move, when it is seen to, and ten times a second that it rests.
+    """Marks when a robot starts to move, when its motion is visible, and ten times per second while it is at rest.
 
-    At rest is who was still for a tenth of a second: a joint that turns back is still for a moment, too.
+    A robot is at rest after 0.1 s without motion, because a joint that reverses also stops for a moment.
     """
 
     def __init__(self, name: str, tell: Tell) -> None:
@@ -252,7 +256,7 @@ class Motion:
         self._waiting = ["moves", "fast"]
 
     def see(self, speed_rad_s: float) -> None:
-        """The fastest of its joints, every 4 ms."""
+        """Takes the highest joint velocity, every 4 ms."""
         if speed_rad_s <= STILL_RAD_S:
             self._still += 1
             if self._still % _RESTS == 0:
@@ -269,7 +273,7 @@ class Motion:
 
 
 def _tell_motion(tell: Tell, joints: Mapping[str, str]) -> None:
-    """What the simulation's own record sees of some joints, which looks every 4 ms."""
+    """Marks the motion of some joints from the simulation's trace, every 4 ms."""
     from device_agent.simulation.trace import Trace
 
     watched: dict[int, tuple[Motion, list[int]]] = {}
@@ -293,7 +297,7 @@ def _tell_motion(tell: Tell, joints: Mapping[str, str]) -> None:
 
 
 def main(program: str, *arguments: str) -> int:
-    """Command line."""
+    """Runs the command line."""
     if program == "machine":
         return machine()
     return functions(arguments) if program == "functions" else agent(arguments)

@@ -44,7 +44,7 @@ def test_an_exchange_waits_for_its_own_answer() -> None:
 
 
 def test_an_exchange_without_an_answer_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(operators, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(operators, "TIMEOUT_S", 0.05)
     with pytest.raises(TimeoutError, match="setpoint 1"):
         operators.PeerOperator(lambda _: None).exchange()
 
