@@ -9,7 +9,7 @@ import msgspec
 from device_agent import drivers, geometry, sensors
 from device_agent.config.agent_config import AgentConfig, DeviceEntry
 from device_agent.config.catalogue import ROOMS, TYPES, enrolled_devices, room_device_of, type_of
-from device_agent.config.client_certificate import OwnCertificate
+from device_agent.config.client_certificate import ClientCertificate
 from device_agent.config.errors import ConfigError
 from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
@@ -38,21 +38,22 @@ from device_agent.transports import factory
 from device_agent.transports.http.client import CloudClient
 from device_agent.transports.http.latency_reports import HttpLatencies
 from device_agent.transports.http.uploads import HttpUploads
+from device_agent.transports.pairing_monitor import PairingMonitor
 
 
-class Cell:
+class RunningAgent:
     """A running agent and what must be closed with it."""
 
-    def __init__(self, agent: Agent, journal: Journal, membership: factory.PairingMonitor, jail: Sandbox) -> None:
+    def __init__(self, agent: Agent, journal: Journal, monitor: PairingMonitor, sandbox: Sandbox) -> None:
         self._agent = agent
-        self._jail = jail
+        self._sandbox = sandbox
         self._journal = journal
-        self._membership = membership
+        self._monitor = monitor
 
     @property
     def outdated(self) -> bool:
         """Whether the agent was un-paired, or moved: whose it is is to be asked, and all of it built again."""
-        return self._membership.outdated.is_set()
+        return self._monitor.outdated.is_set()
 
     def start(self) -> None:
         """Start devices and link.
@@ -61,17 +62,17 @@ class Cell:
             DriverError: A device is not there.
             TransportError: The transport's configuration is unusable.
         """
-        self._jail.start()
+        self._sandbox.start()
         self._agent.start()
 
     def stop(self) -> None:
         """Hold, say goodbye, close. May be called twice."""
         self._agent.stop()
-        self._jail.close()
+        self._sandbox.close()
         self._journal.close()
 
 
-def try_type(folder: Path) -> None:
+def check_robot_type(folder: Path) -> None:
     """Load all of a robot type in a folder, and connect its driver, a simulated one, for a moment.
 
     Raises:
@@ -91,7 +92,7 @@ def _folder(kind: RobotType) -> Path:
     return TYPES.folders().get(kind.type, ROBOTS / kind.type)
 
 
-def geometry_of(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
+def load_geometry(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
     """The shape of a configured device in the scene or room that it stands in.
 
     Raises:
@@ -109,7 +110,9 @@ def geometry_of(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
     return geometry.load(kind, _folder(kind), scene=scene, standing=standing)
 
 
-def driver_of(entry: DeviceEntry, kind: RobotType, *, trace: Path | None = None, faults: Path | None = None) -> Driver:
+def create_driver(
+    entry: DeviceEntry, kind: RobotType, *, trace: Path | None = None, faults: Path | None = None
+) -> Driver:
     """The driver of a configured device, not connected.
 
     Args:
@@ -134,7 +137,7 @@ def driver_of(entry: DeviceEntry, kind: RobotType, *, trace: Path | None = None,
     return drivers.load(name)(kind, folder, options, entry.name)
 
 
-def instrument_of(
+def create_room_device(
     entry: DeviceEntry,
     neighbours: Mapping[str, RoomDriver],
     uploads: Uploads | None = None,
@@ -178,7 +181,9 @@ def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundin
         raise ConfigError(str(error)) from error
 
 
-def api_of(store: IdentityStore, configuration: AgentConfig, clock: CloudClock, *, create: bool = False) -> CloudClient:
+def cloud_client(
+    store: IdentityStore, configuration: AgentConfig, clock: CloudClock, *, create: bool = False
+) -> CloudClient:
     """The agent's view of the HTTP API.
 
     Raises:
@@ -189,7 +194,7 @@ def api_of(store: IdentityStore, configuration: AgentConfig, clock: CloudClock, 
     )
 
 
-def build(store: IdentityStore, *, trace: Path | None = None) -> Cell:
+def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
     """An agent from its folder, ready to start.
 
     Args:
@@ -212,7 +217,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> Cell:
     journal.open(now_ms=wall_ms())
     journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
     pins = PinnedKeys(pairing, save=store.save_pairing, now_ms=clock.now_ms)
-    membership = factory.PairingMonitor(pairing, configuration, enrolled_devices(configuration), pins)
+    monitor = PairingMonitor(pairing, configuration, enrolled_devices(configuration), pins)
     room = ReadingCache(
         space=pairing.space,
         agent=pairing.agent,
@@ -222,11 +227,11 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> Cell:
     wiring = factory.Wiring(
         configuration=configuration,
         pairing=pairing,
-        membership=membership,
-        open_api=lambda: api_of(store, configuration, clock),
+        pairing_monitor=monitor,
+        open_api=lambda: cloud_client(store, configuration, clock),
         next_session=journal.next_session,
         quiet=lambda: agent.quiet,
-        certificate=OwnCertificate(store.folder),
+        certificate=ClientCertificate(store.folder),
         now_ms=clock.now_ms,
         listen=room.topics(),
     )
@@ -235,12 +240,12 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> Cell:
         factory.make(wiring), tell=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms())
     )
     outbox = _outbox(store, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
-    jail = SandboxHost(trusted=configuration.allow_unconfined_scripts)
-    uploads = HttpUploads(pairing.agent, lambda: api_of(store, configuration, clock))
+    sandbox = SandboxHost(trusted=configuration.allow_unconfined_scripts)
+    uploads = HttpUploads(pairing.agent, lambda: cloud_client(store, configuration, clock))
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}
     for entry in configuration.devices:
-        instrument = instrument_of(entry, neighbours, uploads, faults=store.faults)
+        instrument = create_room_device(entry, neighbours, uploads, faults=store.faults)
         if instrument is not None:
             neighbours[entry.name] = instrument.driver
         devices[entry.name] = _device(
@@ -254,13 +259,13 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> Cell:
             transport=transport,
             outbox=outbox,
             room=room,
-            jail=jail,
+            sandbox=sandbox,
             trace=trace,
             faults=store.faults,
             uploads=uploads,
         )
     agent = Agent(devices, transport, outbox=outbox, room=room, address=(pairing.space, pairing.agent))
-    return Cell(agent, journal, membership, jail)
+    return RunningAgent(agent, journal, monitor, sandbox)
 
 
 def _carrier(configuration: AgentConfig) -> str:
@@ -319,7 +324,7 @@ def _device(
     transport: Transport,
     outbox: Outbox,
     room: ReadingCache,
-    jail: Sandbox,
+    sandbox: Sandbox,
     trace: Path | None,
     faults: Path,
     uploads: Uploads,
@@ -332,7 +337,7 @@ def _device(
         agent=pairing.agent,
         robot_type=kind,
         ground=ground,
-        driver=driver_of(entry, kind, trace=trace, faults=faults) if instrument is None else instrument,
+        driver=create_driver(entry, kind, trace=trace, faults=faults) if instrument is None else instrument,
         journal=journal,
         cloud_clock=clock,
         keys=pins,
@@ -341,7 +346,7 @@ def _device(
         room=room,
         interlocks=entry.interlocks,
         geometry=_geometry(entry, kind),
-        jail=jail,
+        jail=sandbox,
         owner=pairing.owner,
         speech=Espeak(),
         uploads=uploads,
@@ -350,6 +355,6 @@ def _device(
 
 def _geometry(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
     try:
-        return geometry_of(entry, kind)
+        return load_geometry(entry, kind)
     except GeometryError as error:
         raise ConfigError(str(error)) from error

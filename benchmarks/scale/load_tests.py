@@ -104,7 +104,7 @@ class LoadTest:
         """Runs the load generator while it connects and publishes."""
         with subprocess.Popen(
             [
-                sys.executable, "-m", "device_agent", "swarm", "--cloud", self._stand.machine.url,
+                sys.executable, "-m", "device_agent", "load-test", "--cloud", self._stand.machine.url,
                 "--home", str(self._home / "keys"), "--count", str(count), "--rate-hz", str(rate_hz),
                 "--spread-s", str(count * gap_s), "--seconds", str(count * gap_s + seconds), "--every-s", str(EVERY_S),
                 "--json", str(self._home / "figures.json"),
@@ -212,7 +212,7 @@ def _there(stand: MeasuredProduct) -> list[str]:
 
 def table(runs: list[LoadTestResult]) -> Table:
     """Returns the table of results."""
-    note = """`python -m device_agent swarm`: agents that are real ones on the wire, in one process, without
+    note = """`python -m device_agent load-test`: agents that are real ones on the wire, in one process, without
 physics, at the product over mosquitto; one subscriber to all that they measure. *Made known*: keys, enrolment
 and claim of those that were not known yet, over HTTP. *Connects*: credentials and the connection, at the pace
 that the swarm was given, or slower; mosquitto writes all the rights that it knows to its file at each new one,

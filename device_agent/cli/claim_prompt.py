@@ -1,4 +1,4 @@
-"""How an agent that is nobody's asks to be claimed: its code, a link that carries it, and the link for a camera."""
+"""Shows the claim code, a link that contains it, and the QR code of the link."""
 
 import shutil
 import sys
@@ -8,27 +8,27 @@ import segno
 
 from device_agent.transports.http.client import Claim
 
-_QUIET = 2
-"""Light modules around it. The standard wants four; cameras do with two, and terminals are small."""
+_QUIET_ZONE = 2
+"""Quiet zone [modules]. The standard requires four; cameras read two, and terminals are small."""
 _HALVES = (("█", "▀"), ("▄", " "))
-"""By upper and lower module, light as ink: on the dark ground of most terminals that is the right way round."""
+"""Characters by upper and lower module. Light modules are printed, for terminals with dark background."""
 _INK = "\N{ESC}[97;40m"
 _PLAIN = "\N{ESC}[0m"
 
 
 def link(server: str, code: str) -> str:
-    """The page that claims this agent. The code is in the fragment, which no server is sent and no log holds."""
+    """URL that claims this agent. The code is in the fragment, which is never sent to a server or logged."""
     return f"{server.rstrip('/')}/#pair={code}"
 
 
 def show(claim: Claim, server: str, *, qr: bool, out: TextIO | None = None) -> None:
-    """Print code and link; and, on a terminal that is wide and dark enough for it to be read, the QR code.
+    """Print code and link, and the QR code if the terminal can display it.
 
     Args:
-        claim: With its code.
-        server: The address at which this agent knows the server.
-        qr: Whether a QR code is wanted.
-        out: Where to; the standard output by default.
+        claim: The claim with its code.
+        server: URL of the server.
+        qr: Whether to show the QR code.
+        out: Output; standard output by default.
     """
     out = out or sys.stdout
     code = claim.code or ""
@@ -36,15 +36,15 @@ def show(claim: Claim, server: str, *, qr: bool, out: TextIO | None = None) -> N
     print(f"claim code {code}  (valid for {claim.expires_in_s or 0:.0f} s)", file=out)
     print(f"or open    {address}", file=out)
     if qr and out.isatty():
-        rows = picture(address)
-        if len(rows[0]) <= shutil.get_terminal_size().columns and _speaks(out):
+        rows = qr_lines(address)
+        if len(rows[0]) <= shutil.get_terminal_size().columns and _can_encode_blocks(out):
             print(*(f"{_INK}{row}{_PLAIN}" for row in rows), sep="\n", file=out)
     out.flush()
 
 
-def picture(text: str) -> list[str]:
-    """A QR code in lines of equal length, two rows of modules in each."""
-    rows = [list(row) for row in segno.make(text, error="m", micro=False).matrix_iter(border=_QUIET)]
+def qr_lines(text: str) -> list[str]:
+    """A QR code as lines of equal length, with two rows of modules per line."""
+    rows = [list(row) for row in segno.make(text, error="m", micro=False).matrix_iter(border=_QUIET_ZONE)]
     if len(rows) % 2:
         rows.append([0] * len(rows[0]))
     return [
@@ -53,8 +53,8 @@ def picture(text: str) -> list[str]:
     ]
 
 
-def _speaks(out: TextIO) -> bool:
-    """Whether its characters can be written there."""
+def _can_encode_blocks(out: TextIO) -> bool:
+    """Whether the output's encoding includes the block characters."""
     try:
         "█▀▄".encode(out.encoding or "ascii")
     except (UnicodeEncodeError, LookupError):

@@ -1,4 +1,4 @@
-"""Tells the service manager that the agent runs, where there is one that asks (systemd's ``Type=notify``)."""
+"""Notifies systemd (``Type=notify``) of readiness and liveness; does nothing without systemd."""
 
 import contextlib
 import os
@@ -6,16 +6,16 @@ import socket
 
 
 def ready(status: str) -> None:
-    """The start is over; ``status`` is for people."""
-    _tell(f"READY=1\nSTATUS={status}")
+    """Report that startup is complete; ``status`` is shown by ``systemctl status``."""
+    _notify(f"READY=1\nSTATUS={status}")
 
 
 def alive() -> None:
-    """To be said more often than the unit's ``WatchdogSec``."""
-    _tell("WATCHDOG=1")
+    """Trigger the watchdog; call more often than ``WatchdogSec``."""
+    _notify("WATCHDOG=1")
 
 
-def _tell(state: str) -> None:
+def _notify(state: str) -> None:
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address or not hasattr(socket, "AF_UNIX"):
         return

@@ -1,4 +1,4 @@
-"""Robot types and rooms: where their folders are, and what a device of ``agent.toml`` is by them."""
+"""Finds the folders of robot types and rooms, and resolves device entries of ``agent.toml`` against them."""
 
 import os
 from collections.abc import Callable
@@ -13,19 +13,19 @@ from device_agent.protocol.manifests import robot_type, room
 from device_agent.protocol.manifests.shipped import ROBOTS
 
 ROBOTS_PATH = "TELESCOPE_ROBOTS_PATH"
-"""Environment: folders of other people's robot types, separated as those of ``PATH``."""
+"""Environment variable: additional search paths, separated as in ``PATH``."""
 
 Manifest = TypeVar("Manifest")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Catalogue(Generic[Manifest]):
-    """Folders of one kind, each with a manifest, in all ``places()``.
+    """Folders of one kind, each with a manifest, in all search paths.
 
     Attributes:
-        what: What they describe, for people.
-        pattern: The manifests' paths in a place; ``*`` stands for the folder's name.
-        read: Reads and checks the manifest of a folder, or raises ``ProtocolError``.
+        what: What a folder describes, for messages.
+        pattern: Path of the manifest relative to a search path; ``*`` is the folder's name.
+        read: Reads the manifest of a folder; raises ``ProtocolError``.
     """
 
     what: str
@@ -33,24 +33,24 @@ class Catalogue(Generic[Manifest]):
     read: Callable[[Path], Manifest]
 
     def folders(self) -> dict[str, Path]:
-        """Every name and its folder; of two with one name that of the earlier place."""
-        found: dict[str, Path] = {}
-        for place in places():
+        """All names and their folders; the first search path takes precedence."""
+        folders: dict[str, Path] = {}
+        for place in search_paths():
             for path in sorted(place.glob(self.pattern)):
-                found.setdefault(path.parent.name, path.parent)
-        return found
+                folders.setdefault(path.parent.name, path.parent)
+        return folders
 
     def folder(self, name: str) -> Path:
         """The folder of this name.
 
         Raises:
-            ConfigError: Unknown; the text lists the known ones.
+            ConfigError: The name is unknown. The message lists the known names.
         """
         known = self.folders()
         if name not in known:
             raise ConfigError(
-                f"no {self.what} '{name}'; there are: {', '.join(known)}. Name the folder that holds yours in "
-                f"{ROBOTS_PATH}, as {self.pattern.replace('*', name)}"
+                f"no {self.what} '{name}'; known: {', '.join(known)}. To add your own, set {ROBOTS_PATH} to the "
+                f"folder that contains {self.pattern.replace('*', name)}"
             )
         return known[name]
 
@@ -58,15 +58,15 @@ class Catalogue(Generic[Manifest]):
         """The manifest of this name.
 
         Raises:
-            ConfigError: Unknown, or the manifest is wrong; the text lists the known ones.
+            ConfigError: The name is unknown, or the manifest is wrong.
         """
         return self.load_from(self.folder(name))
 
     def load_from(self, folder: Path) -> Manifest:
-        """The manifest of any folder.
+        """The manifest of a folder.
 
         Raises:
-            ConfigError: It is missing or wrong.
+            ConfigError: The manifest is missing or wrong.
         """
         try:
             return self.read(folder)
@@ -78,24 +78,24 @@ TYPES = Catalogue(what="robot type", pattern=f"*/{robot_type.MANIFEST}", read=ro
 ROOMS = Catalogue(what="room", pattern=f"rooms/*/{room.MANIFEST}", read=room.load)
 
 
-def places() -> tuple[Path, ...]:
-    """The folders that hold robot types and rooms: this installation's, then those of ``TELESCOPE_ROBOTS_PATH``."""
+def search_paths() -> tuple[Path, ...]:
+    """Search paths: the shipped folder, then those of ``TELESCOPE_ROBOTS_PATH``."""
     more = os.environ.get(ROBOTS_PATH, "").split(os.pathsep)
     return (ROBOTS, *(Path(place).expanduser().resolve() for place in more if place))
 
 
 def type_of(entry: DeviceEntry) -> robot_type.RobotType:
-    """The robot type of a configured device; of a room's device, what the room's manifest says of it.
+    """The robot type of a device entry; for a room device, derived from the room's manifest.
 
     Raises:
-        ConfigError: The type or room is unknown, or the room has nothing of that name and type.
+        ConfigError: The type or room is unknown, or the room has no device of this name and type.
     """
     if not entry.room:
         return TYPES.load(entry.type)
-    there = ROOMS.load(entry.room)
-    device, robot = there.device(entry.name), there.robot(entry.name)
+    manifest = ROOMS.load(entry.room)
+    device, robot = manifest.device(entry.name), manifest.robot(entry.name)
     if device is None and robot is None:
-        raise ConfigError(f"room '{entry.room}' has no '{entry.name}'; it has: {', '.join(there.names)}")
+        raise ConfigError(f"room '{entry.room}' has no '{entry.name}'; known: {', '.join(manifest.names)}")
     kind = TYPES.load(robot.type) if robot is not None else device.robot_type()  # type: ignore[union-attr]
     if kind.type != entry.type:
         raise ConfigError(f"'{entry.name}' of room '{entry.room}' is a {kind.type}, not a {entry.type}")
@@ -103,7 +103,7 @@ def type_of(entry: DeviceEntry) -> robot_type.RobotType:
 
 
 def room_device_of(entry: DeviceEntry) -> room.RoomDeviceManifest | None:
-    """What the room's manifest says of a configured device; ``None`` where it is a robot.
+    """The room manifest's part about a device entry, or ``None`` for a robot.
 
     Raises:
         ConfigError: The room is unknown.
@@ -112,25 +112,25 @@ def room_device_of(entry: DeviceEntry) -> room.RoomDeviceManifest | None:
 
 
 def entries_of(name: str) -> list[DeviceEntry]:
-    """What ``agent.toml`` says of all that is in a room.
+    """Device entries of all robots and devices of a room.
 
     Raises:
-        ConfigError: The room, or the type of a robot in it, is unknown.
+        ConfigError: The room, or the type of one of its robots, is unknown.
     """
-    there = ROOMS.load(name)
+    manifest = ROOMS.load(name)
     robots = (
         DeviceEntry(name=robot.name, type=robot.type, room=name, label=robot.label or TYPES.load(robot.type).label)
-        for robot in there.robots
+        for robot in manifest.robots
     )
-    devices = (DeviceEntry(name=each.name, type=each.kind, room=name, label=each.label) for each in there.devices)
+    devices = (DeviceEntry(name=each.name, type=each.kind, room=name, label=each.label) for each in manifest.devices)
     return [*robots, *devices]
 
 
 def enrolled_devices(configuration: AgentConfig) -> list[dict[str, str]]:
-    """The devices as the cloud is told of them.
+    """The devices as the cloud receives them at enrollment.
 
     Raises:
-        ConfigError: One is of an unknown type or room.
+        ConfigError: A type or room is unknown.
     """
     entries = []
     for device in configuration.devices:

@@ -7,7 +7,7 @@ from typing import Any
 
 import requests
 
-from device_agent.load_generator.options import SwarmError
+from device_agent.load_generator.options import LoadTestError
 
 _WITHIN_S = 20.0
 _TRIES = 6
@@ -38,7 +38,7 @@ class Account:
         """Redeem a claim code.
 
         Raises:
-            SwarmError: Refused, or nobody is signed in.
+            LoadTestError: Refused, or nobody is signed in.
             OSError: Not reached.
         """
         with self._lock:
@@ -56,7 +56,7 @@ class Account:
         if self._token:
             return
         if not self._link:
-            raise SwarmError(
+            raise LoadTestError(
                 "its agents have to be claimed by somebody: give --sign-in with a link from `make link`, "
                 "or an access token in TELESCOPE_TOKEN"
             )
@@ -77,10 +77,10 @@ class Account:
         try:
             found = answer.json()
         except ValueError as error:
-            raise SwarmError(f"{self._base}{path} answered without JSON: is it a Telescope server?") from error
+            raise LoadTestError(f"{self._base}{path} answered without JSON: is it a Telescope server?") from error
         if not answer.ok or not isinstance(found, dict):
             detail = found.get("detail") if isinstance(found, dict) else None
-            raise SwarmError(f"the server refuses {path}: {detail or answer.reason}")
+            raise LoadTestError(f"the server refuses {path}: {detail or answer.reason}")
         return found
 
     def _post(self, path: str, body: dict[str, Any]) -> requests.Response:

@@ -13,11 +13,11 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from device_agent.config.identity_store import Pairing
 from device_agent.load_generator.account import Account
 from device_agent.load_generator.kinematic_arm import DEVICE
-from device_agent.load_generator.options import LoadOptions, SwarmError
+from device_agent.load_generator.options import LoadOptions, LoadTestError
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.security import signing
-from device_agent.transports import factory
+from device_agent.transports import pairing_monitor
 from device_agent.transports.backoff import BackOff
 from device_agent.transports.http import responses
 from device_agent.transports.http.client import CloudClient, CloudError
@@ -37,7 +37,7 @@ class Keys:
         """So many: those on file, and new ones that are put there.
 
         Raises:
-            SwarmError: The file is not one of these.
+            LoadTestError: The file is not one of these.
             OSError: It cannot be read or written.
         """
         known = self._read()
@@ -60,7 +60,7 @@ class Keys:
                 for text in msgspec.json.decode(self._path.read_bytes(), type=list[str])
             ]
         except ValueError as error:
-            raise SwarmError(f"{self._path} is no file of a swarm's keys; name another --home") from error
+            raise LoadTestError(f"{self._path} is no file of a swarm's keys; name another --home") from error
 
 
 class Enrollment:
@@ -86,7 +86,7 @@ class Enrollment:
         """Every agent, known and claimed.
 
         Raises:
-            SwarmError: Nobody claims them, or the server refuses that.
+            LoadTestError: Nobody claims them, or the server refuses that.
             CloudError: The server refuses one.
             OSError: Not reached.
         """
@@ -109,12 +109,12 @@ class Enrollment:
         device = {"name": DEVICE, "kind": self._kind.kind, "robot_type": self._kind.type, "label": f"Arm {number}"}
         claim = _patiently(
             lambda: api.enroll(
-                name=f"swarm-{number:05d}", software=factory.SOFTWARE, transport="mqtt", devices=[device]
+                name=f"swarm-{number:05d}", software=pairing_monitor.SOFTWARE, transport="mqtt", devices=[device]
             )
         )
         if claim.code is not None:
             self._account.claim(claim.code)
-        return factory.pairing_of(responses.read(_patiently(api.enrollment), responses.Claimed))
+        return pairing_monitor.pairing_of(responses.read(_patiently(api.enrollment), responses.Claimed))
 
 
 def _patiently(call: Callable[[], T]) -> T:

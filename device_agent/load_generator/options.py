@@ -16,7 +16,7 @@ MOST_HZ = 50.0
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
-class SwarmError(Exception):
+class LoadTestError(Exception):
     """The swarm cannot begin. Its text is one line that says what to do."""
 
 
@@ -59,15 +59,15 @@ class LoadOptions:
         """Refuse what cannot be run.
 
         Raises:
-            SwarmError: Which option, and what it may be.
+            LoadTestError: Which option, and what it may be.
         """
         parts = urlsplit(self.cloud)
         if parts.scheme not in {"http", "https"} or not parts.hostname:
-            raise SwarmError(f"--cloud: '{self.cloud}' is not an address like http://127.0.0.1:8080")
+            raise LoadTestError(f"--cloud: '{self.cloud}' is not an address like http://127.0.0.1:8080")
         if self.ca is not None and parts.scheme != "https":
-            raise SwarmError("--ca says who may speak for an https server; this one speaks http")
+            raise LoadTestError("--ca says who may speak for an https server; this one speaks http")
         if not re.fullmatch(ID_PATTERN, self.type):
-            raise SwarmError(f"--type: '{self.type}' is not {ID_PATTERN}")
+            raise LoadTestError(f"--type: '{self.type}' is not {ID_PATTERN}")
         ranges: tuple[tuple[str, float, float, float], ...] = (
             ("--count", self.count, 1, MOST_AGENTS),
             ("--rate-hz", self.rate_hz, 0.01, MOST_HZ),
@@ -77,7 +77,7 @@ class LoadOptions:
         )
         for option, value, least, most in ranges:
             if not least <= value <= most:
-                raise SwarmError(f"{option}: {value:g} is not between {least:g} and {most:g}")
+                raise LoadTestError(f"{option}: {value:g} is not between {least:g} and {most:g}")
 
     def may_speak_to(self, host: str) -> bool:
         """Whether this host was named: as the server's, or as the broker's."""
@@ -128,11 +128,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def plan_of(options: argparse.Namespace) -> LoadOptions:
+def parse_options(options: argparse.Namespace) -> LoadOptions:
     """What was asked for, checked.
 
     Raises:
-        SwarmError: An option is wrong.
+        LoadTestError: An option is wrong.
     """
     plan = LoadOptions(
         cloud=options.cloud,

@@ -16,7 +16,7 @@ from device_agent.load_generator.connection import Dialect
 from device_agent.load_generator.enrollment import Enrollment, Keys
 from device_agent.load_generator.kinematic_arm import Shape, robot_type
 from device_agent.load_generator.metrics import Metrics
-from device_agent.load_generator.options import LoadOptions, SwarmError
+from device_agent.load_generator.options import LoadOptions, LoadTestError
 from device_agent.ports.clock import CloudClock
 
 _THREADS = 8
@@ -33,7 +33,7 @@ def run(plan: LoadOptions) -> int:
     """Run the swarm to its end; the exit code: 0 when every agent was connected at once.
 
     Raises:
-        SwarmError: It cannot begin.
+        LoadTestError: It cannot begin.
         CloudError: The server refuses an agent.
         OSError: The server is not reached, or a file cannot be written.
     """
@@ -171,13 +171,13 @@ def _allow_files(wanted: int) -> None:
     """See that so many sockets may be open.
 
     Raises:
-        SwarmError: The system does not let them.
+        LoadTestError: The system does not let them.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft >= wanted:
         return
     if hard != resource.RLIM_INFINITY and hard < wanted:
-        raise SwarmError(f"this system lets a process open {hard} files, {wanted} are needed: see `ulimit -Hn`")
+        raise LoadTestError(f"this system lets a process open {hard} files, {wanted} are needed: see `ulimit -Hn`")
     resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 

@@ -80,7 +80,7 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
 ) -> None:
     link = terminal.link()
     # The same link stands there as a picture.
-    drawn = claim_prompt.picture(link)
+    drawn = claim_prompt.qr_lines(link)
     wait_until(lambda: all(line in terminal.text for line in drawn), "the QR code")
     with machine.api() as api, person(browser, link) as page:
         known = {device["id"] for device in api.get("/devices")["items"]}

@@ -1,4 +1,4 @@
-"""The devices: whether each one's driver and model can be loaded, and whether pictures can be drawn."""
+"""Checks of the devices: drivers, models and rendering."""
 
 import importlib.util
 import os
@@ -30,16 +30,16 @@ _SOFTWARE = {"MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
 
 
 def device(entry: DeviceEntry) -> Iterator[Finding]:
-    """Its type, model and driver. A simulated one is built; a real one is left alone, for it may be at work."""
+    """Check type, model and driver. Builds a simulated device; does not touch a real one, which may be in use."""
     name = f"device {entry.name}"
     try:
         kind = catalogue.type_of(entry)
-        instrument = bootstrap.instrument_of(entry, {})
-        if instrument is not None:
-            yield _instrument(name, kind.type, instrument)
+        room_device = bootstrap.create_room_device(entry, {})
+        if room_device is not None:
+            yield _room_device(name, kind.type, room_device)
             return
-        shape = bootstrap.geometry_of(entry, kind)
-        driver = bootstrap.driver_of(entry, kind)
+        shape = bootstrap.load_geometry(entry, kind)
+        driver = bootstrap.create_driver(entry, kind)
         if driver.simulated:
             driver.connect()
             driver.close()
@@ -49,53 +49,53 @@ def device(entry: DeviceEntry) -> Iterator[Finding]:
     except (DriverError, GeometryError) as error:
         yield problem(name, str(error), "Correct the device in agent.toml, or install what its driver needs.")
         return
-    known = "its shape is known" if shape is not None else "its shape is not known, so it is not kept from itself"
-    seen = "simulated; its model compiles" if driver.simulated else "real; not touched by this check"
-    yield ok(name, f"{entry.type}, driver '{entry.driver or kind.driver}': {seen}, {known}")
+    geometry = "its shape is known" if shape is not None else "its shape is unknown, so self-collision is not checked"
+    checked = "simulated; its model compiles" if driver.simulated else "real; not touched by this check"
+    yield ok(name, f"{entry.type}, driver '{entry.driver or kind.driver}': {checked}, {geometry}")
 
 
-def _instrument(name: str, kind: str, instrument: RoomDevice) -> Finding:
-    """A room device; one that looks with others is only made, for here it is alone."""
-    driver, said = instrument.driver, f"{kind}, driver '{instrument.manifest.driver}'"
+def _room_device(name: str, kind: str, room_device: RoomDevice) -> Finding:
+    """Check a room device. Devices that depend on other devices are created, but not run."""
+    driver, summary = room_device.driver, f"{kind}, driver '{room_device.manifest.driver}'"
     if not driver.simulated:
-        return ok(name, f"{said}: real; not touched by this check")
+        return ok(name, f"{summary}: real; not touched by this check")
     try:
         driver.connect()
         driver.close()
     except SensorError as error:
         return problem(name, str(error), "Correct the device in the room's manifest, or in agent.toml.")
-    return ok(name, f"{said}: simulated; its room has what it needs")
+    return ok(name, f"{summary}: simulated; its room has what it needs")
 
 
 def room(configuration: AgentConfig) -> Iterator[Finding]:
-    """Whether what interlocks and movements listen to can be heard."""
+    """Check that the measurements for interlocks and scripts can be received."""
     own = {entry.name for entry in configuration.devices}
     others = [f"{source}/{stream}" for source, stream in configuration.room_sources if source not in own]
     if others and configuration.transport != "mqtt":
         yield problem(
             "room",
-            f"over {configuration.transport} an agent hears nothing of other agents: {', '.join(others)} stays silent, "
-            "and an interlock that hears nothing holds its robot",
+            f"over {configuration.transport} an agent receives no measurements of other agents: {', '.join(others)}; "
+            "an interlock without measurements holds its robot",
             'Use `transport = "mqtt"` in agent.toml, or connect the sensor to this agent.',
         )
 
 
 def renderer(configuration: AgentConfig) -> Iterator[Finding]:
-    """Whether MuJoCo can draw pictures. In a process of its own: without a renderer its libraries end the process."""
+    """Check that MuJoCo can render, in a process of its own: without a renderer its libraries abort the process."""
     used = {entry.driver or _driver_of(entry) for entry in configuration.devices}
     if "mujoco" not in used or importlib.util.find_spec("mujoco") is None:
         return
     chosen = os.environ.get("MUJOCO_GL", "")
     if _renders({}):
-        yield ok("renderer", f"pictures can be drawn (MUJOCO_GL={chosen or 'not set'})")
+        yield ok("renderer", f"images can be rendered (MUJOCO_GL={chosen or 'not set'})")
     elif _renders(_SOFTWARE):
-        wanted = " ".join(f"{name}={value}" for name, value in _SOFTWARE.items())
-        said = f"no picture can be drawn with MUJOCO_GL={chosen or 'not set'}, but with {wanted}"
-        yield warning("renderer", said, f"Set {wanted} where the agent is started.")
+        settings = " ".join(f"{name}={value}" for name, value in _SOFTWARE.items())
+        message = f"images cannot be rendered with MUJOCO_GL={chosen or 'not set'}, but with {settings}"
+        yield warning("renderer", message, f"Set {settings} in the environment of the agent.")
     else:
         yield warning(
             "renderer",
-            "simulated cameras give no pictures; all else works",
+            "simulated cameras provide no images; everything else works",
             "Install a software renderer (Debian: apt-get install libosmesa6) and set MUJOCO_GL=osmesa.",
         )
 
@@ -109,7 +109,7 @@ def _driver_of(entry: DeviceEntry) -> str:
 
 def _renders(changes: Mapping[str, str]) -> bool:
     try:
-        done = subprocess.run(  # noqa: S603 (our own lines, run by our own interpreter)
+        completed = subprocess.run(  # noqa: S603 (a constant script, run by this interpreter)
             [sys.executable, "-I", "-c", _RENDER],
             env={**os.environ, **changes},
             stdin=subprocess.DEVNULL,
@@ -119,4 +119,4 @@ def _renders(changes: Mapping[str, str]) -> bool:
         )
     except (OSError, subprocess.TimeoutExpired):
         return False
-    return done.returncode == 0
+    return completed.returncode == 0

@@ -1,4 +1,4 @@
-"""One line of a report."""
+"""One line of the report."""
 
 from typing import Literal
 
@@ -6,7 +6,7 @@ from msgspec import Struct
 
 
 class Finding(Struct, frozen=True):
-    """What was looked at, how it is, what that means, and what to do about it where it is not well."""
+    """What was checked, its level, the result, and the remedy for a problem."""
 
     check: str
     level: Literal["ok", "warning", "problem"]
@@ -15,15 +15,15 @@ class Finding(Struct, frozen=True):
 
 
 def ok(check: str, message: str) -> Finding:
-    """All is well."""
+    """The check passed."""
     return Finding(check, "ok", message)
 
 
 def warning(check: str, message: str, advice: str) -> Finding:
-    """The agent runs, but not with all that it could."""
+    """The agent runs, but with reduced functions."""
     return Finding(check, "warning", message, advice)
 
 
 def problem(check: str, message: str, advice: str) -> Finding:
-    """The agent cannot do its work."""
+    """The agent cannot work."""
     return Finding(check, "problem", message, advice)

@@ -1,4 +1,4 @@
-"""This computer: Python, user, the agent's folder, disk, and what locks scripts in."""
+"""Checks of this computer: Python, user, folder, disk, speech and the script sandbox."""
 
 import os
 import platform
@@ -15,83 +15,85 @@ from device_agent.config.identity_store import IdentityStore
 from device_agent.sandbox.host import SandboxHost
 from device_agent.speech.espeak import PROGRAM
 
-_OLDEST = (3, 11)
-_LITTLE_BYTES = 500_000_000
-_TOO_LITTLE_BYTES = 50_000_000
+_MIN_PYTHON = (3, 11)
+_WARNING_BYTES = 500_000_000
+_PROBLEM_BYTES = 50_000_000
 _SECRET = frozenset({"identity.pem"})
 
 
 def python() -> Iterator[Finding]:
-    """Version and system."""
-    here = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
-    if sys.version_info < _OLDEST:
-        yield problem("python", here, f"Install Python {_OLDEST[0]}.{_OLDEST[1]} or newer.")
+    """Check the Python version and the operating system."""
+    version = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+    if sys.version_info < _MIN_PYTHON:
+        yield problem("python", version, f"Install Python {_MIN_PYTHON[0]}.{_MIN_PYTHON[1]} or newer.")
     elif sys.platform != "linux":
-        yield warning("python", here, "All but movement scripts works here; these run on Linux only.")
+        yield warning("python", version, "Everything except movement scripts works here; scripts run on Linux only.")
     else:
-        yield ok("python", here)
+        yield ok("python", version)
 
 
 def user() -> Iterator[Finding]:
-    """Nothing that the agent does needs root."""
+    """Check that the agent does not run as root."""
     if not hasattr(os, "geteuid"):
-        yield ok("user", "runs with the rights of whoever starts it")
+        yield ok("user", "runs with the rights of the user who starts it")
     elif os.geteuid() == 0:
         yield warning(
             "user",
-            "runs as root: a limit on processes does not bind root, and a fault here would be a fault of the machine",
-            "Run the agent as a user of its own: docs/guides/install-an-agent.md, infra/systemd/telescope-agent.service.",
+            "runs as root: process limits do not apply to root, and a fault could affect the whole machine",
+            "Run the agent as a user of its own: docs/guides/install-an-agent.md.",
         )
     else:
         yield ok("user", f"runs as an unprivileged user (uid {os.geteuid()})")
 
 
 def folder(store: IdentityStore) -> Iterator[Finding]:
-    """Whether the agent can use its folder, and nobody else."""
+    """Check that only the agent's user can use its folder."""
     path = store.folder
     if not path.is_dir():
         yield problem(
-            "folder", f"{path} does not exist", "Run `python -m device_agent enroll`, or name it with --store."
+            "folder", f"{path} does not exist", "Run `python -m device_agent enroll`, or name it with --home."
         )
         return
     if not os.access(path, os.R_OK | os.W_OK | os.X_OK):
-        yield problem("folder", f"{path} cannot be written by this user", f"Make it this user's: chown -R USER {path}")
+        yield problem("folder", f"{path} cannot be written by this user", f"Change its owner: chown -R USER {path}")
         return
     if not (path / "identity.pem").exists():
         yield problem("folder", f"{path} holds no agent", "Run `python -m device_agent enroll` first.")
         return
     if sys.platform != "win32":
-        wrong = list(_too_open(path))
-        yield from wrong
-        if wrong:
+        findings = list(_readable_by_others(path))
+        yield from findings
+        if findings:
             return
-    yield ok("folder", f"{path} is this user's alone")
+    yield ok("folder", f"{path} is accessible to this user only")
 
 
-def _too_open(path: Path) -> Iterator[Finding]:
+def _readable_by_others(path: Path) -> Iterator[Finding]:
     for each in (path, *sorted(path.iterdir())):
         if each != path and not each.is_file():
             continue
         if stat.S_IMODE(each.stat().st_mode) & 0o077:
             mode = "700" if each == path else "600"
             if each.name in _SECRET:
-                said = f"others on this machine can read {each}, and then speak as this robot"
-                yield problem("folder", said, f"chmod {mode} {each}; if others use this machine, delete it and enroll.")
+                message = f"other users of this machine can read {each} and impersonate this agent"
+                yield problem(
+                    "folder", message, f"chmod {mode} {each}; if others use this machine, delete it and enroll."
+                )
             else:
-                yield warning("folder", f"others on this machine can read {each}", f"chmod {mode} {each}")
+                yield warning("folder", f"other users of this machine can read {each}", f"chmod {mode} {each}")
 
 
 def disk(store: IdentityStore) -> Iterator[Finding]:
-    """Room for the journal, and whether it can be read: the agent does not run without it."""
+    """Check free space and integrity of the databases; the agent does not run without its journal."""
     existing = next(each for each in (store.folder, *store.folder.resolve().parents) if each.is_dir())
     free = shutil.disk_usage(existing).free
-    said = f"{free / 1e9:.1f} GB free at {existing}"
-    if free < _TOO_LITTLE_BYTES:
-        yield problem("disk", said, "Make room: without its journal the agent obeys nothing.")
-    elif free < _LITTLE_BYTES:
-        yield warning("disk", said, "Make room soon: without its journal the agent obeys nothing.")
+    message = f"{free / 1e9:.1f} GB free at {existing}"
+    if free < _PROBLEM_BYTES:
+        yield problem("disk", message, "Free disk space: without its journal the agent rejects all commands.")
+    elif free < _WARNING_BYTES:
+        yield warning("disk", message, "Free disk space soon: without its journal the agent rejects all commands.")
     else:
-        yield ok("disk", said)
+        yield ok("disk", message)
     for database in (store.journal, store.outbox):
         if database.exists():
             yield _readable(database)
@@ -99,53 +101,55 @@ def disk(store: IdentityStore) -> Iterator[Finding]:
 
 def _readable(database: Path) -> Finding:
     try:
-        with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True, timeout=2)) as opened:
-            said = str(opened.execute("PRAGMA quick_check(1)").fetchone()[0])
+        with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True, timeout=2)) as connection:
+            result = str(connection.execute("PRAGMA quick_check(1)").fetchone()[0])
     except sqlite3.Error as error:
-        said = str(error)
-    if said == "ok":
-        return ok("disk", f"{database.name} is whole")
+        result = str(error)
+    if result == "ok":
+        return ok("disk", f"{database.name} is intact")
     return problem(
         "disk",
-        f"{database} is damaged: {said}",
-        "Move it away. The agent then needs a new lease for each device, and what it had not sent yet is lost.",
+        f"{database} is damaged: {result}",
+        "Move it away. The agent then needs a new lease for each device, and unsent messages are lost.",
     )
 
 
-def scripts(*, trusted: bool) -> Iterator[Finding]:
-    """Whether movement scripts can be locked in, here and now: by doing it."""
-    jail = SandboxHost()
+def scripts(*, allow_unconfined: bool) -> Iterator[Finding]:
+    """Check that movement scripts can be confined, by confining one."""
+    sandbox = SandboxHost()
     try:
-        jail.start()
-        refusal = jail.refusal(stranger=False)
-        strangers = jail.refusal(stranger=True) if refusal is None else None
-        missing = jail.missing
+        sandbox.start()
+        refusal = sandbox.refusal(stranger=False)
+        untrusted_refusal = sandbox.refusal(stranger=True) if refusal is None else None
+        missing = sandbox.missing
     finally:
-        jail.close()
+        sandbox.close()
     if refusal is None:
-        yield ok("scripts", "limits, another user, Landlock and seccomp lock movement scripts in")
-    elif trusted:
-        lacks = ", ".join(f"{layer} ({why})" for layer, why in missing.items()) or "Linux"
+        yield ok("scripts", "limits, another user, Landlock and seccomp confine movement scripts")
+    elif allow_unconfined:
+        lacks = ", ".join(f"{layer} ({reason})" for layer, reason in missing.items()) or "Linux"
         yield warning(
             "scripts",
-            f"movement scripts run with this agent's rights, as its agent.toml wants it: there is no {lacks}",
+            f"movement scripts run with this agent's rights, as agent.toml allows: this machine lacks {lacks}",
             "Remove `allow_unconfined_scripts` from agent.toml unless you wrote every script yourself.",
         )
     elif sys.platform != "linux":
         yield warning("scripts", refusal, "Everything else works here.")
     else:
-        yield warning("scripts", f"movement scripts are refused: {refusal}", "Without scripts everything else works.")
-    if strangers is not None:
-        yield warning("scripts", strangers, "Scripts of the robot's own account run without it.")
+        yield warning(
+            "scripts", f"movement scripts are unavailable: {refusal}", "Without scripts everything else works."
+        )
+    if untrusted_refusal is not None:
+        yield warning("scripts", untrusted_refusal, "Scripts of the agent's owner run without it.")
 
 
 def voice() -> Iterator[Finding]:
-    """Whether robots without a voice of their own can be heard."""
+    """Check that a speech synthesizer is installed."""
     if shutil.which(PROGRAM) is not None:
-        yield ok("voice", f"{PROGRAM} turns what robots say into sound")
+        yield ok("voice", f"{PROGRAM} is installed")
     else:
         yield warning(
             "voice",
-            f"there is no {PROGRAM}: what robots say is shown as text alone",
+            f"{PROGRAM} is not installed: speech of robots without a voice is shown as text only",
             f"Install {PROGRAM} for sound (Debian: apt-get install {PROGRAM}).",
         )

@@ -12,7 +12,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 
-from device_agent.config.client_certificate import OwnCertificate
+from device_agent.config.client_certificate import ClientCertificate
 from device_agent.protocol.security.grants import agent_grant
 from function_app.adapters.local.certificates import FileCertificates
 from function_app.adapters.mqtt.tls import client_context
@@ -48,7 +48,7 @@ class Agent:
     def __init__(self, name: str, site: Path, broker: RunningBroker, folder: Path) -> None:
         self.name, self.site, self.broker = name, site, broker
         folder.mkdir(exist_ok=True)
-        self.own = OwnCertificate(folder)
+        self.own = ClientCertificate(folder)
         self.authority = FileCertificates(site)
         grant = agent_grant("space", name, token_id=new_id(), lifetime_s=600)
         self.credentials = broker.run(broker.access.issue(grant))
@@ -57,7 +57,7 @@ class Agent:
         def ask(request: str) -> str:
             return asyncio.run(self.authority.issue(self.name, request)).chain
 
-        return self.own.ready(after_ms=after_ms, now_ms=dt.datetime.now(dt.UTC).timestamp() * 1000, ask=ask)
+        return self.own.ready(after_ms=after_ms, now_ms=dt.datetime.now(dt.UTC).timestamp() * 1000, request_chain=ask)
 
     def connect(self, *, shown: bool = True) -> Client:
         context = client_context(self.site / "ca.crt")

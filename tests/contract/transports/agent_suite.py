@@ -17,8 +17,8 @@ from device_agent.config.agent_config import AgentConfig, DeviceEntry, HttpPolli
 from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import Ack, AckStatus, MoveJoints, State, codec, topics
-from device_agent.transports.factory import SOFTWARE
 from device_agent.transports.http.client import CloudClient
+from device_agent.transports.pairing_monitor import SOFTWARE
 from tests.contract.transports.suite import Spoken
 from tests.harness.cloud.cloud_processes import Ground
 from tests.harness.network.brokers import wait_until

@@ -237,5 +237,5 @@ class Sensor:
 
 
 if __name__ == "__main__":
-    with mock.patch.object(bootstrap, "api_of", lambda store, _configuration, clock, **_: _Api(store, clock)):
+    with mock.patch.object(bootstrap, "cloud_client", lambda store, _configuration, clock, **_: _Api(store, clock)):
         sys.exit(main(["run", "--home", sys.argv[1]]))

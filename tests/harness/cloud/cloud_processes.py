@@ -18,12 +18,12 @@ from typing import Any, Protocol, Self
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from device_agent.config.agent_config import AgentConfig, DeviceEntry
-from device_agent.config.client_certificate import OwnCertificate
+from device_agent.config.client_certificate import ClientCertificate
 from device_agent.config.identity_store import Pairing
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import Command, Presence, Request, codec, topics
 from device_agent.protocol.security import signing
-from device_agent.transports import factory
+from device_agent.transports import factory, pairing_monitor
 from device_agent.transports.http.client import CloudClient
 from function_app.adapters.local.signing_keys import FileKeys
 from function_app.domain.common.ids import command_id
@@ -218,18 +218,18 @@ class Link:
         )
         pairing = Pairing(agent=self.robot.id, space=self.robot.space, account="anna", keys={})
         entry = {"name": "arm", "kind": "arm", "robot_type": "ur5", "label": "Arm"}
-        self.membership = factory.PairingMonitor(pairing, told, [entry], pinned(pairing))
+        self.membership = pairing_monitor.PairingMonitor(pairing, told, [entry], pinned(pairing))
         if through:
             self.proxy = self._stack.enter_context(start_proxy(ground.endpoints[through].port))
         self.transport = factory.make(
             factory.Wiring(
                 configuration=told,
                 pairing=pairing,
-                membership=self.membership,
+                pairing_monitor=self.membership,
                 open_api=self._open_api,
                 next_session=self._next_session,
                 quiet=lambda: self.quiet,
-                certificate=OwnCertificate(ground.folder),
+                certificate=ClientCertificate(ground.folder),
                 now_ms=lambda: None,
             )
         )

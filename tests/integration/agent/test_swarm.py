@@ -19,7 +19,7 @@ COUNT = 20
 def command(*options: str, token: str = "", link: str = "") -> "subprocess.Popen[str]":
     environment = {**os.environ, "TELESCOPE_TOKEN": token, "TELESCOPE_SIGN_IN": link}
     return subprocess.Popen(
-        [sys.executable, "-m", "device_agent", "swarm", *options],
+        [sys.executable, "-m", "device_agent", "load-test", *options],
         cwd=ROOT,
         env=environment,
         stdout=subprocess.PIPE,

@@ -14,7 +14,7 @@ from device_agent.config import catalogue
 from device_agent.protocol.manifests import robot_type
 from tests.harness.paths import ROBOTS
 
-FOLDERS = sorted(path.parent for place in catalogue.places() for path in place.glob("*/robot.toml"))
+FOLDERS = sorted(path.parent for place in catalogue.search_paths() for path in place.glob("*/robot.toml"))
 SHIPPED = [folder for folder in FOLDERS if folder.parent == ROBOTS]
 MOVEMENTS = sorted(path for folder in FOLDERS for path in (folder / robot_type.MOVEMENTS).glob("*.py"))
 

@@ -37,7 +37,7 @@ def test_the_code_stands_in_its_line_and_in_a_link() -> None:
 
 
 def test_a_terminal_is_shown_a_picture_too() -> None:
-    assert len(shown(Terminal())) == 2 + len(claim_prompt.picture(LINK))
+    assert len(shown(Terminal())) == 2 + len(claim_prompt.qr_lines(LINK))
 
 
 @pytest.mark.parametrize("out", [io.StringIO, Ascii])
@@ -55,7 +55,7 @@ def test_a_narrow_terminal_has_the_link_alone(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_the_picture_has_every_module_of_the_code() -> None:
-    upper, lower = {"█": (0, 0), "▀": (0, 1), "▄": (1, 0), " ": (1, 1)}, claim_prompt.picture(LINK)
+    upper, lower = {"█": (0, 0), "▀": (0, 1), "▄": (1, 0), " ": (1, 1)}, claim_prompt.qr_lines(LINK)
     drawn = [[upper[mark][half] for mark in line] for line in lower for half in (0, 1)]
     wanted = [list(row) for row in segno.make(LINK, error="m", micro=False).matrix_iter(border=2)]
     assert drawn[: len(wanted)] == wanted

@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 
-from device_agent.config.client_certificate import OwnCertificate
+from device_agent.config.client_certificate import ClientCertificate
 from device_agent.config.errors import ConfigError
 
 DAY_MS = 86_400_000
@@ -48,17 +48,17 @@ def signer() -> Signer:
 
 
 @pytest.fixture
-def own(tmp_path: Path) -> OwnCertificate:
-    return OwnCertificate(tmp_path)
+def own(tmp_path: Path) -> ClientCertificate:
+    return ClientCertificate(tmp_path)
 
 
-def ready(own: OwnCertificate, ask: Callable[[str], str], *, after_ms: float = BEGIN_MS, days: float = 1) -> Path:
-    certificate, key = own.ready(after_ms=after_ms, now_ms=BEGIN_MS + days * DAY_MS, ask=ask)
+def ready(own: ClientCertificate, ask: Callable[[str], str], *, after_ms: float = BEGIN_MS, days: float = 1) -> Path:
+    certificate, key = own.ready(after_ms=after_ms, now_ms=BEGIN_MS + days * DAY_MS, request_chain=ask)
     assert key.stat().st_mode & 0o777 == 0o600
     return certificate
 
 
-def test_it_is_asked_for_once_and_again_after_two_thirds_of_its_life(own: OwnCertificate, signer: Signer) -> None:
+def test_it_is_asked_for_once_and_again_after_two_thirds_of_its_life(own: ClientCertificate, signer: Signer) -> None:
     first = ready(own, signer).read_bytes()
     assert ready(own, signer, days=19.9).read_bytes() == first
     assert signer.asked == 1
@@ -66,7 +66,7 @@ def test_it_is_asked_for_once_and_again_after_two_thirds_of_its_life(own: OwnCer
     assert signer.asked == 2
 
 
-def test_one_of_an_earlier_pairing_does_not_count(own: OwnCertificate, signer: Signer) -> None:
+def test_one_of_an_earlier_pairing_does_not_count(own: ClientCertificate, signer: Signer) -> None:
     ready(own, signer)
     ready(own, signer, after_ms=BEGIN_MS + DAY_MS, days=2)
     assert signer.asked == 2
@@ -75,7 +75,7 @@ def test_one_of_an_earlier_pairing_does_not_count(own: OwnCertificate, signer: S
 @pytest.mark.parametrize("name", ["device.crt", "device.key"])
 @pytest.mark.parametrize("content", [b"damaged", None])
 def test_what_is_damaged_or_lost_is_made_again(
-    tmp_path: Path, own: OwnCertificate, signer: Signer, name: str, content: bytes | None
+    tmp_path: Path, own: ClientCertificate, signer: Signer, name: str, content: bytes | None
 ) -> None:
     ready(own, signer)
     if content is None:
@@ -87,7 +87,7 @@ def test_what_is_damaged_or_lost_is_made_again(
 
 
 def test_a_key_and_a_certificate_that_do_not_fit_are_made_again(
-    tmp_path: Path, own: OwnCertificate, signer: Signer
+    tmp_path: Path, own: ClientCertificate, signer: Signer
 ) -> None:
     """As after a kill between the two writes."""
     ready(own, signer)
@@ -97,7 +97,7 @@ def test_a_key_and_a_certificate_that_do_not_fit_are_made_again(
 
 
 def test_a_certificate_for_another_key_is_refused_and_nothing_written(
-    tmp_path: Path, own: OwnCertificate, signer: Signer
+    tmp_path: Path, own: ClientCertificate, signer: Signer
 ) -> None:
     with pytest.raises(ValueError, match="another key"):
         ready(own, signer.another)
@@ -107,4 +107,4 @@ def test_a_certificate_for_another_key_is_refused_and_nothing_written(
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, signer: Signer) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot be written"):
-        ready(OwnCertificate(tmp_path / "file"), signer)
+        ready(ClientCertificate(tmp_path / "file"), signer)

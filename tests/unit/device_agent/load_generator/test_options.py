@@ -9,7 +9,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from device_agent.load_generator.enrollment import FILE, Keys
 from device_agent.load_generator.metrics import Metrics, percentile
-from device_agent.load_generator.options import LoadOptions, SwarmError
+from device_agent.load_generator.options import LoadOptions, LoadTestError
 
 PLAN = LoadOptions(cloud="https://telescope.example:8443")
 
@@ -34,7 +34,7 @@ PLAN = LoadOptions(cloud="https://telescope.example:8443")
 )
 def test_what_cannot_be_run_is_refused_by_the_name_of_its_option(changes: dict[str, Any]) -> None:
     PLAN.check()
-    with pytest.raises(SwarmError, match="--"):
+    with pytest.raises(LoadTestError, match="--"):
         replace(PLAN, **changes).check()
 
 
@@ -58,7 +58,7 @@ def test_the_next_run_has_the_same_keys_and_nobody_else_may_read_them(tmp_path: 
     assert public(3) == more[:3]
     assert (tmp_path / "home" / FILE).stat().st_mode & 0o777 == 0o600
     (tmp_path / "home" / FILE).write_text('["no key"]')
-    with pytest.raises(SwarmError, match="--home"):
+    with pytest.raises(LoadTestError, match="--home"):
         public(1)
 
 

@@ -1,0 +1,103 @@
+"""``run``: run the agent."""
+
+import argparse
+import gc
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+from device_agent import bootstrap
+from device_agent.cli import systemd
+from device_agent.cli.arguments import Commands, add_home, add_no_qr
+from device_agent.cli.enroll import announce, await_claim
+from device_agent.config.agent_config import AgentConfig
+from device_agent.config.identity_store import IdentityStore
+from device_agent.ports.clock import CloudClock
+
+_PAIRING_CHECK_S = 0.5
+_RETRY_S = 5.0
+_SWITCH_INTERVAL_S = 0.001
+
+
+def add_commands(commands: Commands, home: Path) -> None:
+    """Add ``run``."""
+    parser = commands.add_parser("run", help="run the agent until Ctrl-C or SIGTERM")
+    parser.add_argument(
+        "--trace", type=Path, metavar="FOLDER", help="folder in which simulated devices record their ground truth"
+    )
+    add_no_qr(parser)
+    add_home(parser, home)
+    parser.set_defaults(command=_run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    store = IdentityStore(options.home)
+    with store.lock():
+        if store.pairing() is None:
+            _pair(store, qr=not options.no_qr)
+        if options.trace is not None:
+            options.trace.mkdir(parents=True, exist_ok=True)
+        while _run_until_unpaired(store, options.trace):
+            _pair(store, qr=not options.no_qr)
+    return 0
+
+
+def _pair(store: IdentityStore, *, qr: bool) -> None:
+    """Load the pairing from the cloud. If there is none, show a claim code and wait for the claim.
+
+    Retries while the cloud cannot be reached: a robot may boot before its network.
+    """
+    config = AgentConfig.load(store.folder)
+    systemd.ready("waiting to be claimed")
+    previous = signal.signal(signal.SIGTERM, _exit)
+    try:
+        while True:
+            api = bootstrap.cloud_client(store, config, CloudClock())
+            try:
+                await_claim(store, api, config, announce(api, config, qr=qr), qr=qr)
+            except OSError as error:
+                print(f"telescope agent: {error}; trying again in {_RETRY_S:.0f} s", file=sys.stderr, flush=True)
+                time.sleep(_RETRY_S)
+            else:
+                return
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _exit(*_: object) -> None:
+    """Exit at once: no device is running yet."""
+    raise SystemExit(0)
+
+
+def _run_until_unpaired(store: IdentityStore, trace: Path | None) -> bool:
+    """Run with the saved pairing until a signal arrives. Returns True if the pairing is no longer valid."""
+    stop = threading.Event()
+    previous = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    agent = bootstrap.build(store, trace=trace)
+    try:
+        agent.start()
+        _prioritize_control_loops()
+        print("running", flush=True)
+        systemd.ready("running")
+        while not stop.wait(_PAIRING_CHECK_S):
+            systemd.alive()
+            if agent.outdated:
+                return True
+    finally:
+        agent.stop()
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    return False
+
+
+def _prioritize_control_loops() -> None:
+    """Bound the time for which other threads can delay a control loop; see docs/results/measured.md.
+
+    A computing thread yields after 1 ms instead of 5 ms. The garbage collector ignores the objects made so far: a full
+    collection of them paused all threads for 40 ms.
+    """
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    gc.collect()
+    gc.freeze()

@@ -1,0 +1,52 @@
+"""Devices that belong to a room: entries of ``agent.toml`` and their robot types."""
+
+from pathlib import Path
+
+import pytest
+
+from device_agent import bootstrap
+from device_agent.__main__ import main
+from device_agent.config import catalogue
+from device_agent.config.agent_config import DeviceEntry
+from device_agent.config.errors import ConfigError
+
+ARM = DeviceEntry(name="ur5", type="ur5", room="lab")
+
+
+def test_a_room_has_an_entry_for_each_robot_and_device() -> None:
+    entries = catalogue.entries_of("lab")
+    assert [entry.name for entry in entries] == list(catalogue.ROOMS.load("lab").names)
+    assert all(entry.room == "lab" and entry.label for entry in entries)
+    assert all(catalogue.type_of(entry).type == entry.type for entry in entries)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        (DeviceEntry(name="ur5", type="ur5", room="attic"), "no room 'attic'; known: lab"),
+        (DeviceEntry(name="ur6", type="ur5", room="lab"), "room 'lab' has no 'ur6'; known: ur5, "),
+        (DeviceEntry(name="ur5", type="hanson", room="lab"), "'ur5' of room 'lab' is a ur5, not a hanson"),
+    ],
+)
+def test_unknown_names_are_listed_with_the_known_ones(entry: DeviceEntry, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        catalogue.type_of(entry)
+
+
+def test_unknown_room_is_one_line_of_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["enroll", "--home", str(tmp_path), "--server", "http://127.0.0.1:9", "--room", "attic"]
+    assert main(arguments) == 1
+    assert "no room 'attic'; known: lab. To add your own" in capsys.readouterr().err
+
+
+def test_furniture_of_the_room_limits_the_arm() -> None:
+    kind = catalogue.type_of(ARM)
+    geometry = bootstrap.load_geometry(ARM, kind)
+    assert geometry is not None
+    home = [kind.home_rad[joint.name] for joint in kind.joints]
+    down = list(home)
+    down[[joint.name for joint in kind.joints].index("shoulder_lift")] = -0.6
+    path = geometry.sweep([home, down])
+    assert path.clearance is not None
+    assert "table_top" in path.clearance.text
+    assert geometry.clearance(home).room_m > 0
