@@ -39,10 +39,10 @@ class IdentityServices(AuditServices):
     def rate_limiter(self) -> RateLimiter:
         return RateLimiter(
             per_s={
-                "address": self.settings.rate_address,
-                "account": self.settings.rate_account,
-                "key": self.settings.rate_key,
-                "agent": self.settings.rate_agent,
+                "address": self.settings.rate_limits.address,
+                "account": self.settings.rate_limits.account,
+                "key": self.settings.rate_limits.key,
+                "agent": self.settings.rate_limits.agent,
             },
             clock=self.clock,
         )

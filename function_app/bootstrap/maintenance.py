@@ -33,7 +33,7 @@ class MaintenanceServices(AccountServices):
             telemetry_ingest=self.telemetry_ingest,
             uploads=self.uploads,
             robot_types=RobotTypeCleanup(tables=self.tables, blobs=self.blobs, clock=self.clock),
-            keep_actions_ms=self.settings.keep_actions_days * DAY_MS,
+            keep_actions_ms=self.settings.retention.actions_days * DAY_MS,
             clock=self.clock,
         )
 

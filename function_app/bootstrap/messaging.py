@@ -41,7 +41,7 @@ class MessagingServices(HealthServices):
             sign_in=self.sign_in,
             devices=self.devices,
             clock=self.clock,
-            domain=self.settings.xmpp_domain,
+            domain=self.settings.xmpp.domain,
         )
 
     @cached_property

@@ -23,11 +23,11 @@ class TelemetryServices(DeviceServices):
     def retention_policy(self) -> RetentionPolicy:
         settings = self.settings
         return RetentionPolicy(
-            raw_ms=settings.keep_raw_hours * DAY_MS // 24,
+            raw_ms=settings.retention.raw_hours * DAY_MS // 24,
             levels_ms={
-                "10s": settings.keep_10s_days * DAY_MS,
-                "1min": settings.keep_1min_days * DAY_MS,
-                "10min": settings.keep_10min_days * DAY_MS,
+                "10s": settings.retention.level_10s_days * DAY_MS,
+                "1min": settings.retention.level_1min_days * DAY_MS,
+                "10min": settings.retention.level_10min_days * DAY_MS,
             },
         )
 
@@ -38,7 +38,10 @@ class TelemetryServices(DeviceServices):
     @cached_property
     def uploads(self) -> Uploads:
         return Uploads(
-            tables=self.tables, blobs=self.blobs, keep_ms=self.settings.keep_uploads_days * DAY_MS, clock=self.clock
+            tables=self.tables,
+            blobs=self.blobs,
+            keep_ms=self.settings.retention.uploads_days * DAY_MS,
+            clock=self.clock,
         )
 
     @cached_property

@@ -17,13 +17,13 @@ def xmpp_connection(functions: Functions) -> XmppConnection:
     from function_app.adapters.xmpp.connection import SlixmppLine  # noqa: PLC0415 (loads slixmpp only for the gateway)
 
     settings = functions.settings
-    if not settings.xmpp_domain:
+    if not settings.xmpp.domain:
         raise SettingsError("TELESCOPE_XMPP_DOMAIN is empty. Set it to the domain that the XMPP server serves.")
 
     async def password() -> str:
         return (await functions.xmpp_credentials.cloud()).password
 
-    return SlixmppLine(host=settings.xmpp_host, port=settings.xmpp_port, domain=settings.xmpp_domain, password=password)
+    return SlixmppLine(host=settings.xmpp.host, port=settings.xmpp.port, domain=settings.xmpp.domain, password=password)
 
 
 def command_feed(functions: Functions) -> CommandFeed:

@@ -23,7 +23,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.entrypoints.http import create_app
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from function_app.services.identity.authenticator import ACCESS_S, SESSION_S
-from function_app.settings import Settings
+from function_app.settings import RateLimits, Settings
 from tests.fakes.agent import Robot
 from tests.harness.network.brokers import PATIENCE_S, RunningBroker, wait_until
 
@@ -210,8 +210,8 @@ def settings(home: Path, broker: RunningBroker | None = None, **changes: Any) ->
 
     Requests are counted only where a test asks for it: all of a test's people share one address.
     """
-    rates = dict.fromkeys(("rate_address", "rate_account", "rate_key", "rate_agent"), 0)
-    known = Settings(home=home, public_url=BASE, mqtt_port=1, **{**rates, **changes})
+    unlimited = RateLimits(address=0, account=0, key=0, agent=0)
+    known = Settings(home=home, public_url=BASE, mqtt_port=1, **{"rate_limits": unlimited, **changes})
     if broker is None:
         return known
     return replace(

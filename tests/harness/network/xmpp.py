@@ -24,7 +24,7 @@ from device_agent.transports.xmpp import XmppAccess, XmppTransport
 from function_app.bootstrap.xmpp import command_feed, xmpp_connection
 from function_app.entrypoints.xmpp.gateway import XmppGateway
 from function_app.ports.broker_access import Credentials
-from function_app.settings import Settings
+from function_app.settings import Settings, Xmpp
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.harness.cloud.cloud_processes import Ground, start_ground
@@ -189,7 +189,7 @@ def open_site(
         listener = stack.enter_context(socket.create_server((HOST, 0)))
         url = f"http://{HOST}:{listener.getsockname()[1]}"
         prosody = stack.enter_context(start_prosody(folder, f"{url}/api/v1/xmpp/verify"))
-        cloud = open_cloud(replace(settings, xmpp_domain=DOMAIN, xmpp_host=HOST, xmpp_port=prosody.port))
+        cloud = open_cloud(replace(settings, xmpp=Xmpp(domain=DOMAIN, host=HOST, port=prosody.port)))
         stack.enter_context(served(cloud, listener))
         site = XmppSite(cloud, prosody, url)
         if speak:

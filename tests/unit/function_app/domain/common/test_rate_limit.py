@@ -11,6 +11,7 @@ from function_app.domain.common.problems import Problem
 from function_app.domain.common.rate_limit import Rate, request
 from function_app.services.identity import rate_limiter
 from function_app.services.identity.rate_limiter import BURST_S, RateLimiter
+from function_app.settings import RateLimits
 from tests.harness.cloud.cloud import API, Cloud, MovingClock, problem, settings
 
 RATE = Rate(per_s=10, burst=30)
@@ -64,7 +65,9 @@ def test_of_many_names_the_newest_are_remembered(monkeypatch: pytest.MonkeyPatch
 
 def test_too_many_requests_of_an_account_wait_but_stop_never_does(tmp_path: Path) -> None:
     clock = MovingClock()
-    with Cloud(replace(settings(tmp_path), rate_account=1, rate_address=0), clock=clock) as cloud:
+    with Cloud(
+        replace(settings(tmp_path), rate_limits=RateLimits(account=1, address=0, key=0, agent=0)), clock=clock
+    ) as cloud:
         anna, bert = cloud.sign_in("anna"), cloud.sign_in("bert")
         for _ in range(BURST_S):
             assert anna.get("/accounts/me").status_code == 200
@@ -81,7 +84,7 @@ def test_too_many_requests_of_an_account_wait_but_stop_never_does(tmp_path: Path
 
 
 def test_an_address_is_counted_before_anybody_is_known_and_agents_each_for_itself(tmp_path: Path) -> None:
-    with Cloud(replace(settings(tmp_path), rate_address=1, rate_agent=1)) as cloud:
+    with Cloud(replace(settings(tmp_path), rate_limits=RateLimits(address=1, agent=1, account=0, key=0))) as cloud:
         here, there = cloud.client(address="192.0.2.1"), cloud.client(address="192.0.2.2")
         for _ in range(BURST_S):
             assert cloud.run(here.get(f"{API}/health")).status_code == 200
