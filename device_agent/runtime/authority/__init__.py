@@ -1,1 +1,1 @@
-"""Authority."""
+"""Rules that decide who may move a device: leases, Stop, faults, interlocks, reservations."""

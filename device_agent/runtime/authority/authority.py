@@ -1,6 +1,6 @@
-"""Who may move one device now, and what forbids it: leases, Stop, faults, restrictions, the action that has it.
+"""Control authority of one device: leases, Stop, faults, restrictions and the reservation of an action.
 
-Nothing here moves anything. Whenever the right to move ends, ``hold`` is called: it brings the device to rest.
+Nothing here moves the device. When the right to move ends, ``hold`` is called, which brings the device to rest.
 """
 
 import threading
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from device_agent.protocol import StopLatch
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.authority.event_recorder import EventRecord, Severity, Tell
+from device_agent.runtime.authority.event_recorder import EventRecord, RecordEvent, Severity
 from device_agent.runtime.authority.lease_gate import Lease, LeaseGate
 from device_agent.runtime.authority.speed_restrictions import Restrictions
 from device_agent.runtime.errors import Refused
@@ -17,43 +17,43 @@ from device_agent.runtime.errors import Refused
 
 @dataclass(eq=False)
 class Reservation:
-    """An action's hold on the device, from ``begin_action`` until the action ends or ``why`` says who took it away.
+    """An action's exclusive use of the device, until the action ends or ``why`` states why it was revoked.
 
-    ``on_lost`` is called once, with the controller locked: it must be quick and must not call back.
+    ``on_revoked`` is called once with the controller locked: it must be quick and must not call the controller.
     """
 
     epoch: int
-    on_lost: Callable[[Refused], None]
+    on_revoked: Callable[[Refused], None]
     why: Refused | None = None
 
 
 class Authority:
-    """The right to move one device. Not thread-safe: its owner locks.
+    """The right to move one device. Not thread-safe: the controller locks.
 
     Args:
-        gate: The lease gate, with the epochs remembered from before.
-        latch: The Stop latch remembered from before.
-        hold: Called when whoever moved the device no longer may.
-        tell: Called with each change of authority: quick, and does not call back.
+        gate: Lease gate with the epochs of the previous run.
+        latch: Stop latch of the previous run.
+        hold: Called when the current source of motion loses the right to move the device.
+        record: Receives an event for each change of authority. It must not block or call the controller.
 
     Attributes:
-        changed: Set whenever epochs or the latch have changed and must be written down; whoever does clears it.
+        changed: Set when epochs or latch changed and must be journalled; the command processor clears it.
         latch: The Stop latch.
-        fault: What is wrong with the driver.
-        tenure: The action that has the device.
-        restrictions: What the room allows.
+        fault: Error message of the driver.
+        reservation: Reservation of the running action.
+        restrictions: Speed restrictions of the room.
     """
 
     def __init__(
-        self, gate: LeaseGate, latch: StopLatch | None, *, hold: Callable[[Refused], None], tell: Tell
+        self, gate: LeaseGate, latch: StopLatch | None, *, hold: Callable[[Refused], None], record: RecordEvent
     ) -> None:
         self._gate = gate
         self._hold = hold
-        self._tell = tell
+        self._record = record
         self.changed = threading.Event()
         self.latch = latch
         self.fault: str | None = None
-        self.tenure: Reservation | None = None
+        self.reservation: Reservation | None = None
         self.restrictions = Restrictions()
 
     @property
@@ -63,7 +63,7 @@ class Authority:
 
     @property
     def burned(self) -> bool:
-        """Whether the newest epoch is obeyed no more."""
+        """Whether the newest epoch is burned."""
         return self._gate.burned >= self._gate.epoch
 
     def lease(self, now_s: float) -> Lease | None:
@@ -71,100 +71,100 @@ class Authority:
         return self._gate.current(now_s)
 
     def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> bool:
-        """Take in a grant or renewal; True when the epoch is new and whoever had the device before has lost it.
+        """Accept a grant or renewal. Returns True if the epoch is new and the previous holder lost control.
 
         Raises:
-            Refused: Stale or ended.
+            Refused: The epoch is stale or burned.
         """
-        before, had = self._gate.epoch, self._gate.granted
+        before, previous = self._gate.epoch, self._gate.granted
         self._gate.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason)
-        new = self._superseded(before, had)
-        if had is None or had.epoch != epoch:
-            self.note(EventKind.LEASE_GRANTED, f"{holder} took control", {"epoch": epoch, "holder": holder})
+        new = self._superseded(before, previous)
+        if previous is None or previous.epoch != epoch:
+            self.record(EventKind.LEASE_GRANTED, f"{holder} took control", {"epoch": epoch, "holder": holder})
         return new
 
     def release(self, epoch: int) -> None:
-        """The holder gave the lease up.
+        """End the lease that its holder released.
 
         Raises:
-            Refused: From an older lease.
+            Refused: The epoch is older than the lease in force.
         """
         self._gate.fence(epoch)
         self.end(Refused("lease_lost", "control was released"))
 
     def fence(self, epoch: int) -> bool:
-        """Check the epoch of a signed command; True when it is new and takes the device from whoever had it.
+        """Check the epoch of a signed command. Returns True if it is new and the previous holder lost control.
 
         Raises:
-            Refused: Stale, or of a lease that has ended here.
+            Refused: The epoch is stale or burned.
         """
-        before, had = self._gate.epoch, self._gate.granted
+        before, previous = self._gate.epoch, self._gate.granted
         self._gate.fence(epoch)
         if epoch == before and epoch <= self._gate.burned:
             raise Refused("lease_ended", f"lease {epoch} has ended at the device; take control again")
-        return self._superseded(before, had)
+        return self._superseded(before, previous)
 
     def expire(self, now_s: float) -> None:
-        """End a lease that has run out."""
-        had = self._gate.granted
+        """End an expired lease."""
+        previous = self._gate.granted
         if self._gate.expire(now_s):
-            self.end(Refused("lease_lost", "the lease ran out"), had)
+            self.end(Refused("lease_lost", "the lease expired"), previous)
 
     def stop(self, latch: StopLatch) -> None:
-        """Latch Stop. The first latch stays the one shown."""
+        """Latch Stop. The first latch remains the one shown."""
         if self.latch is None:
             self.latch = latch
             data = {"caller": latch.caller, "reason": latch.reason}
-            self.note(EventKind.STOP_LATCHED, f"stopped by {latch.caller}", data, "warning")
+            self.record(EventKind.STOP_LATCHED, f"stopped by {latch.caller}", data, "warning")
         self.end(Refused("stopped", "the device was stopped"))
 
     def reset_stop(self) -> None:
-        """Release the latch; every lease so far ends with it."""
+        """Release the latch. Every lease so far ends."""
         self.end(Refused("lease_lost", "Stop was reset; take control again"))
         self.latch = None
 
-    def fail(self, message: str) -> None:
-        """The driver no longer answers."""
+    def set_fault(self, message: str) -> None:
+        """Record that the driver failed, and hold."""
         if self.fault != message:
-            self.note(EventKind.DRIVER_FAILED, message, {}, "error")
+            self.record(EventKind.DRIVER_FAILED, message, {}, "error")
         self.fault = message
         self.end(Refused("fault", message))
 
-    def recover(self) -> bool:
-        """The driver answers again; False when it had not failed."""
+    def clear_fault(self) -> bool:
+        """Record that the driver works again. Returns False if it had not failed."""
         failed, self.fault = self.fault is not None, None
         if failed:
-            self.note(EventKind.DRIVER_RECOVERED, "the device answers again", {})
+            self.record(EventKind.DRIVER_RECOVERED, "the device responds again", {})
         return failed
 
-    def end(self, why: Refused, had: Lease | None = None) -> None:
+    def end(self, why: Refused, lease: Lease | None = None) -> None:
         """Burn the epoch in force: control must be taken again.
 
         Args:
-            why: Why.
-            had: The lease that ends, where it is no longer known to the gate.
+            why: Reason.
+            lease: The lease that ends, if the gate no longer knows it.
         """
         self.changed.set()
-        self._note_end(had or self._gate.granted, why)
+        self._record_end(lease or self._gate.granted, why)
         self._gate.burn()
-        self.lose(why)
+        self.revoke(why)
 
-    def begin(self, epoch: int, on_lost: Callable[[Refused], None]) -> Reservation:
-        """An action now has the device.
+    def reserve(self, epoch: int, on_revoked: Callable[[Refused], None]) -> Reservation:
+        """Reserve the device for an action.
 
         Raises:
-            Refused: Another has it.
+            Refused: Another action has reserved it.
         """
-        if self.tenure is not None:
+        if self.reservation is not None:
             raise Refused("busy", "another action runs on this device")
-        self.tenure = Reservation(epoch, on_lost)
-        return self.tenure
+        self.reservation = Reservation(epoch, on_revoked)
+        return self.reservation
 
     def check_free(self) -> None:
-        """Nothing forbids that the device moves.
+        """Check that nothing prevents motion.
 
         Raises:
-            Refused: Stopped, faulty, or the room holds it.
+            Refused: Stopped, faulty, or held by the room.
         """
         if self.latch is not None:
             raise Refused("stopped", f"stopped by {self.latch.caller}; reset Stop first")
@@ -174,42 +174,42 @@ class Authority:
         if strictest is not None and strictest.speed <= 0:
             raise Refused("interlock", f"the room holds the device: {strictest.why}")
 
-    def check_tenure(self, tenure: Reservation) -> None:
-        """This action still has the device.
+    def check_reservation(self, reservation: Reservation) -> None:
+        """Check that this reservation is in force.
 
         Raises:
-            Refused: It does not; the reason says who took it away.
+            Refused: It is not; the reason states why it was revoked.
         """
-        if self.tenure is not tenure:
-            raise tenure.why or Refused("ended", "the action ended")
+        if self.reservation is not reservation:
+            raise reservation.why or Refused("ended", "the action ended")
 
-    def lose(self, why: Refused) -> None:
-        """Whoever moved the device, by setpoints or as an action, no longer does."""
-        lost, self.tenure = self.tenure, None
+    def revoke(self, why: Refused) -> None:
+        """Hold, and revoke the reservation of the running action."""
+        revoked, self.reservation = self.reservation, None
         self._hold(why)
-        if lost is not None:
-            self.note(EventKind.ACTION_LOST, why.message, self.said(why), "warning")
-            lost.why = why
-            lost.on_lost(why)
+        if revoked is not None:
+            self.record(EventKind.ACTION_LOST, why.message, self.event_data(why), "warning")
+            revoked.why = why
+            revoked.on_revoked(why)
 
-    def said(self, why: Refused) -> dict[str, object]:
-        """A reason, as events carry it."""
+    def event_data(self, why: Refused) -> dict[str, object]:
+        """Event data of a reason."""
         return {"code": why.code, "epoch": self._gate.epoch}
 
-    def note(self, kind: EventKind, message: str, data: Mapping[str, object], severity: Severity = "info") -> None:
-        """Tell what happened."""
-        self._tell(EventRecord(kind, message, severity, data))
+    def record(self, kind: EventKind, message: str, data: Mapping[str, object], severity: Severity = "info") -> None:
+        """Record an event."""
+        self._record(EventRecord(kind, message, severity, data))
 
-    def _superseded(self, before: int, had: Lease | None) -> bool:
+    def _superseded(self, before: int, previous: Lease | None) -> bool:
         if self._gate.epoch == before:
             return False
         self.changed.set()
         why = Refused("lease_lost", "a newer lease took the device")
-        self._note_end(had, why)
-        self.lose(why)
+        self._record_end(previous, why)
+        self.revoke(why)
         return True
 
-    def _note_end(self, had: Lease | None, why: Refused) -> None:
-        if had is not None:
-            data = {"epoch": had.epoch, "holder": had.holder, "code": why.code}
-            self.note(EventKind.LEASE_ENDED, f"{had.holder}'s control ended: {why.message}", data)
+    def _record_end(self, lease: Lease | None, why: Refused) -> None:
+        if lease is not None:
+            data = {"epoch": lease.epoch, "holder": lease.holder, "code": why.code}
+            self.record(EventKind.LEASE_ENDED, f"{lease.holder}'s control ended: {why.message}", data)

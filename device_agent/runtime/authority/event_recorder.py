@@ -1,6 +1,7 @@
-"""What happened at one device, on its way to being told: whoever notes it never waits, and floods are counted.
+"""Events of one device between their occurrence and their publication. Repeated rejections are counted.
 
-The control loop, the transport's thread and the office note; the office alone takes out and publishes.
+The control loop, the transport's thread and the command processor record events without blocking. Only the command
+processor drains and publishes them.
 """
 
 import threading
@@ -17,16 +18,16 @@ from device_agent.protocol.events import EventKind
 Severity = Literal["info", "warning", "error"]
 
 GAP_S = 5.0
-"""The same refusal is told at most once in this time; those between are counted."""
-_MOST_WAITING = 500
-_LONGEST = 2000
-_MOST_COUNTED = 64
-"""Different refusals that are counted one by one; codes are few, so more than these is no honest traffic."""
+"""Minimum time between two events for the same rejection; those in between are counted [s]."""
+_MAX_WAITING = 500
+_MAX_MESSAGE = 2000
+_MAX_COUNTED = 64
+"""Number of different rejections that are counted individually. Legitimate traffic has fewer codes."""
 
 
 @dataclass(frozen=True, slots=True)
 class EventRecord:
-    """One fact, with its own time [ms since 1970]."""
+    """One event with the time of its occurrence [ms since 1970]; 0 means now."""
 
     kind: EventKind
     message: str
@@ -35,106 +36,106 @@ class EventRecord:
     at_ms: int = 0
 
 
-Tell = Callable[[EventRecord], None]
-"""Takes in a fact; quick, never blocks, never raises."""
+RecordEvent = Callable[[EventRecord], None]
+"""Records an event; never blocks, never raises."""
 
 
 @dataclass(slots=True)
-class _Flood:
-    """One refusal that comes again: how often since it was last told, and the newest of them."""
+class _Repeated:
+    """A rejection that occurs repeatedly: time of its last event [s], newest occurrence, occurrences since then."""
 
-    told_s: float
+    published_s: float
     newest: EventRecord
     count: int = 0
 
 
-def ignore_event(_happened: EventRecord) -> None:
-    """For whoever is watched by nobody."""
+def ignore_event(_event: EventRecord) -> None:
+    """Discard an event; the default of components that run without a recorder."""
 
 
 class EventRecorder:
-    """The facts of one device that wait to be told. Thread-safe."""
+    """Events of one device that wait for publication. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._waiting: deque[EventRecord] = deque()
-        self._floods: dict[tuple[EventKind, str], _Flood] = {}
+        self._repeated: dict[tuple[EventKind, str], _Repeated] = {}
         self._lost = 0
 
-    def note(self, happened: EventRecord) -> None:
-        """Something happened now."""
+    def record(self, event: EventRecord) -> None:
+        """Record an event that occurred now."""
         with self._lock:
-            self._add(_stamped(happened))
+            self._add(_stamped(event))
 
-    def refused(self, happened: EventRecord, *, code: str, now_s: float) -> None:
-        """Something was refused, perhaps not for the first time.
+    def record_rejection(self, event: EventRecord, *, code: str, now_s: float) -> None:
+        """Record a rejection that may occur repeatedly.
 
         Args:
-            happened: What to tell.
-            code: What makes two refusals of one kind the same.
+            event: The rejection.
+            code: Rejections of one kind with the same code are counted together.
             now_s: Monotonic clock [s].
         """
         with self._lock:
-            key = (happened.kind, code)
-            flood = self._floods.get(key)
-            if flood is not None:
-                flood.newest, flood.count = _stamped(happened), flood.count + 1
-            elif len(self._floods) < _MOST_COUNTED:
-                told = _stamped(happened)
-                self._floods[key] = _Flood(now_s, told)
-                self._add(told)
+            key = (event.kind, code)
+            repeated = self._repeated.get(key)
+            if repeated is not None:
+                repeated.newest, repeated.count = _stamped(event), repeated.count + 1
+            elif len(self._repeated) < _MAX_COUNTED:
+                stamped = _stamped(event)
+                self._repeated[key] = _Repeated(now_s, stamped)
+                self._add(stamped)
             else:
                 self._lost += 1
 
-    def take(self, now_s: float) -> list[EventRecord]:
-        """What is to be told now, oldest first.
+    def drain(self, now_s: float) -> list[EventRecord]:
+        """Remove and return the events to publish now, oldest first.
 
         Args:
-            now_s: Monotonic clock [s].
+            now_s: Monotonic clock [s]; infinity returns every counted rejection too.
         """
         with self._lock:
-            found = list(self._waiting)
+            events = list(self._waiting)
             self._waiting.clear()
-            for key, flood in list(self._floods.items()):
-                if now_s - flood.told_s < GAP_S:
+            for key, repeated in list(self._repeated.items()):
+                if now_s - repeated.published_s < GAP_S:
                     continue
-                if not flood.count:
-                    del self._floods[key]
+                if not repeated.count:
+                    del self._repeated[key]
                     continue
-                newest = flood.newest
-                data = {**newest.data, "count": flood.count}
-                found.append(EventRecord(newest.kind, newest.message, newest.severity, data, newest.at_ms))
-                flood.told_s, flood.count = now_s, 0
+                newest = repeated.newest
+                data = {**newest.data, "count": repeated.count}
+                events.append(EventRecord(newest.kind, newest.message, newest.severity, data, newest.at_ms))
+                repeated.published_s, repeated.count = now_s, 0
             if self._lost:
-                message = f"{self._lost} events are not told one by one: too much happened at once"
-                found.append(_stamped(EventRecord(EventKind.EVENTS_DROPPED, message, "warning", {"count": self._lost})))
+                message = f"{self._lost} events were not recorded individually: too many occurred at once"
+                events.append(_stamped(EventRecord(EventKind.EVENTS_DROPPED, message, "warning", {"count": self._lost})))
                 self._lost = 0
-            return found
+            return events
 
-    def _add(self, happened: EventRecord) -> None:
-        if len(self._waiting) >= _MOST_WAITING:
+    def _add(self, event: EventRecord) -> None:
+        if len(self._waiting) >= _MAX_WAITING:
             self._lost += 1
             return
-        self._waiting.append(happened)
+        self._waiting.append(event)
 
 
-def event_of(device: str, happened: EventRecord) -> Event:
-    """A fact as it is told.
+def event_message(device: str, event: EventRecord) -> Event:
+    """The wire message of a recorded event.
 
     Args:
         device: Name of the device.
-        happened: With its time.
+        event: With its time.
     """
     return Event(
         id=uuid.uuid4().hex,
         device=device,
-        at_ms=happened.at_ms,
-        kind=happened.kind,
-        severity=happened.severity,
-        message=happened.message[:_LONGEST],
-        data=dict(happened.data),
+        at_ms=event.at_ms,
+        kind=event.kind,
+        severity=event.severity,
+        message=event.message[:_MAX_MESSAGE],
+        data=dict(event.data),
     )
 
 
-def _stamped(happened: EventRecord) -> EventRecord:
-    return EventRecord(happened.kind, happened.message, happened.severity, happened.data, happened.at_ms or wall_ms())
+def _stamped(event: EventRecord) -> EventRecord:
+    return EventRecord(event.kind, event.message, event.severity, event.data, event.at_ms or wall_ms())

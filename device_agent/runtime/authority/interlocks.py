@@ -1,6 +1,6 @@
-"""The room slows or holds a robot: presence in a zone, a door, whatever a sensor of the space says.
+"""Interlocks: sensor readings of the space that slow or hold a robot, for example presence in a zone or an open door.
 
-A sensor that is silent, unknown or not to be understood counts as one that says there is danger.
+A sensor that is silent, unknown or invalid counts as a sensor that reports danger.
 """
 
 import math
@@ -40,68 +40,68 @@ def _is_met(rule: InterlockRule, value: float) -> bool:
 
 
 Restrict = Callable[[str, float, str], None]
-"""``Controller.restrict``: source, share of speed left, why."""
+"""``Controller.restrict``: source, share of the speed that remains, reason."""
 
 
 @dataclass(slots=True)
-class _Watched:
-    """One rule and what it did last: why it acts, ``None`` where it does not, ``""`` before it was first looked at."""
+class _RuleState:
+    """One rule and why it acts: ``None`` if it does not, ``""`` before the first check."""
 
     rule: InterlockRule
     why: str | None = ""
 
 
 class Interlocks:
-    """The interlocks of one device. ``step`` is called by its control loop, each period.
+    """Interlocks of one device. The control loop calls ``update`` each period.
 
     Args:
         rules: From ``agent.toml``.
-        room: Listens to their streams.
+        readings: Subscribed to the streams of the rules.
         restrict: Slows or holds the device.
-        lift: Lets it go.
-        note: Tells that a rule began or ceased to act: fact, its code, monotonic clock [s].
+        lift: Removes a restriction.
+        record: Records that a rule started or stopped acting: event, code, monotonic clock [s].
     """
 
     def __init__(
         self,
         rules: Sequence[InterlockRule],
-        room: ReadingCache,
+        readings: ReadingCache,
         *,
         restrict: Restrict,
         lift: Callable[[str], None],
-        note: Callable[[EventRecord, str, float], None],
+        record: Callable[[EventRecord, str, float], None],
     ) -> None:
-        self._watched = [_Watched(rule) for rule in rules]
-        self._sources = [room.source(rule.device, rule.stream) for rule in rules]
-        self._room = room
+        self._states = [_RuleState(rule) for rule in rules]
+        self._sources = [readings.source(rule.device, rule.stream) for rule in rules]
+        self._readings = readings
         self._restrict = restrict
         self._lift = lift
-        self._note = note
+        self._record = record
 
-    def step(self, now_s: float) -> None:
-        """Look at every rule; quick, and nothing happens where nothing has changed.
+    def update(self, now_s: float) -> None:
+        """Check every rule, and act on changes.
 
         Args:
             now_s: Monotonic clock [s].
         """
-        for watched, source in zip(self._watched, self._sources, strict=True):
-            why = engagement(watched.rule, self._room.read(source))
-            if why != watched.why:
-                self._change(watched, why, now_s)
+        for state, source in zip(self._states, self._sources, strict=True):
+            why = engagement(state.rule, self._readings.read(source))
+            if why != state.why:
+                self._change(state, why, now_s)
 
-    def _change(self, watched: _Watched, why: str | None, now_s: float) -> None:
-        rule, before = watched.rule, watched.why
+    def _change(self, state: _RuleState, why: str | None, now_s: float) -> None:
+        rule, before = state.rule, state.why
         if why is not None:
             self._restrict(rule.name, rule.remaining_speed, why)
             data = {"interlock": rule.name, "action": rule.action, "reason": why}
             verb = "held" if rule.action == "hold" else "slowed"
-            happened = EventRecord(EventKind.INTERLOCK_ENGAGED, f"the room {verb} the device: {why}", "warning", data)
-            self._note(happened, f"{rule.name} {why}", now_s)
+            event = EventRecord(EventKind.INTERLOCK_ENGAGED, f"the room {verb} the device: {why}", "warning", data)
+            self._record(event, f"{rule.name} {why}", now_s)
         else:
             self._lift(rule.name)
             if before:
-                data = {"interlock": rule.name}
-                self._note(
-                    EventRecord(EventKind.INTERLOCK_CLEARED, "the room is free again", data=data), rule.name, now_s
+                event = EventRecord(
+                    EventKind.INTERLOCK_CLEARED, "the room is free again", data={"interlock": rule.name}
                 )
-        watched.why = why
+                self._record(event, rule.name, now_s)
+        state.why = why

@@ -1,4 +1,4 @@
-"""Who may move the device: the lease gate. Checked here, where the motors are, on the agent's own clock."""
+"""Lease gate: accepts or rejects lease epochs on the agent's own clock."""
 
 from dataclasses import dataclass
 
@@ -7,9 +7,9 @@ from device_agent.runtime.errors import Refused
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """The right to move the device until ``expires_s`` on the agent's monotonic clock [s].
+    """Right to move the device until ``expires_s`` on the agent's monotonic clock [s].
 
-    ``reason``: why it was taken from somebody else.
+    ``reason`` states why control was taken from the previous holder.
     """
 
     holder: str
@@ -19,11 +19,10 @@ class Lease:
 
 
 class LeaseGate:
-    """The epochs of one device. Not thread-safe: its owner locks.
+    """Epochs of one device. Not thread-safe: the controller locks.
 
-    ``epoch`` is the highest ever seen. ``burned`` is the highest that is no longer obeyed, whatever arrives: epochs
-    are burned when the lease ends, and when motion had to be held because the operator's word stopped coming. Nothing
-    resumes by itself: control must be taken again, which gives a new epoch.
+    ``epoch`` is the highest epoch seen. ``burned`` is the highest epoch that the device no longer accepts. An epoch is
+    burned when its lease ends, and when motion is held because setpoints stopped. Motion resumes only with a new epoch.
 
     Args:
         epoch: Highest epoch seen before a restart.
@@ -36,24 +35,24 @@ class LeaseGate:
         self._lease: Lease | None = None
 
     def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
-        """Take in a signed grant or renewal.
+        """Accept a signed grant or renewal.
 
         Raises:
-            Refused: An older epoch than one seen already, or one that was burned.
+            Refused: The epoch is older than the newest one, or burned.
         """
         self.fence(epoch)
         if epoch <= self.burned:
             raise Refused("lease_ended", f"lease {epoch} has ended at the device; take control again")
         self.epoch = epoch
-        if self._lease is not None:  # a renewal: what was said at the beginning still holds
+        if self._lease is not None:  # a renewal keeps the reason of the grant
             reason = reason or self._lease.reason
         self._lease = Lease(holder, epoch, now_s + lease_s, reason)
 
     def fence(self, epoch: int) -> None:
-        """Refuse what comes from an older lease; adopt a newer epoch, which ends the lease in force.
+        """Reject an older epoch. A newer epoch ends the lease in force.
 
         Raises:
-            Refused: ``epoch`` is lower than the highest seen.
+            Refused: ``epoch`` is lower than the highest one seen.
         """
         if epoch < self.epoch:
             raise Refused("stale_epoch", f"from lease {epoch}, but lease {self.epoch} is in force")
@@ -67,17 +66,17 @@ class LeaseGate:
 
     @property
     def granted(self) -> Lease | None:
-        """The lease that was granted last and not ended since, also when it has just run out."""
+        """The last granted lease that has not ended, even if it has just expired."""
         return self._lease
 
     def expire(self, now_s: float) -> bool:
-        """Burn a lease that has run out; True when there was one."""
+        """Burn an expired lease. Returns True if there was one."""
         if self._lease is None or now_s < self._lease.expires_s:
             return False
         self.burn()
         return True
 
     def burn(self) -> None:
-        """End the lease in force: its epoch is not obeyed again."""
+        """End the lease in force. The device never accepts its epoch again."""
         self.burned = max(self.burned, self.epoch)
         self._lease = None

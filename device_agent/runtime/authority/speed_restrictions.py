@@ -1,4 +1,4 @@
-"""What the room allows at this moment: from several sources, the strictest counts."""
+"""Speed restrictions from several sources; the strictest applies."""
 
 import math
 from dataclasses import dataclass
@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Restriction:
-    """How fast a device may move, and who says so.
+    """Speed limit that one source sets.
 
     Attributes:
-        source: Who says so; each source has one word.
-        speed: Share of the speed that it would have, 0…1; 0 means hold.
-        why: For people.
+        source: Name of the source. Each source has one restriction at a time.
+        speed: Share of the normal speed, 0…1; 0 means hold.
+        why: Reason, for operators.
     """
 
     source: str
@@ -20,37 +20,37 @@ class Restriction:
 
     @property
     def text(self) -> str:
-        """As ``limited`` names it."""
+        """Name of the restriction in the telemetry field ``limited``."""
         return f"interlock: {self.why}"[:200]
 
 
 class Restrictions:
-    """The restrictions of one device. Not thread-safe: its owner locks."""
+    """Restrictions of one device. Not thread-safe: the controller locks."""
 
     def __init__(self) -> None:
         self._by_source: dict[str, Restriction] = {}
 
     def set(self, source: str, speed: float, why: str) -> None:
-        """Take in the newest word of a source. A speed that is no number from 0 to 1 means hold."""
+        """Replace the restriction of a source. A speed outside 0…1 means hold."""
         if not math.isfinite(speed) or not 0.0 <= speed <= 1.0:
             speed = 0.0
         self._by_source[source] = Restriction(source, speed, why)
 
-    def lift(self, source: str) -> None:
-        """A source restricts no more."""
+    def clear(self, source: str) -> None:
+        """Remove the restriction of a source."""
         self._by_source.pop(source, None)
 
     @property
     def all(self) -> tuple[Restriction, ...]:
-        """Those in force, the strictest first."""
+        """Restrictions in force, the strictest first."""
         return tuple(sorted(self._by_source.values(), key=lambda one: (one.speed, one.source)))
 
     @property
     def strictest(self) -> Restriction | None:
-        """The one that counts."""
+        """The restriction that applies."""
         return next(iter(self.all), None)
 
     @property
     def speed(self) -> float:
-        """The share of speed that is left."""
+        """Share of the speed that remains."""
         return min((one.speed for one in self._by_source.values()), default=1.0)

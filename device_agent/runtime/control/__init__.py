@@ -1,1 +1,1 @@
-"""Control."""
+"""Control loop, controller and motion generation of one device."""

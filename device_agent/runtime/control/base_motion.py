@@ -1,20 +1,20 @@
-"""Motion of a base over the floor, one control period at a time: speeds up, keeps its twist for a time, brakes."""
+"""Acceleration-limited motion of a mobile base, one control period at a time."""
 
 from ruckig import ControlInterface, InputParameter, OutputParameter, Ruckig, Synchronization
 
 from device_agent.ports.driver import REST, Twist
 from device_agent.protocol.manifests.robot_type import Base
-from device_agent.runtime.control.joint_motion import plan
+from device_agent.runtime.control.joint_motion import generate
 
 _RAMP_S = 0.1
-"""Time in which speeding up reaches its full acceleration."""
+"""Time in which the acceleration reaches its limit [s]."""
 _BRAKING_RAMP_S = 0.01
 _REST = 1e-6
 _SAME = 1e-3
 
 
 def limits_of(base: Base) -> Twist:
-    """The highest twist that a base is told."""
+    """The highest twist of a base."""
     return Twist(base.max_linear_m_s, base.max_linear_m_s * base.sideways, base.max_angular_rad_s)
 
 
@@ -42,35 +42,35 @@ class BaseMotion:
         self.start()
 
     def start(self) -> None:
-        """Begin at rest."""
+        """Start at rest."""
         self.twist = REST
         self._input.current_velocity = list(REST)
         self._input.current_acceleration = list(REST)
         self.brake()
 
     def follow(self, twist: Twist) -> None:
-        """Head for a twist that is inside the limits.
+        """Accelerate to a twist that is inside the limits.
 
-        What still brakes harder than it may speed up goes on braking, as joints do (see ``Motion.follow``): it would
-        run backwards, and faster than it may.
+        A base that brakes harder than its acceleration limit continues to brake. Otherwise it would overshoot into
+        reverse; see ``JointMotion.follow``.
         """
-        now = self._input.current_acceleration
-        if any(abs(part) > limit + _SAME for part, limit in zip(now, self._acceleration, strict=True)):
+        current = self._input.current_acceleration
+        if any(abs(part) > limit + _SAME for part, limit in zip(current, self._acceleration, strict=True)):
             return
-        self._aim(twist, self._acceleration, _RAMP_S)
+        self._set_target(twist, self._acceleration, _RAMP_S)
 
     def brake(self) -> None:
-        """Come to rest as fast as the robot type allows, and stay there."""
-        self._aim(REST, self._braking, _BRAKING_RAMP_S)
+        """Brake to rest at the robot type's deceleration."""
+        self._set_target(REST, self._braking, _BRAKING_RAMP_S)
 
     def update(self, passed_s: float | None = None) -> Twist:
-        """Advance one period, or by what has passed of one [s].
+        """Advance one period, or ``passed_s`` of it [s].
 
         Raises:
-            MotionError: The generator found no way; the twist is as it was.
+            MotionError: The generator found no trajectory; the twist is unchanged.
         """
         self._generator.delta_time = passed_s or self._period_s
-        plan(self._generator.update, self._input, self._output)
+        generate(self._generator.update, self._input, self._output)
         self._output.pass_to_input(self._input)
         self.twist = Twist(*self._output.new_velocity)
         return self.twist
@@ -81,16 +81,16 @@ class BaseMotion:
         return any(abs(part) > _REST for part in self.twist)
 
     def braking_time_s(self) -> float:
-        """How long ``brake`` would take from the present twist [s], rounded up by the ramps at both ends."""
+        """Braking time from the present twist [s], including the ramps at both ends."""
         times = [abs(part) / limit for part, limit in zip(self.twist, self._braking, strict=True)]
         return max(times) + 3 * _BRAKING_RAMP_S if self.moving else 0.0
 
     def limits_to_stop_within(self, time_s: float) -> Twist:
-        """The highest twist from which it comes to rest in this time, a control period late [s]."""
-        left_s = time_s - self._period_s - 2 * _BRAKING_RAMP_S
-        return Twist(*(min(most, limit * left_s) for most, limit in zip(self.limits, self._braking, strict=True)))
+        """The highest twist from which the base stops in ``time_s`` [s] if braking starts one period late."""
+        braking_s = time_s - self._period_s - 2 * _BRAKING_RAMP_S
+        return Twist(*(min(limit, rate * braking_s) for limit, rate in zip(self.limits, self._braking, strict=True)))
 
-    def _aim(self, twist: Twist, acceleration: list[float], ramp_s: float) -> None:
+    def _set_target(self, twist: Twist, acceleration: list[float], ramp_s: float) -> None:
         self._input.target_velocity = list(twist)
         self._input.target_acceleration = list(REST)
         self._input.max_velocity = [max(limit, _REST) for limit in self.limits]

@@ -1,7 +1,7 @@
-"""The control loop of one device: observe, decide, command, every ``period_ms``. The only writer of motor commands.
+"""Control loop of one device: observe, compute, command, every ``period_ms``. The only writer of motor commands.
 
-While the device rests, a setpoint or a move does not wait for the next period: its own begins when it comes. In motion
-periods keep their length, for each carries one period's way; but for a Stop's, which brakes for as long as has passed.
+A device at rest starts a setpoint or goal in a period of its own, without waiting for the next regular period. While
+the device moves, periods keep their length, because each carries one period of motion. Only a Stop shortens a period.
 """
 
 import contextlib
@@ -23,26 +23,28 @@ from device_agent.runtime.control.controller import Controller
 IDLE_RATE_HZ = 20.0
 MOVING_RATE_HZ = 50.0
 _STREAMING_GAP_S = 0.03
-"""Telemetry goes with the setpoints while they come: a word between two of them, which a console sends 25 ms apart,
-would only stand in the way of the next one's."""
-_RECONNECT_EVERY_S = 1.0
-_REST_WITHIN_S = 1.0
-_LEAST_S = 1e-4
-"""What has passed at least since a period when a Stop begins the next: of nothing ``ruckig`` plans nothing."""
+"""Gap between telemetry messages while setpoints arrive [s].
+
+Each setpoint triggers a message. Consoles send setpoints 25 ms apart; a message in between would delay the next one.
+"""
+_RECONNECT_PERIOD_S = 1.0
+_REST_TIMEOUT_S = 1.0
+_MIN_PASSED_S = 1e-4
+"""Lower bound of the time since the last period: ``ruckig`` cannot plan for a duration of 0 [s]."""
 _log = logging.getLogger(__name__)
 
 
 class ControlLoop:
-    """One thread that never waits for disk or network; setpoints for a device at rest may bring their own (``hurry``).
+    """One thread that never waits for disk or network. Callers of ``wake`` may run a period in their own thread.
 
     Args:
         robot_type: The control period.
-        driver: Not yet connected; this loop alone calls ``observe`` and ``send``.
-        controller: Decides.
-        name: The device's name.
-        tell: Called with telemetry, 20 times a second at rest and 50 times in motion, and while setpoints come with
-            each of them as soon as it is applied, at most 50 times a second; must not block.
-        watch: Called before each decision with the monotonic clock [s]: the room's interlocks. Quick; an error holds.
+        driver: Not yet connected; only this loop calls ``observe`` and ``send``.
+        controller: Computes the commands.
+        name: Name of the device.
+        publish: Called with telemetry: 20 Hz at rest, 50 Hz in motion, and with each applied setpoint at up to 50 Hz.
+            It must not block.
+        check_interlocks: Called before each period with the monotonic clock [s]. It must be quick; an error holds.
     """
 
     def __init__(
@@ -52,8 +54,8 @@ class ControlLoop:
         controller: Controller,
         *,
         name: str,
-        tell: Callable[[JointTelemetry], None],
-        watch: Callable[[float], None],
+        publish: Callable[[JointTelemetry], None],
+        check_interlocks: Callable[[float], None],
     ) -> None:
         self._period_s = robot_type.period_ms / 1000
         self._driver = driver
@@ -61,187 +63,192 @@ class ControlLoop:
         self._lacks_base = robot_type.base is not None and self._base is None
         self._controller = controller
         self._name = name
-        self._tell = tell
-        self._watch = watch
+        self._publish = publish
+        self._check_interlocks = check_interlocks
         self._sequence = 0
         self._next_telemetry_s = 0.0
-        self._spent_s = 0.0
-        self._told_setpoint = 0
-        self._shown: tuple[Observation, Observation] | None = None
+        self._budget_s = 0.0
+        self._published_setpoint = 0
+        self._rounded: tuple[Observation, Observation] | None = None
         self._next_s = 0.0
-        self._early = False
-        self._trouble = ""
-        self._prompt = isinstance(driver, RunsInline) and driver.prompt
-        self._asked = threading.Event()
-        self._turn = threading.Lock()  # of whoever runs a period
+        self._out_of_turn = False
+        self._error = ""
+        self._runs_inline = isinstance(driver, RunsInline) and driver.prompt
+        self._requested = threading.Event()
+        self._period_lock = threading.Lock()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"{name}-loop", daemon=True)
-        self.seen: Observation | None = None
+        self.observation: Observation | None = None
 
     def start(self) -> None:
-        """Connect the driver and hold where the device is.
+        """Connect the driver and hold the present position.
 
         Raises:
-            DriverError: The device is not there, or its driver cannot move the base that it should have.
+            DriverError: The device does not respond, or its driver cannot drive the base of the robot type.
         """
         if self._lacks_base:
             raise DriverError(f"the robot type of '{self._name}' has a base, but its driver cannot drive")
         self._driver.connect()
-        self.seen = self._driver.observe()
-        self._controller.start_at(self.seen.position_rad)
+        self.observation = self._driver.observe()
+        self._controller.start_at(self.observation.position_rad)
         self._thread.start()
 
     def stop(self) -> None:
-        """Wait for rest, a second at most, and end the thread. May be called twice."""
-        deadline_s = time.monotonic() + _REST_WITHIN_S
+        """Wait up to a second for rest, and end the thread. May be called twice."""
+        deadline_s = time.monotonic() + _REST_TIMEOUT_S
         while self._controller.moving and self._thread.is_alive() and time.monotonic() < deadline_s:
             time.sleep(self._period_s)
         self._stopping.set()
-        self._asked.set()
-        if self._turn.acquire(timeout=2):  # whoever is in a period ends it; then the driver may be closed
-            self._turn.release()
+        self._requested.set()
+        if self._period_lock.acquire(timeout=2):  # a running period ends first; then the driver may be closed
+            self._period_lock.release()
         if self._thread.is_alive():
             self._thread.join(timeout=2)
 
-    def hurry(self) -> None:
-        """Something is asked of a device: while it rests its period begins now, here if the driver is ``RunsInline``.
+    def wake(self) -> None:
+        """Start the next period now if the device is at rest, in this thread if the driver is ``RunsInline``.
 
-        So does a Stop's while it moves, where the driver is ``RunsInline``; else a Stop waits for the period that comes.
+        A pending Stop also interrupts motion if the driver is ``RunsInline``; otherwise it waits for the next period.
         """
-        # A period that runs may have decided before the Stop was there.
-        if self._prompt and self._turn.acquire(timeout=self._period_s if self._controller.stops else 0):
+        # A running period may have been computed before the Stop arrived.
+        timeout_s = self._period_s if self._controller.stop_pending else 0
+        if self._runs_inline and self._period_lock.acquire(timeout=timeout_s):
             try:
-                if self._free() and self._thread.is_alive() and not self._stopping.is_set():
-                    self._period(early=True)
+                if self._may_run_early() and self._thread.is_alive() and not self._stopping.is_set():
+                    self._run_period(early=True)
                     return
             finally:
-                self._turn.release()
-        self._asked.set()
+                self._period_lock.release()
+        self._requested.set()
 
-    def _free(self) -> bool:
-        """Whether a period may begin early: a Stop's always, others at rest and not twice running."""
-        return not self._trouble and (self._controller.stops or not (self._early or self._controller.moving))
+    def _may_run_early(self) -> bool:
+        """Whether a period may run early: always for a Stop, otherwise at rest and not twice in a row."""
+        at_rest = not (self._out_of_turn or self._controller.moving)
+        return not self._error and (self._controller.stop_pending or at_rest)
 
     def _run(self) -> None:
         self._next_s = time.monotonic()
         while not self._stopping.is_set():
             early = self._wait()
-            with self._turn:
+            with self._period_lock:
                 if self._stopping.is_set():
                     return
-                if self._trouble:
-                    self._fail()
+                if self._error:
+                    self._handle_fault()
                 elif time.monotonic() >= self._next_s:
-                    self._period(early=False)
-                elif early and self._free():  # else somebody has just had a period of their own
-                    self._period(early=True)
+                    self._run_period(early=False)
+                elif early and self._may_run_early():  # otherwise another thread has just run a period
+                    self._run_period(early=True)
 
     def _wait(self) -> bool:
-        """Sleep until the next period, or until something is asked of a device at rest; whether it was."""
+        """Sleep until the next period. Returns True if a device at rest was woken earlier."""
         pause_s = max(0.0, self._next_s - time.monotonic())
-        if self._early or self._controller.moving:
+        if self._out_of_turn or self._controller.moving:
             time.sleep(pause_s)
             return False
-        return self._asked.wait(pause_s)
+        return self._requested.wait(pause_s)
 
-    def _period(self, *, early: bool) -> None:
-        """Observe, decide, command, tell; ``_trouble`` is what went wrong. Its caller has the turn."""
+    def _run_period(self, *, early: bool) -> None:
+        """Observe, compute, command, publish; sets ``_error`` on failure. The caller holds the period lock."""
         now_s = time.monotonic()
-        self._asked.clear()  # what has come until here is decided upon below
+        self._requested.clear()  # this period includes all requests so far
         try:
-            # What rests is where the period before has seen it.
-            seen = self.seen = self.seen if early and self.seen is not None else self._driver.observe()
-            self._watch(now_s)
+            # A device at rest is where the previous period observed it.
+            observation = (early and self.observation) or self._driver.observe()
+            self.observation = observation
+            self._check_interlocks(now_s)
             passed_s = self._passed_s(now_s) if early and self._controller.moving else None
-            tick = self._controller.step(now_s, seen.position_rad, passed_s=passed_s)
-            applied = self._driver.send(tick.position_rad)
-            self._controller.applied(applied)
+            output = self._controller.update(now_s, observation.position_rad, passed_s=passed_s)
+            applied = self._driver.send(output.position_rad)
+            self._controller.record_applied(applied)
             if self._base is not None:
-                self._controller.driven(tick.twist, self._base.drive(tick.twist))
-            self._measure(now_s, seen, tick, applied)
+                self._controller.record_driven(output.twist, self._base.drive(output.twist))
+            self._publish_telemetry(now_s, observation, output, applied)
         except DriverError as error:
-            self._trouble = str(error)
-        except Exception as error:  # noqa: BLE001 (whatever it is: hold until the driver answers)
+            self._error = str(error)
+        except Exception as error:  # noqa: BLE001 (any error holds the device until the driver responds)
             _log.exception("%s: control loop", self._name)
-            self._trouble = f"internal error: {error}"
-        if self._trouble:
-            self._asked.set()  # for the loop's own thread, which sees to it
-        self._early = early
-        # Late periods are dropped, never made up for: a burst of commands would be a jump.
-        begun_s = now_s if early else max(self._next_s, time.monotonic() - 2 * self._period_s)
-        self._next_s = begun_s + self._period_s
+            self._error = f"internal error: {error}"
+        if self._error:
+            self._requested.set()  # wakes the loop's own thread, which handles the fault
+        self._out_of_turn = early
+        # Late periods are dropped and not repeated: a burst of commands would be a jump.
+        start_s = now_s if early else max(self._next_s, time.monotonic() - 2 * self._period_s)
+        self._next_s = start_s + self._period_s
 
     def _passed_s(self, now_s: float) -> float:
-        """Of the period that would end next [s]."""
-        return min(max(now_s - (self._next_s - self._period_s), _LEAST_S), self._period_s)
+        """Time since the start of the present period [s]."""
+        return min(max(now_s - (self._next_s - self._period_s), _MIN_PASSED_S), self._period_s)
 
-    def _fail(self) -> None:
-        _log.error("%s: %s", self._name, self._trouble)
-        self._controller.fail(self._trouble)
-        self._controller.step(time.monotonic())
-        while not self._stopping.wait(_RECONNECT_EVERY_S):
+    def _handle_fault(self) -> None:
+        _log.error("%s: %s", self._name, self._error)
+        self._controller.set_fault(self._error)
+        self._controller.update(time.monotonic())
+        while not self._stopping.wait(_RECONNECT_PERIOD_S):
             with contextlib.suppress(DriverError):
                 self._driver.connect()
-                self.seen = self._driver.observe()
-                self._controller.recover(self.seen.position_rad)
-                self._trouble = ""
+                self.observation = self._driver.observe()
+                self._controller.clear_fault(self.observation.position_rad)
+                self._error = ""
                 return
 
-    def _measure(self, now_s: float, seen: Observation, tick: ControlOutput, applied: tuple[float, ...]) -> None:
-        if not self._due(now_s, tick):
-            if tick.mode is Mode.STREAMING:
-                self._show(seen)  # so that the next setpoint finds it done
+    def _publish_telemetry(
+        self, now_s: float, observation: Observation, output: ControlOutput, applied: tuple[float, ...]
+    ) -> None:
+        if not self._is_due(now_s, output):
+            if output.mode is Mode.STREAMING:
+                self._round(observation)  # prepared for the next setpoint
             return
-        shown = self._show(seen)
+        rounded = self._round(observation)
         self._sequence += 1
-        self._tell(
+        self._publish(
             JointTelemetry(
                 tick_ms=tick_ms(),
                 at_ms=wall_ms(),
                 sequence=self._sequence,
-                mode=tick.mode,
-                position_rad=shown.position_rad,
-                velocity_rad_s=shown.velocity_rad_s,
-                effort_nm=shown.effort_nm,
-                commanded_rad=_rounded(applied),
-                frames=shown.frames,
-                epoch=tick.epoch,
-                setpoint_sequence=tick.setpoint_sequence,
-                setpoint_sent_ms=tick.setpoint_sent_ms,
-                loop_age_ms=tick.loop_age_ms,
-                limited=tick.limited,
+                mode=output.mode,
+                position_rad=rounded.position_rad,
+                velocity_rad_s=rounded.velocity_rad_s,
+                effort_nm=rounded.effort_nm,
+                commanded_rad=_round_values(applied),
+                frames=rounded.frames,
+                epoch=output.epoch,
+                setpoint_sequence=output.setpoint_sequence,
+                setpoint_sent_ms=output.setpoint_sent_ms,
+                loop_age_ms=output.loop_age_ms,
+                limited=output.limited,
             )
         )
 
-    def _show(self, seen: Observation) -> Observation:
-        """An observation as telemetry shows it."""
-        if self._shown is None or self._shown[0] is not seen:
-            shown = Observation(
-                position_rad=_rounded(seen.position_rad),
-                velocity_rad_s=_rounded(seen.velocity_rad_s),
-                effort_nm=_rounded(seen.effort_nm),
-                frames=tuple([(x, y, z, w, i, j, k) for x, y, z, w, i, j, k in _rounded(seen.frames)]),
+    def _round(self, observation: Observation) -> Observation:
+        """The observation rounded for telemetry."""
+        if self._rounded is None or self._rounded[0] is not observation:
+            rounded = Observation(
+                position_rad=_round_values(observation.position_rad),
+                velocity_rad_s=_round_values(observation.velocity_rad_s),
+                effort_nm=_round_values(observation.effort_nm),
+                frames=tuple([(x, y, z, w, i, j, k) for x, y, z, w, i, j, k in _round_values(observation.frames)]),
             )
-            self._shown = seen, shown
-        return self._shown[1]
+            self._rounded = observation, rounded
+        return self._rounded[1]
 
-    def _due(self, now_s: float, tick: ControlOutput) -> bool:
-        """Whether telemetry is to be told: a regular word, or news of a setpoint. Two may be close, many may not."""
+    def _is_due(self, now_s: float, output: ControlOutput) -> bool:
+        """Whether to publish: at the regular rate, or for a new setpoint within a budget of ``MOVING_RATE_HZ``."""
         gap_s = 1 / MOVING_RATE_HZ
-        news = tick.setpoint_sequence != self._told_setpoint and now_s >= self._spent_s - gap_s
-        if now_s < self._next_telemetry_s and not news:
+        new_setpoint = output.setpoint_sequence != self._published_setpoint and now_s >= self._budget_s - gap_s
+        if now_s < self._next_telemetry_s and not new_setpoint:
             return False
-        if tick.mode is Mode.STREAMING:
+        if output.mode is Mode.STREAMING:
             self._next_telemetry_s = now_s + _STREAMING_GAP_S
         else:
-            busy = tick.mode is Mode.ACTION or self._controller.moving
+            busy = output.mode is Mode.ACTION or self._controller.moving
             due_s = min(self._next_telemetry_s, now_s) + (gap_s if busy else 1 / IDLE_RATE_HZ)
             self._next_telemetry_s = max(now_s, due_s)
-        self._spent_s = max(self._spent_s, now_s) + gap_s
-        self._told_setpoint = tick.setpoint_sequence
+        self._budget_s = max(self._budget_s, now_s) + gap_s
+        self._published_setpoint = output.setpoint_sequence
         return True
 
 
-def _rounded(values: Sequence[Any]) -> tuple[Any, ...]:
+def _round_values(values: Sequence[Any]) -> tuple[Any, ...]:
     """Six decimals: a microradian or a micrometre, far below any encoder, at half the bytes."""
     return tuple(np.round(np.array(values, dtype=np.float64), 6).tolist())

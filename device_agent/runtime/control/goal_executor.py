@@ -1,4 +1,4 @@
-"""What an action asks of one device's joints and base: one course at a time, carried out tick by tick."""
+"""Executes one motion goal at a time on the joints and the base of a device."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -16,94 +16,96 @@ from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.trajectory import Trajectory
 
-_LONGEST_DRIVE_S = 60.0
+_MAX_DRIVE_S = 60.0
 _SAME_RAD = 1e-4
 
 
 class GoalExecutor:
-    """Joints and base of one device, and the course that they are on. Not thread-safe: its owner locks.
+    """Joints and base of one device, and their current goal. Not thread-safe: the controller locks.
 
     Args:
         robot_type: Joints and limits.
-        envelope: What positions may be.
+        limits: Limits of the positions.
 
     Attributes:
-        motion: The joints'.
-        base: The base's, if there is one.
-        course: What an action has asked, until it has ended.
+        motion: Motion of the joints.
+        base: Motion of the base, if there is one.
+        goal: Goal of the running action until it ends.
     """
 
-    def __init__(self, robot_type: RobotType, envelope: MotionLimits) -> None:
+    def __init__(self, robot_type: RobotType, limits: MotionLimits) -> None:
         self._period_s = robot_type.period_ms / 1000
-        self._envelope = envelope
+        self._limits = limits
         self.motion = JointMotion(robot_type)
         self.base = None if robot_type.base is None else BaseMotion(robot_type.base, self._period_s)
-        self.course: MotionGoal | None = None
-        self._arrival = GoalTolerance([joint.name for joint in robot_type.joints], self._period_s)
+        self.goal: MotionGoal | None = None
+        self._tolerance = GoalTolerance([joint.name for joint in robot_type.joints], self._period_s)
 
-    # ------------------------------------------------------------ what actions ask
+    # ------------------------------------------------------------ goals
 
-    def move(self, position_rad: Mapping[str, float], speed: float) -> JointGoal:
-        """See ``Controller.move``.
+    def start_joint_goal(self, position_rad: Mapping[str, float], speed: float) -> JointGoal:
+        """Start a motion to joint positions [rad]. Joints without a position stay.
 
         Raises:
-            Refused: Unknown joint, a number that is none, outside a joint's range, or no room there.
+            Refused: Unknown joint, position not finite or out of range, or no clearance there.
         """
         if not 0 < speed <= 1:
             raise Refused("bad_speed", f"speed must be above 0 and at most 1, not {speed}")
-        target = self._envelope.target(position_rad, self.motion.position_rad)
-        self._replace()
-        self._arrival.begin(_differ(target, self.motion.position_rad))
-        self.course = move = JointGoal(target_rad=target, speed=speed)
-        return move
+        target = self._limits.resolve_target(position_rad, self.motion.position_rad)
+        self._interrupt_previous()
+        pairs = zip(target, self.motion.position_rad, strict=True)
+        self._tolerance.start([index for index, (a, b) in enumerate(pairs) if abs(a - b) > _SAME_RAD])
+        self.goal = goal = JointGoal(target_rad=target, speed=speed)
+        return goal
 
-    def go_along(self, way: Trajectory) -> TrajectoryGoal:
-        """See ``Controller.go_along``.
+    def start_trajectory(self, trajectory: Trajectory) -> TrajectoryGoal:
+        """Start to follow a trajectory that starts at the current position.
 
         Raises:
-            Refused: It begins elsewhere, or leaves a joint's range.
+            Refused: It starts elsewhere, or leaves a joint's range.
         """
-        far_rad = float(np.max(np.abs(way.position_rad[0] - self.motion.position_rad), initial=0.0))
-        if self.motion.moving or not far_rad <= _SAME_RAD:
-            raise Refused("moved", "the robot is no longer where the way begins; plan it again")
-        self._envelope.check_way(way.position_rad)
-        self._replace()
-        self._arrival.begin(np.flatnonzero(np.any(way.position_rad != way.position_rad[0], axis=0)).tolist())
-        self.course = passage = TrajectoryGoal(way=way)
-        return passage
+        start_rad = trajectory.position_rad[0]
+        distance_rad = float(np.max(np.abs(start_rad - self.motion.position_rad), initial=0.0))
+        if self.motion.moving or not distance_rad <= _SAME_RAD:
+            raise Refused("moved", "the robot is no longer at the start of the trajectory; plan it again")
+        self._limits.check_trajectory(trajectory.position_rad)
+        self._interrupt_previous()
+        self._tolerance.start(np.flatnonzero(np.any(trajectory.position_rad != start_rad, axis=0)).tolist())
+        self.goal = goal = TrajectoryGoal(trajectory=trajectory)
+        return goal
 
-    def drive(self, twist: Twist, duration_s: float) -> DriveGoal:
-        """See ``Controller.drive``.
+    def start_drive(self, twist: Twist, duration_s: float) -> DriveGoal:
+        """Start to drive the base at a twist for a time [s].
 
         Raises:
-            Refused: No base, a number that is none, or beyond the base's limits.
+            Refused: No base, not finite, or beyond the limits of the base.
         """
         if self.base is None:
             raise Refused("no_base", "this robot does not drive")
-        if not 0 < duration_s <= _LONGEST_DRIVE_S:
+        if not 0 < duration_s <= _MAX_DRIVE_S:
             raise Refused(
-                "bad_duration", f"a drive lasts more than 0 and at most {_LONGEST_DRIVE_S:.0f} s, not {duration_s}"
+                "bad_duration", f"a drive lasts more than 0 and at most {_MAX_DRIVE_S:.0f} s, not {duration_s}"
             )
-        for asked, limit, name in zip(twist, self.base.limits, Twist._fields, strict=True):
-            if not abs(asked) <= limit:
-                raise Refused("out_of_range", f"{name} can be up to {limit:.3f}, not {asked}")
-        self._replace()
-        self.course = drive = DriveGoal(twist=twist, periods=math.ceil(duration_s / self._period_s))
-        return drive
+        for requested, limit, name in zip(twist, self.base.limits, Twist._fields, strict=True):
+            if not abs(requested) <= limit:
+                raise Refused("out_of_range", f"{name} can be up to {limit:.3f}, not {requested}")
+        self._interrupt_previous()
+        self.goal = goal = DriveGoal(twist=twist, periods=math.ceil(duration_s / self._period_s))
+        return goal
 
-    # ------------------------------------------------------------ tick by tick
+    # ------------------------------------------------------------ each period
 
-    def follow(self, allowed: float) -> None:
-        """Set in motion what the course asks.
+    def advance(self, allowed: float) -> None:
+        """Set this period's motion towards the goal.
 
         Args:
-            allowed: Share of the speed that the room leaves, above 0.
+            allowed: Share of the speed that the room allows, above 0.
         """
-        match self.course:
+        match self.goal:
             case JointGoal(target_rad=target, speed=speed):
                 self.motion.follow(target, speed=speed * allowed, together=True)
-            case TrajectoryGoal(way=way):
-                self.motion.ride(way, share=allowed)
+            case TrajectoryGoal(trajectory=trajectory):
+                self.motion.follow_trajectory(trajectory, share=allowed)
             case DriveGoal() as drive if self.base is not None:
                 if drive.periods > 0:
                     self.base.follow(Twist(*(part * allowed for part in drive.twist)))
@@ -111,88 +113,84 @@ class GoalExecutor:
                     self.base.brake()
                 drive.periods -= 1
             case _:
-                self.brake()  # what setpoints have begun does not go on beside an action
+                self.brake()  # motion that setpoints started does not continue during an action
 
-    def look(self, late_s: float) -> Clearance | None:
-        """What is in the way of the period that comes, if anything is.
+    def check_clearance(self, late_s: float) -> Clearance | None:
+        """The obstacle on the path of the next period and of the braking after it, if any.
 
         Args:
-            late_s: How much later than it was due the present period begins [s].
+            late_s: Delay of the present period [s].
 
         Raises:
-            MotionError: No way to go on.
+            MotionError: The generator found no trajectory.
         """
         if self.motion.braking:
             if self.motion.moving and late_s > self._period_s / 2:
-                self.motion.make_up(late_s)  # a busy machine must not stretch a hold
+                self.motion.catch_up(late_s)  # a busy machine must not lengthen a hold
             return None
-        return self._envelope.blocked(self.motion.propose())
+        return self._limits.find_obstacle(self.motion.propose())
 
     def update(self, passed_s: float | None = None) -> None:
-        """Advance one period, or by what has passed of one [s].
+        """Advance one period, or ``passed_s`` of it [s].
 
         Raises:
-            MotionError: No way to go on.
+            MotionError: The generator found no trajectory.
         """
         self.motion.update(passed_s)
         if self.base is not None:
             self.base.update(passed_s)
 
-    def settle(self, limited: tuple[str, ...], *, measured_rad: Sequence[float] | None, soft: Collection[int]) -> None:
-        """See whether the course has come to its end.
+    def finish(self, limited: tuple[str, ...], *, measured_rad: Sequence[float] | None, soft: Collection[int]) -> None:
+        """End the goal if it has been reached.
 
         Args:
-            limited: What makes it other than asked now.
-            measured_rad: Where the joints are, shape (n,); where nobody measures, where they are told to be.
-            soft: Joints that hold with less than all their strength.
+            limited: Limits that apply in this period.
+            measured_rad: Measured positions, shape (n,); ``None``: trust the commanded ones.
+            soft: Joints with reduced stiffness.
         """
-        course = self.course
-        if course is None:
+        goal = self.goal
+        if goal is None:
             return
-        course.note(limited)
+        goal.add_limits(limited)
         try:
-            done = self._drove(course) if isinstance(course, DriveGoal) else self._arrived(measured_rad, soft)
-        except Refused as short:
-            self.interrupt(short)
+            done = (
+                goal.periods <= 0 and not self.moving
+                if isinstance(goal, DriveGoal)
+                else self._is_reached(measured_rad, soft)
+            )
+        except Refused as not_arrived:
+            self.interrupt(not_arrived)
             return
         if done:
-            self.course = None
-            course.end(GoalResult.REACHED)
+            self.goal = None
+            goal.end(GoalResult.REACHED)
 
-    def _drove(self, drive: DriveGoal) -> bool:
-        return drive.periods <= 0 and not self.moving
-
-    def _arrived(self, measured_rad: Sequence[float] | None, soft: Collection[int]) -> bool:
-        """Whether the joints rest at their target.
-
-        Raises:
-            Refused: They were told to long ago.
-        """
+    def _is_reached(self, measured_rad: Sequence[float] | None, soft: Collection[int]) -> bool:
         if not self.motion.reached:
             return False
-        return measured_rad is None or self._arrival.there(self.motion.position_rad, measured_rad, soft=soft)
+        return measured_rad is None or self._tolerance.is_reached(self.motion.position_rad, measured_rad, soft=soft)
 
     def interrupt(self, why: Refused) -> None:
-        """End the course, if there is one, and brake."""
-        if self.course is not None:
-            interrupted, self.course = self.course, None
+        """End the goal, if there is one, and brake."""
+        if self.goal is not None:
+            interrupted, self.goal = self.goal, None
             interrupted.end(GoalResult.INTERRUPTED, why)
             self.brake()
 
     def start_at(self, position_rad: Sequence[float]) -> None:
-        """Begin at rest at ``position_rad``, shape (n,) [rad]."""
+        """Start at rest at ``position_rad``, shape (n,) [rad]."""
         self.motion.start_at(position_rad)
         if self.base is not None:
             self.base.start()
 
     def brake(self) -> None:
-        """Come to rest as fast as the robot type allows."""
+        """Brake to rest at the robot type's deceleration."""
         self.motion.brake()
         if self.base is not None:
             self.base.brake()
 
-    def give_up(self) -> None:
-        """Brake; where even that cannot be planned, stand still at once."""
+    def abort(self) -> None:
+        """Brake; if no braking trajectory is found, stop at once."""
         self.brake()
         try:
             self.motion.update()
@@ -204,23 +202,18 @@ class GoalExecutor:
         """Whether any commanded velocity is not zero."""
         return self.motion.moving or (self.base is not None and self.base.moving)
 
-    def faster_than(self, creep_rad_s: float) -> bool:
-        """Whether it is more than creeping at its target [rad/s]; a base that moves at all is."""
-        return self.motion.fastest_rad_s > creep_rad_s or (self.base is not None and self.base.moving)
+    def faster_than(self, speed_rad_s: float) -> bool:
+        """Whether a joint is faster than this [rad/s], or the base moves."""
+        return self.motion.fastest_rad_s > speed_rad_s or (self.base is not None and self.base.moving)
 
     def braking_time_s(self) -> float:
-        """How long ``brake`` would take [s]."""
+        """Duration of ``brake`` [s]."""
         return max(self.motion.braking_time_s(), 0.0 if self.base is None else self.base.braking_time_s())
 
     @property
     def twist(self) -> Twist:
-        """The base's commanded twist."""
+        """Commanded twist of the base."""
         return REST if self.base is None else self.base.twist
 
-    def _replace(self) -> None:
-        self.interrupt(Refused("replaced", "another course took its place"))
-
-
-def _differ(one: Sequence[float], other: Sequence[float]) -> list[int]:
-    """Indices of the joints that are not in the same place in both."""
-    return [index for index, (a, b) in enumerate(zip(one, other, strict=True)) if abs(a - b) > _SAME_RAD]
+    def _interrupt_previous(self) -> None:
+        self.interrupt(Refused("replaced", "another goal replaced it"))

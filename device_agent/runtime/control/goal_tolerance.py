@@ -1,53 +1,53 @@
-"""Whether joints have really come to where a move should end: a command that has arrived is not yet an arm that has."""
+"""Goal tolerance: checks that the measured joints, not only the commanded ones, have reached the goal."""
 
 import math
 from collections.abc import Collection, Sequence
 
 from device_agent.runtime.errors import Refused
 
-NEAR_RAD = 0.03
-"""As near is there: many times what position servos leave under their own weight, and less than anybody calls short."""
+TOLERANCE_RAD = 0.03
+"""Position tolerance: many times the error of servos under their own weight [rad]."""
 DWELL_S = 0.04
-"""So long in a row, so that who only comes through has not arrived."""
+"""Joints must stay within the tolerance for this time, so that passing through is not arrival [s]."""
 SETTLE_TIMEOUT_S = 2.0
-"""So long after the command has arrived it may take: any servo that can still come has come."""
+"""Joints that are outside the tolerance this long after the command has arrived have failed [s]."""
 
 
 class GoalTolerance:
-    """One device's. Not thread-safe: its owner locks.
+    """Goal tolerance of one device. Not thread-safe: the controller locks.
 
     Args:
-        names: Of the joints.
+        names: Names of the joints.
         period_s: The control period [s].
     """
 
     def __init__(self, names: Sequence[str], period_s: float) -> None:
         self._names = names
-        self._dwell = math.ceil(DWELL_S / period_s)
-        self._patience = math.ceil(SETTLE_TIMEOUT_S / period_s)
-        self.begin(())
+        self._dwell_periods = math.ceil(DWELL_S / period_s)
+        self._timeout_periods = math.ceil(SETTLE_TIMEOUT_S / period_s)
+        self.start(())
 
-    def begin(self, moved: Collection[int]) -> None:
-        """A new course, with the indices of the joints that it moves: whoever stays is not asked."""
+    def start(self, moved: Collection[int]) -> None:
+        """Start a goal that moves the joints with these indices. Other joints are not checked."""
         self._moved = moved
-        self._near = self._waited = 0
+        self._within_periods = self._waited_periods = 0
 
-    def there(self, target_rad: Sequence[float], measured_rad: Sequence[float], *, soft: Collection[int]) -> bool:
-        """Whether they have; to be asked once in each period in which the command rests at its end.
+    def is_reached(self, target_rad: Sequence[float], measured_rad: Sequence[float], *, soft: Collection[int]) -> bool:
+        """Whether the joints have arrived. Call once in each period in which the command rests at the goal.
 
         Args:
-            target_rad: Where the joints should be, shape (n,).
-            measured_rad: Where they are, shape (n,).
-            soft: Joints that hold with less than all their strength, as they were asked to: nobody knows where.
+            target_rad: Goal positions, shape (n,).
+            measured_rad: Measured positions, shape (n,).
+            soft: Joints with reduced stiffness, which are not checked.
 
         Raises:
-            Refused: They have had time enough.
+            Refused: Joints did not arrive before the timeout.
         """
-        off = {index: abs(target_rad[index] - measured_rad[index]) for index in self._moved if index not in soft}
-        far = [index for index, rad in off.items() if not rad <= NEAR_RAD]  # what is no number is far
-        self._near = 0 if far else self._near + 1
-        self._waited += 1
-        if far and self._waited >= self._patience:
-            short = ", ".join(f"{self._names[index]} is {off[index]:.2f} rad short" for index in far)
-            raise Refused("not_arrived", f"did not arrive: {short}; see what holds it, or how it is loaded")
-        return self._near >= self._dwell
+        errors = {index: abs(target_rad[index] - measured_rad[index]) for index in self._moved if index not in soft}
+        outside = [index for index, rad in errors.items() if not rad <= TOLERANCE_RAD]  # NaN is outside
+        self._within_periods = 0 if outside else self._within_periods + 1
+        self._waited_periods += 1
+        if outside and self._waited_periods >= self._timeout_periods:
+            short = ", ".join(f"{self._names[index]} is {errors[index]:.2f} rad short" for index in outside)
+            raise Refused("not_arrived", f"did not arrive: {short}; check for obstacles and load")
+        return self._within_periods >= self._dwell_periods

@@ -1,4 +1,4 @@
-"""What an action asks of the motors: one course at a time, with one end."""
+"""Motion goals of an action. A device executes one goal at a time; each goal has one result."""
 
 import threading
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from device_agent.runtime.planning.trajectory import Trajectory
 
 
 class GoalResult(Enum):
-    """How a course ended."""
+    """How a goal ended."""
 
     REACHED = "reached"
     INTERRUPTED = "interrupted"
@@ -18,30 +18,30 @@ class GoalResult(Enum):
 
 @dataclass(eq=False, kw_only=True)
 class MotionGoal:
-    """On its way until ``finished`` is set, once, after ``outcome`` and ``why`` are.
+    """Goal in execution until ``finished`` is set. ``result`` and ``why`` are set before.
 
     Attributes:
-        limited: What made it slower or other than asked, each thing once, as telemetry names it.
+        limited: Limits that changed the motion, each once, as telemetry names them.
     """
 
     finished: threading.Event = field(default_factory=threading.Event)
-    outcome: GoalResult | None = None
+    result: GoalResult | None = None
     why: Refused | None = None
     limited: tuple[str, ...] = ()
 
-    def note(self, limited: tuple[str, ...]) -> None:
-        """Remember what limits it now."""
+    def add_limits(self, limited: tuple[str, ...]) -> None:
+        """Add limits that apply now."""
         self.limited += tuple(one for one in limited if one not in self.limited)
 
-    def end(self, outcome: GoalResult, why: Refused | None = None) -> None:
-        """Wake whoever waits."""
-        self.outcome, self.why = outcome, why
+    def end(self, result: GoalResult, why: Refused | None = None) -> None:
+        """Set the result and wake waiting threads."""
+        self.result, self.why = result, why
         self.finished.set()
 
 
 @dataclass(eq=False, kw_only=True)
 class JointGoal(MotionGoal):
-    """Joints to positions, shape (n,) [rad], at a share of their speed; then at rest."""
+    """Joint positions, shape (n,) [rad], at a share of the speed; ends at rest."""
 
     target_rad: list[float]
     speed: float
@@ -49,14 +49,14 @@ class JointGoal(MotionGoal):
 
 @dataclass(eq=False, kw_only=True)
 class TrajectoryGoal(MotionGoal):
-    """Along a way that was planned; then at rest at its end."""
+    """A planned trajectory; ends at rest."""
 
-    way: Trajectory
+    trajectory: Trajectory
 
 
 @dataclass(eq=False, kw_only=True)
 class DriveGoal(MotionGoal):
-    """The base at a twist, for some control periods; then at rest."""
+    """A twist of the base for a number of control periods; ends at rest."""
 
     twist: Twist
     periods: int

@@ -1,4 +1,4 @@
-"""Jerk-limited motion of all joints of one device, one control period at a time (``ruckig``)."""
+"""Jerk-limited motion of the joints of one device, one control period at a time (``ruckig``)."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -23,54 +23,53 @@ from device_agent.runtime.planning.joint_couplings import Couplings
 from device_agent.runtime.planning.trajectory import Trajectory
 
 _BRAKING_RAMP_S = 0.01
-"""Time in which braking reaches its full deceleration: short against the 50 ms in which a hold must be complete."""
+"""Time in which braking reaches its full deceleration: short compared with the 50 ms limit of a hold [s]."""
 _KNOT_S = 0.04
-"""Between knots this far apart in time a braking path is straight to within 4 mm at any speed in use."""
-_LOOKS = 4
-"""Parts of a slowing down after which is looked where it has led: what turns on its way is between two of them."""
+"""Between knots this far apart in time a braking path is straight to within 4 mm at any speed in use [s]."""
+_SLOWDOWN_SAMPLES = 4
+"""Samples of a slowdown; a joint that reverses does so between two of them."""
 _REST_RAD_S = 1e-6
 _ROUNDING = 1e-12
-_LITTLE_LESS = 0.999
+_REDUCED_SPEED = 0.999
 _REACHED_RAD = 1e-4
 _SAME_RAD_S2 = 1e-3
 
 
 class MotionError(Exception):
-    """The trajectory generator refused its input; the device must hold."""
+    """The trajectory generator found no trajectory; the device must hold."""
 
 
-def plan(generate: Callable[[Any, Any], Result], order: InputParameter, answer: Any) -> None:
-    """Have ``ruckig`` answer an order.
+def generate(calculate: Callable[[Any, Any], Result], request: InputParameter, output: Any) -> None:
+    """Call ``ruckig``, and retry once at a slightly lower speed.
 
-    Where a joint would meet its greatest speed and acceleration at one moment, and at once leave them, rounding can
-    hide every way from it. With a little less speed there is one.
+    If a joint reaches its speed and acceleration limits at the same moment, rounding can hide every solution.
 
     Raises:
-        MotionError: It found nothing.
+        MotionError: No trajectory was found.
     """
     try:
-        result = generate(order, answer)
+        result = calculate(request, output)
     except RuckigError:
-        fastest = order.max_velocity
-        order.max_velocity = [_LITTLE_LESS * limit for limit in fastest]
+        fastest = request.max_velocity
+        request.max_velocity = [_REDUCED_SPEED * limit for limit in fastest]
         try:
-            result = generate(order, answer)
+            result = calculate(request, output)
         except RuckigError as error:
-            raise MotionError(f"no way to go on from here: {error}") from error
+            raise MotionError(f"no trajectory from the present state: {error}") from error
         finally:
-            order.max_velocity = fastest
+            request.max_velocity = fastest
     if result not in (Result.Working, Result.Finished):
-        raise MotionError(f"no way to go on from here ({result})")
+        raise MotionError(f"no trajectory from the present state ({result})")
 
 
 class JointMotion:
-    """The commanded position and velocity of each joint, moved towards a target or to rest.
+    """Commanded position and velocity of each joint.
 
     Args:
         robot_type: Limits of each joint and the braking deceleration.
 
     Attributes:
-        waits: Which joints wait for which, as ``limited`` names it.
+        waits: Joints that wait for other joints, as ``limited`` names them.
     """
 
     def __init__(self, robot_type: RobotType) -> None:
@@ -89,9 +88,9 @@ class JointMotion:
         self._plan = RuckigTrajectory(len(joints))
         self._plan_input = InputParameter(len(joints))
         self._proposed = False
-        self._ride: TrajectoryFollower | None = None
+        self._follower: TrajectoryFollower | None = None
         self._couplings = Couplings(robot_type)
-        self._limp: dict[int, float] = {}
+        self._tracked: dict[int, float] = {}
         self.waits: tuple[str, ...] = ()
         self.braking = True
         self.position_rad: list[float] = [0.0] * len(joints)
@@ -99,14 +98,14 @@ class JointMotion:
         self.start_at(self.position_rad)
 
     def start_at(self, position_rad: Sequence[float]) -> None:
-        """Begin at rest at ``position_rad``, shape (n,) [rad]."""
+        """Start at rest at ``position_rad``, shape (n,) [rad]."""
         self.position_rad = list(position_rad)
         self.velocity_rad_s = list(self._zeros)
         self._input.current_position = self.position_rad
         self._input.current_velocity = self._zeros
         self._input.current_acceleration = self._zeros
         self._proposed = False
-        self._ride = None
+        self._follower = None
         self.brake()
 
     def follow(
@@ -115,25 +114,25 @@ class JointMotion:
         *,
         speed: float = 1.0,
         cap_rad_s: float = math.inf,
-        most_rad_s: Sequence[float] | None = None,
+        max_rad_s: Sequence[float] | None = None,
         together: bool = False,
     ) -> None:
-        """Head for ``target_rad``, shape (n,) [rad], already inside the joints' ranges.
+        """Move towards ``target_rad``, shape (n,) [rad], which is inside the joints' ranges.
 
-        What still brakes harder than with ordinary jerk it could leave off goes on braking: it would run backwards.
-        What is on a way comes to rest on it first.
+        A joint that brakes harder than ordinary jerk can end in time continues to brake: otherwise it would reverse.
+        A device on a trajectory first brakes to rest on it.
 
         Args:
-            target_rad: Where to come to rest.
+            target_rad: Positions at which to come to rest.
             speed: Share of each joint's velocity limit, above 0 and at most 1.
-            cap_rad_s: What no joint exceeds.
-            most_rad_s: What each joint does not exceed besides, shape (n,), above 0.
-            together: Whether all joints arrive at the same time (a move) or each as fast as it can (a slider).
+            cap_rad_s: Speed limit of every joint.
+            max_rad_s: Additional speed limit of each joint, shape (n,), above 0.
+            together: True: all joints arrive at the same time. False: each joint is as fast as it can be.
         """
         self._target = list(target_rad)
-        for index, measured in self._limp.items():
+        for index, measured in self._tracked.items():
             self._target[index] = measured
-        if self._ride is not None:
+        if self._follower is not None:
             self.brake()
             return
         if self.braking and self._would_turn():
@@ -142,17 +141,17 @@ class JointMotion:
         self._input.control_interface = ControlInterface.Position
         self._input.synchronization = Synchronization.Time if together else Synchronization.No
         fastest = [min(limit * speed, cap_rad_s) for limit in self._velocity_limits]
-        if most_rad_s is not None:
-            fastest = [min(pair) for pair in zip(fastest, most_rad_s, strict=True)]
+        if max_rad_s is not None:
+            fastest = [min(pair) for pair in zip(fastest, max_rad_s, strict=True)]
         self._input.max_velocity = fastest
         self._input.max_acceleration = self._acceleration_limits
         self._input.max_jerk = self._jerk_limits
-        self._input.target_position = self._heading()
+        self._input.target_position = self._period_target()
         self._input.target_velocity = self._zeros
         self._input.target_acceleration = self._zeros
 
     def _would_turn(self) -> bool:
-        """Whether a joint, with ordinary jerk, would run backwards before it has left its deceleration."""
+        """Whether a joint with ordinary jerk would reverse before its deceleration has ended."""
         return any(
             abs(now) > limit + _SAME_RAD_S2
             or (now * velocity <= 0 and now * now > 2 * jerk * abs(velocity) + _SAME_RAD_S2)
@@ -165,183 +164,183 @@ class JointMotion:
             )
         )
 
-    def ride(self, way: Trajectory, *, share: float) -> None:
-        """Go along a way that begins where the device rests.
+    def follow_trajectory(self, trajectory: Trajectory, *, share: float) -> None:
+        """Follow a trajectory that starts at the resting position.
 
         Args:
-            way: Inside the joints' ranges.
-            share: Of the way's speed, above 0 and at most 1.
+            trajectory: Inside the joints' ranges.
+            share: Share of the trajectory's speed, above 0 and at most 1.
         """
-        self._target = way.position_rad[-1].tolist()
-        if self._ride is None and not self.moving and self._rests_at(way.position_rad[0].tolist()):
-            self._ride = TrajectoryFollower(
-                way,
+        self._target = trajectory.position_rad[-1].tolist()
+        if self._follower is None and not self.moving and self._rests_at(trajectory.position_rad[0].tolist()):
+            self._follower = TrajectoryFollower(
+                trajectory,
                 period_s=self._period_s,
                 acceleration_rad_s2=self._acceleration_limits,
                 jerk_rad_s3=self._jerk_limits,
                 braking_rad_s2=self._braking,
             )
-        if self._ride is None or self._ride.way is not way:
+        if self._follower is None or self._follower.trajectory is not trajectory:
             self.brake()
             return
         self.braking = False
-        self._ride.go(share)
+        self._follower.follow(share)
 
     def _rests_at(self, position_rad: Sequence[float]) -> bool:
-        """Whether a way that begins there begins here: on another one the first period would be a jump."""
+        """Whether a trajectory that starts there starts here; otherwise the first period would be a jump."""
         pairs = zip(self.position_rad, position_rad, strict=True)
-        return all(abs(a - b) <= _REACHED_RAD or index in self._limp for index, (a, b) in enumerate(pairs))
+        return all(abs(a - b) <= _REACHED_RAD or index in self._tracked for index, (a, b) in enumerate(pairs))
 
-    def _heading(self) -> list[float]:
-        """The target for this period: joints that leave each other no room wait for each other."""
+    def _period_target(self) -> list[float]:
+        """The target of this period. Coupled joints that would violate each other's range wait."""
         if not self._couplings:
             return self._target
-        order = self._plan_input
-        order.current_position = self._input.current_position
-        order.current_velocity = self._input.current_velocity
-        order.current_acceleration = self._input.current_acceleration
-        self._slow_down(order, self._acceleration_limits, self._jerk_limits)
-        plan(self._planner.calculate, order, self._plan)
-        places = [self._plan.at_time(self._plan.duration * part / _LOOKS)[0] for part in range(_LOOKS + 1)]
-        swing = [(min(of_joint), max(of_joint)) for of_joint in zip(*places, strict=True)]
-        heading, self.waits = self._couplings.steer(self._target, self.position_rad, swing)
-        return heading
+        request = self._plan_from_present()
+        self._set_slowdown(request, self._acceleration_limits, self._jerk_limits)
+        generate(self._planner.calculate, request, self._plan)
+        parts = [part / _SLOWDOWN_SAMPLES for part in range(_SLOWDOWN_SAMPLES + 1)]
+        samples = [self._plan.at_time(self._plan.duration * part)[0] for part in parts]
+        swing = [(min(of_joint), max(of_joint)) for of_joint in zip(*samples, strict=True)]
+        target, self.waits = self._couplings.limit_target(self._target, self.position_rad, swing)
+        return target
+
+    def _plan_from_present(self) -> InputParameter:
+        request = self._plan_input
+        request.current_position = self._input.current_position
+        request.current_velocity = self._input.current_velocity
+        request.current_acceleration = self._input.current_acceleration
+        return request
 
     def brake(self) -> None:
-        """Come to rest as fast as the robot type allows, and stay there; what is on a way stays on it."""
+        """Brake to rest at the robot type's deceleration; a device on a trajectory stays on its path."""
         if not self.braking:
             self._proposed = False
         self.braking = True
         self.waits = ()
-        if self._ride is not None:
-            self._ride.brake()
-        self._brake(self._input)
+        if self._follower is not None:
+            self._follower.brake()
+        self._set_braking(self._input)
 
-    def _brake(self, order: InputParameter) -> None:
+    def _set_braking(self, request: InputParameter) -> None:
         count = len(self._zeros)
-        self._slow_down(order, [self._braking] * count, [self._braking / _BRAKING_RAMP_S] * count)
+        self._set_slowdown(request, [self._braking] * count, [self._braking / _BRAKING_RAMP_S] * count)
 
-    def _slow_down(self, order: InputParameter, acceleration: list[float], jerk: list[float]) -> None:
-        order.control_interface = ControlInterface.Velocity
-        order.synchronization = Synchronization.No
-        order.max_velocity = self._velocity_limits
-        order.max_acceleration = acceleration
-        order.max_jerk = jerk
-        order.target_velocity = self._zeros
-        order.target_acceleration = self._zeros
+    def _set_slowdown(self, request: InputParameter, acceleration: list[float], jerk: list[float]) -> None:
+        request.control_interface = ControlInterface.Velocity
+        request.synchronization = Synchronization.No
+        request.max_velocity = self._velocity_limits
+        request.max_acceleration = acceleration
+        request.max_jerk = jerk
+        request.target_velocity = self._zeros
+        request.target_acceleration = self._zeros
 
     def propose(self) -> list[list[float]]:
-        """Plan one period, and how the device would come to rest if it braked from there on.
+        """Plan one period, and the braking after it.
 
-        Nothing moves until ``update``; a ``brake`` in between takes it back.
+        Nothing moves until ``update``; a ``brake`` in between discards the plan.
 
         Returns:
-            Positions along that way, (n,) [rad] each: where it is now, where it would be, then until rest.
+            Positions along that path, (n,) [rad] each: now, after the period, then until rest.
 
         Raises:
             MotionError: The generator found no trajectory.
         """
-        if self._ride is not None:
-            return self._ride.propose()
-        if not self._zeros:  # ``ruckig`` cannot plan for nothing
+        if self._follower is not None:
+            return self._follower.propose()
+        if not self._zeros:  # ``ruckig`` cannot plan without joints
             return [[], []]
-        plan(self._generator.update, self._input, self._output)
+        generate(self._generator.update, self._input, self._output)
         self._proposed = True
-        order = self._plan_input
-        order.current_position = self._output.new_position
-        order.current_velocity = self._output.new_velocity
-        order.current_acceleration = self._output.new_acceleration
-        self._brake(order)
-        plan(self._planner.calculate, order, self._plan)
+        request = self._plan_input
+        request.current_position = self._output.new_position
+        request.current_velocity = self._output.new_velocity
+        request.current_acceleration = self._output.new_acceleration
+        self._set_braking(request)
+        generate(self._planner.calculate, request, self._plan)
         knots = max(1, math.ceil(self._plan.duration / _KNOT_S))
         ahead = [self._plan.at_time(self._plan.duration * (index + 1) / knots)[0] for index in range(knots)]
         return [list(self.position_rad), list(self._output.new_position), *(list(knot) for knot in ahead)]
 
     def update(self, passed_s: float | None = None) -> list[float]:
-        """Advance one period, as proposed if it was; or by what has passed of one, of which nothing was proposed.
+        """Advance one period, as proposed if it was, or ``passed_s`` of a period without a proposal.
 
         Args:
-            passed_s: Since the last period began, where this one comes early [s].
+            passed_s: Time since the last period began, if this one is early [s].
 
         Returns:
             The position to command now, shape (n,) [rad].
 
         Raises:
-            MotionError: The generator found no trajectory; position and velocity are as they were.
+            MotionError: The generator found no trajectory; position and velocity are unchanged.
         """
-        if self._ride is not None:
-            return self._update_ride(self._ride, passed_s)
+        if self._follower is not None:
+            return self._update_follower(self._follower, passed_s)
         if not self._zeros:
             return self.position_rad
         if not self._proposed:
             self._generator.delta_time = passed_s or self._period_s
             try:
-                plan(self._generator.update, self._input, self._output)
+                generate(self._generator.update, self._input, self._output)
             finally:
                 self._generator.delta_time = self._period_s
         self._proposed = False
         self._output.pass_to_input(self._input)
         before = self.position_rad
         self.position_rad = list(self._output.new_position)
-        # What is left by rounding is rest: from there, ``ruckig`` may find no way back.
-        self.velocity_rad_s = [0.0 if abs(left) < _ROUNDING else left for left in self._output.new_velocity]
+        # A velocity from rounding counts as rest: from it, ``ruckig`` may find no trajectory.
+        self.velocity_rad_s = [0.0 if abs(value) < _ROUNDING else value for value in self._output.new_velocity]
         self._input.current_velocity = self.velocity_rad_s
-        self._hold_together(before)
+        self._apply_couplings(before)
         return self.position_rad
 
-    def _update_ride(self, ride: TrajectoryFollower, passed_s: float | None) -> list[float]:
-        ride.update(passed_s)
+    def _update_follower(self, follower: TrajectoryFollower, passed_s: float | None) -> list[float]:
+        follower.update(passed_s)
         before = self.position_rad
-        self.position_rad, self.velocity_rad_s = ride.position_rad.tolist(), ride.velocity_rad_s.tolist()
-        self._hold_together(before)
-        if ride.resting:
+        self.position_rad, self.velocity_rad_s = follower.position_rad.tolist(), follower.velocity_rad_s.tolist()
+        self._apply_couplings(before)
+        if follower.resting:
             self.start_at(self.position_rad)
         return self.position_rad
 
-    def _hold_together(self, before_rad: Sequence[float]) -> None:
-        """What the generator does not know: joints that hang together, and joints that are limp."""
-        if not self._couplings and not self._limp:
+    def _apply_couplings(self, before_rad: Sequence[float]) -> None:
+        """Correct coupled and compliant joints, which the generator does not know."""
+        if not self._couplings and not self._tracked:
             return
         acceleration = list(self._input.current_acceleration)
-        for index, measured in self._limp.items():
+        for index, measured in self._tracked.items():
             self.position_rad[index] = measured
             self.velocity_rad_s[index] = acceleration[index] = 0.0
-        self._couplings.keep(self.position_rad, before_rad)
+        self._couplings.clamp_to_range(self.position_rad, before_rad)
         for values in (self.position_rad, self.velocity_rad_s, acceleration):
-            self._couplings.tie(values)
+            self._couplings.apply_mirrors(values)
         self._input.current_position = self.position_rad
         self._input.current_velocity = self.velocity_rad_s
         self._input.current_acceleration = acceleration
 
-    def loosen(self, measured_rad: dict[int, float]) -> None:
-        """Command some joints to where they are measured: they are limp, and must not jump once they no longer are.
+    def track_measured(self, measured_rad: dict[int, float]) -> None:
+        """Command compliant joints to their measured positions, so that they do not jump when they stiffen.
 
         Args:
-            measured_rad: Index of each such joint → its position, inside its range [rad].
+            measured_rad: Index of each compliant joint → its position, inside its range [rad].
         """
-        self._limp = measured_rad
+        self._tracked = measured_rad
 
-    def make_up(self, lost_s: float) -> None:
-        """Count time in which no period was commanded as braked: the device was left standing where it is.
-
-        Only the velocity falls, by what braking would have taken from it; there is no jump.
+    def catch_up(self, lost_s: float) -> None:
+        """Reduce the velocity as if the device had braked for ``lost_s``; the position is unchanged.
 
         Args:
-            lost_s: How much later than it was due the present period begins [s].
+            lost_s: Delay of the present period [s].
 
         Raises:
             MotionError: The generator found no trajectory.
         """
-        if self._ride is not None:
-            self._ride.make_up(lost_s)
-            self.velocity_rad_s = self._ride.velocity_rad_s.tolist()
+        if self._follower is not None:
+            self._follower.catch_up(lost_s)
+            self.velocity_rad_s = self._follower.velocity_rad_s.tolist()
             return
-        order = self._plan_input
-        order.current_position = self._input.current_position
-        order.current_velocity = self._input.current_velocity
-        order.current_acceleration = self._input.current_acceleration
-        self._brake(order)
-        plan(self._planner.calculate, order, self._plan)
+        request = self._plan_from_present()
+        self._set_braking(request)
+        generate(self._planner.calculate, request, self._plan)
         _, velocity, acceleration = self._plan.at_time(min(lost_s, self._plan.duration))
         self._input.current_velocity = velocity
         self._input.current_acceleration = acceleration
@@ -359,14 +358,14 @@ class JointMotion:
 
     @property
     def reached(self) -> bool:
-        """Whether the device rests at the target of the last ``follow``."""
+        """Whether the device rests at the last target."""
         near = all(abs(a - b) <= _REACHED_RAD for a, b in zip(self.position_rad, self._target, strict=True))
         return near and not self.moving
 
-    def fastest_allowed_rad_s(self, speed: float) -> float:
-        """The highest speed of any joint at a share of its limit [rad/s]."""
+    def max_speed_rad_s(self, speed: float) -> float:
+        """Highest speed limit of the joints at a share of it [rad/s]."""
         return max(self._velocity_limits, default=0.0) * speed
 
     def braking_time_s(self) -> float:
-        """How long ``brake`` would take from the present velocity [s], rounded up by the ramps at both ends."""
+        """Braking time from the present velocity [s], including the ramps at both ends."""
         return self.fastest_rad_s / self._braking + 3 * _BRAKING_RAMP_S

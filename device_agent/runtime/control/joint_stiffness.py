@@ -1,4 +1,4 @@
-"""How firmly joints hold. What is limp is commanded to where it is, so that it does not jump when it holds again."""
+"""Stiffness of each joint. A compliant joint is commanded to its measured position, so that it does not jump later."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -7,34 +7,34 @@ from device_agent.runtime.errors import Refused
 
 
 class JointStiffness:
-    """The stiffness of each joint of one device. Not thread-safe: its owner locks.
+    """Joint stiffness of one device. Not thread-safe: the controller locks.
 
     Args:
         robot_type: Joints and their ranges.
 
     Attributes:
-        limited: Which joints are limp, as telemetry names it.
-        soft: Indices of the joints that hold with less than all their strength.
+        limited: Compliant joints, as telemetry names them.
+        soft: Indices of the joints with reduced stiffness.
     """
 
     def __init__(self, robot_type: RobotType) -> None:
         self._joints = robot_type.joints
         self._index = {joint.name: index for index, joint in enumerate(robot_type.joints)}
         self._values: dict[str, float] = {}
-        self._limp: tuple[int, ...] = ()
+        self._compliant: tuple[int, ...] = ()
         self.limited: tuple[str, ...] = ()
         self.soft: frozenset[int] = frozenset()
 
     @property
     def values(self) -> Mapping[str, float]:
-        """Joint → share of its strength, of those that do not hold with all of it."""
+        """Joint → stiffness, of the joints with reduced stiffness."""
         return self._values
 
-    def named(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """These joints; all of them where none is named.
+    def resolve_names(self, joints: Sequence[str]) -> tuple[str, ...]:
+        """These joints, or all joints if none is named.
 
         Raises:
-            Refused: There is no such joint.
+            Refused: A joint is unknown.
         """
         for name in joints:
             if name not in self._index:
@@ -42,27 +42,27 @@ class JointStiffness:
         return tuple(joints) or tuple(self._index)
 
     def set(self, values: Mapping[str, float]) -> None:
-        """From now on these joints hold so firmly, 0…1."""
-        known = {**self._values, **values}
-        # In the type's order, so that the same stiffness is always shown the same.
-        self._values = {name: known[name] for name in self._index if known.get(name, 1.0) < 1.0}
+        """Set the stiffness of joints, 0…1."""
+        merged = {**self._values, **values}
+        # In the order of the robot type, so that equal values have one representation.
+        self._values = {name: merged[name] for name in self._index if merged.get(name, 1.0) < 1.0}
         self.soft = frozenset(self._index[name] for name in self._values)
-        self._limp = tuple(self._index[name] for name, value in self._values.items() if value <= 0)
-        self.limited = tuple(f"{self._joints[index].name}: limp" for index in self._limp)
+        self._compliant = tuple(self._index[name] for name, value in self._values.items() if value <= 0)
+        self.limited = tuple(f"{self._joints[index].name}: compliant" for index in self._compliant)
 
-    def check(self, moved: Iterable[str]) -> None:
-        """No joint that is to move is limp.
+    def check_movable(self, moved: Iterable[str]) -> None:
+        """Check that no joint of a goal is compliant.
 
         Raises:
-            Refused: One is.
+            Refused: A joint is compliant.
         """
-        limp = [name for name in moved if self._values.get(name, 1.0) <= 0]
-        if limp:
-            raise Refused("limp", f"{', '.join(limp)}: limp; set a stiffness above 0 first")
+        compliant = [name for name in moved if self._values.get(name, 1.0) <= 0]
+        if compliant:
+            raise Refused("compliant", f"{', '.join(compliant)}: no stiffness; set a stiffness above 0 first")
 
-    def feel(self, measured_rad: Sequence[float]) -> dict[int, float]:
-        """Where limp joints are to be commanded: to where they are, inside of their ranges."""
+    def track(self, measured_rad: Sequence[float]) -> dict[int, float]:
+        """Index → commanded position of each compliant joint: its measured position, clamped to its range [rad]."""
         return {
             index: min(max(measured_rad[index], self._joints[index].lower_rad), self._joints[index].upper_rad)
-            for index in self._limp
+            for index in self._compliant
         }

@@ -1,4 +1,4 @@
-"""What the robot type and the robot's shape allow: names, ranges, room. The same for every source of motion."""
+"""Motion limits: joint names, ranges, couplings and clearance. They apply to every source of motion."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,14 +17,14 @@ _SAME_RAD = 1e-9
 
 
 class MotionLimits:
-    """The limits of one device's positions. Keeps nothing, moves nothing.
+    """Limits of one device's positions. Stateless.
 
     Args:
         robot_type: Joints and their ranges.
-        geometry: The robot's shape; without it nobody knows what it could touch, and only ranges hold.
+        geometry: Shape of the robot; without it, only ranges are checked.
 
     Attributes:
-        limits: What is held, by name.
+        names: Names of the limits.
     """
 
     def __init__(self, robot_type: RobotType, geometry: RobotGeometry | None) -> None:
@@ -35,10 +35,10 @@ class MotionLimits:
         shape = (
             () if geometry is None else ("clearance",) if robot_type.workspace is None else ("clearance", "workspace")
         )
-        self.limits = ("position", "velocity", "acceleration", "jerk", *shape)
+        self.names = ("position", "velocity", "acceleration", "jerk", *shape)
 
     def check(self, position_rad: Mapping[str, float]) -> None:
-        """All joints are known, all numbers are numbers.
+        """Check that all joints are known and all positions are finite.
 
         Raises:
             Refused: They are not.
@@ -50,39 +50,39 @@ class MotionLimits:
             raise Refused("not_finite", "a position must be a finite number")
 
     def clamp(self, position_rad: Mapping[str, float], target_rad: list[float]) -> tuple[str, ...]:
-        """Write positions into a target, each inside its range.
+        """Write positions, clamped to their ranges, into ``target_rad``.
 
         Returns:
-            The joints that were asked beyond it, as ``limited`` names them.
+            The clamped joints, as ``limited`` names them.
         """
-        led, differing = self._couplings.lead(position_rad)
+        leaders, differing = self._couplings.resolve_leaders(position_rad)
         limited = [f"{name}: mirror" for name in differing]
-        for name, value in led.items():
+        for name, value in leaders.items():
             index = self._index[name]
             joint = self._joints[index]
             target_rad[index] = min(max(value, joint.lower_rad), joint.upper_rad)
             if target_rad[index] != value:
                 limited.append(f"{name}: range")
-        self._couplings.tie(target_rad)
-        for index, lower, upper, by in self._couplings.narrowed(target_rad):
+        self._couplings.apply_mirrors(target_rad)
+        for index, lower, upper, by in self._couplings.find_violations(target_rad):
             target_rad[index] = min(max(target_rad[index], lower), upper)
             limited.append(f"{self._joints[index].name}: range at {by}")
         return tuple(limited)
 
-    def target(self, position_rad: Mapping[str, float], now_rad: Sequence[float]) -> list[float]:
-        """Where a move to these positions ends, shape (n,) [rad].
+    def resolve_target(self, position_rad: Mapping[str, float], current_rad: Sequence[float]) -> list[float]:
+        """Final positions of a joint goal, shape (n,) [rad].
 
-        Joints not named stay, but for those to which the others leave no room where they are.
+        Joints without a position stay, except joints whose range the others narrow.
 
         Raises:
-            Refused: Unknown joint, a number that is none, outside a joint's range, or no room there.
+            Refused: Unknown joint, position not finite or out of range, or no clearance there.
         """
         self.check(position_rad)
-        led, differing = self._couplings.lead(position_rad)
+        leaders, differing = self._couplings.resolve_leaders(position_rad)
         if differing:
-            raise Refused("mirrored", f"one motor moves {differing[0]} and another joint; ask for one of the two")
-        target = list(now_rad)
-        for name, value in led.items():
+            raise Refused("mirrored", f"one motor moves {differing[0]} and another joint; give only one of the two")
+        target = list(current_rad)
+        for name, value in leaders.items():
             joint = self._joints[self._index[name]]
             if not joint.lower_rad <= value <= joint.upper_rad:
                 raise Refused(
@@ -90,41 +90,42 @@ class MotionLimits:
                     f"{name} can go from {joint.lower_rad:.4f} to {joint.upper_rad:.4f} rad, not to {value:.4f}",
                 )
             target[self._index[name]] = value
-        self._couplings.tie(target)
-        for index, lower, upper, by in self._couplings.narrowed(target):
+        self._couplings.apply_mirrors(target)
+        for index, lower, upper, by in self._couplings.find_violations(target):
             name = self._joints[index].name
-            if name in led:
+            if name in leaders:
                 raise Refused(
                     "out_of_range",
-                    f"{name} can go from {lower:.4f} to {upper:.4f} rad where {by} is then, not to {target[index]:.4f}",
+                    f"{name} can go from {lower:.4f} to {upper:.4f} rad at the target of {by}, "
+                    f"not to {target[index]:.4f}",
                 )
             target[index] = min(max(target[index], lower), upper)
         if self._geometry is not None:
-            there = self._geometry.clearance(target)
-            # Whoever is too near something already may go to where there is more room.
-            if there.room_m < min(0.0, self._geometry.clearance(now_rad).room_m):
-                short_mm = math.ceil(-there.room_m * 1000)
-                raise Refused("no_room", f"no room there: {there.text}, {short_mm} mm too near; choose another")
+            clearance = self._geometry.clearance(target)
+            # A robot that is already too near to something may move to where there is more clearance.
+            if clearance.room_m < min(0.0, self._geometry.clearance(current_rad).room_m):
+                short_mm = math.ceil(-clearance.room_m * 1000)
+                raise Refused("no_room", f"no room there: {clearance.text}, {short_mm} mm too near; choose another")
         return target
 
-    def check_way(self, position_rad: Floats) -> None:
-        """All of a way is inside the joints' ranges, shape (places, n) [rad].
+    def check_trajectory(self, position_rad: Floats) -> None:
+        """Check that a trajectory, shape (samples, n) [rad], stays inside the joints' ranges.
 
         Raises:
-            Refused: It is not.
+            Refused: It does not.
         """
         lower = np.array([joint.lower_rad for joint in self._joints]) - _SAME_RAD
         upper = np.array([joint.upper_rad for joint in self._joints]) + _SAME_RAD
         outside = ~np.all((position_rad >= lower) & (position_rad <= upper), axis=0)  # true for NaN
         if np.any(outside):
             joint = self._joints[int(np.argmax(outside))]
-            raise Refused("out_of_range", f"the way there leads {joint.name} out of its range")
-        parted = self._couplings.parted(position_rad)
-        if parted:
-            raise Refused("out_of_range", f"the way there {parted}")
+            raise Refused("out_of_range", f"the trajectory leads {joint.name} out of its range")
+        violation = self._couplings.describe_violation(position_rad)
+        if violation:
+            raise Refused("out_of_range", f"the trajectory {violation}")
 
-    def blocked(self, path_rad: Sequence[Sequence[float]]) -> Clearance | None:
-        """What is in the way, if anything is."""
+    def find_obstacle(self, path_rad: Sequence[Sequence[float]]) -> Clearance | None:
+        """The obstacle on a path, if any."""
         if self._geometry is None or all(position == path_rad[0] for position in path_rad):
             return None
         return self._geometry.sweep(path_rad).clearance

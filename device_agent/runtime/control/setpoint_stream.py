@@ -1,4 +1,4 @@
-"""Streamed setpoints of one operator: the newest counts, while it is fresh."""
+"""Streamed setpoints of one operator: the newest one applies while it is fresh."""
 
 import math
 from collections.abc import Sequence
@@ -14,233 +14,233 @@ from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
 
 WATCHDOG_S = 0.3
-"""Commanded velocity is zero this long after the last fresh setpoint."""
+"""The commanded velocity is zero this long after the last fresh setpoint [s]."""
 MAX_LOOP_AGE_S = 0.2
-"""A setpoint that answers telemetry older than this is not fresh."""
-_SOONEST_BRAKING_S = 0.15
-"""Braking never begins sooner than this after a setpoint, so that ordinary jitter does not stop the arm."""
-_SOONEST_BASE_BRAKING_S = 0.1
-"""The same of a base, which takes longer to stop."""
-_NUDGE_RAD = 1e-4
-"""A target that is nearer than this to one that was in the way is the same."""
+"""Maximum age of the telemetry that a setpoint echoes [s]."""
+_MIN_FRESH_S = 0.15
+"""A setpoint applies at least this long, so that ordinary jitter does not stop the arm [s]."""
+_MIN_FRESH_BASE_S = 0.1
+"""The same for a base, which takes longer to stop [s]."""
+_SAME_TARGET_RAD = 1e-4
+"""A target that differs by less from a blocked one is the same target [rad]."""
 
-_AHEAD_S = 0.5
-"""A jog heads for where the joints would be after this time: further than they need to come to rest."""
-_LEAST_RAD_S = 1e-3
+_JOG_AHEAD_S = 0.5
+"""A jog heads for the joint positions after this time, which is longer than braking takes [s]."""
+_MIN_JOG_RAD_S = 1e-3
 JOINT_SPEED = "speed: joints"
-"""As ``limited`` names a jog that joints are too slow for, as near a singularity."""
+"""Name in ``limited`` of a jog that exceeds a joint's speed, for example near a singularity."""
 
 
 class SetpointStream:
-    """What the newest setpoint asks of the joints. Not thread-safe: its owner locks.
+    """The newest setpoint and the motion that it requests. Not thread-safe: the controller locks.
 
     Args:
-        robot_type: Share of the speed that setpoints may use.
-        envelope: What positions may be.
-        geometry: The robot's shape, if it is known.
+        robot_type: Joints, and the share of the speed that setpoints may use.
+        limits: Limits of the positions.
+        geometry: Shape of the robot, if known.
 
     Attributes:
-        taken: Sequence of the newest setpoint that the motors follow; 0 before the first of a lease.
-        sent_ms: The operator's own clock in it.
-        loop_age_ms: Its loop age.
+        applied_sequence: Sequence of the newest applied setpoint; 0 before the first one of a lease.
+        sent_ms: The operator's clock in that setpoint.
+        loop_age_ms: Loop age of the newest setpoint.
     """
 
-    def __init__(self, robot_type: RobotType, envelope: MotionLimits, geometry: RobotGeometry | None) -> None:
-        self._envelope = envelope
+    def __init__(self, robot_type: RobotType, limits: MotionLimits, geometry: RobotGeometry | None) -> None:
+        self._limits = limits
         self._geometry = geometry
-        self._limits = [joint.max_velocity_rad_s for joint in robot_type.joints]
-        led = {mirror.joint for mirror in robot_type.mimic_joints}
-        self._leading = {i: joint.name for i, joint in enumerate(robot_type.joints) if joint.name not in led}
-        self._drives = robot_type.base is not None
-        self._pace = LatencyLimiter(geometry, watchdog_s=WATCHDOG_S, oldest_s=MAX_LOOP_AGE_S)
+        self._max_speeds = [joint.max_velocity_rad_s for joint in robot_type.joints]
+        followers = {mirror.joint for mirror in robot_type.mimic_joints}
+        self._leaders = {i: joint.name for i, joint in enumerate(robot_type.joints) if joint.name not in followers}
+        self._has_base = robot_type.base is not None
+        self._limiter = LatencyLimiter(geometry, watchdog_s=WATCHDOG_S, max_age_s=MAX_LOOP_AGE_S)
         self._speed = robot_type.streaming_speed
-        self.begin([0.0] * len(robot_type.joints))
+        self.reset([0.0] * len(robot_type.joints))
 
-    def begin(self, position_rad: Sequence[float]) -> None:
-        """A new operator finds the device here, shape (n,) [rad]; what the one before said counts no more."""
+    def reset(self, position_rad: Sequence[float]) -> None:
+        """Start for a new operator with the device at ``position_rad``, shape (n,) [rad]."""
         self._target = list(position_rad)
         self._setpoint: Setpoint | None = None
-        self._hand: JointTarget | JogTarget | None = None
-        self._drive = REST
-        self._at_s = self._drive_at_s = -math.inf
-        self._pace.begin()
-        self._ranged: tuple[str, ...] = ()
-        self._slowed: tuple[str, ...] = ()
-        self._driven: tuple[str, ...] = ()
+        self._joint_target: JointTarget | JogTarget | None = None
+        self._twist = REST
+        self._received_s = self._twist_received_s = -math.inf
+        self._limiter.reset()
+        self._range_limits: tuple[str, ...] = ()
+        self._speed_limits: tuple[str, ...] = ()
+        self._base_limits: tuple[str, ...] = ()
         self._obstacle: tuple[list[float], str] | None = None
-        self.taken, self.sent_ms, self.loop_age_ms = 0, 0.0, 0.0
+        self.applied_sequence, self.sent_ms, self.loop_age_ms = 0, 0.0, 0.0
 
     def check(self, setpoint: Setpoint, *, tick_ms: int) -> None:
-        """A setpoint is newer than the last, and answers what was seen a moment ago.
+        """Check that a setpoint is newer than the last one, and that it echoes recent telemetry.
 
         Raises:
-            Refused: It does not.
+            Refused: It is or does not.
         """
         if self._setpoint is not None and setpoint.sequence <= self._setpoint.sequence:
             raise Refused("out_of_order", "a newer setpoint has arrived already")
         age_ms = tick_ms - setpoint.echo_tick_ms
-        if not 0 <= age_ms <= MAX_LOOP_AGE_S * 1000:
-            raise Refused(
-                "too_old", f"answers telemetry of {age_ms} ms ago; {MAX_LOOP_AGE_S * 1000:.0f} ms is the most"
-            )
+        max_ms = MAX_LOOP_AGE_S * 1000
+        if not 0 <= age_ms <= max_ms:
+            raise Refused("too_old", f"echoes telemetry of {age_ms} ms ago; the maximum is {max_ms:.0f} ms")
 
-    def take(self, setpoint: Setpoint, *, now_s: float, tick_ms: int) -> None:
-        """Take in a setpoint that was checked.
+    def accept(self, setpoint: Setpoint, *, now_s: float, tick_ms: int) -> None:
+        """Accept a checked setpoint.
 
-        One that took longer than they have lately, on its way or in this process, is as old as the others would be:
-        what comes late does not move the device for longer.
+        A setpoint that arrived later than usual counts as received earlier, so that it does not move the device longer.
 
         Raises:
-            Refused: Unknown joints, or numbers that are none.
+            Refused: Unknown joints, or values that are not finite.
         """
         self._check_target(setpoint.target)
         self._setpoint = setpoint
         self.loop_age_ms = float(tick_ms - setpoint.echo_tick_ms)
-        self._pace.heard(self.loop_age_ms / 1000)
-        self._at_s = now_s - max(0.0, self.loop_age_ms / 1000 - self._pace.age_s)
+        self._limiter.add_age(self.loop_age_ms / 1000)
+        self._received_s = now_s - max(0.0, self.loop_age_ms / 1000 - self._limiter.age_s)
         if isinstance(setpoint.target, DriveTarget):
             target = setpoint.target
-            self._drive, self._drive_at_s = Twist(target.forward_m_s, target.left_m_s, target.turn_rad_s), self._at_s
+            self._twist = Twist(target.forward_m_s, target.left_m_s, target.turn_rad_s)
+            self._twist_received_s = self._received_s
 
     def _check_target(self, target: JointTarget | JogTarget | DriveTarget) -> None:
         match target:
             case JointTarget(position_rad=position_rad):
-                self._envelope.check(position_rad)
+                self._limits.check(position_rad)
                 return
             case DriveTarget(forward_m_s=forward, left_m_s=left, turn_rad_s=turn):
-                if not self._drives:
+                if not self._has_base:
                     raise Refused("no_base", "this robot does not drive")
                 parts: tuple[float, ...] = (forward, left, turn)
             case _:
                 if self._geometry is None:
                     raise Refused("no_model", "this robot's type has no model; move its joints")
                 if target.frame and target.frame not in self._geometry.frames:
-                    there = ", ".join(self._geometry.frames)
-                    raise Refused("unknown_frame", f"no frame '{target.frame[:80]}'; there are {there}")
+                    frames = ", ".join(self._geometry.frames)
+                    raise Refused("unknown_frame", f"no frame '{target.frame[:80]}'; there are {frames}")
                 parts = (*target.linear_m_s, *target.angular_rad_s)
         if not all(map(math.isfinite, parts)):
             raise Refused("not_finite", "a velocity must be a finite number")
 
-    def stand(self, position_rad: Sequence[float]) -> None:
-        """Something else has moved the device here, shape (n,) [rad]: joints that the next setpoint leaves out stay."""
+    def hold_here(self, position_rad: Sequence[float]) -> None:
+        """Make ``position_rad``, shape (n,) [rad], the target of joints that the next setpoint does not name."""
         self._target = list(position_rad)
 
-    def drop(self) -> None:
-        """Follow no setpoint until the next one."""
-        self._at_s = self._drive_at_s = -math.inf
+    def clear(self) -> None:
+        """Apply no setpoint until the next one arrives."""
+        self._received_s = self._twist_received_s = -math.inf
 
     @property
-    def heard(self) -> bool:
-        """Whether a setpoint may still be followed."""
-        return self._at_s > -math.inf
+    def active(self) -> bool:
+        """Whether there is a setpoint that may still apply."""
+        return self._received_s > -math.inf
 
-    def fresh(self, now_s: float, braking_s: float, *, late_s: float) -> bool:
-        """Whether the newest setpoint is to be followed still: braking then ends in time.
+    def is_fresh(self, now_s: float, braking_s: float, *, late_s: float) -> bool:
+        """Whether the newest setpoint applies: braking after this period still ends before the watchdog time.
 
         Args:
             now_s: Monotonic clock [s].
-            braking_s: How long the device would brake [s].
-            late_s: How late the control loop may be called next [s].
+            braking_s: Braking time of the device [s].
+            late_s: Possible delay of the next period [s].
         """
-        return _fresh(now_s - self._at_s, braking_s, late_s, _SOONEST_BRAKING_S)
+        return _is_fresh(now_s - self._received_s, braking_s, late_s, _MIN_FRESH_S)
 
-    def steer(self, base: BaseMotion, now_s: float, *, late_s: float, allowed: float) -> None:
-        """Set the base in motion as the newest setpoint for it asks, while that is fresh; else brake it.
+    def drive_base(self, base: BaseMotion, now_s: float, *, late_s: float, allowed: float) -> None:
+        """Move the base at the newest twist while it is fresh; else brake.
 
-        One that asks for rest has been let go: the base then brakes as it does without setpoints, and not as gently as
-        it speeds up.
+        A zero twist means that the operator released the control: the base brakes instead of slowing down gently.
 
         Args:
-            base: The base's motion.
+            base: Motion of the base.
             now_s: Monotonic clock [s].
-            late_s: How late the control loop may be called next [s].
-            allowed: Share of the speed that the room leaves, above 0.
+            late_s: Possible delay of the next period [s].
+            allowed: Share of the speed that the room allows, above 0.
         """
-        self._driven = ()
-        fresh = _fresh(now_s - self._drive_at_s, base.braking_time_s(), late_s, _SOONEST_BASE_BRAKING_S)
-        if not fresh or self._drive == REST:
+        self._base_limits = ()
+        fresh = _is_fresh(now_s - self._twist_received_s, base.braking_time_s(), late_s, _MIN_FRESH_BASE_S)
+        if not fresh or self._twist == REST:
             base.brake()
             return
-        limits = base.limits_to_stop_within(WATCHDOG_S - _SOONEST_BASE_BRAKING_S)
-        twist = Twist(*(min(max(part, -most), most) for part, most in zip(self._drive, limits, strict=True)))
-        share = self._pace.blind_share()
-        parts = zip(Twist._fields, self._drive, twist, strict=True)
-        ranged = tuple(f"{name}: range" for name, asked, done in parts if asked != done)
-        self._driven = ranged + ((LIMITED,) if share < 1.0 else ())
+        limits = base.limits_to_stop_within(WATCHDOG_S - _MIN_FRESH_BASE_S)
+        twist = Twist(*(min(max(part, -limit), limit) for part, limit in zip(self._twist, limits, strict=True)))
+        share = self._limiter.unchecked_share()
+        parts = zip(Twist._fields, self._twist, twist, strict=True)
+        clamped = tuple(f"{name}: range" for name, requested, applied in parts if requested != applied)
+        self._base_limits = clamped + ((LIMITED,) if share < 1.0 else ())
         base.follow(Twist(*(part * share * allowed for part in twist)))
 
-    def follow(self, motion: JointMotion, *, allowed: float) -> None:
-        """Set the joints in motion towards the newest setpoint.
+    def apply(self, motion: JointMotion, *, allowed: float) -> None:
+        """Move the joints towards the newest setpoint.
 
         Args:
-            motion: Theirs.
-            allowed: Share of the speed that the room leaves, above 0.
+            motion: Motion of the joints.
+            allowed: Share of the speed that the room allows, above 0.
         """
-        if self._setpoint is not None and self._setpoint.sequence != self.taken:
-            self._take_up(self._setpoint.target, motion)
-            self.taken, self.sent_ms = self._setpoint.sequence, self._setpoint.sent_ms
-        if self._obstacle is not None and (motion.moving or _same(self._obstacle[0], self._asked())):
-            # It had to brake before something: it does so to the end, and goes on when it is asked elsewhere.
+        if self._setpoint is not None and self._setpoint.sequence != self.applied_sequence:
+            self._set_target(self._setpoint.target, motion)
+            self.applied_sequence, self.sent_ms = self._setpoint.sequence, self._setpoint.sent_ms
+        if self._obstacle is not None and (motion.moving or _same(self._obstacle[0], self._requested())):
+            # The motion brakes to rest before an obstacle, and continues when the operator requests another target.
             motion.brake()
             return
         self._obstacle = None
-        cap = self._pace.cap_rad_s(motion.position_rad, motion.velocity_rad_s, motion.braking_time_s())
-        share = self._pace.share()
+        cap = self._limiter.cap_rad_s(motion.position_rad, motion.velocity_rad_s, motion.braking_time_s())
+        share = self._limiter.joint_share()
         speed = self._speed * share * allowed
-        self._slowed = (LIMITED,) if share < 1.0 or cap < motion.fastest_allowed_rad_s(speed) else ()
-        if isinstance(self._hand, JogTarget):
-            self._jog(self._hand, motion, speed=speed, cap_rad_s=cap)
+        self._speed_limits = (LIMITED,) if share < 1.0 or cap < motion.max_speed_rad_s(speed) else ()
+        if isinstance(self._joint_target, JogTarget):
+            self._solve_jog(self._joint_target, motion, speed=speed, cap_rad_s=cap)
         else:
             motion.follow(self._target, speed=speed, cap_rad_s=cap)
 
-    def _take_up(self, target: JointTarget | JogTarget | DriveTarget, motion: JointMotion) -> None:
-        """A setpoint is new: for joints, for a frame or for the base, which leaves the others to what they do."""
+    def _set_target(self, target: JointTarget | JogTarget | DriveTarget, motion: JointMotion) -> None:
+        """Take over a new target. A target for the base leaves the joints unchanged."""
         if isinstance(target, DriveTarget):
             return
-        if isinstance(self._hand, JogTarget):  # joints that are not named stay where it has brought them
-            self._target, self._ranged = list(motion.position_rad), ()
-        self._hand = target
+        if isinstance(self._joint_target, JogTarget):  # joints without a position stay where the jog has moved them
+            self._target, self._range_limits = list(motion.position_rad), ()
+        self._joint_target = target
         if isinstance(target, JointTarget):
-            self._ranged = self._envelope.clamp(target.position_rad, self._target)
+            self._range_limits = self._limits.clamp(target.position_rad, self._target)
 
-    def _asked(self) -> list[float]:
-        """What is asked of the joints, to know it again."""
-        if isinstance(self._hand, JogTarget):
-            return [*self._hand.linear_m_s, *self._hand.angular_rad_s]
+    def _requested(self) -> list[float]:
+        """The request for the joints as numbers, for comparison."""
+        if isinstance(self._joint_target, JogTarget):
+            return [*self._joint_target.linear_m_s, *self._joint_target.angular_rad_s]
         return list(self._target)
 
-    def _jog(self, jog: JogTarget, motion: JointMotion, *, speed: float, cap_rad_s: float) -> None:
-        """Head for where the joints would be in a moment at the velocities that move the frame, at no more than those.
+    def _solve_jog(self, jog: JogTarget, motion: JointMotion, *, speed: float, cap_rad_s: float) -> None:
+        """Move the joints so that the frame moves at the jog's velocity.
 
-        All of them are slower when one would be too fast, so that the frame keeps its direction.
+        All joints slow down if one would be too fast, so that the frame keeps its direction.
         """
         if self._geometry is None or not any((*jog.linear_m_s, *jog.angular_rad_s)):
-            self._target, self._ranged = list(motion.position_rad), ()
+            self._target, self._range_limits = list(motion.position_rad), ()
             motion.brake()
             return
         frame = jog.frame or self._geometry.frames[-1]
         rates = self._geometry.rates(frame, (*jog.linear_m_s, *jog.angular_rad_s), motion.position_rad, tool=jog.tool)
-        over = max(abs(rate) / min(limit * speed, cap_rad_s) for rate, limit in zip(rates, self._limits, strict=True))
-        rates = tuple(rate / max(over, 1.0) for rate in rates)
-        ahead = {name: motion.position_rad[i] + rates[i] * _AHEAD_S for i, name in self._leading.items()}
+        pairs = zip(rates, self._max_speeds, strict=True)
+        excess = max(abs(rate) / min(limit * speed, cap_rad_s) for rate, limit in pairs)
+        rates = tuple(rate / max(excess, 1.0) for rate in rates)
+        ahead = {name: motion.position_rad[i] + rates[i] * _JOG_AHEAD_S for i, name in self._leaders.items()}
         self._target = list(motion.position_rad)
-        self._ranged = self._envelope.clamp(ahead, self._target) + ((JOINT_SPEED,) if over > 1.0 else ())
-        most = [max(abs(rate), _LEAST_RAD_S) for rate in rates]
-        motion.follow(self._target, speed=speed, cap_rad_s=cap_rad_s, most_rad_s=most)
+        self._range_limits = self._limits.clamp(ahead, self._target) + ((JOINT_SPEED,) if excess > 1.0 else ())
+        max_rates = [max(abs(rate), _MIN_JOG_RAD_S) for rate in rates]
+        motion.follow(self._target, speed=speed, cap_rad_s=cap_rad_s, max_rad_s=max_rates)
 
     def block(self, obstacle: Clearance) -> None:
-        """Something is on the way to the newest setpoint."""
-        self._obstacle = (self._asked(), obstacle.text)
+        """Record an obstacle on the path to the present target."""
+        self._obstacle = (self._requested(), obstacle.text)
 
     @property
     def limited(self) -> tuple[str, ...]:
-        """What makes the motion other than asked."""
-        return self._ranged + self._slowed + self._driven + (() if self._obstacle is None else (self._obstacle[1],))
+        """Limits that change the requested motion."""
+        obstacle = () if self._obstacle is None else (self._obstacle[1],)
+        return self._range_limits + self._speed_limits + self._base_limits + obstacle
 
 
-def _fresh(age_s: float, braking_s: float, late_s: float, soonest_s: float) -> bool:
-    return age_s < max(soonest_s, WATCHDOG_S - braking_s - late_s)
+def _is_fresh(age_s: float, braking_s: float, late_s: float, min_fresh_s: float) -> bool:
+    return age_s < max(min_fresh_s, WATCHDOG_S - braking_s - late_s)
 
 
 def _same(one: Sequence[float], other: Sequence[float]) -> bool:
-    return len(one) == len(other) and all(abs(a - b) <= _NUDGE_RAD for a, b in zip(one, other, strict=True))
+    return len(one) == len(other) and all(abs(a - b) <= _SAME_TARGET_RAD for a, b in zip(one, other, strict=True))

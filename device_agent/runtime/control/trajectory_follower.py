@@ -1,4 +1,4 @@
-"""Goes along a way, one control period at a time, at a share of its speed; brakes without leaving it."""
+"""Time-scaled execution of a trajectory: follows it at a share of its speed, and brakes without leaving its path."""
 
 import math
 from collections.abc import Sequence
@@ -8,108 +8,109 @@ import numpy as np
 from device_agent.runtime.planning.trajectory import Floats, Trajectory
 
 _EASE_S = 0.25
-"""Time constant of a change of the share, where nothing has to brake."""
+"""Time constant of a change of the share, except when braking [s]."""
 _KNOT_S = 0.04
-"""As for braking off a way: between knots this far apart it is straight to within 4 mm."""
-_SLACK = 1.5
-"""How much longer than at full braking a way may need that bends or slows down meanwhile."""
-_CAUTION = 0.95
-"""What a way asks between two periods differs by so much from what it asks at their beginning."""
+"""Between knots this far apart in time the path is straight to within 4 mm [s]."""
+_BRAKING_MARGIN = 1.5
+"""Factor of the braking time for trajectories that bend or slow down meanwhile."""
+_ACCELERATION_MARGIN = 0.95
+"""The acceleration demand between two periods differs by up to this factor from the demand at their start."""
 _REST = 1e-6
-_NOTHING = 1e-9
+_EPSILON = 1e-9
 
 
 class TrajectoryFollower:
-    """How far a device has come on a way. Not thread-safe.
+    """Progress of a device on a trajectory. Not thread-safe.
 
     Args:
-        way: From rest to rest.
+        trajectory: From rest to rest.
         period_s: The control period [s].
-        acceleration_rad_s2: What no joint exceeds while it goes on, shape (n,).
-        jerk_rad_s3: As fast its acceleration changes when its speed is changed, shape (n,).
-        braking_rad_s2: What no joint exceeds while it brakes.
+        acceleration_rad_s2: Acceleration limit of each joint except when braking, shape (n,).
+        jerk_rad_s3: Jerk limit of each joint when its speed changes, shape (n,).
+        braking_rad_s2: Deceleration limit of every joint when braking.
     """
 
     def __init__(
         self,
-        way: Trajectory,
+        trajectory: Trajectory,
         *,
         period_s: float,
         acceleration_rad_s2: Sequence[float],
         jerk_rad_s3: Sequence[float],
         braking_rad_s2: float,
     ) -> None:
-        self.way = way
+        self.trajectory = trajectory
         self._period_s = period_s
-        self._easy = np.array(acceleration_rad_s2)
-        self._jerk = np.array(jerk_rad_s3)
-        self._hard = np.maximum(_CAUTION * braking_rad_s2, self._easy)
+        self._acceleration_limits = np.array(acceleration_rad_s2)
+        self._jerk_limits = np.array(jerk_rad_s3)
+        self._braking_limits = np.maximum(_ACCELERATION_MARGIN * braking_rad_s2, self._acceleration_limits)
         self._time_s, self._share, self._change = 0.0, -1.0, 0.0
-        self._aim, self._braking = 0.0, False
+        self._target_share, self._braking = 0.0, False
         self._next: tuple[float, float, float] | None = None
-        self.position_rad, self.velocity_rad_s = way.position_rad[0], np.zeros(len(self._easy))
+        self.position_rad = trajectory.position_rad[0]
+        self.velocity_rad_s = np.zeros(len(self._acceleration_limits))
 
-    def go(self, share: float) -> None:
-        """Go on, at a share of the way's speed, 0…1."""
-        self._aim, self._braking, self._next = share, False, None
-        if self._share < 0:  # the way itself begins at rest
+    def follow(self, share: float) -> None:
+        """Continue at a share of the trajectory's speed, 0…1."""
+        self._target_share, self._braking, self._next = share, False, None
+        if self._share < 0:  # the trajectory itself starts at rest
             self._share = share
 
     def brake(self) -> None:
-        """Come to rest on the way as fast as the robot type allows."""
+        """Brake to rest on the path at the robot type's deceleration."""
         if not self._braking:
-            self._aim, self._braking, self._next = 0.0, True, None
+            self._target_share, self._braking, self._next = 0.0, True, None
 
     @property
     def arrived(self) -> bool:
-        """Whether it rests at the way's end."""
-        return self._time_s >= self.way.duration_s
+        """Whether it rests at the end of the trajectory."""
+        return self._time_s >= self.trajectory.duration_s
 
     @property
     def resting(self) -> bool:
-        """Whether it rests: at the end, or where it was braked."""
+        """Whether it rests, at the end or after braking."""
         return self.arrived or (self._braking and self._share <= _REST)
 
     def propose(self) -> list[list[float]]:
-        """Where it is, where it would be a period on, then places as far as it could need to come to rest."""
-        self._next = time_s, share, _ = self._step(self._period_s)
-        fastest = float(np.max(np.abs(self.way.at(time_s)[1]), initial=0.0)) * share
-        ahead_s = share * _SLACK * (fastest / float(np.min(self._hard)) + self._period_s)
+        """Present position, position after one period, then positions up to where braking would end."""
+        self._next = time_s, share, _ = self._advance(self._period_s)
+        fastest = float(np.max(np.abs(self.trajectory.at(time_s)[1]), initial=0.0)) * share
+        ahead_s = share * _BRAKING_MARGIN * (fastest / float(np.min(self._braking_limits)) + self._period_s)
         knots = max(1, math.ceil(ahead_s / _KNOT_S))
-        places = [time_s, *(time_s + ahead_s * (index + 1) / knots for index in range(knots))]
-        return [self.position_rad.tolist(), *(self.way.at(place)[0].tolist() for place in places)]
+        times = [time_s, *(time_s + ahead_s * (index + 1) / knots for index in range(knots))]
+        return [self.position_rad.tolist(), *(self.trajectory.at(time)[0].tolist() for time in times)]
 
     def update(self, passed_s: float | None = None) -> None:
-        """Advance one period, as proposed if it was; or by what has passed of one [s]."""
-        self._time_s, self._share, self._change = self._next or self._step(passed_s or self._period_s)
+        """Advance one period, as proposed if it was, or ``passed_s`` of it [s]."""
+        self._time_s, self._share, self._change = self._next or self._advance(passed_s or self._period_s)
         self._next = None
-        position, velocity, _ = self.way.at(self._time_s)
+        position, velocity, _ = self.trajectory.at(self._time_s)
         self.position_rad, self.velocity_rad_s = position, velocity * max(self._share, 0.0)
 
-    def make_up(self, lost_s: float) -> None:
-        """Count time in which no period was commanded as braked; it stays where it is, only the speed falls."""
-        least, _ = self._changes(self._hard)
-        self._share, self._next = max(0.0, self._share + least * lost_s), None
-        self.velocity_rad_s = self.way.at(self._time_s)[1] * self._share
+    def catch_up(self, lost_s: float) -> None:
+        """Reduce the speed as if the device had braked for ``lost_s`` [s]; the position is unchanged."""
+        lower, _ = self._change_limits(self._braking_limits)
+        self._share, self._next = max(0.0, self._share + lower * lost_s), None
+        self.velocity_rad_s = self.trajectory.at(self._time_s)[1] * self._share
 
-    def _step(self, passed_s: float) -> tuple[float, float, float]:
-        """Time on the way, share and its change so much later."""
-        now = max(self._share, 0.0)
+    def _advance(self, passed_s: float) -> tuple[float, float, float]:
+        """Trajectory time, share and change of the share after ``passed_s``."""
+        current = max(self._share, 0.0)
         if self._braking:
-            change = max(self._changes(self._hard)[0], -now / passed_s)
+            change = max(self._change_limits(self._braking_limits)[0], -current / passed_s)
         else:
-            least, most = self._changes(self._easy)
-            speed = np.maximum(np.abs(self.way.at(self._time_s)[1]), _NOTHING)
-            ramp = passed_s * float(np.min(self._jerk / speed))
-            wanted = min(max((self._aim - now) / _EASE_S, self._change - ramp), self._change + ramp)
-            change = min(max(wanted, least), most)
-        share = min(max(now + change * passed_s, 0.0), max(now, self._aim))
-        return self._time_s + (now + share) / 2 * passed_s, share, change
+            lower, upper = self._change_limits(self._acceleration_limits)
+            speed = np.maximum(np.abs(self.trajectory.at(self._time_s)[1]), _EPSILON)
+            ramp = passed_s * float(np.min(self._jerk_limits / speed))
+            eased = (self._target_share - current) / _EASE_S
+            change = min(max(min(max(eased, self._change - ramp), self._change + ramp), lower), upper)
+        share = min(max(current + change * passed_s, 0.0), max(current, self._target_share))
+        return self._time_s + (current + share) / 2 * passed_s, share, change
 
-    def _changes(self, limit: Floats) -> tuple[float, float]:
-        """How fast the share may fall and rise so that no joint exceeds an acceleration [1/s]."""
-        _, velocity, acceleration = self.way.at(self._time_s)
-        now = max(self._share, 0.0)
-        speed = np.maximum(np.abs(velocity), _NOTHING)
-        along = acceleration * np.sign(velocity) * now**2
+    def _change_limits(self, limit: Floats) -> tuple[float, float]:
+        """Lowest and highest change of the share that keeps each joint within an acceleration limit [1/s]."""
+        _, velocity, acceleration = self.trajectory.at(self._time_s)
+        current = max(self._share, 0.0)
+        speed = np.maximum(np.abs(velocity), _EPSILON)
+        along = acceleration * np.sign(velocity) * current**2
         return min(0.0, float(np.max((-limit - along) / speed))), max(0.0, float(np.min((limit - along) / speed)))
