@@ -237,7 +237,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
     )
     latencies = HttpLatencies(pairing.agent, _carrier(configuration), wiring.open_api)
     transport = LatencyProbe(
-        factory.make(wiring), tell=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms())
+        factory.make(wiring), upload=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms())
     )
     outbox = _outbox(store, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     sandbox = SandboxHost(trusted=configuration.allow_unconfined_scripts)
@@ -264,7 +264,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
             faults=store.faults,
             uploads=uploads,
         )
-    agent = Agent(devices, transport, outbox=outbox, room=room, address=(pairing.space, pairing.agent))
+    agent = Agent(devices, transport, outbox=outbox, readings=room, address=(pairing.space, pairing.agent))
     return RunningAgent(agent, journal, monitor, sandbox)
 
 
@@ -309,7 +309,9 @@ def _outbox(
     teller = own + configuration.devices[0].name
     # Over the others a message is confirmed once it is stored.
     settle_s = buffer.settle_s if configuration.transport == "mqtt" else 0.0
-    return Outbox(shelf, publish=publish, teller=teller, quiet=quiet, keep_hz=buffer.measurements_hz, settle_s=settle_s)
+    return Outbox(
+        shelf, publish=publish, device_topic=teller, is_quiet=quiet, keep_hz=buffer.measurements_hz, settle_s=settle_s
+    )
 
 
 def _device(
@@ -336,17 +338,17 @@ def _device(
         space=pairing.space,
         agent=pairing.agent,
         robot_type=kind,
-        ground=ground,
+        obstacle_map=ground,
         driver=create_driver(entry, kind, trace=trace, faults=faults) if instrument is None else instrument,
         journal=journal,
         cloud_clock=clock,
         keys=pins,
         publish=transport.publish,
         outbox=outbox,
-        room=room,
+        readings=room,
         interlocks=entry.interlocks,
         geometry=_geometry(entry, kind),
-        jail=sandbox,
+        sandbox=sandbox,
         owner=pairing.owner,
         speech=Espeak(),
         uploads=uploads,

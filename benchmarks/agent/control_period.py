@@ -54,19 +54,19 @@ def setpoints(controller: Controller, kind: RobotType) -> Iterator[None]:
                 sent_ms=0.0,
                 target=JointTarget(position_rad=target),
             )
-            controller.offer(asked, now_s=now_ms / 1000, tick_ms=now_ms + LOOP_AGE_MS)
+            controller.accept_setpoint(asked, now_s=now_ms / 1000, tick_ms=now_ms + LOOP_AGE_MS)
         yield
 
 
 def moves(controller: Controller, kind: RobotType) -> Iterator[None]:
     """Starts moves as a movement script does, before each period."""
     chance = random.Random(2)
-    tenure = controller.begin_action(epoch=1, on_lost=lambda _: None)
+    tenure = controller.reserve(epoch=1, on_revoked=lambda _: None)
     move = None
     for _ in range(round(SIMULATED_S * 1000 / kind.period_ms)):
         while move is None or move.finished.is_set():
             try:
-                move = controller.move(tenure, _random_target(kind, chance), speed=1.0)
+                move = controller.start_joint_goal(tenure, _random_target(kind, chance), speed=1.0)
             except Refused:
                 continue  # the target collides: take another one
         yield
@@ -79,7 +79,7 @@ def measure(kind: RobotType, shape: RobotGeometry | None, source: Source) -> lis
     found = []
     for period, _ in enumerate(source(controller, kind)):
         began = time.thread_time()
-        controller.step(period * kind.period_ms / 1000)
+        controller.update(period * kind.period_ms / 1000)
         if controller.moving:
             found.append((time.thread_time() - began) * 1000)
     return sorted(found)

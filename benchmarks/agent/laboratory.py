@@ -62,7 +62,7 @@ def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
     """Runs the agent with an observer of its threads."""
     gaps: dict[str, list[float]] = {}
     last: dict[str, float] = {}
-    step = Controller.step
+    step = Controller.update
 
     def timed(controller: Controller, *given: Any, **named: Any) -> ControlOutput:
         name, at_s = threading.current_thread().name, time.monotonic()
@@ -71,7 +71,7 @@ def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
         last[name] = at_s
         return step(controller, *given, **named)
 
-    Controller.step = timed  # type: ignore[method-assign,assignment]
+    Controller.update = timed  # type: ignore[method-assign,assignment]
     control_loop.IDLE_RATE_HZ = TELEMETRY_HZ
     threading.Thread(target=_watch, args=(report, for_s, gaps), name="bench", daemon=True).start()
     return agent.main(arguments)

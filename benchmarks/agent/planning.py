@@ -38,7 +38,7 @@ class Loop:
         self._controller = Controller(kind, LeaseGate(), geometry=shape)
         home = [kind.home_rad[joint.name] for joint in kind.joints]
         self._controller.start_at(home)
-        self._tenure = self._controller.begin_action(epoch=1, on_lost=lambda _: None)
+        self._tenure = self._controller.reserve(epoch=1, on_revoked=lambda _: None)
         self._ends = home, [rad + 0.2 * (joint.upper_rad - rad) for rad, joint in zip(home, kind.joints, strict=True)]
         self.late_s: list[float] = []
         self.thread = threading.Thread(target=self._run, daemon=True)
@@ -51,8 +51,8 @@ class Loop:
             self.late_s.append(max(0.0, now_s - due_s))
             if move is None or move.finished.is_set():
                 turn += 1
-                move = self._controller.move(self._tenure, {joint: self._ends[turn % 2][0]}, speed=0.3)
-            self._controller.step(now_s)
+                move = self._controller.start_joint_goal(self._tenure, {joint: self._ends[turn % 2][0]}, speed=0.3)
+            self._controller.update(now_s)
             due_s = max(due_s + period_s, time.monotonic() - period_s)
             time.sleep(max(0.0, due_s - time.monotonic()))
 
@@ -81,7 +81,7 @@ def measure(for_s: float, *, planning: bool) -> None:
         home = [kind.home_rad[joint.name] for joint in kind.joints]
         took_s: list[float] = []
         if planning:  # the first plan starts the planner process
-            MotionPlanner(kind, shape).around(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
+            MotionPlanner(kind, shape).plan(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
         for loop in loops.values():
             loop.thread.start()
         began_s, seed = time.monotonic(), 0
@@ -90,7 +90,7 @@ def measure(for_s: float, *, planning: bool) -> None:
                 time.sleep(0.1)
                 continue
             seed += 1
-            MotionPlanner(kind, shape, seed=seed).around(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
+            MotionPlanner(kind, shape, seed=seed).plan(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
             took_s.append(time.monotonic() - now_s)
             time.sleep(0.2)
         ending.set()

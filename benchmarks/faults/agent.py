@@ -34,7 +34,7 @@ def main(*arguments: str) -> int:
 def _tell(path: str) -> None:
     line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     line.setblocking(False)
-    step, start = Controller.step, ActionExecutor.start
+    step, start = Controller.update, ActionExecutor.start
     before: dict[str, list[float]] = {}
     names: dict[int, str] = {}
 
@@ -62,7 +62,7 @@ def _tell(path: str) -> None:
         say(f"begun {command.device} {command.id}")
         start(executor, command, order)
 
-    Controller.step = stepped  # type: ignore[method-assign,assignment]
+    Controller.update = stepped  # type: ignore[method-assign,assignment]
     ActionExecutor.start = started  # type: ignore[method-assign,assignment]
 
 

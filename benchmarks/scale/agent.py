@@ -42,7 +42,7 @@ class LoopObserver:
 
     def install(self) -> None:
         """In place of what a controller does; it still does it."""
-        step, begin = Controller.step, control_loop.ControlLoop.__init__
+        step, begin = Controller.update, control_loop.ControlLoop.__init__
         watcher = self
 
         def watched(controller: Controller, *given: Any, **named: Any) -> Any:
@@ -53,7 +53,7 @@ class LoopObserver:
             watcher.periods_s[id(controller)] = kind.period_ms / 1000
             begin(made_loop, kind, driver, controller, **more)
 
-        Controller.step = watched  # type: ignore[method-assign,assignment]
+        Controller.update = watched  # type: ignore[method-assign,assignment]
         control_loop.ControlLoop.__init__ = made  # type: ignore[method-assign,assignment]
 
     def note(self, controller: int) -> None:

@@ -44,7 +44,7 @@ from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import signing
 from device_agent.runtime.authority.authority import Authority, Reservation
 from device_agent.runtime.authority.control_request import PendingControlRequest
-from device_agent.runtime.authority.event_recorder import EventRecord, event_of
+from device_agent.runtime.authority.event_recorder import EventRecord, event_message
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.errors import Refused
@@ -103,7 +103,7 @@ class SwarmRobot:
         self._say = say
         self._now_s = now_s
         self._arm = Arm(shape, now_s)
-        self._authority = Authority(LeaseGate(), None, hold=lambda _: self._arm.hold(), tell=self._happened)
+        self._authority = Authority(LeaseGate(), None, hold=lambda _: self._arm.hold(), record=self._happened)
         self._handover = PendingControlRequest()
         self._answers: OrderedDict[str, tuple[int, bytes]] = OrderedDict()
         self._run: _Run | None = None
@@ -149,7 +149,7 @@ class SwarmRobot:
         self._catch_up(now_s)
         run = self._run
         if run is not None and self._arm.arrived:
-            self._run = self._authority.tenure = None
+            self._run = self._authority.reservation = None
             self._ack(run.command, AckStatus.DONE, progress=1.0, result={"position_rad": self._positions()})
         self._sequence += 1
         lease = self._authority.lease(now_s)
@@ -186,7 +186,9 @@ class SwarmRobot:
         if lease is not None:
             request = None
             if asked is not None:
-                request = OpenRequest(id=asked.id, requester=asked.by, expires_in_ms=_left_ms(asked.expires_s, now_s))
+                request = OpenRequest(
+                    id=asked.id, requester=asked.requester, expires_in_ms=_left_ms(asked.expires_s, now_s)
+                )
             leased = LeaseState(
                 holder=lease.holder,
                 epoch=lease.epoch,
@@ -212,7 +214,7 @@ class SwarmRobot:
         self._say(topics.device(*self._address, kind), payload, qos=1, retain=True)
 
     def _happened(self, happened: EventRecord) -> None:
-        self._say(topics.device(*self._address, topics.EVENT), codec.encode(event_of(DEVICE, happened)), qos=1)
+        self._say(topics.device(*self._address, topics.EVENT), codec.encode(event_message(DEVICE, happened)), qos=1)
 
     def _ack(self, command: str, status: AckStatus, **more: Any) -> None:
         sequence, _ = self._answers.get(command, (0, b""))
@@ -316,9 +318,9 @@ class SwarmRobot:
                 self._authority.release(command.epoch)
             case RequestControl() as asked:
                 lease = self._authority.lease(self._now_s)
-                self._handover.ask(asked, epoch=command.epoch, lease=lease, now_s=self._now_s)
+                self._handover.open(asked, epoch=command.epoch, lease=lease, now_s=self._now_s)
             case WithdrawRequest(request=request):
-                self._handover.drop(request)
+                self._handover.withdraw(request)
             case StopDevice(reason=reason):
                 self._authority.stop(StopLatch(caller=command.caller, reason=reason, at_ms=wall_ms()))
             case ResetStop():
@@ -336,16 +338,16 @@ class SwarmRobot:
         self._ack(command.id, AckStatus.ACCEPTED)
         self._authority.fence(command.epoch)
         self._authority.check_free()
-        target = self._shape.envelope.target(move.position_rad, self._arm.position_rad)
-        tenure = self._authority.begin(command.epoch, self._taken_away)
-        self._run = _Run(command.id, tenure)
+        target = self._shape.envelope.resolve_target(move.position_rad, self._arm.position_rad)
+        reservation = self._authority.reserve(command.epoch, self._taken_away)
+        self._run = _Run(command.id, reservation)
         self._ack(command.id, AckStatus.STARTED)
         self._arm.go(target, speed=move.speed)
 
     def _cancel(self, action: str, who: str) -> None:
         if self._run is None or self._run.command != action:
             raise Refused("not_running", f"action {action} does not run on this device")
-        self._run = self._authority.tenure = None
+        self._run = self._authority.reservation = None
         self._arm.hold()
         self._ack(action, AckStatus.CANCELLED, reason=Reason(code="cancelled", message=f"cancelled by {who}"))
 

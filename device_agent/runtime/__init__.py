@@ -1,1 +1,1 @@
-"""What every device gets from the agent: control loop, lease, watchdog, actions, movements, journal."""
+"""Runtime of an agent's devices: control loop, leases, commands, actions, telemetry, journal."""

@@ -1,4 +1,4 @@
-"""One agent: one link, any number of devices. Routes what arrives, and tells every device when the link changes."""
+"""One agent: one link, any number of devices. Routes received messages and link changes to the devices."""
 
 import logging
 from collections.abc import Mapping
@@ -14,13 +14,13 @@ _log = logging.getLogger(__name__)
 
 
 class Agent:
-    """Puts devices on a transport.
+    """Connects devices to a transport.
 
     Args:
-        devices: By name.
+        devices: Devices by name.
         transport: Not yet started.
         outbox: Not yet started.
-        room: Hears what the space's other agents measure.
+        readings: Receives the measurements of the space's other agents.
         address: Space and agent.
     """
 
@@ -30,21 +30,21 @@ class Agent:
         transport: Transport,
         *,
         outbox: Outbox,
-        room: ReadingCache,
+        readings: ReadingCache,
         address: tuple[str, str],
     ) -> None:
         self._devices = devices
         self._transport = transport
         self._outbox = outbox
-        self._room = room
+        self._readings = readings
         self._address = address
 
     def start(self) -> None:
-        """Start every device, then the link: a device holds before anybody can speak to it.
+        """Start every device, then the link: a device holds before it can receive messages.
 
         Raises:
-            DriverError: A device is not there.
-            TransportError: The transport's configuration is unusable.
+            DriverError: A device does not respond.
+            TransportError: The transport's configuration is invalid.
         """
         self._outbox.start()
         for device in self._devices.values():
@@ -52,7 +52,7 @@ class Agent:
         self._transport.start(self._receive, self._link_changed)
 
     def stop(self) -> None:
-        """Hold and close every device, then say goodbye. May be called twice."""
+        """Hold and close every device, then disconnect. May be called twice."""
         for device in self._devices.values():
             device.stop()
         self._outbox.stop()
@@ -60,17 +60,17 @@ class Agent:
 
     @property
     def quiet(self) -> bool:
-        """Whether a short break of the link would disturb nothing."""
+        """Whether no device moves or runs an action, so that a short interruption of the link is harmless."""
         return all(device.quiet for device in self._devices.values())
 
     def _receive(self, topic: str, payload: bytes) -> None:
         try:
             parsed = topics.parse(topic)
             if (parsed.space, parsed.agent) != self._address:
-                self._room.receive(parsed, payload)
+                self._readings.receive(parsed, payload)
                 return
         except ProtocolError as error:
-            _log.warning("message refused: %s", str(error)[:300])
+            _log.warning("message rejected: %s", str(error)[:300])
             return
         device = self._devices.get(parsed.device)
         if device is not None:

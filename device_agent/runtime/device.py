@@ -1,9 +1,8 @@
-"""One device at work: puts its control loop, office, executor and voice together, and routes what arrives.
+"""One device: wires its control loop, command processor, action executor and publisher, and routes its messages.
 
-Two threads a device: the control loop (``loop``), which never waits for disk or network, and the ``office``, which
-does; a third, the ``reporter``, where its driver measures more than joints; a fourth, the ``filmer``, where it has
-cameras. Setpoints and Stop go from the transport's
-thread straight into the controller.
+Threads: the control loop (``loop``), which never waits for disk or network, and the command processor (``commands``),
+which may. A driver with streams besides joints adds ``stream``, and one with cameras adds ``camera``. Setpoints and
+Stop go from the transport's thread straight to the controller.
 """
 
 import logging
@@ -44,7 +43,7 @@ from device_agent.runtime.telemetry.device_publisher import DevicePublisher
 from device_agent.runtime.telemetry.outbox import Outbox, Publish
 from device_agent.runtime.telemetry.stream_sampler import StreamSampler
 
-_REFUSED = {
+_REJECTED = {
     topics.CTL: EventKind.SETPOINTS_REJECTED,
     topics.STOP: EventKind.STOP_REJECTED,
     topics.CMD: EventKind.COMMAND_REJECTED,
@@ -57,25 +56,25 @@ class Device:
     """One device of an agent.
 
     Args:
-        name: Its name at the agent, a level of its topics.
-        label: Its name for people.
+        name: Name of the device at the agent, a level of its topics.
+        label: Name for operators.
         space: Id of the space.
         agent: Id of the agent.
         robot_type: Joints, limits, period.
-        driver: Not yet connected; an ``RoomDevice`` for a device of a room.
+        driver: Not yet connected; a ``RoomDevice`` for a device of a room.
         journal: Open.
-        cloud_clock: For ``ttl_ms``.
-        keys: The cloud's keys, as far as they are pinned.
+        cloud_clock: Time for ``ttl_ms``.
+        keys: The cloud's pinned keys.
         publish: Sends a message.
-        outbox: Sends what must not be lost.
-        room: What the space's other devices have measured last.
-        interlocks: How the room slows or holds this one.
-        jail: Where movement scripts run.
+        outbox: Stores and forwards events and measurements.
+        readings: Newest measurements of the space's devices.
+        sandbox: Runs movement scripts.
         owner: Id of the account that the agent is paired with.
-        geometry: The robot's shape, ``None`` where its type has no model.
-        ground: What stands in its room, while somebody sees that.
-        speech: The machine's voice, if it has one.
-        uploads: Where sounds go.
+        interlocks: Rules by which room sensors slow or hold this device.
+        geometry: Shape of the robot, if its type has a model.
+        obstacle_map: Newest obstacle map of the room, if sensors publish one.
+        speech: Speech synthesis of this machine, if it has one.
+        uploads: Storage for synthesized speech.
     """
 
     def __init__(
@@ -92,187 +91,194 @@ class Device:
         keys: PinnedKeys,
         publish: Publish,
         outbox: Outbox,
-        room: ReadingCache,
-        jail: Sandbox,
+        readings: ReadingCache,
+        sandbox: Sandbox,
         owner: str = "",
         interlocks: Sequence[InterlockRule] = (),
         geometry: RobotGeometry | None = None,
-        ground: Callable[[], ObstacleMap | None] | None = None,
+        obstacle_map: Callable[[], ObstacleMap | None] | None = None,
         speech: Speech | None = None,
         uploads: Uploads | None = None,
     ) -> None:
         self.name = name
         self._driver = driver
-        self._jail = jail
+        self._sandbox = sandbox
+        self._readings = readings
+        room_device = driver if isinstance(driver, RoomDevice) else None
         record = journal.device(name)
-        gate = LeaseGate(epoch=record.epoch, burned=record.epoch)  # a restart ends whatever lease there was
-        self._audit = EventRecorder()
-        self._controller = Controller(robot_type, gate, latch=record.latch, geometry=geometry, tell=self._audit.note)
-        self._controller.changed.set()
-        instrument = driver if isinstance(driver, RoomDevice) else None
-        self._reporter = StreamSampler(
-            robot_type.streams, driver if isinstance(driver, ReportsStreams) else None, name=name, tell=self._measured
+        gate = LeaseGate(epoch=record.epoch, burned=record.epoch)  # a restart ends every lease
+        self._events = EventRecorder()
+        self._controller = Controller(
+            robot_type, gate, latch=record.latch, geometry=geometry, record=self._events.record
         )
-        body = DeviceContext(
+        self._controller.changed.set()
+        self._stream_sampler = StreamSampler(
+            robot_type.streams, driver if isinstance(driver, ReportsStreams) else None, name=name, publish=self._publish
+        )
+        context = DeviceContext(
             robot_type=robot_type,
             controller=self._controller,
-            observe=lambda: self._loop.seen,
+            observe=lambda: self._loop.observation,
             geometry=geometry,
             skills=driver if isinstance(driver, Skills) else None,
-            room=room,
-            reported=self._reporter.latest,
-            instrument=instrument,
+            readings=readings,
+            own_readings=self._stream_sampler.latest,
+            room_device=room_device,
             name=name,
-            ground=ground,
-            hurry=self._hurry,
-            speaker=SpeechOutput(
+            obstacle_map=obstacle_map,
+            wake=self._wake,
+            speech=SpeechOutput(
                 name,
                 speech=speech,
                 uploads=uploads,
-                tell=self._audit.note,
-                heard=driver.speaks if isinstance(driver, HasSpeaker) else None,
+                record=self._events.record,
+                on_start=driver.speaks if isinstance(driver, HasSpeaker) else None,
             ),
         )
-        self.voice = DevicePublisher(
+        self.publisher = DevicePublisher(
             address=(space, agent, name),
             label=label,
             robot_type=robot_type,
-            room_device=None if instrument is None else instrument.manifest,
+            room_device=None if room_device is None else room_device.manifest,
             simulated=driver.simulated,
             limits=self._controller.limits if robot_type.joints else (),
-            actions=body.tasks() if instrument is None else instrument.actions,
+            actions=context.tasks() if room_device is None else room_device.actions,
             interlocks=[rule.description for rule in interlocks],
             journal=journal,
             publish=publish,
             outbox=outbox,
         )
-        self._filmer = CameraStreamer(
+        self._camera_streamer = CameraStreamer(
             robot_type.cameras,
             driver if isinstance(driver, HasCameras) else None,
             name=name,
-            film=self.voice.film,
-            controlled=lambda: self._controller.lease(time.monotonic()) is not None,
+            publish=self.publisher.publish_frame,
+            is_controlled=lambda: self._controller.lease(time.monotonic()) is not None,
         )
-        self._room = room
         self._interlocks = Interlocks(
             interlocks,
-            room,
+            readings,
             restrict=self._controller.restrict,
             lift=self._controller.lift,
-            note=lambda happened, code, now_s: self._audit.refused(happened, code=code, now_s=now_s),
+            record=lambda event, code, now_s: self._events.record_rejection(event, code=code, now_s=now_s),
         )
-        self._loop = self._loop_of(driver, robot_type)
-        trust = ScriptPolicy(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
-        self._executor = ActionExecutor(body, trust=trust, jail=jail, report=self.voice.report, settle=journal.settle)
-        self._office = CommandProcessor(
+        self._loop = self._create_loop(driver, robot_type)
+        policy = ScriptPolicy(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
+        self._executor = ActionExecutor(
+            context, policy=policy, sandbox=sandbox, report=self.publisher.report, sync=journal.sync
+        )
+        self._commands = CommandProcessor(
             address=(space, agent, name),
             controller=self._controller,
             executor=self._executor,
-            voice=self.voice,
-            audit=self._audit,
+            publisher=self.publisher,
+            events=self._events,
             journal=journal,
             cloud_clock=cloud_clock,
             keys=keys,
-            hurry=self._hurry,
-            ailing=tuple if instrument is None else instrument.vigil.faults,
+            wake=self._wake,
+            device_faults=tuple if room_device is None else room_device.watchdog.faults,
         )
 
-    def _loop_of(self, driver: Driver | RoomDevice, robot_type: RobotType) -> ControlLoop | SensorLoop:
-        watch = self._interlocks.step
+    def _create_loop(self, driver: Driver | RoomDevice, robot_type: RobotType) -> ControlLoop | SensorLoop:
         if isinstance(driver, RoomDevice):
             return SensorLoop(
-                driver, self._controller, name=self.name, tell=self._measured, film=self.voice.film, watch=watch
+                driver,
+                self._controller,
+                name=self.name,
+                publish=self._publish,
+                publish_frame=self.publisher.publish_frame,
+                check_interlocks=self._interlocks.update,
             )
         return ControlLoop(
             robot_type,
             driver,
             self._controller,
             name=self.name,
-            tell=lambda telemetry: self._measured(topics.JOINTS, telemetry),
-            watch=watch,
+            publish=lambda telemetry: self._publish(topics.JOINTS, telemetry),
+            check_interlocks=self._interlocks.update,
         )
 
-    # ------------------------------------------------------------ life
+    # ------------------------------------------------------------ start and stop
 
     def start(self) -> None:
-        """Connect the driver and begin to hold.
+        """Connect the driver, and hold the present position.
 
         Raises:
-            DriverError: The device is not there.
+            DriverError: The device does not respond.
         """
         self._loop.start()
-        self._reporter.start()
-        self._filmer.start()
+        self._stream_sampler.start()
+        self._camera_streamer.start()
         epoch, _ = self._controller.epochs
         data = {"epoch": epoch, "stopped": self._controller.latch is not None}
-        self._audit.note(
-            EventRecord(EventKind.AGENT_STARTED, "the agent started; leases of before have ended", data=data)
-        )
-        self.voice.scripts = scripts = self._jail.standing()
-        if scripts.how != "sandboxed":
-            self._audit.note(EventRecord(_SCRIPTS[scripts.how], scripts.why, "warning", {"reason": scripts.why}))
-        self._office.start(None if isinstance(self._driver, RoomDevice) else self._driver.twin())
+        message = "the agent started; all previous leases have ended"
+        self._events.record(EventRecord(EventKind.AGENT_STARTED, message, data=data))
+        self.publisher.scripts = scripts = self._sandbox.standing()
+        if scripts.how in _SCRIPTS:
+            self._events.record(EventRecord(_SCRIPTS[scripts.how], scripts.why, "warning", {"reason": scripts.why}))
+        self._commands.start(None if isinstance(self._driver, RoomDevice) else self._driver.twin())
 
     def stop(self) -> None:
-        """End what runs, hold, and let the driver go. May be called twice."""
-        self._controller.lost(Refused("agent_stopping", "the agent was shut down"))
+        """End the running action, hold, and close the driver. May be called twice."""
+        self._controller.interrupt(Refused("agent_stopping", "the agent was shut down"))
         self._executor.close()
         self._loop.stop()
-        self._reporter.stop()
-        self._filmer.stop()
-        self._audit.note(EventRecord(EventKind.AGENT_STOPPED, "the agent was shut down"))
-        self._office.stop()
+        self._stream_sampler.stop()
+        self._camera_streamer.stop()
+        self._events.record(EventRecord(EventKind.AGENT_STOPPED, "the agent was shut down"))
+        self._commands.stop()
         self._driver.close()
 
     @property
     def quiet(self) -> bool:
-        """Whether nothing would be disturbed by a short break of the link."""
+        """Whether the device neither moves nor runs an action."""
         return not self._controller.moving and self._executor.current() is None
 
-    def _measured(self, stream: str, telemetry: JointTelemetry | Measurements) -> None:
-        self._room.note(self.name, stream, telemetry)
-        self.voice.tell(stream, telemetry)
+    def _publish(self, stream: str, telemetry: JointTelemetry | Measurements) -> None:
+        self._readings.record(self.name, stream, telemetry)
+        self.publisher.publish_telemetry(stream, telemetry)
 
-    # ------------------------------------------------------------ what arrives (transport's thread)
+    # ------------------------------------------------------------ received messages (transport's thread)
 
     def receive(self, topic: topics.Topic, payload: bytes) -> None:
-        """Take in one message; quick, and never raises."""
+        """Handle one message; quick, and never raises."""
         try:
             if topic.kind == topics.CTL:
-                self._take_setpoint(topic.name, payload)
+                self._accept_setpoint(topic.name, payload)
             elif topic.kind == topics.STOP:
                 stop = codec.decode(payload, Stop)
                 self._controller.stop(StopLatch(caller=stop.caller, reason=stop.reason, at_ms=wall_ms()))
-                self._hurry()
+                self._wake()
                 _log.warning("%s: stopped by %s", self.name, stop.caller)
             elif topic.kind == topics.CMD:
-                self._office.put(payload)
+                self._commands.submit(payload)
         except Refused as refused:
-            self._refuse(topic.kind, refused.code, refused.message)
+            self._reject(topic.kind, refused.code, refused.message)
         except ProtocolError as error:
-            _log.warning("%s: %s refused: %s", self.name, topic.kind, str(error)[:300])
-            self._refuse(topic.kind, "malformed", str(error)[:300])
+            _log.warning("%s: %s rejected: %s", self.name, topic.kind, str(error)[:300])
+            self._reject(topic.kind, "malformed", str(error)[:300])
 
-    def _refuse(self, topic_kind: str, code: str, message: str) -> None:
-        self.voice.count(code)
-        kind = _REFUSED[topic_kind]
-        self._audit.refused(EventRecord(kind, message, "warning", {"code": code}), code=code, now_s=time.monotonic())
+    def _reject(self, topic_kind: str, code: str, message: str) -> None:
+        self.publisher.count_rejection(code)
+        event = EventRecord(_REJECTED[topic_kind], message, "warning", {"code": code})
+        self._events.record_rejection(event, code=code, now_s=time.monotonic())
 
-    def _take_setpoint(self, epoch: str, payload: bytes) -> None:
+    def _accept_setpoint(self, epoch: str, payload: bytes) -> None:
         setpoint = codec.decode(payload, Setpoint)
         if epoch != str(setpoint.epoch):
-            raise Refused("no_lease", "the epoch in the topic and in the message differ")
-        self._controller.offer(setpoint, now_s=time.monotonic(), tick_ms=tick_ms())
-        self._hurry()
+            raise Refused("no_lease", "the epochs in the topic and in the message differ")
+        self._controller.accept_setpoint(setpoint, now_s=time.monotonic(), tick_ms=tick_ms())
+        self._wake()
 
-    def _hurry(self) -> None:
-        """What was asked does not wait for the next period."""
-        self._loop.hurry()
+    def _wake(self) -> None:
+        """Run the next control period without waiting, if possible."""
+        self._loop.wake()
 
     def link_changed(self, up: bool) -> None:
-        """The link came or went."""
-        self._filmer.link_changed(up)
+        """Handle a change of the link."""
+        self._camera_streamer.link_changed(up)
         if up:
-            self._office.introduce()
+            self._commands.on_connected()
         else:
-            self._controller.lost(Refused("link_lost", "the device lost its link"))
+            self._controller.interrupt(Refused("link_lost", "the device lost its link"))

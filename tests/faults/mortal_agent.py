@@ -121,7 +121,7 @@ class Body:
     def live(self) -> None:
         key = Ed25519PrivateKey.from_private_bytes(self.life.key)
         writes = [self.steps.around(Journal, name) for name in ("begin", "record", "delivered", "save_epoch")]
-        with mock.patch.object(Controller, "move", self._counted(Controller.move)):
+        with mock.patch.object(Controller, "move", self._counted(Controller.start_joint_goal)):
             for write in writes:
                 write.start()
             journal = Journal(self.folder / "journal.db")
@@ -129,9 +129,9 @@ class Body:
             journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
             device = Device(
                 name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=ToyDriver(),
-                journal=journal, cloud_clock=self.clock, publish=self._publish, jail=LateJail(),
+                journal=journal, cloud_clock=self.clock, publish=self._publish, sandbox=LateJail(),
                 keys=pins_of(key),
-                room=ReadingCache(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
+                readings=ReadingCache(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
             )  # fmt: skip
             device.start()
             device.link_changed(True)
@@ -142,7 +142,7 @@ class Body:
     def _outbox(self) -> Outbox:
         own = f"ts/v1/{SPACE}/{AGENT}/"
         shelf = OutboxStore(self.folder / "outbox.db", own=own, max_bytes=10**7, max_age_ms=3_600_000)
-        return Outbox(shelf, publish=self._publish, teller=own + DEVICE)
+        return Outbox(shelf, publish=self._publish, device_topic=own + DEVICE)
 
     def _deliver(self, device: Device, key: Ed25519PrivateKey) -> None:
         topic = topics.Topic(SPACE, AGENT, DEVICE, topics.CMD)

@@ -109,7 +109,7 @@ class History:
         self._plan(handovers)
         while self._queue:
             message = heapq.heappop(self._queue)
-            self._robot.step(message.arrives_s)
+            self._robot.update(message.arrives_s)
             self.tally.delivered += 1
             getattr(self, f"_{message.kind}")(message)
         return self.tally
@@ -189,8 +189,8 @@ class History:
         self._witness.ordered(message.epoch)
 
         def act() -> None:
-            tenure = self._robot.begin_action(epoch=message.epoch, on_lost=lambda _: None)
-            self._robot.end_action(tenure)
+            tenure = self._robot.reserve(epoch=message.epoch, on_revoked=lambda _: None)
+            self._robot.end_reservation(tenure)
             self._judge(stale=stale)
 
         self._signed(message.epoch, act)
@@ -206,10 +206,10 @@ class History:
             target=JointTarget(position_rad={"elbow": 1.0 if message.epoch % 2 else -1.0}),
         )
         try:
-            self._robot.offer(setpoint, now_s=now_s, tick_ms=tick_ms)
+            self._robot.accept_setpoint(setpoint, now_s=now_s, tick_ms=tick_ms)
         except Refused:
             return
-        if self._robot.step(now_s).mode is Mode.STREAMING:
+        if self._robot.update(now_s).mode is Mode.STREAMING:
             self._judge(stale=self._witness.stale(message.epoch, now_s, needs_lease=True))
 
     def _stop(self, _message: Message) -> None:

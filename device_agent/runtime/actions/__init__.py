@@ -1,1 +1,1 @@
-"""Actions."""
+"""Execution of actions: single tasks and movement scripts."""

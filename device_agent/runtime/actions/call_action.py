@@ -7,7 +7,7 @@ from device_agent.runtime.actions.robot_api import RobotApi
 
 
 class CallAction:
-    """Executes one task of a command. Losing the device ends it.
+    """Executes one task of a command. Losing the reservation ends it.
 
     Args:
         task: The request.
@@ -20,8 +20,8 @@ class CallAction:
 
     def run(self) -> dict[str, Any]:
         """Execute the task to its end; returns what limited the motion."""
-        self._robot.do(self._task)
+        self._robot.execute(self._task)
         return {"limited": self._robot.limited} if self._robot.limited else {}
 
     def kill(self) -> None:
-        """Do nothing: the reservation of ``RobotApi`` has already ended."""
+        """Do nothing: the end of the reservation ends the task."""

@@ -1,4 +1,4 @@
-"""A device as its scripts and orders meet it."""
+"""Parts of a device that its actions and scripts use."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -41,26 +41,26 @@ SCRIPT_NAMES: Mapping[StructMeta, str] = {
 }
 """Methods of the script API whose name differs from the kind of their message."""
 CARTESIAN = "cartesian"
-"""A capability that a manifest may name, besides those of ``ports.skills``."""
+"""Capability of a manifest in addition to those of ``ports.skills``."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceContext:
-    """A device as its scripts meet it.
+    """Parts of a device that its actions use.
 
     Attributes:
         robot_type: Joints, frames, capabilities, home.
-        controller: What moves it.
-        observe: The newest measurement, or ``None`` before the first.
-        geometry: Its shape, where its type has a model.
-        skills: What its driver can besides.
-        room: What the space's other devices have measured last.
-        reported: The newest of each of its own streams besides ``joints``.
-        instrument: The device as a room's, where it is one.
-        name: As the room's positions name it.
-        ground: What stands in its room, while somebody sees that; without it, it goes nowhere by itself.
-        speaker: Who says what it is to say.
-        hurry: Called when something is asked of the controller: see ``ControlLoop.hurry``.
+        controller: Moves the device.
+        observe: Newest observation, or ``None`` before the first one.
+        geometry: Shape of the robot, if its type has a model.
+        skills: Driver with skills, if it has any.
+        readings: Newest measurements of the space's other devices.
+        own_readings: Newest reading of each stream of this device except ``joints``.
+        room_device: The device, if it is a room device.
+        name: Name of the device in the positions that room sensors publish.
+        obstacle_map: Newest obstacle map of the room, if sensors publish one. ``go_to`` needs it.
+        speech: Output of speech.
+        wake: Called after a goal has started; see ``ControlLoop.wake``.
     """
 
     robot_type: RobotType
@@ -68,31 +68,31 @@ class DeviceContext:
     observe: Callable[[], Observation | None]
     geometry: RobotGeometry | None
     skills: Skills | None
-    room: ReadingCache
-    reported: Callable[[], Mapping[str, Reading]] = dict
-    instrument: RoomDevice | None = None
+    readings: ReadingCache
+    own_readings: Callable[[], Mapping[str, Reading]] = dict
+    room_device: RoomDevice | None = None
     name: str = ""
-    ground: Callable[[], ObstacleMap | None] | None = None
-    speaker: SpeechOutput = field(default_factory=SpeechOutput)
-    hurry: Callable[[], None] = lambda: None
+    obstacle_map: Callable[[], ObstacleMap | None] | None = None
+    speech: SpeechOutput = field(default_factory=SpeechOutput)
+    wake: Callable[[], None] = lambda: None
 
-    def seen(self) -> Observation:
-        """The newest measurement.
+    def observation(self) -> Observation:
+        """The newest observation.
 
         Raises:
             Refused: There is none yet.
         """
-        seen = self.observe()
-        if seen is None:
+        observation = self.observe()
+        if observation is None:
             raise Refused("no_measurement", "the robot has not been measured yet")
-        return seen
+        return observation
 
     def measured(self) -> dict[str, Any]:
-        """Where it is, as results show it; empty before the first measurement, and without joints."""
-        seen = self.observe()
-        if seen is None or not self.robot_type.joints:
+        """Measured joint positions for results; empty before the first observation, and without joints."""
+        observation = self.observe()
+        if observation is None or not self.robot_type.joints:
             return {}
-        return {"position_rad": by_name(self.robot_type, seen.position_rad)}
+        return {"position_rad": by_name(self.robot_type, observation.position_rad)}
 
     def supported(self) -> tuple[StructMeta, ...]:
         """Types of the calls that this robot supports."""
@@ -104,7 +104,7 @@ class DeviceContext:
             Home: bool(kind.joints),
             MovePose: CARTESIAN in named and self.geometry is not None,
             Drive: kind.base is not None,
-            GoTo: kind.base is not None and self.ground is not None,
+            GoTo: kind.base is not None and self.obstacle_map is not None,
             LookAt: skills.GAZE in by_driver or (kind.gaze is not None and self.geometry is not None),
             Say: skills.SPEECH in named,
             SetStiffness: skills.STIFFNESS in by_driver,
@@ -126,9 +126,9 @@ class DeviceContext:
         return tuple(tag(task) for task in get_args(RobotTask) if task in supported)
 
     def performs(self, capability: str) -> bool:
-        """Whether its driver does this itself; else it is done by what the manifest says."""
-        able = self.skills
-        return able is not None and capability in self.robot_type.capabilities and capability in able.performs
+        """Whether the driver executes this skill itself; otherwise the manifest describes it."""
+        driver = self.skills
+        return driver is not None and capability in self.robot_type.capabilities and capability in driver.performs
 
 
 def tag(call: StructMeta) -> str:
@@ -137,5 +137,5 @@ def tag(call: StructMeta) -> str:
 
 
 def by_name(robot_type: RobotType, values: Sequence[float]) -> dict[str, float]:
-    """Values in joint order as joint name → value."""
+    """Joint name → value, of values in joint order."""
     return dict(zip((joint.name for joint in robot_type.joints), values, strict=True))

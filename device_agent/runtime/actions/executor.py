@@ -1,4 +1,4 @@
-"""Runs one action at a time on one device, in a thread of its own, and reports each step of it as an ack."""
+"""Executes one action at a time on one device, in its own thread, and acknowledges each step."""
 
 import logging
 import threading
@@ -8,69 +8,73 @@ from typing import Any, Protocol
 
 from device_agent.ports.sandbox import Sandbox
 from device_agent.protocol import AckStatus, ActionState, Command, Reason, RoomTask, RunMovement, Task
-from device_agent.runtime.actions import call_action
+from device_agent.runtime.actions.call_action import CallAction
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
-from device_agent.runtime.actions.script_action import MAX_OUTPUT, Cell, Script, ScriptFailed
+from device_agent.runtime.actions.script_action import MAX_OUTPUT, ScriptAction, ScriptFailed, ScriptSandbox
 from device_agent.runtime.actions.script_policy import ScriptPolicy
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.room import room_actions
 
 Report = Callable[..., None]
 """``report(command_id, status, reason=…, progress=…, output=…, result=…)``: journal and publish one ack."""
-Order = RunMovement | Task
-"""What is an action."""
+ActionRequest = RunMovement | Task
 
-_TELL_EVERY_S = 0.2
+_PROGRESS_PERIOD_S = 0.2
 _log = logging.getLogger(__name__)
 
 
 class ActionExecutor:
-    """The one action of one device. Thread-safe.
+    """The running action of one device. Thread-safe.
 
     Args:
-        body: The device.
-        trust: Judges scripts.
-        jail: Where they run.
+        context: The device.
+        policy: Decides which scripts may run.
+        sandbox: Runs scripts.
         report: Journals and publishes an ack.
-        settle: Sees to it that what was journalled is on the disk; raises where it cannot be.
+        sync: Writes the journal to disk; raises if it cannot.
     """
 
     def __init__(
-        self, body: DeviceContext, *, trust: ScriptPolicy, jail: Sandbox, report: Report, settle: Callable[[], None]
+        self,
+        context: DeviceContext,
+        *,
+        policy: ScriptPolicy,
+        sandbox: Sandbox,
+        report: Report,
+        sync: Callable[[], None],
     ) -> None:
-        self._settle = settle
-        self._body = body
-        self._trust = trust
-        self._jail = jail
+        self._sync = sync
+        self._context = context
+        self._policy = policy
+        self._sandbox = sandbox
         self._report = report
         self._lock = threading.Lock()
         self._run: _Run | None = None
 
-    def start(self, command: Command, order: Order) -> None:
-        """Begin the action of a command that has been accepted; its acks follow by themselves.
+    def start(self, command: Command, request: ActionRequest) -> None:
+        """Start the action of an accepted command. Its acks follow.
 
         Raises:
-            Refused: The device is busy, stopped or faulty, the lease is stale, the script is not what was signed or
-                older than one that ran, or this machine cannot lock it in.
+            Refused: The device is busy, stopped or faulty; the lease is stale; the script is not the signed one or
+                older than one that ran; or this machine has no sandbox.
         """
         with self._lock:
             if self._run is not None:
                 raise Refused("busy", f"action {self._run.command.id} runs on this device")
-            run = _Run(command, self._body, self._report, self._settle)
-            if isinstance(order, RunMovement):
-                cell = self._cell(order)
-                run.begin(_Playing(order, run, cell))
-                self._trust.remember(order)
-            elif isinstance(order, RoomTask):
-                run.begin(room_actions.activity(order, self._body.instrument, run.tell))
+            run = _Run(command, self._context, self._report, self._sync)
+            if isinstance(request, RunMovement):
+                run.reserve(_TimedScript(request, run, self._check_script(request)))
+                self._policy.record_version(request)
+            elif isinstance(request, RoomTask):
+                run.reserve(room_actions.create(request, self._context.room_device, run.add_output))
             else:
-                run.begin(call_action.CallAction(order, run.robot))
+                run.reserve(CallAction(request, run.robot))
             self._run = run
-        threading.Thread(target=self._follow, args=(run,), name=f"action-{command.id}", daemon=True).start()
-        run.announce()
+        threading.Thread(target=self._execute, args=(run,), name=f"action-{command.id}", daemon=True).start()
+        run.report_started()
 
-    def cancel(self, action: str, who: str) -> None:
+    def cancel(self, action: str, caller: str) -> None:
         """End the named action; the device holds.
 
         Raises:
@@ -80,122 +84,120 @@ class ActionExecutor:
             run = self._run
         if run is None or run.command.id != action:
             raise Refused("not_running", f"action {action} does not run on this device")
-        run.end(AckStatus.CANCELLED, Refused("cancelled", f"cancelled by {who}"))
+        run.end(AckStatus.CANCELLED, Refused("cancelled", f"cancelled by {caller}"))
 
     def current(self) -> ActionState | None:
-        """The action that runs now."""
+        """The running action."""
         with self._lock:
             return None if self._run is None else self._run.state()
 
     def close(self) -> None:
-        """End what runs; the agent is going down."""
+        """End the running action because the agent shuts down."""
         with self._lock:
             run = self._run
         if run is not None:
             run.end(AckStatus.FAILED, Refused("agent_stopping", "the agent was shut down"))
             run.over.wait(timeout=2)
 
-    def _cell(self, order: RunMovement) -> Cell:
-        """Where a script may run, once it is seen to be what it should be."""
-        self._trust.check(order)
-        stranger = self._trust.stranger(order)
-        refusal = self._jail.refusal(stranger=stranger)
+    def _check_script(self, request: RunMovement) -> ScriptSandbox:
+        """Check a script, and select the sandbox for it."""
+        self._policy.verify(request)
+        untrusted = self._policy.is_untrusted(request)
+        refusal = self._sandbox.refusal(stranger=untrusted)
         if refusal is not None:
-            raise Refused("no_jail", refusal)
-        return Cell(self._jail, stranger)
+            raise Refused("no_sandbox", refusal)
+        return ScriptSandbox(self._sandbox, untrusted)
 
-    def _follow(self, run: "_Run") -> None:
+    def _execute(self, run: "_Run") -> None:
         try:
-            run.play()
+            run.execute()
         finally:
-            run.robot.give_back()
+            run.robot.release()
             with self._lock:
                 self._run = None
-            run.tell_end()
+            run.report_end()
 
 
 class _Activity(Protocol):
     """What an action does."""
 
     def run(self) -> dict[str, Any]:
-        """Do it to its end; gives what there is to tell besides."""
+        """Run to the end; returns additional entries of the result."""
 
     def kill(self) -> None:
         """End it, from any thread; never blocks. May be called twice."""
 
 
-class _Playing:
-    """An action that is a script, and its time."""
+class _TimedScript:
+    """A script with a time limit."""
 
-    def __init__(self, order: RunMovement, run: "_Run", cell: Cell) -> None:
-        self._script = Script(order, run.robot, run.tell, cell=cell, died=run.robot.give_back)
-        self._timeout_s = order.timeout_ms / 1000
+    def __init__(self, request: RunMovement, run: "_Run", sandbox: ScriptSandbox) -> None:
+        self._script = ScriptAction(request, run.robot, run.add_output, sandbox=sandbox, on_exit=run.robot.release)
+        self._timeout_s = request.timeout_ms / 1000
         self._robot, self._end = run.robot, run.end
 
     def kill(self) -> None:
-        """See ``_Activity``."""
         self._script.kill()
 
     def run(self) -> dict[str, Any]:
-        """See ``_Activity``."""
         why = Refused("too_long", f"the movement was ended after its {self._timeout_s:g} s")
-        alarm = threading.Timer(self._timeout_s, self._end, (AckStatus.FAILED, why))
-        alarm.daemon = True
-        alarm.start()
+        timer = threading.Timer(self._timeout_s, self._end, (AckStatus.FAILED, why))
+        timer.daemon = True
+        timer.start()
         try:
             self._script.run()
         finally:
-            alarm.cancel()
+            timer.cancel()
         return {"limited": self._robot.limited} if self._robot.limited else {}
 
 
 class _Run:
-    """One action from begin to end.
+    """One action from start to end.
 
     Args:
-        command: What is to be done.
-        body: The device.
+        command: The command of the action.
+        context: The device.
         report: Journals and publishes an ack.
-        settle: See ``ActionExecutor``.
+        sync: See ``ActionExecutor``.
     """
 
-    def __init__(self, command: Command, body: DeviceContext, report: Report, settle: Callable[[], None]) -> None:
-        self._settle = settle
+    def __init__(self, command: Command, context: DeviceContext, report: Report, sync: Callable[[], None]) -> None:
+        self._sync = sync
         self.command = command
         self.over = threading.Event()
-        self._announced = threading.Event()
-        self.robot = RobotApi(body)
-        self._body = body
+        self._started = threading.Event()
+        self.robot = RobotApi(context)
+        self._context = context
         self._report = report
         self._ending: tuple[AckStatus, Refused] | None = None
         self._result: dict[str, Any] = {}
         self._output = ""
         self._progress: float | None = None
-        self._told_at_s = 0.0
+        self._reported_s = 0.0
         self._activity: _Activity
 
-    def begin(self, activity: _Activity) -> None:
-        """Take the device, for this activity.
+    def reserve(self, activity: _Activity) -> None:
+        """Reserve the device for an activity.
 
         Raises:
-            Refused: It cannot be taken.
+            Refused: The device cannot be reserved.
         """
         self._activity = activity
-        self.robot.begin(self.command.epoch, self._lost)
+        self.robot.reserve(self.command.epoch, self._on_revoked)
 
-    def announce(self) -> None:
-        """Tell that it has begun, while its own thread comes up and sees to the disk: somebody waits to hear it."""
+    def report_started(self) -> None:
+        """Acknowledge the start at once, while the action's thread starts and syncs the journal."""
         self._attempt(lambda: self._report(self.command.id, AckStatus.STARTED))
-        self._announced.set()
+        self._started.set()
 
-    def play(self) -> None:
-        """Do it; returns when it is over, however it ended."""
-        self._attempt(self._settle)  # before anything moves: what has moved once must not be run again
-        self._announced.wait()
+    def execute(self) -> None:
+        """Run the activity; returns when it has ended, with or without success."""
+        self._attempt(self._sync)  # before any motion: a motion that started must not run again
+        self._started.wait()
         if self._ending is None:
-            self._attempt(self._do)
+            self._attempt(self._run_activity)
 
-    def _do(self) -> None:
+    def _run_activity(self) -> None:
         self._result = self._activity.run()
 
     def _attempt(self, step: Callable[[], None]) -> None:
@@ -205,19 +207,19 @@ class _Run:
             self.end(AckStatus.FAILED, refused)
         except ScriptFailed as failed:
             self.end(AckStatus.FAILED, Refused("script_failed", str(failed)))
-        except Exception as error:  # noqa: BLE001 (whatever it was: what was not done must not be told as done)
+        except Exception as error:  # noqa: BLE001 (any error ends the action as failed)
             _log.exception("action %s", self.command.id)
-            self.end(AckStatus.FAILED, Refused("internal", f"internal error: {error}; look at the agent's log"))
+            self.end(AckStatus.FAILED, Refused("internal", f"internal error: {error}; see the agent's log"))
 
     def end(self, status: AckStatus, why: Refused) -> None:
-        """Bring it to an end, from any thread; the first reason stays."""
+        """End the action, from any thread; the first reason applies."""
         self._ending = self._ending or (status, why)
-        self.robot.give_back()
+        self.robot.release()
         self._activity.kill()
 
-    def tell_end(self) -> None:
-        """Report the end."""
-        result = self._body.measured() | self._result
+    def report_end(self) -> None:
+        """Acknowledge the end."""
+        result = self._context.measured() | self._result
         if self._ending is None:
             self._report(self.command.id, AckStatus.DONE, output=self._output, progress=1.0, result=result)
         else:
@@ -227,23 +229,23 @@ class _Run:
         self.over.set()
 
     def state(self) -> ActionState:
-        """As the device's ``state`` shows it."""
+        """The action as the device's ``state`` contains it."""
         request = self.command.request
         kind, name = str(type(request).__struct_config__.tag), getattr(request, "name", "")
         return ActionState(id=self.command.id, kind=kind, name=name, progress=self._progress or 0.0)
 
-    def _lost(self, why: Refused) -> None:
-        # The controller calls this with its lock held: no call back into it from here.
+    def _on_revoked(self, why: Refused) -> None:
+        # The controller calls this with its lock held, so this must not call the controller.
         self._ending = self._ending or (AckStatus.FAILED, why)
         self.robot.end()
         self._activity.kill()
 
-    def tell(self, text: str, progress: float | None) -> None:
-        """Take in what a script printed, and how far it says it is."""
+    def add_output(self, text: str, progress: float | None) -> None:
+        """Add printed output, and the progress if it is given."""
         self._output = (self._output + text)[-MAX_OUTPUT:]
         if progress is not None:
             self._progress = progress
         now_s = time.monotonic()
-        if now_s - self._told_at_s >= _TELL_EVERY_S:
-            self._told_at_s = now_s
+        if now_s - self._reported_s >= _PROGRESS_PERIOD_S:
+            self._reported_s = now_s
             self._report(self.command.id, AckStatus.STARTED, output=self._output, progress=self._progress)

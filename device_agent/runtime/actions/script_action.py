@@ -1,4 +1,4 @@
-"""Runs a movement script in a locked process, and answers what comes out of it."""
+"""Runs a movement script in a sandboxed process, and answers its calls."""
 
 import contextlib
 import select
@@ -18,20 +18,20 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.errors import Refused
 
 MAX_OUTPUT = 2000
-"""Characters of printed output that an ack carries; of more, the newest are kept."""
+"""Characters of printed output in an ack; the newest ones are kept."""
 _MESSAGES_PER_S = 500.0
 _BYTES_PER_MESSAGE = 1024
-"""A script that says more than that is read more slowly: it waits, the agent's processor does not boil."""
+"""Rate limit of a script's messages. A script that exceeds it waits, so that it cannot exhaust the agent's CPU."""
 _BURST = 500.0
-_READY_S = 30.0
-_WRITE_S = 5.0
-"""A process that does not read the answers it asked for is ended after this time."""
-_LOOK_S = 60.0
-_PIECE = 65_536
+_READY_TIMEOUT_S = 30.0
+_WRITE_TIMEOUT_S = 5.0
+"""A process that does not read its answers is ended after this time [s]."""
+_EXIT_CHECK_S = 60.0
+_CHUNK = 65_536
 
 
 class RobotApiProtocol(Protocol):
-    """What a script's calls reach."""
+    """Device operations that a script calls."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -39,17 +39,17 @@ class RobotApiProtocol(Protocol):
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """Frames that can be brought somewhere."""
+        """Frames that can be moved to a pose."""
 
     @property
-    def can(self) -> tuple[str, ...]:
-        """Names of the calls that this robot has."""
+    def calls(self) -> tuple[str, ...]:
+        """Names of the script API's methods that this robot supports."""
 
-    def do(self, call: script_calls.Call) -> Any:
-        """Do what was asked, to its end; gives the answer, plain JSON.
+    def execute(self, call: script_calls.Call) -> Any:
+        """Execute a call to its end; returns its result as plain JSON.
 
         Raises:
-            Refused: It was not done.
+            Refused: The call failed.
         """
 
 
@@ -58,184 +58,182 @@ class ScriptFailed(Exception):  # noqa: N818 (an outcome to report)
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
-    """Where a script runs: jail and limits, and whether it is a ``stranger``, a script of an unknown owner."""
+class ScriptSandbox:
+    """Sandbox and limits of a script, and whether its author is untrusted."""
 
-    jail: Sandbox
-    stranger: bool
+    sandbox: Sandbox
+    untrusted: bool
     limits: Limits = field(default_factory=Limits)
 
 
-class Script:
+class ScriptAction:
     """One run of one movement script.
 
     Args:
-        order: Source, name and parameters.
-        reach: What its calls reach.
-        told: Called with what the script printed last and its progress 0…1, if it gave one.
-        cell: Where it runs.
-        died: Called, from another thread, once its process is dead, however it ended: what it moves must not go on.
+        request: Source, name and parameters.
+        robot: Executes the script's calls.
+        on_output: Called with new printed output and the progress 0…1, or ``None``.
+        sandbox: Runs the script.
+        on_exit: Called from another thread when the process has exited. It must stop the motion.
     """
 
     def __init__(
         self,
-        order: RunMovement,
-        reach: RobotApiProtocol,
-        told: Callable[[str, float | None], None],
+        request: RunMovement,
+        robot: RobotApiProtocol,
+        on_output: Callable[[str, float | None], None],
         *,
-        cell: Cell,
-        died: Callable[[], None],
+        sandbox: ScriptSandbox,
+        on_exit: Callable[[], None],
     ) -> None:
-        self._order = order
-        self._reach = reach
-        self._told = told
-        self._cell = cell
-        self._died = died
+        self._request = request
+        self._robot = robot
+        self._on_output = on_output
+        self._sandbox = sandbox
+        self._on_exit = on_exit
         self._killed = threading.Event()
         self._over = threading.Event()
-        self._inmate: SandboxProcess | None = None
+        self._process: SandboxProcess | None = None
 
     def run(self) -> None:
-        """Run to the end.
+        """Run the script to its end.
 
         Raises:
             ScriptFailed: The script raised, or its process died.
         """
         try:
-            self._inmate = inmate = self._cell.jail.open(self._cell.limits, stranger=self._cell.stranger)
+            process = self._sandbox.sandbox.open(self._sandbox.limits, stranger=self._sandbox.untrusted)
         except JailError as error:
             raise ScriptFailed(str(error)) from error
-        watch = threading.Thread(target=self._watch, args=(inmate,), name="script-watch", daemon=True)
-        with contextlib.closing(inmate):
+        self._process = process
+        watcher = threading.Thread(target=self._watch, args=(process,), name="script-watch", daemon=True)
+        with contextlib.closing(process):
             if self._killed.is_set():
-                inmate.kill()
-            watch.start()
+                process.kill()
+            watcher.start()
             try:
-                self._serve(inmate)
+                self._serve(process)
             finally:
                 self._over.set()
-                inmate.kill()
-                watch.join(_WRITE_S)
+                process.kill()
+                watcher.join(_WRITE_TIMEOUT_S)
 
     def kill(self) -> None:
         """End the process at once, from any thread; ``run`` then raises. May be called twice."""
-        # No lock: the control loop may call this, and must not wait for a process to be started.
+        # No lock: the control loop may call this, and must not wait for the start of a process.
         self._killed.set()
-        if self._inmate is not None:
-            self._inmate.kill()
+        if self._process is not None:
+            self._process.kill()
 
-    def _watch(self, inmate: SandboxProcess) -> None:
-        """Whoever serves the script may be busy with its last call for as long as a move takes."""
-        while not inmate.wait(_LOOK_S):
+    def _watch(self, process: SandboxProcess) -> None:
+        """Wait for the exit in a separate thread: the serving thread may be busy with a call."""
+        while not process.wait(_EXIT_CHECK_S):
             if self._over.is_set():
                 return
-        self._died()
+        self._on_exit()
 
-    def _serve(self, inmate: SandboxProcess) -> None:
-        lines = _Lines(inmate.link, self._killed)
+    def _serve(self, process: SandboxProcess) -> None:
+        reader = _LineReader(process.link, self._killed)
         try:
-            self._send_script(inmate.link, lines)
+            self._send_script(process.link, reader)
             while True:
                 try:
-                    message = script_calls.parse(lines.read())
+                    message = script_calls.parse(reader.read())
                 except ProtocolError as error:
-                    _write(inmate.link, error=str(error)[:MAX_OUTPUT])
+                    _write(process.link, error=str(error)[:MAX_OUTPUT])
                     continue
                 if isinstance(message, script_calls.Ended):
                     break
-                self._take(inmate.link, message)
+                self._handle(process.link, message)
         except (OSError, EOFError) as error:
-            raise ScriptFailed(f"the script's process ended before the script did{_because(inmate)}") from error
+            raise ScriptFailed(f"the script's process ended before the script did{_exit_reason(process)}") from error
         if message.error:
             raise ScriptFailed(message.error[:MAX_OUTPUT])
 
-    def _send_script(self, link: socket.socket, lines: "_Lines") -> None:
-        """Once the jail is known to hold."""
+    def _send_script(self, link: socket.socket, reader: "_LineReader") -> None:
+        """Send the script after the process has confirmed its confinement."""
         try:
-            first = script_calls.parse(lines.read(within_s=_READY_S))
+            first = script_calls.parse(reader.read(timeout_s=_READY_TIMEOUT_S))
         except ProtocolError as error:
             raise EOFError from error
         if isinstance(first, script_calls.Unfit):
-            raise ScriptFailed(f"the script was not run, the jail does not hold: {first.reason[:MAX_OUTPUT]}")
+            raise ScriptFailed(f"the script was not run, the sandbox is incomplete: {first.reason[:MAX_OUTPUT]}")
         _write(
             link,
-            source=self._order.source,
-            name=self._order.name,
-            parameters=self._order.parameters,
-            joints=self._reach.joints,
-            frames=self._reach.frames,
-            can=self._reach.can,
+            source=self._request.source,
+            name=self._request.name,
+            parameters=self._request.parameters,
+            joints=self._robot.joints,
+            frames=self._robot.frames,
+            can=self._robot.calls,
         )
 
-    def _take(self, link: socket.socket, message: script_calls.Message) -> None:
+    def _handle(self, link: socket.socket, message: script_calls.Message) -> None:
         match message:
             case script_calls.Output(text=text):
-                self._told(text[-MAX_OUTPUT:], None)
+                self._on_output(text[-MAX_OUTPUT:], None)
             case script_calls.Progress(share=share):
-                self._told("", share)
+                self._on_output("", share)
             case script_calls.Ready() | script_calls.Unfit() | script_calls.Ended():
-                _write(link, error="this is said once")
+                _write(link, error="this message may be sent only once")
             case _:
                 try:
-                    answer = self._reach.do(message)
+                    result = self._robot.execute(message)
                 except Refused as refused:
                     _write(link, error=refused.message)
                 else:
-                    _write(link, value=answer)
+                    _write(link, value=result)
 
 
-class _Lines:
-    """Reads lines, of bounded length and at a bounded rate."""
+class _LineReader:
+    """Reads lines of bounded length at a bounded rate."""
 
     def __init__(self, link: socket.socket, killed: threading.Event) -> None:
         self._link = link
         self._killed = killed
-        self._rest = b""
+        self._buffer = b""
         self._credit = _BURST
-        self._at_s = time.monotonic()
+        self._updated_s = time.monotonic()
 
-    def read(self, *, within_s: float | None = None) -> bytes:
+    def read(self, *, timeout_s: float | None = None) -> bytes:
         """The next line, without its end.
 
         Raises:
-            EOFError: The process has ended, or sends a line without end, or nothing ``within_s`` [s].
+            EOFError: The process has ended, the line is too long, or there was no data within ``timeout_s`` [s].
             OSError: The same.
         """
-        while b"\n" not in self._rest:
-            if len(self._rest) >= script_calls.MAX_LINE or not _readable(self._link, within_s):
+        while b"\n" not in self._buffer:
+            too_long = len(self._buffer) >= script_calls.MAX_LINE
+            if too_long or not select.select([self._link], [], [], timeout_s)[0]:
                 raise EOFError
-            piece = self._link.recv(_PIECE)
-            if not piece:
+            chunk = self._link.recv(_CHUNK)
+            if not chunk:
                 raise EOFError
-            self._rest += piece
-        line, _, self._rest = self._rest.partition(b"\n")
+            self._buffer += chunk
+        line, _, self._buffer = self._buffer.partition(b"\n")
         if len(line) >= script_calls.MAX_LINE:
             raise EOFError
-        self._pay(1 + len(line) / _BYTES_PER_MESSAGE)
+        self._throttle(1 + len(line) / _BYTES_PER_MESSAGE)
         return line
 
-    def _pay(self, price: float) -> None:
+    def _throttle(self, cost: float) -> None:
         now_s = time.monotonic()
-        self._credit = min(_BURST, self._credit + (now_s - self._at_s) * _MESSAGES_PER_S) - price
-        self._at_s = now_s
+        self._credit = min(_BURST, self._credit + (now_s - self._updated_s) * _MESSAGES_PER_S) - cost
+        self._updated_s = now_s
         if self._credit < 0:
             self._killed.wait(-self._credit / _MESSAGES_PER_S)
 
 
-def _readable(link: socket.socket, within_s: float | None) -> bool:
-    return bool(select.select([link], [], [], within_s)[0])
-
-
 def _write(link: socket.socket, **message: Any) -> None:
-    link.settimeout(_WRITE_S)
+    link.settimeout(_WRITE_TIMEOUT_S)
     try:
         link.sendall(msgspec.json.encode(message) + b"\n")
     finally:
         link.settimeout(None)
 
 
-def _because(inmate: SandboxProcess) -> str:
-    """Why it died, as far as that can be known."""
-    inmate_died = inmate.wait(_WRITE_S)
-    why = inmate.ending() if inmate_died else "it stopped making sense"
+def _exit_reason(process: SandboxProcess) -> str:
+    """Why the process ended, if it is known."""
+    exited = process.wait(_WRITE_TIMEOUT_S)
+    why = process.ending() if exited else "it stopped following the protocol"
     return f": {why}" if why else ""

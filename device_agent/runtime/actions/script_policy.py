@@ -1,4 +1,4 @@
-"""Which movement scripts a device runs: those that the cloud has signed, unchanged, and never an older one again."""
+"""Script policy: a device runs only scripts that the cloud signed, unmodified, and never an older version again."""
 
 import hashlib
 from collections.abc import Mapping
@@ -13,12 +13,12 @@ from device_agent.runtime.storage.journal import Journal
 
 
 class ScriptPolicy:
-    """The judgement of one device about scripts, besides that about the command they came with.
+    """Checks of one device for scripts, in addition to those of their commands.
 
     Args:
-        device: Its name.
+        device: Name of the device.
         robot_type: Id of its robot type.
-        owner: Id of the account that the agent is paired with; empty where the pairing does not say.
+        owner: Id of the account that the agent is paired with; empty if the pairing does not contain it.
         keys: The cloud's pinned public keys by key id.
         journal: Open.
     """
@@ -32,41 +32,39 @@ class ScriptPolicy:
         self._keys = keys
         self._journal = journal
 
-    def check(self, order: RunMovement) -> None:
-        """Look at a script before anything of it is run.
+    def verify(self, request: RunMovement) -> None:
+        """Check a script before it runs.
 
         Raises:
-            Refused: Changed, not signed, of another robot type, or older than one of its name that ran here.
+            Refused: Modified, not signed, of another robot type, or older than a version that ran here.
         """
-        if order.robot_type != self._robot_type:
-            raise Refused("wrong_type", f"a movement of '{order.robot_type}', not of '{self._robot_type}'")
-        if hashlib.sha256(order.source.encode()).hexdigest() != order.sha256:
-            raise Refused("wrong_hash", "the script is not the one that was signed for; save the movement again")
-        self._check_signature(order)
-        highest = self._journal.movement(self._device, order.author, order.robot_type, order.name)
-        if order.version < highest:
+        if request.robot_type != self._robot_type:
+            raise Refused("wrong_type", f"a movement of '{request.robot_type}', not of '{self._robot_type}'")
+        if hashlib.sha256(request.source.encode()).hexdigest() != request.sha256:
+            raise Refused("wrong_hash", "the script is not the signed one; save the movement again")
+        self._verify_signature(request)
+        highest = self._journal.movement(self._device, request.author, request.robot_type, request.name)
+        if request.version < highest:
             raise Refused(
                 "rolled_back",
-                f"version {order.version} of '{order.name}' is older than version {highest}, which has run on this "
+                f"version {request.version} of '{request.name}' is older than version {highest}, which has run on this "
                 "device; save the script again, which gives it a new version",
             )
 
-    def remember(self, order: RunMovement) -> None:
-        """A script begins: none of its name that is older may follow."""
-        self._journal.save_movement(self._device, order.author, order.robot_type, order.name, order.version)
+    def record_version(self, request: RunMovement) -> None:
+        """Journal the version of a script that starts; older versions are rejected from now on."""
+        self._journal.save_movement(self._device, request.author, request.robot_type, request.name, request.version)
 
-    def stranger(self, order: RunMovement) -> bool:
-        """Whether its author is neither the account that the agent is paired with nor who made Telescope."""
-        return order.author not in {SHIPPED, self._owner} or not order.author
+    def is_untrusted(self, request: RunMovement) -> bool:
+        """Whether the author is neither the agent's owner nor the Telescope project."""
+        return request.author not in {SHIPPED, self._owner} or not request.author
 
-    def _check_signature(self, order: RunMovement) -> None:
-        key = self._keys.get(order.key)
+    def _verify_signature(self, request: RunMovement) -> None:
+        key = self._keys.get(request.key)
         if key is None:
-            raise Refused(
-                "bad_signature", "the movement is not signed with a key that this device knows; save it again"
-            )
-        text = signing.movement_text(order.robot_type, order.name, order.version, order.sha256)
+            raise Refused("bad_signature", "the movement is not signed with a pinned key; save it again")
+        text = signing.movement_text(request.robot_type, request.name, request.version, request.sha256)
         try:
-            signing.verify_text(text, order.signature, key, context=signing.MOVEMENT_CONTEXT)
+            signing.verify_text(text, request.signature, key, context=signing.MOVEMENT_CONTEXT)
         except SignatureError as error:
-            raise Refused("bad_signature", "the movement is not the one that was signed; save it again") from error
+            raise Refused("bad_signature", "the movement is not the signed one; save it again") from error

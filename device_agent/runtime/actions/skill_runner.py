@@ -1,4 +1,4 @@
-"""What a robot shows: speech, expressions, postures, behaviours, stiffness. By its manifest, or by its driver."""
+"""Skills: speech, expressions, postures, behaviours and stiffness, executed by the manifest or by the driver."""
 
 import contextlib
 import threading
@@ -14,175 +14,176 @@ from device_agent.runtime.authority.authority import Reservation
 from device_agent.runtime.control.goals import MotionGoal
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import named_poses
-from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, Line
+from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, SpokenLine
 
-_REST_WITHIN_S = 3.0
-_PERIODS = 4
-"""Control periods after which the servos surely have what was commanded."""
+_REST_TIMEOUT_S = 3.0
+_SETTLE_PERIODS = 4
+"""Control periods after which the servos have received a command."""
 
 
 class JointMover(Protocol):
-    """The action that shows something."""
+    """The action that runs a skill."""
 
-    tenure: Reservation
-    over: threading.Event
+    reservation: Reservation
+    ended: threading.Event
 
     def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
-        """Move and wait until there [rad].
+        """Move to joint positions [rad] and wait.
 
         Raises:
-            Refused: It did not get there.
+            Refused: The robot did not reach the positions.
         """
 
-    def follow(self, course: MotionGoal) -> None:
-        """Wait for the end of a course.
+    def wait_for(self, goal: MotionGoal) -> None:
+        """Wait for the end of a goal.
 
         Raises:
-            Refused: It was interrupted.
+            Refused: The goal was interrupted.
         """
 
 
 class SkillRunner:
-    """Shows what one action asks for.
+    """Runs the skills of one action.
 
     Args:
-        body: The device.
+        context: The device.
         mover: The action.
     """
 
-    def __init__(self, body: DeviceContext, mover: JointMover) -> None:
-        self._body = body
+    def __init__(self, context: DeviceContext, mover: JointMover) -> None:
+        self._context = context
         self._mover = mover
 
-    def show(self, skill: Skill) -> None:
-        """Execute a skill to its end, by the driver if it supports the skill.
+    def run(self, skill: Skill) -> None:
+        """Run a skill to its end, by the driver if the driver supports it.
 
         Raises:
-            Refused: It was not done.
+            Refused: The skill failed.
         """
-        kind = self._body.robot_type
+        robot_type, by_driver = self._context.robot_type, self._context.performs
         match skill:
-            case Express(name=name, strength=strength) if not self._body.performs(skills.EXPRESSIONS):
-                self._mover.move_joints(named_poses.expression(kind, name, strength), named_poses.EXPRESSION_SPEED)
-            case TakePosture(name=name, speed=speed) if not self._body.performs(skills.POSTURES):
-                self._mover.move_joints(named_poses.posture(kind, name), speed)
-            case RunBehaviour(name=name) if not self._body.performs(skills.BEHAVIOURS):
-                self._behave(name)
-            case Say(text=text, language=language) if not self._body.performs(skills.SPEECH):
+            case Express(name=name, strength=strength) if not by_driver(skills.EXPRESSIONS):
+                target = named_poses.expression(robot_type, name, strength)
+                self._mover.move_joints(target, named_poses.EXPRESSION_SPEED)
+            case TakePosture(name=name, speed=speed) if not by_driver(skills.POSTURES):
+                self._mover.move_joints(named_poses.posture(robot_type, name), speed)
+            case RunBehaviour(name=name) if not by_driver(skills.BEHAVIOURS):
+                self._run_behaviour(name)
+            case Say(text=text, language=language) if not by_driver(skills.SPEECH):
                 self._say(text, language)
             case SetStiffness():
-                self._stiffen(skill)
+                self._set_stiffness(skill)
             case _:
                 self.perform(skill)
 
     def perform(self, skill: Skill) -> None:
-        """Have the driver do it, to its end.
+        """Run a skill by the driver, to its end.
 
         Raises:
-            Refused: It cannot, or the action has lost the device.
+            Refused: The driver cannot run it, or the action has ended.
         """
-        if self._body.skills is None:
+        if self._context.skills is None:
             raise Refused("cannot", "this robot's driver has no skills")
-        if not self._mover.over.is_set():
+        if not self._mover.ended.is_set():
             try:
-                self._body.skills.perform(skill, _SkillContext(self._mover))
+                self._context.skills.perform(skill, _SkillContext(self._mover))
             except SkillError as error:
-                raise self._mover.tenure.why or Refused("skill_failed", str(error)) from error
-        self._check()
+                raise self._mover.reservation.why or Refused("skill_failed", str(error)) from error
+        self._check_running()
 
     # ------------------------------------------------------------ speech and behaviours
 
     def _say(self, text: str, language: str) -> None:
-        utterance = self._body.speaker.prepare(text, language)
-        kind = self._body.robot_type
-        if not kind.visemes:
-            self._body.speaker.begin(utterance)
-            self._mover.over.wait(utterance.duration_s)
-            self._check()
+        speech = self._context.speech
+        utterance = speech.prepare(text, language)
+        if not self._context.robot_type.visemes:
+            speech.start(utterance)
+            self._mover.ended.wait(utterance.duration_s)
+            self._check_running()
             return
-        self.come_to_rest()
-        score = BehaviourTrajectory(kind, self._body.controller.commanded_rad)
-        score.speak(Line(0.0, text, utterance.duration_s))
-        course = self._body.controller.go_along(self._mover.tenure, score.way())
-        self._body.speaker.begin(utterance)
-        self._mover.follow(course)
+        self.wait_for_rest()
+        behaviour = BehaviourTrajectory(self._context.robot_type, self._context.controller.commanded_rad)
+        behaviour.add_speech(SpokenLine(0.0, text, utterance.duration_s))
+        goal = self._context.controller.start_trajectory(self._mover.reservation, behaviour.trajectory())
+        speech.start(utterance)
+        self._mover.wait_for(goal)
 
-    def _behave(self, name: str) -> None:
-        kind = self._body.robot_type
-        keyframes = named_poses.named("behaviour", name, kind.behaviours)
-        said = {one.say: self._body.speaker.prepare(one.say, "") for one in keyframes if one.say}
-        self.come_to_rest()
-        score = BehaviourTrajectory(kind, self._body.controller.commanded_rad)
-        lines = score.keyframes(keyframes, {text: utterance.duration_s for text, utterance in said.items()})
-        course = self._body.controller.go_along(self._mover.tenure, score.way())
-        begun_s = time.monotonic()
+    def _run_behaviour(self, name: str) -> None:
+        robot_type, controller = self._context.robot_type, self._context.controller
+        keyframes = named_poses.find("behaviour", name, robot_type.behaviours)
+        utterances = {one.say: self._context.speech.prepare(one.say, "") for one in keyframes if one.say}
+        self.wait_for_rest()
+        behaviour = BehaviourTrajectory(robot_type, controller.commanded_rad)
+        durations_s = {text: utterance.duration_s for text, utterance in utterances.items()}
+        lines = behaviour.add_keyframes(keyframes, durations_s)
+        goal = controller.start_trajectory(self._mover.reservation, behaviour.trajectory())
+        start_s = time.monotonic()
         for line in lines:
-            if course.finished.wait(max(0.0, begun_s + line.begin_s - time.monotonic())):
+            if goal.finished.wait(max(0.0, start_s + line.start_s - time.monotonic())):
                 break
-            self._speak(said[line.text])
-        self._mover.follow(course)
+            self._start_line(utterances[line.text])
+        self._mover.wait_for(goal)
 
-    def _speak(self, utterance: Utterance) -> None:
-        """While something moves."""
-        self._body.speaker.begin(utterance)
-        if self._body.performs(skills.SPEECH):
-            threading.Thread(target=self._aloud, args=(utterance.text,), name="speech", daemon=True).start()
+    def _start_line(self, utterance: Utterance) -> None:
+        """Start to speak while the robot moves."""
+        self._context.speech.start(utterance)
+        if self._context.performs(skills.SPEECH):
+            args = (utterance.text,)
+            threading.Thread(target=self._speak_by_driver, args=args, name="speech", daemon=True).start()
 
-    def _aloud(self, text: str) -> None:
-        with contextlib.suppress(Refused):  # the words of a behaviour that is over, or of a robot that lost its voice
+    def _speak_by_driver(self, text: str) -> None:
+        with contextlib.suppress(Refused):  # the behaviour has ended, or the driver cannot speak now
             self.perform(Say(text=text))
 
     # ------------------------------------------------------------ stiffness
 
-    def _stiffen(self, order: SetStiffness) -> None:
-        """While servos change their strength their joints are commanded to where they are: nothing jumps or drops."""
-        controller = self._body.controller
-        held = before = controller.stiffness(order.joints)
-        self.come_to_rest()
-        controller.stiffen(self._mover.tenure, dict.fromkeys(before, 0.0))
+    def _set_stiffness(self, order: SetStiffness) -> None:
+        """Change the stiffness. Meanwhile the joints are commanded to their measured positions, so that none jumps."""
+        controller = self._context.controller
+        resulting = before = controller.stiffness_of(order.joints)
+        self.wait_for_rest()
+        controller.set_stiffness(dict.fromkeys(before, 0.0), reservation=self._mover.reservation)
+        settle_s = _SETTLE_PERIODS * self._context.robot_type.period_ms / 1000
         try:
-            self._mover.over.wait(_PERIODS * self._body.robot_type.period_ms / 1000)
+            self._mover.ended.wait(settle_s)
             self.perform(order)
-            held = dict.fromkeys(before, order.value)
-            self._mover.over.wait(_PERIODS * self._body.robot_type.period_ms / 1000)
+            resulting = dict.fromkeys(before, order.value)
+            self._mover.ended.wait(settle_s)
         finally:
-            controller.stiffened(held)
+            controller.set_stiffness(resulting)
 
-    # ------------------------------------------------------------ for all of them
+    # ------------------------------------------------------------ shared
 
-    def come_to_rest(self) -> None:
-        """Wait for what the action before left in motion: it brakes by itself.
+    def wait_for_rest(self) -> None:
+        """Wait until the motion of the previous action has braked.
 
         Raises:
-            Refused: The action has lost the device.
+            Refused: The action has ended.
         """
-        until_s = time.monotonic() + _REST_WITHIN_S
-        while self._body.controller.moving and time.monotonic() < until_s:
-            self._mover.over.wait(self._body.robot_type.period_ms / 1000)
-            self._check()
+        deadline_s = time.monotonic() + _REST_TIMEOUT_S
+        while self._context.controller.moving and time.monotonic() < deadline_s:
+            self._mover.ended.wait(self._context.robot_type.period_ms / 1000)
+            self._check_running()
 
-    def _check(self) -> None:
-        if self._mover.over.is_set():
-            raise self._mover.tenure.why or Refused("ended", "the action ended")
+    def _check_running(self) -> None:
+        if self._mover.ended.is_set():
+            raise self._mover.reservation.why or Refused("ended", "the action ended")
 
 
 class _SkillContext:
-    """``Stage`` of one skill."""
+    """``SkillContext`` of one skill."""
 
     def __init__(self, mover: JointMover) -> None:
         self._mover = mover
 
     @property
     def ended(self) -> bool:
-        """See ``Stage``."""
-        return self._mover.over.is_set()
+        return self._mover.ended.is_set()
 
     def wait(self, timeout_s: float) -> bool:
-        """See ``Stage``."""
-        return self._mover.over.wait(timeout_s)
+        return self._mover.ended.wait(timeout_s)
 
     def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
-        """See ``Stage``."""
         try:
             self._mover.move_joints(position_rad, speed)
         except Refused as refused:

@@ -1,4 +1,4 @@
-"""What a device says: as text that everybody can see, and as sound where the machine has a voice."""
+"""Speech output: publishes the text as an event, and the synthesized audio as an upload."""
 
 import logging
 import re
@@ -11,45 +11,46 @@ from device_agent.ports.speech import Speech, SpeechError, Spoken
 from device_agent.ports.uploads import UploadError, Uploads
 from device_agent.protocol import LANGUAGE_PATTERN
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.authority.event_recorder import EventRecord
+from device_agent.runtime.authority.event_recorder import EventRecord, RecordEvent
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.visemes import estimate_duration_s
 
 STREAM = "speech"
-_UPLOAD_WITHIN_S = 2.0
-"""Longer nobody waits for the sound: the text then goes alone, and the robot speaks."""
-_MOST_S = 300.0
+_UPLOAD_TIMEOUT_S = 2.0
+"""If the upload takes longer, the event is published without audio [s]."""
+_MAX_DURATION_S = 300.0
 _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
 class Utterance:
-    """Something that is ready to be said.
+    """A prepared utterance.
 
     Attributes:
-        text: The words; ``language``: as they were asked for.
-        duration_s: How long it takes [s].
-        sound: Whether there is any.
-        upload: Id of the sound in the cloud, once ``stored``.
+        text: The words.
+        language: The requested language.
+        duration_s: Duration [s].
+        has_audio: Whether there is audio.
+        upload: Id of the uploaded audio, once ``stored``.
     """
 
     text: str
     language: str
     duration_s: float
-    sound: bool = False
+    has_audio: bool = False
     upload: str = ""
     stored: threading.Event = field(default_factory=threading.Event)
 
 
 class SpeechOutput:
-    """Who says what one device is to say.
+    """Speech of one device.
 
     Args:
-        device: Its name.
-        speech: The machine's voice; ``None``: none.
-        uploads: Where sounds go, for pages to fetch; ``None``: nowhere.
-        tell: Called with what is said, when it begins.
-        heard: Called with how long that is [s], at the same time.
+        device: Name of the device.
+        speech: Speech synthesis of this machine, if it has one.
+        uploads: Storage for audio, from which the UI fetches it.
+        record: Receives the event when an utterance starts.
+        on_start: Called with the duration [s] when an utterance starts.
     """
 
     def __init__(
@@ -58,36 +59,36 @@ class SpeechOutput:
         *,
         speech: Speech | None = None,
         uploads: Uploads | None = None,
-        tell: Callable[[EventRecord], None] | None = None,
-        heard: Callable[[float], None] | None = None,
+        record: RecordEvent | None = None,
+        on_start: Callable[[float], None] | None = None,
     ) -> None:
         self._device = device
         self._speech = speech
         self._uploads = uploads
-        self._tell = tell
-        self._heard = heard
+        self._record = record
+        self._on_start = on_start
 
     def prepare(self, text: str, language: str) -> Utterance:
-        """Make the sound, and begin to store it. Takes some tenths of a second.
+        """Synthesize the audio, and start its upload. Takes some tenths of a second.
 
         Raises:
-            Refused: There is nothing to say, or no such language.
+            Refused: The text is empty, or the language is invalid.
         """
         if not text.strip():
             raise Refused("nothing_to_say", "there is nothing to say; give a text")
         if re.fullmatch(LANGUAGE_PATTERN, language) is None:
-            raise Refused("bad_language", f"'{language[:40]}' is no language; give one as en, sk, or none")
-        spoken = self._spoken(text, language)
+            raise Refused("bad_language", f"'{language[:40]}' is not a language; use a code such as en or sk, or none")
+        spoken = self._synthesize(text, language)
         if spoken is None:
             return Utterance(text, language, estimate_duration_s(text))
-        utterance = Utterance(text, language, min(spoken.duration_s, _MOST_S), sound=True)
-        threading.Thread(target=self._store, args=(utterance, spoken), name="speech", daemon=True).start()
+        utterance = Utterance(text, language, min(spoken.duration_s, _MAX_DURATION_S), has_audio=True)
+        threading.Thread(target=self._upload, args=(utterance, spoken), name="speech", daemon=True).start()
         return utterance
 
-    def begin(self, utterance: Utterance) -> None:
-        """Tell that it is said from now on; with its sound, if that is stored in time."""
-        if utterance.sound:
-            utterance.stored.wait(_UPLOAD_WITHIN_S)
+    def start(self, utterance: Utterance) -> None:
+        """Publish that an utterance starts; with its audio if the upload finishes in time."""
+        if utterance.has_audio:
+            utterance.stored.wait(_UPLOAD_TIMEOUT_S)
         data: dict[str, object] = {
             "text": utterance.text,
             "language": utterance.language,
@@ -95,12 +96,12 @@ class SpeechOutput:
         }
         if utterance.upload:
             data["upload"] = utterance.upload
-        if self._heard is not None:
-            self._heard(utterance.duration_s)
-        if self._tell is not None:
-            self._tell(EventRecord(EventKind.SPEECH_STARTED, utterance.text, data=data))
+        if self._on_start is not None:
+            self._on_start(utterance.duration_s)
+        if self._record is not None:
+            self._record(EventRecord(EventKind.SPEECH_STARTED, utterance.text, data=data))
 
-    def _spoken(self, text: str, language: str) -> Spoken | None:
+    def _synthesize(self, text: str, language: str) -> Spoken | None:
         if self._speech is None:
             return None
         try:
@@ -109,7 +110,7 @@ class SpeechOutput:
             _log.warning("%s: %s", self._device, error)
             return None
 
-    def _store(self, utterance: Utterance, spoken: Spoken) -> None:
+    def _upload(self, utterance: Utterance, spoken: Spoken) -> None:
         try:
             if self._uploads is not None:
                 utterance.upload = self._uploads.store(

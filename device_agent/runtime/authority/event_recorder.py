@@ -108,7 +108,9 @@ class EventRecorder:
                 repeated.published_s, repeated.count = now_s, 0
             if self._lost:
                 message = f"{self._lost} events were not recorded individually: too many occurred at once"
-                events.append(_stamped(EventRecord(EventKind.EVENTS_DROPPED, message, "warning", {"count": self._lost})))
+                events.append(
+                    _stamped(EventRecord(EventKind.EVENTS_DROPPED, message, "warning", {"count": self._lost}))
+                )
                 self._lost = 0
             return events
 

@@ -1,1 +1,1 @@
-"""Commands."""
+"""Processing of signed commands."""

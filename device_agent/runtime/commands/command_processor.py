@@ -1,6 +1,6 @@
-"""The office of one device: a thread that obeys signed commands one by one and writes the journal.
+"""Processes a device's signed commands sequentially in its own thread; the only writer of the device's journal.
 
-The control loop never waits for disk or network; this thread does.
+This thread may wait for disk and network; the control loop never does.
 """
 
 import contextlib
@@ -43,25 +43,25 @@ from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.telemetry.device_publisher import DevicePublisher, StateSnapshot
 
 _FUTURE_MS = 2000
-"""A command may seem issued this much later than now: more than the error of the clock estimate ever is."""
-_MOST_WAITING = 1000
+"""Tolerance for commands issued in the future; larger than the error of the clock estimate [ms]."""
+_MAX_WAITING = 1000
 _log = logging.getLogger(__name__)
 
 
 class CommandProcessor:
-    """Takes in commands, one after another.
+    """Verifies, deduplicates, applies and acknowledges commands; publishes state and events.
 
     Args:
-        address: Space, agent and name of the device: what a command must be bound to.
-        controller: Leases, Stop.
+        address: Space, agent and name of the device, to which commands must be addressed.
+        controller: Leases and Stop.
         executor: Actions.
-        voice: Answers.
-        audit: What happened, to be told.
+        publisher: Publishes acks, state and events.
+        events: Events to publish.
         journal: Open.
-        cloud_clock: For ``ttl_ms``.
-        keys: The cloud's keys, as far as they are pinned.
-        hurry: Called when a Stop has come: it waits for no control period.
-        ailing: What is wrong with the device though its driver raises no error.
+        cloud_clock: Time for ``ttl_ms``.
+        keys: The cloud's pinned keys.
+        wake: Called after a Stop, so that it does not wait for the next control period.
+        device_faults: Faults that the driver does not raise as errors.
     """
 
     def __init__(
@@ -70,205 +70,206 @@ class CommandProcessor:
         address: tuple[str, str, str],
         controller: Controller,
         executor: ActionExecutor,
-        voice: DevicePublisher,
-        audit: EventRecorder,
+        publisher: DevicePublisher,
+        events: EventRecorder,
         journal: Journal,
         cloud_clock: CloudClock,
         keys: PinnedKeys,
-        hurry: Callable[[], None],
-        ailing: Callable[[], tuple[Fault, ...]] = tuple,
+        wake: Callable[[], None],
+        device_faults: Callable[[], tuple[Fault, ...]] = tuple,
     ) -> None:
         self._address = address
         self._name = address[2]
         self._controller = controller
         self._executor = executor
-        self._voice = voice
-        self._audit = audit
+        self._publisher = publisher
+        self._events = events
         self._journal = journal
         self._cloud_clock = cloud_clock
         self._keys = keys
-        self._hurry = hurry
-        self._ailing = ailing
-        self._handover = PendingControlRequest()
+        self._wake = wake
+        self._device_faults = device_faults
+        self._control_request = PendingControlRequest()
         self._twin: Twin | None = None
-        self._commands: queue.Queue[bytes] = queue.Queue(maxsize=_MOST_WAITING)
-        self._introduce = threading.Event()
+        self._commands: queue.Queue[bytes] = queue.Queue(maxsize=_MAX_WAITING)
+        self._connected = threading.Event()
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"{self._name}-office", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"{self._name}-commands", daemon=True)
 
     def start(self, twin: Twin | None) -> None:
-        """Begin to work.
+        """Start to process commands.
 
         Args:
-            twin: The drawing that ``introduce`` shows.
+            twin: Drawing of the device, published after each connection.
         """
         self._twin = twin
         self._thread.start()
 
     def stop(self) -> None:
-        """Write down what is left, and end. May be called twice."""
+        """Journal and publish the rest, and end. May be called twice."""
         self._stopping.set()
         if self._thread.is_alive():
             self._thread.join(timeout=2)
 
-    def put(self, payload: bytes) -> None:
-        """Hand in a command as it arrived; never blocks.
+    def submit(self, payload: bytes) -> None:
+        """Add a received command to the queue; never blocks.
 
         Raises:
-            Refused: Too many wait.
+            Refused: The queue is full.
         """
         try:
             self._commands.put_nowait(payload)
         except queue.Full as error:
-            raise Refused("overrun", f"{_MOST_WAITING} commands wait already") from error
+            raise Refused("overrun", f"{_MAX_WAITING} commands are waiting already") from error
 
-    def introduce(self) -> None:
-        """The link has come: say soon what the device is, and what may not have been heard."""
-        self._voice.link_came()
-        self._introduce.set()
+    def on_connected(self) -> None:
+        """Publish the description, state and unacknowledged acks soon: the link is up."""
+        self._publisher.on_connected()
+        self._connected.set()
 
     def _run(self) -> None:
         while not self._stopping.is_set():
             with contextlib.suppress(queue.Empty):
                 payload = self._commands.get(timeout=0.1)
-                self._guarded(partial(self._obey, payload))
-            # Each by itself: with a full disk, what is shown and told must go on.
-            for step in (self._keep, self._show, self._tell):
+                self._guarded(partial(self._process, payload))
+            # Guarded separately: with a full disk, state and events are still published.
+            for step in (self._write_journal, self._publish_state, self._publish_events):
                 self._guarded(step)
-        self._guarded(self._keep)
-        self._guarded(partial(self._tell, last=True))
+        self._guarded(self._write_journal)
+        self._guarded(partial(self._publish_events, last=True))
 
     def _guarded(self, step: Callable[[], None]) -> None:
-        """One bad command, or a disk that is full, must not end the office."""
+        """Keep the thread alive on an invalid command or a full disk."""
         try:
             step()
         except JournalError as error:
-            self._journal_failed(error)
+            event = EventRecord(EventKind.JOURNAL_FAILED, str(error), "error")
+            self._events.record_rejection(event, code="journal", now_s=time.monotonic())
         except Exception:  # noqa: BLE001 (see above)
-            _log.exception("%s: office", self._name)
+            _log.exception("%s: command processor", self._name)
 
-    def _journal_failed(self, error: JournalError) -> None:
-        happened = EventRecord(EventKind.JOURNAL_FAILED, str(error), "error")
-        self._audit.refused(happened, code="journal", now_s=time.monotonic())
+    def _publish_state(self) -> None:
+        if self._connected.is_set():
+            self._connected.clear()
+            self._publisher.publish_description(self._twin)
+        self._publisher.publish_state(self._snapshot())
 
-    def _show(self) -> None:
-        if self._introduce.is_set():
-            self._introduce.clear()
-            self._voice.introduce(self._twin)
-        self._voice.show(self._condition())
-
-    def _tell(self, *, last: bool = False) -> None:
-        """Tell what happened; at the last also what a flood has still to say."""
-        for happened in self._audit.take(float("inf") if last else time.monotonic()):
-            if happened.severity == "error":
-                _log.error("%s: %s", self._name, happened.message)
-            self._voice.event(happened)
+    def _publish_events(self, *, last: bool = False) -> None:
+        """Publish the recorded events; at the last call also counted rejections."""
+        for event in self._events.drain(float("inf") if last else time.monotonic()):
+            if event.severity == "error":
+                _log.error("%s: %s", self._name, event.message)
+            self._publisher.publish_event(event)
 
     # ------------------------------------------------------------ one command
 
-    def _obey(self, payload: bytes) -> None:
+    def _process(self, payload: bytes) -> None:
         try:
             command = codec.decode(signing.verify(payload, self._keys), Command)
         except SignatureError as error:
-            self._refuse("bad_signature", str(error))
+            self._record_rejection("bad_signature", str(error))
             return
         except ProtocolError as error:
-            self._refuse("malformed", str(error)[:300])
+            self._record_rejection("malformed", str(error)[:300])
             return
         if (command.space, command.agent, command.device) != self._address:
-            self._refuse("wrong_address", "it is addressed to another device", command)
+            self._record_rejection("wrong_address", "it is addressed to another device", command)
             return
-        first = self._voice.ack(command.id, AckStatus.RECEIVED)
-        seen = self._journal.begin(self._name, first)
-        if seen is not None:
-            self._voice.send_ack(seen)
+        first = self._publisher.create_ack(command.id, AckStatus.RECEIVED)
+        previous = self._journal.begin(self._name, first)
+        if previous is not None:
+            self._publisher.send_ack(previous)
             return
         try:
             self._check_time(command)
-            self._write_down(command.epoch)
-            self._carry_out(command)
+            self._journal_epoch(command.epoch)
+            self._apply(command)
         except Refused as refused:
-            self._end_refused(command, refused)
+            self._reject(command, refused)
         except JournalError:
             raise
-        except Exception as error:  # noqa: BLE001 (whoever asked must hear an end of it)
+        except Exception as error:  # noqa: BLE001 (every command gets a terminal ack)
             _log.exception("%s: command %s", self._name, command.id)
-            self._end_refused(command, Refused("internal", f"internal error: {error}; look at the agent's log"))
+            self._reject(command, Refused("internal", f"internal error: {error}; see the agent's log"))
 
-    def _end_refused(self, command: Command, refused: Refused) -> None:
+    def _reject(self, command: Command, refused: Refused) -> None:
         status = AckStatus.EXPIRED if refused.code == "expired" else AckStatus.FAILED
-        self._voice.report(command.id, status, reason=Reason(code=refused.code, message=refused.message[:2000]))
-        self._refuse(refused.code, refused.message[:2000], command)
+        self._publisher.report(command.id, status, reason=Reason(code=refused.code, message=refused.message[:2000]))
+        self._record_rejection(refused.code, refused.message[:2000], command)
 
-    def _refuse(self, code: str, message: str, command: Command | None = None) -> None:
-        _log.warning("%s: command %s refused: %s", self._name, command.id if command else "", message)
-        self._voice.count(code)
+    def _record_rejection(self, code: str, message: str, command: Command | None = None) -> None:
+        _log.warning("%s: command %s rejected: %s", self._name, command.id if command else "", message)
+        self._publisher.count_rejection(code)
         data: dict[str, object] = {"code": code}
         if command is not None:
             request = type(command.request).__struct_config__.tag
             data |= {"command": command.id, "request": request, "caller": command.caller, "epoch": command.epoch}
-        happened = EventRecord(EventKind.COMMAND_REJECTED, f"a command was refused: {message}", "warning", data)
-        self._audit.refused(happened, code=code, now_s=time.monotonic())
+        event = EventRecord(EventKind.COMMAND_REJECTED, f"a command was rejected: {message}", "warning", data)
+        self._events.record_rejection(event, code=code, now_s=time.monotonic())
 
     def _check_time(self, command: Command) -> None:
         if isinstance(command.request, StopDevice):
-            return  # a late Stop is still a Stop
+            return  # a late Stop still stops
         now_ms = self._cloud_clock.now_ms()
         if now_ms is None:
             raise Refused("no_clock", "the device does not know the cloud's time yet; send it again")
         if now_ms > command.issued_at_ms + command.ttl_ms:
             late = round(now_ms - command.issued_at_ms - command.ttl_ms)
-            raise Refused("expired", f"arrived {late} ms after it had run out")
+            raise Refused("expired", f"arrived {late} ms after it had expired")
         if command.issued_at_ms > now_ms + _FUTURE_MS:
             raise Refused("from_the_future", "issued later than now; the cloud's clock or this device's is wrong")
 
-    def _write_down(self, epoch: int) -> None:
-        """Journal a newer epoch before it is obeyed: killed in between, the agent must not obey an older one again."""
-        known, burned = self._controller.epochs
-        if epoch > known:
+    def _journal_epoch(self, epoch: int) -> None:
+        """Journal a newer epoch before applying it, so that a restarted agent never accepts an older one."""
+        highest, burned = self._controller.epochs
+        if epoch > highest:
             self._journal.save_epoch(self._name, epoch=epoch, burned=burned)
 
-    def _carry_out(self, command: Command) -> None:
+    def _apply(self, command: Command) -> None:
         now_s = time.monotonic()
         match command.request:
             case GrantLease(holder=holder, lease_ms=lease_ms, reason=reason):
                 self._controller.grant(
                     epoch=command.epoch, holder=holder, lease_s=lease_ms / 1000, now_s=now_s, reason=reason
                 )
-            case RequestControl() as asked:
-                self._handover.ask(asked, epoch=command.epoch, lease=self._controller.lease(now_s), now_s=now_s)
+            case RequestControl() as request:
+                lease = self._controller.lease(now_s)
+                self._control_request.open(request, epoch=command.epoch, lease=lease, now_s=now_s)
             case WithdrawRequest(request=request):
-                self._handover.drop(request)
+                self._control_request.withdraw(request)
             case ReleaseLease():
                 self._controller.release(epoch=command.epoch)
             case StopDevice(reason=reason):
                 self._controller.stop(StopLatch(caller=command.caller, reason=reason, at_ms=wall_ms()))
-                self._hurry()
+                self._wake()
             case ResetStop():
-                latched = self._controller.latch is not None
-                self._controller.reset_stop(epoch=command.epoch)
-                if latched:
-                    message = f"Stop was reset by {command.caller}"
-                    self._audit.note(EventRecord(EventKind.STOP_RESET, message, data={"caller": command.caller}))
-                _log.warning("%s: Stop reset by %s", self._name, command.caller)
+                self._reset_stop(command)
             case RotateKey(statements=statements):
                 self._keys.follow(statements)
             case CancelAction(action=action):
                 self._executor.cancel(action, command.caller)
-            case order:  # an action
-                # Journalled before it begins: after a crash here it is ended, never run again.
-                self._voice.pass_by(command.id, AckStatus.ACCEPTED)
-                self._executor.start(command, order)
-                self._keep()
+            case action:
+                # Journalled before it starts: after a crash it is ended, never run again.
+                self._publisher.ack_transient(command.id, AckStatus.ACCEPTED)
+                self._executor.start(command, action)
+                self._write_journal()
                 return
-        self._keep()
-        self._voice.report(command.id, AckStatus.DONE)
+        self._write_journal()
+        self._publisher.report(command.id, AckStatus.DONE)
 
-    # ------------------------------------------------------------ what is kept and shown
+    def _reset_stop(self, command: Command) -> None:
+        was_latched = self._controller.latch is not None
+        self._controller.reset_stop(epoch=command.epoch)
+        message = f"Stop was reset by {command.caller}"
+        if was_latched:
+            self._events.record(EventRecord(EventKind.STOP_RESET, message, data={"caller": command.caller}))
+        _log.warning("%s: %s", self._name, message)
 
-    def _keep(self) -> None:
-        """Write down epochs and latch when they have changed, and which answers have arrived."""
-        self._voice.keep()
+    # ------------------------------------------------------------ journal and state
+
+    def _write_journal(self) -> None:
+        """Journal delivered acks, and epochs and latch if they have changed."""
+        self._publisher.record_delivered()
         if self._controller.changed.is_set():
             self._controller.changed.clear()
             epoch, burned = self._controller.epochs
@@ -276,17 +277,17 @@ class CommandProcessor:
                 self._journal.save_epoch(self._name, epoch=epoch, burned=burned)
                 self._journal.save_latch(self._name, self._controller.latch)
             except JournalError:
-                self._controller.changed.set()  # still to be written, as soon as that goes again
+                self._controller.changed.set()  # written once the journal works again
                 raise
 
     def _faults(self) -> tuple[Fault, ...]:
-        """What lasts: an error of the driver, or else what it does not tell of itself."""
+        """The driver's error, or else the faults that the driver does not raise."""
         fault = self._controller.fault
         if fault is not None:
             return (Fault(code="driver", message=fault[:2000], since_ms=wall_ms()),)
-        return self._ailing()
+        return self._device_faults()
 
-    def _condition(self) -> StateSnapshot:
+    def _snapshot(self) -> StateSnapshot:
         now_s = time.monotonic()
         epoch, ended = self._controller.epochs
         lease = self._controller.lease(now_s)
@@ -295,12 +296,12 @@ class CommandProcessor:
             epoch=epoch,
             ended=ended,
             lease=lease,
-            asked=self._handover.current(lease, now_s),
+            control_request=self._control_request.current(lease, now_s),
             latch=self._controller.latch,
             faults=self._faults(),
             action=self._executor.current(),
             restrictions=tuple(
                 Restriction(source=one.source, speed=one.speed, reason=one.why) for one in self._controller.restrictions
             ),
-            stiffness=self._controller.slack,
+            stiffness=self._controller.reduced_stiffness,
         )

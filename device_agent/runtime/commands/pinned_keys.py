@@ -1,4 +1,4 @@
-"""The keys whose orders the agent obeys: pinned when it was claimed, and followed when the cloud gets new ones."""
+"""Public keys of the cloud that the agent accepts: pinned at pairing, and followed when the cloud rotates them."""
 
 import logging
 import threading
@@ -20,13 +20,13 @@ ADVICE = "run `python -m device_agent repin` on this machine, or un-pair the age
 
 
 class PinnedKeys(Mapping[str, Ed25519PublicKey]):
-    """Pinned keys that count now, by key id. Thread-safe: every device and the link look here.
+    """Valid pinned keys by key id. Thread-safe: every device and the link use it.
 
     Args:
-        pairing: With the keys as they are on file.
-        save: Writes the pairing; a new key counts only after that.
-        now_ms: The cloud's time [ms], or ``None`` while it is not known. Then no key ends: all that is obeyed without
-            the time is a Stop.
+        pairing: With the stored keys.
+        save: Stores the pairing; a new key is valid only after that.
+        now_ms: The cloud's time [ms], or ``None`` while it is unknown. Then no key expires, but without the time the
+            agent accepts only a Stop.
     """
 
     def __init__(
@@ -37,18 +37,18 @@ class PinnedKeys(Mapping[str, Ed25519PublicKey]):
         self._keys = pairing.public_keys()
         self._save = save
         self._now_ms = now_ms
-        self._complained = ""
+        self._reported = ""
 
     def __getitem__(self, name: str) -> Ed25519PublicKey:
         with self._lock:
             key = self._keys[name]
-            if self._ended(self._pairing, name):
+            if self._expired(self._pairing, name):
                 raise KeyError(name)
             return key
 
     def __iter__(self) -> Iterator[str]:
         with self._lock:
-            names = [name for name in self._keys if not self._ended(self._pairing, name)]
+            names = [name for name in self._keys if not self._expired(self._pairing, name)]
         return iter(names)
 
     def __len__(self) -> int:
@@ -56,27 +56,27 @@ class PinnedKeys(Mapping[str, Ed25519PublicKey]):
 
     @property
     def serial(self) -> int:
-        """The newest key's."""
+        """Serial number of the newest key."""
         with self._lock:
             return self._pairing.serial
 
     def follow(self, statements: Iterable[str]) -> None:
-        """Pin what the statements lead to, oldest first; those of keys that are pinned already change nothing.
+        """Pin the keys that the statements introduce, oldest first. Keys that are pinned already are skipped.
 
         Raises:
-            Refused: Not signed with a pinned key that still counts, over, or leading back to an older key.
+            Refused: Not signed with a valid pinned key, expired, or a return to an older key.
         """
         for statement in statements:
             with self._lock:
                 self._follow(statement.encode())
 
     def check(self, name: str) -> None:
-        """Complain, once, when the cloud signs orders with a key that is not pinned."""
+        """Log once if the cloud signs commands with a key that is not pinned."""
         if not name or name in self:
             return
-        if self._complained != name:
-            self._complained = name
-            _log.error("the cloud signs its orders with key %s, which this agent has not learned: %s", name, ADVICE)
+        if self._reported != name:
+            self._reported = name
+            _log.error("the cloud signs commands with key %s, which this agent has not pinned: %s", name, ADVICE)
 
     def _follow(self, statement: bytes) -> None:
         before = self._pairing
@@ -86,41 +86,38 @@ class PinnedKeys(Mapping[str, Ed25519PublicKey]):
             new = codec.decode(signing.verify(statement, self._keys, context=key_rotation.KEYS_CONTEXT), NewKey)
             key = signing.public_key(new.key)
         except SignatureError as error:
-            if self._known(statement):
+            if self._is_pinned(statement):
                 return
-            raise Refused("bad_signature", f"the statement of a new key is refused: {error}; {ADVICE}") from error
+            raise Refused("bad_signature", f"the statement of a new key is rejected: {error}; {ADVICE}") from error
         except ProtocolError as error:
-            raise Refused("malformed", f"the statement of a new key cannot be read: {error}") from error
+            raise Refused("malformed", f"the statement of a new key is invalid: {error}") from error
         name = signing.key_id(key)
         if name in self._keys and new.serial <= before.serial:
             return
         if new.serial <= before.serial:
             raise Refused("rolled_back", f"key {new.serial} is not newer than key {before.serial}, which is pinned")
         if before.until_ms.get(signer):
-            raise Refused("rolled_back", f"key {new.serial} is told of by a key that has a successor already; {ADVICE}")
+            raise Refused("rolled_back", f"key {new.serial} is signed by a key that has a successor already; {ADVICE}")
         if now_ms is None:
             raise Refused("no_clock", "the device does not know the cloud's time yet; send it again")
         if now_ms >= new.former_until_ms:
-            raise Refused("expired", f"the key that tells of a new one is over; {ADVICE}")
+            raise Refused("expired", f"the key that signed the statement has expired; {ADVICE}")
+        valid = {old: text for old, text in before.keys.items() if not self._expired(before, old)}
         pairing = replace(
             before,
-            keys={old: text for old, text in before.keys.items() if not self._ended(before, old)} | {name: new.key},
-            until_ms={
-                old: min(before.until_ms.get(old) or new.former_until_ms, new.former_until_ms)
-                for old in before.keys
-                if not self._ended(before, old)
-            },
+            keys=valid | {name: new.key},
+            until_ms={old: min(before.until_ms.get(old) or new.former_until_ms, new.former_until_ms) for old in valid},
             serial=new.serial,
         )
         try:
             self._save(pairing)
         except ConfigError as error:
-            raise Refused("journal", f"the new key could not be written down: {error}") from error
+            raise Refused("journal", f"the new key could not be stored: {error}") from error
         self._pairing, self._keys = pairing, pairing.public_keys()
         _log.info("the cloud has a new key, %s (number %d)", name, new.serial)
 
-    def _known(self, statement: bytes) -> bool:
-        """Whether it tells of a key that is pinned already, and was signed by one that is so no longer."""
+    def _is_pinned(self, statement: bytes) -> bool:
+        """Whether a statement introduces a key that is pinned already; its signer may have expired since."""
         try:
             body = codec.decode(bytes(codec.decode(statement, signing.Signed).body), NewKey)
             name = signing.key_id(signing.public_key(body.key))
@@ -128,6 +125,6 @@ class PinnedKeys(Mapping[str, Ed25519PublicKey]):
             return False
         return name in self._keys and body.serial <= self._pairing.serial
 
-    def _ended(self, pairing: Pairing, name: str) -> bool:
+    def _expired(self, pairing: Pairing, name: str) -> bool:
         until_ms, now_ms = pairing.until_ms.get(name, 0), self._now_ms()
         return bool(until_ms) and now_ms is not None and now_ms >= until_ms

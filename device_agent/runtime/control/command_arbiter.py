@@ -108,9 +108,7 @@ class CommandArbiter:
             self._state.motion.brake()
         else:
             goals.goal.add_limits((obstacle.text,))
-            goals.interrupt(
-                Refused("no_room", f"something is in the way: {obstacle.text}; the device holds before it")
-            )
+            goals.interrupt(Refused("no_room", f"something is in the way: {obstacle.text}; the device holds before it"))
 
     def _select_mode(self, now_s: float) -> Mode:
         authority, goals, stream = self._state.authority, self._state.goals, self._state.stream

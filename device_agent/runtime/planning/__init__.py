@@ -1,1 +1,1 @@
-"""Planning."""
+"""Planning of joint trajectories, gaze, speech movements and navigation."""

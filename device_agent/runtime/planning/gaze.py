@@ -1,4 +1,4 @@
-"""Turns what a robot sees with towards a point: of all ways to look there, the one with the least motion."""
+"""Gaze: joint positions with which a robot looks at a point, with the least motion."""
 
 from collections.abc import Sequence
 
@@ -10,29 +10,29 @@ from device_agent.protocol import Pose, Vector3
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
 
-_ROUNDS = 60
-_NUDGE_RAD = 1e-5
+_ITERATIONS = 60
+_STEP_RAD = 1e-5
 _NEAR_RAD = 5e-4
 _DAMPING = 1e-3
-_LONGEST_STEP_RAD = 0.3
-_NEAREST_M = 1e-3
+_MAX_STEP_RAD = 0.3
+_MIN_DISTANCE_M = 1e-3
 
 Array = NDArray[np.float64]
 
 
-def aim(
+def solve_gaze(
     robot_type: RobotType, geometry: RobotGeometry, start_rad: Sequence[float], point_m: Vector3
 ) -> dict[str, float]:
-    """Where the joints of the gaze have to be [rad].
+    """Positions of the gaze joints [rad].
 
     Args:
-        robot_type: With a ``gaze``, which names frame, axis and joints.
-        geometry: The robot's shape.
-        start_rad: Where all joints are, shape (n,) [rad].
+        robot_type: Its ``gaze`` names frame, axis and joints.
+        geometry: Shape of the robot.
+        start_rad: Present positions of all joints, shape (n,) [rad].
         point_m: The point in the robot's base frame [m].
 
     Raises:
-        Refused: It cannot look there.
+        Refused: The robot cannot look there.
     """
     gaze = robot_type.gaze
     if gaze is None:
@@ -44,40 +44,40 @@ def aim(
     axis = np.array(gaze.axis) / np.linalg.norm(gaze.axis)
 
     def error(joints: Array) -> Array:
-        """From where it looks to where it should, as unit vectors, one frame after the other."""
+        """Differences between actual and required viewing directions, frame after frame."""
         position = np.array(start_rad, dtype=float)
         position[turning] = joints
         poses = geometry.poses(position.tolist())
-        return np.concatenate([_beside(poses[frame], axis, point_m) for frame in (gaze.frame, *gaze.additional_frames)])
+        return np.concatenate(
+            [_direction_error(poses[frame], axis, point_m) for frame in (gaze.frame, *gaze.additional_frames)]
+        )
 
     joints = np.clip(np.array(start_rad, dtype=float)[turning], lower, upper)
-    for _ in range(_ROUNDS):
-        now = error(joints)
-        if float(np.linalg.norm(now)) < _NEAR_RAD:
+    for _ in range(_ITERATIONS):
+        current = error(joints)
+        if float(np.linalg.norm(current)) < _NEAR_RAD:
             return {names[index]: float(value) for index, value in zip(turning, joints, strict=True)}
         slopes = np.column_stack(
-            [(error(joints + step) - now) / _NUDGE_RAD for step in np.eye(len(turning)) * _NUDGE_RAD]
+            [(error(joints + step) - current) / _STEP_RAD for step in np.eye(len(turning)) * _STEP_RAD]
         )
-        # Far from the point much damping: else eyes and neck turn against one another, which changes next to nothing.
-        square = slopes @ slopes.T + (_DAMPING + float(now @ now)) * np.eye(len(now))
-        step = -slopes.T @ np.linalg.solve(square, now)
-        joints = np.clip(
-            joints + step * min(1.0, _LONGEST_STEP_RAD / max(float(np.abs(step).max()), 1e-12)), lower, upper
-        )
+        # Strong damping far from the point prevents eyes and neck from turning against each other.
+        square = slopes @ slopes.T + (_DAMPING + float(current @ current)) * np.eye(len(current))
+        step = -slopes.T @ np.linalg.solve(square, current)
+        joints = np.clip(joints + step * min(1.0, _MAX_STEP_RAD / max(float(np.abs(step).max()), 1e-12)), lower, upper)
     raise Refused("out_of_reach", f"{', '.join(gaze.joints)} cannot turn far enough to look there")
 
 
-def _beside(pose: Pose, axis: Array, point_m: Vector3) -> Array:
-    """From where a frame looks to where it should, as unit vectors."""
-    way = np.array(point_m) - np.array(pose[:3])
-    far = float(np.linalg.norm(way))
-    if far < _NEAREST_M:
-        raise Refused("out_of_reach", "the point is inside of what it looks with")
-    return np.asarray(way / far - _turned(pose, axis))
+def _direction_error(pose: Pose, axis: Array, point_m: Vector3) -> Array:
+    """Difference between the actual and the required viewing direction of a frame, as unit vectors."""
+    offset = np.array(point_m) - np.array(pose[:3])
+    distance = float(np.linalg.norm(offset))
+    if distance < _MIN_DISTANCE_M:
+        raise Refused("out_of_reach", "the point is inside the frame that looks")
+    return np.asarray(offset / distance - _rotated(pose, axis))
 
 
-def _turned(pose: Pose, axis: Array) -> Array:
-    """An axis of a frame, in the base."""
+def _rotated(pose: Pose, axis: Array) -> Array:
+    """An axis of a frame, in the base frame."""
     w, vector = pose[3], np.array(pose[4:])
     around = 2 * np.cross(vector, axis)
     return np.asarray(axis + w * around + np.cross(vector, around))

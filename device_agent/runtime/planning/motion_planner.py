@@ -1,4 +1,4 @@
-"""Finds ways to go along before anything moves: around things, or straight through space. Never in the control loop."""
+"""Motion planning: collision-free and straight-line trajectories. Never called in the control loop."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -13,24 +13,24 @@ from device_agent.runtime.planning import trajectory
 from device_agent.runtime.planning.joint_couplings import Couplings
 from device_agent.runtime.planning.trajectory import Floats, Trajectory
 
-_SEARCH_S = 5.0
-_SEEDS = 3
+_SEARCH_TIMEOUT_S = 5.0
+_ATTEMPTS = 3
 _STEP_M, _STEP_RAD = 0.01, 0.05
-"""Between places of a straight way, for which joint positions are found one after the other."""
-_LEAP_RAD = 0.3
-"""A joint that turns by more between two of them goes to another posture: no straight way."""
-_APART_RAD = 0.03
-"""Of the points through which a straight way is drawn: between them it strays by less than a tenth of a millimetre."""
-_SHORTEST = 1e-6
+"""Distance between poses on a straight path for which inverse kinematics is solved."""
+_MAX_CHANGE_RAD = 0.3
+"""A joint that turns further between two poses changes its configuration: the path is not straight [rad]."""
+_SPACING_RAD = 0.03
+"""Spacing of the points of a straight path; between them it deviates by less than a tenth of a millimetre [rad]."""
+_MIN_NORM = 1e-6
 
 
 class MotionPlanner:
-    """Ways of one robot.
+    """Motion planner of one robot.
 
     Args:
         robot_type: Joints and limits.
-        geometry: The robot's shape.
-        seed: Of the search for a way: the same finds the same.
+        geometry: Shape of the robot.
+        seed: Seed of the search, for reproducible results.
     """
 
     def __init__(self, robot_type: RobotType, geometry: RobotGeometry, *, seed: int = 0) -> None:
@@ -39,88 +39,91 @@ class MotionPlanner:
         self._geometry = geometry
         self._couplings = Couplings(robot_type)
 
-    def around(
+    def plan(
         self, start_rad: Sequence[float], goal_rad: Sequence[float], *, speed: float, ended: Callable[[], bool]
     ) -> Trajectory:
-        """A way around what is near, rounded off where there is room for it.
+        """A collision-free trajectory with blended corners.
 
         Args:
-            start_rad: Where the joints are, shape (n,) [rad].
-            goal_rad: Where they shall be, shape (n,) [rad].
+            start_rad: Start positions, shape (n,) [rad].
+            goal_rad: Goal positions, shape (n,) [rad].
             speed: Share of each joint's velocity limit.
-            ended: Whether nobody wants it any more.
+            ended: Whether the caller has ended the search.
 
         Raises:
-            Refused: None was found, or whoever looks for it has ended.
+            Refused: No path was found, or the search was ended.
         """
-        for seed in range(_SEEDS):
+        for seed in range(_ATTEMPTS):
             try:
                 corners = self._geometry.plan(
-                    start_rad, goal_rad, seed=self._seed + seed, within_s=_SEARCH_S, ended=ended
+                    start_rad, goal_rad, seed=self._seed + seed, within_s=_SEARCH_TIMEOUT_S, ended=ended
                 )
             except PlannerLostError as error:
                 raise Refused("planner_lost", str(error)) from error
             except GeometryError as error:
                 raise Refused("no_way", str(error)) from error
-            points = trajectory.blend_corners(corners, self._clear)
+            points = trajectory.blend_corners(corners, self._is_clear)
             if points is not None:
-                return self._timed(points, speed)
-        raise Refused("no_way", "what was found is too narrow to go along; move to a place with more room first")
+                return self._parameterize(points, speed)
+        raise Refused("no_way", "the paths that were found are too narrow; move to a place with more room first")
 
-    def straight(self, start_rad: Sequence[float], frame: str, pose: Pose, *, speed: float) -> Trajectory:
-        """A way on which a frame goes straight to a pose, and turns evenly.
+    def plan_straight(self, start_rad: Sequence[float], frame: str, pose: Pose, *, speed: float) -> Trajectory:
+        """A trajectory on which a frame moves straight to a pose, and turns at a constant rate.
 
         Args:
-            start_rad: Where the joints are, shape (n,) [rad].
+            start_rad: Start positions, shape (n,) [rad].
             frame: One of the geometry's frames.
-            pose: In the robot's base frame.
+            pose: Target pose in the robot's base frame.
             speed: Share of each joint's velocity limit.
 
         Raises:
-            Refused: It cannot go there, not straight, or something is in the way.
+            Refused: Out of reach, not straight, or something is in the way.
         """
-        begin = self._geometry.poses(start_rad)[frame]
-        turn = _between(begin[3:], pose[3:])
+        start = self._geometry.poses(start_rad)[frame]
+        turn = _rotation_between(start[3:], pose[3:])
         steps = max(
             2,
-            math.ceil(math.dist(begin[:3], pose[:3]) / _STEP_M),
+            math.ceil(math.dist(start[:3], pose[:3]) / _STEP_M),
             math.ceil(2 * math.acos(min(1.0, abs(turn[0]))) / _STEP_RAD),
         )
         points = [np.array(start_rad)]
         for step in range(1, steps + 1):
             share = step / steps
-            x, y, z = (a + share * (b - a) for a, b in zip(begin[:3], pose[:3], strict=True))
+            x, y, z = (a + share * (b - a) for a, b in zip(start[:3], pose[:3], strict=True))
             try:
-                turned = _times(begin[3:], _part(turn, share))
-                found = self._geometry.solve(frame, (x, y, z, *turned), points[-1].tolist())
+                turned = _times(start[3:], _scale(turn, share))
+                solution = self._geometry.solve(frame, (x, y, z, *turned), points[-1].tolist())
             except GeometryError as error:
                 raise Refused("out_of_reach", f"{share:.0%} of the way there: {error}") from error
-            points.append(np.array(found))
-            if float(np.max(np.abs(points[-1] - points[-2]))) > _LEAP_RAD:
+            points.append(np.array(solution))
+            if float(np.max(np.abs(points[-1] - points[-2]))) > _MAX_CHANGE_RAD:
                 raise Refused(
                     "not_straight",
-                    f"{frame} cannot go straight there: {share:.0%} of the way on the robot would have to take "
-                    "another posture; go without straight, or with plan",
+                    f"{frame} cannot go straight there: at {share:.0%} of the way the robot would have to change its "
+                    "configuration; use straight=False or plan=True",
                 )
         swept = self._geometry.sweep([point.tolist() for point in points])
         if swept.clearance is not None:
-            raise Refused("no_room", f"something is in the way: {swept.clearance.text}; go with plan")
-        return self._timed(trajectory.resample(np.array(points), _APART_RAD), speed)
+            raise Refused("no_room", f"something is in the way: {swept.clearance.text}; use plan=True")
+        return self._parameterize(trajectory.resample(np.array(points), _SPACING_RAD), speed)
 
-    def _timed(self, points: Floats, speed: float) -> Trajectory:
+    def _parameterize(self, points: Floats, speed: float) -> Trajectory:
         return trajectory.time_parameterize(points, self._type.joints, speed=speed, step_s=self._type.period_ms / 1000)
 
-    def _clear(self, path_rad: Floats) -> bool:
-        return not self._couplings.parted(path_rad) and self._geometry.sweep(path_rad.tolist()).clearance is None
+    def _is_clear(self, path_rad: Floats) -> bool:
+        return (
+            not self._couplings.describe_violation(path_rad)
+            and self._geometry.sweep(path_rad.tolist()).clearance is None
+        )
 
 
 def quaternion_of(
     poses: Mapping[str, Pose], frame: str, quaternion: Quaternion | None, rpy_rad: Vector3 | None
 ) -> Quaternion:
-    """The orientation that is asked for, of length 1; the frame's own where none is.
+    """The requested orientation as a unit quaternion; without a request, that of the frame.
 
     Raises:
-        Refused: No such frame, both are given, or no direction.
+        Refused: Unknown frame, two orientations, or a quaternion of length 0.
     """
     if frame not in poses:
         raise Refused("unknown_frame", f"no frame '{frame[:80]}'; there are {', '.join(poses)}")
@@ -130,7 +133,7 @@ def quaternion_of(
         return _from_rpy(rpy_rad)
     w, x, y, z = poses[frame][3:] if quaternion is None else quaternion
     length = math.hypot(w, x, y, z)
-    if not _SHORTEST < length < math.inf:
+    if not _MIN_NORM < length < math.inf:
         raise Refused("bad_quaternion", "the quaternion (w, x, y, z) has no direction")
     return (w / length, x / length, y / length, z / length)
 
@@ -146,19 +149,19 @@ def _from_rpy(rpy_rad: Vector3) -> Quaternion:
     )
 
 
-def _between(begin: Quaternion, end: Quaternion) -> Quaternion:
-    """The shorter turn from one orientation to another, in the first's own axes."""
-    w, x, y, z = begin
+def _rotation_between(start: Quaternion, end: Quaternion) -> Quaternion:
+    """The shorter rotation from one orientation to another, in the axes of the first."""
+    w, x, y, z = start
     turn = _times((w, -x, -y, -z), end)
     sign = math.copysign(1.0, turn[0])
     return (sign * turn[0], sign * turn[1], sign * turn[2], sign * turn[3])
 
 
-def _part(turn: Quaternion, share: float) -> Quaternion:
-    """A share of a turn."""
+def _scale(turn: Quaternion, share: float) -> Quaternion:
+    """A share of a rotation."""
     w, *axis = turn
     size = math.hypot(*axis)
-    if size < _SHORTEST:
+    if size < _MIN_NORM:
         return (1.0, 0.0, 0.0, 0.0)
     half = math.atan2(size, w) * share
     x, y, z = (math.sin(half) * part / size for part in axis)

@@ -1,4 +1,4 @@
-"""What a robot type's manifest says how to show: where the joints have to be."""
+"""Joint positions of the expressions and postures in a robot type's manifest."""
 
 from collections.abc import Mapping
 from typing import TypeVar
@@ -7,24 +7,24 @@ from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
 
 EXPRESSION_SPEED = 0.5
-"""Share of each joint's velocity limit with which an expression comes: a face that snaps frightens."""
+"""Share of each joint's velocity limit for expressions: a face that snaps is unpleasant to watch."""
 
 T = TypeVar("T")
 
 
 def expression(robot_type: RobotType, name: str, strength: float) -> dict[str, float]:
-    """Joint positions of an expression, so much of the way from home [rad].
+    """Joint positions of an expression, scaled by ``strength`` from home [rad].
 
-    Joints that only other expressions move are brought home: a smile must not be left in a frown.
+    Joints that only other expressions move return home, so that expressions do not mix.
 
     Raises:
-        Refused: There is no such expression.
+        Refused: The expression is unknown.
     """
-    shown = named("expression", name, robot_type.expressions)
+    positions_rad = find("expression", name, robot_type.expressions)
     moved = {joint for positions in robot_type.expressions.values() for joint in positions}
     home_rad = robot_type.home_rad
     return {
-        joint: home_rad[joint] + strength * (shown.get(joint, home_rad[joint]) - home_rad[joint])
+        joint: home_rad[joint] + strength * (positions_rad.get(joint, home_rad[joint]) - home_rad[joint])
         for joint in home_rad
         if joint in moved
     }
@@ -34,18 +34,18 @@ def posture(robot_type: RobotType, name: str) -> dict[str, float]:
     """Joint positions of a posture [rad].
 
     Raises:
-        Refused: There is no such posture.
+        Refused: The posture is unknown.
     """
-    return named("posture", name, robot_type.postures)
+    return find("posture", name, robot_type.postures)
 
 
-def named(word: str, name: str, there: Mapping[str, T]) -> T:
-    """One of several things that have names.
+def find(kind: str, name: str, items: Mapping[str, T]) -> T:
+    """The item with this name.
 
     Raises:
-        Refused: There is no such thing; the text lists what there is.
+        Refused: The name is unknown; the text lists the valid names.
     """
-    found = there.get(name)
-    if found is None:
-        raise Refused(f"unknown_{word}", f"no {word} '{name[:80]}'; there are {', '.join(there) or 'none'}")
-    return found
+    item = items.get(name)
+    if item is None:
+        raise Refused(f"unknown_{kind}", f"no {kind} '{name[:80]}'; there are {', '.join(items) or 'none'}")
+    return item

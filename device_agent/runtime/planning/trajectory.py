@@ -1,4 +1,4 @@
-"""Ways through joint space: corners rounded off, and a time for each place at which no joint exceeds its limits."""
+"""Joint-space trajectories: corner blending, resampling and time parameterization."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,27 +10,27 @@ from device_agent.protocol import Joint
 
 Floats = npt.NDArray[np.float64]
 
-_ROUNDING_RAD = (0.8, 0.5, 0.3, 0.2, 0.12, 0.08, 0.05, 0.03)
-"""How far apart the points are that draw a way round a corner: the first that leaves it clear counts."""
-_LOOKS = 4
-"""Places of each span of the spline between which the way is looked at."""
-_LEGS = 8
-"""Legs of a way that are looked at together: few things are near a short way."""
+_SPACINGS_RAD = (0.8, 0.5, 0.3, 0.2, 0.12, 0.08, 0.05, 0.03)
+"""Spacings of the spline points that blend a corner, widest first; the first collision-free one is used [rad]."""
+_CHECKS = 4
+"""Collision checks in each span of the spline."""
+_BATCH = 8
+"""Segments that are checked together: few obstacles are near a short path."""
 _GRID = 16
-"""Places of each span for which a speed is found."""
-_TURNING = 0.5
-"""Share of acceleration and jerk that bends may use; the rest is for speeding up and slowing down in them."""
+"""Points of each span for which a speed is computed."""
+_CURVE_SHARE = 0.5
+"""Share of acceleration and jerk for curvature; the rest is for changes of speed."""
 _STEP_S = 0.001
-_FITS = 1.005
-_TRIES = 10
-_NOTHING = 1e-9
+_TOLERANCE = 1.005
+_ITERATIONS = 10
+_EPSILON = 1e-9
 # A uniform cubic B-spline in one span: rows for 1, u, u², u³ of the share of the span, columns for its four points.
 _SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Where all joints are at each moment of a motion from rest to rest.
+    """Positions, velocities and accelerations of all joints in a motion from rest to rest.
 
     Attributes:
         step_s: Time between two samples [s].
@@ -46,48 +46,48 @@ class Trajectory:
 
     @property
     def duration_s(self) -> float:
-        """How long it takes when nothing slows it [s]."""
+        """Duration at full speed [s]."""
         return (len(self.position_rad) - 1) * self.step_s
 
     def at(self, time_s: float) -> tuple[Floats, Floats, Floats]:
-        """Position, velocity and acceleration, shape (n,) each; before its beginning and after its end it rests."""
-        place = min(max(time_s / self.step_s, 0.0), len(self.position_rad) - 1.0)
-        index = min(int(place), len(self.position_rad) - 2)
-        u = place - index
-        begin, end = self.position_rad[index : index + 2]
+        """Position, velocity and acceleration, shape (n,) each, at a time that is clamped to the duration."""
+        sample = min(max(time_s / self.step_s, 0.0), len(self.position_rad) - 1.0)
+        index = min(int(sample), len(self.position_rad) - 2)
+        u = sample - index
+        start, end = self.position_rad[index : index + 2]
         rise, fall = self.velocity_rad_s[index : index + 2]
-        way, a, b = end - begin, rise * self.step_s, fall * self.step_s
-        position = begin + u * (a + u * ((3 * way - 2 * a - b) + u * (a + b - 2 * way)))
+        delta, a, b = end - start, rise * self.step_s, fall * self.step_s
+        position = start + u * (a + u * ((3 * delta - 2 * a - b) + u * (a + b - 2 * delta)))
         acceleration = (1 - u) * self.acceleration_rad_s2[index] + u * self.acceleration_rad_s2[index + 1]
         return position, rise + u * (fall - rise), acceleration
 
 
-def blend_corners(corners: Sequence[Sequence[float]], clear: Callable[[Floats], bool]) -> Floats | None:
-    """The points of a spline that goes from corner to corner, and rounds off those between as widely as there is room.
+def blend_corners(corners: Sequence[Sequence[float]], is_clear: Callable[[Floats], bool]) -> Floats | None:
+    """The points of a spline along a path, with corners blended as widely as obstacles allow.
 
     Args:
         corners: At least two positions, shape (n,) [rad] each.
-        clear: Whether some positions, shape (k, n), and the straight ways from each to the next are clear.
+        is_clear: Whether positions, shape (k, n), and the straight segments between them are collision-free.
 
     Returns:
-        The points, shape (points, n); ``None`` when not even the narrowest is clear.
+        The points, shape (points, n); ``None`` if not even the narrowest blend is collision-free.
     """
     path = np.array(corners, dtype=np.float64)
-    for rounding_rad in _ROUNDING_RAD:
-        points = resample(path, rounding_rad)
-        places = _along(points, _LOOKS)[0]
-        if all(clear(places[index : index + _LEGS + 1]) for index in range(0, len(places) - 1, _LEGS)):
+    for spacing_rad in _SPACINGS_RAD:
+        points = resample(path, spacing_rad)
+        places = _along(points, _CHECKS)[0]
+        if all(is_clear(places[index : index + _BATCH + 1]) for index in range(0, len(places) - 1, _BATCH)):
             return points
     return None
 
 
-def resample(path: Floats, apart_rad: float) -> Floats:
-    """Points on a path from corner to corner that are equally far apart, no further than ``apart_rad``.
+def resample(path: Floats, spacing_rad: float) -> Floats:
+    """Equally spaced points on a path, at most ``spacing_rad`` apart.
 
-    A spline through points that are here near and there far apart would hurry and hesitate.
+    A spline through unequally spaced points would have an uneven speed.
     """
     lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))))
-    count = max(1, int(np.ceil(lengths[-1] / apart_rad)))
+    count = max(1, int(np.ceil(lengths[-1] / spacing_rad)))
     places = np.linspace(0.0, lengths[-1], count + 1)
     points: Floats = np.stack([np.interp(places, lengths, joint) for joint in path.T], axis=1)
     points[0], points[-1] = path[0], path[-1]
@@ -95,31 +95,31 @@ def resample(path: Floats, apart_rad: float) -> Floats:
 
 
 def time_parameterize(points: Floats, joints: Sequence[Joint], *, speed: float, step_s: float) -> Trajectory:
-    """When to be where on a spline: as fast as each joint's velocity, acceleration and jerk allow.
+    """The fastest trajectory along a spline within each joint's velocity, acceleration and jerk limits.
 
-    The speed along the spline is the highest that its bends allow, reached and left at the acceleration that is left,
-    then evened out over the time in which jerk builds it up.
+    The speed is the highest that the curvature allows. The remaining acceleration limits its changes, and a moving
+    average over the jerk's ramp time smooths it.
 
     Args:
-        points: Of the spline, shape (points, n) [rad].
-        joints: Their limits.
+        points: Points of the spline, shape (points, n) [rad].
+        joints: Joints with their limits.
         speed: Share of each joint's velocity limit, above 0 and at most 1.
-        step_s: Time between two samples of the way [s].
+        step_s: Time between two samples of the trajectory [s].
     """
     limits = np.array(
         [(joint.max_velocity_rad_s * speed, joint.max_acceleration_rad_s2, joint.max_jerk_rad_s3) for joint in joints]
     ).T
     ramp_s = float(np.max(limits[1] / limits[2]))
     allowed = limits.copy()
-    for _ in range(_TRIES):
-        places = _spread(points, _law(points, allowed), ramp_s)
-        velocity_over, acceleration_over, jerk_over = _over(places, limits)
-        over = max(velocity_over, acceleration_over**0.5)
-        if max(over, jerk_over) <= _FITS:
+    for _ in range(_ITERATIONS):
+        places = _sample(points, _time_law(points, allowed), ramp_s)
+        velocity_excess, acceleration_excess, jerk_excess = _excess(places, limits)
+        excess = max(velocity_excess, acceleration_excess**0.5)
+        if max(excess, jerk_excess) <= _TOLERANCE:
             break
-        if over > _FITS:
-            allowed /= np.array([[over], [over**2], [over**3]])
-        ramp_s *= max(1.0, jerk_over)
+        if excess > _TOLERANCE:
+            allowed /= np.array([[excess], [excess**2], [excess**3]])
+        ramp_s *= max(1.0, jerk_excess)
     every = max(1, round(step_s / _STEP_S))
     places = np.concatenate((places, np.repeat(places[-1:], -(len(places) - 1) % every, axis=0)))
     velocity = np.gradient(places, _STEP_S, axis=0)
@@ -129,13 +129,13 @@ def time_parameterize(points: Floats, joints: Sequence[Joint], *, speed: float, 
 
 
 def _along(points: Floats, parts: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """The spline and its first three derivatives at so many places a span and at its end, shape (places, n) each."""
+    """The spline and its first three derivatives at ``parts`` points per span, shape (places, n) each."""
     spans = len(points) - 1
     return _spline(points, np.linspace(0.0, spans, spans * parts + 1))
 
 
 def _spline(points: Floats, places: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    # Mirrored ends: the spline begins and ends in its first and last point.
+    # Mirrored ends: the spline starts and ends at its first and last point.
     whole = np.concatenate(([2 * points[0] - points[1]], points, [2 * points[-1] - points[-2]]))
     index = np.minimum(places.astype(np.intp), len(points) - 2)
     u = (places - index)[:, np.newaxis]
@@ -149,12 +149,12 @@ def _spline(points: Floats, places: Floats) -> tuple[Floats, Floats, Floats, Flo
     )
 
 
-def _law(points: Floats, limits: Floats) -> tuple[Floats, Floats]:
-    """Places of the spline and the times at which to be there [s], at no more than the acceleration."""
-    _, first, second, third = (np.abs(part) + _NOTHING for part in _along(points, _GRID))
+def _time_law(points: Floats, limits: Floats) -> tuple[Floats, Floats]:
+    """Spline parameters and the times at which to reach them [s], within the acceleration limit."""
+    _, first, second, third = (np.abs(part) + _EPSILON for part in _along(points, _GRID))
     velocity, acceleration, jerk = limits
-    bends = np.minimum(np.sqrt(_TURNING * acceleration / second), np.cbrt(_TURNING * jerk / third))
-    fastest = np.min(np.minimum(velocity / first, bends), axis=1)
+    curve_speed = np.minimum(np.sqrt(_CURVE_SHARE * acceleration / second), np.cbrt(_CURVE_SHARE * jerk / third))
+    fastest = np.min(np.minimum(velocity / first, curve_speed), axis=1)
     gain = np.min((acceleration - second * fastest[:, np.newaxis] ** 2) / first, axis=1)
     square = fastest**2
     square[[0, -1]] = 0.0
@@ -166,34 +166,34 @@ def _law(points: Floats, limits: Floats) -> tuple[Floats, Floats]:
     return np.arange(len(square)) / _GRID, np.concatenate(([0.0], np.cumsum(2 / _GRID / (speed[1:] + speed[:-1]))))
 
 
-def _spread(points: Floats, law: tuple[Floats, Floats], ramp_s: float) -> Floats:
-    """Where to be every ``_STEP_S``, with accelerations that take ``ramp_s`` to build up, shape (samples, n)."""
-    places, times = law
+def _sample(points: Floats, time_law: tuple[Floats, Floats], ramp_s: float) -> Floats:
+    """Positions every ``_STEP_S``, with accelerations that build up over ``ramp_s``, shape (samples, n)."""
+    places, times = time_law
     width = max(1, round(ramp_s / _STEP_S))
     moments: Floats = np.arange(-width, int(times[-1] / _STEP_S) + 2 * width, dtype=np.float64) * _STEP_S
-    # Between two places the acceleration is constant: the place is a parabola of time there, not a line.
-    resample = np.convolve(
+    # Between two parameters the acceleration is constant, so the parameter is a parabola of time.
+    smoothed = np.convolve(
         _parabolas(places, times, moments), np.full(width, 1 / width, dtype=np.float64), mode="valid"
     )
-    return _spline(points, np.clip(resample, 0.0, places[-1]))[0]
+    return _spline(points, np.clip(smoothed, 0.0, places[-1]))[0]
 
 
 def _parabolas(places: Floats, times: Floats, moments: Floats) -> Floats:
     inside = np.clip(moments, 0.0, times[-1])
     index = np.clip(np.searchsorted(times, inside, side="right") - 1, 0, len(times) - 2)
-    lasts = np.diff(times)
+    durations = np.diff(times)
     speed = np.zeros(len(times))
-    for at, (way, last) in enumerate(zip(np.diff(places), lasts, strict=True)):
-        speed[at + 1] = max(0.0, 2 * way / last - speed[at])
-    u = (inside - times[index]) / lasts[index]
-    begin, end = speed[index], speed[index + 1]
-    return np.asarray(places[index] + lasts[index] * u * (begin + u * (end - begin) / 2))
+    for segment, (delta, duration) in enumerate(zip(np.diff(places), durations, strict=True)):
+        speed[segment + 1] = max(0.0, 2 * delta / duration - speed[segment])
+    u = (inside - times[index]) / durations[index]
+    start, end = speed[index], speed[index + 1]
+    return np.asarray(places[index] + durations[index] * u * (start + u * (end - start) / 2))
 
 
-def _over(places: Floats, limits: Floats) -> list[float]:
-    """How many times the limit velocity, acceleration and jerk come to."""
-    over, slopes = [], places
+def _excess(places: Floats, limits: Floats) -> list[float]:
+    """Ratios of velocity, acceleration and jerk to their limits."""
+    excess, slopes = [], places
     for limit in limits:
         slopes = np.diff(slopes, axis=0) / _STEP_S
-        over.append(float(np.max(np.abs(slopes) / limit, initial=0.0)))
-    return over
+        excess.append(float(np.max(np.abs(slopes) / limit, initial=0.0)))
+    return excess

@@ -1,7 +1,7 @@
-"""Which shape a mouth has when, from the letters of a text and the time it takes to say them.
+"""Visemes: mouth shapes over time, from the letters of a text and its duration.
 
-The names are those that talking heads agree on: ``sil``, ``PP``, ``FF``, ``TH``, ``DD``, ``kk``, ``CH``, ``SS``,
-``nn``, ``RR``, ``aa``, ``E``, ``ih``, ``oh``, ``ou``. Letters are no sounds, but near enough for a mouth.
+The names are the common viseme set: ``sil``, ``PP``, ``FF``, ``TH``, ``DD``, ``kk``, ``CH``, ``SS``,
+``nn``, ``RR``, ``aa``, ``E``, ``ih``, ``oh``, ``ou``. Letters approximate the sounds.
 """
 
 import re
@@ -42,43 +42,43 @@ _NEAREST = {
     "FF": ("PP", "sil"),
     "PP": ("sil", "FF"),
 }
-"""What does for a shape that a robot lacks, the best first."""
+"""Substitutes for a shape that a robot lacks, the best first."""
 VOWELS = frozenset({"aa", "E", "ih", "oh", "ou"})
 _LONG, _SHORT, _PAUSE = 1.6, 1.0, 2.5
-"""How long a vowel, a consonant and a pause last, by each other."""
+"""Relative durations of a vowel, a consonant and a pause."""
 _TOKENS = re.compile(r"th|sh|ch|[a-z]|[.,;:!?]|\s")
 CHARACTERS_PER_S = 14.0
-"""About what a calm speaker says; where no voice has said how long it takes."""
+"""Rate of a calm speaker; used without synthesized audio [1/s]."""
 _SHORTEST_S = 0.4
 
 
 def estimate_duration_s(text: str) -> float:
-    """How long a text takes to say where there is no sound [s]."""
+    """Estimated speaking time of a text without audio [s]."""
     return max(_SHORTEST_S, len(text) / CHARACTERS_PER_S)
 
 
-def visemes_of(text: str, duration_s: float, there: Collection[str]) -> list[tuple[float, str]]:
-    """When the mouth is to have which shape: time from the beginning [s] and the name of a viseme, times rising.
+def visemes_of(text: str, duration_s: float, available: Collection[str]) -> list[tuple[float, str]]:
+    """Times from the start [s] and names of visemes, in order of time.
 
     Args:
-        text: What is said.
-        duration_s: How long that takes.
-        there: The visemes that the robot has. Sounds for which it has none are left out.
+        text: Spoken text.
+        duration_s: Its duration.
+        available: Visemes of the robot. Sounds without a suitable one are omitted.
     """
     plain = unicodedata.normalize("NFD", text.lower())
     parts: list[tuple[str, float]] = []
     for token in _TOKENS.findall(plain):
-        wanted = _BY_LETTERS.get(token)
-        if wanted is None:
+        shape = _BY_LETTERS.get(token)
+        if shape is None:
             weight = _SHORT / 2 if token.isspace() else _PAUSE
             parts.append((REST, weight))
         else:
-            parts.append((wanted, _LONG if wanted in VOWELS else _SHORT))
-    whole = sum(weight for _, weight in parts)
-    found, begun = [], 0.0
-    for wanted, weight in parts:
-        shape = next((one for one in (wanted, *_NEAREST.get(wanted, ())) if one in there), None)
-        if shape is not None:
-            found.append(((begun + weight / 2) / whole * duration_s, shape))
-        begun += weight
-    return found
+            parts.append((shape, _LONG if shape in VOWELS else _SHORT))
+    total = sum(weight for _, weight in parts)
+    visemes, start = [], 0.0
+    for shape, weight in parts:
+        substitute = next((one for one in (shape, *_NEAREST.get(shape, ())) if one in available), None)
+        if substitute is not None:
+            visemes.append(((start + weight / 2) / total * duration_s, substitute))
+        start += weight
+    return visemes

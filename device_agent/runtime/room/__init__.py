@@ -1,1 +1,1 @@
-"""Room."""
+"""Room devices: their streams, actions and fault detection."""

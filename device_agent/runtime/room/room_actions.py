@@ -1,4 +1,4 @@
-"""Actions of room devices: gather for a while, measure once, take something raw, set something."""
+"""Actions of room devices: collect data, measure once, capture raw data, set a control."""
 
 import threading
 import time
@@ -9,71 +9,71 @@ from device_agent.protocol import CaptureRaw, CollectData, RoomTask, TakePicture
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.room.room_device import RoomDevice
 
-_TELL_EVERY_S = 1.0
+_PROGRESS_PERIOD_S = 1.0
 _STEPS = 100
-"""Progress is told so often over the length of a gathering, once a second at most."""
+"""Number of progress reports of a collection, if they are at least ``_PROGRESS_PERIOD_S`` apart."""
 
-Tell = Callable[[str, float | None], None]
-"""What was printed, and how much is done."""
+OnOutput = Callable[[str, float | None], None]
+"""Called with printed output and progress."""
 
 
-class Gathering:
-    """Reads some streams at another rate for a while, and then again as before. Whoever listens hears of it."""
+class CollectAction:
+    """Reads streams at another rate for a time; subscribers receive the measurements."""
 
-    def __init__(self, order: CollectData, instrument: RoomDevice, tell: Tell) -> None:
-        self._order = order
-        self._instrument = instrument
-        self._tell = tell
-        self._over = threading.Event()
+    def __init__(self, request: CollectData, room_device: RoomDevice, on_output: OnOutput) -> None:
+        self._request = request
+        self._room_device = room_device
+        self._on_output = on_output
+        self._killed = threading.Event()
 
     def run(self) -> dict[str, Any]:
-        """Until its time is over, or until ``kill``."""
-        began_s, duration_s = time.monotonic(), self._order.duration_s
-        streams = self._instrument.gather(self._order.streams, self._order.rate_hz)
+        """Run until the duration has passed, or until ``kill``; returns the number of samples of each stream."""
+        start_s, duration_s = time.monotonic(), self._request.duration_s
+        streams = self._room_device.collect(self._request.streams, self._request.rate_hz)
         try:
-            while not self._over.is_set():
-                passed_s = time.monotonic() - began_s
+            while not self._killed.is_set():
+                passed_s = time.monotonic() - start_s
                 if passed_s >= duration_s:
                     break
-                step_s = min(duration_s - passed_s, max(_TELL_EVERY_S, duration_s / _STEPS))
-                if not self._over.wait(step_s):
-                    self._tell("", min(1.0, (time.monotonic() - began_s) / duration_s))
+                step_s = min(duration_s - passed_s, max(_PROGRESS_PERIOD_S, duration_s / _STEPS))
+                if not self._killed.wait(step_s):
+                    self._on_output("", min(1.0, (time.monotonic() - start_s) / duration_s))
         finally:
-            counts = self._instrument.rest()
+            counts = self._room_device.idle()
         return {"samples": {stream: counts.get(stream, 0) for stream in streams}}
 
     def kill(self) -> None:
         """End it, from any thread."""
-        self._over.set()
+        self._killed.set()
 
 
-class Once:
-    """Something that is asked of the device once, and takes as long as it takes."""
+class OneShotAction:
+    """One call of the device, which takes as long as the device needs."""
 
-    def __init__(self, deed: Callable[[], dict[str, Any]]) -> None:
-        self._deed = deed
+    def __init__(self, call: Callable[[], dict[str, Any]]) -> None:
+        self._call = call
 
     def run(self) -> dict[str, Any]:
-        """Do it."""
-        return self._deed()
+        """Call the device."""
+        return self._call()
 
     def kill(self) -> None:
-        """It is not broken off: a measurement or upload ends by itself, and a Stop reaches what moves by the loop."""
+        """Do nothing: a measurement or upload ends by itself, and the sensor loop applies Stop to actuators."""
 
 
-def activity(order: RoomTask, instrument: RoomDevice | None, tell: Tell) -> Gathering | Once:
-    """What does this order.
+def create(request: RoomTask, room_device: RoomDevice | None, on_output: OnOutput) -> CollectAction | OneShotAction:
+    """The action for a request.
 
     Raises:
-        Refused: The device is none of a room.
+        Refused: The device is not a room device.
     """
-    if instrument is None:
-        raise Refused("cannot", "this is no device of a room: it gathers, captures and sets nothing")
-    match order:
+    if room_device is None:
+        raise Refused("cannot", "this is not a room device: it cannot collect, capture or set anything")
+    match request:
         case CollectData():
-            return Gathering(order, instrument, tell)
+            return CollectAction(request, room_device, on_output)
         case TakePicture(streams=streams):
-            return Once(lambda: {"values": instrument.shoot(streams)})
+            return OneShotAction(lambda: {"values": room_device.take_picture(streams)})
         case CaptureRaw(name=name):
-            return Once(lambda: instrument.capture(name))
-    return Once(lambda: {"applied": {order.control: instrument.set(order.control, order.value)}})
+            return OneShotAction(lambda: room_device.capture_raw(name))
+    return OneShotAction(lambda: {"applied": {request.control: room_device.set(request.control, request.value)}})

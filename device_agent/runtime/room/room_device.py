@@ -1,4 +1,4 @@
-"""A room device as its loop and its actions meet it: what it has, how often it is read, what may be asked of it."""
+"""Room device: streams, rates and actions of one sensor."""
 
 import math
 import threading
@@ -15,85 +15,86 @@ from device_agent.runtime.errors import Refused
 from device_agent.runtime.room.stream_watchdog import StreamWatchdog
 
 _SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "application/json": "json"}
-_LEAST_RATE_HZ = 0.001
+_MIN_RATE_HZ = 0.001
 
 
 class RoomDevice:
-    """One room device. Thread-safe as far as its driver is.
+    """One room device. As thread-safe as its driver.
 
     Args:
         driver: Not yet connected.
-        manifest: What it has.
-        uploads: Where its captures go; ``None`` where the agent has no such place.
+        manifest: Streams, cameras, captures and controls.
+        uploads: Storage for captures, if the agent has one.
 
     Attributes:
-        driver: As given; the loop connects it.
+        driver: As given; the sensor loop connects it.
         manifest: As given.
-        streams: Names of what it measures; ``cameras``: of what it films.
-        vigil: Over streams and cameras that are silent or stuck; the loop tells it what they gave.
-        changed: Set whenever a rate has changed; whoever heeds it clears it.
+        streams: Names of the streams.
+        cameras: Names of the cameras.
+        watchdog: Detects silent or stuck streams and cameras.
+        rates_changed: Set when a rate has changed; the sensor loop clears it.
     """
 
     def __init__(self, driver: RoomDriver, manifest: RoomDeviceManifest, uploads: Uploads | None) -> None:
         self.driver = driver
         self.manifest = manifest
         self._uploads = uploads
-        self._gathering: Mapping[str, float] = {}
+        self._collecting: Mapping[str, float] = {}
         self._counts: Counter[str] = Counter()
-        self.vigil = StreamWatchdog(manifest.watch, self.rate_hz)
-        self.changed = threading.Event()
+        self.watchdog = StreamWatchdog(manifest.watch, self.rate_hz)
+        self.rates_changed = threading.Event()
         self.streams = tuple(stream.name for stream in manifest.streams)
         self.cameras = tuple(camera.name for camera in manifest.cameras) if isinstance(driver, Camera) else ()
 
     @property
     def simulated(self) -> bool:
-        """Whether it is no real sensor."""
+        """Whether the sensor is simulated."""
         return self.driver.simulated
 
     def close(self) -> None:
-        """Let the driver go."""
+        """Close the driver."""
         self.driver.close()
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The kinds of action that it takes."""
-        takes = (
+        """Kinds of the supported actions."""
+        supported = (
             (CollectData, self.streams),
             (TakePicture, self.streams),
             (CaptureRaw, self.manifest.captures),
             (SetControl, self.manifest.controls),
         )
-        return tuple(str(order.__struct_config__.tag) for order, things in takes if things)
+        return tuple(str(order.__struct_config__.tag) for order, items in supported if items)
 
     # ------------------------------------------------------------ rates
 
     def rate_hz(self, name: str) -> float:
-        """How often a stream or camera is to be read now [Hz]."""
-        asked = self._gathering.get(name)
-        if asked is not None:
-            return asked
-        every = (*self.manifest.streams, *self.manifest.cameras)
-        return max(_LEAST_RATE_HZ, next(each.rate_hz for each in every if each.name == name))
+        """Present rate of a stream or camera [Hz]."""
+        rate_hz = self._collecting.get(name)
+        if rate_hz is not None:
+            return rate_hz
+        sources = (*self.manifest.streams, *self.manifest.cameras)
+        return max(_MIN_RATE_HZ, next(source.rate_hz for source in sources if source.name == name))
 
-    def gather(self, streams: Collection[str], rate_hz: float) -> tuple[str, ...]:
-        """Read these streams so often, from now until ``rest``; empty: all.
+    def collect(self, streams: Collection[str], rate_hz: float) -> tuple[str, ...]:
+        """Read these streams, or all if none is named, at a rate until ``idle``; returns their names.
 
         Raises:
-            Refused: There is no such stream.
+            Refused: A stream is unknown.
         """
-        chosen = tuple(self._known(streams))
+        chosen = tuple(self._resolve_streams(streams))
         self._counts = Counter()
-        self._gathering = dict.fromkeys(chosen, rate_hz)
-        self.changed.set()
+        self._collecting = dict.fromkeys(chosen, rate_hz)
+        self.rates_changed.set()
         return chosen
 
-    def rest(self) -> Mapping[str, int]:
-        """Read every stream as often as the manifest says; gives how many measurements were gathered of each."""
-        self._gathering = {}
-        self.changed.set()
+    def idle(self) -> Mapping[str, int]:
+        """Return to the manifest's rates; returns the number of collected measurements of each stream."""
+        self._collecting = {}
+        self.rates_changed.set()
         return self._counts
 
-    def _known(self, streams: Collection[str]) -> Iterable[str]:
+    def _resolve_streams(self, streams: Collection[str]) -> Iterable[str]:
         if not self.streams:
             raise Refused("no_streams", f"'{self.manifest.name}' has no streams")
         for stream in streams:
@@ -101,35 +102,35 @@ class RoomDevice:
                 raise Refused("unknown_stream", f"no stream '{stream}'; there are {', '.join(self.streams)}")
         return streams or self.streams
 
-    # ------------------------------------------------------------ what is done with it
+    # ------------------------------------------------------------ operations
 
     def read(self, stream: str) -> Values:
-        """The newest values of one of its streams, but for numbers that are none.
+        """The newest finite values of a stream.
 
         Raises:
             SensorError: As the driver's ``read``.
         """
         values = {name: value for name, value in self.driver.read(stream).items() if math.isfinite(value)}
-        if values and stream in self._gathering:
+        if values and stream in self._collecting:
             self._counts[stream] += 1
         return values
 
-    def shoot(self, streams: Collection[str]) -> dict[str, dict[str, float | bool]]:
-        """One measurement now, of these streams or of all.
+    def take_picture(self, streams: Collection[str]) -> dict[str, dict[str, float | bool]]:
+        """Measure these streams, or all if none is named, once.
 
         Raises:
-            Refused: There is no such stream, or the device does not answer.
+            Refused: A stream is unknown, or the device does not respond.
         """
         try:
-            return {stream: dict(self.read(stream)) for stream in self._known(streams)}
+            return {stream: dict(self.read(stream)) for stream in self._resolve_streams(streams)}
         except SensorError as error:
             raise Refused("sensor_failed", str(error)) from error
 
     def set(self, name: str, value: float) -> float:
-        """Set a control; gives what was applied.
+        """Set a control; returns the applied value.
 
         Raises:
-            Refused: There is no such control, the value is none or beyond its limits, or it failed.
+            Refused: Unknown control, value not finite or out of range, or the device failed.
         """
         control = self._control(name)
         if not math.isfinite(value):
@@ -143,23 +144,23 @@ class RoomDevice:
             raise Refused("sensor_failed", str(error)) from error
 
     def _control(self, name: str) -> Control:
-        found = next((each for each in self.manifest.controls if each.name == name), None)
-        if found is None:
-            known = ", ".join(each.name for each in self.manifest.controls) or "none"
-            raise Refused("unknown_control", f"no control '{name}'; there are: {known}")
-        return found
+        control = next((control for control in self.manifest.controls if control.name == name), None)
+        if control is None:
+            names = ", ".join(control.name for control in self.manifest.controls) or "none"
+            raise Refused("unknown_control", f"no control '{name}'; there are: {names}")
+        return control
 
-    def capture(self, name: str) -> dict[str, object]:
-        """Take something raw and store it; gives the upload, as results show it.
+    def capture_raw(self, name: str) -> dict[str, object]:
+        """Capture raw data and upload it; returns the upload for the result.
 
         Raises:
-            Refused: There is no such capture, it failed, or it could not be stored.
+            Refused: Unknown capture, the device failed, or the upload failed.
         """
         if name not in self.manifest.captures:
-            known = ", ".join(self.manifest.captures) or "none"
-            raise Refused("unknown_capture", f"no capture '{name}'; there are: {known}")
+            names = ", ".join(self.manifest.captures) or "none"
+            raise Refused("unknown_capture", f"no capture '{name}'; there are: {names}")
         if self._uploads is None:
-            raise Refused("no_store", "this agent has nowhere to store captures")
+            raise Refused("no_store", "this agent has no storage for captures")
         try:
             at_ms, taken = wall_ms(), self.driver.capture(name)
             upload = self._uploads.store(
@@ -177,10 +178,10 @@ class RoomDevice:
         return {"upload": upload, "media_type": taken.media_type, "length": len(taken.content)}
 
     def hold(self) -> None:
-        """What moves stays where it is.
+        """Hold the position of moving parts.
 
         Raises:
-            SensorError: It failed.
+            SensorError: The device failed.
         """
         if isinstance(self.driver, Movable):
             self.driver.hold()

@@ -1,6 +1,6 @@
-"""The loop of a room device: reads each stream and camera at its rate, and watches over Stop, lease and interlocks.
+"""Sensor loop of a room device: reads each stream and camera at its rate, and applies Stop, lease and interlocks.
 
-It stands where a robot's control loop stands. A sensor may take its time: one that is slow makes nobody else wait.
+It replaces the control loop of a robot. A slow sensor delays only its own device.
 """
 
 import contextlib
@@ -19,82 +19,82 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.room.room_device import RoomDevice
 
-_LOOK_S = 0.05
-"""How often it looks whether the device is stopped or held."""
-_RECONNECT_EVERY_S = 1.0
-_BUSY = frozenset({Mode.STOPPED, Mode.HOLDING, Mode.FAULT})
-"""Modes in which nothing of the device may move."""
-_NOTHING = Observation((), (), (), ())
+_CHECK_PERIOD_S = 0.05
+"""Period of the checks for Stop and hold [s]."""
+_RECONNECT_PERIOD_S = 1.0
+_HOLD_MODES = frozenset({Mode.STOPPED, Mode.HOLDING, Mode.FAULT})
+"""Modes in which the device must not move."""
+_NO_JOINTS = Observation((), (), (), ())
 _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
 class _Source:
-    """A stream or camera: when it is due [s], and how many it has given."""
+    """A stream or camera: when it is due [s], and the sequence of its newest message."""
 
     name: str
-    film: bool
+    is_camera: bool
     due_s: float = 0.0
     sequence: int = 0
 
 
 class SensorLoop:
-    """One thread, which reads what is due.
+    """One thread that reads the sources that are due.
 
     Args:
-        instrument: Its driver is not yet connected.
-        controller: Who may use it.
-        name: The device's name.
-        tell: Called with a stream's name and its measurement; must not block.
-        film: Called with a camera's name and its picture; must not block.
-        watch: Called before each look with the monotonic clock [s]: the room's interlocks. An error holds.
+        room_device: Its driver is not yet connected.
+        controller: Leases, Stop and interlocks.
+        name: Name of the device.
+        publish: Called with a stream's name and its measurement; must not block.
+        publish_frame: Called with a camera's name and its frame; must not block.
+        check_interlocks: Called in each iteration with the monotonic clock [s]. An error holds.
     """
 
     def __init__(
         self,
-        instrument: RoomDevice,
+        room_device: RoomDevice,
         controller: Controller,
         *,
         name: str,
-        tell: Callable[[str, Measurements], None],
-        film: Callable[[str, CameraFrame], None],
-        watch: Callable[[float], None],
+        publish: Callable[[str, Measurements], None],
+        publish_frame: Callable[[str, CameraFrame], None],
+        check_interlocks: Callable[[float], None],
     ) -> None:
-        self._driver = instrument.driver
-        self._camera = instrument.driver if isinstance(instrument.driver, Camera) else None
-        self._instrument = instrument
+        self._driver = room_device.driver
+        self._camera = room_device.driver if isinstance(room_device.driver, Camera) else None
+        self._room_device = room_device
         self._controller = controller
         self._name = name
-        self._tell = tell
-        self._film = film
-        self._watch = watch
-        self._sources = [_Source(stream, film=False) for stream in instrument.streams]
-        self._sources += [_Source(camera, film=True) for camera in instrument.cameras]
+        self._publish = publish
+        self._publish_frame = publish_frame
+        self._check_interlocks = check_interlocks
+        self._sources = [_Source(stream, is_camera=False) for stream in room_device.streams]
+        self._sources += [_Source(camera, is_camera=True) for camera in room_device.cameras]
         self._held = False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"{name}-sensing", daemon=True)
-        self.seen: Observation | None = None
+        self.observation: Observation | None = None
 
     def start(self) -> None:
-        """Connect the driver and begin to read. A sensor that is not there is a fault, and no reason to run nothing."""
-        self.seen = _NOTHING
+        """Connect the driver and start to read. A missing sensor is a fault; the agent still runs."""
+        self.observation = _NO_JOINTS
         self._controller.start_at(())
         try:
             self._driver.connect()
         except SensorError as error:
-            self._failed(str(error))
-        self._instrument.vigil.begin()
+            self._set_fault(str(error))
+        self._room_device.watchdog.reset()
         self._thread.start()
 
     def stop(self) -> None:
         """End the thread. May be called twice."""
         self._stopping.set()
-        self._instrument.changed.set()
+        self._room_device.rates_changed.set()
         if self._thread.is_alive():
             self._thread.join(timeout=2)
 
-    def hurry(self) -> None:
-        """See ``ControlLoop.hurry``: nothing here follows setpoints."""
+    def wake(self) -> None:
+        """See ``ControlLoop.wake``: a room device has no setpoints."""
 
     def _run(self) -> None:
         while not self._stopping.is_set():
@@ -102,68 +102,72 @@ class SensorLoop:
             try:
                 if self._controller.fault is not None:
                     self._driver.connect()
-                    self._instrument.vigil.begin()
-                    self._controller.recover(())
-                self._watch(now_s)
-                self._heed(self._controller.step(now_s).mode)
+                    self._room_device.watchdog.reset()
+                    self._controller.clear_fault(())
+                self._check_interlocks(now_s)
+                self._apply_mode(self._controller.update(now_s).mode)
                 for source in self._sources:
                     if source.due_s <= now_s:
-                        self._take(source, now_s)
+                        self._read(source, now_s)
             except SensorError as error:
-                self._failed(str(error))
-            except Exception as error:  # noqa: BLE001 (whatever it is: a sensor that is silent must say why)
+                self._set_fault(str(error))
+            except Exception as error:  # noqa: BLE001 (any error is reported as a fault)
                 _log.exception("%s: sensing", self._name)
-                self._failed(f"internal error: {error}")
+                self._set_fault(f"internal error: {error}")
             self._pause()
 
     def _pause(self) -> None:
         if self._controller.fault is not None:
-            self._stopping.wait(_RECONNECT_EVERY_S)
+            self._stopping.wait(_RECONNECT_PERIOD_S)
             return
         now_s = time.monotonic()
-        due_s = min((source.due_s for source in self._sources), default=now_s + _LOOK_S)
-        if self._instrument.changed.wait(min(_LOOK_S, max(0.0, due_s - now_s))):
-            self._instrument.changed.clear()
-            for source in self._sources:  # a faster rate counts at once
-                source.due_s = min(source.due_s, now_s + 1 / self._instrument.rate_hz(source.name))
+        due_s = min((source.due_s for source in self._sources), default=now_s + _CHECK_PERIOD_S)
+        if self._room_device.rates_changed.wait(min(_CHECK_PERIOD_S, max(0.0, due_s - now_s))):
+            self._room_device.rates_changed.clear()
+            for source in self._sources:  # a faster rate applies at once
+                source.due_s = min(source.due_s, now_s + 1 / self._room_device.rate_hz(source.name))
 
-    def _heed(self, mode: Mode) -> None:
-        """At a Stop, a hold or a fault, have what moves stay where it is."""
-        held, self._held = self._held, mode in _BUSY
-        if self._held and not held:
-            self._instrument.hold()
+    def _apply_mode(self, mode: Mode) -> None:
+        """Hold moving parts on a Stop, a hold or a fault."""
+        was_held, self._held = self._held, mode in _HOLD_MODES
+        if self._held and not was_held:
+            self._room_device.hold()
 
-    def _take(self, source: _Source, now_s: float) -> None:
-        """Read one source. What was missed is not made up for."""
-        period_s = 1 / self._instrument.rate_hz(source.name)
+    def _read(self, source: _Source, now_s: float) -> None:
+        """Read one source. Missed readings are dropped."""
+        period_s = 1 / self._room_device.rate_hz(source.name)
         source.due_s += period_s
         if source.due_s < now_s:
             source.due_s = now_s + period_s
-        if source.film and self._camera is not None:
-            self._shoot(source, self._camera)
+        if source.is_camera and self._camera is not None:
+            self._read_camera(source, self._camera)
             return
-        values = self._instrument.read(source.name)
+        values = self._room_device.read(source.name)
         if not values:
             return
-        self._instrument.vigil.note(source.name, values)
+        self._room_device.watchdog.record(source.name, values)
         source.sequence += 1
-        told = dict(list(values.items())[:MAX_VALUES])
-        self._tell(source.name, Measurements(tick_ms=tick_ms(), at_ms=wall_ms(), sequence=source.sequence, values=told))
+        published = dict(list(values.items())[:MAX_VALUES])
+        self._publish(
+            source.name, Measurements(tick_ms=tick_ms(), at_ms=wall_ms(), sequence=source.sequence, values=published)
+        )
 
-    def _shoot(self, source: _Source, camera: Camera) -> None:
-        taken = camera.frame(source.name)
-        if taken is None:
+    def _read_camera(self, source: _Source, camera: Camera) -> None:
+        picture = camera.frame(source.name)
+        if picture is None:
             return
-        self._instrument.vigil.note(source.name, taken.content)
+        self._room_device.watchdog.record(source.name, picture.content)
         source.sequence += 1
-        tick = round(taken.taken_s * 1000)
+        tick = round(picture.taken_s * 1000)
         try:
-            self._film(source.name, CameraFrame(source.sequence, tick, taken.width, taken.height, taken.content))
+            self._publish_frame(
+                source.name, CameraFrame(source.sequence, tick, picture.width, picture.height, picture.content)
+            )
         except ProtocolError as error:
-            raise SensorError(f"{source.name}: {error}; have it take smaller pictures") from error
+            raise SensorError(f"{source.name}: {error}; configure smaller pictures") from error
 
-    def _failed(self, message: str) -> None:
+    def _set_fault(self, message: str) -> None:
         _log.error("%s: %s", self._name, message)
-        self._controller.fail(message)
+        self._controller.set_fault(message)
         with contextlib.suppress(SensorError):
-            self._heed(self._controller.step(time.monotonic()).mode)
+            self._apply_mode(self._controller.update(time.monotonic()).mode)

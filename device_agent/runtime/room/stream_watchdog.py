@@ -1,6 +1,6 @@
-"""Streams and cameras of a room device that are not well though its driver raises no error: silent, or stuck.
+"""Stream watchdog: reports silent or stuck streams and cameras of a room device whose driver raises no error.
 
-It is asked from another thread than the one that reads: a driver that never comes back from a reading is silent too.
+It runs in another thread than the reads, so that it also detects a driver that blocks in a read.
 """
 
 import threading
@@ -14,27 +14,27 @@ from device_agent.protocol.manifests.room import Watch
 
 SILENT, STUCK = "silent", "stuck"
 _PERIODS = 3.0
-"""A source that is read less often than it is to be heard is silent when so many of its readings are missing."""
-_LIKE = 10
-"""So many readings without any difference are needed, however long they take: two of them may be alike by chance."""
+"""A source with a low rate is silent if this many readings are missing."""
+_MIN_EQUAL = 10
+"""Minimum number of equal readings of a stuck source: a few may be equal by chance."""
 
 
 @dataclass(slots=True)
-class _Heard:
-    """What a source gave last, since when it is the same [s], how often in a row, and when the newest came [s]."""
+class _SourceState:
+    """Last content of a source, start of the equal readings [s], their number, and time of the newest one [s]."""
 
     content: object = None
-    same_since_s: float = 0.0
-    times: int = 0
-    at_s: float = 0.0
+    equal_since_s: float = 0.0
+    equal_count: int = 0
+    received_s: float = 0.0
 
 
 class StreamWatchdog:
-    """Watches over the sources of one device. Thread-safe.
+    """Watchdog of one device's sources. Thread-safe.
 
     Args:
-        watches: What the room's manifest says of them.
-        rate_hz: How often a source is read now [Hz].
+        watches: Limits from the room's manifest.
+        rate_hz: Present rate of a source [Hz].
         clock_s: Monotonic clock [s].
     """
 
@@ -48,56 +48,60 @@ class StreamWatchdog:
         self._rate_hz = rate_hz
         self._clock_s = clock_s
         self._lock = threading.Lock()
-        self._heard: dict[str, _Heard] = {}
+        self._sources: dict[str, _SourceState] = {}
         self._open: dict[str, Fault] = {}
 
-    def begin(self) -> None:
-        """The device is there, or there again: its sources are expected from now on."""
+    def reset(self) -> None:
+        """Expect readings from now on: the device has connected."""
         now_s = self._clock_s()
         with self._lock:
-            self._heard = {watch.source: _Heard(at_s=now_s) for watch in self._watches}
+            self._sources = {watch.source: _SourceState(received_s=now_s) for watch in self._watches}
 
-    def note(self, source: str, content: object) -> None:
-        """A source gave this: its values, or a picture's bytes."""
+    def record(self, source: str, content: object) -> None:
+        """Record a reading: the values of a stream, or the bytes of a picture."""
         now_s = self._clock_s()
         with self._lock:
-            heard = self._heard.get(source)
-            if heard is None:
+            state = self._sources.get(source)
+            if state is None:
                 return
-            heard.at_s = now_s
-            if heard.times and heard.content == content:
-                heard.times += 1
+            state.received_s = now_s
+            if state.equal_count and state.content == content:
+                state.equal_count += 1
             else:
-                heard.content, heard.same_since_s, heard.times = content, now_s, 1
+                state.content, state.equal_since_s, state.equal_count = content, now_s, 1
 
     def faults(self) -> tuple[Fault, ...]:
-        """What is wrong now; one that goes on keeps its words and the time when it was found."""
+        """Present faults; a continuing fault keeps its message and the time of its detection."""
         now_s = self._clock_s()
         with self._lock:
-            wrong = {f"{what}.{source}": message for what, source, message in self._wrong(now_s)}
+            found = {f"{what}.{source}": message for what, source, message in self._check(now_s)}
             self._open = {
                 code: self._open.get(code) or Fault(code=code, message=message, since_ms=wall_ms())
-                for code, message in wrong.items()
+                for code, message in found.items()
             }
             return tuple(self._open.values())
 
-    def _wrong(self, now_s: float) -> list[tuple[str, str, str]]:
-        found = []
+    def _check(self, now_s: float) -> list[tuple[str, str, str]]:
+        faults = []
         for watch in self._watches:
-            heard = self._heard.get(watch.source)
-            if heard is None:
+            state = self._sources.get(watch.source)
+            if state is None:
                 continue
             gap_s = _PERIODS / self._rate_hz(watch.source)
-            if watch.silent_s is not None and now_s - heard.at_s > max(watch.silent_s, gap_s):
+            if watch.silent_s is not None and now_s - state.received_s > max(watch.silent_s, gap_s):
                 message = (
-                    f"'{watch.source}' has given nothing for {watch.silent_s:g} s. See that the device has power and "
-                    "is connected; once it is heard again this clears by itself."
+                    f"'{watch.source}' has sent nothing for {watch.silent_s:g} s. Check that the device has power and "
+                    "is connected; the fault clears with the next reading."
                 )
-                found.append((SILENT, watch.source, message))
-            elif watch.stuck_s is not None and heard.times >= _LIKE and heard.at_s - heard.same_since_s > watch.stuck_s:
+                faults.append((SILENT, watch.source, message))
+            elif watch.stuck_s is not None and _equal_s(state) > watch.stuck_s:
                 message = (
-                    f"'{watch.source}' has been exactly the same for {watch.stuck_s:g} s, as nothing measured is. "
-                    "Do not go by it; switch the device off and on, and have it replaced if that does not help."
+                    f"'{watch.source}' has not changed at all for {watch.stuck_s:g} s, so it is probably defective. "
+                    "Do not rely on it; restart the device, and replace it if the fault remains."
                 )
-                found.append((STUCK, watch.source, message))
-        return found
+                faults.append((STUCK, watch.source, message))
+        return faults
+
+
+def _equal_s(state: _SourceState) -> float:
+    return state.received_s - state.equal_since_s if state.equal_count >= _MIN_EQUAL else 0.0

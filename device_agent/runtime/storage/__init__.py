@@ -1,1 +1,1 @@
-"""Storage."""
+"""Persistent storage: journal and outbox."""

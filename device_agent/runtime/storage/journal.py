@@ -1,8 +1,8 @@
-"""What an agent must not forget: commands it has seen, epochs, Stop latches, movements that ran, its session number.
+"""Write-ahead journal of an agent: commands, epochs, Stop latches, movement versions and the session number.
 
-SQLite, one file per agent. Epochs, latches, movements and the ends of commands are on the disk when their call returns.
-That a command has come, and what it has come to, is only written, which outlives the agent but not the machine's power:
-whoever is about to move something because of it calls ``settle`` before.
+One SQLite file per agent. Epochs, latches, movement versions and terminal acks are on disk when their call returns.
+Other acks survive a crash of the agent, but not a power failure. Before a command moves a device, ``sync`` writes them
+to disk.
 """
 
 import contextlib
@@ -29,18 +29,18 @@ CREATE TABLE IF NOT EXISTS movements (
 CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NULL);
 """
 _CACHE_KB = 256
-"""Rows are found one by one, by their key: more would only fill up over days, in the memory of a small computer."""
+"""Rows are accessed individually by key, so a larger cache would only use memory [kB]."""
 _KEEP_MS = 7 * 24 * 3600 * 1000
-"""Commands are remembered a week: longer than any ``ttl_ms`` (a day at most), so that none can run twice."""
+"""Commands are kept for a week, longer than any ``ttl_ms`` (at most a day), so that none runs twice [ms]."""
 
 
 class JournalError(Exception):
-    """The journal cannot be read or written; the text says what to do. The agent must not run without it."""
+    """The journal cannot be read or written; the text states what to do. The agent must not run without it."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceRecord:
-    """What one device remembers across restarts: highest epoch seen, highest epoch no longer obeyed, Stop latch."""
+    """Persistent state of a device: highest epoch seen, highest epoch burned, Stop latch."""
 
     epoch: int = 0
     burned: int = 0
@@ -48,7 +48,7 @@ class DeviceRecord:
 
 
 class Journal:
-    """The agent's memory. Thread-safe.
+    """The journal of an agent. Thread-safe.
 
     Args:
         path: The database file; its folder must exist.
@@ -60,10 +60,10 @@ class Journal:
         self._database: sqlite3.Connection | None = None
 
     def open(self, *, now_ms: int) -> None:
-        """Open or create the file, and forget commands older than a week.
+        """Open or create the file, and delete commands older than a week.
 
         Raises:
-            JournalError: Unreadable, or not a journal.
+            JournalError: The file cannot be read, or is not a journal.
         """
         try:
             self._database = sqlite3.connect(self._path, check_same_thread=False, isolation_level=None)
@@ -86,14 +86,14 @@ class Journal:
                 self._database = None
 
     def begin(self, device: str, ack: Ack) -> Ack | None:
-        """Remember a command before anything is done about it; see ``settle``.
+        """Record a command before it is processed; see ``sync``.
 
         Args:
             device: Name of the device.
-            ack: The first answer to it, ``received`` or already a refusal.
+            ack: Its first ack.
 
         Returns:
-            ``None`` for a new command; for one seen before, the last answer given to it, and nothing may be done again.
+            ``None`` for a new command. For a duplicate, its last ack: it must not be processed again.
         """
         with self._lock:
             rows = self._execute(
@@ -105,7 +105,7 @@ class Journal:
             return codec.decode(self._execute("SELECT last_ack FROM commands WHERE id = ?", (ack.id,))[0][0], Ack)
 
     def record(self, ack: Ack) -> None:
-        """Remember the newest answer to a command begun before; on the disk when this returns if it is the last."""
+        """Record the newest ack of a command; a terminal ack is on disk when this returns."""
         with self._lock, self._on_disk() if ack.status.terminal else contextlib.nullcontext():
             self._execute(
                 "UPDATE commands SET last_ack = ?, terminal = ?, delivered = 0, at_ms = ? "
@@ -113,11 +113,11 @@ class Journal:
                 (codec.encode(ack), ack.status.terminal, ack.at_ms, ack.id),
             )
 
-    def settle(self) -> None:
-        """All that was written is on the disk when this returns: with the next start, none of it is done again.
+    def sync(self) -> None:
+        """Write all records to disk, so that no recorded command runs again after a restart.
 
-        The disk takes most of a millisecond, for which nobody is kept from writing: what was written is in SQLite's
-        write-ahead log, or has been synced from there into the file, and a log may be synced by anybody.
+        The sync takes most of a millisecond and does not block writers: all records are in SQLite's write-ahead log or
+        already in the file, and any process may sync the log.
 
         Raises:
             JournalError: It is closed, or the disk fails.
@@ -129,10 +129,10 @@ class Journal:
             finally:
                 os.close(log)
         except OSError as error:
-            raise JournalError(f"the journal {self._path} is not on the disk ({error}); look at the disk") from error
+            raise JournalError(f"the journal {self._path} could not be synced ({error}); check the disk") from error
 
     def delivered(self, ack: Ack) -> None:
-        """Note that the cloud has this answer, unless a newer one has been recorded since."""
+        """Record that an ack was delivered, unless a newer one has been recorded since."""
         with self._lock:
             if self._database is not None:
                 self._execute(
@@ -140,16 +140,16 @@ class Journal:
                 )
 
     def undelivered(self, device: str) -> tuple[Ack, ...]:
-        """The last answers to this device's commands that the cloud may not have."""
+        """The last acks of this device's commands that may not have been delivered."""
         with self._lock:
             rows = self._execute("SELECT last_ack FROM commands WHERE device = ? AND delivered = 0", (device,))
         return tuple(codec.decode(row[0], Ack) for row in rows)
 
     def end_open(self, *, now_ms: int, tick_ms: int) -> int:
-        """At start: give every command that a former run left without an end one, ``failed``.
+        """Fail every command that a previous run did not finish. Called at start.
 
         Returns:
-            How many there were. None of them will be run again: the device may have moved already.
+            Number of these commands. They do not run again, because the device may have moved already.
         """
         reason = Reason(code="agent_restarted", message="the agent restarted while this ran; it was not run again")
         with self._lock:
@@ -169,7 +169,7 @@ class Journal:
         return len(rows)
 
     def device(self, device: str) -> DeviceRecord:
-        """What is remembered of a device; all zero for a new one."""
+        """Persistent state of a device; all zero for a new one."""
         with self._lock:
             rows = self._execute("SELECT epoch, burned, latch FROM devices WHERE device = ?", (device,))
         if not rows:
@@ -178,7 +178,7 @@ class Journal:
         return DeviceRecord(epoch, burned, codec.decode(latch, StopLatch) if latch else None)
 
     def save_epoch(self, device: str, *, epoch: int, burned: int) -> None:
-        """Remember a device's epochs; neither ever falls."""
+        """Record a device's epochs; they never decrease."""
         with self._lock, self._on_disk():
             self._execute(
                 "INSERT INTO devices (device, epoch, burned) VALUES (?, ?, ?) ON CONFLICT (device) DO UPDATE SET "
@@ -187,7 +187,7 @@ class Journal:
             )
 
     def save_latch(self, device: str, latch: StopLatch | None) -> None:
-        """Remember a device's Stop latch."""
+        """Record a device's Stop latch."""
         with self._lock, self._on_disk():
             self._execute(
                 "INSERT INTO devices (device, latch) VALUES (?, ?) "
@@ -205,7 +205,7 @@ class Journal:
         return int(rows[0][0]) if rows else 0
 
     def save_movement(self, device: str, author: str, robot_type: str, name: str, version: int) -> None:
-        """Remember a version that runs; what is remembered never falls."""
+        """Record the version of a movement that runs; it never decreases."""
         with self._lock, self._on_disk():
             self._execute(
                 "INSERT INTO movements VALUES (?, ?, ?, ?, ?) ON CONFLICT (device, author, robot_type, name) "
@@ -214,7 +214,7 @@ class Journal:
             )
 
     def next_session(self) -> int:
-        """The next session number of this agent's link, rising for ever."""
+        """The next session number of this agent's link."""
         with self._lock, self._on_disk():
             rows = self._execute(
                 "INSERT INTO counters VALUES ('session', 1) ON CONFLICT (name) DO UPDATE SET value = value + 1 "
@@ -224,12 +224,12 @@ class Journal:
 
     @contextlib.contextmanager
     def _on_disk(self) -> Iterator[None]:
-        """What is written here, and all before it, is on the disk at the end."""
+        """Sync this write and all previous ones to disk."""
         self._execute("PRAGMA synchronous=FULL")
         try:
             yield
         finally:
-            with contextlib.suppress(JournalError):  # what went wrong is being told already
+            with contextlib.suppress(JournalError):  # the original error propagates
                 self._execute("PRAGMA synchronous=NORMAL")
 
     def _execute(self, sql: str, values: tuple[object, ...] = ()) -> list[Any]:

@@ -1,7 +1,7 @@
-"""What could not be sent yet, on disk: events, and measurements thinned. One SQLite file with a bound.
+"""Bounded on-disk queue of unsent events and measurements: one SQLite file.
 
-The oldest goes first when it is full, measurements before events; how many is remembered until it was told. Not
-thread-safe: the outbox's own thread uses it.
+When it is full, the oldest messages are dropped, measurements before events. Drops are counted until they have been
+reported. Not thread-safe: only the outbox's thread uses it.
 """
 
 import contextlib
@@ -12,27 +12,27 @@ from pathlib import Path
 from typing import Any
 
 _SCHEMA = """
-CREATE TABLE IF NOT EXISTS kept (
+CREATE TABLE IF NOT EXISTS items (
     id INTEGER PRIMARY KEY AUTOINCREMENT, late INTEGER NOT NULL, at_ms INTEGER NOT NULL,
     size INTEGER NOT NULL, topic TEXT NOT NULL, payload BLOB NOT NULL);
-CREATE INDEX IF NOT EXISTS in_order ON kept (late, id);
+CREATE INDEX IF NOT EXISTS in_order ON items (late, id);
 CREATE TABLE IF NOT EXISTS dropped (
     device TEXT NOT NULL, late INTEGER NOT NULL, count INTEGER NOT NULL, PRIMARY KEY (device, late));
 """
 _ROW_BYTES = 100
-"""What a row costs beside its topic and payload [B], rounded up: ids, index, page overhead."""
+"""Size of a row in addition to topic and payload [B], rounded up: ids, index, page overhead."""
 _CHUNK = 200
-_LOOK_EVERY_MS = 60_000
+_AGE_CHECK_PERIOD_MS = 60_000
 _DEVICE_LEVELS = 5
 
 
-class ShelfError(Exception):
-    """The disk does not take or give what is kept; the text says why."""
+class OutboxStoreError(Exception):
+    """The file cannot be read or written; the text states why."""
 
 
 @dataclass(frozen=True, slots=True)
 class OutboxItem:
-    """One message to be sent when it can be. ``late``: a measurement, else an event. ``at_ms``: its own time."""
+    """One unsent message. ``late``: a measurement, otherwise an event. ``at_ms``: time of its origin."""
 
     topic: str
     payload: bytes
@@ -42,7 +42,7 @@ class OutboxItem:
 
 @dataclass(frozen=True, slots=True)
 class DroppedCount:
-    """How much of one device was dropped and not yet told."""
+    """Number of dropped messages of one device that have not been reported."""
 
     device: str
     measurements: int
@@ -50,13 +50,13 @@ class DroppedCount:
 
 
 class OutboxStore:
-    """The file. The constructor touches nothing.
+    """The queue. The constructor does not access the disk.
 
     Args:
-        path: Its folder must exist.
-        own: Beginning of the agent's topics; what was kept for another space is deleted.
-        max_bytes: Most that is kept [B].
-        max_age_ms: Older measurements are dropped [ms].
+        path: Database file; its folder must exist.
+        own: Prefix of the agent's topics; messages for another space are deleted.
+        max_bytes: Maximum size [B].
+        max_age_ms: Maximum age of measurements [ms].
     """
 
     def __init__(self, path: Path, *, own: str, max_bytes: int, max_age_ms: int) -> None:
@@ -66,13 +66,13 @@ class OutboxStore:
         self._max_age_ms = max_age_ms
         self._database: sqlite3.Connection | None = None
         self._bytes = 0
-        self._looked_ms = 0
+        self._age_checked_ms = 0
 
     def open(self) -> None:
-        """Open the file, or a new one in its place where it is damaged.
+        """Open the file; a damaged file is moved away and replaced.
 
         Raises:
-            ShelfError: Neither can be.
+            OutboxStoreError: The file cannot be created.
         """
         try:
             self._connect()
@@ -84,19 +84,19 @@ class OutboxStore:
                 self._connect()
             except (sqlite3.Error, OSError) as error:
                 self.close()
-                raise ShelfError(f"{self._path} cannot be used: {error}") from error
+                raise OutboxStoreError(f"{self._path} cannot be used: {error}") from error
 
     def _connect(self) -> None:
         self._database = sqlite3.connect(self._path, check_same_thread=False, isolation_level=None)
         self._database.execute("PRAGMA journal_mode=WAL")
         self._database.execute("PRAGMA synchronous=NORMAL")
         self._database.executescript(_SCHEMA)
-        for table, column in (("kept", "topic"), ("dropped", "device")):
+        for table, column in (("items", "topic"), ("dropped", "device")):
             self._database.execute(
-                f"DELETE FROM {table} WHERE substr({column}, 1, ?) <> ?",  # noqa: S608 (both are written above)  # nosec B608
+                f"DELETE FROM {table} WHERE substr({column}, 1, ?) <> ?",  # noqa: S608 (constants, see above)  # nosec B608
                 (len(self._own), self._own),
             )
-        self._bytes = self._database.execute("SELECT coalesce(sum(size), 0) FROM kept").fetchone()[0]
+        self._bytes = self._database.execute("SELECT coalesce(sum(size), 0) FROM items").fetchone()[0]
 
     def close(self) -> None:
         """Close the file. May be called twice."""
@@ -105,39 +105,39 @@ class OutboxStore:
             self._database = None
 
     def put(self, items: Iterable[OutboxItem], *, now_ms: int) -> None:
-        """Keep items, all or none, within the bound.
+        """Store items atomically, and enforce the bounds.
 
         Args:
             items: Oldest first.
             now_ms: Wall clock [ms since 1970].
 
         Raises:
-            ShelfError: None of them is kept.
+            OutboxStoreError: None of them is stored.
         """
         rows = [(item.late, item.at_ms, _size(item), item.topic, item.payload) for item in items]
 
         def write(database: sqlite3.Connection) -> int:
-            database.executemany("INSERT INTO kept (late, at_ms, size, topic, payload) VALUES (?, ?, ?, ?, ?)", rows)
+            database.executemany("INSERT INTO items (late, at_ms, size, topic, payload) VALUES (?, ?, ?, ?, ?)", rows)
             return self._bytes + sum(row[2] for row in rows)
 
         self._change(write)
-        self.bound(now_ms=now_ms)
+        self.enforce_bounds(now_ms=now_ms)
 
-    def bound(self, *, now_ms: int) -> None:
-        """Drop what is too much, and measurements that are too old; count them.
+    def enforce_bounds(self, *, now_ms: int) -> None:
+        """Drop and count messages beyond the maximum size, and measurements beyond the maximum age.
 
         Raises:
-            ShelfError: It stays as it is.
+            OutboxStoreError: Nothing has changed.
         """
-        if not 0 <= now_ms - self._looked_ms < _LOOK_EVERY_MS:
+        if not 0 <= now_ms - self._age_checked_ms < _AGE_CHECK_PERIOD_MS:
             self._drop("late = 1 AND at_ms < ?", (now_ms - self._max_age_ms,))
-            self._looked_ms = now_ms
+            self._age_checked_ms = now_ms
         while (excess := self._bytes - self._max_bytes) > 0:
             self._drop("late = ? AND id <= ?", self._oldest(excess))
 
     def _oldest(self, excess: int) -> tuple[bool, int]:
-        """Of which kind to drop, and up to which id, to get rid of ``excess`` bytes or of a good part of them."""
-        rows = self._read("SELECT late, id, size FROM kept ORDER BY late DESC, id LIMIT ?", (_CHUNK,))
+        """The kind and the highest id of messages to drop, for up to ``excess`` bytes."""
+        rows = self._read("SELECT late, id, size FROM items ORDER BY late DESC, id LIMIT ?", (_CHUNK,))
         late, last, _ = rows[0]
         for kind, number, size in rows:
             if kind != late or excess <= 0:
@@ -147,33 +147,33 @@ class OutboxStore:
 
     def _drop(self, which: str, values: tuple[object, ...]) -> None:
         def write(database: sqlite3.Connection) -> int:
-            gone = database.execute(
-                f"DELETE FROM kept WHERE {which} RETURNING late, topic, size",  # noqa: S608 (ours, see above)  # nosec B608
+            rows = database.execute(
+                f"DELETE FROM items WHERE {which} RETURNING late, topic, size",  # noqa: S608 (constants)  # nosec B608
                 values,
             ).fetchall()
-            for late, topic, _ in gone:
+            for late, topic, _ in rows:
                 _count(database, device_of(topic), late=late, count=1)
-            return self._bytes - sum(int(row[2]) for row in gone)
+            return self._bytes - sum(int(row[2]) for row in rows)
 
         self._change(write)
 
     def drop(self, ids: Iterable[int]) -> None:
-        """Drop items that nobody will ever confirm, and count them.
+        """Drop and count items that were never acknowledged.
 
         Raises:
-            ShelfError: Not all of them are dropped.
+            OutboxStoreError: Not all of them are dropped.
         """
         for number in ids:
             self._drop("id = ?", (number,))
 
     def count(self, dropped: Mapping[tuple[str, bool], int]) -> None:
-        """Count what was never kept as dropped.
+        """Count messages that were dropped before they were stored.
 
         Args:
-            dropped: How many by device and whether they are measurements.
+            dropped: Number by device and whether they are measurements.
 
         Raises:
-            ShelfError: They are not counted.
+            OutboxStoreError: They are not counted.
         """
 
         def write(database: sqlite3.Connection) -> int:
@@ -184,38 +184,38 @@ class OutboxStore:
         self._change(write)
 
     def after(self, last: int, *, late: bool, limit: int) -> list[tuple[int, OutboxItem]]:
-        """The oldest items that came after one, with their ids.
+        """The oldest items after an id, with their ids.
 
         Raises:
-            ShelfError: They cannot be read.
+            OutboxStoreError: They cannot be read.
         """
         rows = self._read(
-            "SELECT id, topic, payload, at_ms FROM kept WHERE late = ? AND id > ? ORDER BY id LIMIT ?",
+            "SELECT id, topic, payload, at_ms FROM items WHERE late = ? AND id > ? ORDER BY id LIMIT ?",
             (late, last, limit),
         )
         return [(row[0], OutboxItem(row[1], row[2], row[3], late)) for row in rows]
 
     def remove(self, ids: Sequence[int]) -> None:
-        """Delete what has arrived.
+        """Delete acknowledged items.
 
         Raises:
-            ShelfError: It is still there, and will be sent once more.
+            OutboxStoreError: They remain, and will be sent again.
         """
 
         def write(database: sqlite3.Connection) -> int:
-            gone = 0
+            removed = 0
             for number in ids:
-                rows = database.execute("DELETE FROM kept WHERE id = ? RETURNING size", (number,)).fetchall()
-                gone += sum(row[0] for row in rows)
-            return self._bytes - gone
+                rows = database.execute("DELETE FROM items WHERE id = ? RETURNING size", (number,)).fetchall()
+                removed += sum(row[0] for row in rows)
+            return self._bytes - removed
 
         self._change(write)
 
-    def tell_dropped(self, event: Callable[[DroppedCount], OutboxItem]) -> None:
-        """Keep an event for each device of which something was dropped, and begin to count anew.
+    def store_dropped_events(self, event: Callable[[DroppedCount], OutboxItem]) -> None:
+        """Store an event for each device with dropped messages, and reset the counts.
 
         Raises:
-            ShelfError: Nothing has changed.
+            OutboxStoreError: Nothing has changed.
         """
 
         def write(database: sqlite3.Connection) -> int:
@@ -226,7 +226,7 @@ class OutboxStore:
             database.execute("DELETE FROM dropped")
             for item in items:
                 database.execute(
-                    "INSERT INTO kept (late, at_ms, size, topic, payload) VALUES (?, ?, ?, ?, ?)",
+                    "INSERT INTO items (late, at_ms, size, topic, payload) VALUES (?, ?, ?, ?, ?)",
                     (item.late, item.at_ms, _size(item), item.topic, item.payload),
                 )
             return self._bytes + sum(map(_size, items))
@@ -234,8 +234,8 @@ class OutboxStore:
         self._change(write)
 
     def _change(self, write: Callable[[sqlite3.Connection], int]) -> None:
-        """One transaction; ``write`` gives how many bytes are kept after it."""
-        database = self._use()
+        """Run one transaction; ``write`` returns the number of stored bytes after it."""
+        database = self._connection()
         try:
             database.execute("BEGIN IMMEDIATE")
             after = write(database)
@@ -244,24 +244,24 @@ class OutboxStore:
         except sqlite3.Error as error:
             with contextlib.suppress(sqlite3.Error):
                 database.execute("ROLLBACK")
-            raise ShelfError(f"{self._path} cannot be written ({error}): is the disk full?") from error
+            raise OutboxStoreError(f"{self._path} cannot be written ({error}): is the disk full?") from error
 
     def _read(self, sql: str, values: tuple[object, ...]) -> list[Any]:
-        database = self._use()
+        database = self._connection()
         try:
             rows: list[Any] = database.execute(sql, values).fetchall()
         except sqlite3.Error as error:
-            raise ShelfError(f"{self._path} cannot be read: {error}") from error
+            raise OutboxStoreError(f"{self._path} cannot be read: {error}") from error
         return rows
 
-    def _use(self) -> Any:
+    def _connection(self) -> Any:
         if self._database is None:
-            raise ShelfError(f"{self._path} is not open")
+            raise OutboxStoreError(f"{self._path} is not open")
         return self._database
 
 
 def device_of(topic: str) -> str:
-    """The part of a topic that names the device."""
+    """The device part of a topic."""
     return "/".join(topic.split("/")[:_DEVICE_LEVELS])
 
 

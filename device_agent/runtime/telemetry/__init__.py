@@ -1,1 +1,1 @@
-"""Telemetry."""
+"""Publication of telemetry, state, events and camera frames."""

@@ -1,8 +1,8 @@
-"""What a robot sees, camera by camera, in a thread that may wait: beside all that moves it.
+"""Streams camera frames, in a thread that may wait.
 
-Drawing or taking a picture costs far more than anything else that a robot at rest does. The agent is not told who looks
-at it, but knows whether somebody controls it: while they do, and for a while after, each camera films at its own rate;
-else once a second, which is enough to see that the eyes are open. While the link is down nothing is filmed.
+Rendering or taking a picture costs far more than the rest of an idle robot. The agent does not know its viewers, but
+it knows whether the robot is controlled. During control and for a while after, each camera streams at its own rate;
+otherwise once a second. Without a link there are no frames.
 """
 
 import math
@@ -17,20 +17,20 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.telemetry.periodic_poller import PeriodicPoller
 
 IDLE_PERIOD_S = 1.0
-"""From one picture to the next of a robot that nobody controls."""
+"""Time between two frames of a robot without control [s]."""
 LINGER_S = 60.0
-"""After the end of control pictures go on as before for so long: who has just let go still looks."""
+"""Time after the end of control in which cameras keep their rate, because the operator may still watch [s]."""
 
 
 class CameraStreamer:
-    """Asks a driver for pictures, and tells them.
+    """Polls a driver for camera frames, and publishes them.
 
     Args:
-        cameras: Those of the robot type, with how many pictures a second.
-        driver: What takes them; ``None``: it has no eyes.
-        name: The device's name.
-        film: Called with a camera's name and its picture; must not block.
-        controlled: Whether somebody controls the robot.
+        cameras: Cameras of the robot type, with their frame rates.
+        driver: Takes the pictures; ``None`` if it has no cameras.
+        name: Name of the device.
+        publish: Called with a camera's name and its frame; must not block.
+        is_controlled: Whether the robot has a lease holder.
         linger_s: See ``LINGER_S``.
     """
 
@@ -40,52 +40,52 @@ class CameraStreamer:
         driver: HasCameras | None,
         *,
         name: str,
-        film: Callable[[str, CameraFrame], None],
-        controlled: Callable[[], bool],
+        publish: Callable[[str, CameraFrame], None],
+        is_controlled: Callable[[], bool],
         linger_s: float = LINGER_S,
     ) -> None:
-        self._film = film
-        self._controlled = controlled
+        self._publish = publish
+        self._is_controlled = is_controlled
         self._linger_s = linger_s
         self._linked = False
         self._controlled_s = -math.inf
-        self._filmed_s: dict[str, float] = {}
+        self._last_frame_s: dict[str, float] = {}
         self._driver = driver
-        self._taken: Counter[str] = Counter()
-        self._rounds = PeriodicPoller(() if driver is None else cameras, self._shoot, device=name, what="camera")
+        self._sequences: Counter[str] = Counter()
+        self._poller = PeriodicPoller(() if driver is None else cameras, self._stream, device=name, kind="camera")
 
     def start(self) -> None:
-        """Begin, where there is something to film."""
-        self._rounds.start()
+        """Start to stream, if there are cameras."""
+        self._poller.start()
 
     def stop(self) -> None:
-        """End. May be called twice."""
-        self._rounds.stop()
+        """Stop. May be called twice."""
+        self._poller.stop()
 
     def link_changed(self, up: bool) -> None:
-        """The link came or went: without one nobody sees anything."""
+        """Pause without a link."""
         self._linked = up
 
-    def _wanted(self, camera: str) -> bool:
+    def _is_due(self, camera: str) -> bool:
         now_s = time.monotonic()
-        if self._controlled():
+        if self._is_controlled():
             self._controlled_s = now_s
         live = now_s - self._controlled_s <= self._linger_s
-        if not self._linked or not (live or now_s - self._filmed_s.get(camera, -math.inf) >= IDLE_PERIOD_S):
+        if not self._linked or not (live or now_s - self._last_frame_s.get(camera, -math.inf) >= IDLE_PERIOD_S):
             return False
-        self._filmed_s[camera] = now_s
+        self._last_frame_s[camera] = now_s
         return True
 
-    def _shoot(self, camera: str) -> None:
-        if not self._wanted(camera):
+    def _stream(self, camera: str) -> None:
+        if not self._is_due(camera):
             return
         picture = None if self._driver is None else self._driver.frame(camera)
         if picture is None:
             return
-        self._taken[camera] += 1
+        self._sequences[camera] += 1
         tick = round(picture.taken_s * 1000)
-        frame = CameraFrame(self._taken[camera], tick, picture.width, picture.height, picture.content)
+        frame = CameraFrame(self._sequences[camera], tick, picture.width, picture.height, picture.content)
         try:
-            self._film(camera, frame)
+            self._publish(camera, frame)
         except ProtocolError as error:
-            raise DriverError(f"{error}; have it take smaller pictures") from error
+            raise DriverError(f"{error}; configure smaller pictures") from error

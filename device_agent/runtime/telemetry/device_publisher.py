@@ -1,4 +1,4 @@
-"""What one device tells the world: acks, events, ``desc``, ``state``, telemetry, and the refusals it counts."""
+"""Publishes the acks, events, description, state and telemetry of one device."""
 
 import queue
 import threading
@@ -33,41 +33,41 @@ from device_agent.protocol import (
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.manifests.room import RoomDeviceManifest
-from device_agent.runtime.authority.control_request import Asked
-from device_agent.runtime.authority.event_recorder import EventRecord, event_of
+from device_agent.runtime.authority.control_request import ControlRequest
+from device_agent.runtime.authority.event_recorder import EventRecord, event_message
 from device_agent.runtime.authority.lease_gate import Lease
 from device_agent.runtime.control.base_motion import limits_of
 from device_agent.runtime.control.setpoint_stream import MAX_LOOP_AGE_S, WATCHDOG_S
 from device_agent.runtime.storage.journal import Journal
 from device_agent.runtime.telemetry.outbox import Outbox, Publish
 
-STATE_EVERY_S = 30.0
-STATE_GAP_S = 1.0
+STATE_PERIOD_S = 30.0
+STATE_MIN_GAP_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class StateSnapshot:
-    """What ``state`` shows; two that are equal need not be told twice."""
+    """Content of ``state``."""
 
     mode: Mode
     epoch: int
     ended: int
     lease: Lease | None
-    asked: Asked | None
+    control_request: ControlRequest | None
     latch: StopLatch | None
     faults: tuple[Fault, ...]
     action: ActionState | None
     restrictions: tuple[Restriction, ...]
     stiffness: Mapping[str, float]
 
-    def shown(self) -> tuple[object, ...]:
-        """What makes a new ``state`` worth sending: progress alone does not."""
+    def key(self) -> tuple[object, ...]:
+        """The part whose change triggers a new ``state``; progress alone does not."""
         return (
             self.mode,
             self.epoch,
             self.ended,
             self.lease,
-            self.asked,
+            self.control_request,
             self.latch,
             tuple((fault.code, fault.message) for fault in self.faults),
             self.action and self.action.id,
@@ -77,24 +77,26 @@ class StateSnapshot:
 
 
 class DevicePublisher:
-    """Publishes for one device. Thread-safe but for ``introduce``, ``show`` and ``keep``, which are its office's.
+    """Publisher of one device. Thread-safe.
+
+    Only the command processor calls ``publish_description``, ``publish_state`` and ``record_delivered``.
 
     Args:
         address: Space, agent and name.
-        label: Its name for people.
+        label: Name for operators.
         robot_type: Joints, limits, streams.
-        room_device: What it has where it is a device of a room.
-        simulated: Whether no real metal moves.
-        limits: What the agent itself holds, whoever moves it.
-        actions: The kinds of action that it takes.
-        interlocks: How the room slows or holds it.
+        room_device: Manifest of a room device.
+        simulated: Whether the device is simulated.
+        limits: Names of the limits that the agent enforces.
+        actions: Kinds of the supported actions.
+        interlocks: Rules by which room sensors slow or hold the device.
         journal: Open.
         publish: Sends a message.
-        outbox: Sends what must not be lost.
+        outbox: Stores and forwards events and measurements.
 
     Attributes:
-        refusals: How often what was refused, by code.
-        scripts: How movement scripts run here, as ``desc`` says it.
+        rejections: Number of rejections by code.
+        scripts: How movement scripts run here, for the description.
     """
 
     def __init__(
@@ -125,149 +127,149 @@ class DevicePublisher:
         self._publish = publish
         self._outbox = outbox
         self._delivered: queue.SimpleQueue[Ack] = queue.SimpleQueue()
-        self._believed_from_s = float("-inf")
-        self._answer_again = False
+        self._acks_valid_from_s = float("-inf")
+        self._resend_acks = False
         self._sequences: dict[str, int] = {}
         self._lock = threading.Lock()
-        self._shown: tuple[object, ...] = ()
-        self._shown_at_s = float("-inf")
-        self.refusals: dict[str, int] = {}
-        self.scripts = SandboxStatus("unavailable", "the agent has not looked yet what this machine has")
+        self._published_key: tuple[object, ...] = ()
+        self._published_s = float("-inf")
+        self.rejections: dict[str, int] = {}
+        self.scripts = SandboxStatus("unavailable", "the agent has not checked this machine yet")
 
-    # ------------------------------------------------------------ answers to commands
+    # ------------------------------------------------------------ acks
 
-    def ack(self, command: str, status: AckStatus, **more: object) -> Ack:
-        """The next ack of a command; not yet written or sent."""
+    def create_ack(self, command: str, status: AckStatus, **fields: object) -> Ack:
+        """Create the next ack of a command; it is neither journalled nor sent yet."""
         with self._lock:
             sequence = self._sequences.get(command, 0) + 1
             if status.terminal:
                 self._sequences.pop(command, None)
             else:
                 self._sequences[command] = sequence
-        return Ack(id=command, status=status, sequence=sequence, at_ms=wall_ms(), tick_ms=tick_ms(), **more)  # type: ignore[arg-type]
+        return Ack(id=command, status=status, sequence=sequence, at_ms=wall_ms(), tick_ms=tick_ms(), **fields)  # type: ignore[arg-type]
 
-    def report(self, command: str, status: AckStatus, **more: object) -> None:
+    def report(self, command: str, status: AckStatus, **fields: object) -> None:
         """Journal and publish the next ack of a command."""
-        ack = self.ack(command, status, **more)
+        ack = self.create_ack(command, status, **fields)
         self._journal.record(ack)
         self.send_ack(ack)
 
-    def pass_by(self, command: str, status: AckStatus) -> None:
-        """Publish the next ack of a command without journalling it: the one after it follows at once, and is."""
-        self.send_ack(self.ack(command, status))
+    def ack_transient(self, command: str, status: AckStatus) -> None:
+        """Publish the next ack of a command without journalling it, because another one follows at once."""
+        self.send_ack(self.create_ack(command, status))
 
     def send_ack(self, ack: Ack) -> None:
-        """Publish an ack that the journal has."""
-        self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=partial(self._confirmed, ack))
+        """Publish a journalled ack."""
+        self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=partial(self._on_delivered, ack))
 
-    def _confirmed(self, ack: Ack) -> None:
-        if time.monotonic() >= self._believed_from_s:
+    def _on_delivered(self, ack: Ack) -> None:
+        if time.monotonic() >= self._acks_valid_from_s:
             self._delivered.put(ack)
 
-    def keep(self) -> None:
-        """Write down which answers have arrived."""
+    def record_delivered(self) -> None:
+        """Journal which acks were delivered."""
         while not self._delivered.empty():
             self._journal.delivered(self._delivered.get())
 
-    # ------------------------------------------------------------ what the device is, and how
+    # ------------------------------------------------------------ description and state
 
-    def link_came(self) -> None:
-        """Until the outbox begins to send, a confirmation does not say that the cloud has an answer: see ``Outbox``."""
-        self._believed_from_s = time.monotonic() + self._outbox.settle_s
-        self._answer_again = self._outbox.settle_s > 0
+    def on_connected(self) -> None:
+        """Ignore delivery confirmations until the outbox's settle time has passed; see ``Outbox``."""
+        self._acks_valid_from_s = time.monotonic() + self._outbox.settle_s
+        self._resend_acks = self._outbox.settle_s > 0
 
-    def introduce(self, twin: Twin | None) -> None:
-        """After each connection: what the device is, how it is, and the answers that may not have arrived."""
+    def publish_description(self, twin: Twin | None) -> None:
+        """Publish the description and unconfirmed acks, and make the next state due: the link is up."""
         self._retain(self._topic(topics.DESC), self._description())
         if twin is not None:
             self._retain(self._topic(topics.DESC, topics.TWIN), twin)
-        self._shown_at_s = float("-inf")
-        self._answer()
+        self._published_s = float("-inf")
+        self._send_undelivered()
 
-    def _answer(self) -> None:
+    def _send_undelivered(self) -> None:
         for ack in self._journal.undelivered(self._name):
             self.send_ack(ack)
 
-    def show(self, now: StateSnapshot) -> None:
+    def publish_state(self, snapshot: StateSnapshot) -> None:
         """Publish ``state`` on change, at most once a second, and every 30 s."""
         now_s = time.monotonic()
-        if self._answer_again and now_s >= self._believed_from_s:
-            self._answer_again = False
-            self._answer()
-        shown = now.shown()
-        age_s = now_s - self._shown_at_s
-        if age_s < STATE_GAP_S or (shown == self._shown and age_s < STATE_EVERY_S):
+        if self._resend_acks and now_s >= self._acks_valid_from_s:
+            self._resend_acks = False
+            self._send_undelivered()
+        key = snapshot.key()
+        age_s = now_s - self._published_s
+        if age_s < STATE_MIN_GAP_S or (key == self._published_key and age_s < STATE_PERIOD_S):
             return
         at_ms = wall_ms()
         state = State(
             device=self._name,
             at_ms=at_ms,
             tick_ms=tick_ms(),
-            mode=now.mode,
-            epoch=now.epoch,
-            ended_epoch=now.ended,
-            stop=now.latch,
-            lease=_lease_state(now.lease, now.asked, now_s),
-            action=now.action,
-            faults=now.faults,
-            restrictions=now.restrictions,
-            stiffness=dict(now.stiffness),
+            mode=snapshot.mode,
+            epoch=snapshot.epoch,
+            ended_epoch=snapshot.ended,
+            stop=snapshot.latch,
+            lease=_lease_state(snapshot.lease, snapshot.control_request, now_s),
+            action=snapshot.action,
+            faults=snapshot.faults,
+            restrictions=snapshot.restrictions,
+            stiffness=dict(snapshot.stiffness),
         )
         if self._retain(self._topic(topics.STATE), state):
-            self._shown, self._shown_at_s = shown, now_s
+            self._published_key, self._published_s = key, now_s
 
-    def tell(self, stream: str, telemetry: JointTelemetry | Measurements) -> None:
-        """Publish a measurement; called by the control loop too, must not block."""
+    def publish_telemetry(self, stream: str, telemetry: JointTelemetry | Measurements) -> None:
+        """Publish a measurement; never blocks, because the control loop calls it."""
         payload = codec.encode(telemetry)
         sent = self._publish(self._topic(topics.TELE, stream), payload, qos=0)
         late = self._topic(topics.LATE, stream)
-        self._outbox.measured(late, payload, at_ms=telemetry.at_ms, sent=sent, now_s=time.monotonic())
+        self._outbox.add_measurement(late, payload, at_ms=telemetry.at_ms, sent=sent, now_s=time.monotonic())
 
-    def film(self, camera: str, frame: CameraFrame) -> None:
-        """Publish a picture; one that cannot go out at once is let go."""
+    def publish_frame(self, camera: str, frame: CameraFrame) -> None:
+        """Publish a camera frame; it is dropped if it cannot be sent at once."""
         self._publish(self._topic(topics.CAM, camera), camera_frames.encode(frame), qos=0)
 
-    def event(self, happened: EventRecord) -> None:
-        """Tell a fact that happened, as soon as it can be."""
-        event = event_of(self._name, happened)
-        self._outbox.happened(self._topic(topics.EVENT), codec.encode(event), at_ms=event.at_ms)
+    def publish_event(self, event: EventRecord) -> None:
+        """Publish an event through the outbox."""
+        message = event_message(self._name, event)
+        self._outbox.add_event(self._topic(topics.EVENT), codec.encode(message), at_ms=message.at_ms)
 
-    def count(self, code: str) -> None:
-        """Count a refusal."""
-        self.refusals[code] = self.refusals.get(code, 0) + 1
+    def count_rejection(self, code: str) -> None:
+        """Count a rejection."""
+        self.rejections[code] = self.rejections.get(code, 0) + 1
 
     def _retain(self, topic: str, message: object) -> bool:
         return self._publish(topic, codec.encode(message, limit=codec.MAX_RETAINED_BYTES), qos=1, retain=True)
 
     def _description(self) -> Description:
-        kind, fitted = self._robot_type, self._room_device
+        robot_type, room = self._robot_type, self._room_device
         return Description(
             device=self._name,
-            kind=kind.kind,
-            robot_type=kind.type,
+            kind=robot_type.kind,
+            robot_type=robot_type.type,
             label=self._label,
-            joints=kind.joints,
-            mimic_joints=kind.mimic_joints,
-            position_dependent_limits=kind.position_dependent_limits,
-            frames=kind.frames,
-            capabilities=kind.capabilities,
+            joints=robot_type.joints,
+            mimic_joints=robot_type.mimic_joints,
+            position_dependent_limits=robot_type.position_dependent_limits,
+            frames=robot_type.frames,
+            capabilities=robot_type.capabilities,
             actions=self._actions,
-            postures=tuple(kind.postures),
-            expressions=tuple(kind.expressions),
-            behaviours=tuple(kind.behaviours),
-            streams=kind.streams,
-            cameras=kind.cameras if fitted is None else fitted.cameras,
-            captures=() if fitted is None else fitted.captures,
-            controls=() if fitted is None else fitted.controls,
+            postures=tuple(robot_type.postures),
+            expressions=tuple(robot_type.expressions),
+            behaviours=tuple(robot_type.behaviours),
+            streams=robot_type.streams,
+            cameras=robot_type.cameras if room is None else room.cameras,
+            captures=() if room is None else room.captures,
+            controls=() if room is None else room.controls,
             watchdog_ms=round(WATCHDOG_S * 1000),
             max_loop_age_ms=round(MAX_LOOP_AGE_S * 1000),
             simulated=self._simulated,
             limits=self._limits,
             interlocks=self._interlocks,
-            diagnostics=() if fitted is None else fitted.diagnostics,
-            # In the origin of the floor is what the manifest gives no place.
-            position_m=fitted.position_m if fitted is not None and any(fitted.position_m) else None,
-            base=None if kind.base is None else BaseLimits(**limits_of(kind.base)._asdict()),
+            diagnostics=() if room is None else room.diagnostics,
+            # A manifest without a position leaves the origin.
+            position_m=room.position_m if room is not None and any(room.position_m) else None,
+            base=None if robot_type.base is None else BaseLimits(**limits_of(robot_type.base)._asdict()),
             scripts=self.scripts.how,
             scripts_note=self.scripts.why[:2000],
         )
@@ -276,20 +278,24 @@ class DevicePublisher:
         return topics.device(*self._address, kind, name)
 
 
-def _lease_state(lease: Lease | None, asked: Asked | None, now_s: float) -> LeaseState | None:
+def _lease_state(lease: Lease | None, control_request: ControlRequest | None, now_s: float) -> LeaseState | None:
     if lease is None:
         return None
     request = None
-    if asked is not None:
-        request = OpenRequest(id=asked.id, requester=asked.by, expires_in_ms=_left_ms(asked.expires_s, now_s))
+    if control_request is not None:
+        request = OpenRequest(
+            id=control_request.id,
+            requester=control_request.requester,
+            expires_in_ms=_remaining_ms(control_request.expires_s, now_s),
+        )
     return LeaseState(
         holder=lease.holder,
         epoch=lease.epoch,
-        expires_in_ms=_left_ms(lease.expires_s, now_s),
+        expires_in_ms=_remaining_ms(lease.expires_s, now_s),
         reason=lease.reason,
         request=request,
     )
 
 
-def _left_ms(expires_s: float, now_s: float) -> int:
+def _remaining_ms(expires_s: float, now_s: float) -> int:
     return max(0, round((expires_s - now_s) * 1000))

@@ -1,4 +1,4 @@
-"""Asks for several things, each at its own rate, in a thread of its own: one that is slow must not cost a period."""
+"""Polls several sources, each at its own rate, in one thread."""
 
 import logging
 import math
@@ -14,37 +14,38 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
-class _Due:
-    """One thing: its period [s], when it is next asked for [s], and what is wrong with it."""
+class _Schedule:
+    """Period of a source [s], time of its next poll [s], and its last error."""
 
     period_s: float
     due_s: float = -math.inf
-    trouble: str = ""
+    error: str = ""
 
 
 class PeriodicPoller:
-    """Asks, at each one's rate, until it is stopped. What was missed is not made up for.
+    """Polls each source at its rate until it is stopped. Missed polls are dropped.
 
     Args:
-        things: What is asked for, and how often.
-        ask: Called with the name of one; may take its time, and raise ``DriverError``.
-        device: The device's name, for the log; ``what``: the kind of thing, for the log too.
+        sources: Names and rates.
+        poll: Called with the name of a source; may block, and raise ``DriverError``.
+        device: Name of the device, for the log.
+        kind: Kind of the sources, for the log.
     """
 
-    def __init__(self, things: Iterable[Stream], ask: Callable[[str], None], *, device: str, what: str) -> None:
-        self._ask = ask
-        self._called = f"{device}: {what}"
-        self._things = {thing.name: _Due(1 / thing.rate_hz) for thing in things}
+    def __init__(self, sources: Iterable[Stream], poll: Callable[[str], None], *, device: str, kind: str) -> None:
+        self._poll = poll
+        self._label = f"{device}: {kind}"
+        self._schedules = {source.name: _Schedule(1 / source.rate_hz) for source in sources}
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"{device}-{what}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"{device}-{kind}", daemon=True)
 
     def start(self) -> None:
-        """Begin, where there is something to ask for."""
-        if self._things:
+        """Start to poll, if there are sources."""
+        if self._schedules:
             self._thread.start()
 
     def stop(self) -> None:
-        """End. May be called twice."""
+        """Stop. May be called twice."""
         self._stopping.set()
         if self._thread.is_alive():
             self._thread.join(timeout=2)
@@ -53,25 +54,25 @@ class PeriodicPoller:
         wait_s = 0.0
         while not self._stopping.wait(wait_s):
             now_s = time.monotonic()
-            for name, due in self._things.items():
-                if due.due_s <= now_s:
-                    following_s = due.due_s + due.period_s
-                    due.due_s = following_s if following_s > now_s else now_s + due.period_s
-                    self._note(name, due, self._trouble(name))
-            wait_s = max(0.0, min(due.due_s for due in self._things.values()) - time.monotonic())
+            for name, schedule in self._schedules.items():
+                if schedule.due_s <= now_s:
+                    next_s = schedule.due_s + schedule.period_s
+                    schedule.due_s = next_s if next_s > now_s else now_s + schedule.period_s
+                    self._log_change(name, schedule, self._poll_once(name))
+            wait_s = max(0.0, min(schedule.due_s for schedule in self._schedules.values()) - time.monotonic())
 
-    def _trouble(self, name: str) -> str:
-        """Ask for it; what went wrong, or nothing."""
+    def _poll_once(self, name: str) -> str:
+        """Poll a source; returns the error message, or an empty string."""
         try:
-            self._ask(name)
+            self._poll(name)
         except DriverError as error:
             return str(error)
-        except Exception as error:  # noqa: BLE001 (one that goes wrong must not end all of them)
+        except Exception as error:  # noqa: BLE001 (an error of one source must not stop the others)
             return f"internal error: {error!r}"
         return ""
 
-    def _note(self, name: str, due: _Due, trouble: str) -> None:
-        """Log trouble when it comes and when it goes, not each time."""
-        if trouble != due.trouble:
-            due.trouble = trouble
-            _log.warning("%s %s: %s", self._called, name, trouble or "is measured again")
+    def _log_change(self, name: str, schedule: _Schedule, error: str) -> None:
+        """Log an error when it starts and ends, not at each poll."""
+        if error != schedule.error:
+            schedule.error = error
+            _log.warning("%s %s: %s", self._label, name, error or "works again")

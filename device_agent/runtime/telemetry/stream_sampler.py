@@ -1,6 +1,6 @@
-"""What a device measures besides its joints, stream by stream at its own rate, in a thread that may wait.
+"""Samples a device's streams other than joints, each at its rate, in a thread that may wait.
 
-The control loop knows nothing of it: a sonar that is slow to answer must not cost a period.
+It is separate from the control loop, so that a slow sensor cannot delay a control period.
 """
 
 import math
@@ -16,13 +16,13 @@ from device_agent.runtime.telemetry.periodic_poller import PeriodicPoller
 
 
 class StreamSampler:
-    """Asks a driver for its streams, and tells them.
+    """Polls the streams of a driver, and publishes them.
 
     Args:
-        streams: Those of the robot type.
-        driver: What measures them; ``None``: it measures nothing but joints.
-        name: The device's name.
-        tell: Called with each stream's measurements; must not block for long.
+        streams: Streams of the robot type.
+        driver: Measures the streams; ``None`` if it measures only joints.
+        name: Name of the device.
+        publish: Called with each stream's measurements; must not block for long.
     """
 
     def __init__(
@@ -31,34 +31,33 @@ class StreamSampler:
         driver: ReportsStreams | None,
         *,
         name: str,
-        tell: Callable[[str, Measurements], None],
+        publish: Callable[[str, Measurements], None],
     ) -> None:
-        self._tell = tell
-        self._told: Counter[str] = Counter()
+        self._publish = publish
+        self._sequences: Counter[str] = Counter()
         self._latest: Mapping[str, tuple[Values, float]] = {}
-        asked = [] if driver is None else [stream for stream in streams if stream.name != topics.JOINTS]
+        polled = [] if driver is None else [stream for stream in streams if stream.name != topics.JOINTS]
         self._driver = driver
-        self._rounds = PeriodicPoller(asked, self._ask, device=name, what="stream")
+        self._poller = PeriodicPoller(polled, self._sample, device=name, kind="stream")
 
     def start(self) -> None:
-        """Begin, where there is something to ask for."""
-        self._rounds.start()
+        """Start to poll, if there are streams."""
+        self._poller.start()
 
     def stop(self) -> None:
-        """End. May be called twice."""
-        self._rounds.stop()
+        """Stop. May be called twice."""
+        self._poller.stop()
 
     def latest(self) -> Mapping[str, Reading]:
-        """The newest values of each stream that has been measured."""
+        """The newest values of each measured stream."""
         now_s = time.monotonic()
         return {stream: Reading(values, max(0.0, now_s - at_s)) for stream, (values, at_s) in self._latest.items()}
 
-    def _ask(self, stream: str) -> None:
-        given: Values = {} if self._driver is None else self._driver.report(stream)
-        values = {name: value for name, value in given.items() if math.isfinite(value)}
+    def _sample(self, stream: str) -> None:
+        measured: Values = {} if self._driver is None else self._driver.report(stream)
+        values = {name: value for name, value in measured.items() if math.isfinite(value)}
         if values:
-            self._told[stream] += 1
+            self._sequences[stream] += 1
             self._latest = {**self._latest, stream: (values, time.monotonic())}
-            self._tell(
-                stream, Measurements(tick_ms=tick_ms(), at_ms=wall_ms(), sequence=self._told[stream], values=values)
-            )
+            sequence = self._sequences[stream]
+            self._publish(stream, Measurements(tick_ms=tick_ms(), at_ms=wall_ms(), sequence=sequence, values=values))

@@ -44,13 +44,13 @@ class Rig:
             sent_ms=1.0,
             target=JointTarget(position_rad={"elbow": elbow}),
         )
-        self.controller.offer(setpoint, now_s=self.now_s, tick_ms=self.tick_ms)
+        self.controller.accept_setpoint(setpoint, now_s=self.now_s, tick_ms=self.tick_ms)
 
     def run(self, seconds: float) -> Mode:
         before = self.elbow
         for _ in range(round(seconds / PERIOD_S)):
             self.now_s += PERIOD_S
-            tick = self.controller.step(self.now_s)
+            tick = self.controller.update(self.now_s)
             self.limited |= set(tick.limited)
             self.elbow = tick.position_rad[1]
             self.velocities.append((self.elbow - before) / PERIOD_S)
@@ -82,11 +82,11 @@ def lost(_: Refused) -> None:
 def interruptions() -> dict[str, object]:
     return {
         "stop": lambda rig: rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1)),
-        "link": lambda rig: rig.controller.lost(Refused("link_lost", "the link is gone")),
+        "link": lambda rig: rig.controller.interrupt(Refused("link_lost", "the link is gone")),
         "takeover": lambda rig: rig.take(2),
         "release": lambda rig: rig.controller.release(epoch=1),
         "expiry": lambda rig: rig.run(6.0),
-        "fault": lambda rig: rig.controller.fail("no answer"),
+        "fault": lambda rig: rig.controller.set_fault("no answer"),
     }
 
 

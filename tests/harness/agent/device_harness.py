@@ -69,7 +69,7 @@ class Bench:
         self.clock.observe(server_ms=wall_ms(), sent_tick_ms=tick_ms(), received_tick_ms=tick_ms())
         self.number = 0
         shelf = OutboxStore(folder / "outbox.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
-        self.outbox = Outbox(shelf, publish=self.publish, teller="ts/v1/s/a/arm")
+        self.outbox = Outbox(shelf, publish=self.publish, device_topic="ts/v1/s/a/arm")
         self.outbox.link_changed(True)
         self.outbox.start()
         self.device = Device(
@@ -84,12 +84,12 @@ class Bench:
             keys=pins_of(self.key),
             publish=self.publish,
             outbox=self.outbox,
-            room=ReadingCache(
+            readings=ReadingCache(
                 space="s", agent="a", own=["arm"], named=[(rule.device, rule.stream) for rule in interlocks]
             ),
             interlocks=interlocks,
             geometry=geometry,
-            jail=jail or warm_jail(),
+            sandbox=jail or warm_jail(),
             owner=OWNER,
             speech=speech,
             uploads=uploads,

@@ -232,12 +232,12 @@ def test_no_version_that_may_run_is_older_for_the_device_than_one_that_ran(
     trust = ScriptPolicy(device="arm", robot_type="ur5", owner=anna.account, keys=robot._keys, journal=journal)
     for order in orders:
         assert isinstance(order, RunMovement)
-        trust.check(order)
-        trust.remember(order)
-        assert not trust.stranger(order)
+        trust.verify(order)
+        trust.record_version(order)
+        assert not trust.is_untrusted(order)
         assert order.timeout_ms == 300_000
     with pytest.raises(Refused, match="older than version"):
-        trust.check(orders[1])  # type: ignore[arg-type]
+        trust.verify(orders[1])  # type: ignore[arg-type]
     journal.close()
     assert [each.author for each in orders if isinstance(each, RunMovement)] == [
         SHIPPED, anna.account, anna.account, SHIPPED, anna.account,

@@ -26,7 +26,7 @@ import msgspec
 from device_agent.ports import script_calls
 from device_agent.ports.sandbox import Limits, SandboxProcess
 from device_agent.protocol import RunMovement
-from device_agent.runtime.actions.script_action import Cell, Script, ScriptFailed
+from device_agent.runtime.actions.script_action import ScriptAction, ScriptFailed, ScriptSandbox
 from device_agent.runtime.errors import Refused
 from device_agent.sandbox.host import SandboxHost
 from tests.security.sandbox.attacks import ATTACKS
@@ -67,13 +67,13 @@ class Puppet:
 
     joints = ("shoulder", "elbow")
     frames = ("tool",)
-    can = ("move_joints", "home", "state")
+    calls = ("move_joints", "home", "state")
 
     def __init__(self) -> None:
         self.moves: list[Any] = []
         self.messages = 0
 
-    def do(self, call: script_calls.Call) -> Any:
+    def execute(self, call: script_calls.Call) -> Any:
         self.messages += 1
         if isinstance(call, script_calls.AskState):
             return {"position_rad": dict.fromkeys(self.joints, 0.0)}
@@ -233,7 +233,7 @@ def attack(jail: SandboxHost, around: Surroundings, name: str, source: str, *, s
         robot_type="toy", name=name, version=1, sha256="0" * 64, source=source,
         parameters=around.parameters(warm_parents()),
     )  # fmt: skip
-    script = Script(order, puppet, told, cell=Cell(jail, stranger, LIMITS), died=lambda: None)
+    script = ScriptAction(order, puppet, told, sandbox=ScriptSandbox(jail, stranger, LIMITS), on_exit=lambda: None)
     killed_at_s = 0.0
 
     def stop() -> None:
@@ -252,7 +252,7 @@ def attack(jail: SandboxHost, around: Surroundings, name: str, source: str, *, s
     alarm.cancel()
     breaches = [line for line in printed[0].splitlines() if line.startswith("BREACH")]
     breaches += around.breaches()
-    inmate = script._inmate
+    inmate = script._process
     if inmate is not None and strays(jail, inmate.pid):  # type: ignore[attr-defined]
         breaches.append("something of it is still alive")
     return Result(

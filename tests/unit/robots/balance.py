@@ -89,7 +89,7 @@ class Walking:
         self.dof = np.array([self.model.joint(name).dofadr[0] for name in self.names])
         self.controller = Controller(self.type, LeaseGate())
         self.controller.start_at(self.home)
-        self.tenure = self.controller.begin_action(epoch=1, on_lost=lambda _: None)
+        self.tenure = self.controller.reserve(epoch=1, on_revoked=lambda _: None)
         self.period_s = self.type.period_ms / 1000
         self.now_s = 0.0
         self.least_upright = 1.0
@@ -103,9 +103,9 @@ class Walking:
         """One control period: what the loop does, then the physics."""
         self.now_s += self.period_s
         self.driver.observe()
-        tick = self.controller.step(self.now_s)
+        tick = self.controller.update(self.now_s)
         self.applied = self.driver.send(tick.position_rad)
-        self.controller.applied(self.applied)
+        self.controller.record_applied(self.applied)
         self.twist = self.driver.drive(tick.twist)
         self.world.step(round(self.period_s / STEP_S))
         self.least_upright = min(self.least_upright, self.upright)
@@ -117,11 +117,11 @@ class Walking:
 
     def move(self, position_rad: Mapping[str, float], *, speed: float = 0.3) -> None:
         """As an action does, to its end."""
-        self.follow(self.controller.move(self.tenure, position_rad, speed=speed))
+        self.follow(self.controller.start_joint_goal(self.tenure, position_rad, speed=speed))
 
     def drive(self, twist: Twist, *, duration_s: float) -> None:
         """As an action does, to its end."""
-        self.follow(self.controller.drive(self.tenure, twist, duration_s=duration_s))
+        self.follow(self.controller.start_drive(self.tenure, twist, duration_s=duration_s))
 
     def follow(self, course: MotionGoal) -> None:
         """Wait for its end."""
@@ -129,7 +129,7 @@ class Walking:
         while not course.finished.is_set():
             self.period()
             assert self.now_s < end_s, "did not arrive"
-        assert course.outcome is GoalResult.REACHED, course.why
+        assert course.result is GoalResult.REACHED, course.why
 
     @property
     def torso_m(self) -> npt.NDArray[Any]:
@@ -176,7 +176,7 @@ class WalkedRobot:
         if not isinstance(position_rad, Mapping):
             position_rad = dict(zip(self.joints, position_rad, strict=True))
         walking = self._walking
-        self._follow(walking.controller.move(walking.tenure, position_rad, speed=speed))
+        self._follow(walking.controller.start_joint_goal(walking.tenure, position_rad, speed=speed))
 
     def home(self, speed: float = 0.5) -> None:
         self.move_joints(self._walking.type.home_rad, speed=speed)
@@ -198,7 +198,7 @@ class WalkedRobot:
         self, forward_m_s: float = 0.0, left_m_s: float = 0.0, turn_rad_s: float = 0.0, *, duration_s: float = 1.0
     ) -> None:
         walking, twist = self._walking, Twist(forward_m_s, left_m_s, turn_rad_s)
-        self._follow(walking.controller.drive(walking.tenure, twist, duration_s=duration_s))
+        self._follow(walking.controller.start_drive(walking.tenure, twist, duration_s=duration_s))
 
     def wait(self, seconds: float) -> None:
         assert seconds >= 0
@@ -216,7 +216,7 @@ class WalkedRobot:
     def _follow(self, course: MotionGoal) -> None:
         while not course.finished.is_set():
             self._period()
-        assert course.outcome is GoalResult.REACHED, course.why
+        assert course.result is GoalResult.REACHED, course.why
         self.moves += 1
 
     def _period(self) -> None:

@@ -10,7 +10,7 @@ import pytest
 from device_agent import geometry
 from device_agent.runtime.planning import gaze
 from device_agent.runtime.planning import visemes as mouth
-from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, Line
+from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, SpokenLine
 from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 from tests.harness.paths import ROBOTS
 from tests.unit.robots.folders import Bench
@@ -65,7 +65,7 @@ def test_both_eyes_look_at_a_point_and_the_neck_helps(bench: Bench, point_m: tup
     shape = geometry.load(bench.type, FOLDER)
     assert shape is not None
     position = dict(zip(bench.names, bench.home.tolist(), strict=True))
-    position |= gaze.aim(bench.type, shape, bench.home.tolist(), point_m)
+    position |= gaze.solve_gaze(bench.type, shape, bench.home.tolist(), point_m)
     poses = shape.poses([position[name] for name in bench.names])
     for eye in ("eye_left", "eye_right"):
         x, y, z, *quaternion = poses[eye]
@@ -96,8 +96,8 @@ def test_its_mouth_has_a_dozen_shapes(bench: Bench):
 def test_it_opens_its_mouth_for_a_vowel_as_wide_as_its_shape_says_at_a_calm_pace(bench: Bench):
     text = "Hello, I am a robot, and I am glad to see all of you at the table today."
     score = BehaviourTrajectory(bench.type, bench.home.tolist())
-    score.speak(Line(0.0, text, mouth.estimate_duration_s(text)))
-    way, jaw = score.way(), bench.names.index("Jaw")
+    score.add_speech(SpokenLine(0.0, text, mouth.estimate_duration_s(text)))
+    way, jaw = score.trajectory(), bench.names.index("Jaw")
     assert way.position_rad[:, jaw].max() == pytest.approx(bench.type.visemes["aa"]["Jaw"], abs=1e-3)
     follows = []
     for time_s in np.arange(0.0, way.duration_s, bench.model.opt.timestep):

@@ -31,7 +31,7 @@ class LimitedRobot:
         self.controller = Controller(self.type, LeaseGate(), geometry=self.shape)
         self.position = [self.type.home_rad[joint.name] for joint in self.type.joints]
         self.controller.start_at(self.position)
-        self.tenure = self.controller.begin_action(epoch=1, on_lost=lambda _: None)
+        self.tenure = self.controller.reserve(epoch=1, on_revoked=lambda _: None)
         self.joints = tuple(joint.name for joint in self.type.joints)
         self.can = ("say",)
         self.now_s = 0.0
@@ -42,13 +42,13 @@ class LimitedRobot:
     def move_joints(self, position_rad: Mapping[str, float] | Sequence[float], speed: float = 0.5) -> None:
         if not isinstance(position_rad, Mapping):
             position_rad = dict(zip(self.joints, position_rad, strict=True))
-        self.follow(self.controller.move(self.tenure, position_rad, speed=speed))
+        self.follow(self.controller.start_joint_goal(self.tenure, position_rad, speed=speed))
 
     def drive(
         self, forward_m_s: float = 0.0, left_m_s: float = 0.0, turn_rad_s: float = 0.0, *, duration_s: float = 1.0
     ) -> None:
         twist = Twist(forward_m_s, left_m_s, turn_rad_s)
-        self.follow(self.controller.drive(self.tenure, twist, duration_s=duration_s))
+        self.follow(self.controller.start_drive(self.tenure, twist, duration_s=duration_s))
 
     def go_to(self, x_m: float, y_m: float, yaw_rad: float | None = None) -> None:
         """Straight there: ``test_errands.py`` goes around things."""
@@ -63,7 +63,7 @@ class LimitedRobot:
 
     def look(self, position_m: tuple[float, float, float], speed: float = 0.5) -> None:
         assert self.shape is not None
-        self.move_joints(gaze.aim(self.type, self.shape, self.position, position_m), speed=speed)
+        self.move_joints(gaze.solve_gaze(self.type, self.shape, self.position, position_m), speed=speed)
 
     def express(self, name: str, strength: float = 1.0) -> None:
         self.move_joints(named_poses.expression(self.type, name, strength), speed=named_poses.EXPRESSION_SPEED)
@@ -76,14 +76,14 @@ class LimitedRobot:
         end_s = self.now_s + LONGEST_S
         while not move.finished.is_set():
             self.now_s += self.type.period_ms / 1000
-            tick = self.controller.step(self.now_s)
+            tick = self.controller.update(self.now_s)
             self.position = tick.position_rad
             self.go(tick.twist)
             assert self.now_s < end_s, "did not arrive"
             if self.shape is not None and round(self.now_s * 1000) % 40 == 0:
                 self.tightest_m = min(self.tightest_m, self.shape.clearance(self.position).room_m)
         self.limited |= set(move.limited)
-        if move.outcome is not GoalResult.REACHED:
+        if move.result is not GoalResult.REACHED:
             raise move.why or AssertionError("no reason")
 
     def go(self, twist: Twist) -> None:

@@ -10,7 +10,7 @@ from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.planning import named_poses
-from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, Line
+from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, SpokenLine
 from device_agent.runtime.planning.visemes import estimate_duration_s
 from tests.unit.robots.folders import FOLDERS
 
@@ -31,21 +31,23 @@ class Shower:
         self.kind = robot_type.load(folder)
         self.controller = Controller(self.kind, LeaseGate(), geometry=geometry.load(self.kind, folder))
         self.controller.start_at([self.kind.home_rad[joint.name] for joint in self.kind.joints])
-        self.tenure = self.controller.begin_action(epoch=1, on_lost=lambda _: None)
+        self.tenure = self.controller.reserve(epoch=1, on_revoked=lambda _: None)
         self.now_s = 0.0
 
     def move(self, position_rad: dict[str, float], what: str) -> None:
-        self.follow(self.controller.move(self.tenure, position_rad, speed=named_poses.EXPRESSION_SPEED), what)
+        self.follow(
+            self.controller.start_joint_goal(self.tenure, position_rad, speed=named_poses.EXPRESSION_SPEED), what
+        )
 
     def go(self, score: BehaviourTrajectory, what: str) -> None:
-        self.follow(self.controller.go_along(self.tenure, score.way()), what)
+        self.follow(self.controller.start_trajectory(self.tenure, score.trajectory()), what)
 
     def follow(self, course: MotionGoal, what: str) -> None:
         until_s = self.now_s + LONGEST_S
         while not course.finished.is_set() and self.now_s < until_s:
             self.now_s += self.kind.period_ms / 1000
-            self.controller.step(self.now_s)
-        assert course.outcome is GoalResult.REACHED, f"{what}: {course.why and course.why.message}"
+            self.controller.update(self.now_s)
+        assert course.result is GoalResult.REACHED, f"{what}: {course.why and course.why.message}"
 
 
 @pytest.mark.parametrize("folder", kinds("postures", "expressions"), ids=lambda folder: folder.name)
@@ -63,7 +65,7 @@ def test_every_behaviour_is_played_from_home(folder: Path) -> None:
     shower = Shower(folder)
     for name, keyframes in shower.kind.behaviours.items():
         score = BehaviourTrajectory(shower.kind, shower.controller.commanded_rad)
-        score.keyframes(keyframes, {frame.say: estimate_duration_s(frame.say) for frame in keyframes})
+        score.add_keyframes(keyframes, {frame.say: estimate_duration_s(frame.say) for frame in keyframes})
         shower.go(score, name)
         shower.move(shower.kind.home_rad, f"home after {name}")
 
@@ -72,7 +74,7 @@ def test_every_behaviour_is_played_from_home(folder: Path) -> None:
 def test_a_mouth_forms_every_sound(folder: Path) -> None:
     shower = Shower(folder)
     score = BehaviourTrajectory(shower.kind, shower.controller.commanded_rad)
-    score.speak(Line(0.0, TEXT, estimate_duration_s(TEXT)))
-    jaws = [place for place in score.way().position_rad.T if place.max() - place.min() > 0.05]
+    score.add_speech(SpokenLine(0.0, TEXT, estimate_duration_s(TEXT)))
+    jaws = [place for place in score.trajectory().position_rad.T if place.max() - place.min() > 0.05]
     assert jaws, "nobody would see that it speaks"
     shower.go(score, TEXT)

@@ -99,7 +99,7 @@ def test_behaviours_are_played_standing(name: str) -> None:
             walking.move(keyframe.position_rad, speed=1.0)
     walking.wait(0.5)
     assert walking.least_upright > UPRIGHT
-    last = dict(zip(walking.names, walking.controller.step(walking.now_s).position_rad, strict=True))
+    last = dict(zip(walking.names, walking.controller.update(walking.now_s).position_rad, strict=True))
     assert {name: last[name] for name in LEGS} == pytest.approx({name: TYPE.home_rad[name] for name in LEGS})
 
 
@@ -137,7 +137,7 @@ def test_it_does_not_fall_in_twenty_such_days(seed: int) -> None:
 
 def test_feet_leave_the_ground_in_turn() -> None:
     walking = Walking(FOLDER)
-    course = walking.controller.drive(walking.tenure, FORWARD, duration_s=4.0)
+    course = walking.controller.start_drive(walking.tenure, FORWARD, duration_s=4.0)
     lifted = []
     while not course.finished.is_set():
         walking.period()
@@ -180,7 +180,7 @@ def test_odometry_counts_steps_and_drifts_a_little() -> None:
 
 def test_a_stop_ends_a_walk_on_both_feet_within_the_brakes() -> None:
     walking = Walking(FOLDER)
-    walking.controller.drive(walking.tenure, FORWARD, duration_s=10.0)
+    walking.controller.start_drive(walking.tenure, FORWARD, duration_s=10.0)
     walking.wait(2.0)
     while walking.soles_m.max() < 0.015:  # with a foot in the air
         walking.period()
@@ -199,9 +199,9 @@ def test_a_stop_ends_a_walk_on_both_feet_within_the_brakes() -> None:
 
 def test_legs_are_the_gaits_while_it_walks_and_what_is_sent_back_says_so() -> None:
     walking = Walking(FOLDER)
-    walking.controller.drive(walking.tenure, FORWARD, duration_s=3.0)
+    walking.controller.start_drive(walking.tenure, FORWARD, duration_s=3.0)
     walking.wait(1.5)
-    tick = walking.controller.step(walking.now_s + 0.02)
+    tick = walking.controller.update(walking.now_s + 0.02)
     assert set(tick.limited) >= {"LKneePitch: driver", "RHipPitch: driver"}
     assert not [text for text in tick.limited if text.startswith(("Head", "LShoulder", "LElbow"))]
     asked = [
@@ -254,7 +254,7 @@ def test_it_is_helped_only_while_it_walks_and_no_more_than_the_manifest_says() -
     help_now = walking.world._data.xfrc_applied[walking.body]  # nobody else can see it
     walking.wait(0.5)
     assert not help_now.any()
-    course = walking.controller.drive(walking.tenure, FORWARD, duration_s=3.0)
+    course = walking.controller.start_drive(walking.tenure, FORWARD, duration_s=3.0)
     strongest = np.zeros(2)
     while not course.finished.is_set():
         walking.period()
@@ -268,7 +268,7 @@ def test_it_is_helped_only_while_it_walks_and_no_more_than_the_manifest_says() -
 
 def test_it_falls_when_it_is_pushed_hard_and_then_lies() -> None:
     walking = Walking(FOLDER)
-    walking.controller.drive(walking.tenure, FORWARD, duration_s=10.0)
+    walking.controller.start_drive(walking.tenure, FORWARD, duration_s=10.0)
     walking.wait(1.0)
     walking.world._data.qvel[:2] = (0.0, 2.0)  # a kick
     walking.wait(2.0)

@@ -61,11 +61,11 @@ class Steered(Controller):
         super().__init__(QBO, LeaseGate())
         self._laboratory = lab
 
-    def drive(self, *order: Any, **more: Any) -> Any:
-        return self._waited(super().drive(*order, **more))
+    def start_drive(self, *order: Any, **more: Any) -> Any:
+        return self._waited(super().start_drive(*order, **more))
 
-    def move(self, *order: Any, **more: Any) -> Any:
-        return self._waited(super().move(*order, **more))
+    def start_joint_goal(self, *order: Any, **more: Any) -> Any:
+        return self._waited(super().start_joint_goal(*order, **more))
 
     def _waited(self, course: MotionGoal) -> MotionGoal:
         course.finished = Meanwhile(self._laboratory)
@@ -94,14 +94,16 @@ class Laboratory:
             observe=self.driver.observe,
             geometry=None,
             skills=None,
-            room=self.room,
-            reported=lambda: {stream: Reading(self.driver.report(stream), 0.02) for stream in ("odometry", "sonar")},
+            readings=self.room,
+            own_readings=lambda: {
+                stream: Reading(self.driver.report(stream), 0.02) for stream in ("odometry", "sonar")
+            },
             name="qbo",
-            ground=lambda: self.watched.sight.grid,
+            obstacle_map=lambda: self.watched.sight.grid,
         )
         self.robot = RobotApi(self.body)
         self.go_on(settle_s)
-        self.robot.begin(1, lambda _: None)
+        self.robot.reserve(1, lambda _: None)
 
     @property
     def now_s(self) -> float:
@@ -121,9 +123,9 @@ class Laboratory:
 
     def period(self) -> None:
         seen = self.driver.observe()
-        tick = self.controller.step(self.now_s, seen.position_rad)
-        self.controller.applied(self.driver.send(tick.position_rad))
-        self.controller.driven(tick.twist, self.driver.drive(tick.twist))
+        tick = self.controller.update(self.now_s, seen.position_rad)
+        self.controller.record_applied(self.driver.send(tick.position_rad))
+        self.controller.record_driven(tick.twist, self.driver.drive(tick.twist))
         self.watched.world.world.step(round(PERIOD_S / STEP_S))
         if self.now_s - self.looked_s >= LOOK_S - PERIOD_S / 2:
             self.look()
@@ -147,11 +149,13 @@ class Laboratory:
         self.watched.see()
         told = _flat(self.watched.sight.places(now_s))
         tick_ms = round(now_s * 1000)
-        self.room.note("perception", "positions", Measurements(tick_ms=tick_ms, at_ms=0, sequence=tick_ms, values=told))
+        self.room.record(
+            "perception", "positions", Measurements(tick_ms=tick_ms, at_ms=0, sequence=tick_ms, values=told)
+        )
         self.touched |= self.touching()
 
     def close(self) -> None:
-        self.robot.give_back()
+        self.robot.release()
         self.watched.close()
 
 
@@ -172,13 +176,13 @@ def play(lab: Laboratory, movement: str, parameters: dict[str, Any]) -> list[str
         if kind == "look":
             return None  # without a look at its shape nobody can tell where; its own tests do
         try:
-            return lab.robot.do(script_calls.parse(json.dumps({"kind": kind, **arguments}).encode()))  # type: ignore[arg-type]
+            return lab.robot.execute(script_calls.parse(json.dumps({"kind": kind, **arguments}).encode()))  # type: ignore[arg-type]
         except Refused as refused:
             raise api.RobotError(refused.message) from refused
 
     path = ROBOTS / "qbo" / "movements" / f"{movement}.py"
     given = {
-        "robot": api.Robot(ask, joints=lab.robot.joints, frames=(), can=lab.robot.can),
+        "robot": api.Robot(ask, joints=lab.robot.joints, frames=(), can=lab.robot.calls),
         "room": api.Room(ask),
         "parameters": parameters,
         "wait": lab.go_on,
@@ -191,7 +195,7 @@ def play(lab: Laboratory, movement: str, parameters: dict[str, Any]) -> list[str
 
 
 def check(lab: Laboratory, x_m: float, y_m: float, yaw_rad: float) -> None:
-    lab.robot.do(GoTo(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad))
+    lab.robot.execute(GoTo(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad))
     x, y, yaw = lab.truth
     assert math.dist((x, y), (x_m, y_m)) <= NEAR_M
     assert abs(math.remainder(yaw - yaw_rad, 2 * math.pi)) <= NEAR_RAD
@@ -200,7 +204,7 @@ def check(lab: Laboratory, x_m: float, y_m: float, yaw_rad: float) -> None:
 
 def test_qbo_goes_around_another_robot_to_where_it_is_sent(lab: Laboratory) -> None:
     with pytest.raises(Refused, match="nearest place to go to is x_m") as refused:
-        lab.robot.do(GoTo(x_m=1.5, y_m=2.0))  # the arm's table stands there
+        lab.robot.execute(GoTo(x_m=1.5, y_m=2.0))  # the arm's table stands there
     assert refused.value.code == "taken"
     check(lab, 0.6, -0.35, 1.0)  # straight there stands the NAO
 

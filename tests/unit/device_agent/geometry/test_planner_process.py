@@ -123,15 +123,15 @@ class Arm:
             observe=lambda: None,
             geometry=shape,
             skills=None,
-            room=ReadingCache(space="s", agent="a", own=[]),
+            readings=ReadingCache(space="s", agent="a", own=[]),
         )
         self.robot = RobotApi(body)
-        self.robot.begin(1, lambda _: self.robot.end())
+        self.robot.reserve(1, lambda _: self.robot.end())
 
     def cross(self) -> Refused:
         """Ask for what there is no way to; gives why it did not go."""
         with pytest.raises(Refused) as refused:
-            self.robot.do(MoveJoints(position_rad={KIND.joints[0].name: BEYOND[0]}, speed=0.5, plan=True))
+            self.robot.execute(MoveJoints(position_rad={KIND.joints[0].name: BEYOND[0]}, speed=0.5, plan=True))
         return refused.value
 
 
@@ -233,19 +233,19 @@ def test_a_planned_way_keeps_to_what_a_yaw_leaves_the_head_and_moves_both_hips_a
     controller = Controller(kind, LeaseGate(), geometry=shape)
     home = [kind.home_rad[name] for name in names]
     controller.start_at(home)
-    tenure = controller.begin_action(epoch=1, on_lost=lambda _: None)
+    tenure = controller.reserve(epoch=1, on_revoked=lambda _: None)
     now_s, orders = 0.0, ({"HeadPitch": 0.45}, {"HeadYaw": 2.05, "HeadPitch": 0.25, "LHipYawPitch": -0.1})
     for order in orders:
-        start, goal = controller.commanded_rad, controller.target(tenure, order)
-        way = MotionPlanner(kind, shape).around(start, goal, speed=1.0, ended=lambda: False)
-        passage = controller.go_along(tenure, way)
+        start, goal = controller.commanded_rad, controller.resolve_target(tenure, order)
+        way = MotionPlanner(kind, shape).plan(start, goal, speed=1.0, ended=lambda: False)
+        passage = controller.start_trajectory(tenure, way)
         for _ in range(round(way.duration_s / (kind.period_ms / 1000)) + 50):
             now_s += kind.period_ms / 1000
-            tick = controller.step(now_s)
-            assert couplings.parted(np.array([tick.position_rad])) == ""
-        assert passage.outcome is GoalResult.REACHED, passage.why
+            tick = controller.update(now_s)
+            assert couplings.describe_violation(np.array([tick.position_rad])) == ""
+        assert passage.result is GoalResult.REACHED, passage.why
         assert controller.commanded_rad == pytest.approx(goal, abs=1e-4)
-    assert couplings.parted(np.linspace(start, goal, 50)) != "", "straight there it would not"
+    assert couplings.describe_violation(np.linspace(start, goal, 50)) != "", "straight there it would not"
     assert goal[names.index("RHipYawPitch")] == pytest.approx(-0.1)
 
 
@@ -262,7 +262,7 @@ def test_between_rows_of_its_table_a_straight_way_is_looked_at_where_it_is_narro
         start[[yaw, pitch]] = chance.uniform((-2, -0.5), (2, 0.4))
         end[[yaw, pitch]] = chance.uniform((-2, -0.5), (2, 0.4))
         keeps = bounds.keeps(start, end, np.zeros(1))
-        assert keeps == (couplings.parted(np.linspace(start, end, 2000)) == "")
+        assert keeps == (couplings.describe_violation(np.linspace(start, end, 2000)) == "")
         kept += keeps
     assert 50 < kept < 350
     assert bounds.spare(home, home)[0] == pytest.approx(0.03)

@@ -150,7 +150,7 @@ class Nao:
         self._driver.connect()
         self._controller = Controller(self.type, LeaseGate())
         self._controller.start_at([self.type.home_rad[joint.name] for joint in self.type.joints])
-        self._tenure = self._controller.begin_action(epoch=1, on_lost=lambda _: None)
+        self._tenure = self._controller.reserve(epoch=1, on_revoked=lambda _: None)
         self._now_s = 0.0
         self._ended = threading.Event()
         self._ended.set()
@@ -163,10 +163,10 @@ class Nao:
         self.move(self.type.home_rad if name == "home" else self.type.postures[name], speed)
 
     def move(self, position_rad: Mapping[str, float], speed: float) -> None:
-        self._ended = self._controller.move(self._tenure, position_rad, speed=speed).finished
+        self._ended = self._controller.start_joint_goal(self._tenure, position_rad, speed=speed).finished
 
     def walk(self, twist: Twist, *, duration_s: float) -> None:
-        self._ended = self._controller.drive(self._tenure, twist, duration_s=duration_s).finished
+        self._ended = self._controller.start_drive(self._tenure, twist, duration_s=duration_s).finished
 
     def go_on(self, for_s: float) -> None:
         """What its control loop does, and the physics."""
@@ -174,8 +174,8 @@ class Nao:
         for _ in range(round(for_s / period_s)):
             self._now_s += period_s
             self._driver.observe()
-            tick = self._controller.step(self._now_s)
-            self._controller.applied(self._driver.send(tick.position_rad))
+            tick = self._controller.update(self._now_s)
+            self._controller.record_applied(self._driver.send(tick.position_rad))
             self._driver.drive(tick.twist)
             self._world.go_on(period_s)
 

@@ -23,7 +23,7 @@ class ToyLink:
         self.stopped = 0
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
-        self.held_first = self._bench.device._loop.seen is not None
+        self.held_first = self._bench.device._loop.observation is not None
         self.receive, self.link_changed = receive, link_changed
 
     def publish(self, *_: Any, **__: Any) -> bool:
@@ -39,8 +39,8 @@ class Whole:
         self.link = ToyLink(bench)
         self.room = ReadingCache(space="s", agent="a", own=["arm"], named=[("other-pir", "presence")])
         shelf = OutboxStore(folder / "whole.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
-        self.outbox = Outbox(shelf, publish=bench.publish, teller="ts/v1/s/a/arm")
-        self.agent = Agent({"arm": bench.device}, self.link, outbox=self.outbox, room=self.room, address=("s", "a"))
+        self.outbox = Outbox(shelf, publish=bench.publish, device_topic="ts/v1/s/a/arm")
+        self.agent = Agent({"arm": bench.device}, self.link, outbox=self.outbox, readings=self.room, address=("s", "a"))
 
 
 @pytest.fixture

@@ -101,20 +101,20 @@ def test_a_command_for_somebody_else_is_not_even_answered(bench: Bench, changes:
     foreign = bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1, **changes)
     bench.end(bench.command(GrantLease(holder="ann", lease_ms=5000), epoch=1))
     assert bench.acks(foreign) == []
-    assert bench.device.voice.refusals == {"wrong_address": 1}
+    assert bench.device.publisher.rejections == {"wrong_address": 1}
 
 
 def test_what_the_cloud_did_not_sign_is_not_obeyed(bench: Bench) -> None:
     bench.key = signing.generate()
     bench.command(GrantLease(holder="eve", lease_ms=5000), epoch=9)
     bench.receive(topics.CMD, b"{}")
-    eventually(lambda: bench.device.voice.refusals == {"bad_signature": 1, "malformed": 1})
+    eventually(lambda: bench.device.publisher.rejections == {"bad_signature": 1, "malformed": 1})
     assert bench.heard(topics.ACK, Ack) == []
 
 
 def test_streaming_needs_the_lease_and_moves_the_device(bench: Bench) -> None:
     bench.setpoint(1, 1)
-    assert bench.device.voice.refusals == {"no_lease": 1}
+    assert bench.device.publisher.rejections == {"no_lease": 1}
     bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
     for sequence in range(1, 40):
         bench.setpoint(1, sequence)
@@ -133,7 +133,7 @@ def test_an_epoch_in_the_topic_that_differs_from_the_message_is_refused(bench: B
         epoch=2, sequence=1, echo_tick_ms=tick_ms(), sent_ms=0, target=JointTarget(position_rad={"elbow": 1})
     )
     bench.receive(topics.CTL, codec.encode(setpoint), "1")
-    assert bench.device.voice.refusals == {"no_lease": 1}
+    assert bench.device.publisher.rejections == {"no_lease": 1}
 
 
 def test_stop_needs_no_lease_and_survives_a_restart(bench: Bench, tmp_path: Path) -> None:
@@ -228,10 +228,10 @@ def test_a_lost_link_ends_what_runs_and_the_answer_is_sent_when_it_is_back(bench
         gone.set()
         return False
 
-    bench.device.voice._publish = deaf
+    bench.device.publisher._publish = deaf
     bench.device.link_changed(False)
     assert gone.wait(WITHIN_S)
-    bench.device.voice._publish = bench.publish
+    bench.device.publisher._publish = bench.publish
     bench.device.link_changed(True)
     reason = bench.end(running).reason
     assert reason is not None
@@ -265,7 +265,7 @@ def test_garbage_is_counted_and_harms_nothing(bench: Bench) -> None:
     for kind in (topics.CTL, topics.STOP, topics.CMD):
         for payload in (b"", b"\x00" * 10, b'{"id":1}', b"NaN"):
             bench.receive(kind, payload, "1")
-    eventually(lambda: bench.device.voice.refusals == {"malformed": 12})
+    eventually(lambda: bench.device.publisher.rejections == {"malformed": 12})
     assert bench.telemetry().mode is Mode.IDLE
 
 
@@ -308,7 +308,7 @@ def test_nothing_gets_past_stop(bench: Bench, tmp_path: Path) -> None:
         assert reason is not None
         assert reason.code == "stopped"
     bench.setpoint(2, 1)
-    assert bench.device.voice.refusals["stopped"] == 3
+    assert bench.device.publisher.rejections["stopped"] == 3
     again = Bench(tmp_path)
     again.key = bench.key
     again.device.start()

@@ -76,7 +76,7 @@ def test_a_lease_that_ran_out_is_told_with_its_holder(bench: Bench) -> None:
     bench.end(bench.command(GrantLease(holder="ann", lease_ms=50), epoch=1))
     ended = event(bench, EventKind.LEASE_ENDED)
     assert ended.data["holder"] == "ann"
-    assert "ran out" in ended.message
+    assert "expired" in ended.message
 
 
 def test_a_take_over_ends_the_lease_before(bench: Bench) -> None:
@@ -185,7 +185,7 @@ def test_commands_beyond_what_can_wait_are_refused_and_told(bench: Bench, monkey
     def full(_: bytes) -> None:
         raise queue.Full
 
-    monkeypatch.setattr(bench.device._office._commands, "put_nowait", full)
+    monkeypatch.setattr(bench.device._commands._commands, "put_nowait", full)
     bench.command(ResetStop())
     assert event(bench, EventKind.COMMAND_REJECTED).data == {"code": "overrun"}
 
@@ -197,7 +197,7 @@ def test_a_mistake_in_the_office_ends_neither_the_office_nor_the_device(
         raise RuntimeError("a mistake")
 
     with monkeypatch.context() as patch:
-        patch.setattr(bench.device.voice, "show", mistake)
+        patch.setattr(bench.device.publisher, "publish_state", mistake)
         eventually(lambda: "a mistake" in caplog.text)
     take_control(bench)
 
@@ -210,7 +210,7 @@ def test_what_is_not_for_a_device_is_let_go_and_the_drawing_is_shown(tmp_path: P
     bench.receive(topics.TELE, b"{}", "joints")
     assert eventually(lambda: bench.heard(topics.DESC, Twin, topics.TWIN)) == [Twin(device="arm", bodies=())]
     assert bench.device.quiet
-    assert bench.device.voice.refusals == {}
+    assert bench.device.publisher.rejections == {}
     bench.device.stop()
     bench.outbox.stop()
     bench.journal.close()
@@ -238,7 +238,7 @@ def test_a_room_that_is_not_known_holds_and_is_shown(tmp_path: Path) -> None:
 def test_a_state_that_the_link_did_not_take_is_told_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     eventually(lambda: bench.heard(topics.STATE, State))
     with monkeypatch.context() as patch:
-        patch.setattr(bench.device.voice, "_publish", lambda *_, **__: False)
+        patch.setattr(bench.device.publisher, "_publish", lambda *_, **__: False)
         bench.device.link_changed(True)
         time.sleep(0.3)
     before = len(bench.heard(topics.STATE, State))
@@ -246,7 +246,7 @@ def test_a_state_that_the_link_did_not_take_is_told_again(bench: Bench, monkeypa
 
 
 def test_an_answer_that_nobody_confirmed_is_given_again_over_the_next_link(bench: Bench) -> None:
-    with mock.patch.object(bench.device.voice, "_delivered"):
+    with mock.patch.object(bench.device.publisher, "_delivered"):
         command = bench.command(StopDevice())
         bench.end(command)
     before = len(bench.acks(command))
@@ -263,7 +263,7 @@ def test_while_a_link_is_young_answers_are_not_believed_to_have_arrived_and_give
     answer = bench.end(command)
     time.sleep(0.3)
     assert bench.journal.undelivered("arm") == (answer,)
-    bench.device.voice._believed_from_s = 0.0
+    bench.device.publisher._acks_valid_from_s = 0.0
     eventually(lambda: bench.acks(command)[-2:] == [answer, answer])
     eventually(lambda: bench.journal.undelivered("arm") == ())
     later = bench.command(StopDevice())

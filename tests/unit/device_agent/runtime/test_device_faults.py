@@ -52,7 +52,7 @@ def test_an_action_that_meets_a_bug_has_failed_and_the_next_one_runs(
 
 
 def test_a_command_that_meets_a_bug_has_failed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(CommandProcessor, "_carry_out", broken)
+    monkeypatch.setattr(CommandProcessor, "_apply", broken)
     assert code(bench, bench.command(GrantLease(holder="ann", lease_ms=1000), epoch=1)) == "internal"
 
 
@@ -99,7 +99,7 @@ def test_what_else_goes_wrong_does_not_end_the_office(bench: Bench, monkeypatch:
         met.set()
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(CommandProcessor, "_condition", fail)
+    monkeypatch.setattr(CommandProcessor, "_snapshot", fail)
     assert met.wait(10)
     monkeypatch.undo()
     assert bench.end(bench.command(MOVE, epoch=1)).status is AckStatus.DONE
@@ -120,12 +120,12 @@ def test_of_too_many_commands_the_last_are_refused(bench: Bench, monkeypatch: py
         busy.set()
         go_on.wait(20)
 
-    monkeypatch.setattr(CommandProcessor, "_obey", wait)
+    monkeypatch.setattr(CommandProcessor, "_process", wait)
     bench.receive(topics.CMD, b"{}")
     assert busy.wait(10)
-    for _ in range(command_processor._MOST_WAITING + 3):
+    for _ in range(command_processor._MAX_WAITING + 3):
         bench.receive(topics.CMD, b"{}")
-    assert bench.device.voice.refusals == {"overrun": 3}
+    assert bench.device.publisher.rejections == {"overrun": 3}
     go_on.set()
 
 
@@ -154,7 +154,7 @@ def test_a_device_that_never_started_can_be_stopped(tmp_path: Path) -> None:
 def test_topics_that_a_device_does_not_hear_are_passed_over(bench: Bench) -> None:
     bench.receive(topics.STATE, b"{}")
     bench.receive(topics.TELE, b"{}", "joints")
-    assert bench.device.voice.refusals == {}
+    assert bench.device.publisher.rejections == {}
 
 
 def test_a_drawing_is_shown_when_the_driver_knows_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +170,7 @@ def test_a_drawing_is_shown_when_the_driver_knows_one(tmp_path: Path, monkeypatc
 
 def test_before_the_first_measurement_there_is_none_to_tell(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    assert bench.device._executor._body.measured() == {}
+    assert bench.device._executor._context.measured() == {}
     bench.outbox.stop()
     bench.journal.close()
 
@@ -189,4 +189,4 @@ def test_a_fault_that_outlives_the_agent_lets_it_go_down(bench: Bench) -> None:
     bench.driver.broken = True
     eventually(lambda: bench.device._controller.fault)
     bench.device.stop()
-    assert isinstance(bench.device._loop.seen, Observation)
+    assert isinstance(bench.device._loop.observation, Observation)

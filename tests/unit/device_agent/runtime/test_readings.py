@@ -5,7 +5,7 @@ import pytest
 from device_agent.protocol import JointTelemetry, Measurements, Mode, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.readings import OVERTAKEN_S, Reading, ReadingCache
+from device_agent.runtime.readings import RESTART_GAP_S, Reading, ReadingCache
 
 
 class Clock:
@@ -57,10 +57,10 @@ def test_the_newest_reading_is_given_with_its_age_since_it_arrived(room: Reading
 
 
 def test_an_own_device_is_named_by_its_name_or_its_id(room: ReadingCache) -> None:
-    room.note("lamp", "light", measured(lux=80.0))
+    room.record("lamp", "light", measured(lux=80.0))
     assert room.latest("lamp", "light") == room.latest("own-lamp", "light") == Reading({"lux": 80.0}, 0.0)
-    room.note("arm", "heat", measured(t_c=20.0))
-    with pytest.raises(Refused, match="own-arm/heat is not listened to"):
+    room.record("arm", "heat", measured(t_c=20.0))
+    with pytest.raises(Refused, match="own-arm/heat is not subscribed"):
         room.latest("arm", "heat")
 
 
@@ -82,10 +82,10 @@ def test_joints_are_read_by_their_place(room: ReadingCache) -> None:
 
 
 def test_what_is_not_listened_to_is_refused_and_says_what_is(room: ReadingCache) -> None:
-    with pytest.raises(Refused, match=r"name it under \[\[room\]\].*own-lamp/light, sensors-arm/joints") as refused:
+    with pytest.raises(Refused, match=r"add it under \[\[room\]\].*own-lamp/light, sensors-arm/joints") as refused:
         room.latest("sensors-door", "open")
     assert refused.value.code == "unknown_stream"
-    with pytest.raises(Refused, match="There is: none"):
+    with pytest.raises(Refused, match="There are: none"):
         ReadingCache(space="lab", agent="own", own=["arm"]).latest("x-y", "z")
 
 
@@ -94,7 +94,7 @@ def test_what_was_not_asked_for_costs_no_memory(room: ReadingCache) -> None:
         hear(room, measured(present=1.0), topic(f"d{number}"))
     hear(room, measured(present=1.0), topic(space="elsewhere"))
     room.receive(topics.Topic("lab", "sensors", "pir", topics.LATE, "presence"), codec.encode(measured(present=1.0)))
-    assert room._heard == {}
+    assert room._received == {}
 
 
 @pytest.mark.parametrize("payload", [b"", b"{}", b'{"tick_ms":1,"at_ms":1,"sequence":1,"values":{"present":NaN}}'])
@@ -114,6 +114,6 @@ def test_a_message_that_was_overtaken_is_left_out_but_a_sender_that_began_anew_i
     assert value(room) == 1.0
     hear(room, measured(1, tick_ms=900, present=2.0))
     assert value(room) == 2.0, "the agent there restarted"
-    clock.now_s += OVERTAKEN_S
+    clock.now_s += RESTART_GAP_S
     hear(room, measured(1, tick_ms=5, present=3.0))
     assert value(room) == 3.0, "the machine there restarted"

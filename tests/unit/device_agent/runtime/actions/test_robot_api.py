@@ -258,10 +258,10 @@ def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> N
         ("robot.move_to((0, 0, 0), straight=True, plan=True)", "straight or planned, not both"),
         ("robot.move_joints({'elbow': 1.5}, plan=True)", "found no way there"),
         ("robot.move_joints({'elbow': 99}, plan=True)", "elbow can go from"),
-        ("robot.look((0, 0, 1))", "inside of what it looks with"),
+        ("robot.look((0, 0, 1))", "inside the frame that looks"),
         ("robot.look((-1, -0.1, 0.9), speed=9)", "Expected `float` <= 1.0 - at `$.speed`"),
         ("robot.drive(99)", "forward_m_s can be up to 0.500"),
-        ("room.latest('x', 'y')", "is not listened to"),
+        ("room.latest('x', 'y')", "is not subscribed"),
         ("robot.play([{'time_s': 0}, {'time_s': 1, 'position_rad': {'elbow': 9}}])", "keyframe 2: elbow can go from"),
         ("robot.play([{'time_s': 0}, {'time_s': 1, 'position_rad': {'nose': 9}}])", "keyframe 2: no joint 'nose'"),
         ("robot.play([{'time_s': float('nan')}, {'time_s': 1}])", "the time of keyframe 1 is not a finite number"),
@@ -357,7 +357,7 @@ def test_where_scripts_cannot_be_locked_in_it_is_said_at_once(
     eventually(lambda: [event for event in bench.heard(topics.EVENT, Event) if event.kind == f"scripts-{how}"])
     reason = bench.end(bench.command(bench.script("print(1)"), epoch=1)).reason
     assert reason is not None
-    assert (reason.code, reason.message) == ("no_jail", LACK)
+    assert (reason.code, reason.message) == ("no_sandbox", LACK)
     bench.stop()
 
 
@@ -377,13 +377,13 @@ def test_an_agent_that_is_shut_down_ends_the_script(bench: Bench) -> None:
 
 def test_a_script_reads_what_the_room_measured() -> None:
     room = ReadingCache(space="s", agent="a", own=["arm"], named=[("b-pir", "presence")])
-    body = replace(body_of(robot_type()), room=room)
+    body = replace(body_of(robot_type()), readings=room)
     robot = RobotApi(body)
     asked = script_calls.AskLatest(device="b-pir", stream="presence")
-    assert robot.do(asked) is None
+    assert robot.execute(asked) is None
     measured = Measurements(tick_ms=1, at_ms=1, sequence=1, values={"present": True, "distance_m": 1.5})
     room.receive(topics.parse("ts/v1/s/b/pir/tele/presence"), codec.encode(measured))
-    answer = robot.do(asked)
+    answer = robot.execute(asked)
     assert answer["values"] == {"present": True, "distance_m": 1.5}
     assert 0 <= answer["age_s"] < 60
 
@@ -403,7 +403,7 @@ def body_of(
         observe=lambda: observation if seen else None,
         geometry=head,
         skills=able,
-        room=ReadingCache(space="s", agent="a", own=["arm"]),
+        readings=ReadingCache(space="s", agent="a", own=["arm"]),
     )
 
 
@@ -411,34 +411,34 @@ def test_before_the_first_measurement_there_is_no_state() -> None:
     body = body_of(robot_type(), seen=False)
     assert body.measured() == {}
     with pytest.raises(Refused, match="not been measured"):
-        body.seen()
+        body.observation()
 
 
 def test_a_robot_that_has_ended_performs_nothing_more() -> None:
     able = AbleDriver()
     kind = msgspec.structs.replace(able_type(), gaze=None, capabilities=("gaze", "speech"))
     robot = RobotApi(body_of(kind, able=able))
-    robot.do(LookAt(position_m=(1.0, 0.0, 0.0)))
+    robot.execute(LookAt(position_m=(1.0, 0.0, 0.0)))
     assert able.performed == [LookAt(position_m=(1.0, 0.0, 0.0))]
     robot.end()
     with pytest.raises(Refused, match="the action ended"):
-        robot.performer.perform(Say(text="x"))
+        robot.skill_runner.perform(Say(text="x"))
     assert len(able.performed) == 1
 
 
 def test_without_model_or_skills_nothing_is_guessed() -> None:
     robot = RobotApi(body_of(robot_type()))
     with pytest.raises(Refused, match="no model"):
-        robot._shape()
+        robot._geometry()
     with pytest.raises(Refused, match="no skills"):
-        robot.performer.perform(Say(text="x"))
+        robot.skill_runner.perform(Say(text="x"))
     with pytest.raises(Refused, match="no gaze"):
-        gaze.aim(robot_type(), Head(), (0.0, 0.0), (1.0, 0.0, 0.0))
+        gaze.solve_gaze(robot_type(), Head(), (0.0, 0.0), (1.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("point", [(1.0, 1.0, 1.0), (2.0, -1.0, 0.2), (0.3, 0.1, 1.8), (-0.5, 0.8, 1.0)])
 def test_a_gaze_meets_its_point(point: tuple[float, float, float]) -> None:
-    found = gaze.aim(able_type(), Head(), (0.1, -0.1), point)
+    found = gaze.solve_gaze(able_type(), Head(), (0.1, -0.1), point)
     left, up = math.atan2(point[1], point[0]), math.atan2(point[2] - 1, math.hypot(point[0], point[1]))
     assert found["shoulder"] == pytest.approx(left, abs=5e-3)
     assert found["elbow"] == pytest.approx(up, abs=5e-3)
@@ -448,14 +448,14 @@ def test_a_gaze_that_cannot_turn_far_enough_says_so() -> None:
     kind = able_type()
     narrow = tuple(msgspec.structs.replace(joint, lower_rad=-0.2, upper_rad=0.2) for joint in kind.joints)
     with pytest.raises(Refused, match="shoulder, elbow cannot turn far enough"):
-        gaze.aim(msgspec.structs.replace(kind, joints=narrow), Head(), (0.0, 0.0), (0.0, 1.0, 1.0))
+        gaze.solve_gaze(msgspec.structs.replace(kind, joints=narrow), Head(), (0.0, 0.0), (0.0, 1.0, 1.0))
 
 
 def test_nothing_is_left_of_a_tenure_that_nobody_has() -> None:
     robot = RobotApi(body_of(robot_type()))
-    robot.tenure.on_lost(Refused("x", "y"))
-    robot.give_back()
-    assert robot.over.is_set()
+    robot.reservation.on_revoked(Refused("x", "y"))
+    robot.release()
+    assert robot.ended.is_set()
 
 
 def showing_type() -> RobotType:

@@ -16,7 +16,7 @@ from device_agent.ports import script_calls
 from device_agent.ports.sandbox import JailError, Limits, SandboxStatus
 from device_agent.protocol import RunMovement
 from device_agent.runtime.actions import script_action
-from device_agent.runtime.actions.script_action import Cell, Script, ScriptFailed
+from device_agent.runtime.actions.script_action import ScriptAction, ScriptFailed, ScriptSandbox
 from device_agent.runtime.errors import Refused
 from tests.harness.agent.sandbox import warm_jail
 
@@ -24,21 +24,21 @@ from tests.harness.agent.sandbox import warm_jail
 class Notes:
     joints = ("shoulder", "elbow")
     frames = ("tool",)
-    can = ("move_joints", "home", "state")
+    calls = ("move_joints", "home", "state")
 
     def __init__(self) -> None:
-        self.calls: list[Any] = []
+        self.received: list[Any] = []
 
-    def do(self, call: script_calls.Call) -> Any:
+    def execute(self, call: script_calls.Call) -> Any:
         match call:
             case protocol.MoveJoints(position_rad=position_rad, speed=speed):
                 if "knee" in position_rad:
                     raise Refused("unknown_joint", "no joint 'knee'")
-                self.calls.append((position_rad, speed))
+                self.received.append((position_rad, speed))
             case script_calls.AskState():
                 return {"position_rad": {"shoulder": 0.1, "elbow": 0.2}, "mode": "action"}
             case _:
-                self.calls.append(call)
+                self.received.append(call)
         return None
 
 
@@ -116,13 +116,17 @@ def order(source: str, parameters: dict[str, Any] | None = None) -> RunMovement:
 
 def run(source: str, parameters: dict[str, Any] | None = None) -> tuple[Notes, Told]:
     notes, told = Notes(), Told()
-    Script(order(source, parameters), notes, told, cell=Cell(warm_jail(), stranger=False), died=nothing).run()
+    ScriptAction(
+        order(source, parameters), notes, told, sandbox=ScriptSandbox(warm_jail(), untrusted=False), on_exit=nothing
+    ).run()
     return notes, told
 
 
 def run_fake(inmate: FakeInmate) -> Told:
     told = Told()
-    Script(order(""), Notes(), told, cell=Cell(FakeJail(inmate), stranger=False), died=nothing).run()
+    ScriptAction(
+        order(""), Notes(), told, sandbox=ScriptSandbox(FakeJail(inmate), untrusted=False), on_exit=nothing
+    ).run()
     return told
 
 
@@ -137,7 +141,7 @@ def test_a_script_moves_prints_and_reads_its_parameters() -> None:
         "print('elbow', robot.state()['position_rad']['elbow'], robot.joints, robot.frames, robot.can[0])\n",
         {"angles": [0.5, 1]},
     )
-    assert notes.calls == [
+    assert notes.received == [
         ({"elbow": 0.5}, 0.3),
         ({"elbow": 1.0}, 0.3),
         ({"shoulder": 1.0, "elbow": 2.0}, 0.5),
@@ -159,7 +163,7 @@ def test_every_call_of_the_api_arrives_as_it_was_meant() -> None:
         "robot.behaviour('wave')\n"
         "room.latest('agent-pir', 'presence')\n"
     )
-    assert notes.calls == [
+    assert notes.received == [
         protocol.MovePose(frame="tool", position_m=(0.1, 0, 0.3), rpy_rad=(0, 0, 1), speed=0.2),
         protocol.MovePose(frame="camera", position_m=(0.1, 0, 0.3), quaternion=(1, 0, 0, 0), speed=0.5),
         protocol.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0.5, duration_s=2),
@@ -185,7 +189,7 @@ def test_keyframes_are_played_up_to_each_at_which_something_is_done() -> None:
         "robot.play([])\n"
     )
     there = script_calls.Moment(time_s=1, position_rad={"elbow": 0.2})
-    assert notes.calls == [
+    assert notes.received == [
         ({"elbow": 0.1}, 0.25),
         protocol.Say(text="off", language=""),
         script_calls.Play(keyframes=(there, script_calls.Moment(time_s=2)), first=2, speed=0.5),
@@ -259,7 +263,7 @@ def test_two_scripts_draw_different_random_numbers() -> None:
 
 
 @contextlib.contextmanager
-def running(script: Script) -> Iterator[list[ScriptFailed]]:
+def running(script: ScriptAction) -> Iterator[list[ScriptFailed]]:
     failures: list[ScriptFailed] = []
 
     def body() -> None:
@@ -278,7 +282,9 @@ def running(script: Script) -> Iterator[list[ScriptFailed]]:
 def test_a_script_is_killed_at_once() -> None:
     told = Told()
     source = "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('here')\nwhile True: pass"
-    script = Script(order(source), Notes(), told, cell=Cell(warm_jail(), stranger=False), died=nothing)
+    script = ScriptAction(
+        order(source), Notes(), told, sandbox=ScriptSandbox(warm_jail(), untrusted=False), on_exit=nothing
+    )
     with running(script) as failures:
         while not told.printed:
             time.sleep(0.01)
@@ -291,15 +297,17 @@ def test_a_script_that_dies_in_the_middle_of_a_call_lets_go_of_the_robot_at_once
     let_go = threading.Event()
 
     class Busy(Notes):
-        def do(self, call: script_calls.Call) -> Any:
+        def execute(self, call: script_calls.Call) -> Any:
             del call
-            inmate = script._inmate
+            inmate = script._process
             assert inmate is not None
             inmate.kill()
             assert let_go.wait(10), "the call went on for as long as it liked"
             raise Refused("ended", "the action ended")
 
-    script = Script(order("robot.home()"), Busy(), Told(), cell=Cell(warm_jail(), stranger=False), died=let_go.set)
+    script = ScriptAction(
+        order("robot.home()"), Busy(), Told(), sandbox=ScriptSandbox(warm_jail(), untrusted=False), on_exit=let_go.set
+    )
     with pytest.raises(ScriptFailed, match="ended before the script did"):
         script.run()
 
@@ -308,21 +316,27 @@ def test_a_process_that_cannot_be_killed_does_not_hold_up_the_action() -> None:
     inmate = FakeInmate(dies=False)
     inmate.say(b'{"kind":"ready"}', b'{"kind":"ended"}')
     died = threading.Event()
-    Script(order(""), Notes(), Told(), cell=Cell(FakeJail(inmate), stranger=False), died=died.set).run()
+    ScriptAction(
+        order(""), Notes(), Told(), sandbox=ScriptSandbox(FakeJail(inmate), untrusted=False), on_exit=died.set
+    ).run()
     assert not died.is_set()
 
 
 def test_a_script_killed_before_it_began_does_not_run() -> None:
     notes = Notes()
-    script = Script(order("robot.home()"), notes, Told(), cell=Cell(warm_jail(), stranger=False), died=nothing)
+    script = ScriptAction(
+        order("robot.home()"), notes, Told(), sandbox=ScriptSandbox(warm_jail(), untrusted=False), on_exit=nothing
+    )
     script.kill()
     with pytest.raises(ScriptFailed):
         script.run()
-    assert notes.calls == []
+    assert notes.received == []
 
 
 def test_without_a_process_it_says_why() -> None:
-    script = Script(order(""), Notes(), Told(), cell=Cell(FakeJail(None), stranger=False), died=nothing)
+    script = ScriptAction(
+        order(""), Notes(), Told(), sandbox=ScriptSandbox(FakeJail(None), untrusted=False), on_exit=nothing
+    )
     with pytest.raises(ScriptFailed, match="no process can be started"):
         script.run()
 
@@ -330,7 +344,7 @@ def test_without_a_process_it_says_why() -> None:
 def test_a_jail_that_does_not_hold_gets_no_script() -> None:
     inmate = FakeInmate()
     inmate.say(b'{"kind": "unfit", "reason": "landlock: no"}')
-    with pytest.raises(ScriptFailed, match="the jail does not hold: landlock: no"):
+    with pytest.raises(ScriptFailed, match="the sandbox is incomplete: landlock: no"):
         run_fake(inmate)
 
 
@@ -343,8 +357,8 @@ def test_a_process_that_does_not_begin_as_it_should_gets_no_script(first: bytes)
 
 
 def test_a_process_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(script_action, "_READY_S", 0.05)
-    with pytest.raises(ScriptFailed, match="it stopped making sense"):
+    monkeypatch.setattr(script_action, "_READY_TIMEOUT_S", 0.05)
+    with pytest.raises(ScriptFailed, match="it stopped following the protocol"):
         run_fake(FakeInmate(dies=False))
 
 
@@ -365,8 +379,8 @@ def _flood(link: socket.socket) -> None:
 
 def test_a_line_that_is_too_long_is_the_end() -> None:
     with socket.socket() as unread:
-        lines = script_action._Lines(unread, threading.Event())
-        lines._rest = b" " * script_calls.MAX_LINE + b"\n"
+        lines = script_action._LineReader(unread, threading.Event())
+        lines._buffer = b" " * script_calls.MAX_LINE + b"\n"
         with pytest.raises(EOFError):
             lines.read()
 
@@ -385,7 +399,7 @@ def test_what_is_said_twice_or_is_no_message_is_answered_with_an_error() -> None
     assert (told.printed, told.progress) == ("x", [])
     got = [json.loads(line) for line in answers.makefile("rb").read().splitlines()]
     assert got[0]["name"] == "wave"
-    assert got[1] == {"error": "this is said once"}
+    assert got[1] == {"error": "this message may be sent only once"}
     assert "share" in got[2]["error"]
     answers.close()
 
@@ -396,7 +410,7 @@ def test_a_script_that_floods_is_read_slowly(monkeypatch: pytest.MonkeyPatch) ->
         killed = threading.Event()
         waited: list[float] = []
         monkeypatch.setattr(killed, "wait", waited.append)
-        lines = script_action._Lines(ours, killed)
+        lines = script_action._LineReader(ours, killed)
         theirs.sendall(b"{}\n" * 700)
         for _ in range(700):
             assert lines.read() == b"{}"

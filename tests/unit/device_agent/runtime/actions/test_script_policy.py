@@ -36,12 +36,12 @@ def movement(version: int = 1, author: str = OWNER) -> RunMovement:
 
 def refusal(trust: ScriptPolicy, order: RunMovement) -> str:
     with pytest.raises(Refused) as refused:
-        trust.check(order)
+        trust.verify(order)
     return refused.value.code
 
 
 def test_a_script_that_the_cloud_signed_is_run(journal: Journal) -> None:
-    trust_of(journal).check(movement())
+    trust_of(journal).verify(movement())
 
 
 @pytest.mark.parametrize(
@@ -81,30 +81,30 @@ def test_a_signature_made_for_a_command_is_none_for_a_movement(journal: Journal)
 
 def test_an_older_version_than_one_that_ran_is_refused_also_after_a_restart(journal: Journal, tmp_path: Path) -> None:
     trust = trust_of(journal)
-    trust.check(movement(3))
-    trust.remember(movement(3))
-    trust.remember(movement(2))
+    trust.verify(movement(3))
+    trust.record_version(movement(3))
+    trust.record_version(movement(2))
     journal.close()
     journal.open(now_ms=0)
     again = trust_of(journal)
     assert refusal(again, movement(2)) == "rolled_back"
-    again.check(movement(3))
-    again.check(movement(4))
+    again.verify(movement(3))
+    again.verify(movement(4))
     assert (tmp_path / "journal.db").exists()
 
 
 def test_what_only_asked_to_run_locks_nothing_out(journal: Journal) -> None:
     trust = trust_of(journal)
-    trust.check(movement(9))
-    trust.check(movement(3))
+    trust.verify(movement(9))
+    trust.verify(movement(3))
 
 
 @pytest.mark.parametrize(
     ("device", "author"), [("other", OWNER), ("arm", SHIPPED), ("arm", OTHER)], ids=["device", "shipped", "account"]
 )
 def test_each_device_and_author_counts_by_itself(journal: Journal, device: str, author: str) -> None:
-    trust_of(journal).remember(movement(9))
-    trust_of(journal, device=device).check(movement(1, author))
+    trust_of(journal).record_version(movement(9))
+    trust_of(journal, device=device).verify(movement(1, author))
 
 
 @pytest.mark.parametrize(
@@ -120,4 +120,4 @@ def test_each_device_and_author_counts_by_itself(journal: Journal, device: str, 
     ],
 )
 def test_who_is_a_stranger(journal: Journal, author: str, owner: str, stranger: bool) -> None:
-    assert trust_of(journal, owner=owner).stranger(movement(author=author)) is stranger
+    assert trust_of(journal, owner=owner).is_untrusted(movement(author=author)) is stranger

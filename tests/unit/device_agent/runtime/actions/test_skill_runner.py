@@ -210,7 +210,9 @@ def test_stop_ends_speech_without_a_mouth(tmp_path: Path) -> None:
     bench.stop()
 
 
-@pytest.mark.parametrize(("text", "language", "says"), [("  ", "", "nothing to say"), ("a", "-v x", "no language")])
+@pytest.mark.parametrize(
+    ("text", "language", "says"), [("  ", "", "nothing to say"), ("a", "-v x", "is not a language")]
+)
 def test_what_cannot_be_said_is_refused(text: str, language: str, says: str) -> None:
     with pytest.raises(Refused, match=says):
         SpeechOutput().prepare(text, language)
@@ -218,15 +220,15 @@ def test_what_cannot_be_said_is_refused(text: str, language: str, says: str) -> 
 
 def test_a_speaker_whom_nobody_hears_begins_all_the_same() -> None:
     speaker = SpeechOutput()
-    speaker.begin(speaker.prepare("hello", ""))
+    speaker.start(speaker.prepare("hello", ""))
 
 
 def test_who_stands_around_hears_for_how_long_something_is_said() -> None:
     heard: list[float] = []
-    speaker = SpeechOutput(heard=heard.append)
+    speaker = SpeechOutput(on_start=heard.append)
     said = speaker.prepare("hello, how are you today", "")
     assert heard == []
-    speaker.begin(said)
+    speaker.start(said)
     assert heard == [said.duration_s]
 
 
@@ -288,9 +290,9 @@ def test_a_limp_joint_is_followed_and_does_not_jump_when_it_holds_again(bench: B
     assert state.stiffness == {"shoulder": 0.0, "elbow": 0.0}
     bench.driver.position = (0.0, 1.2)
     eventually(lambda: abs(bench.telemetry().commanded_rad[1] - 1.2) < 1e-6)
-    assert "elbow: limp" in bench.telemetry().limited
-    assert "elbow: limp; set a stiffness above 0" in why(bench, MoveJoints(position_rad={"elbow": 0.0}))
-    assert "limp" in why(bench, RunBehaviour(name="bow"))
+    assert "elbow: compliant" in bench.telemetry().limited
+    assert "elbow: no stiffness; set a stiffness above 0" in why(bench, MoveJoints(position_rad={"elbow": 0.0}))
+    assert "no stiffness" in why(bench, RunBehaviour(name="bow"))
     ends(bench, SetStiffness(value=0.6, joints=("elbow",)))
     time.sleep(WAIT_S)
     assert bench.driver.position[1] == pytest.approx(1.2)
@@ -333,7 +335,7 @@ def test_a_stiffness_that_is_none_is_refused(bench: Bench, request_: Any, says: 
 def test_a_limp_joint_beyond_its_range_is_commanded_to_its_end() -> None:
     slack = JointStiffness(robot_type())
     slack.set({"elbow": 0.0})
-    assert slack.feel((0.5, 3.3)) == {1: 3.0}
+    assert slack.track((0.5, 3.3)) == {1: 3.0}
 
 
 # ---------------------------------------------------------------- before it begins
@@ -343,8 +345,8 @@ class Late:
     """An action that is over at once."""
 
     def __init__(self) -> None:
-        self.over = threading.Event()
-        self.tenure: Any = type("Tenure", (), {"why": None})()
+        self.ended = threading.Event()
+        self.reservation: Any = type("Tenure", (), {"why": None})()
 
 
 class Restless:
@@ -362,8 +364,8 @@ def test_what_still_moves_is_waited_for_and_a_lost_action_does_not_wait() -> Non
         observe=lambda: None,
         geometry=None,
         skills=None,
-        room=None,  # type: ignore[arg-type]
+        readings=None,  # type: ignore[arg-type]
     )
-    threading.Timer(0.1, mover.over.set).start()
+    threading.Timer(0.1, mover.ended.set).start()
     with pytest.raises(Refused, match="the action ended"):
-        SkillRunner(body, mover).come_to_rest()
+        SkillRunner(body, mover).wait_for_rest()

@@ -19,10 +19,10 @@ def asked(handover: PendingControlRequest, lease: Lease | None = LEASE, now_s: f
 def test_a_request_is_shown_until_its_time_is_over() -> None:
     handover = PendingControlRequest()
     assert asked(handover) is None
-    handover.ask(ASKED, epoch=5, lease=LEASE, now_s=100.0)
+    handover.open(ASKED, epoch=5, lease=LEASE, now_s=100.0)
     shown = handover.current(LEASE, 129.9)
     assert shown is not None
-    assert (shown.by, shown.epoch, shown.expires_s) == ("bob", 5, 130.0)
+    assert (shown.requester, shown.epoch, shown.expires_s) == ("bob", 5, 130.0)
     assert asked(handover, now_s=130.0) is None
     assert asked(handover, now_s=100.0) is None, "what has lapsed stays so"
 
@@ -30,7 +30,7 @@ def test_a_request_is_shown_until_its_time_is_over() -> None:
 @pytest.mark.parametrize("lease", [None, Lease("ann", 6, 1_000.0)])
 def test_it_ends_with_the_lease_that_it_asks_for(lease: Lease | None) -> None:
     handover = PendingControlRequest()
-    handover.ask(ASKED, epoch=5, lease=LEASE, now_s=100.0)
+    handover.open(ASKED, epoch=5, lease=LEASE, now_s=100.0)
     assert asked(handover, lease) is None
     assert asked(handover) is None
 
@@ -39,20 +39,20 @@ def test_it_ends_with_the_lease_that_it_asks_for(lease: Lease | None) -> None:
 def test_a_lease_that_is_not_in_force_cannot_be_asked_for(epoch: int, lease: Lease | None) -> None:
     handover = PendingControlRequest()
     with pytest.raises(Refused) as refused:
-        handover.ask(ASKED, epoch=epoch, lease=lease, now_s=100.0)
+        handover.open(ASKED, epoch=epoch, lease=lease, now_s=100.0)
     assert refused.value.code == "no_lease"
     assert asked(handover) is None
 
 
 def test_the_end_of_a_request_counts_even_before_the_request_itself_and_for_no_other() -> None:
     handover = PendingControlRequest()
-    handover.drop("r1")
-    handover.ask(ASKED, epoch=5, lease=LEASE, now_s=100.0)
+    handover.withdraw("r1")
+    handover.open(ASKED, epoch=5, lease=LEASE, now_s=100.0)
     assert asked(handover) is None
-    handover.ask(
+    handover.open(
         RequestControl(request="r2", requester="cid", answer_within_ms=1_000), epoch=5, lease=LEASE, now_s=100.0
     )
-    handover.drop("r1")
+    handover.withdraw("r1")
     assert asked(handover) == "r2"
-    handover.drop("r2")
+    handover.withdraw("r2")
     assert asked(handover) is None

@@ -11,53 +11,53 @@ def refusal(message: str = "too late") -> EventRecord:
 
 def test_facts_come_out_once_in_their_order_with_their_own_time() -> None:
     audit = EventRecorder()
-    audit.note(EventRecord(EventKind.LEASE_GRANTED, "ann took control", at_ms=5))
-    audit.note(EventRecord(EventKind.LEASE_ENDED, "ann let go"))
-    first, second = audit.take(0.0)
+    audit.record(EventRecord(EventKind.LEASE_GRANTED, "ann took control", at_ms=5))
+    audit.record(EventRecord(EventKind.LEASE_ENDED, "ann let go"))
+    first, second = audit.drain(0.0)
     assert (first.kind, first.at_ms) == (EventKind.LEASE_GRANTED, 5)
     assert second.kind is EventKind.LEASE_ENDED
     assert second.at_ms > 0
-    assert audit.take(100.0) == []
+    assert audit.drain(100.0) == []
 
 
 def test_a_flood_of_refusals_is_told_at_once_and_then_with_its_count() -> None:
     audit = EventRecorder()
     for _ in range(1000):
-        audit.refused(refusal(), code="too_old", now_s=10.0)
-    (first,) = audit.take(10.0)
+        audit.record_rejection(refusal(), code="too_old", now_s=10.0)
+    (first,) = audit.drain(10.0)
     assert "count" not in first.data
-    assert audit.take(10.0 + GAP_S / 2) == []
-    (rest,) = audit.take(10.0 + GAP_S)
+    assert audit.drain(10.0 + GAP_S / 2) == []
+    (rest,) = audit.drain(10.0 + GAP_S)
     assert rest.data == {"code": "too_old", "count": 999}
-    assert audit.take(10.0 + 2 * GAP_S) == [], "it is over"
-    audit.refused(refusal(), code="too_old", now_s=30.0)
-    assert len(audit.take(30.0)) == 1, "and a later one is told at once again"
+    assert audit.drain(10.0 + 2 * GAP_S) == [], "it is over"
+    audit.record_rejection(refusal(), code="too_old", now_s=30.0)
+    assert len(audit.drain(30.0)) == 1, "and a later one is told at once again"
 
 
 def test_at_the_end_a_flood_is_told_however_young_it_is() -> None:
     audit = EventRecorder()
-    audit.refused(refusal(), code="too_old", now_s=10.0)
-    audit.refused(refusal("later"), code="too_old", now_s=10.1)
-    first, last = audit.take(float("inf"))
+    audit.record_rejection(refusal(), code="too_old", now_s=10.0)
+    audit.record_rejection(refusal("later"), code="too_old", now_s=10.1)
+    first, last = audit.drain(float("inf"))
     assert (first.message, last.message, last.data["count"]) == ("too late", "later", 1)
 
 
 def test_different_codes_are_told_by_themselves_up_to_a_bound_and_the_rest_is_counted() -> None:
     audit = EventRecorder()
-    for number in range(module._MOST_COUNTED + 3):
-        audit.refused(refusal(), code=f"code{number}", now_s=0.0)
-    told = audit.take(0.0)
-    assert len(told) == module._MOST_COUNTED + 1
+    for number in range(module._MAX_COUNTED + 3):
+        audit.record_rejection(refusal(), code=f"code{number}", now_s=0.0)
+    told = audit.drain(0.0)
+    assert len(told) == module._MAX_COUNTED + 1
     assert (told[-1].kind, told[-1].data) == (EventKind.EVENTS_DROPPED, {"count": 3})
-    assert audit.take(0.1) == []
+    assert audit.drain(0.1) == []
 
 
 def test_an_office_that_is_stuck_costs_no_memory() -> None:
     audit = EventRecorder()
-    for _ in range(module._MOST_WAITING + 7):
-        audit.note(EventRecord(EventKind.MOTION_HELD, "held"))
-    told = audit.take(0.0)
-    assert len(told) == module._MOST_WAITING + 1
+    for _ in range(module._MAX_WAITING + 7):
+        audit.record(EventRecord(EventKind.MOTION_HELD, "held"))
+    told = audit.drain(0.0)
+    assert len(told) == module._MAX_WAITING + 1
     assert told[-1].data == {"count": 7}
 
 

@@ -90,19 +90,19 @@ class Bench:
             self.room,
             restrict=lambda *what: self.done.append(what),
             lift=lambda name: self.done.append((name,)),
-            note=lambda happened, *_: self.told.append(happened),
+            record=lambda happened, *_: self.told.append(happened),
         )
 
     def measure(self, **values: float | bool) -> None:
         self.sequence += 1
         message = Measurements(tick_ms=self.sequence, at_ms=1, sequence=self.sequence, values=values)
-        self.room.note("pir", "presence", message)
+        self.room.record("pir", "presence", message)
 
     def step(self, wait_s: float = 0.0) -> list[tuple[Any, ...]]:
         """What one period did, after a while."""
         self.now_s += wait_s
         self.done.clear()
-        self.interlocks.step(self.now_s)
+        self.interlocks.update(self.now_s)
         return list(self.done)
 
 

@@ -58,14 +58,14 @@ def trust() -> ScriptPolicy:
 def test_no_byte_of_a_movement_may_differ_though_the_order_around_it_is_signed_anew() -> None:
     """Who changes what the cloud has stored has the cloud itself sign the order."""
     good = signed_movement('"""Wave."""\nrobot.home()\n', KEY)
-    trust().check(good)
+    trust().verify(good)
     for field in ("source", "sha256", "name", "robot_type", "signature", "key"):
         text: str = getattr(good, field)
         for place in range(len(text)):
             other = "b" if text[place] != "b" else "c"
             bad: RunMovement = msgspec.structs.replace(good, **{field: text[:place] + other + text[place + 1 :]})
             with pytest.raises(Refused):
-                trust().check(bad)
+                trust().verify(bad)
     for version in (good.version - 1, good.version + 1):
         with pytest.raises(Refused):
-            trust().check(msgspec.structs.replace(good, version=version))
+            trust().verify(msgspec.structs.replace(good, version=version))

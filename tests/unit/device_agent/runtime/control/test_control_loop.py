@@ -41,7 +41,12 @@ class Desk:
         self.controller = Controller(kind, LeaseGate())
         self.told: list[JointTelemetry] = []
         self.loop = ControlLoop(
-            kind, self.driver, self.controller, name="arm", tell=self.told.append, watch=lambda _now_s: None
+            kind,
+            self.driver,
+            self.controller,
+            name="arm",
+            publish=self.told.append,
+            check_interlocks=lambda _now_s: None,
         )
         self._sequence = 0
 
@@ -54,8 +59,8 @@ class Desk:
         self._sequence += 1
         target = JointTarget(position_rad={"elbow": elbow_rad})
         setpoint = Setpoint(epoch=1, sequence=self._sequence, echo_tick_ms=5, sent_ms=0.0, target=target)
-        self.controller.offer(setpoint, now_s=time.monotonic(), tick_ms=10)
-        self.loop.hurry()
+        self.controller.accept_setpoint(setpoint, now_s=time.monotonic(), tick_ms=10)
+        self.loop.wake()
 
 
 @pytest.fixture
@@ -107,7 +112,7 @@ def test_a_prompt_driver_is_commanded_by_the_thread_that_brings_the_setpoint() -
         assert desk.driver.threads[1:] == [threading.current_thread().name]
     finally:
         desk.loop.stop()
-    desk.loop._early = False
+    desk.loop._out_of_turn = False
     desk.ask(0.9)
     assert len(desk.driver.threads) == 2, "who has stopped commands nothing more"
 
@@ -119,7 +124,7 @@ def test_the_period_after_a_setpoints_own_comes_a_whole_period_later() -> None:
     try:
         before = len(driver.threads)
         wait_until(lambda: len(driver.threads) > before, "a period")
-        desk.loop._early = False
+        desk.loop._out_of_turn = False
         desk.ask(0.5)
         asked_s, commanded = time.monotonic(), len(driver.threads)
         wait_until(lambda: len(driver.threads) > commanded, "the next period")
@@ -131,7 +136,7 @@ def test_the_period_after_a_setpoints_own_comes_a_whole_period_later() -> None:
 def test_a_period_that_does_not_end_keeps_nobody_from_stopping() -> None:
     desk = Desk()
     desk.start()
-    with desk.loop._turn:
+    with desk.loop._period_lock:
         desk.loop.stop()
     assert desk.loop._stopping.is_set()
 
@@ -141,14 +146,14 @@ def test_of_two_that_hurry_at_once_one_begins_a_period() -> None:
     driver = PromptDriver()
     desk = Desk(driver)
     desk.start()
-    real = desk.loop._turn
+    real = desk.loop._period_lock
 
     class Turn:
         """Whoever takes it finds that somebody else was quicker."""
 
         def acquire(self, **how: Any) -> bool:
             taken = real.acquire(**how)
-            desk.loop._early = True
+            desk.loop._out_of_turn = True
             return taken
 
         def release(self) -> None:
@@ -162,13 +167,13 @@ def test_of_two_that_hurry_at_once_one_begins_a_period() -> None:
 
     try:
         wait_until(lambda: desk.loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
-        desk.loop._turn = Turn()  # type: ignore[assignment]
+        desk.loop._period_lock = Turn()  # type: ignore[assignment]
         commanded = len(driver.threads)
         desk.ask(0.5)
         time.sleep(SILENCE_S)
         assert len(driver.threads) == commanded
     finally:
-        desk.loop._turn = real
+        desk.loop._period_lock = real
         desk.loop.stop()
 
 
@@ -176,9 +181,9 @@ def test_what_goes_wrong_in_a_setpoints_own_period_is_a_fault_until_the_driver_a
     desk = Desk(PromptDriver(), period_ms=8)
     desk.start()
     try:
-        with desk.loop._turn:  # its loop's thread waits meanwhile
+        with desk.loop._period_lock:  # its loop's thread waits meanwhile
             desk.driver.broken = True
-            desk.controller.step(time.monotonic())
+            desk.controller.update(time.monotonic())
         wait_until(lambda: desk.controller.fault is not None, "the fault")
         desk.driver.broken = False
         wait_until(lambda: desk.controller.fault is None, "the driver's return")
@@ -226,7 +231,7 @@ def test_in_motion_periods_keep_their_length() -> None:
     desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
     desk.ask(0.5)
     assert desk.loop._wait()
-    desk.controller.step(now_s)
+    desk.controller.update(now_s)
     assert desk.controller.moving
     desk.ask(0.6)
     assert not desk.loop._wait()
@@ -240,10 +245,10 @@ def moving(period_ms: int, periods: int = 20) -> Desk:
     desk.loop._thread = threading.current_thread()
     now_s = time.monotonic()
     desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
-    desk.loop._early = True
+    desk.loop._out_of_turn = True
     desk.ask(2.5)
     for _ in range(periods):
-        desk.loop._period(early=False)
+        desk.loop._run_period(early=False)
     assert desk.controller.mode is Mode.STREAMING
     assert desk.controller.moving
     return desk
@@ -252,25 +257,25 @@ def moving(period_ms: int, periods: int = 20) -> Desk:
 def test_a_stop_in_motion_brakes_at_once_and_by_no_more_than_has_passed() -> None:
     desk = moving(period_ms=4)
     assert isinstance(desk.driver, PromptDriver)
-    before_rad, speed_rad_s = desk.driver.position[1], desk.controller._motion.velocity_rad_s[1]
+    before_rad, speed_rad_s = desk.driver.position[1], desk.controller._state.motion.velocity_rad_s[1]
     commanded = len(desk.driver.threads)
     desk.loop._next_s = time.monotonic() + 0.004 - 0.001  # a quarter of the period has passed, or more
     desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    desk.loop.hurry()
+    desk.loop.wake()
     assert desk.controller.mode is Mode.STOPPED
     assert len(desk.driver.threads) == commanded + 1
     assert 0 < desk.driver.position[1] - before_rad <= speed_rad_s * 0.004 + 1e-9
     assert desk.controller.moving, "it brakes, it does not jump"
     assert desk.loop._next_s > time.monotonic() - 1
-    desk.loop.hurry()
+    desk.loop.wake()
     assert len(desk.driver.threads) == commanded + 1, "only once: then periods keep their length again"
 
 
 def test_a_stop_waits_for_no_period_after_a_setpoints_own_either() -> None:
     desk = moving(period_ms=4)
-    desk.loop._early = True
+    desk.loop._out_of_turn = True
     desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    desk.loop.hurry()
+    desk.loop.wake()
     assert desk.controller.mode is Mode.STOPPED
 
 
@@ -285,20 +290,20 @@ def test_what_has_passed_is_never_more_than_a_period_and_never_nothing() -> None
 def test_a_stop_waits_for_the_end_of_a_period_that_may_not_know_of_it() -> None:
     desk = moving(period_ms=100, periods=3)
     desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    desk.loop._turn.acquire()
-    threading.Timer(0.05, desk.loop._turn.release).start()
-    desk.loop.hurry()
+    desk.loop._period_lock.acquire()
+    threading.Timer(0.05, desk.loop._period_lock.release).start()
+    desk.loop.wake()
     assert desk.controller.mode is Mode.STOPPED
 
 
 def test_telemetry_tells_of_a_new_setpoint_but_not_more_often_than_in_motion() -> None:
     desk = Desk()
     desk.controller.start_at((0.0, 0.0))
-    seen, tick = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ()), desk.controller.step(0.0)
+    seen, tick = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ()), desk.controller.update(0.0)
 
     def told(now_s: float, sequence: int) -> bool:
         before = len(desk.told)
-        desk.loop._measure(now_s, seen, replace(tick, setpoint_sequence=sequence), (0.0, 0.0))
+        desk.loop._publish_telemetry(now_s, seen, replace(tick, setpoint_sequence=sequence), (0.0, 0.0))
         return len(desk.told) > before
 
     asked = ((0.0, 0), (0.03, 0), (0.03, 1), (0.04, 2), (0.045, 3), (0.0501, 3))
@@ -309,12 +314,12 @@ def test_while_setpoints_come_telemetry_goes_with_them_and_else_33_times_a_secon
     desk = Desk()
     desk.controller.start_at((0.0, 0.0))
     seen = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
-    tick = replace(desk.controller.step(0.0), mode=Mode.STREAMING)
+    tick = replace(desk.controller.update(0.0), mode=Mode.STREAMING)
     for period in range(1001):
         now_s = period / 1000
-        desk.loop._measure(now_s, seen, replace(tick, setpoint_sequence=period // 25), (0.0, 0.0))
+        desk.loop._publish_telemetry(now_s, seen, replace(tick, setpoint_sequence=period // 25), (0.0, 0.0))
     assert [each.setpoint_sequence for each in desk.told] == list(range(41))
     desk.told.clear()
     for period in range(1001, 2002):
-        desk.loop._measure(period / 1000, seen, replace(tick, setpoint_sequence=40), (0.0, 0.0))
+        desk.loop._publish_telemetry(period / 1000, seen, replace(tick, setpoint_sequence=40), (0.0, 0.0))
     assert 32 <= len(desk.told) <= 34

@@ -50,14 +50,14 @@ def unwatched(_now_s: float) -> None:
 def test_the_driver_is_told_the_twist_until_the_drive_has_ended() -> None:
     kind, cart = robot_type(BASE), Cart()
     controller = Controller(kind, LeaseGate())
-    loop = ControlLoop(kind, cart, controller, name="cart", tell=ignore, watch=unwatched)
+    loop = ControlLoop(kind, cart, controller, name="cart", publish=ignore, check_interlocks=unwatched)
     loop.start()
     try:
-        tenure = controller.begin_action(epoch=1, on_lost=lost)
-        drive = controller.drive(tenure, Twist(0.2), duration_s=0.3)
+        tenure = controller.reserve(epoch=1, on_revoked=lost)
+        drive = controller.start_drive(tenure, Twist(0.2), duration_s=0.3)
         assert cart.drove.wait(WITHIN_S)
         assert drive.finished.wait(WITHIN_S)
-        assert drive.outcome is GoalResult.REACHED
+        assert drive.result is GoalResult.REACHED
     finally:
         loop.stop()
     assert 0 < max(twist.forward_m_s for twist in cart.twists) <= 0.2 + 1e-9
@@ -68,11 +68,11 @@ def test_the_driver_is_told_the_twist_until_the_drive_has_ended() -> None:
 def test_a_drive_that_the_driver_does_not_follow_says_so(cart: Cart, limited: tuple[str, ...]) -> None:
     kind = robot_type(BASE)
     controller = Controller(kind, LeaseGate())
-    loop = ControlLoop(kind, cart, controller, name="cart", tell=ignore, watch=unwatched)
+    loop = ControlLoop(kind, cart, controller, name="cart", publish=ignore, check_interlocks=unwatched)
     loop.start()
     try:
-        tenure = controller.begin_action(epoch=1, on_lost=lost)
-        drive = controller.drive(tenure, Twist(0.2), duration_s=0.5)
+        tenure = controller.reserve(epoch=1, on_revoked=lost)
+        drive = controller.start_drive(tenure, Twist(0.2), duration_s=0.5)
         assert drive.finished.wait(WITHIN_S)
         assert drive.limited == limited
     finally:
@@ -81,7 +81,9 @@ def test_a_drive_that_the_driver_does_not_follow_says_so(cart: Cart, limited: tu
 
 def test_a_driver_that_cannot_drive_does_not_start_with_a_type_that_has_a_base() -> None:
     kind = robot_type(BASE)
-    loop = ControlLoop(kind, ToyDriver(), Controller(kind, LeaseGate()), name="cart", tell=ignore, watch=unwatched)
+    loop = ControlLoop(
+        kind, ToyDriver(), Controller(kind, LeaseGate()), name="cart", publish=ignore, check_interlocks=unwatched
+    )
     with pytest.raises(DriverError, match="'cart' has a base, but its driver cannot drive"):
         loop.start()
     loop.stop()

@@ -84,7 +84,7 @@ def test_a_setpoint_beyond_the_range_is_clamped_and_says_so() -> None:
     rig = Rig()
     rig.take(1)
     rig.offer(1, elbow=9.0)
-    assert rig.controller.step(rig.now_s + PERIOD_S).limited == ("elbow: range",)
+    assert rig.controller.update(rig.now_s + PERIOD_S).limited == ("elbow: range",)
     rig.stream(1, 6.0, elbow=9.0)
     assert rig.elbow == pytest.approx(3.0, abs=1e-3)
 
@@ -161,7 +161,7 @@ def test_what_was_ordered_before_a_reset_is_not_obeyed_after_it() -> None:
     rig.controller.reset_stop(epoch=3)
     for epoch in (1, 2, 3):
         with pytest.raises(Refused) as refused:
-            rig.controller.begin_action(epoch=epoch, on_lost=lambda _: None)
+            rig.controller.reserve(epoch=epoch, on_revoked=lambda _: None)
         assert refused.value.code in {"stale_epoch", "lease_ended"}
         with pytest.raises(Refused):
             rig.take(epoch)
@@ -177,21 +177,21 @@ def test_the_first_stop_stays_the_one_shown() -> None:
 
 def test_a_move_reaches_its_target_and_says_so() -> None:
     rig = Rig()
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    move = rig.controller.move(tenure, {"elbow": 1.0}, speed=1.0)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    move = rig.controller.start_joint_goal(tenure, {"elbow": 1.0}, speed=1.0)
     rig.run(2.0)
-    assert move.outcome is GoalResult.REACHED
+    assert move.result is GoalResult.REACHED
     assert rig.elbow == pytest.approx(1.0, abs=1e-4)
-    rig.controller.end_action(tenure)
+    rig.controller.end_reservation(tenure)
     assert rig.run(0.1) is Mode.IDLE
 
 
 @pytest.mark.parametrize(("position_rad", "code"), [({"elbow": 3.1}, "out_of_range"), ({"knee": 0.0}, "unknown_joint")])
 def test_a_move_that_cannot_be_is_refused_whole(position_rad: dict[str, float], code: str) -> None:
     rig = Rig()
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.controller.move(tenure, {"shoulder": 1.0} | position_rad, speed=1.0)
+        rig.controller.start_joint_goal(tenure, {"shoulder": 1.0} | position_rad, speed=1.0)
     assert refused.value.code == code
     rig.run(0.5)
     assert not rig.controller.moving
@@ -202,28 +202,28 @@ def test_an_action_that_loses_the_device_moves_it_no_more(cause: str) -> None:
     rig = Rig()
     why: list[Refused] = []
     rig.take(1, lease_s=5.0)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=why.append)
-    move = rig.controller.move(tenure, {"elbow": 2.9}, speed=0.1)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=why.append)
+    move = rig.controller.start_joint_goal(tenure, {"elbow": 2.9}, speed=0.1)
     rig.run(0.5)
     interruptions()[cause](rig)  # type: ignore[operator]
     rig.run(0.3)
-    assert move.outcome is GoalResult.INTERRUPTED
+    assert move.result is GoalResult.INTERRUPTED
     assert len(why) == 1
     assert not rig.controller.moving
     with pytest.raises(Refused):
-        rig.controller.move(tenure, {"elbow": -1.0}, speed=1.0)
+        rig.controller.start_joint_goal(tenure, {"elbow": -1.0}, speed=1.0)
 
 
 def test_setpoints_are_refused_while_an_action_runs() -> None:
     rig = Rig()
     rig.take(1)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
         rig.offer(1)
     assert refused.value.code == "busy"
     with pytest.raises(Refused):
-        rig.controller.begin_action(epoch=1, on_lost=lost)
-    rig.controller.end_action(tenure)
+        rig.controller.reserve(epoch=1, on_revoked=lost)
+    rig.controller.end_reservation(tenure)
     rig.offer(1)
 
 
@@ -238,18 +238,18 @@ def test_epochs_burned_before_a_restart_stay_burned() -> None:
 def test_losing_the_link_at_rest_keeps_the_lease() -> None:
     rig = Rig()
     rig.take(1)
-    rig.controller.lost(Refused("link_lost", ""))
+    rig.controller.interrupt(Refused("link_lost", ""))
     assert rig.controller.lease(rig.now_s) is not None
 
 
 def test_a_driver_that_fails_again_is_one_fault_and_one_that_never_failed_does_not_recover() -> None:
     rig = Rig()
-    rig.controller.recover([1.0, 1.0])
+    rig.controller.clear_fault([1.0, 1.0])
     rig.run(PERIOD_S)
     assert rig.elbow == 0.0, "a device that is well stays where it is"
-    rig.controller.fail("no answer")
-    rig.controller.fail("no answer")
+    rig.controller.set_fault("no answer")
+    rig.controller.set_fault("no answer")
     assert rig.run(PERIOD_S) is Mode.FAULT
-    rig.controller.recover([1.0, 1.0])
+    rig.controller.clear_fault([1.0, 1.0])
     assert rig.run(PERIOD_S) is Mode.IDLE
     assert rig.elbow == 1.0

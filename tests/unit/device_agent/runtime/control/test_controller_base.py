@@ -19,13 +19,13 @@ def twists(rig: Rig, seconds: float) -> list[Twist]:
     found = []
     for _ in range(round(seconds / PERIOD_S)):
         rig.now_s += PERIOD_S
-        found.append(rig.controller.step(rig.now_s).twist)
+        found.append(rig.controller.update(rig.now_s).twist)
     return found
 
 
 def driving(rig: Rig, duration_s: float = 2.0) -> DriveGoal:
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    return rig.controller.drive(tenure, Twist(0.4, 0.0, -0.5), duration_s=duration_s)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    return rig.controller.start_drive(tenure, Twist(0.4, 0.0, -0.5), duration_s=duration_s)
 
 
 def test_a_drive_speeds_up_keeps_its_twist_and_ends_by_itself() -> None:
@@ -37,7 +37,7 @@ def test_a_drive_speeds_up_keeps_its_twist_and_ends_by_itself() -> None:
     gains = [(b.forward_m_s - a.forward_m_s) / PERIOD_S for a, b in pairwise(found)]
     assert max(gains) <= BASE.max_linear_acceleration_m_s2 + 1e-6
     assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
-    assert drive.outcome is GoalResult.REACHED
+    assert drive.result is GoalResult.REACHED
     assert rig.elbow == 0.0
 
 
@@ -50,7 +50,7 @@ def test_whatever_takes_the_device_away_brakes_the_base(cause: str) -> None:
     assert rig.controller.moving
     interruptions()[cause](rig)  # type: ignore[operator]
     assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
-    assert drive.outcome is GoalResult.INTERRUPTED
+    assert drive.result is GoalResult.INTERRUPTED
     assert not rig.controller.moving
 
 
@@ -79,15 +79,15 @@ def test_a_drive_is_slowed_by_the_room() -> None:
 
 def test_a_drive_takes_the_place_of_a_move_and_the_other_way_round() -> None:
     rig = Rig(base=BASE)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    move = rig.controller.move(tenure, {"elbow": 2.0}, speed=1.0)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    move = rig.controller.start_joint_goal(tenure, {"elbow": 2.0}, speed=1.0)
     rig.run(0.3)
-    drive = rig.controller.drive(tenure, Twist(0.4), duration_s=5.0)
+    drive = rig.controller.start_drive(tenure, Twist(0.4), duration_s=5.0)
     rig.run(0.5)
-    assert (move.outcome, move.why and move.why.code) == (GoalResult.INTERRUPTED, "replaced")
-    rig.controller.move(tenure, {"elbow": 0.0}, speed=1.0)
+    assert (move.result, move.why and move.why.code) == (GoalResult.INTERRUPTED, "replaced")
+    rig.controller.start_joint_goal(tenure, {"elbow": 0.0}, speed=1.0)
     rig.run(2.0)
-    assert drive.outcome is GoalResult.INTERRUPTED
+    assert drive.result is GoalResult.INTERRUPTED
     assert not rig.controller.moving
 
 
@@ -105,19 +105,19 @@ def refusals() -> dict[str, tuple[Twist, float]]:
 @pytest.mark.parametrize("case", refusals())
 def test_what_cannot_be_driven_is_refused(case: str) -> None:
     rig = Rig(base=BASE)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
     twist, duration_s = refusals()[case]
     with pytest.raises(Refused) as refused:
-        rig.controller.drive(tenure, twist, duration_s=duration_s)
+        rig.controller.start_drive(tenure, twist, duration_s=duration_s)
     assert refused.value.code == case.split(maxsplit=1)[0]
     assert twists(rig, 0.1)[-1] == REST
 
 
 def test_a_robot_without_a_base_does_not_drive() -> None:
     rig = Rig()
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.controller.drive(tenure, Twist(0.1), duration_s=1.0)
+        rig.controller.start_drive(tenure, Twist(0.1), duration_s=1.0)
     assert refused.value.code == "no_base"
 
 
@@ -125,8 +125,8 @@ def test_a_driver_that_comes_back_finds_the_base_at_rest() -> None:
     rig = Rig(base=BASE)
     driving(rig)
     twists(rig, 0.5)
-    rig.controller.fail("no answer")
-    rig.controller.recover([0.0, 0.0])
+    rig.controller.set_fault("no answer")
+    rig.controller.clear_fault([0.0, 0.0])
     assert twists(rig, 0.1)[0] == REST
 
 
@@ -145,13 +145,13 @@ def test_a_base_without_a_way_to_go_on_says_so() -> None:
 
 def test_an_action_may_end_while_it_drives() -> None:
     rig = Rig(base=BASE)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    drive = rig.controller.drive(tenure, Twist(0.4), duration_s=5.0)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    drive = rig.controller.start_drive(tenure, Twist(0.4), duration_s=5.0)
     twists(rig, 0.5)
-    rig.controller.end_action(tenure)
-    rig.controller.end_action(tenure)
+    rig.controller.end_reservation(tenure)
+    rig.controller.end_reservation(tenure)
     assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
-    assert drive.outcome is GoalResult.INTERRUPTED
+    assert drive.result is GoalResult.INTERRUPTED
 
 
 def test_two_parts_of_a_period_brake_a_base_as_much_as_a_whole_one() -> None:

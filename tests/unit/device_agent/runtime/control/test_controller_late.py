@@ -14,7 +14,7 @@ def rig() -> Rig:
     rig = Rig()
     rig.take(1)
     rig.stream(1, 1.0, elbow=2.9)
-    assert rig.controller._motion.fastest_rad_s > 0.5
+    assert rig.controller._state.motion.fastest_rad_s > 0.5
     return rig
 
 
@@ -24,7 +24,7 @@ def rest_after(rig: Rig, *gaps_s: float) -> float:
     for count in range(200):
         before = rig.elbow
         rig.now_s += gaps_s[count % len(gaps_s)]
-        rig.elbow = rig.controller.step(rig.now_s).position_rad[1]
+        rig.elbow = rig.controller.update(rig.now_s).position_rad[1]
         assert abs(rig.elbow - before) <= FASTEST_RAD_S * PERIOD_S, "a jump"
         if not rig.controller.moving:
             return rig.now_s - began_s
@@ -41,7 +41,7 @@ def test_a_loop_that_has_been_late_begins_to_brake_the_sooner(rig: Rig, gap_s: f
     for _ in range(20):
         rig.offer(1, 2.9)
         rig.now_s += gap_s
-        rig.elbow = rig.controller.step(rig.now_s).position_rad[1]
+        rig.elbow = rig.controller.update(rig.now_s).position_rad[1]
     rig.offer(1, 2.9)
     assert rest_after(rig, gap_s) <= LIMIT_S
 
@@ -49,7 +49,7 @@ def test_a_loop_that_has_been_late_begins_to_brake_the_sooner(rig: Rig, gap_s: f
 def test_what_a_loop_was_late_is_forgotten(rig: Rig) -> None:
     rig.now_s += 0.1
     rig.offer(1, 2.9)
-    rig.controller.step(rig.now_s)
+    rig.controller.update(rig.now_s)
     rig.offer(1, -2.9)
     sooner_s = rest_after(rig, PERIOD_S)
     rig.take(2)
@@ -74,8 +74,8 @@ def test_a_loop_that_hangs_past_the_limit_is_at_rest_at_once(rig: Rig) -> None:
 
 
 def test_what_does_not_brake_is_not_hurried(rig: Rig) -> None:
-    before = rig.controller._motion.fastest_rad_s
+    before = rig.controller._state.motion.fastest_rad_s
     rig.offer(1, 2.9)
     rig.now_s += 0.1
-    rig.controller.step(rig.now_s)
-    assert rig.controller._motion.fastest_rad_s == pytest.approx(before, rel=0.2)
+    rig.controller.update(rig.now_s)
+    assert rig.controller._state.motion.fastest_rad_s == pytest.approx(before, rel=0.2)

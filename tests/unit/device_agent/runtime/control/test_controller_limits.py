@@ -11,7 +11,7 @@ from device_agent.ports.geometry import Sweep
 from device_agent.protocol import Mode
 from device_agent.protocol.manifests.robot_type import Workspace
 from device_agent.runtime.control.goals import GoalResult
-from device_agent.runtime.control.joint_motion import JointMotion, MotionError, plan
+from device_agent.runtime.control.joint_motion import JointMotion, MotionError, generate
 from device_agent.runtime.control.latency_limiter import LatencyLimiter
 from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
@@ -28,7 +28,7 @@ def test_a_streamed_arm_stops_before_the_wall_and_says_so() -> None:
     assert "clearance: hand \u2013 wall" in rig.limited
     rig.stream(1, 1.0, elbow=0.2)
     assert rig.elbow == pytest.approx(0.2, abs=1e-3)
-    assert rig.controller.step(rig.now_s + PERIOD_S).limited == ()
+    assert rig.controller.update(rig.now_s + PERIOD_S).limited == ()
 
 
 def test_an_operator_who_pushes_against_the_wall_moves_nothing() -> None:
@@ -44,28 +44,28 @@ def test_an_operator_who_pushes_against_the_wall_moves_nothing() -> None:
 
 def test_a_wall_that_is_met_at_full_speed_is_not_touched() -> None:
     rig = Rig(geometry=Wall(2.0))
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
     wall = Wall(2.0)
-    rig.controller._envelope._geometry = None  # the target is not looked at: only the way is
-    move = rig.controller.move(tenure, {"elbow": 2.9}, speed=1.0)
-    rig.controller._envelope._geometry = wall
+    rig.controller._state.limits._geometry = None  # the target is not looked at: only the way is
+    move = rig.controller.start_joint_goal(tenure, {"elbow": 2.9}, speed=1.0)
+    rig.controller._state.limits._geometry = wall
     rig.run(3.0)
     assert 1.9 < rig.elbow <= 2.0
-    assert move.outcome is GoalResult.INTERRUPTED
+    assert move.result is GoalResult.INTERRUPTED
     assert move.why is not None
     assert (move.why.code, "hand \u2013 wall" in move.why.message) == ("no_room", True)
     assert move.limited == ("clearance: hand \u2013 wall",)
     assert rig.controller.mode is Mode.ACTION
-    rig.controller.move(tenure, {"elbow": 0.0}, speed=1.0)
+    rig.controller.start_joint_goal(tenure, {"elbow": 0.0}, speed=1.0)
     rig.run(2.5)
     assert rig.elbow == pytest.approx(0.0, abs=1e-4)
 
 
 def test_a_move_to_where_there_is_no_room_is_refused_and_says_what_is_there() -> None:
     rig = Rig(geometry=Wall())
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.controller.move(tenure, {"elbow": 1.25}, speed=1.0)
+        rig.controller.start_joint_goal(tenure, {"elbow": 1.25}, speed=1.0)
     assert refused.value.code == "no_room"
     assert "hand \u2013 wall, 250 mm" in refused.value.message
     rig.run(0.5)
@@ -75,12 +75,12 @@ def test_a_move_to_where_there_is_no_room_is_refused_and_says_what_is_there() ->
 def test_who_is_too_near_already_may_leave_but_not_go_on() -> None:
     rig = Rig(geometry=Wall())
     rig.controller.start_at([0.0, 1.3])
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused):
-        rig.controller.move(tenure, {"elbow": 1.4}, speed=1.0)
-    assert rig.controller.move(tenure, {"elbow": 1.2}, speed=1.0)
+        rig.controller.start_joint_goal(tenure, {"elbow": 1.4}, speed=1.0)
+    assert rig.controller.start_joint_goal(tenure, {"elbow": 1.2}, speed=1.0)
     rig.run(1.0)
-    rig.controller.move(tenure, {"elbow": 0.5}, speed=1.0)
+    rig.controller.start_joint_goal(tenure, {"elbow": 0.5}, speed=1.0)
     rig.run(1.0)
     assert rig.elbow == pytest.approx(0.5, abs=1e-4)
 
@@ -88,9 +88,9 @@ def test_who_is_too_near_already_may_leave_but_not_go_on() -> None:
 @pytest.mark.parametrize("speed", [0.0, -1.0, 1.1, math.nan, math.inf])
 def test_a_speed_that_is_none_is_refused(speed: float) -> None:
     rig = Rig()
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.controller.move(tenure, {"elbow": 1.0}, speed=speed)
+        rig.controller.start_joint_goal(tenure, {"elbow": 1.0}, speed=speed)
     assert refused.value.code == "bad_speed"
 
 
@@ -101,9 +101,9 @@ def test_a_position_that_is_no_number_is_refused_for_every_source(value: float) 
     with pytest.raises(Refused) as refused:
         rig.offer(1, elbow=value)
     assert refused.value.code == "not_finite"
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.controller.move(tenure, {"elbow": value}, speed=1.0)
+        rig.controller.start_joint_goal(tenure, {"elbow": value}, speed=1.0)
     assert refused.value.code == "not_finite"
 
 
@@ -149,27 +149,27 @@ def test_where_nobody_knows_the_shape_age_alone_slows() -> None:
 
 
 def test_one_late_answer_is_no_slow_link() -> None:
-    pace = LatencyLimiter(None, watchdog_s=0.3, oldest_s=0.2)
+    pace = LatencyLimiter(None, watchdog_s=0.3, max_age_s=0.2)
     assert pace.age_s == 0.0
     for _ in range(50):
-        pace.heard(0.03)
-    pace.heard(0.19)
+        pace.add_age(0.03)
+    pace.add_age(0.19)
     assert pace.age_s < 0.07
-    assert pace.share() == 1.0
-    pace.begin()
+    assert pace.joint_share() == 1.0
+    pace.reset()
     assert pace.age_s == 0.0
 
 
 def test_what_the_driver_changes_is_told() -> None:
     rig = Rig()
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    move = rig.controller.move(tenure, {"elbow": 1.0}, speed=1.0)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    move = rig.controller.start_joint_goal(tenure, {"elbow": 1.0}, speed=1.0)
     rig.run(0.1)
-    rig.controller.applied([0.0, rig.elbow - 0.01])
-    assert rig.controller.step(rig.now_s + PERIOD_S).limited == ("elbow: driver",)
+    rig.controller.record_applied([0.0, rig.elbow - 0.01])
+    assert rig.controller.update(rig.now_s + PERIOD_S).limited == ("elbow: driver",)
     assert move.limited == ("elbow: driver",)
-    rig.controller.applied(rig.controller._motion.position_rad)
-    assert rig.controller.step(rig.now_s + 2 * PERIOD_S).limited == ()
+    rig.controller.record_applied(rig.controller._state.motion.position_rad)
+    assert rig.controller.update(rig.now_s + 2 * PERIOD_S).limited == ()
 
 
 def test_a_shape_that_fails_under_way_is_no_permission() -> None:
@@ -180,11 +180,11 @@ def test_a_shape_that_fails_under_way_is_no_permission() -> None:
             raise RuntimeError("no shape")
 
     rig = Rig(geometry=Broken())
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    rig.controller.move(tenure, {"elbow": 0.5}, speed=1.0)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    rig.controller.start_joint_goal(tenure, {"elbow": 0.5}, speed=1.0)
     with pytest.raises(RuntimeError):
         rig.run(0.1)
-    rig.controller.fail("internal error")
+    rig.controller.set_fault("internal error")
     rig.run(0.2)
     assert rig.elbow == pytest.approx(0.0, abs=1e-4)
 
@@ -211,7 +211,7 @@ def test_a_motion_without_a_way_to_brake_is_an_error() -> None:
 
 def test_a_planner_that_finds_nothing_is_an_error() -> None:
     with pytest.raises(MotionError):
-        plan(lambda _order, _answer: Result.ErrorExecutionTimeCalculation, None, None)
+        generate(lambda _order, _answer: Result.ErrorExecutionTimeCalculation, None, None)
 
 
 def test_a_way_that_rounding_hides_from_the_planner_is_found_with_a_little_less_speed() -> None:
@@ -222,7 +222,7 @@ def test_a_way_that_rounding_hides_from_the_planner_is_found_with_a_little_less_
     with pytest.raises(RuckigError):
         Ruckig(1).calculate(order, Trajectory(1))
     found = Trajectory(1)
-    plan(Ruckig(1).calculate, order, found)
+    generate(Ruckig(1).calculate, order, found)
     assert found.at_time(found.duration)[0] == pytest.approx([0.5])
     assert order.max_velocity == [3.0]
 
@@ -231,7 +231,7 @@ def test_a_motion_that_cannot_be_planned_holds_and_ends_the_lease() -> None:
     rig = Rig()
     rig.take(1)
     rig.stream(1, 0.5)
-    rig.controller._motion._jerk_limits = [math.nan, math.nan]
+    rig.controller._state.motion._jerk_limits = [math.nan, math.nan]
     assert rig.stream(1, 0.024) is Mode.HOLDING
     assert rig.controller.moving, "it brakes, and does not stand still with a jerk"
     assert rig.at_rest_after(0.3) < 0.1
@@ -242,8 +242,8 @@ def test_where_not_even_braking_can_be_planned_the_command_stands_still_at_once(
     rig = Rig()
     rig.take(1)
     rig.stream(1, 0.5)
-    rig.controller._motion._jerk_limits = [math.nan, math.nan]
-    rig.controller._motion._braking = math.nan
+    rig.controller._state.motion._jerk_limits = [math.nan, math.nan]
+    rig.controller._state.motion._braking = math.nan
     rest = rig.elbow
     assert rig.stream(1, 0.024) is Mode.HOLDING
     assert rig.elbow == rest
@@ -255,10 +255,10 @@ def test_it_says_what_it_holds_and_what_it_cannot_know() -> None:
     assert Rig(geometry=Wall()).controller.limits == (*known, "clearance")
     box = Workspace(lower_m=(-1, -1, 0), upper_m=(1, 1, 1), frames=("hand",))
     kind = msgspec.structs.replace(robot_type(), workspace=box)
-    assert MotionLimits(kind, Wall()).limits == (*known, "clearance", "workspace")
+    assert MotionLimits(kind, Wall()).names == (*known, "clearance", "workspace")
 
 
 def test_a_path_that_leads_nowhere_is_not_looked_at() -> None:
     envelope = MotionLimits(robot_type(), Wall(-1.0))
-    assert envelope.blocked([[0.0, 0.0], [0.0, 0.0]]) is None
-    assert envelope.blocked([[0.0, 0.0], [0.0, 0.1]]) is not None
+    assert envelope.find_obstacle([[0.0, 0.0], [0.0, 0.0]]) is None
+    assert envelope.find_obstacle([[0.0, 0.0], [0.0, 0.1]]) is not None

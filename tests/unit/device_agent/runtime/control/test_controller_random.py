@@ -149,7 +149,7 @@ class Chance:
                 sent_ms=0.0,
                 target=target() if callable(target) else target,
             )
-            self.controller.offer(setpoint, now_s=self.now_s, tick_ms=tick_ms)
+            self.controller.accept_setpoint(setpoint, now_s=self.now_s, tick_ms=tick_ms)
             assert self.epoch > self.burned, "a lease that has ended"
             assert self.speed() > 0, "the room holds it"
             self.may_move_until_s = self.now_s + REST_WITHIN_S
@@ -176,7 +176,7 @@ class Chance:
     def act(self) -> None:
         if self.tenure is None and not self.likely():
             self.epoch += self.random.choice((0, 1))
-        self.tenure = self.controller.begin_action(epoch=self.epoch, on_lost=self.lost)
+        self.tenure = self.controller.reserve(epoch=self.epoch, on_revoked=self.lost)
         assert self.epoch > self.burned, "a lease that has ended"
         assert self.speed() > 0, "the room holds it"
 
@@ -188,16 +188,16 @@ class Chance:
             self.act()
         if self.tenure is not None:
             target = {"elbow": self.random.uniform(-3, 3), "shoulder": self.random.uniform(-1, 2)}
-            self.controller.move(self.tenure, target, speed=self.random.uniform(0.05, 1.0))
+            self.controller.start_joint_goal(self.tenure, target, speed=self.random.uniform(0.05, 1.0))
 
     def drive(self) -> None:
         if self.tenure is not None:
             twist = Twist(self.random.uniform(-0.5, 0.5), 0.0, self.random.uniform(-1, 1))
-            self.controller.drive(self.tenure, twist, duration_s=self.random.uniform(0.05, 3))
+            self.controller.start_drive(self.tenure, twist, duration_s=self.random.uniform(0.05, 3))
 
     def end(self) -> None:
         if self.tenure is not None:
-            self.controller.end_action(self.tenure)
+            self.controller.end_reservation(self.tenure)
             self.tenure = None
 
     def stop(self) -> None:
@@ -212,14 +212,14 @@ class Chance:
         self.taken_away()
 
     def lose(self) -> None:
-        self.controller.lost(Refused("link_lost", "the link is gone"))
+        self.controller.interrupt(Refused("link_lost", "the link is gone"))
 
     def fail(self) -> None:
-        self.controller.fail("no answer")
+        self.controller.set_fault("no answer")
         self.taken_away()
         for _ in range(30):
             self.tick()
-        self.controller.recover(self.position)
+        self.controller.clear_fault(self.position)
 
     def restrict(self) -> None:
         speed, source = self.random.choice((0.0, 0.2, 0.7, 0.7, math.nan)), self.random.choice("ab")
@@ -253,7 +253,7 @@ class Chance:
 
     def tick(self, passed_s: float = PERIOD_S) -> None:
         self.now_s += passed_s
-        tick = self.controller.step(self.now_s, passed_s=None if passed_s == PERIOD_S else passed_s)
+        tick = self.controller.update(self.now_s, passed_s=None if passed_s == PERIOD_S else passed_s)
         between_s, self.passed_s = (self.passed_s + passed_s) / 2, passed_s
         faster = False
         self.slowed_for = self.slowed_for + 1 if self.speed() == self.share else 0

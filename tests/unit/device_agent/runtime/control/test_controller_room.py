@@ -18,8 +18,8 @@ def test_the_strictest_of_several_sources_counts_until_it_is_lifted() -> None:
     restrictions.set("zone", 0.2, "somebody is near")
     assert restrictions.speed == 0.2
     assert restrictions.strictest == Restriction("zone", 0.2, "somebody is near")
-    restrictions.lift("zone")
-    restrictions.lift("never set")
+    restrictions.clear("zone")
+    restrictions.clear("never set")
     assert restrictions.speed == 0.5
 
 
@@ -45,8 +45,8 @@ def test_a_slowed_stream_is_slower_says_why_and_speeds_up_again_by_itself() -> N
 
 def test_a_move_in_mid_motion_is_slowed_and_goes_on_when_the_zone_is_free() -> None:
     rig = Rig()
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    move = rig.controller.move(tenure, {"elbow": 2.5}, speed=1.0)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    move = rig.controller.start_joint_goal(tenure, {"elbow": 2.5}, speed=1.0)
     rig.run(0.5)
     rig.controller.restrict("zone", 0.1, "somebody is near")
     rig.run(1.0)
@@ -54,7 +54,7 @@ def test_a_move_in_mid_motion_is_slowed_and_goes_on_when_the_zone_is_free() -> N
     assert not move.finished.is_set()
     rig.controller.lift("zone")
     rig.run(2.0)
-    assert move.outcome is GoalResult.REACHED
+    assert move.result is GoalResult.REACHED
     assert move.limited == ("interlock: somebody is near",)
 
 
@@ -80,15 +80,15 @@ def test_a_hold_stops_a_stream_and_lifting_it_resumes_nothing() -> None:
 def test_a_hold_ends_an_action_and_refuses_the_next() -> None:
     rig = Rig()
     why: list[Refused] = []
-    tenure = rig.controller.begin_action(epoch=1, on_lost=why.append)
-    move = rig.controller.move(tenure, {"elbow": 2.5}, speed=0.5)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=why.append)
+    move = rig.controller.start_joint_goal(tenure, {"elbow": 2.5}, speed=0.5)
     rig.run(0.5)
     rig.controller.restrict("zone", 0.0, "somebody is there")
     rig.run(0.3)
-    assert (move.outcome, [refused.code for refused in why]) == (GoalResult.INTERRUPTED, ["interlock"])
+    assert (move.result, [refused.code for refused in why]) == (GoalResult.INTERRUPTED, ["interlock"])
     assert not rig.controller.moving
     with pytest.raises(Refused) as refused:
-        rig.controller.begin_action(epoch=2, on_lost=lost)
+        rig.controller.reserve(epoch=2, on_revoked=lost)
     assert refused.value.code == "interlock"
     assert "somebody is there" in refused.value.message
 

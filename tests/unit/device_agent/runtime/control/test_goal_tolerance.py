@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from device_agent.protocol import Mode
-from device_agent.runtime.control.goal_tolerance import NEAR_RAD, SETTLE_TIMEOUT_S
+from device_agent.runtime.control.goal_tolerance import SETTLE_TIMEOUT_S, TOLERANCE_RAD
 from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.planning.motion_planner import MotionPlanner
 from tests.fakes.drivers import PERIOD_S, robot_type
@@ -21,7 +21,7 @@ class Loaded(Rig):
     def __init__(self, servo: Servo) -> None:
         super().__init__()
         self.servo = servo
-        self.tenure = self.controller.begin_action(epoch=1, on_lost=lost)
+        self.tenure = self.controller.reserve(epoch=1, on_revoked=lost)
 
     def go(self, course: MotionGoal, *, most_s: float = 10.0) -> float:
         """Until its end; gives how long the command had rested by then [s]."""
@@ -30,12 +30,12 @@ class Loaded(Rig):
             assert self.now_s < until_s, "it never ends"
             self.now_s += PERIOD_S
             measured = self.servo(self.controller.commanded_rad)
-            self.controller.step(self.now_s, measured)
+            self.controller.update(self.now_s, measured)
             rested_s = 0.0 if self.controller.moving else rested_s + PERIOD_S
         return rested_s
 
     def move(self, **position_rad: float) -> MotionGoal:
-        return self.controller.move(self.tenure, position_rad, speed=1.0)
+        return self.controller.start_joint_goal(self.tenure, position_rad, speed=1.0)
 
 
 def late(periods: int) -> Servo:
@@ -54,8 +54,8 @@ def test_a_move_ends_when_the_joints_have_followed(periods: int) -> None:
     rig = Loaded(late(periods))
     move = rig.move(elbow=1.0)
     rested_s = rig.go(move)
-    assert move.outcome is GoalResult.REACHED
-    assert rig.servo(rig.controller.commanded_rad)[1] == pytest.approx(1.0, abs=NEAR_RAD)
+    assert move.result is GoalResult.REACHED
+    assert rig.servo(rig.controller.commanded_rad)[1] == pytest.approx(1.0, abs=TOLERANCE_RAD)
     assert rested_s >= 0.04 or periods == 0
     assert rested_s < 0.4
 
@@ -74,7 +74,7 @@ def test_what_never_comes_fails_names_the_joint_and_is_held_there(off_rad: float
     rig = Loaded(lambda told: (told[0] - 0.2, told[1] - off_rad))
     move = rig.move(elbow=1.0)
     rested_s = rig.go(move)
-    assert move.outcome is GoalResult.INTERRUPTED
+    assert move.result is GoalResult.INTERRUPTED
     assert move.why is not None
     assert move.why.code == "not_arrived"
     assert f"elbow is {abs(off_rad):.2f} rad short" in move.why.message
@@ -85,15 +85,15 @@ def test_what_never_comes_fails_names_the_joint_and_is_held_there(off_rad: float
     again = rig.move(elbow=0.9)
     rig.servo = late(0)
     rig.go(again)
-    assert again.outcome is GoalResult.REACHED
+    assert again.result is GoalResult.REACHED
 
 
 def test_a_joint_that_holds_softly_is_where_it_sags_to() -> None:
     rig = Loaded(lambda told: (told[0], told[1] - 0.3))
-    rig.controller.stiffen(rig.tenure, {"elbow": 0.4})
+    rig.controller.set_stiffness({"elbow": 0.4}, reservation=rig.tenure)
     move = rig.move(elbow=1.0)
     rig.go(move)
-    assert move.outcome is GoalResult.REACHED
+    assert move.result is GoalResult.REACHED
 
 
 def test_the_end_of_a_planned_way_is_looked_at_too() -> None:
@@ -104,8 +104,8 @@ def test_the_end_of_a_planned_way_is_looked_at_too() -> None:
             return tuple(start_rad), tuple(goal_rad)
 
     rig = Loaded(lambda told: (told[0], told[1] - 0.12))
-    way = MotionPlanner(robot_type(), Open(9.0)).around([0.0, 0.0], [0.0, 1.0], speed=1.0, ended=lambda: False)
-    passage = rig.controller.go_along(rig.tenure, way)
+    way = MotionPlanner(robot_type(), Open(9.0)).plan([0.0, 0.0], [0.0, 1.0], speed=1.0, ended=lambda: False)
+    passage = rig.controller.start_trajectory(rig.tenure, way)
     rig.go(passage)
     assert passage.why is not None
     assert "elbow is 0.12 rad short" in passage.why.message

@@ -46,14 +46,14 @@ class Jogger(Rig):
             setpoint = Setpoint(
                 epoch=1, sequence=self.sequence, echo_tick_ms=self.tick_ms - age_ms, sent_ms=1.0, target=target
             )
-            self.controller.offer(setpoint, now_s=self.now_s, tick_ms=self.tick_ms)
+            self.controller.accept_setpoint(setpoint, now_s=self.now_s, tick_ms=self.tick_ms)
             self.rest(0.024)
         return self.controller.mode
 
     def rest(self, seconds: float) -> Mode:
         for _ in range(round(seconds / self.period_s)):
             self.now_s += self.period_s
-            tick = self.controller.step(self.now_s)
+            tick = self.controller.update(self.now_s)
             self.limited |= set(tick.limited)
             self.gone.append(tick.position_rad)
             self.twists.append(tuple(tick.twist))
@@ -195,7 +195,7 @@ def test_joints_that_are_still_asked_let_the_base_stand() -> None:
 def test_an_action_that_begins_takes_the_base_from_the_joystick() -> None:
     rig = jogger(base=True)
     rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
-    rig.controller.begin_action(epoch=1, on_lost=lost)
+    rig.controller.reserve(epoch=1, on_revoked=lost)
     rig.rest(0.3)
     assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 

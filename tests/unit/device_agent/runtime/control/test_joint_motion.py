@@ -12,20 +12,20 @@ from tests.fakes.head_driver import head
 
 def way_to(yaw: float) -> Trajectory:
     score = BehaviourTrajectory(head(), (0.0,) * 4)
-    score._reach(0, 0.0, 2.0, yaw)
+    score._add_motion(0, 0.0, 2.0, yaw)
     score._end_s = 2.0
-    return score.way()
+    return score.trajectory()
 
 
 def test_a_way_that_begins_elsewhere_is_not_taken() -> None:
     motion, one, other = JointMotion(head()), way_to(1.0), way_to(-1.0)
     for _ in range(50):
-        motion.ride(one, share=1.0)
+        motion.follow_trajectory(one, share=1.0)
         motion.propose()
         motion.update()
     assert motion.fastest_rad_s > 0.1
     for _ in range(50):
-        motion.ride(other, share=1.0)
+        motion.follow_trajectory(other, share=1.0)
         motion.update()
     assert not motion.moving
     assert 0.4 < motion.position_rad[0] < 0.7, "it came to rest on the way that it was on"
@@ -49,7 +49,7 @@ def test_two_parts_of_a_period_brake_as_much_as_a_whole_one() -> None:
             way, period_s = way_to(1.0), motion._period_s
             for _ in range(45 if ridden else 15):
                 if ridden:
-                    motion.ride(way, share=1.0)
+                    motion.follow_trajectory(way, share=1.0)
                 else:
                     motion.follow(way.position_rad[-1].tolist())
                 motion.propose()

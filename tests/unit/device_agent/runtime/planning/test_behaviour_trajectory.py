@@ -12,7 +12,7 @@ from device_agent.protocol.manifests.capabilities import Keyframe
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.planning import visemes
-from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, Line
+from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, SpokenLine
 from device_agent.runtime.planning.trajectory import Trajectory
 from tests.fakes.head_driver import BENT, RANGES, head
 
@@ -47,8 +47,8 @@ def check_limits(way: Trajectory, kind: RobotType) -> None:
 
 def test_joints_are_where_a_keyframe_says_when_it_says() -> None:
     score = BehaviourTrajectory(head(), HOME)
-    assert score.keyframes([frame(1.0, yaw=0.5), frame(2.0, left=-0.4), frame(3.0, yaw=0.0)], {}) == []
-    way = score.way()
+    assert score.add_keyframes([frame(1.0, yaw=0.5), frame(2.0, left=-0.4), frame(3.0, yaw=0.0)], {}) == []
+    way = score.trajectory()
     assert way.duration_s == pytest.approx(3.0, abs=0.03)
     assert at(way, 1.0) == pytest.approx([0.5, 0.0, 0.0, 0.0], abs=1e-9)
     assert at(way, 2.0) == pytest.approx([0.5, 0.0, -0.4, 0.2], abs=1e-9)
@@ -60,8 +60,8 @@ def test_joints_are_where_a_keyframe_says_when_it_says() -> None:
 
 def test_what_cannot_be_reached_in_time_is_reached_later_and_the_rest_after_it() -> None:
     score = BehaviourTrajectory(head(), HOME)
-    score.keyframes([frame(0.1, yaw=2.0), frame(0.2, yaw=-2.0)], {})
-    way = score.way()
+    score.add_keyframes([frame(0.1, yaw=2.0), frame(0.2, yaw=-2.0)], {})
+    way = score.trajectory()
     check_limits(way, head())
     assert way.duration_s > 2.0
     turn = int(np.argmax(way.position_rad[:, 0]))
@@ -72,13 +72,13 @@ def test_what_cannot_be_reached_in_time_is_reached_later_and_the_rest_after_it()
 def test_words_begin_when_their_keyframe_is_set_out_for() -> None:
     score = BehaviourTrajectory(head(), HOME)
     frames = [frame(1.0, yaw=0.2), frame(2.0, say="there"), frame(2.5, yaw=0.0, say="and back")]
-    lines = score.keyframes(frames, {"there": 0.5, "and back": 3.0})
-    assert lines == [Line(1.0, "there", 0.5), Line(2.0, "and back", 3.0)]
-    assert score.way().duration_s >= 5.0, "it lasts until all is said"
+    lines = score.add_keyframes(frames, {"there": 0.5, "and back": 3.0})
+    assert lines == [SpokenLine(1.0, "there", 0.5), SpokenLine(2.0, "and back", 3.0)]
+    assert score.trajectory().duration_s >= 5.0, "it lasts until all is said"
 
 
 def test_nothing_to_do_is_a_way_of_rest() -> None:
-    way = BehaviourTrajectory(head(), (0.3, 0.0, 0.0, 0.0)).way()
+    way = BehaviourTrajectory(head(), (0.3, 0.0, 0.0, 0.0)).trajectory()
     assert way.duration_s > 0
     assert at(way, 0.0) == at(way, 9.0) == [0.3, 0.0, 0.0, 0.0]
 
@@ -106,9 +106,9 @@ def test_a_way_stays_inside_of_every_range_and_limit(
         places = {name: low + share * (high - low) for name, share in shares.items() for low, high in [_range(name)]}
         frames.append(frame(time_s, say, **places))
     score = BehaviourTrajectory(kind, HOME)
-    score.keyframes(frames, {"hello there": 1.0})
-    way = score.way()
-    MotionLimits(kind, None).check_way(way.position_rad)
+    score.add_keyframes(frames, {"hello there": 1.0})
+    way = score.trajectory()
+    MotionLimits(kind, None).check_trajectory(way.position_rad)
     assert np.isfinite(way.velocity_rad_s).all()
     if table is None:
         check_limits(way, kind)
@@ -120,8 +120,8 @@ def _range(name: str) -> tuple[float, float]:
 
 def test_a_mouth_opens_for_vowels_and_is_as_before_in_the_end() -> None:
     score = BehaviourTrajectory(talking(), (0.0, -0.1, 0.0, 0.0))
-    score.speak(Line(0.0, "mama", 3.0))
-    way = score.way()
+    score.add_speech(SpokenLine(0.0, "mama", 3.0))
+    way = score.trajectory()
     assert way.position_rad[:, 1].min() < -0.25
     assert at(way, way.duration_s)[1] == pytest.approx(-0.1)
     check_limits(way, talking())
@@ -129,8 +129,8 @@ def test_a_mouth_opens_for_vowels_and_is_as_before_in_the_end() -> None:
 
 def test_a_mouth_goes_on_where_the_keyframes_had_it_and_they_go_on_after() -> None:
     score = BehaviourTrajectory(talking(), HOME)
-    score.keyframes([frame(0.5, pitch=-0.2), frame(1.0, say="baba"), frame(4.0, pitch=0.1)], {"baba": 1.0})
-    way = score.way()
+    score.add_keyframes([frame(0.5, pitch=-0.2), frame(1.0, say="baba"), frame(4.0, pitch=0.1)], {"baba": 1.0})
+    way = score.trajectory()
     assert at(way, 0.5)[1] == pytest.approx(-0.2)
     assert at(way, 2.5)[1] == pytest.approx(-0.2, abs=0.15), "closed as it was, or on its way to the next"
     assert at(way, way.duration_s)[1] == pytest.approx(0.1)
@@ -138,9 +138,9 @@ def test_a_mouth_goes_on_where_the_keyframes_had_it_and_they_go_on_after() -> No
 
 def test_words_that_begin_before_others_have_ended_wait_for_the_mouth() -> None:
     score = BehaviourTrajectory(talking(), HOME)
-    score.speak(Line(0.0, "mama", 3.0))
-    score.speak(Line(2.9, "mama", 3.0))
-    way = score.way()
+    score.add_speech(SpokenLine(0.0, "mama", 3.0))
+    score.add_speech(SpokenLine(2.9, "mama", 3.0))
+    way = score.trajectory()
     check_limits(way, talking())
     assert way.duration_s == pytest.approx(5.9 + 0.2, abs=0.03)
     assert at(way, way.duration_s)[1] == pytest.approx(0.0)

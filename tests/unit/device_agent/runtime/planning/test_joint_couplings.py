@@ -50,11 +50,11 @@ class Neck:
         setpoint = Setpoint(
             epoch=self.epoch, sequence=self.sequence, echo_tick_ms=tick_ms - 20, sent_ms=0.0, target=target
         )
-        self.controller.offer(setpoint, now_s=self.now_s, tick_ms=tick_ms)
+        self.controller.accept_setpoint(setpoint, now_s=self.now_s, tick_ms=tick_ms)
 
     def tick(self, late_s: float = 0.0) -> None:
         self.now_s += PERIOD_S + late_s
-        tick = self.controller.step(self.now_s)
+        tick = self.controller.update(self.now_s)
         self.limited |= set(tick.limited)
         yaw, pitch, left, right = tick.position_rad
         lower, upper = self.kind.position_dependent_limits[0].at(yaw)
@@ -71,14 +71,14 @@ class Neck:
             self.tick()
 
     def move(self, seconds: float = 5.0, **position_rad: float) -> GoalResult | None:
-        tenure = self.controller.begin_action(epoch=self.epoch, on_lost=lambda _: None)
-        move = self.controller.move(tenure, position_rad, speed=1.0)
+        tenure = self.controller.reserve(epoch=self.epoch, on_revoked=lambda _: None)
+        move = self.controller.start_joint_goal(tenure, position_rad, speed=1.0)
         for _ in range(round(seconds / PERIOD_S)):
             if not move.finished.is_set():
                 self.tick()
         self.limited |= set(move.limited)
-        self.controller.end_action(tenure)
-        return move.outcome
+        self.controller.end_reservation(tenure)
+        return move.result
 
 
 asked = st.fixed_dictionaries(
@@ -107,12 +107,12 @@ def live(neck: Neck, life: list[tuple[str, dict[str, float], int]]) -> None:
             case "stop":
                 neck.controller.stop(StopLatch(caller="bob", reason="", at_ms=0))
             case "move":
-                tenure = neck.controller.begin_action(epoch=neck.epoch, on_lost=lambda _: None)
+                tenure = neck.controller.reserve(epoch=neck.epoch, on_revoked=lambda _: None)
                 with suppress(Refused):
-                    neck.controller.move(tenure, position_rad, speed=1.0)
+                    neck.controller.start_joint_goal(tenure, position_rad, speed=1.0)
                 for _ in range(periods):
                     neck.tick()
-                neck.controller.end_action(tenure)
+                neck.controller.end_reservation(tenure)
         for number in range(periods):
             if act == "stream" and position_rad:
                 with suppress(Refused):  # the watchdog may have ended the lease, where periods came late
@@ -169,7 +169,9 @@ def test_a_joint_waits_until_the_other_is_out_of_its_way() -> None:
 
 def test_a_move_that_asks_for_more_than_is_left_is_refused_with_what_is() -> None:
     neck = Neck()
-    with pytest.raises(Refused, match=r"pitch can go from -0\.4000 to 0\.1000 rad where yaw is then, not to 0\.3000"):
+    with pytest.raises(
+        Refused, match=r"pitch can go from -0\.4000 to 0\.1000 rad at the target of yaw, not to 0\.3000"
+    ):
         neck.move(yaw=2.0, pitch=0.3)
 
 
@@ -198,7 +200,7 @@ def test_who_is_set_up_outside_is_led_back_and_never_farther_out() -> None:
     for _ in range(100):
         neck.offer({"yaw": 2.0, "pitch": 0.5})
         neck.now_s += PERIOD_S
-        pitch = neck.controller.step(neck.now_s).position_rad[1]
+        pitch = neck.controller.update(neck.now_s).position_rad[1]
         assert pitch <= farthest + 1e-9
         farthest = pitch
     assert farthest == pytest.approx(0.1, abs=1e-3)
@@ -208,15 +210,17 @@ def test_what_would_leave_its_range_is_held_at_its_edge() -> None:
     """The last word, for whatever comes to the motors by a way of its own."""
     couplings = Couplings(head())
     position = [2.0, 0.3, 0.0, 0.0]
-    couplings.keep(position, [0.0, 0.3, 0.0, 0.0])
+    couplings.clamp_to_range(position, [0.0, 0.3, 0.0, 0.0])
     assert position == [2.0, 0.1, 0.0, 0.0]
     outside = [1.0, 0.6, 0.0, 0.0]
-    couplings.keep(outside, [1.0, 0.55, 0.0, 0.0])
+    couplings.clamp_to_range(outside, [1.0, 0.55, 0.0, 0.0])
     assert outside[1] == 0.55
 
 
 def test_a_joint_that_cannot_get_inside_stays_where_it_is() -> None:
-    heading, waits = Couplings(head(BENT)).steer([2.0, 0.3, 0.0, 0.0], [-2.0, 0.3, 0.0, 0.0], [(-2.0, 2.0), (0.3, 0.3)])
+    heading, waits = Couplings(head(BENT)).limit_target(
+        [2.0, 0.3, 0.0, 0.0], [-2.0, 0.3, 0.0, 0.0], [(-2.0, 2.0), (0.3, 0.3)]
+    )
     assert heading[:2] == [-2.0, 0.3]
     assert waits == ("yaw: waits for pitch",)
 
@@ -225,30 +229,30 @@ def test_a_joint_that_cannot_get_inside_stays_where_it_is() -> None:
     ("places", "says"),
     [
         ([[0.0, 0.0, -0.4, 0.2], [2.0, 0.1, 0.0, 0.0]], ""),
-        ([[0.0, 0.0, -0.4, 0.2], [2.0, 0.2, 0.0, 0.0]], "leads pitch where yaw leaves it no room"),
-        ([[0.0, 0.0, -0.4, 0.2], [2.0, 0.1, 0.0, 0.1]], "parts right from left, which the same motor moves"),
+        ([[0.0, 0.0, -0.4, 0.2], [2.0, 0.2, 0.0, 0.0]], "leads pitch where yaw does not allow it"),
+        ([[0.0, 0.0, -0.4, 0.2], [2.0, 0.1, 0.0, 0.1]], "separates right from left, which the same motor moves"),
     ],
 )
 def test_a_way_must_not_part_what_hangs_together(places: list[list[float]], says: str) -> None:
     envelope = MotionLimits(head(), None)
     if says:
         with pytest.raises(Refused, match=says):
-            envelope.check_way(np.array(places))
+            envelope.check_trajectory(np.array(places))
     else:
-        envelope.check_way(np.array(places))
+        envelope.check_trajectory(np.array(places))
 
 
 def test_limp_joints_are_commanded_to_where_they_are() -> None:
     motion = JointMotion(head())
     motion.start_at([0.0, 0.0, 0.0, 0.0])
-    motion.loosen({0: 0.8})
+    motion.track_measured({0: 0.8})
     motion.follow([1.5, 0.0, -0.3, 0.15])
     for _ in range(200):
         motion.propose()
         motion.update()
     assert motion.position_rad == pytest.approx([0.8, 0.0, -0.3, 0.15], abs=1e-3)
     assert motion.reached
-    motion.loosen({})
+    motion.track_measured({})
     motion.brake()
     assert motion.update()[0] == 0.8
     assert not math.isnan(motion.velocity_rad_s[0])

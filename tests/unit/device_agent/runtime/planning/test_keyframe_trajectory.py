@@ -16,7 +16,7 @@ from device_agent.ports.script_calls import Moment, Play
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.planning.keyframe_trajectory import Timeline
+from device_agent.runtime.planning.keyframe_trajectory import KeyframeTrajectory
 from device_agent.runtime.planning.trajectory import Trajectory
 from tests.fakes.head_driver import RANGES, head
 
@@ -29,8 +29,8 @@ def frame(time_s: float, **position_rad: float) -> Moment:
     return Moment(time_s=time_s, position_rad=position_rad)
 
 
-def timeline(*keyframes: Moment, speed: float = 1.0) -> Timeline:
-    return Timeline(head(), START, Play(keyframes=keyframes, speed=speed))
+def timeline(*keyframes: Moment, speed: float = 1.0) -> KeyframeTrajectory:
+    return KeyframeTrajectory(head(), START, Play(keyframes=keyframes, speed=speed))
 
 
 def at(way: Trajectory, time_s: float) -> list[float]:
@@ -49,7 +49,7 @@ def check_limits(way: Trajectory, kind: RobotType, joints: tuple[int, ...]) -> N
 
 def test_joints_are_where_a_keyframe_says_when_it_says_and_pass_where_they_go_on() -> None:
     made = timeline(frame(1.0, yaw=0.5), frame(2.0, yaw=1.0, left=0.3), frame(4.0, yaw=0.0))
-    way = made.way()
+    way = made.trajectory()
     assert made.limited == ()
     assert way.duration_s == pytest.approx(4.0, abs=0.021)
     assert at(way, 1.0) == pytest.approx([0.5, 0.0, at(way, 1.0)[2], at(way, 1.0)[3]], abs=1e-6)
@@ -63,7 +63,7 @@ def test_joints_are_where_a_keyframe_says_when_it_says_and_pass_where_they_go_on
 
 def test_what_cannot_be_there_in_time_comes_later_and_the_rest_with_it() -> None:
     made = timeline(frame(0.01, yaw=1.0), frame(1.0, left=0.3))
-    way = made.way()
+    way = made.trajectory()
     assert made.limited == ("keyframes: later",)
     assert way.duration_s > 1.3
     assert at(way, 9.0) == pytest.approx([1.0, 0.0, 0.3, -0.15], abs=1e-6)
@@ -72,14 +72,14 @@ def test_what_cannot_be_there_in_time_comes_later_and_the_rest_with_it() -> None
 
 def test_speed_stretches_time_and_limits_hold_all_the_same() -> None:
     keyframes = (frame(1.0, yaw=0.8), frame(2.0, yaw=0.0))
-    assert timeline(*keyframes, speed=0.5).way().duration_s == pytest.approx(4.0, abs=0.021)
+    assert timeline(*keyframes, speed=0.5).trajectory().duration_s == pytest.approx(4.0, abs=0.021)
     fast = timeline(*keyframes, speed=2.0)
     assert fast.limited
-    check_limits(fast.way(), head(), (0,))
+    check_limits(fast.trajectory(), head(), (0,))
 
 
 def test_keyframes_without_joints_only_take_their_time() -> None:
-    way = timeline(frame(0.5)).way()
+    way = timeline(frame(0.5)).trajectory()
     assert way.duration_s == pytest.approx(0.5, abs=0.021)
     assert np.ptp(way.position_rad) == 0
 
@@ -93,9 +93,9 @@ def test_poses_are_those_at_the_keyframes_by_the_joints_that_count() -> None:
 @pytest.mark.parametrize(
     ("keyframes", "says"),
     [
-        ([frame(0.0, yaw=0.1)], "keyframe 1: time_s is 0.0; times must rise"),
-        ([frame(1.0), frame(1.0)], "keyframe 2: time_s is 1.0; times must rise"),
-        ([frame(601.0)], "to 600 at most"),
+        ([frame(0.0, yaw=0.1)], "keyframe 1: time_s is 0.0; times must increase"),
+        ([frame(1.0), frame(1.0)], "keyframe 2: time_s is 1.0; times must increase"),
+        ([frame(601.0)], "up to 600"),
         ([frame(1.0), frame(2.0, nose=0.1)], "keyframe 2: no joint 'nose'; there are yaw, pitch, left, right"),
         ([frame(1.0, left=0.1, right=0.1)], "keyframe 1: one motor moves right and another joint"),
     ],
@@ -107,8 +107,8 @@ def test_what_is_no_timeline_is_refused_by_the_number_of_its_keyframe(keyframes:
 
 
 def test_where_again_and_again_does_not_do_all_of_it_becomes_slower(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("device_agent.runtime.planning.keyframe_trajectory._TRIES", 1)
-    way = timeline(frame(0.1, yaw=1.5), frame(0.12, yaw=1.6), frame(0.5, yaw=-1.0)).way()
+    monkeypatch.setattr("device_agent.runtime.planning.keyframe_trajectory._ITERATIONS", 1)
+    way = timeline(frame(0.1, yaw=1.5), frame(0.12, yaw=1.6), frame(0.5, yaw=-1.0)).trajectory()
     assert np.abs(way.velocity_rad_s).max() <= 4.0
 
 
@@ -127,8 +127,8 @@ def movements(draw: st.DrawFn) -> list[Moment]:
 @given(movements())
 def test_any_movement_stays_in_its_limits_and_between_its_places(keyframes: list[Moment]) -> None:
     kind = head()
-    way = Timeline(kind, START, Play(keyframes=tuple(keyframes), speed=1.0)).way()
-    MotionLimits(kind, None).check_way(way.position_rad)
+    way = KeyframeTrajectory(kind, START, Play(keyframes=tuple(keyframes), speed=1.0)).trajectory()
+    MotionLimits(kind, None).check_trajectory(way.position_rad)
     check_limits(way, kind, (0, 2))
     for index, name in ((0, "yaw"), (2, "left")):
         places = [0.0, *(one.position_rad[name] for one in keyframes if name in one.position_rad)]
@@ -143,10 +143,10 @@ def test_any_movement_stays_in_its_limits_and_between_its_places(keyframes: list
 def reckoned(case: dict[str, Any]) -> dict[str, Any]:
     """A shared movement with when its keyframes are reached and where its joints are at ten moments."""
     keyframes = msgspec.convert(case["keyframes"], tuple[Moment, ...])
-    made = Timeline(head(), case["start_rad"], Play(keyframes=keyframes, speed=1.0))
+    made = KeyframeTrajectory(head(), case["start_rad"], Play(keyframes=keyframes, speed=1.0))
     moments = made._moments()
     looks = np.linspace(0, moments[-1], 10)
-    way = [[float(value) for value in at(made.way(), one)] for one in looks]
+    way = [[float(value) for value in at(made.trajectory(), one)] for one in looks]
     return {"reached_s": moments[1:].tolist(), "position_rad": way}
 
 

@@ -49,14 +49,14 @@ class Physics:
         self.data.qpos[:] = self.data.ctrl[:] = HOME
         self.controller = Controller(KIND, LeaseGate(), geometry=shape)
         self.controller.start_at(HOME)
-        self.tenure = self.controller.begin_action(epoch=1, on_lost=lambda _: None)
+        self.tenure = self.controller.reserve(epoch=1, on_revoked=lambda _: None)
         self.now_s = 0.0
         self.touched = 0
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / PERIOD_S)):
             self.now_s += PERIOD_S
-            self.data.ctrl[:] = self.controller.step(self.now_s).position_rad
+            self.data.ctrl[:] = self.controller.update(self.now_s).position_rad
             mujoco.mj_step(self.model, self.data, nstep=round(PERIOD_S / 0.002))
             self.touched += self.data.ncon
 
@@ -68,10 +68,10 @@ class Physics:
 def check_around(scene: Path, shape: MujocoGeometry, seed: int) -> float:
     """Plan with this seed, go, and give how far the flange then is from where it should be [m]."""
     physics, routes = Physics(scene, shape), MotionPlanner(KIND, shape, seed=seed)
-    way = routes.around(HOME, BEYOND, speed=1.0, ended=lambda: False)
-    passage = physics.controller.go_along(physics.tenure, way)
+    way = routes.plan(HOME, BEYOND, speed=1.0, ended=lambda: False)
+    passage = physics.controller.start_trajectory(physics.tenure, way)
     physics.run(way.duration_s + 1.5)
-    assert passage.outcome is GoalResult.REACHED, passage.why
+    assert passage.result is GoalResult.REACHED, passage.why
     assert passage.limited == ()
     assert physics.touched == 0
     return math.dist(physics.flange_m(), shape.poses(BEYOND)["flange"][:3])
@@ -98,8 +98,8 @@ def test_a_straight_way_is_straight_in_physics_too(scene: Path, shape: MujocoGeo
     physics = Physics(scene, shape)
     begin = shape.poses(HOME)["flange"]
     pose = (begin[0], begin[1] + 0.25, begin[2] - 0.05, *begin[3:])
-    way = MotionPlanner(KIND, shape).straight(HOME, "flange", pose, speed=0.5)
-    physics.controller.go_along(physics.tenure, way)
+    way = MotionPlanner(KIND, shape).plan_straight(HOME, "flange", pose, speed=0.5)
+    physics.controller.start_trajectory(physics.tenure, way)
     line, off_m = np.subtract(pose[:3], begin[:3]), []
     for _ in range(round(way.duration_s / PERIOD_S) + 100):
         physics.run(PERIOD_S)
@@ -133,7 +133,7 @@ def test_whoever_looks_for_a_way_may_be_lost(shape: MujocoGeometry, monkeypatch:
 
     monkeypatch.setattr(shape, "plan", lost)
     with pytest.raises(Refused, match="try again") as refused:
-        MotionPlanner(KIND, shape).around(HOME, BEYOND, speed=1.0, ended=lambda: False)
+        MotionPlanner(KIND, shape).plan(HOME, BEYOND, speed=1.0, ended=lambda: False)
     assert refused.value.code == "planner_lost"
 
 
@@ -153,5 +153,5 @@ def test_a_straight_way_that_needs_another_posture_or_leads_through_something_is
     through = (-0.249, -0.414, begin[2], *begin[3:])
     for pose in (through, (-begin[0], -begin[1], *begin[2:]), (begin[0], begin[1], -0.05, *begin[3:])):
         with pytest.raises(Refused) as refused:
-            routes.straight(HOME, "flange", pose, speed=0.5)
+            routes.plan_straight(HOME, "flange", pose, speed=0.5)
         assert refused.value.code in {"not_straight", "no_room", "out_of_reach"}

@@ -14,15 +14,9 @@ from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import navigator as errand_module
-from device_agent.runtime.planning.navigator import (
-    BLOCKED_TIMEOUT_S,
-    SHORT_PATIENCE_S,
-    UPDATE_PERIOD_S,
-    Navigator,
-    Pose2D,
-    PoseEstimator,
-    way,
-)
+from device_agent.runtime.planning.grid_search import find_path
+from device_agent.runtime.planning.localization import Pose2D, PoseEstimator
+from device_agent.runtime.planning.navigator import BLOCKED_TIMEOUT_S, START_TIMEOUT_S, UPDATE_PERIOD_S, Navigator
 from device_agent.runtime.readings import Reading, ReadingCache
 from tests.fakes.drivers import BASE, PERIOD_S, robot_type
 from tests.harness.agent.controller_fixture import Rig
@@ -46,7 +40,7 @@ def go(errand: Navigator, grid: OccupancyGrid, place: Pose2D, *, seconds: float 
     """Where an ideal base comes."""
     places = [place]
     for _ in range(round(seconds / UPDATE_PERIOD_S)):
-        twist = errand.twist(places[-1], grid)
+        twist = errand.compute_twist(places[-1], grid)
         if twist is None:
             return places
         assert all(abs(part) <= most + 1e-9 for part, most in zip(twist, LIMITS, strict=True))
@@ -81,68 +75,68 @@ def test_where_no_way_leads_is_refused() -> None:
     shut = room((-0.1, -2.0, 0.1, 2.0))
     for goal, code in (((1.0, 0.0), "no_way"), ((0.0, 0.0), "taken"), ((9.0, 0.0), "out_of_room")):
         with pytest.raises(Refused) as refused:
-            Navigator(goal, None, limits=LIMITS, radius_m=0.25).twist(Pose2D(-1.0, 0.0, 0.0), shut)
+            Navigator(goal, None, limits=LIMITS, radius_m=0.25).compute_twist(Pose2D(-1.0, 0.0, 0.0), shut)
         assert refused.value.code == code
 
 
 def test_somebody_who_stands_in_the_way_is_gone_around_or_waited_for() -> None:
     floor = Floor(np.zeros((5, 5), dtype=bool), (0.0, 0.0), 1.0)
-    assert way(floor, (0.5, 0.5), (4.5, 0.5))[-1] == (4.5, 0.5)
+    assert find_path(floor, (0.5, 0.5), (4.5, 0.5))[-1] == (4.5, 0.5)
     floor.blocked[:, 2] = True
-    with pytest.raises(Refused, match="no free way"):
-        way(floor, (0.5, 0.5), (4.5, 0.5))
+    with pytest.raises(Refused, match="no free path"):
+        find_path(floor, (0.5, 0.5), (4.5, 0.5))
 
 
 def test_a_refusal_names_the_nearest_place_that_has_a_way() -> None:
     for goal, code, near in (((1.0, 0.0), "no_way", r"x_m -0\.\d+, y_m -?0\.0"), ((0.0, 0.3), "taken", r"y_m 0\.\d+")):
-        with pytest.raises(Refused, match=f"nearest place to go to is .*{near}") as refused:
-            Navigator(goal, None, limits=LIMITS, radius_m=0.25).twist(
+        with pytest.raises(Refused, match=f"nearest reachable place is .*{near}") as refused:
+            Navigator(goal, None, limits=LIMITS, radius_m=0.25).compute_twist(
                 Pose2D(-1.0, 0.0, 0.0), room((-0.1, -2.0, 0.1, 2.0))
             )
         assert refused.value.code == code
     full = Floor(np.ones((5, 5), dtype=bool), (0.0, 0.0), 1.0)
-    with pytest.raises(Refused, match=r"or nobody has seen it$"):
-        way(full, (0.5, 0.5), (4.5, 0.5))
+    with pytest.raises(Refused, match=r"or it is unseen$"):
+        find_path(full, (0.5, 0.5), (4.5, 0.5))
 
 
 def test_who_stands_too_near_to_something_leaves_it_for_the_nearest_free_place() -> None:
     floor = Floor(np.zeros((40, 40), dtype=bool), (0.0, 0.0), 0.05)
     floor.blocked[:, :6] = True
-    places = way(floor, (0.08, 1.0), (1.5, 1.0))
+    places = find_path(floor, (0.08, 1.0), (1.5, 1.0))
     assert places[0] == pytest.approx((0.325, 1.025))
     floor.blocked[:, :20] = True
-    with pytest.raises(Refused, match="no free way"):
-        way(floor, (0.08, 1.0), (1.5, 1.0))
+    with pytest.raises(Refused, match="no free path"):
+        find_path(floor, (0.08, 1.0), (1.5, 1.0))
 
 
 def test_a_way_leads_between_things_corner_by_corner() -> None:
     floor = Floor(np.eye(6, dtype=bool)[::-1].copy(), (0.0, 0.0), 1.0)
     floor.blocked[0, 5] = False
-    assert way(floor, (0.5, 0.5), (5.5, 5.5))[-1] == (5.5, 5.5)
+    assert find_path(floor, (0.5, 0.5), (5.5, 5.5))[-1] == (5.5, 5.5)
 
 
 def test_a_place_that_is_taken_from_the_beginning_is_not_waited_for_long() -> None:
     errand = Navigator((1.0, 0.0), None, limits=LIMITS, radius_m=0.25)
     taken = Refused("taken", "")
-    assert errand.patience_s(taken) == SHORT_PATIENCE_S
-    assert errand.patience_s(Refused("out_of_room", "")) == 0
-    errand.twist(Pose2D(0.0, 0.0, 0.0), room())
-    assert errand.patience_s(taken) == BLOCKED_TIMEOUT_S
+    assert errand.timeout_s(taken) == START_TIMEOUT_S
+    assert errand.timeout_s(Refused("out_of_room", "")) == 0
+    errand.compute_twist(Pose2D(0.0, 0.0, 0.0), room())
+    assert errand.timeout_s(taken) == BLOCKED_TIMEOUT_S
 
 
 def test_the_room_corrects_what_the_wheels_believe() -> None:
     where = PoseEstimator("qbo")
     wheels = Reading({"x_m": 1.0, "y_m": 0.0, "yaw_rad": 0.5}, 0.02)
     seen = Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "age_s.qbo": 0.2}, 0.1)
-    assert where.place(wheels, None) == Pose2D(1.0, 0.0, 0.5)
-    found = where.place(wheels, seen)
+    assert where.estimate(wheels, None) == Pose2D(1.0, 0.0, 0.5)
+    found = where.estimate(wheels, seen)
     assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((1.2, 0.1, 0.5))
-    assert where.place(wheels, None).x_m == pytest.approx(1.2), "what it has learned stays"
+    assert where.estimate(wheels, None).x_m == pytest.approx(1.2), "what it has learned stays"
 
 
 def test_without_wheels_that_count_the_room_alone_tells() -> None:
     seen = Reading({"x_m.nao": 1.2, "y_m.nao": 0.1, "yaw_rad.nao": 0.3}, 0.1)
-    assert PoseEstimator("nao").place(None, seen) == Pose2D(1.2, 0.1, 0.3)
+    assert PoseEstimator("nao").estimate(None, seen) == Pose2D(1.2, 0.1, 0.3)
 
 
 @pytest.mark.parametrize(
@@ -157,13 +151,13 @@ def test_without_wheels_that_count_the_room_alone_tells() -> None:
     ],
 )
 def test_a_robot_that_nobody_sees_does_not_go(seen: Reading | None) -> None:
-    with pytest.raises(Refused, match="nobody knows where the robot is"):
-        PoseEstimator("nao").place(None, seen)
+    with pytest.raises(Refused, match="the position of the robot is unknown"):
+        PoseEstimator("nao").estimate(None, seen)
 
 
 def test_at_its_place_it_only_turns() -> None:
     errand = Navigator((0.0, 0.0), 1.0, limits=LIMITS, radius_m=0.25)
-    twist = errand.twist(Pose2D(0.01, 0.0, 0.0), room())
+    twist = errand.compute_twist(Pose2D(0.01, 0.0, 0.0), room())
     assert twist is not None
     assert (twist.forward_m_s, twist.left_m_s) == (REST.forward_m_s, REST.left_m_s)
     assert twist.turn_rad_s > 0
@@ -182,20 +176,20 @@ class Toy:
             observe=lambda: None,
             geometry=None,
             skills=None,
-            room=ReadingCache(space="s", agent="a", own=["toy"]),
-            reported=lambda: {"odometry": Reading(asdict(self.at), 0.0)},
+            readings=ReadingCache(space="s", agent="a", own=["toy"]),
+            own_readings=lambda: {"odometry": Reading(asdict(self.at), 0.0)},
             name="toy",
-            ground=lambda: ground,
+            obstacle_map=lambda: ground,
         )
         self.robot = RobotApi(body)
-        self.robot.begin(1, lambda _: None)
+        self.robot.reserve(1, lambda _: None)
         self.thread = threading.Thread(target=self.live, daemon=True)
         self.thread.start()
 
     def live(self) -> None:
         while not self.over.wait(PERIOD_S):
             self.rig.now_s += PERIOD_S
-            twist = self.rig.controller.step(self.rig.now_s).twist
+            twist = self.rig.controller.update(self.rig.now_s).twist
             at = self.at
             self.at = Pose2D(
                 at.x_m + twist.forward_m_s * PERIOD_S * math.cos(at.yaw_rad),
@@ -204,14 +198,14 @@ class Toy:
             )
 
     def end(self) -> None:
-        self.robot.give_back()
+        self.robot.release()
         self.over.set()
         self.thread.join()
 
 
 def test_a_robot_goes_to_a_place_and_rests_there() -> None:
     toy = Toy(room())
-    toy.robot.do(GoTo(x_m=0.3, y_m=0.0, yaw_rad=0.3))
+    toy.robot.execute(GoTo(x_m=0.3, y_m=0.0, yaw_rad=0.3))
     assert math.dist((toy.at.x_m, toy.at.y_m), (0.3, 0.0)) < 0.15
     assert not toy.rig.controller.moving
     toy.end()
@@ -219,12 +213,12 @@ def test_a_robot_goes_to_a_place_and_rests_there() -> None:
 
 def test_who_cannot_see_the_room_or_waits_in_vain_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(errand_module, "BLOCKED_TIMEOUT_S", 0.15)
-    monkeypatch.setattr(errand_module, "SHORT_PATIENCE_S", 0.15)
+    monkeypatch.setattr(errand_module, "START_TIMEOUT_S", 0.15)
     shut = room((0.5, -2, 0.7, 2))
     for ground, x_m, code in ((None, 1.0, "no_ground"), (shut, 0.6, "taken"), (room(), 9.0, "out_of_room")):
         toy = Toy(ground)
         with pytest.raises(Refused) as refused:
-            toy.robot.do(GoTo(x_m=x_m, y_m=0.0))
+            toy.robot.execute(GoTo(x_m=x_m, y_m=0.0))
         assert refused.value.code == code
         toy.end()
 
@@ -233,14 +227,14 @@ def test_an_errand_that_loses_the_device_ends() -> None:
     toy = Toy(room())
     threading.Timer(0.3, lambda: toy.rig.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))).start()
     with pytest.raises(Refused, match="stopped"):
-        toy.robot.do(GoTo(x_m=1.5, y_m=0.0))
+        toy.robot.execute(GoTo(x_m=1.5, y_m=0.0))
     toy.end()
     with pytest.raises(Refused):
-        toy.robot.do(GoTo(x_m=1.5, y_m=0.0))
+        toy.robot.execute(GoTo(x_m=1.5, y_m=0.0))
 
 
 def test_a_place_is_finite_and_a_robot_without_a_base_goes_nowhere() -> None:
     with pytest.raises(Refused, match="does not drive"):
-        Navigator.of(0.0, 0.0, None, robot_type())
+        Navigator.for_robot(0.0, 0.0, None, robot_type())
     with pytest.raises(Refused, match="finite"):
-        Navigator.of(math.nan, 0.0, None, robot_type(BASE))
+        Navigator.for_robot(math.nan, 0.0, None, robot_type(BASE))

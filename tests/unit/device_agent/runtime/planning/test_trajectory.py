@@ -68,8 +68,8 @@ def test_a_way_of_one_leg_is_straight_and_nearly_as_quick_as_a_move() -> None:
     found = along([[0.0, 0.0], [2.0, 1.0]])
     assert found.position_rad[:, 0] == pytest.approx(2 * found.position_rad[:, 1], abs=1e-9)
     rig = Rig()
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    move = rig.controller.move(tenure, {"shoulder": 2.0, "elbow": 1.0}, speed=1.0)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    move = rig.controller.start_joint_goal(tenure, {"shoulder": 2.0, "elbow": 1.0}, speed=1.0)
     began_s = rig.now_s
     while not move.finished.is_set():
         rig.run(PERIOD_S)
@@ -92,10 +92,10 @@ def test_corners_are_rounded_off_as_widely_as_there_is_room() -> None:
 
 def test_the_device_goes_along_a_way_and_rests_at_its_end() -> None:
     rig, found = Rig(), along(CORNER)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    passage = rig.controller.go_along(tenure, found)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    passage = rig.controller.start_trajectory(tenure, found)
     gone = ride(rig, found.duration_s + 0.1)
-    assert passage.outcome is GoalResult.REACHED
+    assert passage.result is GoalResult.REACHED
     assert gone[: len(found.position_rad) - 1] == pytest.approx(found.position_rad[1:], abs=1e-6)
     assert rig.controller.commanded_rad == pytest.approx([1.2, 1.0], abs=1e-9)
     assert not rig.controller.moving
@@ -105,7 +105,7 @@ def ride(rig: Rig, seconds: float) -> Floats:
     gone = []
     for _ in range(round(seconds / PERIOD_S)):
         rig.now_s += PERIOD_S
-        gone.append(rig.controller.step(rig.now_s).position_rad)
+        gone.append(rig.controller.update(rig.now_s).position_rad)
     return np.array(gone)
 
 
@@ -120,13 +120,13 @@ def check_on(found: Trajectory, gone: Floats) -> None:
 def test_whatever_takes_the_device_away_brakes_it_on_its_way(cause: str, after_s: float) -> None:
     rig, found = Rig(), along(CORNER)
     rig.take(1, lease_s=5.0)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    passage = rig.controller.go_along(tenure, found)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    passage = rig.controller.start_trajectory(tenure, found)
     before = ride(rig, after_s)
     assert before[-1] != pytest.approx(before[-2], abs=1e-6)
     interruptions()[cause](rig)  # type: ignore[operator]
     gone = ride(rig, 0.3)
-    assert passage.outcome is GoalResult.INTERRUPTED
+    assert passage.result is GoalResult.INTERRUPTED
     assert not rig.controller.moving
     assert gone[-1] == pytest.approx(gone[-2], abs=1e-6)
     check_on(found, gone)
@@ -135,8 +135,8 @@ def test_whatever_takes_the_device_away_brakes_it_on_its_way(cause: str, after_s
 
 def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> None:
     rig, found = Rig(), along(CORNER)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    passage = rig.controller.go_along(tenure, found)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    passage = rig.controller.start_trajectory(tenure, found)
     gone = [ride(rig, 0.4)]
     rig.controller.restrict("room", 0.3, "somebody is near")
     gone.append(ride(rig, 1.5))
@@ -144,7 +144,7 @@ def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> 
     assert slow <= 0.3 * 3.0 + 1e-6
     rig.controller.lift("room")
     gone.append(ride(rig, 3.0))
-    assert passage.outcome is GoalResult.REACHED
+    assert passage.result is GoalResult.REACHED
     assert any("somebody is near" in one for one in passage.limited)
     whole = np.concatenate(gone)
     check_on(found, whole)
@@ -153,8 +153,8 @@ def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> 
 
 def test_what_appears_on_a_way_holds_it_before() -> None:
     rig, found = Rig(geometry=Wall(0.5)), along(CORNER)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    passage = rig.controller.go_along(tenure, found)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    passage = rig.controller.start_trajectory(tenure, found)
     gone = ride(rig, 3.0)
     assert passage.why is not None
     assert passage.why.code == "no_room"
@@ -164,10 +164,10 @@ def test_what_appears_on_a_way_holds_it_before() -> None:
 
 def test_a_late_control_loop_counts_what_it_missed_as_braked_on_a_way_too() -> None:
     rig, found = Rig(), along(CORNER)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    rig.controller.go_along(tenure, found)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    rig.controller.start_trajectory(tenure, found)
     ride(rig, 0.5)
-    rig.controller.end_action(tenure)
+    rig.controller.end_reservation(tenure)
     ride(rig, 2 * PERIOD_S)
     rig.now_s += 0.08
     gone = ride(rig, 0.15)
@@ -177,43 +177,43 @@ def test_a_late_control_loop_counts_what_it_missed_as_braked_on_a_way_too() -> N
 
 def test_a_move_that_follows_waits_until_the_device_rests_on_its_way() -> None:
     rig, found = Rig(), along(CORNER)
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    passage = rig.controller.go_along(tenure, found)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    passage = rig.controller.start_trajectory(tenure, found)
     ride(rig, 0.5)
-    move = rig.controller.move(tenure, {"shoulder": 0.0, "elbow": 0.0}, speed=1.0)
-    assert passage.outcome is GoalResult.INTERRUPTED
+    move = rig.controller.start_joint_goal(tenure, {"shoulder": 0.0, "elbow": 0.0}, speed=1.0)
+    assert passage.result is GoalResult.INTERRUPTED
     gone = ride(rig, 3.0)
-    assert move.outcome is GoalResult.REACHED
+    assert move.result is GoalResult.REACHED
     assert slopes(gone)[1] <= 20.5
 
 
 def test_a_way_that_begins_elsewhere_or_leaves_a_range_is_refused() -> None:
     rig = Rig()
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
     for corners, code in (
         ([[0.1, 0.0], [1.0, 0.0]], "moved"),
         ([[0.0, 0.0], [0.0, 3.2]], "out_of_range"),
     ):
         with pytest.raises(Refused) as refused:
-            rig.controller.go_along(tenure, along(corners))
+            rig.controller.start_trajectory(tenure, along(corners))
         assert refused.value.code == code
     broken = along([[0.0, 0.0], [1.0, 0.0]])
     broken.position_rad[3, 1] = math.nan
     with pytest.raises(Refused, match="leads elbow out of its range"):
-        rig.controller.go_along(tenure, broken)
-    rig.controller.move(tenure, {"elbow": 1.0}, speed=1.0)
+        rig.controller.start_trajectory(tenure, broken)
+    rig.controller.start_joint_goal(tenure, {"elbow": 1.0}, speed=1.0)
     rig.run(0.3)
-    with pytest.raises(Refused, match="no longer where the way begins"):
-        rig.controller.go_along(tenure, along(CORNER))
+    with pytest.raises(Refused, match="no longer at the start of the trajectory"):
+        rig.controller.start_trajectory(tenure, along(CORNER))
     assert rig.controller.mode is Mode.ACTION
 
 
 def test_a_target_is_looked_at_before_a_way_to_it() -> None:
     rig = Rig(geometry=Wall())
-    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
-    assert rig.controller.target(tenure, {"elbow": 0.5}) == [0.0, 0.5]
+    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    assert rig.controller.resolve_target(tenure, {"elbow": 0.5}) == [0.0, 0.5]
     with pytest.raises(Refused, match="no room there"):
-        rig.controller.target(tenure, {"elbow": 1.5})
+        rig.controller.resolve_target(tenure, {"elbow": 1.5})
 
 
 def test_an_orientation_has_a_direction_and_is_given_once() -> None:
@@ -239,7 +239,7 @@ def test_samples_of_a_way_are_joined_smoothly() -> None:
 
 
 def test_after_its_last_try_a_way_is_taken_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trajectory, "_TRIES", 1)
+    monkeypatch.setattr(trajectory, "_ITERATIONS", 1)
     assert along(CORNER).position_rad[-1] == pytest.approx([1.2, 1.0], abs=1e-9)
 
 
@@ -278,6 +278,6 @@ class Sliding(Narrow):
 
 def test_a_way_that_is_too_narrow_is_refused() -> None:
     with pytest.raises(Refused, match="too narrow"):
-        MotionPlanner(robot_type(), Narrow()).around([0.0, 0.0], [1.0, 1.0], speed=1.0, ended=never)
+        MotionPlanner(robot_type(), Narrow()).plan([0.0, 0.0], [1.0, 1.0], speed=1.0, ended=never)
     with pytest.raises(Refused, match="something is in the way: clearance: hand"):
-        MotionPlanner(robot_type(), Sliding()).straight([0.0, 0.0], "hand", (0.1, 0, 0, 1, 0, 0, 0), speed=1.0)
+        MotionPlanner(robot_type(), Sliding()).plan_straight([0.0, 0.0], "hand", (0.1, 0, 0, 1, 0, 0, 0), speed=1.0)

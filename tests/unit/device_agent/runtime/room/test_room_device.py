@@ -321,8 +321,8 @@ def test_what_fails_is_told_as_it_was_said(bench: RoomBench) -> None:
     assert isinstance(instrument, RoomDevice)
     bench.sensor.broken = "it is wet"
     for deed in (
-        lambda: instrument.shoot(()),
-        lambda: instrument.capture("image"),
+        lambda: instrument.take_picture(()),
+        lambda: instrument.capture_raw("image"),
         lambda: instrument.set("opening", 0.1),
     ):
         with pytest.raises(Exception, match="it is wet"):
@@ -411,7 +411,7 @@ def test_the_room_holds_a_room_device_too(tmp_path: Path) -> None:
 
 def test_what_it_measures_is_what_the_agents_others_read_of_the_room(bench: RoomBench) -> None:
     room = ReadingCache(space="s", agent="a", own=["arm"], named=[("arm", "air")])
-    bench.device._room = room
+    bench.device._readings = room
     eventually(lambda: room.latest("arm", "air"))
 
 

@@ -10,14 +10,14 @@ class Bedside:
     def __init__(self, *watches: Watch, rate_hz: float = 1.0) -> None:
         self.now_s, self.rate_hz = 100.0, rate_hz
         self.vigil = StreamWatchdog(watches, lambda _: self.rate_hz, lambda: self.now_s)
-        self.vigil.begin()
+        self.vigil.reset()
 
     def pass_s(self, seconds: int, *contents: object) -> list[str]:
         """Seconds go by, in which it gives these in turn, or nothing; the codes of what is wrong then."""
         for second in range(seconds):
             self.now_s += 1.0
             if contents:
-                self.vigil.note("air", contents[second % len(contents)])
+                self.vigil.record("air", contents[second % len(contents)])
         return [fault.code for fault in self.vigil.faults()]
 
 
@@ -34,14 +34,14 @@ def test_what_gives_nothing_is_silent_until_it_is_heard() -> None:
 
 def test_nothing_is_wrong_before_anything_is_expected() -> None:
     vigil = StreamWatchdog((Watch(source="air", silent_s=5.0),), lambda _: 1.0, lambda: 100.0)
-    vigil.note("air", {"x": 1.0})
+    vigil.record("air", {"x": 1.0})
     assert vigil.faults() == ()
 
 
 def test_what_is_there_again_has_its_time_anew() -> None:
     bed = Bedside(Watch(source="air", silent_s=5.0))
     assert bed.pass_s(60) == ["silent.air"]
-    bed.vigil.begin()
+    bed.vigil.reset()
     assert bed.pass_s(5) == []
 
 
@@ -77,4 +77,4 @@ def test_a_fault_that_goes_on_keeps_its_time_and_says_what_to_do() -> None:
     (first,) = bed.vigil.faults()
     bed.pass_s(100)
     assert bed.vigil.faults() == (first,)
-    assert "'air' has given nothing for 5 s. See that the device has power" in first.message
+    assert "'air' has sent nothing for 5 s. Check that the device has power" in first.message

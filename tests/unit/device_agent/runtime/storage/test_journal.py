@@ -148,7 +148,7 @@ def test_what_is_settled_is_on_the_disk_while_others_write(
     monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_ino))
     journal.begin("arm", ack("1", AckStatus.RECEIVED))
     with journal._lock:
-        journal.settle()
+        journal.sync()
     assert synced == [next(tmp_path.glob("*-wal")).stat().st_ino]
 
 
@@ -157,8 +157,8 @@ def test_what_is_not_on_the_disk_is_not_settled(journal: Journal, monkeypatch: p
         raise OSError(errno.EIO, "I/O error")
 
     monkeypatch.setattr(os, "fsync", fails)
-    with pytest.raises(JournalError, match="look at the disk"):
-        journal.settle()
+    with pytest.raises(JournalError, match="check the disk"):
+        journal.sync()
     journal.close()
-    with pytest.raises(JournalError, match="not on the disk"):
-        journal.settle()
+    with pytest.raises(JournalError, match="could not be synced"):
+        journal.sync()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from device_agent.runtime.storage.outbox_store import DroppedCount, OutboxItem, OutboxStore, ShelfError
+from device_agent.runtime.storage.outbox_store import DroppedCount, OutboxItem, OutboxStore, OutboxStoreError
 
 OWN = "ts/v1/s/a/"
 EVENT, LATE = OWN + "arm/event", OWN + "arm/late/joints"
@@ -40,7 +40,7 @@ def dropped(shelf: OutboxStore) -> list[DroppedCount]:
         told.append(what)
         return OutboxItem(what.device + "/event", b"0", NOW_MS, late=False)
 
-    shelf.tell_dropped(event)
+    shelf.store_dropped_events(event)
     return told
 
 
@@ -101,7 +101,7 @@ def test_the_sum_of_what_is_kept_is_true_after_anything(tmp_path: Path) -> None:
         shelf.put([item(number, size=number), item(number, EVENT)], now_ms=NOW_MS + number)
         shelf.remove([number // 2, number // 3])
         if number % 50 == 0:
-            shelf.tell_dropped(lambda what: OutboxItem(what.device + "/event", b"0", NOW_MS, late=False))
+            shelf.store_dropped_events(lambda what: OutboxItem(what.device + "/event", b"0", NOW_MS, late=False))
     kept = shelf._bytes
     shelf.close()
     again = make(tmp_path / "db")
@@ -112,9 +112,9 @@ def test_the_sum_of_what_is_kept_is_true_after_anything(tmp_path: Path) -> None:
 
 def test_what_is_too_old_is_dropped_and_counted(shelf: OutboxStore) -> None:
     shelf.put([item(1), item(2, at_ms=NOW_MS + 3_000_000), item(3, EVENT)], now_ms=NOW_MS)
-    shelf.bound(now_ms=NOW_MS + 3_700_000)
+    shelf.enforce_bounds(now_ms=NOW_MS + 3_700_000)
     assert (numbers(shelf), numbers(shelf, late=False)) == ([2], [3])
-    shelf.bound(now_ms=NOW_MS + 31 * 24 * 3_600_000)
+    shelf.enforce_bounds(now_ms=NOW_MS + 31 * 24 * 3_600_000)
     assert numbers(shelf, late=False) == [3], "what happened stays worth telling"
     assert dropped(shelf) == [DroppedCount(OWN + "arm", measurements=2, events=0)]
     assert dropped(shelf) == [], "told once"
@@ -146,25 +146,25 @@ def test_a_damaged_file_is_laid_aside(tmp_path: Path) -> None:
 
 
 def test_where_nothing_can_be_written_it_says_so(tmp_path: Path) -> None:
-    with pytest.raises(ShelfError, match="cannot be used"):
+    with pytest.raises(OutboxStoreError, match="cannot be used"):
         make(tmp_path / "none" / "outbox.db").open()
     closed = make(tmp_path / "db")
     for call in (lambda: closed.put([item(1)], now_ms=NOW_MS), lambda: closed.after(0, late=True, limit=1)):
-        with pytest.raises(ShelfError, match="is not open"):
+        with pytest.raises(OutboxStoreError, match="is not open"):
             call()
 
 
 def test_a_full_disk_changes_nothing_and_is_named(tmp_path: Path, shelf: OutboxStore) -> None:
     shelf.put([item(1)], now_ms=NOW_MS)
     before = shelf._bytes
-    shelf._use().execute("PRAGMA max_page_count = 1")
-    with pytest.raises(ShelfError, match="is the disk full"):
+    shelf._connection().execute("PRAGMA max_page_count = 1")
+    with pytest.raises(OutboxStoreError, match="is the disk full"):
         shelf.put([item(2), item(3, size=500_000)], now_ms=NOW_MS)
     assert (numbers(shelf), shelf._bytes) == ([1], before)
-    shelf._use().execute("PRAGMA max_page_count = 100000")
+    shelf._connection().execute("PRAGMA max_page_count = 100000")
     shelf.put([item(4)], now_ms=NOW_MS)
     assert numbers(shelf) == [1, 4]
     with sqlite3.connect(tmp_path / "outbox.db") as other:
-        other.execute("DROP TABLE kept")
-    with pytest.raises(ShelfError, match="cannot be read"):
+        other.execute("DROP TABLE items")
+    with pytest.raises(OutboxStoreError, match="cannot be read"):
         shelf.after(0, late=True, limit=1)

@@ -45,7 +45,7 @@ def watched(
     linger_s: float = 60.0,
 ) -> CameraStreamer:
     """A filmer at work, with a link."""
-    filmer = CameraStreamer([EYES], driver, name="cart", film=film, controlled=controlled, linger_s=linger_s)
+    filmer = CameraStreamer([EYES], driver, name="cart", publish=film, is_controlled=controlled, linger_s=linger_s)
     filmer.link_changed(True)
     filmer.start()
     return filmer
@@ -98,7 +98,7 @@ def test_trouble_is_logged_once_with_what_to_do_and_ends_nothing(caplog: pytest.
     texts = [record.getMessage() for record in caplog.records]
     assert texts == [
         "cart: camera eyes: the lens is covered",
-        f"cart: camera eyes: a picture of {len(JPEG)} bytes; have it take smaller pictures",
+        f"cart: camera eyes: a picture of {len(JPEG)} bytes; configure smaller pictures",
     ]
 
 

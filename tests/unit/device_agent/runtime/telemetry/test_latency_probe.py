@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.runtime.telemetry.latency_probe import MOST, LatencyProbe, Sample
+from device_agent.runtime.telemetry.latency_probe import MAX_SAMPLES, LatencyProbe, Sample
 from tests.harness.agent.device_harness import eventually
 
 STATE = "ts/v1/s/a/arm/state"
@@ -41,7 +41,7 @@ class Timed:
         self.told: list[tuple[str, Sequence[Sample]]] = []
         self.trouble: list[Exception] = []
         self.link_was: list[bool] = []
-        self.trips = LatencyProbe(self.link, tell=self.tell, at_ms=lambda: NOW_MS, **periods)
+        self.trips = LatencyProbe(self.link, upload=self.tell, at_ms=lambda: NOW_MS, **periods)
         self.trips.start(lambda _topic, _payload: None, self.link_was.append)
 
     def tell(self, device: str, samples: Sequence[Sample]) -> None:
@@ -64,7 +64,7 @@ def made() -> Iterator[Callable[..., Timed]]:
     all_of_them = []
 
     def make(**periods: float) -> Timed:
-        all_of_them.append(Timed(**{"round_s": 0.02, "again_s": 0.0, "spacing_s": 0.0, **periods}))
+        all_of_them.append(Timed(**{"upload_period_s": 0.02, "device_period_s": 0.0, "spacing_s": 0.0, **periods}))
         return all_of_them[-1]
 
     yield make
@@ -125,14 +125,14 @@ def test_of_what_is_said_in_quick_succession_one_is_timed_for_each_device(made: 
 
 
 def test_samples_that_wait_are_bounded_and_the_newest_stay(made: Callable[..., Timed]) -> None:
-    timed = made(round_s=0.5)
-    for _ in range(MOST + 20):
+    timed = made(upload_period_s=0.5)
+    for _ in range(MAX_SAMPLES + 20):
         timed.trip()
-    assert len(eventually(lambda: timed.told)[0][1]) == MOST
+    assert len(eventually(lambda: timed.told)[0][1]) == MAX_SAMPLES
 
 
 def test_one_device_after_another_is_told_and_each_only_so_often(made: Callable[..., Timed]) -> None:
-    timed = made(again_s=60.0)
+    timed = made(device_period_s=60.0)
     timed.trip()
     timed.trip("ts/v1/s/a/leg/state")
     eventually(lambda: len(timed.told) == 2)
@@ -143,7 +143,7 @@ def test_one_device_after_another_is_told_and_each_only_so_often(made: Callable[
 
 
 def test_samples_of_before_are_dropped_when_the_link_is_lost(made: Callable[..., Timed]) -> None:
-    timed = made(round_s=0.3)
+    timed = made(upload_period_s=0.3)
     timed.link.link_changed(True)
     timed.trip()
     timed.link.link_changed(False)

@@ -9,7 +9,7 @@ import pytest
 
 from device_agent.protocol import Event, codec, topics
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.storage.outbox_store import OutboxItem, OutboxStore, ShelfError
+from device_agent.runtime.storage.outbox_store import OutboxItem, OutboxStore, OutboxStoreError
 from device_agent.runtime.telemetry import outbox as module
 from device_agent.runtime.telemetry.outbox import BUSY_RATE_HZ, RATE_HZ, Outbox
 from tests.harness.agent.device_harness import eventually
@@ -65,21 +65,21 @@ class Bench:
         """As after a restart."""
         self.shelf = OutboxStore(self.path, own="ts/v1/s/a/", **self.limits)
         self.outbox = Outbox(
-            self.shelf, publish=self.link.publish, teller=ARM, quiet=lambda: not self.moves, keep_hz=1.0
+            self.shelf, publish=self.link.publish, device_topic=ARM, is_quiet=lambda: not self.moves, keep_hz=1.0
         )
 
     def rounds(self, count: int = 1, step_s: float = 0.25) -> None:
         for _ in range(count):
             self.now_s += step_s
-            self.outbox._round(self.now_s)
+            self.outbox._iterate(self.now_s)
 
     def event(self, name: str) -> None:
-        self.outbox.happened(ARM + "/event", name.encode(), at_ms=1)
+        self.outbox.add_event(ARM + "/event", name.encode(), at_ms=1)
 
     def measure(self, first: int, last: int, *, sent: bool, each_s: float = 1.0) -> None:
         for number in range(first, last):
             self.now_s += each_s
-            self.outbox.measured(LATE, str(number).encode(), at_ms=number, sent=sent, now_s=self.now_s)
+            self.outbox.add_measurement(LATE, str(number).encode(), at_ms=number, sent=sent, now_s=self.now_s)
 
     def kept(self, *, late: bool = True) -> list[str]:
         return [found.payload.decode() for _, found in self.shelf.after(0, late=late, limit=10**6)]
@@ -212,8 +212,8 @@ def test_what_is_never_confirmed_is_sent_some_times_and_then_dropped_and_counted
     bench.outbox.link_changed(True)
     bench.link.confirms = False
     bench.event("refused")
-    bench.rounds(int(4 * module._CONFIRM_S * (module._TRIES + 1)))
-    assert bench.link.payloads(topics.EVENT).count(b"refused") == module._TRIES
+    bench.rounds(int(4 * module._ACK_TIMEOUT_S * (module._MAX_ATTEMPTS + 1)))
+    assert bench.link.payloads(topics.EVENT).count(b"refused") == module._MAX_ATTEMPTS
     assert bench.kept(late=False) == []
     bench.outbox.link_changed(False)
     bench.outbox.link_changed(True)
@@ -238,7 +238,7 @@ def test_what_did_not_fit_is_told_after_the_link_has_come_back(tmp_path: Path) -
 def test_a_thread_that_is_stuck_costs_a_bounded_memory_and_what_it_costs_is_counted(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_MOST_INCOMING", 10)
+    monkeypatch.setattr(module, "_MAX_INCOMING", 10)
     for number in range(14):
         bench.event(str(number))
     bench.rounds()
@@ -257,7 +257,7 @@ class TestFullDisk:
 
         def fail(items: Any, **options: Any) -> None:
             if full[0]:
-                raise ShelfError("outbox.db cannot be written: is the disk full?")
+                raise OutboxStoreError("outbox.db cannot be written: is the disk full?")
             put(items, **options)
 
         monkeypatch.setattr(bench.shelf, "put", fail)
@@ -287,7 +287,7 @@ class TestFullDisk:
         bench.event("second")
         bench.rounds()
         assert bench.kept(late=False) == []
-        bench.rounds(int(4 * module._SAVE_AGAIN_S))
+        bench.rounds(int(4 * module._SAVE_RETRY_S))
         assert bench.kept(late=False)[::2] == ["first", "second"], "with what was said of the disk between"
         bench.outbox.link_changed(True)
         bench.rounds(2)
@@ -296,18 +296,18 @@ class TestFullDisk:
 
     def test_memory_is_bounded(self, bench: Bench, full: list[bool]) -> None:
         assert full
-        for number in range(module._MOST_UNSAVED + 20):
+        for number in range(module._MAX_UNSAVED + 20):
             bench.event(str(number))
         bench.rounds()
-        assert len(bench.outbox._unsaved) == module._MOST_UNSAVED
+        assert len(bench.outbox._unsaved) == module._MAX_UNSAVED
 
     def test_what_is_only_in_memory_and_never_confirmed_is_let_go(self, bench: Bench, full: list[bool]) -> None:
         assert full
         bench.link.confirms = False
         bench.outbox.link_changed(True)
         bench.event("refused")
-        bench.rounds(int(4 * module._CONFIRM_S * (module._TRIES + 1)))
-        assert bench.link.payloads(topics.EVENT).count(b"refused") == module._TRIES
+        bench.rounds(int(4 * module._ACK_TIMEOUT_S * (module._MAX_ATTEMPTS + 1)))
+        assert bench.link.payloads(topics.EVENT).count(b"refused") == module._MAX_ATTEMPTS
         assert bench.outbox._unsaved == {}
 
 
@@ -320,7 +320,7 @@ def test_a_folder_that_cannot_be_used_stops_nothing(tmp_path: Path) -> None:
     bench.rounds(2)
     assert b"held" in bench.link.payloads(topics.EVENT)
     bench.path.parent.mkdir()
-    bench.rounds(int(4 * module._SAVE_AGAIN_S) + 1)
+    bench.rounds(int(4 * module._SAVE_RETRY_S) + 1)
     bench.event("again")
     bench.link.takes = False
     bench.rounds()
@@ -340,7 +340,7 @@ def test_an_error_in_reading_is_trouble_too_and_one_nobody_thought_of_ends_nothi
         return after
 
     with monkeypatch.context() as patch:
-        patch.setattr(bench.shelf, "after", fail(ShelfError("outbox.db cannot be read")))
+        patch.setattr(bench.shelf, "after", fail(OutboxStoreError("outbox.db cannot be read")))
         bench.event("one")
         bench.rounds()
     assert "cannot be read" in caplog.text
@@ -348,7 +348,7 @@ def test_an_error_in_reading_is_trouble_too_and_one_nobody_thought_of_ends_nothi
         patch.setattr(bench.shelf, "after", fail(RuntimeError("a mistake")))
         bench.rounds()
     assert "a mistake" in caplog.text
-    bench.rounds(int(4 * module._SAVE_AGAIN_S) + 1)
+    bench.rounds(int(4 * module._SAVE_RETRY_S) + 1)
     assert b"one" in bench.link.payloads(topics.EVENT)
 
 

@@ -59,7 +59,7 @@ class Bell:
 
 
 def run(gauge: Gauge | None, *streams: Stream, tell: Callable[[str, Measurements], None]) -> StreamSampler:
-    reporter = StreamSampler(streams, gauge, name="cart", tell=tell)
+    reporter = StreamSampler(streams, gauge, name="cart", publish=tell)
     reporter.start()
     return reporter
 
@@ -116,7 +116,7 @@ def test_trouble_with_one_stream_is_logged_once_and_ends_nothing(caplog: pytest.
         reporter.stop()
     told = [record.getMessage() for record in caplog.records]
     assert told.count("cart: stream sonar: no answer from the sonar") == 1
-    assert told.count("cart: stream sonar: is measured again") == 1
+    assert told.count("cart: stream sonar: works again") == 1
     assert sum("internal error: ZeroDivisionError" in text for text in told) == 1
 
 
