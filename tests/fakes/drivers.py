@@ -51,7 +51,7 @@ def robot_type(base: Base | None = None, joints: Sequence[Joint] | None = None, 
     return RobotType(**(toy | {"base": base, "joints": joints} | more))
 
 
-class ToyDriver:
+class FakeDriver:
     """Is where it was told to be."""
 
     simulated = True

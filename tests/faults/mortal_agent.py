@@ -33,8 +33,8 @@ from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.storage.journal import Journal
 from device_agent.runtime.storage.outbox_store import OutboxStore
 from device_agent.runtime.telemetry.outbox import Outbox
-from tests.fakes.drivers import ToyDriver, robot_type
-from tests.harness.agent.pinned_keys import pins_of
+from tests.fakes.drivers import FakeDriver, robot_type
+from tests.harness.agent.pinned_keys import pinned_keys_of
 from tests.harness.agent.sandbox import LateJail
 
 TARGET_RAD = 1e-4
@@ -128,9 +128,9 @@ class Body:
             journal.open(now_ms=wall_ms())
             journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
             device = Device(
-                name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=ToyDriver(),
+                name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=FakeDriver(),
                 journal=journal, cloud_clock=self.clock, publish=self._publish, sandbox=LateJail(),
-                keys=pins_of(key),
+                keys=pinned_keys_of(key),
                 readings=ReadingCache(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
             )  # fmt: skip
             device.start()
@@ -159,9 +159,9 @@ class Body:
             time.sleep(0.002)
 
     def _counted(self, real: Callable[..., Any]) -> Callable[..., Any]:
-        def move(controller: Controller, tenure: Any, position_rad: dict[str, float], **options: Any) -> Any:
+        def move(controller: Controller, reservation: Any, position_rad: dict[str, float], **options: Any) -> Any:
             self.steps.step()
-            moving = real(controller, tenure, position_rad, **options)
+            moving = real(controller, reservation, position_rad, **options)
             self.moved.add(number=round(position_rad["elbow"] / TARGET_RAD), cloud_ms=self.clock.now_ms())
             self.steps.step()
             return moving

@@ -189,8 +189,8 @@ class History:
         self._witness.ordered(message.epoch)
 
         def act() -> None:
-            tenure = self._robot.reserve(epoch=message.epoch, on_revoked=lambda _: None)
-            self._robot.end_reservation(tenure)
+            reservation = self._robot.reserve(epoch=message.epoch, on_revoked=lambda _: None)
+            self._robot.end_reservation(reservation)
             self._judge(stale=stale)
 
         self._signed(message.epoch, act)

@@ -16,7 +16,7 @@ from tests.fakes.drivers import PERIOD_S, robot_type
 WALL_RAD = 1.0
 
 
-class Rig:
+class ControllerFixture:
     """A controller with a clock of its own and an operator who answers the newest telemetry."""
 
     def __init__(self, *, geometry: RobotGeometry | None = None, base: Base | None = None, **gate: int) -> None:
@@ -81,12 +81,12 @@ def lost(_: Refused) -> None:
 
 def interruptions() -> dict[str, object]:
     return {
-        "stop": lambda rig: rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1)),
-        "link": lambda rig: rig.controller.interrupt(Refused("link_lost", "the link is gone")),
-        "takeover": lambda rig: rig.take(2),
-        "release": lambda rig: rig.controller.release(epoch=1),
-        "expiry": lambda rig: rig.run(6.0),
-        "fault": lambda rig: rig.controller.set_fault("no answer"),
+        "stop": lambda fixture: fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1)),
+        "link": lambda fixture: fixture.controller.interrupt(Refused("link_lost", "the link is gone")),
+        "takeover": lambda fixture: fixture.take(2),
+        "release": lambda fixture: fixture.controller.release(epoch=1),
+        "expiry": lambda fixture: fixture.run(6.0),
+        "fault": lambda fixture: fixture.controller.set_fault("no answer"),
     }
 
 

@@ -35,15 +35,15 @@ from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.storage.journal import Journal
 from device_agent.runtime.storage.outbox_store import OutboxStore
 from device_agent.runtime.telemetry.outbox import Outbox
-from tests.fakes.drivers import ToyDriver, robot_type
-from tests.harness.agent.pinned_keys import pins_of
-from tests.harness.agent.sandbox import warm_jail
+from tests.fakes.drivers import FakeDriver, robot_type
+from tests.harness.agent.pinned_keys import pinned_keys_of
+from tests.harness.agent.sandbox import warm_sandbox
 
 WITHIN_S = 120.0
 OWNER = "accountaaaaaaaaa"
 
 
-class Bench:
+class DeviceHarness:
     """A device, the cloud's key, and everything the device has said."""
 
     def __init__(
@@ -51,17 +51,17 @@ class Bench:
         folder: Path,
         *,
         interlocks: Sequence[InterlockRule] = (),
-        driver: ToyDriver | None = None,
+        driver: FakeDriver | None = None,
         kind: RobotType | None = None,
         geometry: RobotGeometry | None = None,
-        jail: Sandbox | None = None,
+        sandbox: Sandbox | None = None,
         speech: Speech | None = None,
         uploads: Uploads | None = None,
     ) -> None:
         self.key = signing.generate()
         self.kind = kind or robot_type()
         self.said: list[tuple[str, bytes]] = []
-        self.driver = driver or ToyDriver()
+        self.driver = driver or FakeDriver()
         self.journal = Journal(folder / "journal.db")
         self.journal.open(now_ms=wall_ms())
         self.journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
@@ -81,7 +81,7 @@ class Bench:
             driver=self.driver,
             journal=self.journal,
             cloud_clock=self.clock,
-            keys=pins_of(self.key),
+            keys=pinned_keys_of(self.key),
             publish=self.publish,
             outbox=self.outbox,
             readings=ReadingCache(
@@ -89,7 +89,7 @@ class Bench:
             ),
             interlocks=interlocks,
             geometry=geometry,
-            sandbox=jail or warm_jail(),
+            sandbox=sandbox or warm_sandbox(),
             owner=OWNER,
             speech=speech,
             uploads=uploads,
@@ -187,6 +187,6 @@ def eventually(probe: Callable[[], Any]) -> Any:
     pytest.fail("it never happened")
 
 
-def shown(bench: Bench, wanted: Callable[[State], Any]) -> State:
-    found: State = eventually(lambda: [s for s in bench.heard(topics.STATE, State)[-1:] if wanted(s)])[0]
+def shown(harness: DeviceHarness, wanted: Callable[[State], Any]) -> State:
+    found: State = eventually(lambda: [s for s in harness.heard(topics.STATE, State)[-1:] if wanted(s)])[0]
     return found

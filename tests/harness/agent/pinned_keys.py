@@ -12,7 +12,7 @@ def pinned(pairing: Pairing) -> PinnedKeys:
     return PinnedKeys(pairing, save=lambda _: None, now_ms=lambda: None)
 
 
-def pins_of(*keys: Ed25519PrivateKey) -> PinnedKeys:
+def pinned_keys_of(*keys: Ed25519PrivateKey) -> PinnedKeys:
     """PinnedKeys of the public halves of some keys."""
     halves = {signing.key_id(key.public_key()): signing.public_text(key.public_key()) for key in keys}
     return pinned(Pairing(agent="a", space="s", account="ann", keys=halves))

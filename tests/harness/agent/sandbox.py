@@ -11,7 +11,7 @@ LACK = "no seccomp; install libseccomp2"
 
 
 @cache
-def warm_jail() -> SandboxHost:
+def warm_sandbox() -> SandboxHost:
     """The real one, with every layer."""
     jail = SandboxHost()
     jail.start()
@@ -26,7 +26,7 @@ class LateJail(SandboxHost):
         return SandboxStatus("sandboxed")
 
 
-class NoJail:
+class NoSandbox:
     """A machine on which no script runs; starts no process."""
 
     def __init__(self, how: Literal["unconfined", "unavailable"] = "unavailable") -> None:

@@ -11,7 +11,7 @@ from device_agent.drivers import load
 from device_agent.drivers.mujoco import WheeledDriver
 from device_agent.protocol import AckStatus, Measurements, topics
 from device_agent.protocol.manifests import robot_type
-from tests.harness.agent.device_harness import Bench, eventually
+from tests.harness.agent.device_harness import DeviceHarness, eventually
 from tests.harness.paths import ROBOTS
 
 FOLDER = ROBOTS / "qbo"
@@ -19,27 +19,29 @@ QBO = robot_type.load(FOLDER)
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
+def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
     driver = load("mujoco")(QBO, FOLDER, {}, "qbo")
     assert isinstance(driver, WheeledDriver)
-    bench = Bench(tmp_path, kind=QBO, driver=driver, geometry=geometry.load(QBO, FOLDER))  # type: ignore[arg-type]
-    bench.device.start()
-    yield bench
-    bench.stop()
+    harness = DeviceHarness(tmp_path, kind=QBO, driver=driver, geometry=geometry.load(QBO, FOLDER))  # type: ignore[arg-type]
+    harness.device.start()
+    yield harness
+    harness.stop()
 
 
-def test_it_comes_forward_until_its_sonars_say_near(bench: Bench) -> None:
+def test_it_comes_forward_until_its_sonars_say_near(harness: DeviceHarness) -> None:
     source = (FOLDER / "movements" / "come_near.py").read_text(encoding="utf-8")
-    eventually(lambda: bench.heard(topics.TELE, Measurements, "sonar"))
-    ack = bench.end(bench.command(bench.script("parameters = {'near_m': 1.65, 'speed_m_s': 0.2}\n" + source), epoch=1))
+    eventually(lambda: harness.heard(topics.TELE, Measurements, "sonar"))
+    ack = harness.end(
+        harness.command(harness.script("parameters = {'near_m': 1.65, 'speed_m_s': 0.2}\n" + source), epoch=1)
+    )
     assert ack.status is AckStatus.DONE, ack.reason
     assert ack.output.startswith("stands 1.")
-    sonar = bench.heard(topics.TELE, Measurements, "sonar")
+    sonar = harness.heard(topics.TELE, Measurements, "sonar")
     nearest_m = min(float(told.values["distance_m.left"]) for told in sonar)
     assert 1.4 < nearest_m <= 1.65
-    odometry = bench.heard(topics.TELE, Measurements, "odometry")
+    odometry = harness.heard(topics.TELE, Measurements, "odometry")
     farthest_m = max(float(told.values["x_m"]) for told in odometry)
     assert farthest_m == pytest.approx(2.0 - 0.156 - nearest_m, abs=0.06)
     assert float(odometry[-1].values["x_m"]) < farthest_m, "it went back a little"
     assert math.isclose(float(odometry[-1].values["y_m"]), 0.0, abs_tol=0.01)
-    assert bench.heard(topics.TELE, Measurements, "health")
+    assert harness.heard(topics.TELE, Measurements, "health")

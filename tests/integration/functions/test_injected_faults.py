@@ -14,7 +14,7 @@ from device_agent.protocol import AckStatus, Measurements, Mode, MoveJoints, Sta
 from device_agent.protocol.manifests import robot_type
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from tests.fakes.agent import Robot
-from tests.harness.agent.device_harness import Bench, eventually
+from tests.harness.agent.device_harness import DeviceHarness, eventually
 from tests.harness.cloud.cloud import Cloud
 from tests.harness.paths import ROBOTS
 from tests.integration.functions.test_diagnostics import MINUTE, Pair, field, open_faults
@@ -79,18 +79,18 @@ def test_a_joint_made_to_overheat_is_told_as_a_trend_before_its_limit(cloud: Clo
 
 
 @pytest.fixture
-def arm(tmp_path: Path) -> Iterator[Bench]:
+def arm(tmp_path: Path) -> Iterator[DeviceHarness]:
     driver = load("mujoco")(UR5, ROBOTS / "ur5", {"faults": str(tmp_path / "arm.toml")}, "arm")
     assert isinstance(driver, MujocoDriver)
-    bench = Bench(tmp_path, kind=UR5, driver=driver)  # type: ignore[arg-type]  # a driver, if no toy
-    bench.device.start()
-    bench.device.link_changed(True)
-    yield bench
-    bench.stop()
+    harness = DeviceHarness(tmp_path, kind=UR5, driver=driver)  # type: ignore[arg-type]  # a driver, if no toy
+    harness.device.start()
+    harness.device.link_changed(True)
+    yield harness
+    harness.stop()
 
 
 def test_a_joint_that_is_stuck_raises_a_fault_in_the_state_and_in_the_cloud(
-    cloud: Cloud, pair: Pair, arm: Bench, tmp_path: Path
+    cloud: Cloud, pair: Pair, arm: DeviceHarness, tmp_path: Path
 ) -> None:
     anna, robot = pair
     eventually(lambda: arm.heard(topics.TELE, Measurements, "health"))

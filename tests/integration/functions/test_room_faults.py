@@ -15,7 +15,7 @@ from device_agent.simulation.room.climate import Climate
 from device_agent.simulation.room.pedestrian import Walker
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from tests.fakes.agent import Robot
-from tests.harness.agent.device_harness import Bench, eventually
+from tests.harness.agent.device_harness import DeviceHarness, eventually
 from tests.harness.agent.rooms import LAB, StillWorld
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.integration.functions.test_diagnostics import MINUTE, diagnostics, open_faults
@@ -109,7 +109,7 @@ def test_people_behind_a_closed_door_raise_a_fault_of_the_air_and_the_open_door_
 
 
 @pytest.fixture
-def meter(tmp_path: Path) -> Iterator[Bench]:
+def meter(tmp_path: Path) -> Iterator[DeviceHarness]:
     """The laboratory's carbon dioxide meter at work, read and watched faster than there."""
     world = StillWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
     entry = world.entry("co2")
@@ -121,23 +121,23 @@ def meter(tmp_path: Path) -> Iterator[Bench]:
         options={"faults": str(tmp_path / "co2.toml")},
     )
     instrument = RoomDevice(world.driver(entry), entry, None)
-    bench = Bench(tmp_path, driver=instrument, kind=entry.robot_type())  # type: ignore[arg-type]  # no toy
-    bench.device.start()
-    bench.device.link_changed(True)
-    yield bench
-    bench.stop()
+    harness = DeviceHarness(tmp_path, driver=instrument, kind=entry.robot_type())  # type: ignore[arg-type]  # no toy
+    harness.device.start()
+    harness.device.link_changed(True)
+    yield harness
+    harness.stop()
 
 
 @pytest.mark.parametrize("ailment", ["silent", "stuck"])
 def test_a_sensor_made_silent_or_stuck_raises_a_fault_in_the_state_and_in_the_cloud(
-    cloud: Cloud, meter: Bench, tmp_path: Path, ailment: str
+    cloud: Cloud, meter: DeviceHarness, tmp_path: Path, ailment: str
 ) -> None:
     anna = cloud.sign_in("anna")
     with cloud.robot("arm") as robot:
         claim(anna, robot, msgspec.structs.replace(room.load(LAB).devices[0], name="arm"))
 
         def tell() -> State:
-            """The bench's newest state, which it tells once a second at most, also to the cloud."""
+            """The harness's newest state, which it tells once a second at most, also to the cloud."""
             state: State = meter.heard(topics.STATE, State)[-1]
             cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), codec.encode(state)))
             return state

@@ -13,7 +13,7 @@ from device_agent.config.catalogue import TYPES
 from device_agent.protocol import AckStatus
 from device_agent.protocol.manifests.shipped import ROBOTS
 from function_app.services.robot_types.script_linter import check_script
-from tests.harness.agent.device_harness import Bench
+from tests.harness.agent.device_harness import DeviceHarness
 from tests.harness.paths import ROOT
 
 UR5 = ROBOTS / "ur5"
@@ -23,17 +23,17 @@ TELLS = "\nimport json\nprint(json.dumps(robot.state()['position_rad']))\n"
 
 
 @pytest.fixture
-def arm(tmp_path: Path) -> Iterator[Bench]:
+def arm(tmp_path: Path) -> Iterator[DeviceHarness]:
     kind = TYPES.load("ur5")
     driver = drivers.load(kind.driver)(kind, UR5, {}, "arm")
-    bench = Bench(tmp_path, driver=driver, kind=kind, geometry=geometry.load(kind, UR5))  # type: ignore[arg-type]
-    bench.device.start()
-    bench.device.link_changed(True)
-    yield bench
-    bench.stop()
+    harness = DeviceHarness(tmp_path, driver=driver, kind=kind, geometry=geometry.load(kind, UR5))  # type: ignore[arg-type]
+    harness.device.start()
+    harness.device.link_changed(True)
+    yield harness
+    harness.stop()
 
 
-def test_a_frame_goes_where_it_is_sent(arm: Bench) -> None:
+def test_a_frame_goes_where_it_is_sent(arm: DeviceHarness) -> None:
     source = (
         "import json\n"
         "robot.home(speed=1)\n"
@@ -64,13 +64,13 @@ def test_a_frame_goes_where_it_is_sent(arm: Bench) -> None:
         ("robot.look((1, 0, 0))", "this robot has no look"),
     ],
 )
-def test_what_the_arm_cannot_or_may_not_do_is_refused(arm: Bench, call: str, says: str) -> None:
+def test_what_the_arm_cannot_or_may_not_do_is_refused(arm: DeviceHarness, call: str, says: str) -> None:
     reason = arm.end(arm.command(arm.script(call), epoch=1)).reason
     assert reason is not None
     assert says in reason.message
 
 
-def test_what_the_keyframe_editor_writes_is_good_and_is_played(arm: Bench) -> None:
+def test_what_the_keyframe_editor_writes_is_good_and_is_played(arm: DeviceHarness) -> None:
     source = WRITTEN.read_text()
     assert check_script(source, TYPES.load("ur5")).marks == ()
     order = msgspec.structs.replace(arm.script(source + TELLS), parameters={"speed": 2})

@@ -35,7 +35,7 @@ from device_agent.protocol import (
 )
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.security import signing
-from tests.harness.agent.pinned_keys import pins_of
+from tests.harness.agent.pinned_keys import pinned_keys_of
 
 SPACE, AGENT = "space", "agent"
 FAR = {"joint_1": 3.0}
@@ -52,7 +52,7 @@ class Bench:
         self.robot = SwarmRobot(
             (SPACE, AGENT),
             Shape(robot_type("swarm-arm", 2, rate_hz)),
-            pins=pins_of(self.key),
+            pins=pinned_keys_of(self.key),
             cloud_ms=lambda: self.cloud_ms,
             say=self.say,
             now_s=self.now_s,

@@ -11,14 +11,14 @@ from device_agent.runtime.agent import Agent
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.storage.outbox_store import OutboxStore
 from device_agent.runtime.telemetry.outbox import Outbox
-from tests.harness.agent.device_harness import Bench, eventually
+from tests.harness.agent.device_harness import DeviceHarness, eventually
 
 
 class ToyLink:
     """A link that the test moves by hand."""
 
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+    def __init__(self, harness: DeviceHarness) -> None:
+        self._bench = harness
         self.held_first = False
         self.stopped = 0
 
@@ -34,24 +34,26 @@ class ToyLink:
 
 
 class Whole:
-    def __init__(self, bench: Bench, folder: Path) -> None:
-        self.bench = bench
-        self.link = ToyLink(bench)
+    def __init__(self, harness: DeviceHarness, folder: Path) -> None:
+        self.harness = harness
+        self.link = ToyLink(harness)
         self.room = ReadingCache(space="s", agent="a", own=["arm"], named=[("other-pir", "presence")])
         shelf = OutboxStore(folder / "whole.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
-        self.outbox = Outbox(shelf, publish=bench.publish, device_topic="ts/v1/s/a/arm")
-        self.agent = Agent({"arm": bench.device}, self.link, outbox=self.outbox, readings=self.room, address=("s", "a"))
+        self.outbox = Outbox(shelf, publish=harness.publish, device_topic="ts/v1/s/a/arm")
+        self.agent = Agent(
+            {"arm": harness.device}, self.link, outbox=self.outbox, readings=self.room, address=("s", "a")
+        )
 
 
 @pytest.fixture
 def whole(tmp_path: Path):
-    whole = Whole(Bench(tmp_path), tmp_path)
+    whole = Whole(DeviceHarness(tmp_path), tmp_path)
     whole.agent.start()
     whole.link.link_changed(True)
     yield whole
     whole.agent.stop()
-    whole.bench.outbox.stop()
-    whole.bench.journal.close()
+    whole.harness.outbox.stop()
+    whole.harness.journal.close()
 
 
 def test_a_device_holds_before_anybody_can_speak_to_it(whole: Whole) -> None:
@@ -61,13 +63,13 @@ def test_a_device_holds_before_anybody_can_speak_to_it(whole: Whole) -> None:
 
 def test_what_arrives_reaches_its_device(whole: Whole) -> None:
     whole.link.receive("ts/v1/s/a/arm/stop", codec.encode(Stop(id="s1", caller="bob")))
-    eventually(lambda: whole.bench.telemetry().mode is Mode.STOPPED)
+    eventually(lambda: whole.harness.telemetry().mode is Mode.STOPPED)
 
 
 @pytest.mark.parametrize("topic", ["ts/v1/s/a/leg/stop", "ts/v2/s/a/arm/stop", "$SYS", "", "ts/v1/x/y/arm/stop"])
 def test_what_is_for_nobody_here_harms_nothing(whole: Whole, topic: str) -> None:
     whole.link.receive(topic, codec.encode(Stop(id="s1", caller="bob")))
-    assert whole.bench.telemetry().mode is Mode.IDLE
+    assert whole.harness.telemetry().mode is Mode.IDLE
 
 
 def test_what_others_of_the_space_measure_goes_to_the_room(whole: Whole) -> None:
@@ -80,11 +82,11 @@ def test_what_others_of_the_space_measure_goes_to_the_room(whole: Whole) -> None
 
 
 def test_a_lost_link_is_told_to_every_device(whole: Whole) -> None:
-    running = whole.bench.command(whole.bench.script("wait(600)"), epoch=1)
-    eventually(lambda: whole.bench.acks(running)[1:])
+    running = whole.harness.command(whole.harness.script("wait(600)"), epoch=1)
+    eventually(lambda: whole.harness.acks(running)[1:])
     assert not whole.agent.quiet
     whole.link.link_changed(False)
-    reason = whole.bench.end(running).reason
+    reason = whole.harness.end(running).reason
     assert reason is not None
     assert reason.code == "link_lost"
 

@@ -34,44 +34,44 @@ from device_agent.protocol import (
 from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
 from device_agent.runtime.control.controller import Controller
-from tests.harness.agent.device_harness import WITHIN_S, Bench, eventually, shown
+from tests.harness.agent.device_harness import WITHIN_S, DeviceHarness, eventually, shown
 
 
 @pytest.fixture
-def bench(tmp_path: Path):
-    bench = Bench(tmp_path)
-    bench.device.start()
-    bench.device.link_changed(True)
-    yield bench
-    bench.stop()
+def harness(tmp_path: Path):
+    harness = DeviceHarness(tmp_path)
+    harness.device.start()
+    harness.device.link_changed(True)
+    yield harness
+    harness.stop()
 
 
-def test_it_introduces_itself_when_the_link_comes_up(bench: Bench) -> None:
-    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
+def test_it_introduces_itself_when_the_link_comes_up(harness: DeviceHarness) -> None:
+    described: Description = eventually(lambda: harness.heard(topics.DESC, Description))[0]
     assert [joint.name for joint in described.joints] == ["shoulder", "elbow"]
-    state: State = eventually(lambda: bench.heard(topics.STATE, State))[0]
+    state: State = eventually(lambda: harness.heard(topics.STATE, State))[0]
     assert state.mode is Mode.IDLE
-    assert bench.telemetry().position_rad == (0.0, 0.0)
+    assert harness.telemetry().position_rad == (0.0, 0.0)
 
 
-def test_an_action_is_accepted_started_and_done_in_this_order(bench: Bench) -> None:
-    ack = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}, speed=1.0), epoch=1))
+def test_an_action_is_accepted_started_and_done_in_this_order(harness: DeviceHarness) -> None:
+    ack = harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.2}, speed=1.0), epoch=1))
     assert ack.status is AckStatus.DONE
     assert ack.result["position_rad"]["elbow"] == pytest.approx(0.2, abs=1e-3)
-    acks = bench.acks(ack.id)
+    acks = harness.acks(ack.id)
     assert [ack.status for ack in acks] == [AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE]
     assert [ack.sequence for ack in acks] == sorted({ack.sequence for ack in acks})
-    assert bench.driver.position[1] == pytest.approx(0.2, abs=1e-3)
+    assert harness.driver.position[1] == pytest.approx(0.2, abs=1e-3)
 
 
-def test_a_command_runs_once_however_often_it_arrives(bench: Bench) -> None:
+def test_a_command_runs_once_however_often_it_arrives(harness: DeviceHarness) -> None:
     move = MoveJoints(position_rad={"elbow": 0.2}, speed=1.0)
-    first = bench.end(bench.command(move, epoch=1, command_id="same"))
-    bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.0}, speed=1.0), epoch=1))
-    bench.command(move, epoch=1, command_id="same")
-    eventually(lambda: len(bench.acks("same")) == 4)
-    assert bench.acks("same")[-1] == first
-    assert bench.driver.position[1] == pytest.approx(0.0, abs=1e-3)
+    first = harness.end(harness.command(move, epoch=1, command_id="same"))
+    harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.0}, speed=1.0), epoch=1))
+    harness.command(move, epoch=1, command_id="same")
+    eventually(lambda: len(harness.acks("same")) == 4)
+    assert harness.acks("same")[-1] == first
+    assert harness.driver.position[1] == pytest.approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -82,75 +82,75 @@ def test_a_command_runs_once_however_often_it_arrives(bench: Bench) -> None:
     ],
 )
 def test_a_command_out_of_its_time_does_not_run(
-    bench: Bench, changes: dict[str, Any], code: str, status: AckStatus
+    harness: DeviceHarness, changes: dict[str, Any], code: str, status: AckStatus
 ) -> None:
-    ack = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1, **changes))
+    ack = harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1, **changes))
     assert (ack.status, ack.reason and ack.reason.code) == (status, code)
-    assert bench.driver.position == (0.0, 0.0)
+    assert harness.driver.position == (0.0, 0.0)
 
 
-def test_without_the_clouds_time_nothing_that_moves_is_obeyed(bench: Bench) -> None:
-    bench.clock.__init__()  # type: ignore[misc]
-    ack = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1))
+def test_without_the_clouds_time_nothing_that_moves_is_obeyed(harness: DeviceHarness) -> None:
+    harness.clock.__init__()  # type: ignore[misc]
+    ack = harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1))
     assert ack.reason is not None
     assert ack.reason.code == "no_clock"
 
 
 @pytest.mark.parametrize("changes", [{"space": "x"}, {"agent": "x"}, {"device": "x"}])
-def test_a_command_for_somebody_else_is_not_even_answered(bench: Bench, changes: dict[str, str]) -> None:
-    foreign = bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1, **changes)
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=5000), epoch=1))
-    assert bench.acks(foreign) == []
-    assert bench.device.publisher.rejections == {"wrong_address": 1}
+def test_a_command_for_somebody_else_is_not_even_answered(harness: DeviceHarness, changes: dict[str, str]) -> None:
+    foreign = harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1, **changes)
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=5000), epoch=1))
+    assert harness.acks(foreign) == []
+    assert harness.device.publisher.rejections == {"wrong_address": 1}
 
 
-def test_what_the_cloud_did_not_sign_is_not_obeyed(bench: Bench) -> None:
-    bench.key = signing.generate()
-    bench.command(GrantLease(holder="eve", lease_ms=5000), epoch=9)
-    bench.receive(topics.CMD, b"{}")
-    eventually(lambda: bench.device.publisher.rejections == {"bad_signature": 1, "malformed": 1})
-    assert bench.heard(topics.ACK, Ack) == []
+def test_what_the_cloud_did_not_sign_is_not_obeyed(harness: DeviceHarness) -> None:
+    harness.key = signing.generate()
+    harness.command(GrantLease(holder="eve", lease_ms=5000), epoch=9)
+    harness.receive(topics.CMD, b"{}")
+    eventually(lambda: harness.device.publisher.rejections == {"bad_signature": 1, "malformed": 1})
+    assert harness.heard(topics.ACK, Ack) == []
 
 
-def test_streaming_needs_the_lease_and_moves_the_device(bench: Bench) -> None:
-    bench.setpoint(1, 1)
-    assert bench.device.publisher.rejections == {"no_lease": 1}
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
+def test_streaming_needs_the_lease_and_moves_the_device(harness: DeviceHarness) -> None:
+    harness.setpoint(1, 1)
+    assert harness.device.publisher.rejections == {"no_lease": 1}
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
     for sequence in range(1, 40):
-        bench.setpoint(1, sequence)
+        harness.setpoint(1, sequence)
         time.sleep(0.02)
-    assert bench.driver.position[1] > 0.1
-    assert bench.telemetry().epoch == 1
-    assert bench.telemetry().setpoint_sequence > 1
-    state: State = eventually(lambda: [s for s in bench.heard(topics.STATE, State) if s.lease])[-1]
+    assert harness.driver.position[1] > 0.1
+    assert harness.telemetry().epoch == 1
+    assert harness.telemetry().setpoint_sequence > 1
+    state: State = eventually(lambda: [s for s in harness.heard(topics.STATE, State) if s.lease])[-1]
     assert state.lease is not None
     assert state.lease.holder == "ann"
 
 
-def test_an_epoch_in_the_topic_that_differs_from_the_message_is_refused(bench: Bench) -> None:
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=2))
+def test_an_epoch_in_the_topic_that_differs_from_the_message_is_refused(harness: DeviceHarness) -> None:
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000), epoch=2))
     setpoint = Setpoint(
         epoch=2, sequence=1, echo_tick_ms=tick_ms(), sent_ms=0, target=JointTarget(position_rad={"elbow": 1})
     )
-    bench.receive(topics.CTL, codec.encode(setpoint), "1")
-    assert bench.device.publisher.rejections == {"no_lease": 1}
+    harness.receive(topics.CTL, codec.encode(setpoint), "1")
+    assert harness.device.publisher.rejections == {"no_lease": 1}
 
 
-def test_stop_needs_no_lease_and_survives_a_restart(bench: Bench, tmp_path: Path) -> None:
-    running = bench.command(bench.script("wait(600)"), epoch=1)
-    eventually(lambda: [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED])
-    bench.receive(topics.STOP, codec.encode(Stop(id="s1", caller="bob", reason="smoke")))
-    ack = bench.end(running)
+def test_stop_needs_no_lease_and_survives_a_restart(harness: DeviceHarness, tmp_path: Path) -> None:
+    running = harness.command(harness.script("wait(600)"), epoch=1)
+    eventually(lambda: [ack for ack in harness.acks(running) if ack.status is AckStatus.STARTED])
+    harness.receive(topics.STOP, codec.encode(Stop(id="s1", caller="bob", reason="smoke")))
+    ack = harness.end(running)
     assert ack.status is AckStatus.FAILED
     assert ack.reason is not None
     assert ack.reason.code == "stopped"
-    state = shown(bench, lambda state: state.mode is Mode.STOPPED)
+    state = shown(harness, lambda state: state.mode is Mode.STOPPED)
     assert state.stop is not None
     assert state.stop.caller == "bob"
-    refused = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=2))
+    refused = harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=2))
     assert refused.reason is not None
     assert refused.reason.code == "stopped"
-    again = Bench(tmp_path)
+    again = DeviceHarness(tmp_path)
     again.device.start()
     eventually(lambda: again.telemetry().mode is Mode.STOPPED)
     again.end(again.command(ResetStop(), epoch=3))
@@ -158,13 +158,13 @@ def test_stop_needs_no_lease_and_survives_a_restart(bench: Bench, tmp_path: Path
     again.stop()
 
 
-def test_a_signed_stop_is_obeyed_however_late(bench: Bench) -> None:
-    ack = bench.end(bench.command(StopDevice(reason="late"), issued_at_ms=1))
+def test_a_signed_stop_is_obeyed_however_late(harness: DeviceHarness) -> None:
+    ack = harness.end(harness.command(StopDevice(reason="late"), issued_at_ms=1))
     assert ack.status is AckStatus.DONE
-    eventually(lambda: bench.telemetry().mode is Mode.STOPPED)
+    eventually(lambda: harness.telemetry().mode is Mode.STOPPED)
 
 
-def test_it_follows_to_the_clouds_new_key_when_told_by_the_one_it_has_pinned(bench: Bench) -> None:
+def test_it_follows_to_the_clouds_new_key_when_told_by_the_one_it_has_pinned(harness: DeviceHarness) -> None:
     new = signing.generate()
 
     def statement(by: Ed25519PrivateKey, of: Ed25519PrivateKey = new, serial: int = 2) -> str:
@@ -172,87 +172,87 @@ def test_it_follows_to_the_clouds_new_key_when_told_by_the_one_it_has_pinned(ben
         told = NewKey(serial=serial, key=key, former_until_ms=wall_ms() + 60_000)
         return signing.sign(codec.encode(told), by, context=KEYS_CONTEXT).decode()
 
-    refused = bench.end(bench.command(RotateKey(statements=(statement(new),))))
+    refused = harness.end(harness.command(RotateKey(statements=(statement(new),))))
     assert refused.reason is not None
     assert refused.reason.code == "bad_signature"
-    # The bench's pins know no time of the cloud, and without it no key is taken up.
-    later = bench.end(bench.command(RotateKey(statements=(statement(bench.key),))))
+    # The harness's pins know no time of the cloud, and without it no key is taken up.
+    later = harness.end(harness.command(RotateKey(statements=(statement(harness.key),))))
     assert later.reason is not None
     assert later.reason.code == "no_clock"
-    known = statement(bench.key, of=bench.key, serial=1)
-    assert bench.end(bench.command(RotateKey(statements=(known,)))).status is AckStatus.DONE
+    known = statement(harness.key, of=harness.key, serial=1)
+    assert harness.end(harness.command(RotateKey(statements=(known,)))).status is AckStatus.DONE
 
 
-def test_a_second_action_is_refused_while_one_runs_and_the_first_can_be_cancelled(bench: Bench) -> None:
-    first = bench.command(bench.script("print('hello')\nwait(600)"), epoch=1)
-    eventually(lambda: [ack for ack in bench.acks(first) if ack.status is AckStatus.STARTED])
-    second = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1))
+def test_a_second_action_is_refused_while_one_runs_and_the_first_can_be_cancelled(harness: DeviceHarness) -> None:
+    first = harness.command(harness.script("print('hello')\nwait(600)"), epoch=1)
+    eventually(lambda: [ack for ack in harness.acks(first) if ack.status is AckStatus.STARTED])
+    second = harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1))
     assert second.reason is not None
     assert second.reason.code == "busy"
-    eventually(lambda: [ack for ack in bench.acks(first) if "hello" in ack.output])
-    assert bench.end(bench.command(CancelAction(action="nobody"))).status is AckStatus.FAILED
-    assert bench.end(bench.command(CancelAction(action=first))).status is AckStatus.DONE
-    cancelled = bench.end(first)
+    eventually(lambda: [ack for ack in harness.acks(first) if "hello" in ack.output])
+    assert harness.end(harness.command(CancelAction(action="nobody"))).status is AckStatus.FAILED
+    assert harness.end(harness.command(CancelAction(action=first))).status is AckStatus.DONE
+    cancelled = harness.end(first)
     assert cancelled.status is AckStatus.CANCELLED
     assert cancelled.output == "hello\n"
-    assert bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=1)).status is AckStatus.DONE
+    assert harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=1)).status is AckStatus.DONE
 
 
-def test_a_script_with_another_hash_or_of_another_robot_does_not_run(bench: Bench) -> None:
-    good = bench.script("print(1)")
+def test_a_script_with_another_hash_or_of_another_robot_does_not_run(harness: DeviceHarness) -> None:
+    good = harness.script("print(1)")
     forged = msgspec.structs.replace(good, source="print(2)")
     other = msgspec.structs.replace(good, robot_type="nao")
     codes = []
     for order in (forged, other):
-        reason = bench.end(bench.command(order, epoch=1)).reason
+        reason = harness.end(harness.command(order, epoch=1)).reason
         codes.append(reason and reason.code)
     assert codes == ["wrong_hash", "wrong_type"]
 
 
-def test_the_release_of_a_lease_ends_its_action(bench: Bench) -> None:
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
-    running = bench.command(bench.script("wait(600)"), epoch=1)
-    eventually(lambda: [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED])
-    bench.end(bench.command(ReleaseLease(), epoch=1))
-    reason = bench.end(running).reason
+def test_the_release_of_a_lease_ends_its_action(harness: DeviceHarness) -> None:
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
+    running = harness.command(harness.script("wait(600)"), epoch=1)
+    eventually(lambda: [ack for ack in harness.acks(running) if ack.status is AckStatus.STARTED])
+    harness.end(harness.command(ReleaseLease(), epoch=1))
+    reason = harness.end(running).reason
     assert reason is not None
     assert reason.code == "lease_lost"
 
 
-def test_a_lost_link_ends_what_runs_and_the_answer_is_sent_when_it_is_back(bench: Bench) -> None:
-    running = bench.command(bench.script("wait(600)"), epoch=1)
-    eventually(lambda: [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED])
+def test_a_lost_link_ends_what_runs_and_the_answer_is_sent_when_it_is_back(harness: DeviceHarness) -> None:
+    running = harness.command(harness.script("wait(600)"), epoch=1)
+    eventually(lambda: [ack for ack in harness.acks(running) if ack.status is AckStatus.STARTED])
     gone = threading.Event()
 
     def deaf(*_args: Any, **_options: Any) -> bool:
         gone.set()
         return False
 
-    bench.device.publisher._publish = deaf
-    bench.device.link_changed(False)
+    harness.device.publisher._publish = deaf
+    harness.device.link_changed(False)
     assert gone.wait(WITHIN_S)
-    bench.device.publisher._publish = bench.publish
-    bench.device.link_changed(True)
-    reason = bench.end(running).reason
+    harness.device.publisher._publish = harness.publish
+    harness.device.link_changed(True)
+    reason = harness.end(running).reason
     assert reason is not None
     assert reason.code == "link_lost"
 
 
-def test_a_driver_that_stops_answering_is_a_fault_that_ends_when_it_answers(bench: Bench) -> None:
-    bench.driver.broken = True
-    state: State = eventually(lambda: [s for s in bench.heard(topics.STATE, State) if s.faults])[-1]
+def test_a_driver_that_stops_answering_is_a_fault_that_ends_when_it_answers(harness: DeviceHarness) -> None:
+    harness.driver.broken = True
+    state: State = eventually(lambda: [s for s in harness.heard(topics.STATE, State) if s.faults])[-1]
     assert "switched on" in state.faults[0].message
-    refused = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1)).reason
+    refused = harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1)).reason
     assert refused is not None
     assert refused.code == "fault"
-    bench.driver.broken = False
-    eventually(lambda: (s := bench.heard(topics.STATE, State)) and not s[-1].faults)
-    assert bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=1)).status is AckStatus.DONE
+    harness.driver.broken = False
+    eventually(lambda: (s := harness.heard(topics.STATE, State)) and not s[-1].faults)
+    assert harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=1)).status is AckStatus.DONE
 
 
-def test_a_lease_from_before_a_restart_is_not_obeyed(bench: Bench, tmp_path: Path) -> None:
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=4))
-    again = Bench(tmp_path)
+def test_a_lease_from_before_a_restart_is_not_obeyed(harness: DeviceHarness, tmp_path: Path) -> None:
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000), epoch=4))
+    again = DeviceHarness(tmp_path)
     again.device.start()
     ack = again.end(again.command(GrantLease(holder="ann", lease_ms=60_000), epoch=4))
     assert ack.reason is not None
@@ -261,21 +261,23 @@ def test_a_lease_from_before_a_restart_is_not_obeyed(bench: Bench, tmp_path: Pat
     again.stop()
 
 
-def test_garbage_is_counted_and_harms_nothing(bench: Bench) -> None:
+def test_garbage_is_counted_and_harms_nothing(harness: DeviceHarness) -> None:
     for kind in (topics.CTL, topics.STOP, topics.CMD):
         for payload in (b"", b"\x00" * 10, b'{"id":1}', b"NaN"):
-            bench.receive(kind, payload, "1")
-    eventually(lambda: bench.device.publisher.rejections == {"malformed": 12})
-    assert bench.telemetry().mode is Mode.IDLE
+            harness.receive(kind, payload, "1")
+    eventually(lambda: harness.device.publisher.rejections == {"malformed": 12})
+    assert harness.telemetry().mode is Mode.IDLE
 
 
-def test_state_shows_who_asks_for_control_until_that_is_dropped(bench: Bench) -> None:
-    early = bench.end(bench.command(RequestControl(request="r1", requester="bob", answer_within_ms=30_000), epoch=1))
+def test_state_shows_who_asks_for_control_until_that_is_dropped(harness: DeviceHarness) -> None:
+    early = harness.end(
+        harness.command(RequestControl(request="r1", requester="bob", answer_within_ms=30_000), epoch=1)
+    )
     assert early.reason is not None
     assert early.reason.code == "no_lease"
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000, reason="needed in the lab"), epoch=1))
-    bench.end(bench.command(RequestControl(request="r1", requester="bob", answer_within_ms=30_000), epoch=1))
-    lease = shown(bench, lambda state: state.lease and state.lease.request).lease
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000, reason="needed in the lab"), epoch=1))
+    harness.end(harness.command(RequestControl(request="r1", requester="bob", answer_within_ms=30_000), epoch=1))
+    lease = shown(harness, lambda state: state.lease and state.lease.request).lease
     assert lease is not None
     assert lease.request is not None
     assert (lease.holder, lease.reason, lease.request.id, lease.request.requester) == (
@@ -285,74 +287,78 @@ def test_state_shows_who_asks_for_control_until_that_is_dropped(bench: Bench) ->
         "bob",
     )
     assert 0 < lease.request.expires_in_ms <= 30_000
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
-    bench.end(bench.command(WithdrawRequest(request="r1"), epoch=1))
-    lease = shown(bench, lambda state: state.lease and not state.lease.request).lease
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
+    harness.end(harness.command(WithdrawRequest(request="r1"), epoch=1))
+    lease = shown(harness, lambda state: state.lease and not state.lease.request).lease
     assert lease is not None
     assert lease.reason == "needed in the lab", "a renewal does not wipe it out"
 
 
-def test_state_tells_which_leases_will_never_be_obeyed_again(bench: Bench) -> None:
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=4))
-    assert shown(bench, lambda state: state.lease).ended_epoch < 4
-    bench.end(bench.command(ReleaseLease(), epoch=4))
-    assert shown(bench, lambda state: not state.lease).ended_epoch == 4
+def test_state_tells_which_leases_will_never_be_obeyed_again(harness: DeviceHarness) -> None:
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000), epoch=4))
+    assert shown(harness, lambda state: state.lease).ended_epoch < 4
+    harness.end(harness.command(ReleaseLease(), epoch=4))
+    assert shown(harness, lambda state: not state.lease).ended_epoch == 4
 
 
-def test_nothing_gets_past_stop(bench: Bench, tmp_path: Path) -> None:
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
-    bench.end(bench.command(StopDevice(reason="smoke")))
-    bench.end(bench.command(GrantLease(holder="eve", lease_ms=60_000), epoch=2))
-    for order in (MoveJoints(position_rad={"elbow": 0.2}), bench.script("robot.home()")):
-        reason = bench.end(bench.command(order, epoch=2)).reason
+def test_nothing_gets_past_stop(harness: DeviceHarness, tmp_path: Path) -> None:
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
+    harness.end(harness.command(StopDevice(reason="smoke")))
+    harness.end(harness.command(GrantLease(holder="eve", lease_ms=60_000), epoch=2))
+    for order in (MoveJoints(position_rad={"elbow": 0.2}), harness.script("robot.home()")):
+        reason = harness.end(harness.command(order, epoch=2)).reason
         assert reason is not None
         assert reason.code == "stopped"
-    bench.setpoint(2, 1)
-    assert bench.device.publisher.rejections["stopped"] == 3
-    again = Bench(tmp_path)
-    again.key = bench.key
+    harness.setpoint(2, 1)
+    assert harness.device.publisher.rejections["stopped"] == 3
+    again = DeviceHarness(tmp_path)
+    again.key = harness.key
     again.device.start()
     eventually(lambda: again.telemetry().mode is Mode.STOPPED)
     again.stop()
-    assert bench.driver.position == again.driver.position == (0.0, 0.0)
+    assert harness.driver.position == again.driver.position == (0.0, 0.0)
 
 
-def test_a_reset_that_is_played_again_or_comes_late_leaves_a_later_stop_alone(bench: Bench) -> None:
-    bench.end(bench.command(StopDevice()))
-    bench.command(ResetStop(), epoch=3, command_id="reset")
-    bench.end("reset")
-    eventually(lambda: bench.telemetry().mode is not Mode.STOPPED)
-    bench.end(bench.command(StopDevice()))
-    bench.command(ResetStop(), epoch=3, command_id="reset")
-    late = bench.end(bench.command(ResetStop(), epoch=2)).reason
-    again = bench.end(bench.command(ResetStop(), epoch=3)).reason
-    expired = bench.end(bench.command(ResetStop(), epoch=9, issued_at_ms=1)).reason
+def test_a_reset_that_is_played_again_or_comes_late_leaves_a_later_stop_alone(harness: DeviceHarness) -> None:
+    harness.end(harness.command(StopDevice()))
+    harness.command(ResetStop(), epoch=3, command_id="reset")
+    harness.end("reset")
+    eventually(lambda: harness.telemetry().mode is not Mode.STOPPED)
+    harness.end(harness.command(StopDevice()))
+    harness.command(ResetStop(), epoch=3, command_id="reset")
+    late = harness.end(harness.command(ResetStop(), epoch=2)).reason
+    again = harness.end(harness.command(ResetStop(), epoch=3)).reason
+    expired = harness.end(harness.command(ResetStop(), epoch=9, issued_at_ms=1)).reason
     assert [why and why.code for why in (late, again, expired)] == ["stale_epoch", "lease_ended", "expired"]
-    eventually(lambda: bench.telemetry().mode is Mode.STOPPED)
-    assert bench.device._controller.latch is not None
+    eventually(lambda: harness.telemetry().mode is Mode.STOPPED)
+    assert harness.device._controller.latch is not None
 
 
-def test_what_was_ordered_before_a_reset_and_arrives_after_it_does_not_move(bench: Bench) -> None:
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
-    bench.end(bench.command(StopDevice()))
-    bench.end(bench.command(ResetStop(), epoch=3))
+def test_what_was_ordered_before_a_reset_and_arrives_after_it_does_not_move(harness: DeviceHarness) -> None:
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
+    harness.end(harness.command(StopDevice()))
+    harness.end(harness.command(ResetStop(), epoch=3))
     for epoch in (1, 2, 3):
-        reason = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=epoch)).reason
+        reason = harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=epoch)).reason
         assert reason is not None
         assert reason.code in {"stale_epoch", "lease_ended"}
-    assert bench.driver.position == (0.0, 0.0)
-    assert bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=4)).status is AckStatus.DONE
+    assert harness.driver.position == (0.0, 0.0)
+    assert harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=4)).status is AckStatus.DONE
 
 
-def test_a_new_epoch_stands_in_the_journal_before_it_is_obeyed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_epoch_stands_in_the_journal_before_it_is_obeyed(
+    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
+) -> None:
     written: list[int] = []
     grant = Controller.grant
 
     def watched(controller: Controller, **given: Any) -> None:
-        written.append(bench.journal.device("arm").epoch)
+        written.append(harness.journal.device("arm").epoch)
         grant(controller, **given)
 
     monkeypatch.setattr(Controller, "grant", watched)
     for epoch in (4, 4, 7):
-        assert bench.end(bench.command(GrantLease(holder="ann", lease_ms=1000), epoch=epoch)).status is AckStatus.DONE
+        assert (
+            harness.end(harness.command(GrantLease(holder="ann", lease_ms=1000), epoch=epoch)).status is AckStatus.DONE
+        )
     assert written == [4, 4, 7]

@@ -14,63 +14,65 @@ from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.commands import command_processor
 from device_agent.runtime.commands.command_processor import CommandProcessor
 from device_agent.runtime.storage.journal import Journal, JournalError
-from tests.fakes.drivers import ToyDriver
-from tests.harness.agent.device_harness import Bench, eventually
+from tests.fakes.drivers import FakeDriver
+from tests.harness.agent.device_harness import DeviceHarness, eventually
 
 MOVE = MoveJoints(position_rad={"elbow": 0.1}, speed=1.0)
 
 
 @pytest.fixture
-def bench(tmp_path: Path):
-    bench = Bench(tmp_path)
-    bench.device.start()
-    bench.device.link_changed(True)
-    yield bench
-    bench.device.stop()
-    bench.outbox.stop()
-    bench.journal.close()
+def harness(tmp_path: Path):
+    harness = DeviceHarness(tmp_path)
+    harness.device.start()
+    harness.device.link_changed(True)
+    yield harness
+    harness.device.stop()
+    harness.outbox.stop()
+    harness.journal.close()
 
 
 def broken(*_: Any, **__: Any) -> Any:
     raise ZeroDivisionError("a bug")
 
 
-def code(bench: Bench, command: str) -> str:
-    ack = bench.end(command)
+def code(harness: DeviceHarness, command: str) -> str:
+    ack = harness.end(command)
     assert ack.status is AckStatus.FAILED
     assert ack.reason is not None
     return ack.reason.code
 
 
 def test_an_action_that_meets_a_bug_has_failed_and_the_next_one_runs(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(RobotApi, "move_joints", broken)
-    assert code(bench, bench.command(MOVE, epoch=1)) == "internal"
+    assert code(harness, harness.command(MOVE, epoch=1)) == "internal"
     monkeypatch.undo()
-    assert bench.end(bench.command(MOVE, epoch=1)).status is AckStatus.DONE
+    assert harness.end(harness.command(MOVE, epoch=1)).status is AckStatus.DONE
 
 
-def test_a_command_that_meets_a_bug_has_failed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_that_meets_a_bug_has_failed(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CommandProcessor, "_apply", broken)
-    assert code(bench, bench.command(GrantLease(holder="ann", lease_ms=1000), epoch=1)) == "internal"
+    assert code(harness, harness.command(GrantLease(holder="ann", lease_ms=1000), epoch=1)) == "internal"
 
 
-def test_a_command_that_could_not_be_written_down_is_not_obeyed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_that_could_not_be_written_down_is_not_obeyed(
+    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(*_: Any, **__: Any) -> None:
         raise JournalError("is the disk full?")
 
     monkeypatch.setattr(Journal, "save_epoch", full)
-    command = bench.command(MOVE, epoch=7)
-    eventually(lambda: [event for event in bench.heard(topics.EVENT, Event) if "disk" in event.message])
-    assert {ack.status for ack in bench.acks(command)} <= {AckStatus.RECEIVED}
-    assert bench.driver.position == (0.0, 0.0)
+    command = harness.command(MOVE, epoch=7)
+    eventually(lambda: [event for event in harness.heard(topics.EVENT, Event) if "disk" in event.message])
+    assert {ack.status for ack in harness.acks(command)} <= {AckStatus.RECEIVED}
+    assert harness.driver.position == (0.0, 0.0)
     monkeypatch.undo()
 
 
 @pytest.mark.parametrize("what", ["its start cannot be journalled", "the disk does not take it"])
 def test_nothing_moves_where_what_has_come_could_not_be_written(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, what: str
+    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     record = Journal.record
 
@@ -86,13 +88,13 @@ def test_nothing_moves_where_what_has_come_could_not_be_written(
         monkeypatch.setattr(Journal, "record", full)
     else:
         monkeypatch.setattr(os, "fsync", fails)
-    assert code(bench, bench.command(MOVE, epoch=1)) == "internal"
-    assert bench.driver.position == (0.0, 0.0)
+    assert code(harness, harness.command(MOVE, epoch=1)) == "internal"
+    assert harness.driver.position == (0.0, 0.0)
     monkeypatch.undo()
-    assert bench.end(bench.command(MOVE, epoch=1)).status is AckStatus.DONE
+    assert harness.end(harness.command(MOVE, epoch=1)).status is AckStatus.DONE
 
 
-def test_what_else_goes_wrong_does_not_end_the_office(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_else_goes_wrong_does_not_end_the_office(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
     met = threading.Event()
 
     def fail(*_: Any) -> None:
@@ -102,18 +104,18 @@ def test_what_else_goes_wrong_does_not_end_the_office(bench: Bench, monkeypatch:
     monkeypatch.setattr(CommandProcessor, "_snapshot", fail)
     assert met.wait(10)
     monkeypatch.undo()
-    assert bench.end(bench.command(MOVE, epoch=1)).status is AckStatus.DONE
+    assert harness.end(harness.command(MOVE, epoch=1)).status is AckStatus.DONE
 
 
-def test_a_control_loop_that_meets_a_bug_is_a_fault_until_it_runs_again(bench: Bench) -> None:
-    whole = bench.driver.observe
-    bench.driver.observe = broken  # type: ignore[method-assign]
-    eventually(lambda: bench.device._controller.fault == "internal error: a bug")
-    bench.driver.observe = whole  # type: ignore[method-assign]
-    eventually(lambda: bench.telemetry().mode is Mode.IDLE and bench.device._controller.fault is None)
+def test_a_control_loop_that_meets_a_bug_is_a_fault_until_it_runs_again(harness: DeviceHarness) -> None:
+    whole = harness.driver.observe
+    harness.driver.observe = broken  # type: ignore[method-assign]
+    eventually(lambda: harness.device._controller.fault == "internal error: a bug")
+    harness.driver.observe = whole  # type: ignore[method-assign]
+    eventually(lambda: harness.telemetry().mode is Mode.IDLE and harness.device._controller.fault is None)
 
 
-def test_of_too_many_commands_the_last_are_refused(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_too_many_commands_the_last_are_refused(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
     busy, go_on = threading.Event(), threading.Event()
 
     def wait(*_: Any) -> None:
@@ -121,72 +123,72 @@ def test_of_too_many_commands_the_last_are_refused(bench: Bench, monkeypatch: py
         go_on.wait(20)
 
     monkeypatch.setattr(CommandProcessor, "_process", wait)
-    bench.receive(topics.CMD, b"{}")
+    harness.receive(topics.CMD, b"{}")
     assert busy.wait(10)
     for _ in range(command_processor._MAX_WAITING + 3):
-        bench.receive(topics.CMD, b"{}")
-    assert bench.device.publisher.rejections == {"overrun": 3}
+        harness.receive(topics.CMD, b"{}")
+    assert harness.device.publisher.rejections == {"overrun": 3}
     go_on.set()
 
 
-def test_an_agent_that_goes_down_ends_what_runs(bench: Bench) -> None:
-    running = bench.command(bench.script("wait(600)"), epoch=1)
-    eventually(lambda: bench.acks(running)[1:])
-    bench.device.stop()
-    assert code(bench, running) == "agent_stopping"
+def test_an_agent_that_goes_down_ends_what_runs(harness: DeviceHarness) -> None:
+    running = harness.command(harness.script("wait(600)"), epoch=1)
+    eventually(lambda: harness.acks(running)[1:])
+    harness.device.stop()
+    assert code(harness, running) == "agent_stopping"
 
 
-def test_it_comes_to_rest_before_it_goes_down(bench: Bench) -> None:
-    bench.command(MoveJoints(position_rad={"elbow": 2.5}, speed=1.0), epoch=1)
-    eventually(lambda: bench.device._controller.moving)
-    bench.device.stop()
-    assert not bench.device._controller.moving
+def test_it_comes_to_rest_before_it_goes_down(harness: DeviceHarness) -> None:
+    harness.command(MoveJoints(position_rad={"elbow": 2.5}, speed=1.0), epoch=1)
+    eventually(lambda: harness.device._controller.moving)
+    harness.device.stop()
+    assert not harness.device._controller.moving
 
 
 def test_a_device_that_never_started_can_be_stopped(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    bench.device.stop()
-    bench.device.stop()
-    bench.outbox.stop()
-    bench.journal.close()
+    harness = DeviceHarness(tmp_path)
+    harness.device.stop()
+    harness.device.stop()
+    harness.outbox.stop()
+    harness.journal.close()
 
 
-def test_topics_that_a_device_does_not_hear_are_passed_over(bench: Bench) -> None:
-    bench.receive(topics.STATE, b"{}")
-    bench.receive(topics.TELE, b"{}", "joints")
-    assert bench.device.publisher.rejections == {}
+def test_topics_that_a_device_does_not_hear_are_passed_over(harness: DeviceHarness) -> None:
+    harness.receive(topics.STATE, b"{}")
+    harness.receive(topics.TELE, b"{}", "joints")
+    assert harness.device.publisher.rejections == {}
 
 
 def test_a_drawing_is_shown_when_the_driver_knows_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ToyDriver, "twin", lambda _: Twin(device="arm", bodies=()))
-    bench = Bench(tmp_path)
-    bench.device.start()
-    bench.device.link_changed(True)
-    eventually(lambda: bench.heard(topics.DESC, Twin, topics.TWIN))
-    bench.device.stop()
-    bench.outbox.stop()
-    bench.journal.close()
+    monkeypatch.setattr(FakeDriver, "twin", lambda _: Twin(device="arm", bodies=()))
+    harness = DeviceHarness(tmp_path)
+    harness.device.start()
+    harness.device.link_changed(True)
+    eventually(lambda: harness.heard(topics.DESC, Twin, topics.TWIN))
+    harness.device.stop()
+    harness.outbox.stop()
+    harness.journal.close()
 
 
 def test_before_the_first_measurement_there_is_none_to_tell(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    assert bench.device._executor._context.measured() == {}
-    bench.outbox.stop()
-    bench.journal.close()
+    harness = DeviceHarness(tmp_path)
+    assert harness.device._executor._context.measured() == {}
+    harness.outbox.stop()
+    harness.journal.close()
 
 
 def test_a_driver_that_is_not_there_is_named_at_the_start(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    bench.driver.broken = True
+    harness = DeviceHarness(tmp_path)
+    harness.driver.broken = True
     with pytest.raises(DriverError, match="switched on"):
-        bench.device.start()
-    bench.device.stop()
-    bench.outbox.stop()
-    bench.journal.close()
+        harness.device.start()
+    harness.device.stop()
+    harness.outbox.stop()
+    harness.journal.close()
 
 
-def test_a_fault_that_outlives_the_agent_lets_it_go_down(bench: Bench) -> None:
-    bench.driver.broken = True
-    eventually(lambda: bench.device._controller.fault)
-    bench.device.stop()
-    assert isinstance(bench.device._loop.observation, Observation)
+def test_a_fault_that_outlives_the_agent_lets_it_go_down(harness: DeviceHarness) -> None:
+    harness.driver.broken = True
+    eventually(lambda: harness.device._controller.fault)
+    harness.device.stop()
+    assert isinstance(harness.device._loop.observation, Observation)

@@ -44,12 +44,12 @@ from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import gaze
 from device_agent.runtime.readings import ReadingCache
-from tests.fakes.drivers import ToyDriver, robot_type
-from tests.harness.agent.device_harness import Bench, eventually
-from tests.harness.agent.sandbox import LACK, NoJail
+from tests.fakes.drivers import FakeDriver, robot_type
+from tests.harness.agent.device_harness import DeviceHarness, eventually
+from tests.harness.agent.sandbox import LACK, NoSandbox
 
 
-class AbleDriver(ToyDriver):
+class AbleDriver(FakeDriver):
     """Does at once whatever it is asked, and remembers it."""
 
     performs = ("speech", "stiffness", "gaze", "expressions", "behaviours", "postures")
@@ -152,29 +152,29 @@ def able_type() -> RobotType:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(tmp_path, driver=AbleDriver(), kind=able_type(), geometry=Head())
-    bench.device.start()
-    bench.device.link_changed(True)
-    yield bench
-    bench.stop()
+def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
+    harness = DeviceHarness(tmp_path, driver=AbleDriver(), kind=able_type(), geometry=Head())
+    harness.device.start()
+    harness.device.link_changed(True)
+    yield harness
+    harness.stop()
 
 
-def driver_of(bench: Bench) -> AbleDriver:
-    assert isinstance(bench.driver, AbleDriver)
-    return bench.driver
+def driver_of(harness: DeviceHarness) -> AbleDriver:
+    assert isinstance(harness.driver, AbleDriver)
+    return harness.driver
 
 
-def play(bench: Bench, source: str) -> str:
+def play(harness: DeviceHarness, source: str) -> str:
     """What it printed; it must end well."""
-    ack = bench.end(bench.command(bench.script(source), epoch=1))
+    ack = harness.end(harness.command(harness.script(source), epoch=1))
     assert ack.status is AckStatus.DONE, ack.reason
     return ack.output
 
 
-def test_a_robot_that_can_all_of_it_does_all_of_it(bench: Bench) -> None:
+def test_a_robot_that_can_all_of_it_does_all_of_it(harness: DeviceHarness) -> None:
     printed = play(
-        bench,
+        harness,
         "robot.say('hello', language='en')\n"
         "robot.stiffness(0.4, ['elbow'])\n"
         "robot.express('smile', 0.7)\n"
@@ -188,21 +188,21 @@ def test_a_robot_that_can_all_of_it_does_all_of_it(bench: Bench) -> None:
         "state = robot.state()\n"
         "print(round(state['position_rad']['shoulder'], 2), state['mode'], robot.can)\n",
     )
-    assert driver_of(bench).performed == [
+    assert driver_of(harness).performed == [
         Say(text="hello", language="en"),
         SetStiffness(value=0.4, joints=("elbow",)),
         Express(name="smile", strength=0.7),
         TakePosture(name="Sit", speed=0.9),
         RunBehaviour(name="nod"),
     ]
-    assert max(twist.forward_m_s for twist in driver_of(bench).twists) > 0
+    assert max(twist.forward_m_s for twist in driver_of(harness).twists) > 0
     assert printed.startswith(f"{math.pi / 4:.2f} action (")
     assert all(call in printed for call in ("move_to", "look", "say", "drive", "behaviour"))
 
 
-def test_a_frame_goes_straight_to_a_pose_and_says_where_it_cannot(bench: Bench) -> None:
+def test_a_frame_goes_straight_to_a_pose_and_says_where_it_cannot(harness: DeviceHarness) -> None:
     printed = play(
-        bench,
+        harness,
         "robot.move_to((0.1, 0, 0), rpy_rad=(0, 0, 0.6), speed=1, straight=True)\n"
         "print(round(robot.state()['position_rad']['shoulder'], 2))\n"
         "try: robot.move_to((2, 0, 0), straight=True)\n"
@@ -212,19 +212,19 @@ def test_a_frame_goes_straight_to_a_pose_and_says_where_it_cannot(bench: Bench) 
     assert "of the way there: face cannot come nearer than 0.5 m" in printed[1]
 
 
-def test_keyframes_are_played_in_their_time_and_what_takes_longer_is_said(bench: Bench) -> None:
+def test_keyframes_are_played_in_their_time_and_what_takes_longer_is_said(harness: DeviceHarness) -> None:
     keyframes = "{'time_s': 0, 'position_rad': {'elbow': 0.1}}, {'time_s': %s, 'position_rad': {'elbow': 0.3}}"
     begun_s = time.monotonic()
-    play(bench, f"robot.play([{keyframes % 0.8}])")
+    play(harness, f"robot.play([{keyframes % 0.8}])")
     assert time.monotonic() - begun_s >= 0.8
-    assert bench.driver.position[1] == pytest.approx(0.3, abs=1e-3)
-    ack = bench.end(bench.command(bench.script(f"robot.play([{keyframes % 0.001}])"), epoch=1))
+    assert harness.driver.position[1] == pytest.approx(0.3, abs=1e-3)
+    ack = harness.end(harness.command(harness.script(f"robot.play([{keyframes % 0.001}])"), epoch=1))
     assert ack.result["limited"] == ["keyframes: later"]
 
 
 def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    bench.device.start()
+    harness = DeviceHarness(tmp_path)
+    harness.device.start()
     asked = (
         "robot.say('x')",
         "robot.express('x')",
@@ -236,12 +236,12 @@ def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> N
         "robot.move_to((1, 0, 0))",
     )
     lines = "".join(f"try: {call}\nexcept RobotError as error: print(error)\n" for call in asked)
-    printed = play(bench, lines).splitlines()
+    printed = play(harness, lines).splitlines()
     assert [line.split(";")[0] for line in printed] == [
         f"this robot has no {call.removeprefix('robot.').split('(')[0]}" for call in asked
     ]
     assert all(line.endswith("it has move_joints, play, home, state, latest") for line in printed)
-    bench.stop()
+    harness.stop()
 
 
 @pytest.mark.parametrize(
@@ -268,69 +268,69 @@ def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> N
         ("robot.play([{'time_s': 0}, {'time_s': 1}], speed=3)", "speed must be above 0 and at most 2, not 3.0"),
     ],
 )
-def test_what_is_not_done_says_why_and_in_which_line(bench: Bench, call: str, says: str) -> None:
-    ack = bench.end(bench.command(bench.script(f"\n{call}"), epoch=1))
+def test_what_is_not_done_says_why_and_in_which_line(harness: DeviceHarness, call: str, says: str) -> None:
+    ack = harness.end(harness.command(harness.script(f"\n{call}"), epoch=1))
     assert ack.reason is not None
     assert ack.reason.message.startswith("line 2: RobotError: ")
     assert says in ack.reason.message
 
 
-def test_stop_ends_a_skill_and_nothing_more_is_performed(bench: Bench) -> None:
-    running = bench.command(bench.script("robot.behaviour('dance')\nrobot.say('still here')"), epoch=1)
-    eventually(lambda: driver_of(bench).performed)
-    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="smoke")))
-    reason = bench.end(running).reason
+def test_stop_ends_a_skill_and_nothing_more_is_performed(harness: DeviceHarness) -> None:
+    running = harness.command(harness.script("robot.behaviour('dance')\nrobot.say('still here')"), epoch=1)
+    eventually(lambda: driver_of(harness).performed)
+    harness.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="smoke")))
+    reason = harness.end(running).reason
     assert reason is not None
     assert reason.code == "stopped"
-    assert driver_of(bench).interrupted.wait(10)
-    assert driver_of(bench).performed == [RunBehaviour(name="dance")]
+    assert driver_of(harness).interrupted.wait(10)
+    assert driver_of(harness).performed == [RunBehaviour(name="dance")]
 
 
-def test_stop_ends_a_move_of_a_script_and_the_script(bench: Bench) -> None:
-    running = bench.command(bench.script("print('off')\nrobot.move_joints({'elbow': 2.5}, speed=0.05)"), epoch=1)
-    eventually(lambda: bench.driver.position[1] > 1e-4)
-    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="smoke")))
-    reason = bench.end(running).reason
+def test_stop_ends_a_move_of_a_script_and_the_script(harness: DeviceHarness) -> None:
+    running = harness.command(harness.script("print('off')\nrobot.move_joints({'elbow': 2.5}, speed=0.05)"), epoch=1)
+    eventually(lambda: harness.driver.position[1] > 1e-4)
+    harness.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="smoke")))
+    reason = harness.end(running).reason
     assert reason is not None
     assert reason.code == "stopped"
 
 
 @pytest.mark.parametrize("name", ["dance", "sulk"])
-def test_a_cancel_ends_a_skill(bench: Bench, name: str) -> None:
-    running = bench.command(bench.script(f"robot.behaviour('{name}')"), epoch=1)
-    eventually(lambda: driver_of(bench).performed)
-    bench.command(CancelAction(action=running))
-    assert bench.end(running).status is AckStatus.CANCELLED
+def test_a_cancel_ends_a_skill(harness: DeviceHarness, name: str) -> None:
+    running = harness.command(harness.script(f"robot.behaviour('{name}')"), epoch=1)
+    eventually(lambda: driver_of(harness).performed)
+    harness.command(CancelAction(action=running))
+    assert harness.end(running).status is AckStatus.CANCELLED
 
 
-def test_a_script_is_ended_when_its_time_is_over(bench: Bench) -> None:
-    order = msgspec.structs.replace(bench.script("print('begun')\nwait(600)"), timeout_ms=300)
-    ack = bench.end(bench.command(order, epoch=1))
+def test_a_script_is_ended_when_its_time_is_over(harness: DeviceHarness) -> None:
+    order = msgspec.structs.replace(harness.script("print('begun')\nwait(600)"), timeout_ms=300)
+    ack = harness.end(harness.command(order, epoch=1))
     assert ack.reason is not None
     assert (ack.status, ack.reason.code) == (AckStatus.FAILED, "too_long")
     assert "after its 0.3 s" in ack.reason.message
 
 
-def test_progress_and_prints_are_told_while_it_runs(bench: Bench) -> None:
+def test_progress_and_prints_are_told_while_it_runs(harness: DeviceHarness) -> None:
     source = "for i in range(4):\n    progress(i / 4)\n    print('part', i)\n    wait(0.25)\n"
-    running = bench.command(bench.script(source), epoch=1)
-    bench.end(running)
-    told = [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED]
+    running = harness.command(harness.script(source), epoch=1)
+    harness.end(running)
+    told = [ack for ack in harness.acks(running) if ack.status is AckStatus.STARTED]
     assert len({ack.progress for ack in told}) > 2
     assert any("part 0" in ack.output and "part 3" not in ack.output for ack in told)
 
 
-def test_an_older_version_does_not_run_again(bench: Bench) -> None:
-    assert bench.end(bench.command(bench.script("print(2)", version=2), epoch=1)).status is AckStatus.DONE
-    reason = bench.end(bench.command(bench.script("print(1)", version=1), epoch=1)).reason
+def test_an_older_version_does_not_run_again(harness: DeviceHarness) -> None:
+    assert harness.end(harness.command(harness.script("print(2)", version=2), epoch=1)).status is AckStatus.DONE
+    reason = harness.end(harness.command(harness.script("print(1)", version=1), epoch=1)).reason
     assert reason is not None
     assert reason.code == "rolled_back"
 
 
-def test_a_script_of_another_account_runs_behind_bubblewrap(bench: Bench) -> None:
+def test_a_script_of_another_account_runs_behind_bubblewrap(harness: DeviceHarness) -> None:
     source = "import os\nprint(os.getpid())"
-    own = int(bench.end(bench.command(bench.script(source), epoch=1)).output)
-    strange = int(bench.end(bench.command(bench.script(source, author="accountbbbbbbbbb"), epoch=1)).output)
+    own = int(harness.end(harness.command(harness.script(source), epoch=1)).output)
+    strange = int(harness.end(harness.command(harness.script(source, author="accountbbbbbbbbb"), epoch=1)).output)
     parents = [
         int(process) for task in Path("/proc/self/task").glob("*/children") for process in task.read_text().split()
     ]
@@ -338,9 +338,9 @@ def test_a_script_of_another_account_runs_behind_bubblewrap(bench: Bench) -> Non
     assert strange < min(own, *parents), "it does not see process ids of its own"
 
 
-def test_a_move_says_what_limited_it(bench: Bench) -> None:
-    bench.device._controller.restrict("room", 0.2, "somebody is near")
-    ack = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.05}, speed=1.0), epoch=1))
+def test_a_move_says_what_limited_it(harness: DeviceHarness) -> None:
+    harness.device._controller.restrict("room", 0.2, "somebody is near")
+    ack = harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.05}, speed=1.0), epoch=1))
     assert ack.status is AckStatus.DONE
     assert ack.result["limited"] == ["interlock: somebody is near"]
 
@@ -349,28 +349,28 @@ def test_a_move_says_what_limited_it(bench: Bench) -> None:
 def test_where_scripts_cannot_be_locked_in_it_is_said_at_once(
     tmp_path: Path, how: Literal["unavailable", "unconfined"]
 ) -> None:
-    bench = Bench(tmp_path, jail=NoJail(how))
-    bench.device.start()
-    bench.device.link_changed(True)
-    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
+    harness = DeviceHarness(tmp_path, sandbox=NoSandbox(how))
+    harness.device.start()
+    harness.device.link_changed(True)
+    described: Description = eventually(lambda: harness.heard(topics.DESC, Description))[0]
     assert (described.scripts, described.scripts_note) == (how, LACK)
-    eventually(lambda: [event for event in bench.heard(topics.EVENT, Event) if event.kind == f"scripts-{how}"])
-    reason = bench.end(bench.command(bench.script("print(1)"), epoch=1)).reason
+    eventually(lambda: [event for event in harness.heard(topics.EVENT, Event) if event.kind == f"scripts-{how}"])
+    reason = harness.end(harness.command(harness.script("print(1)"), epoch=1)).reason
     assert reason is not None
     assert (reason.code, reason.message) == ("no_sandbox", LACK)
-    bench.stop()
+    harness.stop()
 
 
-def test_where_the_jail_holds_desc_says_so(bench: Bench) -> None:
-    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
+def test_where_the_jail_holds_desc_says_so(harness: DeviceHarness) -> None:
+    described: Description = eventually(lambda: harness.heard(topics.DESC, Description))[0]
     assert (described.scripts, described.scripts_note) == ("sandboxed", "")
 
 
-def test_an_agent_that_is_shut_down_ends_the_script(bench: Bench) -> None:
-    running = bench.command(bench.script("print('here')\nwait(600)"), epoch=1)
-    eventually(lambda: [ack for ack in bench.acks(running) if "here" in ack.output])
-    bench.device._executor.close()
-    reason = bench.end(running).reason
+def test_an_agent_that_is_shut_down_ends_the_script(harness: DeviceHarness) -> None:
+    running = harness.command(harness.script("print('here')\nwait(600)"), epoch=1)
+    eventually(lambda: [ack for ack in harness.acks(running) if "here" in ack.output])
+    harness.device._executor.close()
+    reason = harness.end(running).reason
     assert reason is not None
     assert reason.code == "agent_stopping"
 
@@ -479,12 +479,12 @@ def showing_type() -> RobotType:
 def test_what_the_manifest_says_is_shown_without_a_driver_that_could(
     tmp_path: Path, request_: Express | TakePosture, there: dict[str, float]
 ) -> None:
-    bench = Bench(tmp_path, kind=showing_type())
-    bench.device.start()
-    ack = bench.end(bench.command(request_, epoch=1))
+    harness = DeviceHarness(tmp_path, kind=showing_type())
+    harness.device.start()
+    ack = harness.end(harness.command(request_, epoch=1))
     assert ack.status is AckStatus.DONE, ack.reason
-    assert bench.driver.position == pytest.approx([there["shoulder"], there["elbow"]], abs=2e-4)
-    bench.stop()
+    assert harness.driver.position == pytest.approx([there["shoulder"], there["elbow"]], abs=2e-4)
+    harness.stop()
 
 
 @pytest.mark.parametrize(
@@ -503,15 +503,15 @@ def test_what_the_manifest_says_is_shown_without_a_driver_that_could(
     ],
 )
 def test_an_order_that_the_robot_cannot_do_fails_with_what_it_can(tmp_path: Path, request_: Task, says: str) -> None:
-    bench = Bench(tmp_path, kind=showing_type())
-    bench.device.start()
-    reason = bench.end(bench.command(request_, epoch=1)).reason
+    harness = DeviceHarness(tmp_path, kind=showing_type())
+    harness.device.start()
+    reason = harness.end(harness.command(request_, epoch=1)).reason
     assert reason is not None
     assert says in reason.message
-    bench.stop()
+    harness.stop()
 
 
-def test_orders_reach_the_skills_that_scripts_reach(bench: Bench) -> None:
+def test_orders_reach_the_skills_that_scripts_reach(harness: DeviceHarness) -> None:
     orders: tuple[Task, ...] = (
         Say(text="ahoj", language="sk"),
         SetStiffness(value=0.5, joints=("elbow",)),
@@ -522,11 +522,11 @@ def test_orders_reach_the_skills_that_scripts_reach(bench: Bench) -> None:
         Drive(forward_m_s=0.1, duration_s=0.05),
     )
     for order in orders:
-        ack = bench.end(bench.command(order, epoch=1))
+        ack = harness.end(harness.command(order, epoch=1))
         assert ack.status is AckStatus.DONE, ack.reason
-    assert driver_of(bench).performed == list(orders[:5])
-    assert max(twist.forward_m_s for twist in driver_of(bench).twists) > 0
-    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
+    assert driver_of(harness).performed == list(orders[:5])
+    assert max(twist.forward_m_s for twist in driver_of(harness).twists) > 0
+    described: Description = eventually(lambda: harness.heard(topics.DESC, Description))[0]
     assert described.actions == (
         "move_joints",
         "move_pose",

@@ -18,7 +18,7 @@ from device_agent.protocol import RunMovement
 from device_agent.runtime.actions import script_action
 from device_agent.runtime.actions.script_action import ScriptAction, ScriptFailed, ScriptSandbox
 from device_agent.runtime.errors import Refused
-from tests.harness.agent.sandbox import warm_jail
+from tests.harness.agent.sandbox import warm_sandbox
 
 
 class Notes:
@@ -117,7 +117,7 @@ def order(source: str, parameters: dict[str, Any] | None = None) -> RunMovement:
 def run(source: str, parameters: dict[str, Any] | None = None) -> tuple[Notes, Told]:
     notes, told = Notes(), Told()
     ScriptAction(
-        order(source, parameters), notes, told, sandbox=ScriptSandbox(warm_jail(), untrusted=False), on_exit=nothing
+        order(source, parameters), notes, told, sandbox=ScriptSandbox(warm_sandbox(), untrusted=False), on_exit=nothing
     ).run()
     return notes, told
 
@@ -283,7 +283,7 @@ def test_a_script_is_killed_at_once() -> None:
     told = Told()
     source = "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('here')\nwhile True: pass"
     script = ScriptAction(
-        order(source), Notes(), told, sandbox=ScriptSandbox(warm_jail(), untrusted=False), on_exit=nothing
+        order(source), Notes(), told, sandbox=ScriptSandbox(warm_sandbox(), untrusted=False), on_exit=nothing
     )
     with running(script) as failures:
         while not told.printed:
@@ -306,7 +306,11 @@ def test_a_script_that_dies_in_the_middle_of_a_call_lets_go_of_the_robot_at_once
             raise Refused("ended", "the action ended")
 
     script = ScriptAction(
-        order("robot.home()"), Busy(), Told(), sandbox=ScriptSandbox(warm_jail(), untrusted=False), on_exit=let_go.set
+        order("robot.home()"),
+        Busy(),
+        Told(),
+        sandbox=ScriptSandbox(warm_sandbox(), untrusted=False),
+        on_exit=let_go.set,
     )
     with pytest.raises(ScriptFailed, match="ended before the script did"):
         script.run()
@@ -325,7 +329,7 @@ def test_a_process_that_cannot_be_killed_does_not_hold_up_the_action() -> None:
 def test_a_script_killed_before_it_began_does_not_run() -> None:
     notes = Notes()
     script = ScriptAction(
-        order("robot.home()"), notes, Told(), sandbox=ScriptSandbox(warm_jail(), untrusted=False), on_exit=nothing
+        order("robot.home()"), notes, Told(), sandbox=ScriptSandbox(warm_sandbox(), untrusted=False), on_exit=nothing
     )
     script.kill()
     with pytest.raises(ScriptFailed):

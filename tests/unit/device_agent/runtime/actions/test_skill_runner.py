@@ -32,13 +32,13 @@ from device_agent.runtime.actions.skill_runner import SkillRunner
 from device_agent.runtime.actions.speech_output import SpeechOutput
 from device_agent.runtime.control.joint_stiffness import JointStiffness
 from device_agent.runtime.errors import Refused
-from tests.fakes.drivers import ToyDriver, robot_type
-from tests.harness.agent.device_harness import Bench, eventually
+from tests.fakes.drivers import FakeDriver, robot_type
+from tests.harness.agent.device_harness import DeviceHarness, eventually
 
 WAIT_S = 0.3
 
 
-class Servos(ToyDriver):
+class Servos(FakeDriver):
     """Holds as firmly as it is told; what is limp hangs where somebody puts it."""
 
     performs = ("stiffness",)
@@ -119,37 +119,39 @@ def actor() -> RobotType:
     )
 
 
-def make(folder: Path, **more: Any) -> Bench:
-    bench = Bench(folder, driver=more.pop("driver", None) or Servos(), kind=more.pop("kind", None) or actor(), **more)
-    bench.device.start()
-    bench.device.link_changed(True)
-    return bench
+def make(folder: Path, **more: Any) -> DeviceHarness:
+    harness = DeviceHarness(
+        folder, driver=more.pop("driver", None) or Servos(), kind=more.pop("kind", None) or actor(), **more
+    )
+    harness.device.start()
+    harness.device.link_changed(True)
+    return harness
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    bench = make(tmp_path)
-    yield bench
-    bench.stop()
+def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
+    harness = make(tmp_path)
+    yield harness
+    harness.stop()
 
 
-def servos(bench: Bench) -> Servos:
-    assert isinstance(bench.driver, Servos)
-    return bench.driver
+def servos(harness: DeviceHarness) -> Servos:
+    assert isinstance(harness.driver, Servos)
+    return harness.driver
 
 
-def said(bench: Bench) -> list[Event]:
-    return [event for event in bench.heard(topics.EVENT, Event) if event.kind == "speech-started"]
+def said(harness: DeviceHarness) -> list[Event]:
+    return [event for event in harness.heard(topics.EVENT, Event) if event.kind == "speech-started"]
 
 
-def ends(bench: Bench, request: Any, epoch: int = 1) -> AckStatus:
-    ack = bench.end(bench.command(request, epoch=epoch))
+def ends(harness: DeviceHarness, request: Any, epoch: int = 1) -> AckStatus:
+    ack = harness.end(harness.command(request, epoch=epoch))
     assert ack.status is AckStatus.DONE, ack.reason
     return ack.status
 
 
-def why(bench: Bench, request: Any, epoch: int = 1) -> str:
-    reason = bench.end(bench.command(request, epoch=epoch)).reason
+def why(harness: DeviceHarness, request: Any, epoch: int = 1) -> str:
+    reason = harness.end(harness.command(request, epoch=epoch)).reason
     assert reason is not None
     return reason.message
 
@@ -157,14 +159,14 @@ def why(bench: Bench, request: Any, epoch: int = 1) -> str:
 # ---------------------------------------------------------------- speech
 
 
-def test_what_is_said_is_told_as_text_and_the_mouth_moves(bench: Bench) -> None:
-    ends(bench, Say(text="Aha, mama!", language="sk"))
-    (event,) = eventually(lambda: said(bench))
+def test_what_is_said_is_told_as_text_and_the_mouth_moves(harness: DeviceHarness) -> None:
+    ends(harness, Say(text="Aha, mama!", language="sk"))
+    (event,) = eventually(lambda: said(harness))
     assert (event.message, event.data["language"]) == ("Aha, mama!", "sk")
     assert event.data["duration_s"] == pytest.approx(10 / 14, abs=0.01)
     assert "upload" not in event.data
-    assert max(servos(bench).elbows) > 0.02
-    assert servos(bench).elbows[-1] == pytest.approx(0.0, abs=1e-4)
+    assert max(servos(harness).elbows) > 0.02
+    assert servos(harness).elbows[-1] == pytest.approx(0.0, abs=1e-4)
 
 
 @pytest.mark.parametrize(("how", "upload"), [("", "u1"), ("fails", None), ("hangs", None)])
@@ -172,9 +174,9 @@ def test_with_a_voice_the_sound_is_stored_and_named_if_that_is_done_in_time(
     tmp_path: Path, how: str, upload: str | None
 ) -> None:
     voice, store = Voice(), Store(how)
-    bench = make(tmp_path, speech=voice, uploads=store)
-    ends(bench, Say(text="hello"))
-    (event,) = eventually(lambda: said(bench))
+    harness = make(tmp_path, speech=voice, uploads=store)
+    ends(harness, Say(text="hello"))
+    (event,) = eventually(lambda: said(harness))
     assert event.data.get("upload") == upload
     assert event.data["duration_s"] == 0.2
     assert voice.said == [("hello", "")]
@@ -182,32 +184,32 @@ def test_with_a_voice_the_sound_is_stored_and_named_if_that_is_done_in_time(
         wanted = {"device": "arm", "stream": "speech", "media_type": "audio/wav", "content": b"RIFF"}
         assert wanted.items() <= store.kept[0].items()
     store.ended.set()
-    bench.stop()
+    harness.stop()
 
 
 def test_a_voice_that_fails_leaves_the_text(tmp_path: Path) -> None:
-    bench = make(tmp_path, speech=Voice(broken=True), kind=msgspec.structs.replace(actor(), visemes={}))
-    ends(bench, Say(text="hi"))
-    assert [event.message for event in eventually(lambda: said(bench))] == ["hi"]
-    bench.stop()
+    harness = make(tmp_path, speech=Voice(broken=True), kind=msgspec.structs.replace(actor(), visemes={}))
+    ends(harness, Say(text="hi"))
+    assert [event.message for event in eventually(lambda: said(harness))] == ["hi"]
+    harness.stop()
 
 
 def test_a_voice_without_a_place_for_its_sounds_speaks_all_the_same(tmp_path: Path) -> None:
-    bench = make(tmp_path, speech=Voice())
-    ends(bench, Say(text="hi"))
-    assert [event.message for event in eventually(lambda: said(bench))] == ["hi"]
-    bench.stop()
+    harness = make(tmp_path, speech=Voice())
+    ends(harness, Say(text="hi"))
+    assert [event.message for event in eventually(lambda: said(harness))] == ["hi"]
+    harness.stop()
 
 
 def test_stop_ends_speech_without_a_mouth(tmp_path: Path) -> None:
-    bench = make(tmp_path, kind=msgspec.structs.replace(actor(), visemes={}))
-    running = bench.command(Say(text="a" * 1000), epoch=1)
-    eventually(lambda: said(bench))
-    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
-    reason = bench.end(running).reason
+    harness = make(tmp_path, kind=msgspec.structs.replace(actor(), visemes={}))
+    running = harness.command(Say(text="a" * 1000), epoch=1)
+    eventually(lambda: said(harness))
+    harness.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
+    reason = harness.end(running).reason
     assert reason is not None
     assert reason.code == "stopped"
-    bench.stop()
+    harness.stop()
 
 
 @pytest.mark.parametrize(
@@ -235,26 +237,26 @@ def test_who_stands_around_hears_for_how_long_something_is_said() -> None:
 # ---------------------------------------------------------------- behaviours
 
 
-def test_a_behaviour_moves_and_speaks_in_its_time(bench: Bench) -> None:
+def test_a_behaviour_moves_and_speaks_in_its_time(harness: DeviceHarness) -> None:
     begun_s = time.monotonic()
-    ends(bench, RunBehaviour(name="bow"))
+    ends(harness, RunBehaviour(name="bow"))
     assert time.monotonic() - begun_s >= 0.6
-    assert [event.message for event in eventually(lambda: said(bench))] == ["Good day"]
-    assert bench.driver.position == pytest.approx([0.0, 0.0], abs=1e-3)
+    assert [event.message for event in eventually(lambda: said(harness))] == ["Good day"]
+    assert harness.driver.position == pytest.approx([0.0, 0.0], abs=1e-3)
 
 
-def test_an_unknown_behaviour_is_refused_with_those_there_are(bench: Bench) -> None:
-    assert "no behaviour 'dance'; there are bow, speech" in why(bench, RunBehaviour(name="dance"))
+def test_an_unknown_behaviour_is_refused_with_those_there_are(harness: DeviceHarness) -> None:
+    assert "no behaviour 'dance'; there are bow, speech" in why(harness, RunBehaviour(name="dance"))
 
 
-def test_stop_ends_a_behaviour_before_its_next_words(bench: Bench) -> None:
-    running = bench.command(RunBehaviour(name="speech"), epoch=1)
-    eventually(lambda: said(bench))
-    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
-    reason = bench.end(running).reason
+def test_stop_ends_a_behaviour_before_its_next_words(harness: DeviceHarness) -> None:
+    running = harness.command(RunBehaviour(name="speech"), epoch=1)
+    eventually(lambda: said(harness))
+    harness.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
+    reason = harness.end(running).reason
     assert reason is not None
     assert reason.code == "stopped"
-    assert [event.message for event in said(bench)] == ["so much to say"]
+    assert [event.message for event in said(harness)] == ["so much to say"]
 
 
 class Speaking(Servos):
@@ -274,51 +276,51 @@ class Speaking(Servos):
 
 def test_a_robot_with_a_voice_of_its_own_says_the_words_of_a_behaviour(tmp_path: Path) -> None:
     driver = Speaking()
-    bench = make(tmp_path, driver=driver)
-    ends(bench, RunBehaviour(name="bow"))
+    harness = make(tmp_path, driver=driver)
+    ends(harness, RunBehaviour(name="bow"))
     assert eventually(lambda: driver.heard) == ["Good day"]
-    bench.stop()
+    harness.stop()
 
 
 # ---------------------------------------------------------------- stiffness
 
 
-def test_a_limp_joint_is_followed_and_does_not_jump_when_it_holds_again(bench: Bench) -> None:
-    ends(bench, SetStiffness(value=0.0))
-    assert servos(bench).stiffness == 0.0
-    state: State = eventually(lambda: [one for one in bench.heard(topics.STATE, State) if one.stiffness])[-1]
+def test_a_limp_joint_is_followed_and_does_not_jump_when_it_holds_again(harness: DeviceHarness) -> None:
+    ends(harness, SetStiffness(value=0.0))
+    assert servos(harness).stiffness == 0.0
+    state: State = eventually(lambda: [one for one in harness.heard(topics.STATE, State) if one.stiffness])[-1]
     assert state.stiffness == {"shoulder": 0.0, "elbow": 0.0}
-    bench.driver.position = (0.0, 1.2)
-    eventually(lambda: abs(bench.telemetry().commanded_rad[1] - 1.2) < 1e-6)
-    assert "elbow: compliant" in bench.telemetry().limited
-    assert "elbow: no stiffness; set a stiffness above 0" in why(bench, MoveJoints(position_rad={"elbow": 0.0}))
-    assert "no stiffness" in why(bench, RunBehaviour(name="bow"))
-    ends(bench, SetStiffness(value=0.6, joints=("elbow",)))
+    harness.driver.position = (0.0, 1.2)
+    eventually(lambda: abs(harness.telemetry().commanded_rad[1] - 1.2) < 1e-6)
+    assert "elbow: compliant" in harness.telemetry().limited
+    assert "elbow: no stiffness; set a stiffness above 0" in why(harness, MoveJoints(position_rad={"elbow": 0.0}))
+    assert "no stiffness" in why(harness, RunBehaviour(name="bow"))
+    ends(harness, SetStiffness(value=0.6, joints=("elbow",)))
     time.sleep(WAIT_S)
-    assert bench.driver.position[1] == pytest.approx(1.2)
-    assert servos(bench).jumped < 0.01
+    assert harness.driver.position[1] == pytest.approx(1.2)
+    assert servos(harness).jumped < 0.01
     shown = {"shoulder": 0.0, "elbow": 0.6}
-    assert eventually(lambda: bench.heard(topics.STATE, State)[-1].stiffness == shown)
-    ends(bench, SetStiffness(value=1.0))
-    assert eventually(lambda: bench.heard(topics.STATE, State)[-1].stiffness == {})
-    ends(bench, MoveJoints(position_rad={"elbow": 1.0}, speed=1.0))
+    assert eventually(lambda: harness.heard(topics.STATE, State)[-1].stiffness == shown)
+    ends(harness, SetStiffness(value=1.0))
+    assert eventually(lambda: harness.heard(topics.STATE, State)[-1].stiffness == {})
+    ends(harness, MoveJoints(position_rad={"elbow": 1.0}, speed=1.0))
 
 
-def test_after_an_action_a_setpoint_leaves_the_other_joints_where_they_are(bench: Bench) -> None:
-    bench.end(bench.command(GrantLease(holder="ann", lease_ms=30_000), epoch=1))
-    bench.setpoint(1, 1, elbow=0.2)
-    ends(bench, MoveJoints(position_rad={"shoulder": 0.3}, speed=1.0))
+def test_after_an_action_a_setpoint_leaves_the_other_joints_where_they_are(harness: DeviceHarness) -> None:
+    harness.end(harness.command(GrantLease(holder="ann", lease_ms=30_000), epoch=1))
+    harness.setpoint(1, 1, elbow=0.2)
+    ends(harness, MoveJoints(position_rad={"shoulder": 0.3}, speed=1.0))
     for sequence in range(2, 20):
-        bench.setpoint(1, sequence, elbow=0.1)
+        harness.setpoint(1, sequence, elbow=0.1)
         time.sleep(0.02)
-    assert bench.driver.position[0] == pytest.approx(0.3, abs=1e-3)
+    assert harness.driver.position[0] == pytest.approx(0.3, abs=1e-3)
 
 
-def test_servos_that_do_not_change_are_not_taken_for_limp(bench: Bench) -> None:
-    servos(bench).fails = True
-    assert "the servos do not answer" in why(bench, SetStiffness(value=0.0))
-    assert eventually(lambda: bench.telemetry().limited == ())
-    ends(bench, MoveJoints(position_rad={"elbow": 0.1}, speed=1.0))
+def test_servos_that_do_not_change_are_not_taken_for_limp(harness: DeviceHarness) -> None:
+    servos(harness).fails = True
+    assert "the servos do not answer" in why(harness, SetStiffness(value=0.0))
+    assert eventually(lambda: harness.telemetry().limited == ())
+    ends(harness, MoveJoints(position_rad={"elbow": 0.1}, speed=1.0))
 
 
 @pytest.mark.parametrize(
@@ -328,8 +330,8 @@ def test_servos_that_do_not_change_are_not_taken_for_limp(bench: Bench) -> None:
         ("robot.stiffness(2)", "not a valid message: Expected `float` <= 1.0 - at `$.value`"),
     ],
 )
-def test_a_stiffness_that_is_none_is_refused(bench: Bench, request_: Any, says: str) -> None:
-    assert says in why(bench, bench.script(request_) if isinstance(request_, str) else request_)
+def test_a_stiffness_that_is_none_is_refused(harness: DeviceHarness, request_: Any, says: str) -> None:
+    assert says in why(harness, harness.script(request_) if isinstance(request_, str) else request_)
 
 
 def test_a_limp_joint_beyond_its_range_is_commanded_to_its_end() -> None:

@@ -75,7 +75,7 @@ class TestRule:
         assert rule(below=2).name == "pir/presence present < 2"
 
 
-class Bench:
+class DeviceHarness:
     """Interlocks, the room they watch, and what they did."""
 
     def __init__(self, *rules: InterlockRule) -> None:
@@ -110,49 +110,49 @@ NAME = "pir/presence present = true"
 
 
 def test_a_room_that_is_not_known_yet_holds() -> None:
-    bench = Bench(rule(equals=True))
-    assert bench.step() == [(NAME, 0.0, "no measurement of pir/presence has arrived")]
-    assert bench.step(1.0) == [], "once"
-    assert [happened.kind for happened in bench.told] == [EventKind.INTERLOCK_ENGAGED]
+    harness = DeviceHarness(rule(equals=True))
+    assert harness.step() == [(NAME, 0.0, "no measurement of pir/presence has arrived")]
+    assert harness.step(1.0) == [], "once"
+    assert [happened.kind for happened in harness.told] == [EventKind.INTERLOCK_ENGAGED]
 
 
 def test_presence_slows_absence_frees_and_silence_slows_again() -> None:
-    bench = Bench(rule(equals=True, action="slow", speed=0.25))
-    bench.measure(present=False)
-    assert bench.step() == [(NAME,)]
-    assert bench.told == [], "nothing changed for anybody"
-    bench.measure(present=True)
-    assert bench.step() == [(NAME, 0.25, "present = true")]
-    bench.measure(present=False)
-    assert bench.step() == [(NAME,)]
-    assert bench.step(2.0) == []
-    assert bench.step(0.01) == [(NAME, 0.25, "pir/presence is silent")]
-    bench.measure(present=False)
-    assert bench.step() == [(NAME,)]
-    kinds = [happened.kind for happened in bench.told]
+    harness = DeviceHarness(rule(equals=True, action="slow", speed=0.25))
+    harness.measure(present=False)
+    assert harness.step() == [(NAME,)]
+    assert harness.told == [], "nothing changed for anybody"
+    harness.measure(present=True)
+    assert harness.step() == [(NAME, 0.25, "present = true")]
+    harness.measure(present=False)
+    assert harness.step() == [(NAME,)]
+    assert harness.step(2.0) == []
+    assert harness.step(0.01) == [(NAME, 0.25, "pir/presence is silent")]
+    harness.measure(present=False)
+    assert harness.step() == [(NAME,)]
+    kinds = [happened.kind for happened in harness.told]
     assert kinds == [EventKind.INTERLOCK_ENGAGED, EventKind.INTERLOCK_CLEARED] * 2
-    assert bench.told[0].data == {"interlock": NAME, "action": "slow", "reason": "present = true"}
+    assert harness.told[0].data == {"interlock": NAME, "action": "slow", "reason": "present = true"}
 
 
 def test_each_rule_acts_by_itself() -> None:
-    bench = Bench(rule(field="distance_m", below=2, action="slow"), rule(field="distance_m", below=1))
-    bench.measure(distance_m=1.5)
-    assert bench.step() == [
+    harness = DeviceHarness(rule(field="distance_m", below=2, action="slow"), rule(field="distance_m", below=1))
+    harness.measure(distance_m=1.5)
+    assert harness.step() == [
         ("pir/presence distance_m < 2", 0.2, "distance_m < 2"),
         ("pir/presence distance_m < 1",),
     ]
-    bench.measure(distance_m=0.5)
-    assert bench.step() == [("pir/presence distance_m < 1", 0.0, "distance_m < 1")]
+    harness.measure(distance_m=0.5)
+    assert harness.step() == [("pir/presence distance_m < 1", 0.0, "distance_m < 1")]
 
 
 def test_what_could_not_be_done_is_done_in_the_next_period() -> None:
-    bench = Bench(rule(equals=True))
+    harness = DeviceHarness(rule(equals=True))
 
     def fail(*_: object) -> None:
         raise RuntimeError
 
-    restrict, bench.interlocks._restrict = bench.interlocks._restrict, fail
+    restrict, harness.interlocks._restrict = harness.interlocks._restrict, fail
     with pytest.raises(RuntimeError):
-        bench.step()
-    bench.interlocks._restrict = restrict
-    assert bench.step() != []
+        harness.step()
+    harness.interlocks._restrict = restrict
+    assert harness.step() != []

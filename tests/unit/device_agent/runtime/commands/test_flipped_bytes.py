@@ -9,10 +9,10 @@ from device_agent.protocol.security import signing
 from device_agent.runtime.actions.script_policy import ScriptPolicy
 from device_agent.runtime.errors import Refused
 from tests.harness.agent.device_harness import signed_movement
-from tests.harness.agent.pinned_keys import pins_of
+from tests.harness.agent.pinned_keys import pinned_keys_of
 
 KEY = signing.generate()
-PINS = pins_of(KEY)
+PINS = pinned_keys_of(KEY)
 
 
 def envelope(request: Request) -> bytes:

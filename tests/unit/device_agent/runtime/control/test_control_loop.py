@@ -24,8 +24,8 @@ from device_agent.protocol import (
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.control_loop import ControlLoop
 from device_agent.runtime.control.controller import Controller
-from tests.fakes.drivers import ToyDriver, robot_type
-from tests.harness.agent.device_harness import Bench
+from tests.fakes.drivers import FakeDriver, robot_type
+from tests.harness.agent.device_harness import DeviceHarness
 from tests.harness.network.brokers import SILENCE_S, wait_until
 
 LONG_MS = 600_000
@@ -35,9 +35,9 @@ LONG_MS = 600_000
 class Desk:
     """A toy arm whose control loop runs, and its operator."""
 
-    def __init__(self, driver: ToyDriver | None = None, *, period_ms: int = LONG_MS) -> None:
+    def __init__(self, driver: FakeDriver | None = None, *, period_ms: int = LONG_MS) -> None:
         kind = robot_type(period_ms=period_ms)
-        self.driver = driver or ToyDriver()
+        self.driver = driver or FakeDriver()
         self.controller = Controller(kind, LeaseGate())
         self.told: list[JointTelemetry] = []
         self.loop = ControlLoop(
@@ -85,7 +85,7 @@ def test_a_flood_of_setpoints_makes_one_more_period_and_not_one_each(desk: Desk)
     assert desk.driver.position[1] == pytest.approx(0.5)
 
 
-class PromptDriver(ToyDriver):
+class PromptDriver(FakeDriver):
     """Its loop's thread is not needed: ``threads`` are those that have commanded it."""
 
     prompt = True
@@ -199,29 +199,29 @@ def test_what_goes_wrong_in_a_setpoints_own_period_is_a_fault_until_the_driver_a
         desk.loop.stop()
 
 
-def plainly(bench: Bench) -> None:
-    bench.receive(topics.STOP, codec.encode(Stop(id="s", caller="ann", reason="")))
+def plainly(harness: DeviceHarness) -> None:
+    harness.receive(topics.STOP, codec.encode(Stop(id="s", caller="ann", reason="")))
 
 
-def signed(bench: Bench) -> None:
-    bench.command(StopDevice(reason=""))
+def signed(harness: DeviceHarness) -> None:
+    harness.command(StopDevice(reason=""))
 
 
 @pytest.mark.parametrize("stop", [plainly, signed])
-@pytest.mark.parametrize("driver", [ToyDriver, PromptDriver])
+@pytest.mark.parametrize("driver", [FakeDriver, PromptDriver])
 def test_a_stop_of_a_device_at_rest_waits_for_no_period(
-    tmp_path: Path, driver: type[ToyDriver], stop: Callable[[Bench], object]
+    tmp_path: Path, driver: type[FakeDriver], stop: Callable[[DeviceHarness], object]
 ) -> None:
-    bench = Bench(tmp_path, driver=driver(), kind=robot_type(period_ms=LONG_MS))
-    bench.device.start()
+    harness = DeviceHarness(tmp_path, driver=driver(), kind=robot_type(period_ms=LONG_MS))
+    harness.device.start()
     try:
-        loop = bench.device._loop
+        loop = harness.device._loop
         assert isinstance(loop, ControlLoop)
         wait_until(lambda: loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
-        stop(bench)
-        wait_until(lambda: bench.device._controller.mode is Mode.STOPPED, "the period that obeys")
+        stop(harness)
+        wait_until(lambda: harness.device._controller.mode is Mode.STOPPED, "the period that obeys")
     finally:
-        bench.stop()
+        harness.stop()
 
 
 def test_in_motion_periods_keep_their_length() -> None:

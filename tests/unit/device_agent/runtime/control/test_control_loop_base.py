@@ -10,13 +10,13 @@ from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.control_loop import ControlLoop
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import GoalResult
-from tests.fakes.drivers import BASE, ToyDriver, robot_type
+from tests.fakes.drivers import BASE, FakeDriver, robot_type
 from tests.harness.agent.controller_fixture import lost
 
 WITHIN_S = 60.0
 
 
-class Cart(ToyDriver):
+class Cart(FakeDriver):
     """A toy that drives."""
 
     def __init__(self) -> None:
@@ -53,8 +53,8 @@ def test_the_driver_is_told_the_twist_until_the_drive_has_ended() -> None:
     loop = ControlLoop(kind, cart, controller, name="cart", publish=ignore, check_interlocks=unwatched)
     loop.start()
     try:
-        tenure = controller.reserve(epoch=1, on_revoked=lost)
-        drive = controller.start_drive(tenure, Twist(0.2), duration_s=0.3)
+        reservation = controller.reserve(epoch=1, on_revoked=lost)
+        drive = controller.start_drive(reservation, Twist(0.2), duration_s=0.3)
         assert cart.drove.wait(WITHIN_S)
         assert drive.finished.wait(WITHIN_S)
         assert drive.result is GoalResult.REACHED
@@ -71,8 +71,8 @@ def test_a_drive_that_the_driver_does_not_follow_says_so(cart: Cart, limited: tu
     loop = ControlLoop(kind, cart, controller, name="cart", publish=ignore, check_interlocks=unwatched)
     loop.start()
     try:
-        tenure = controller.reserve(epoch=1, on_revoked=lost)
-        drive = controller.start_drive(tenure, Twist(0.2), duration_s=0.5)
+        reservation = controller.reserve(epoch=1, on_revoked=lost)
+        drive = controller.start_drive(reservation, Twist(0.2), duration_s=0.5)
         assert drive.finished.wait(WITHIN_S)
         assert drive.limited == limited
     finally:
@@ -82,7 +82,7 @@ def test_a_drive_that_the_driver_does_not_follow_says_so(cart: Cart, limited: tu
 def test_a_driver_that_cannot_drive_does_not_start_with_a_type_that_has_a_base() -> None:
     kind = robot_type(BASE)
     loop = ControlLoop(
-        kind, ToyDriver(), Controller(kind, LeaseGate()), name="cart", publish=ignore, check_interlocks=unwatched
+        kind, FakeDriver(), Controller(kind, LeaseGate()), name="cart", publish=ignore, check_interlocks=unwatched
     )
     with pytest.raises(DriverError, match="'cart' has a base, but its driver cannot drive"):
         loop.start()

@@ -6,250 +6,250 @@ from device_agent.protocol import Mode, StopLatch
 from device_agent.runtime.control.goals import GoalResult
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S
-from tests.harness.agent.controller_fixture import Rig, interruptions, lost
+from tests.harness.agent.controller_fixture import ControllerFixture, interruptions, lost
 
 
 def test_streamed_setpoints_move_the_device_and_end_at_the_target() -> None:
-    rig = Rig()
-    rig.take(1)
-    assert rig.stream(1, 3.5) is Mode.STREAMING
-    assert rig.elbow == pytest.approx(2.0, abs=1e-4)
+    fixture = ControllerFixture()
+    fixture.take(1)
+    assert fixture.stream(1, 3.5) is Mode.STREAMING
+    assert fixture.elbow == pytest.approx(2.0, abs=1e-4)
 
 
 def test_velocity_stays_under_the_streaming_share_of_the_limit() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 3.5)
-    assert 1.0 < max(rig.velocities) <= 0.35 * 3.0 + 1e-6
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 3.5)
+    assert 1.0 < max(fixture.velocities) <= 0.35 * 3.0 + 1e-6
 
 
 def test_motion_is_at_rest_within_350_ms_of_the_last_setpoint() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 1.0)
-    assert rig.controller.moving
-    assert rig.at_rest_after(1.0) <= 0.35
-    assert rig.controller.mode is Mode.HOLDING
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 1.0)
+    assert fixture.controller.moving
+    assert fixture.at_rest_after(1.0) <= 0.35
+    assert fixture.controller.mode is Mode.HOLDING
 
 
 def test_after_the_watchdog_nothing_moves_until_control_is_taken_again() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 1.0)
-    rig.run(0.5)
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 1.0)
+    fixture.run(0.5)
     with pytest.raises(Refused) as refused:
-        rig.offer(1)
+        fixture.offer(1)
     assert refused.value.code == "no_lease"
     with pytest.raises(Refused):
-        rig.take(1)
-    rest = rig.elbow
-    rig.run(1.0)
-    assert rig.elbow == rest
-    rig.take(2)
-    rig.stream(2, 0.5)
-    assert rig.elbow > rest
+        fixture.take(1)
+    rest = fixture.elbow
+    fixture.run(1.0)
+    assert fixture.elbow == rest
+    fixture.take(2)
+    fixture.stream(2, 0.5)
+    assert fixture.elbow > rest
 
 
 def test_setpoints_that_end_at_the_target_keep_the_lease() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 3.5)
-    assert rig.run(1.0) is Mode.IDLE
-    lease = rig.controller.lease(rig.now_s)
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 3.5)
+    assert fixture.run(1.0) is Mode.IDLE
+    lease = fixture.controller.lease(fixture.now_s)
     assert lease is not None
     assert lease.epoch == 1
 
 
 @pytest.mark.parametrize("age_ms", [201, 5_000, -1])
 def test_a_setpoint_that_answers_old_or_invented_telemetry_is_refused(age_ms: int) -> None:
-    rig = Rig()
-    rig.take(1)
+    fixture = ControllerFixture()
+    fixture.take(1)
     with pytest.raises(Refused) as refused:
-        rig.offer(1, age_ms=age_ms)
+        fixture.offer(1, age_ms=age_ms)
     assert refused.value.code == "too_old"
-    rig.run(0.2)
-    assert rig.elbow == 0.0
+    fixture.run(0.2)
+    assert fixture.elbow == 0.0
 
 
 def test_an_older_setpoint_that_arrives_late_is_dropped() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.offer(1, sequence=7)
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.offer(1, sequence=7)
     with pytest.raises(Refused) as refused:
-        rig.offer(1, sequence=7)
+        fixture.offer(1, sequence=7)
     assert refused.value.code == "out_of_order"
 
 
 def test_a_setpoint_beyond_the_range_is_clamped_and_says_so() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.offer(1, elbow=9.0)
-    assert rig.controller.update(rig.now_s + PERIOD_S).limited == ("elbow: range",)
-    rig.stream(1, 6.0, elbow=9.0)
-    assert rig.elbow == pytest.approx(3.0, abs=1e-3)
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.offer(1, elbow=9.0)
+    assert fixture.controller.update(fixture.now_s + PERIOD_S).limited == ("elbow: range",)
+    fixture.stream(1, 6.0, elbow=9.0)
+    assert fixture.elbow == pytest.approx(3.0, abs=1e-3)
 
 
 def test_a_newer_lease_fences_the_older() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 0.5)
-    rig.take(2)
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 0.5)
+    fixture.take(2)
     with pytest.raises(Refused):
-        rig.offer(1)
+        fixture.offer(1)
     with pytest.raises(Refused) as refused:
-        rig.take(1)
+        fixture.take(1)
     assert refused.value.code == "stale_epoch"
-    assert rig.at_rest_after(0.5) < 0.2
-    lease = rig.controller.lease(rig.now_s)
+    assert fixture.at_rest_after(0.5) < 0.2
+    lease = fixture.controller.lease(fixture.now_s)
     assert lease is not None
     assert lease.epoch == 2
 
 
 def test_a_lease_that_runs_out_in_mid_motion_is_a_hold() -> None:
-    rig = Rig()
-    rig.take(1, lease_s=0.5)
-    rig.stream(1, 0.48)
-    rig.run(0.3)
-    assert not rig.controller.moving
-    assert rig.controller.mode is Mode.HOLDING
+    fixture = ControllerFixture()
+    fixture.take(1, lease_s=0.5)
+    fixture.stream(1, 0.48)
+    fixture.run(0.3)
+    assert not fixture.controller.moving
+    assert fixture.controller.mode is Mode.HOLDING
     with pytest.raises(Refused):
-        rig.offer(1)
+        fixture.offer(1)
 
 
 def test_stop_latches_and_reset_resumes_nothing() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 1.0)
-    rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    assert rig.at_rest_after(0.5) < 0.2
-    assert rig.controller.mode is Mode.STOPPED
-    rig.take(2)
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 1.0)
+    fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    assert fixture.at_rest_after(0.5) < 0.2
+    assert fixture.controller.mode is Mode.STOPPED
+    fixture.take(2)
     with pytest.raises(Refused) as refused:
-        rig.offer(2)
+        fixture.offer(2)
     assert refused.value.code == "stopped"
-    rest = rig.elbow
-    rig.controller.reset_stop(epoch=3)
-    rig.run(0.5)
-    assert rig.elbow == pytest.approx(rest, abs=1e-9)
+    rest = fixture.elbow
+    fixture.controller.reset_stop(epoch=3)
+    fixture.run(0.5)
+    assert fixture.elbow == pytest.approx(rest, abs=1e-9)
     with pytest.raises(Refused) as refused:
-        rig.offer(2)
+        fixture.offer(2)
     assert refused.value.code == "no_lease", "a lease from before the reset ends with it: its setpoints resume nothing"
-    rig.take(4)
-    rig.stream(4, 0.5)
-    assert rig.elbow != rest
+    fixture.take(4)
+    fixture.stream(4, 0.5)
+    assert fixture.elbow != rest
 
 
 def test_a_reset_that_comes_again_or_late_does_not_release_a_later_stop() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    rig.controller.reset_stop(epoch=3)
-    rig.controller.stop(StopLatch(caller="eve", reason="", at_ms=2))
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    fixture.controller.reset_stop(epoch=3)
+    fixture.controller.stop(StopLatch(caller="eve", reason="", at_ms=2))
     for epoch, code in ((3, "lease_ended"), (2, "stale_epoch"), (0, "stale_epoch")):
         with pytest.raises(Refused) as refused:
-            rig.controller.reset_stop(epoch=epoch)
+            fixture.controller.reset_stop(epoch=epoch)
         assert refused.value.code == code
-    assert rig.controller.latch is not None
-    rig.controller.reset_stop(epoch=4)
-    assert rig.controller.latch is None
+    assert fixture.controller.latch is not None
+    fixture.controller.reset_stop(epoch=4)
+    assert fixture.controller.latch is None
 
 
 def test_what_was_ordered_before_a_reset_is_not_obeyed_after_it() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    rig.controller.reset_stop(epoch=3)
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    fixture.controller.reset_stop(epoch=3)
     for epoch in (1, 2, 3):
         with pytest.raises(Refused) as refused:
-            rig.controller.reserve(epoch=epoch, on_revoked=lambda _: None)
+            fixture.controller.reserve(epoch=epoch, on_revoked=lambda _: None)
         assert refused.value.code in {"stale_epoch", "lease_ended"}
         with pytest.raises(Refused):
-            rig.take(epoch)
+            fixture.take(epoch)
 
 
 def test_the_first_stop_stays_the_one_shown() -> None:
-    rig = Rig()
-    rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    rig.controller.stop(StopLatch(caller="eve", reason="", at_ms=2))
-    assert rig.controller.latch is not None
-    assert rig.controller.latch.caller == "bob"
+    fixture = ControllerFixture()
+    fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    fixture.controller.stop(StopLatch(caller="eve", reason="", at_ms=2))
+    assert fixture.controller.latch is not None
+    assert fixture.controller.latch.caller == "bob"
 
 
 def test_a_move_reaches_its_target_and_says_so() -> None:
-    rig = Rig()
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    move = rig.controller.start_joint_goal(tenure, {"elbow": 1.0}, speed=1.0)
-    rig.run(2.0)
+    fixture = ControllerFixture()
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    move = fixture.controller.start_joint_goal(reservation, {"elbow": 1.0}, speed=1.0)
+    fixture.run(2.0)
     assert move.result is GoalResult.REACHED
-    assert rig.elbow == pytest.approx(1.0, abs=1e-4)
-    rig.controller.end_reservation(tenure)
-    assert rig.run(0.1) is Mode.IDLE
+    assert fixture.elbow == pytest.approx(1.0, abs=1e-4)
+    fixture.controller.end_reservation(reservation)
+    assert fixture.run(0.1) is Mode.IDLE
 
 
 @pytest.mark.parametrize(("position_rad", "code"), [({"elbow": 3.1}, "out_of_range"), ({"knee": 0.0}, "unknown_joint")])
 def test_a_move_that_cannot_be_is_refused_whole(position_rad: dict[str, float], code: str) -> None:
-    rig = Rig()
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    fixture = ControllerFixture()
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.controller.start_joint_goal(tenure, {"shoulder": 1.0} | position_rad, speed=1.0)
+        fixture.controller.start_joint_goal(reservation, {"shoulder": 1.0} | position_rad, speed=1.0)
     assert refused.value.code == code
-    rig.run(0.5)
-    assert not rig.controller.moving
+    fixture.run(0.5)
+    assert not fixture.controller.moving
 
 
 @pytest.mark.parametrize("cause", interruptions())
 def test_an_action_that_loses_the_device_moves_it_no_more(cause: str) -> None:
-    rig = Rig()
+    fixture = ControllerFixture()
     why: list[Refused] = []
-    rig.take(1, lease_s=5.0)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=why.append)
-    move = rig.controller.start_joint_goal(tenure, {"elbow": 2.9}, speed=0.1)
-    rig.run(0.5)
-    interruptions()[cause](rig)  # type: ignore[operator]
-    rig.run(0.3)
+    fixture.take(1, lease_s=5.0)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=why.append)
+    move = fixture.controller.start_joint_goal(reservation, {"elbow": 2.9}, speed=0.1)
+    fixture.run(0.5)
+    interruptions()[cause](fixture)  # type: ignore[operator]
+    fixture.run(0.3)
     assert move.result is GoalResult.INTERRUPTED
     assert len(why) == 1
-    assert not rig.controller.moving
+    assert not fixture.controller.moving
     with pytest.raises(Refused):
-        rig.controller.start_joint_goal(tenure, {"elbow": -1.0}, speed=1.0)
+        fixture.controller.start_joint_goal(reservation, {"elbow": -1.0}, speed=1.0)
 
 
 def test_setpoints_are_refused_while_an_action_runs() -> None:
-    rig = Rig()
-    rig.take(1)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    fixture = ControllerFixture()
+    fixture.take(1)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.offer(1)
+        fixture.offer(1)
     assert refused.value.code == "busy"
     with pytest.raises(Refused):
-        rig.controller.reserve(epoch=1, on_revoked=lost)
-    rig.controller.end_reservation(tenure)
-    rig.offer(1)
+        fixture.controller.reserve(epoch=1, on_revoked=lost)
+    fixture.controller.end_reservation(reservation)
+    fixture.offer(1)
 
 
 def test_epochs_burned_before_a_restart_stay_burned() -> None:
-    rig = Rig(epoch=4, burned=4)
+    fixture = ControllerFixture(epoch=4, burned=4)
     with pytest.raises(Refused):
-        rig.take(4)
-    rig.take(5)
-    rig.offer(5)
+        fixture.take(4)
+    fixture.take(5)
+    fixture.offer(5)
 
 
 def test_losing_the_link_at_rest_keeps_the_lease() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.controller.interrupt(Refused("link_lost", ""))
-    assert rig.controller.lease(rig.now_s) is not None
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.controller.interrupt(Refused("link_lost", ""))
+    assert fixture.controller.lease(fixture.now_s) is not None
 
 
 def test_a_driver_that_fails_again_is_one_fault_and_one_that_never_failed_does_not_recover() -> None:
-    rig = Rig()
-    rig.controller.clear_fault([1.0, 1.0])
-    rig.run(PERIOD_S)
-    assert rig.elbow == 0.0, "a device that is well stays where it is"
-    rig.controller.set_fault("no answer")
-    rig.controller.set_fault("no answer")
-    assert rig.run(PERIOD_S) is Mode.FAULT
-    rig.controller.clear_fault([1.0, 1.0])
-    assert rig.run(PERIOD_S) is Mode.IDLE
-    assert rig.elbow == 1.0
+    fixture = ControllerFixture()
+    fixture.controller.clear_fault([1.0, 1.0])
+    fixture.run(PERIOD_S)
+    assert fixture.elbow == 0.0, "a device that is well stays where it is"
+    fixture.controller.set_fault("no answer")
+    fixture.controller.set_fault("no answer")
+    assert fixture.run(PERIOD_S) is Mode.FAULT
+    fixture.controller.clear_fault([1.0, 1.0])
+    assert fixture.run(PERIOD_S) is Mode.IDLE
+    assert fixture.elbow == 1.0

@@ -12,46 +12,46 @@ from device_agent.runtime.control.goals import DriveGoal, GoalResult
 from device_agent.runtime.control.joint_motion import MotionError
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE, PERIOD_S
-from tests.harness.agent.controller_fixture import Rig, interruptions, lost
+from tests.harness.agent.controller_fixture import ControllerFixture, interruptions, lost
 
 
-def twists(rig: Rig, seconds: float) -> list[Twist]:
+def twists(fixture: ControllerFixture, seconds: float) -> list[Twist]:
     found = []
     for _ in range(round(seconds / PERIOD_S)):
-        rig.now_s += PERIOD_S
-        found.append(rig.controller.update(rig.now_s).twist)
+        fixture.now_s += PERIOD_S
+        found.append(fixture.controller.update(fixture.now_s).twist)
     return found
 
 
-def driving(rig: Rig, duration_s: float = 2.0) -> DriveGoal:
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    return rig.controller.start_drive(tenure, Twist(0.4, 0.0, -0.5), duration_s=duration_s)
+def driving(fixture: ControllerFixture, duration_s: float = 2.0) -> DriveGoal:
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    return fixture.controller.start_drive(reservation, Twist(0.4, 0.0, -0.5), duration_s=duration_s)
 
 
 def test_a_drive_speeds_up_keeps_its_twist_and_ends_by_itself() -> None:
-    rig = Rig(base=BASE)
-    drive = driving(rig)
-    found = twists(rig, 2.0)
+    fixture = ControllerFixture(base=BASE)
+    drive = driving(fixture)
+    found = twists(fixture, 2.0)
     assert not drive.finished.is_set()
     assert found[-1] == pytest.approx(Twist(0.4, 0.0, -0.5))
     gains = [(b.forward_m_s - a.forward_m_s) / PERIOD_S for a, b in pairwise(found)]
     assert max(gains) <= BASE.max_linear_acceleration_m_s2 + 1e-6
-    assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
+    assert twists(fixture, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
     assert drive.result is GoalResult.REACHED
-    assert rig.elbow == 0.0
+    assert fixture.elbow == 0.0
 
 
 @pytest.mark.parametrize("cause", interruptions())
 def test_whatever_takes_the_device_away_brakes_the_base(cause: str) -> None:
-    rig = Rig(base=BASE)
-    rig.take(1, lease_s=5.0)
-    drive = driving(rig, duration_s=50.0)
-    twists(rig, 1.0)
-    assert rig.controller.moving
-    interruptions()[cause](rig)  # type: ignore[operator]
-    assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
+    fixture = ControllerFixture(base=BASE)
+    fixture.take(1, lease_s=5.0)
+    drive = driving(fixture, duration_s=50.0)
+    twists(fixture, 1.0)
+    assert fixture.controller.moving
+    interruptions()[cause](fixture)  # type: ignore[operator]
+    assert twists(fixture, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
     assert drive.result is GoalResult.INTERRUPTED
-    assert not rig.controller.moving
+    assert not fixture.controller.moving
 
 
 def test_a_base_that_is_told_to_go_on_while_it_brakes_does_not_run_backwards() -> None:
@@ -69,26 +69,26 @@ def test_a_base_that_is_told_to_go_on_while_it_brakes_does_not_run_backwards() -
 
 
 def test_a_drive_is_slowed_by_the_room() -> None:
-    rig = Rig(base=BASE)
-    drive = driving(rig)
-    twists(rig, 1.0)
-    rig.controller.restrict("zone", 0.5, "somebody is near")
-    assert twists(rig, 0.8)[-1] == pytest.approx(Twist(0.2, 0.0, -0.25))
+    fixture = ControllerFixture(base=BASE)
+    drive = driving(fixture)
+    twists(fixture, 1.0)
+    fixture.controller.restrict("zone", 0.5, "somebody is near")
+    assert twists(fixture, 0.8)[-1] == pytest.approx(Twist(0.2, 0.0, -0.25))
     assert drive.limited == ("interlock: somebody is near",)
 
 
 def test_a_drive_takes_the_place_of_a_move_and_the_other_way_round() -> None:
-    rig = Rig(base=BASE)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    move = rig.controller.start_joint_goal(tenure, {"elbow": 2.0}, speed=1.0)
-    rig.run(0.3)
-    drive = rig.controller.start_drive(tenure, Twist(0.4), duration_s=5.0)
-    rig.run(0.5)
+    fixture = ControllerFixture(base=BASE)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    move = fixture.controller.start_joint_goal(reservation, {"elbow": 2.0}, speed=1.0)
+    fixture.run(0.3)
+    drive = fixture.controller.start_drive(reservation, Twist(0.4), duration_s=5.0)
+    fixture.run(0.5)
     assert (move.result, move.why and move.why.code) == (GoalResult.INTERRUPTED, "replaced")
-    rig.controller.start_joint_goal(tenure, {"elbow": 0.0}, speed=1.0)
-    rig.run(2.0)
+    fixture.controller.start_joint_goal(reservation, {"elbow": 0.0}, speed=1.0)
+    fixture.run(2.0)
     assert drive.result is GoalResult.INTERRUPTED
-    assert not rig.controller.moving
+    assert not fixture.controller.moving
 
 
 def refusals() -> dict[str, tuple[Twist, float]]:
@@ -104,36 +104,36 @@ def refusals() -> dict[str, tuple[Twist, float]]:
 
 @pytest.mark.parametrize("case", refusals())
 def test_what_cannot_be_driven_is_refused(case: str) -> None:
-    rig = Rig(base=BASE)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    fixture = ControllerFixture(base=BASE)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
     twist, duration_s = refusals()[case]
     with pytest.raises(Refused) as refused:
-        rig.controller.start_drive(tenure, twist, duration_s=duration_s)
+        fixture.controller.start_drive(reservation, twist, duration_s=duration_s)
     assert refused.value.code == case.split(maxsplit=1)[0]
-    assert twists(rig, 0.1)[-1] == REST
+    assert twists(fixture, 0.1)[-1] == REST
 
 
 def test_a_robot_without_a_base_does_not_drive() -> None:
-    rig = Rig()
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    fixture = ControllerFixture()
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.controller.start_drive(tenure, Twist(0.1), duration_s=1.0)
+        fixture.controller.start_drive(reservation, Twist(0.1), duration_s=1.0)
     assert refused.value.code == "no_base"
 
 
 def test_a_driver_that_comes_back_finds_the_base_at_rest() -> None:
-    rig = Rig(base=BASE)
-    driving(rig)
-    twists(rig, 0.5)
-    rig.controller.set_fault("no answer")
-    rig.controller.clear_fault([0.0, 0.0])
-    assert twists(rig, 0.1)[0] == REST
+    fixture = ControllerFixture(base=BASE)
+    driving(fixture)
+    twists(fixture, 0.5)
+    fixture.controller.set_fault("no answer")
+    fixture.controller.clear_fault([0.0, 0.0])
+    assert twists(fixture, 0.1)[0] == REST
 
 
 def test_a_stop_while_nothing_moves_leaves_the_base_at_rest() -> None:
-    rig = Rig(base=BASE)
-    rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    assert twists(rig, 0.1)[-1] == REST
+    fixture = ControllerFixture(base=BASE)
+    fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    assert twists(fixture, 0.1)[-1] == REST
 
 
 def test_a_base_without_a_way_to_go_on_says_so() -> None:
@@ -144,13 +144,13 @@ def test_a_base_without_a_way_to_go_on_says_so() -> None:
 
 
 def test_an_action_may_end_while_it_drives() -> None:
-    rig = Rig(base=BASE)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    drive = rig.controller.start_drive(tenure, Twist(0.4), duration_s=5.0)
-    twists(rig, 0.5)
-    rig.controller.end_reservation(tenure)
-    rig.controller.end_reservation(tenure)
-    assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
+    fixture = ControllerFixture(base=BASE)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    drive = fixture.controller.start_drive(reservation, Twist(0.4), duration_s=5.0)
+    twists(fixture, 0.5)
+    fixture.controller.end_reservation(reservation)
+    fixture.controller.end_reservation(reservation)
+    assert twists(fixture, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
     assert drive.result is GoalResult.INTERRUPTED
 
 

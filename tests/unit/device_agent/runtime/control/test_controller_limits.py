@@ -16,94 +16,94 @@ from device_agent.runtime.control.latency_limiter import LatencyLimiter
 from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S, robot_type
-from tests.harness.agent.controller_fixture import WALL_RAD, Rig, Wall, lost
+from tests.harness.agent.controller_fixture import WALL_RAD, ControllerFixture, Wall, lost
 
 
 def test_a_streamed_arm_stops_before_the_wall_and_says_so() -> None:
-    rig = Rig(geometry=Wall())
-    rig.take(1)
-    assert rig.stream(1, 4.0) is Mode.STREAMING
-    assert WALL_RAD - 0.02 < rig.elbow <= WALL_RAD + 1e-6
-    assert not rig.controller.moving
-    assert "clearance: hand \u2013 wall" in rig.limited
-    rig.stream(1, 1.0, elbow=0.2)
-    assert rig.elbow == pytest.approx(0.2, abs=1e-3)
-    assert rig.controller.update(rig.now_s + PERIOD_S).limited == ()
+    fixture = ControllerFixture(geometry=Wall())
+    fixture.take(1)
+    assert fixture.stream(1, 4.0) is Mode.STREAMING
+    assert WALL_RAD - 0.02 < fixture.elbow <= WALL_RAD + 1e-6
+    assert not fixture.controller.moving
+    assert "clearance: hand \u2013 wall" in fixture.limited
+    fixture.stream(1, 1.0, elbow=0.2)
+    assert fixture.elbow == pytest.approx(0.2, abs=1e-3)
+    assert fixture.controller.update(fixture.now_s + PERIOD_S).limited == ()
 
 
 def test_an_operator_who_pushes_against_the_wall_moves_nothing() -> None:
-    rig = Rig(geometry=Wall())
-    rig.take(1)
-    rig.stream(1, 4.0)
-    rest = rig.elbow
+    fixture = ControllerFixture(geometry=Wall())
+    fixture.take(1)
+    fixture.stream(1, 4.0)
+    rest = fixture.elbow
     for push in range(50):
-        rig.stream(1, 0.05, elbow=1.5 + push * 0.01)
-    assert rig.elbow - rest < 0.01
-    assert rig.elbow <= WALL_RAD + 1e-6
+        fixture.stream(1, 0.05, elbow=1.5 + push * 0.01)
+    assert fixture.elbow - rest < 0.01
+    assert fixture.elbow <= WALL_RAD + 1e-6
 
 
 def test_a_wall_that_is_met_at_full_speed_is_not_touched() -> None:
-    rig = Rig(geometry=Wall(2.0))
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    fixture = ControllerFixture(geometry=Wall(2.0))
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
     wall = Wall(2.0)
-    rig.controller._state.limits._geometry = None  # the target is not looked at: only the way is
-    move = rig.controller.start_joint_goal(tenure, {"elbow": 2.9}, speed=1.0)
-    rig.controller._state.limits._geometry = wall
-    rig.run(3.0)
-    assert 1.9 < rig.elbow <= 2.0
+    fixture.controller._state.limits._geometry = None  # the target is not looked at: only the way is
+    move = fixture.controller.start_joint_goal(reservation, {"elbow": 2.9}, speed=1.0)
+    fixture.controller._state.limits._geometry = wall
+    fixture.run(3.0)
+    assert 1.9 < fixture.elbow <= 2.0
     assert move.result is GoalResult.INTERRUPTED
     assert move.why is not None
     assert (move.why.code, "hand \u2013 wall" in move.why.message) == ("no_room", True)
     assert move.limited == ("clearance: hand \u2013 wall",)
-    assert rig.controller.mode is Mode.ACTION
-    rig.controller.start_joint_goal(tenure, {"elbow": 0.0}, speed=1.0)
-    rig.run(2.5)
-    assert rig.elbow == pytest.approx(0.0, abs=1e-4)
+    assert fixture.controller.mode is Mode.ACTION
+    fixture.controller.start_joint_goal(reservation, {"elbow": 0.0}, speed=1.0)
+    fixture.run(2.5)
+    assert fixture.elbow == pytest.approx(0.0, abs=1e-4)
 
 
 def test_a_move_to_where_there_is_no_room_is_refused_and_says_what_is_there() -> None:
-    rig = Rig(geometry=Wall())
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    fixture = ControllerFixture(geometry=Wall())
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.controller.start_joint_goal(tenure, {"elbow": 1.25}, speed=1.0)
+        fixture.controller.start_joint_goal(reservation, {"elbow": 1.25}, speed=1.0)
     assert refused.value.code == "no_room"
     assert "hand \u2013 wall, 250 mm" in refused.value.message
-    rig.run(0.5)
-    assert rig.elbow == 0.0
+    fixture.run(0.5)
+    assert fixture.elbow == 0.0
 
 
 def test_who_is_too_near_already_may_leave_but_not_go_on() -> None:
-    rig = Rig(geometry=Wall())
-    rig.controller.start_at([0.0, 1.3])
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    fixture = ControllerFixture(geometry=Wall())
+    fixture.controller.start_at([0.0, 1.3])
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused):
-        rig.controller.start_joint_goal(tenure, {"elbow": 1.4}, speed=1.0)
-    assert rig.controller.start_joint_goal(tenure, {"elbow": 1.2}, speed=1.0)
-    rig.run(1.0)
-    rig.controller.start_joint_goal(tenure, {"elbow": 0.5}, speed=1.0)
-    rig.run(1.0)
-    assert rig.elbow == pytest.approx(0.5, abs=1e-4)
+        fixture.controller.start_joint_goal(reservation, {"elbow": 1.4}, speed=1.0)
+    assert fixture.controller.start_joint_goal(reservation, {"elbow": 1.2}, speed=1.0)
+    fixture.run(1.0)
+    fixture.controller.start_joint_goal(reservation, {"elbow": 0.5}, speed=1.0)
+    fixture.run(1.0)
+    assert fixture.elbow == pytest.approx(0.5, abs=1e-4)
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, 1.1, math.nan, math.inf])
 def test_a_speed_that_is_none_is_refused(speed: float) -> None:
-    rig = Rig()
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    fixture = ControllerFixture()
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.controller.start_joint_goal(tenure, {"elbow": 1.0}, speed=speed)
+        fixture.controller.start_joint_goal(reservation, {"elbow": 1.0}, speed=speed)
     assert refused.value.code == "bad_speed"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_position_that_is_no_number_is_refused_for_every_source(value: float) -> None:
-    rig = Rig()
-    rig.take(1)
+    fixture = ControllerFixture()
+    fixture.take(1)
     with pytest.raises(Refused) as refused:
-        rig.offer(1, elbow=value)
+        fixture.offer(1, elbow=value)
     assert refused.value.code == "not_finite"
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
     with pytest.raises(Refused) as refused:
-        rig.controller.start_joint_goal(tenure, {"elbow": value}, speed=1.0)
+        fixture.controller.start_joint_goal(reservation, {"elbow": value}, speed=1.0)
     assert refused.value.code == "not_finite"
 
 
@@ -111,41 +111,41 @@ def test_speed_falls_before_the_wall_by_how_old_the_picture_is() -> None:
     """v <= clearance / (loop age + watchdog + braking time), all the way."""
     fastest = {}
     for age_ms in (20, 190):
-        rig = Rig(geometry=Wall(1.5))
-        rig.take(1)
+        fixture = ControllerFixture(geometry=Wall(1.5))
+        fixture.take(1)
         for _ in range(200):
-            rig.stream(1, 0.024, age_ms=age_ms)
-            velocity = rig.velocities[-1]
+            fixture.stream(1, 0.024, age_ms=age_ms)
+            velocity = fixture.velocities[-1]
             blind_s = age_ms / 1000 + 0.3 + abs(velocity) / 20.0
-            assert velocity <= max(0.02, (1.5 - rig.elbow) / blind_s) + 1e-3
-        fastest[age_ms] = rig.now_s
-        assert "speed: loop age" in rig.limited
-        assert rig.elbow == pytest.approx(1.5, abs=0.02)
+            assert velocity <= max(0.02, (1.5 - fixture.elbow) / blind_s) + 1e-3
+        fastest[age_ms] = fixture.now_s
+        assert "speed: loop age" in fixture.limited
+        assert fixture.elbow == pytest.approx(1.5, abs=0.02)
 
 
 def test_with_a_young_picture_and_room_the_stream_has_its_full_speed() -> None:
-    rig = Rig(geometry=Wall(2.9))
-    rig.take(1)
-    rig.stream(1, 1.2, age_ms=40)
-    assert max(rig.velocities) == pytest.approx(0.35 * 3.0, rel=1e-6)
-    assert rig.limited == set()
+    fixture = ControllerFixture(geometry=Wall(2.9))
+    fixture.take(1)
+    fixture.stream(1, 1.2, age_ms=40)
+    assert max(fixture.velocities) == pytest.approx(0.35 * 3.0, rel=1e-6)
+    assert fixture.limited == set()
 
 
 def test_where_nobody_knows_the_shape_age_alone_slows() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 1.0, age_ms=90)
-    assert max(rig.velocities) == pytest.approx(0.35 * 3.0, rel=1e-6)
-    assert rig.limited == set()
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 1.5, age_ms=150)
-    assert rig.velocities[-1] == pytest.approx(0.5 * 0.35 * 3.0, rel=1e-3)
-    assert rig.limited == {"speed: loop age"}
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 1.0, age_ms=200)
-    assert 0 < rig.velocities[-1] <= 0.1 * 0.35 * 3.0 + 1e-6
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 1.0, age_ms=90)
+    assert max(fixture.velocities) == pytest.approx(0.35 * 3.0, rel=1e-6)
+    assert fixture.limited == set()
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 1.5, age_ms=150)
+    assert fixture.velocities[-1] == pytest.approx(0.5 * 0.35 * 3.0, rel=1e-3)
+    assert fixture.limited == {"speed: loop age"}
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 1.0, age_ms=200)
+    assert 0 < fixture.velocities[-1] <= 0.1 * 0.35 * 3.0 + 1e-6
 
 
 def test_one_late_answer_is_no_slow_link() -> None:
@@ -161,15 +161,15 @@ def test_one_late_answer_is_no_slow_link() -> None:
 
 
 def test_what_the_driver_changes_is_told() -> None:
-    rig = Rig()
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    move = rig.controller.start_joint_goal(tenure, {"elbow": 1.0}, speed=1.0)
-    rig.run(0.1)
-    rig.controller.record_applied([0.0, rig.elbow - 0.01])
-    assert rig.controller.update(rig.now_s + PERIOD_S).limited == ("elbow: driver",)
+    fixture = ControllerFixture()
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    move = fixture.controller.start_joint_goal(reservation, {"elbow": 1.0}, speed=1.0)
+    fixture.run(0.1)
+    fixture.controller.record_applied([0.0, fixture.elbow - 0.01])
+    assert fixture.controller.update(fixture.now_s + PERIOD_S).limited == ("elbow: driver",)
     assert move.limited == ("elbow: driver",)
-    rig.controller.record_applied(rig.controller._state.motion.position_rad)
-    assert rig.controller.update(rig.now_s + 2 * PERIOD_S).limited == ()
+    fixture.controller.record_applied(fixture.controller._state.motion.position_rad)
+    assert fixture.controller.update(fixture.now_s + 2 * PERIOD_S).limited == ()
 
 
 def test_a_shape_that_fails_under_way_is_no_permission() -> None:
@@ -179,26 +179,26 @@ def test_a_shape_that_fails_under_way_is_no_permission() -> None:
         def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:  # noqa: ARG002
             raise RuntimeError("no shape")
 
-    rig = Rig(geometry=Broken())
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    rig.controller.start_joint_goal(tenure, {"elbow": 0.5}, speed=1.0)
+    fixture = ControllerFixture(geometry=Broken())
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    fixture.controller.start_joint_goal(reservation, {"elbow": 0.5}, speed=1.0)
     with pytest.raises(RuntimeError):
-        rig.run(0.1)
-    rig.controller.set_fault("internal error")
-    rig.run(0.2)
-    assert rig.elbow == pytest.approx(0.0, abs=1e-4)
+        fixture.run(0.1)
+    fixture.controller.set_fault("internal error")
+    fixture.run(0.2)
+    assert fixture.elbow == pytest.approx(0.0, abs=1e-4)
 
 
 def test_a_new_order_in_the_middle_of_hard_braking_does_not_turn_the_arm_round() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 1.5, elbow=2.9)
-    rig.take(2)
-    rig.run(2 * PERIOD_S)
-    rig.velocities.clear()
-    rig.stream(2, 1.0, elbow=2.9)
-    assert min(rig.velocities) > -1e-3
-    assert rig.elbow > 1.0
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 1.5, elbow=2.9)
+    fixture.take(2)
+    fixture.run(2 * PERIOD_S)
+    fixture.velocities.clear()
+    fixture.stream(2, 1.0, elbow=2.9)
+    assert min(fixture.velocities) > -1e-3
+    assert fixture.elbow > 1.0
 
 
 def test_a_motion_without_a_way_to_brake_is_an_error() -> None:
@@ -228,31 +228,31 @@ def test_a_way_that_rounding_hides_from_the_planner_is_found_with_a_little_less_
 
 
 def test_a_motion_that_cannot_be_planned_holds_and_ends_the_lease() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 0.5)
-    rig.controller._state.motion._jerk_limits = [math.nan, math.nan]
-    assert rig.stream(1, 0.024) is Mode.HOLDING
-    assert rig.controller.moving, "it brakes, and does not stand still with a jerk"
-    assert rig.at_rest_after(0.3) < 0.1
-    assert rig.controller.lease(rig.now_s) is None
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 0.5)
+    fixture.controller._state.motion._jerk_limits = [math.nan, math.nan]
+    assert fixture.stream(1, 0.024) is Mode.HOLDING
+    assert fixture.controller.moving, "it brakes, and does not stand still with a jerk"
+    assert fixture.at_rest_after(0.3) < 0.1
+    assert fixture.controller.lease(fixture.now_s) is None
 
 
 def test_where_not_even_braking_can_be_planned_the_command_stands_still_at_once() -> None:
-    rig = Rig()
-    rig.take(1)
-    rig.stream(1, 0.5)
-    rig.controller._state.motion._jerk_limits = [math.nan, math.nan]
-    rig.controller._state.motion._braking = math.nan
-    rest = rig.elbow
-    assert rig.stream(1, 0.024) is Mode.HOLDING
-    assert rig.elbow == rest
+    fixture = ControllerFixture()
+    fixture.take(1)
+    fixture.stream(1, 0.5)
+    fixture.controller._state.motion._jerk_limits = [math.nan, math.nan]
+    fixture.controller._state.motion._braking = math.nan
+    rest = fixture.elbow
+    assert fixture.stream(1, 0.024) is Mode.HOLDING
+    assert fixture.elbow == rest
 
 
 def test_it_says_what_it_holds_and_what_it_cannot_know() -> None:
     known = ("position", "velocity", "acceleration", "jerk")
-    assert Rig().controller.limits == known
-    assert Rig(geometry=Wall()).controller.limits == (*known, "clearance")
+    assert ControllerFixture().controller.limits == known
+    assert ControllerFixture(geometry=Wall()).controller.limits == (*known, "clearance")
     box = Workspace(lower_m=(-1, -1, 0), upper_m=(1, 1, 1), frames=("hand",))
     kind = msgspec.structs.replace(robot_type(), workspace=box)
     assert MotionLimits(kind, Wall()).names == (*known, "clearance", "workspace")

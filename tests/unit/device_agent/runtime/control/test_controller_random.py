@@ -16,7 +16,7 @@ from device_agent.ports.geometry import Clearance, Sweep
 from device_agent.protocol import DriveTarget, JogTarget, JointTarget, Mode, Setpoint, StopLatch
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE, PERIOD_S
-from tests.harness.agent.controller_fixture import Rig, Wall
+from tests.harness.agent.controller_fixture import ControllerFixture, Wall
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -75,12 +75,12 @@ class Chance:
         self.random = random.Random(seed)  # noqa: S311
         shape = self.random.random()
         self.shape = Board(WALL_RAD) if shape < 0.4 else Post(WALL_RAD) if shape < 0.8 else None
-        self.rig = Rig(geometry=self.shape, base=BASE)
-        self.controller = self.rig.controller
+        self.fixture = ControllerFixture(geometry=self.shape, base=BASE)
+        self.controller = self.fixture.controller
         self.now_s = 100.0
         self.epoch = 0
         self.sequence = 0
-        self.tenure: Reservation | None = None
+        self.reservation: Reservation | None = None
         self.may_move_until_s = -1.0
         self.position = [0.0, 0.0]
         self.velocity, self.passed_s = [0.0, 0.0], PERIOD_S
@@ -136,7 +136,7 @@ class Chance:
         return True
 
     def setpoint(self) -> None:
-        if self.tenure is None and self.likely():
+        if self.reservation is None and self.likely():
             self.grant()
         target = self.target()
         for _ in range(self.random.choice((1, 5, 20, 60, 120))):
@@ -174,31 +174,31 @@ class Chance:
         return any_of_them if self.random.random() < 0.2 else any_of_them()
 
     def act(self) -> None:
-        if self.tenure is None and not self.likely():
+        if self.reservation is None and not self.likely():
             self.epoch += self.random.choice((0, 1))
-        self.tenure = self.controller.reserve(epoch=self.epoch, on_revoked=self.lost)
+        self.reservation = self.controller.reserve(epoch=self.epoch, on_revoked=self.lost)
         assert self.epoch > self.burned, "a lease that has ended"
         assert self.speed() > 0, "the room holds it"
 
     def lost(self, _why: Refused) -> None:
-        self.tenure = None
+        self.reservation = None
 
     def move(self) -> None:
-        if self.tenure is None:
+        if self.reservation is None:
             self.act()
-        if self.tenure is not None:
+        if self.reservation is not None:
             target = {"elbow": self.random.uniform(-3, 3), "shoulder": self.random.uniform(-1, 2)}
-            self.controller.start_joint_goal(self.tenure, target, speed=self.random.uniform(0.05, 1.0))
+            self.controller.start_joint_goal(self.reservation, target, speed=self.random.uniform(0.05, 1.0))
 
     def drive(self) -> None:
-        if self.tenure is not None:
+        if self.reservation is not None:
             twist = Twist(self.random.uniform(-0.5, 0.5), 0.0, self.random.uniform(-1, 1))
-            self.controller.start_drive(self.tenure, twist, duration_s=self.random.uniform(0.05, 3))
+            self.controller.start_drive(self.reservation, twist, duration_s=self.random.uniform(0.05, 3))
 
     def end(self) -> None:
-        if self.tenure is not None:
-            self.controller.end_reservation(self.tenure)
-            self.tenure = None
+        if self.reservation is not None:
+            self.controller.end_reservation(self.reservation)
+            self.reservation = None
 
     def stop(self) -> None:
         self.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
@@ -223,11 +223,11 @@ class Chance:
 
     def restrict(self) -> None:
         speed, source = self.random.choice((0.0, 0.2, 0.7, 0.7, math.nan)), self.random.choice("ab")
-        moved = self.controller.moving or self.tenure is not None
+        moved = self.controller.moving or self.reservation is not None
         self.controller.restrict(source, speed, "somebody is near")
         self.restrictions[source] = speed if speed > 0 else 0.0
         if self.speed() <= 0:
-            assert self.tenure is None, "the action was not told"
+            assert self.reservation is None, "the action was not told"
             self.may_move_until_s = -1.0
             assert not moved or self.controller.epochs[0] == self.controller.epochs[1]
 
@@ -244,7 +244,7 @@ class Chance:
         self.taken_away()
 
     def taken_away(self) -> None:
-        assert self.tenure is None, "the action was not told"
+        assert self.reservation is None, "the action was not told"
         self.may_move_until_s = -1.0
         self.burned = max(self.burned, self.controller.epochs[0])
         assert self.controller.epochs[1] == self.controller.epochs[0]
@@ -274,7 +274,7 @@ class Chance:
         if self.shape is not None:
             assert self.shape.clearance(self.position).room_m >= -CLIPPED
         faster |= self.base(tick.twist, passed_s)
-        allowed = self.tenure is not None or self.now_s <= self.may_move_until_s + 1e-9
+        allowed = self.reservation is not None or self.now_s <= self.may_move_until_s + 1e-9
         # What speeds up when the hold begins does so for four milliseconds more: the brakes have a ramp.
         asked = allowed and tick.mode in {Mode.STREAMING, Mode.ACTION}
         self.unasked_s = 0.0 if asked else self.unasked_s + passed_s
@@ -282,12 +282,12 @@ class Chance:
         moving = max(map(abs, self.velocity)) > 1e-6 or any(abs(part) > 1e-6 for part in tick.twist)
         if asked:
             self.unmoved_since_s = self.now_s
-        if self.tenure is not None:
+        if self.reservation is not None:
             self.rest_from_s = self.now_s + REST_WITHIN_S
         assert not moving or self.now_s <= self.rest_from_s + PERIOD_S, "zero 300 ms after the last setpoint"
         if self.now_s - self.unmoved_since_s > 0.2:
             assert not moving, "a hold is complete within 200 ms"
-        if self.tenure is None and self.now_s > self.may_move_until_s + PERIOD_S and tick.mode is Mode.STREAMING:
+        if self.reservation is None and self.now_s > self.may_move_until_s + PERIOD_S and tick.mode is Mode.STREAMING:
             pytest.fail("setpoints that stopped coming are followed no more after 300 ms")
 
     def base(self, twist: Twist, passed_s: float) -> bool:

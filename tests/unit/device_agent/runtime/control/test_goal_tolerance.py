@@ -10,18 +10,18 @@ from device_agent.runtime.control.goal_tolerance import SETTLE_TIMEOUT_S, TOLERA
 from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.planning.motion_planner import MotionPlanner
 from tests.fakes.drivers import PERIOD_S, robot_type
-from tests.harness.agent.controller_fixture import Rig, Wall, lost
+from tests.harness.agent.controller_fixture import ControllerFixture, Wall, lost
 
 Servo = Callable[[Sequence[float]], Sequence[float]]
 
 
-class Loaded(Rig):
-    """A rig whose joints are measured: each time where a servo has them, by where they are told to be."""
+class Loaded(ControllerFixture):
+    """A fixture whose joints are measured: each time where a servo has them, by where they are told to be."""
 
     def __init__(self, servo: Servo) -> None:
         super().__init__()
         self.servo = servo
-        self.tenure = self.controller.reserve(epoch=1, on_revoked=lost)
+        self.reservation = self.controller.reserve(epoch=1, on_revoked=lost)
 
     def go(self, course: MotionGoal, *, most_s: float = 10.0) -> float:
         """Until its end; gives how long the command had rested by then [s]."""
@@ -35,7 +35,7 @@ class Loaded(Rig):
         return rested_s
 
     def move(self, **position_rad: float) -> MotionGoal:
-        return self.controller.start_joint_goal(self.tenure, position_rad, speed=1.0)
+        return self.controller.start_joint_goal(self.reservation, position_rad, speed=1.0)
 
 
 def late(periods: int) -> Servo:
@@ -51,48 +51,48 @@ def late(periods: int) -> Servo:
 
 @pytest.mark.parametrize("periods", [0, 30])
 def test_a_move_ends_when_the_joints_have_followed(periods: int) -> None:
-    rig = Loaded(late(periods))
-    move = rig.move(elbow=1.0)
-    rested_s = rig.go(move)
+    fixture = Loaded(late(periods))
+    move = fixture.move(elbow=1.0)
+    rested_s = fixture.go(move)
     assert move.result is GoalResult.REACHED
-    assert rig.servo(rig.controller.commanded_rad)[1] == pytest.approx(1.0, abs=TOLERANCE_RAD)
+    assert fixture.servo(fixture.controller.commanded_rad)[1] == pytest.approx(1.0, abs=TOLERANCE_RAD)
     assert rested_s >= 0.04 or periods == 0
     assert rested_s < 0.4
 
 
 def test_who_only_comes_through_has_not_arrived() -> None:
     swing = iter(range(10_000))
-    rig = Loaded(lambda told: (told[0], told[1] + 0.2 * math.cos(next(swing) * PERIOD_S * 20)))
-    move = rig.move(elbow=1.0)
-    rig.go(move)
+    fixture = Loaded(lambda told: (told[0], told[1] + 0.2 * math.cos(next(swing) * PERIOD_S * 20)))
+    move = fixture.move(elbow=1.0)
+    fixture.go(move)
     assert move.why is not None
     assert move.why.code == "not_arrived"
 
 
 @pytest.mark.parametrize("off_rad", [0.12, -0.12, math.nan])
 def test_what_never_comes_fails_names_the_joint_and_is_held_there(off_rad: float) -> None:
-    rig = Loaded(lambda told: (told[0] - 0.2, told[1] - off_rad))
-    move = rig.move(elbow=1.0)
-    rested_s = rig.go(move)
+    fixture = Loaded(lambda told: (told[0] - 0.2, told[1] - off_rad))
+    move = fixture.move(elbow=1.0)
+    rested_s = fixture.go(move)
     assert move.result is GoalResult.INTERRUPTED
     assert move.why is not None
     assert move.why.code == "not_arrived"
     assert f"elbow is {abs(off_rad):.2f} rad short" in move.why.message
     assert "shoulder" not in move.why.message, "it was not to move"
     assert rested_s == pytest.approx(SETTLE_TIMEOUT_S, abs=0.1)
-    assert rig.controller.mode is Mode.ACTION
-    assert rig.controller.commanded_rad[1] == pytest.approx(1.0, abs=1e-4)
-    again = rig.move(elbow=0.9)
-    rig.servo = late(0)
-    rig.go(again)
+    assert fixture.controller.mode is Mode.ACTION
+    assert fixture.controller.commanded_rad[1] == pytest.approx(1.0, abs=1e-4)
+    again = fixture.move(elbow=0.9)
+    fixture.servo = late(0)
+    fixture.go(again)
     assert again.result is GoalResult.REACHED
 
 
 def test_a_joint_that_holds_softly_is_where_it_sags_to() -> None:
-    rig = Loaded(lambda told: (told[0], told[1] - 0.3))
-    rig.controller.set_stiffness({"elbow": 0.4}, reservation=rig.tenure)
-    move = rig.move(elbow=1.0)
-    rig.go(move)
+    fixture = Loaded(lambda told: (told[0], told[1] - 0.3))
+    fixture.controller.set_stiffness({"elbow": 0.4}, reservation=fixture.reservation)
+    move = fixture.move(elbow=1.0)
+    fixture.go(move)
     assert move.result is GoalResult.REACHED
 
 
@@ -103,9 +103,9 @@ def test_the_end_of_a_planned_way_is_looked_at_too() -> None:
         ) -> tuple[tuple[float, ...], ...]:
             return tuple(start_rad), tuple(goal_rad)
 
-    rig = Loaded(lambda told: (told[0], told[1] - 0.12))
+    fixture = Loaded(lambda told: (told[0], told[1] - 0.12))
     way = MotionPlanner(robot_type(), Open(9.0)).plan([0.0, 0.0], [0.0, 1.0], speed=1.0, ended=lambda: False)
-    passage = rig.controller.start_trajectory(rig.tenure, way)
-    rig.go(passage)
+    passage = fixture.controller.start_trajectory(fixture.reservation, way)
+    fixture.go(passage)
     assert passage.why is not None
     assert "elbow is 0.12 rad short" in passage.why.message

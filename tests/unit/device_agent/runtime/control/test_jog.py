@@ -18,7 +18,7 @@ from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE
-from tests.harness.agent.controller_fixture import Rig, lost
+from tests.harness.agent.controller_fixture import ControllerFixture, lost
 from tests.harness.paths import UR5
 
 KIND = robot_type.load(UR5)
@@ -27,7 +27,7 @@ HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
 Target = JointTarget | JogTarget | DriveTarget
 
 
-class Jogger(Rig):
+class Jogger(ControllerFixture):
     """An operator with a joystick at a UR5, or at the toy with a base."""
 
     def __init__(self, *, base: bool = False) -> None:
@@ -71,55 +71,55 @@ def jogger(*, base: bool = False) -> Jogger:
 
 
 def test_a_frame_goes_where_it_is_pushed_and_keeps_its_orientation() -> None:
-    rig = jogger()
-    begin = rig.flange()
-    rig.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 1.2)
-    rig.hold(JogTarget(), 0.3)
-    end = rig.flange()
+    fixture = jogger()
+    begin = fixture.flange()
+    fixture.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 1.2)
+    fixture.hold(JogTarget(), 0.3)
+    end = fixture.flange()
     assert end[1] - begin[1] == pytest.approx(0.11, abs=0.02)
     assert math.dist((begin[0], begin[2]), (end[0], end[2])) < 0.004
     assert abs(sum(a * b for a, b in zip(begin[3:], end[3:], strict=True))) > math.cos(0.01)
-    assert not rig.controller.moving
-    assert rig.controller.lease(rig.now_s) is not None, "letting go is no loss"
+    assert not fixture.controller.moving
+    assert fixture.controller.lease(fixture.now_s) is not None, "letting go is no loss"
 
 
 def test_a_tool_goes_along_its_own_axes() -> None:
-    rig = jogger()
-    begin = rig.flange()
-    rig.hold(JogTarget(linear_m_s=(0.0, 0.0, 0.05), tool=True, frame="flange"), 0.8)
-    rig.hold(JogTarget(), 0.3)
-    assert rig.flange()[2] < begin[2] - 0.02, "the flange looks down"
-    rig.hold(JogTarget(angular_rad_s=(0.0, 0.0, 0.4)), 0.8)
-    assert abs(sum(a * b for a, b in zip(begin[3:], rig.flange()[3:], strict=True))) < math.cos(0.1)
+    fixture = jogger()
+    begin = fixture.flange()
+    fixture.hold(JogTarget(linear_m_s=(0.0, 0.0, 0.05), tool=True, frame="flange"), 0.8)
+    fixture.hold(JogTarget(), 0.3)
+    assert fixture.flange()[2] < begin[2] - 0.02, "the flange looks down"
+    fixture.hold(JogTarget(angular_rad_s=(0.0, 0.0, 0.4)), 0.8)
+    assert abs(sum(a * b for a, b in zip(begin[3:], fixture.flange()[3:], strict=True))) < math.cos(0.1)
 
 
 def test_a_jog_that_ends_in_motion_is_an_operator_lost() -> None:
-    rig = jogger()
-    rig.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.8)
-    assert rig.controller.moving
-    rig.rest(0.31)
-    assert not np.any(np.abs(np.subtract(rig.gone[-1], rig.gone[-2])) > 1e-9)
+    fixture = jogger()
+    fixture.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.8)
+    assert fixture.controller.moving
+    fixture.rest(0.31)
+    assert not np.any(np.abs(np.subtract(fixture.gone[-1], fixture.gone[-2])) > 1e-9)
     with pytest.raises(Refused):
-        rig.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.1)
+        fixture.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.1)
 
 
 def test_a_jog_is_held_before_the_table_and_can_leave_it() -> None:
-    rig = jogger()
+    fixture = jogger()
     assert SHAPE is not None
-    rig.hold(JogTarget(linear_m_s=(0.0, 0.0, -0.4)), 4.0)
-    assert any(one.startswith(("clearance", "workspace")) for one in rig.limited)
-    low = rig.flange()[2]
-    assert SHAPE.clearance(rig.controller.commanded_rad).room_m >= 0
-    rig.hold(JogTarget(linear_m_s=(0.0, 0.0, 0.2)), 0.8)
-    assert rig.flange()[2] > low + 0.03
+    fixture.hold(JogTarget(linear_m_s=(0.0, 0.0, -0.4)), 4.0)
+    assert any(one.startswith(("clearance", "workspace")) for one in fixture.limited)
+    low = fixture.flange()[2]
+    assert SHAPE.clearance(fixture.controller.commanded_rad).room_m >= 0
+    fixture.hold(JogTarget(linear_m_s=(0.0, 0.0, 0.2)), 0.8)
+    assert fixture.flange()[2] > low + 0.03
 
 
 def test_near_a_singularity_it_is_slow_instead_of_jumping() -> None:
-    rig = jogger()
-    rig.hold(JogTarget(linear_m_s=(-0.5, 0.0, 0.2)), 5.0)
-    steps = np.abs(np.diff(rig.gone, axis=0)) / 0.008
+    fixture = jogger()
+    fixture.hold(JogTarget(linear_m_s=(-0.5, 0.0, 0.2)), 5.0)
+    steps = np.abs(np.diff(fixture.gone, axis=0)) / 0.008
     assert steps.max() <= 0.35 * 3.1416 * 1.001
-    assert "speed: joints" in rig.limited
+    assert "speed: joints" in fixture.limited
 
 
 @settings(max_examples=12, deadline=None)
@@ -133,82 +133,82 @@ def test_near_a_singularity_it_is_slow_instead_of_jumping() -> None:
 def test_whatever_is_pushed_every_limit_holds(
     twists: list[tuple[float, ...]],
 ) -> None:
-    rig = jogger()
+    fixture = jogger()
     assert SHAPE is not None
     for x, y, z, a, b, c, tool in twists:
-        rig.hold(JogTarget(linear_m_s=(x, y, z), angular_rad_s=(a, b, c), tool=bool(tool)), 0.5)
-    rig.rest(0.35)
-    gone = np.array(rig.gone)
+        fixture.hold(JogTarget(linear_m_s=(x, y, z), angular_rad_s=(a, b, c), tool=bool(tool)), 0.5)
+    fixture.rest(0.35)
+    gone = np.array(fixture.gone)
     velocity = np.diff(gone, axis=0) / 0.008
     assert np.abs(velocity).max() <= 0.35 * 3.1416 * 1.01
     assert np.abs(np.diff(velocity, axis=0) / 0.008).max() <= 21.0 + 0.1
-    assert not rig.controller.moving
+    assert not fixture.controller.moving
     assert all(SHAPE.clearance(place).room_m > -0.004 for place in gone[::10].tolist())
 
 
 def test_joints_go_on_from_where_a_jog_has_left_them() -> None:
-    rig = jogger()
-    rig.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.8)
-    rig.hold(JointTarget(position_rad={"wrist_3": 0.3}), 1.5)
-    assert rig.controller.commanded_rad[5] == pytest.approx(0.3, abs=1e-3)
-    assert abs(rig.controller.commanded_rad[0] - HOME[0]) > 0.02
+    fixture = jogger()
+    fixture.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.8)
+    fixture.hold(JointTarget(position_rad={"wrist_3": 0.3}), 1.5)
+    assert fixture.controller.commanded_rad[5] == pytest.approx(0.3, abs=1e-3)
+    assert abs(fixture.controller.commanded_rad[0] - HOME[0]) > 0.02
 
 
 def test_a_base_drives_while_setpoints_are_fresh_and_no_longer() -> None:
-    rig = jogger(base=True)
-    rig.hold(DriveTarget(forward_m_s=0.3, turn_rad_s=-0.4), 1.5)
-    assert rig.twists[-1] == pytest.approx((0.3, 0.0, -0.4), abs=1e-6)
-    rig.rest(0.31)
-    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
-    assert rig.controller.mode is Mode.HOLDING
+    fixture = jogger(base=True)
+    fixture.hold(DriveTarget(forward_m_s=0.3, turn_rad_s=-0.4), 1.5)
+    assert fixture.twists[-1] == pytest.approx((0.3, 0.0, -0.4), abs=1e-6)
+    fixture.rest(0.31)
+    assert fixture.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert fixture.controller.mode is Mode.HOLDING
     with pytest.raises(Refused):
-        rig.hold(DriveTarget(forward_m_s=0.3), 0.1)
+        fixture.hold(DriveTarget(forward_m_s=0.3), 0.1)
 
 
 def test_a_base_that_is_let_go_brakes_at_once_and_its_operator_keeps_control() -> None:
-    rig = jogger(base=True)
-    rig.hold(DriveTarget(forward_m_s=0.5, turn_rad_s=0.4), 1.5)
-    rig.hold(DriveTarget(), 0.25)  # half of the time that it would take at the acceleration of a start
-    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
-    rig.rest(0.5)
-    rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
-    assert rig.twists[-1] == pytest.approx((0.3, 0.0, 0.0), abs=1e-6)
+    fixture = jogger(base=True)
+    fixture.hold(DriveTarget(forward_m_s=0.5, turn_rad_s=0.4), 1.5)
+    fixture.hold(DriveTarget(), 0.25)  # half of the time that it would take at the acceleration of a start
+    assert fixture.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    fixture.rest(0.5)
+    fixture.hold(DriveTarget(forward_m_s=0.3), 1.0)
+    assert fixture.twists[-1] == pytest.approx((0.3, 0.0, 0.0), abs=1e-6)
 
 
 def test_a_drive_beyond_the_limits_is_bounded_and_says_so() -> None:
-    rig = jogger(base=True)
-    rig.hold(DriveTarget(forward_m_s=9.0, left_m_s=1.0), 1.5)
-    assert rig.twists[-1] == pytest.approx((0.5, 0.0, 0.0), abs=1e-6)
-    assert {"forward_m_s: range", "left_m_s: range"} <= rig.limited
-    rig.hold(DriveTarget(forward_m_s=0.5), 2.0, age_ms=160)
-    assert rig.twists[-1][0] < 0.4, "an old picture slows it"
+    fixture = jogger(base=True)
+    fixture.hold(DriveTarget(forward_m_s=9.0, left_m_s=1.0), 1.5)
+    assert fixture.twists[-1] == pytest.approx((0.5, 0.0, 0.0), abs=1e-6)
+    assert {"forward_m_s: range", "left_m_s: range"} <= fixture.limited
+    fixture.hold(DriveTarget(forward_m_s=0.5), 2.0, age_ms=160)
+    assert fixture.twists[-1][0] < 0.4, "an old picture slows it"
 
 
 def test_joints_that_are_still_asked_let_the_base_stand() -> None:
-    rig = jogger(base=True)
-    rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
-    rig.hold(JointTarget(position_rad={"elbow": 1.0}), 0.6)
-    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
-    assert rig.controller.mode is Mode.STREAMING
+    fixture = jogger(base=True)
+    fixture.hold(DriveTarget(forward_m_s=0.3), 1.0)
+    fixture.hold(JointTarget(position_rad={"elbow": 1.0}), 0.6)
+    assert fixture.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert fixture.controller.mode is Mode.STREAMING
 
 
 def test_an_action_that_begins_takes_the_base_from_the_joystick() -> None:
-    rig = jogger(base=True)
-    rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
-    rig.controller.reserve(epoch=1, on_revoked=lost)
-    rig.rest(0.3)
-    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    fixture = jogger(base=True)
+    fixture.hold(DriveTarget(forward_m_s=0.3), 1.0)
+    fixture.controller.reserve(epoch=1, on_revoked=lost)
+    fixture.rest(0.3)
+    assert fixture.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
 def test_stop_brakes_a_base_that_is_driven_and_nothing_resumes() -> None:
-    rig = jogger(base=True)
-    rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
-    rig.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))
-    rig.rest(0.3)
-    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
-    rig.controller.reset_stop(epoch=2)
-    rig.rest(0.5)
-    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    fixture = jogger(base=True)
+    fixture.hold(DriveTarget(forward_m_s=0.3), 1.0)
+    fixture.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))
+    fixture.rest(0.3)
+    assert fixture.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    fixture.controller.reset_stop(epoch=2)
+    fixture.rest(0.5)
+    assert fixture.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -257,14 +257,14 @@ def test_whatever_is_sent_to_drive_a_base_is_refused_or_driven_inside_its_limits
         return
     assert isinstance(target, DriveTarget)
     assert all(math.isfinite(part) for part in (target.forward_m_s, target.left_m_s, target.turn_rad_s))
-    rig = jogger(base=True)
+    fixture = jogger(base=True)
     with suppress(Refused):
-        rig.hold(target, 0.4, age_ms=age_ms)
-    rig.rest(0.31)
+        fixture.hold(target, 0.4, age_ms=age_ms)
+    fixture.rest(0.31)
     limits = (BASE.max_linear_m_s, 0.0, BASE.max_angular_rad_s)
-    assert all(abs(part) <= most + 1e-9 for twist in rig.twists for part, most in zip(twist, limits, strict=True))
-    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
-    assert age_ms <= 200 or not any(map(any, rig.twists))
+    assert all(abs(part) <= most + 1e-9 for twist in fixture.twists for part, most in zip(twist, limits, strict=True))
+    assert fixture.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert age_ms <= 200 or not any(map(any, fixture.twists))
 
 
 def _number(value: object) -> bool:

@@ -71,13 +71,13 @@ class Neck:
             self.tick()
 
     def move(self, seconds: float = 5.0, **position_rad: float) -> GoalResult | None:
-        tenure = self.controller.reserve(epoch=self.epoch, on_revoked=lambda _: None)
-        move = self.controller.start_joint_goal(tenure, position_rad, speed=1.0)
+        reservation = self.controller.reserve(epoch=self.epoch, on_revoked=lambda _: None)
+        move = self.controller.start_joint_goal(reservation, position_rad, speed=1.0)
         for _ in range(round(seconds / PERIOD_S)):
             if not move.finished.is_set():
                 self.tick()
         self.limited |= set(move.limited)
-        self.controller.end_reservation(tenure)
+        self.controller.end_reservation(reservation)
         return move.result
 
 
@@ -107,12 +107,12 @@ def live(neck: Neck, life: list[tuple[str, dict[str, float], int]]) -> None:
             case "stop":
                 neck.controller.stop(StopLatch(caller="bob", reason="", at_ms=0))
             case "move":
-                tenure = neck.controller.reserve(epoch=neck.epoch, on_revoked=lambda _: None)
+                reservation = neck.controller.reserve(epoch=neck.epoch, on_revoked=lambda _: None)
                 with suppress(Refused):
-                    neck.controller.start_joint_goal(tenure, position_rad, speed=1.0)
+                    neck.controller.start_joint_goal(reservation, position_rad, speed=1.0)
                 for _ in range(periods):
                     neck.tick()
-                neck.controller.end_reservation(tenure)
+                neck.controller.end_reservation(reservation)
         for number in range(periods):
             if act == "stream" and position_rad:
                 with suppress(Refused):  # the watchdog may have ended the lease, where periods came late

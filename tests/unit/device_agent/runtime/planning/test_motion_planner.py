@@ -49,7 +49,7 @@ class Physics:
         self.data.qpos[:] = self.data.ctrl[:] = HOME
         self.controller = Controller(KIND, LeaseGate(), geometry=shape)
         self.controller.start_at(HOME)
-        self.tenure = self.controller.reserve(epoch=1, on_revoked=lambda _: None)
+        self.reservation = self.controller.reserve(epoch=1, on_revoked=lambda _: None)
         self.now_s = 0.0
         self.touched = 0
 
@@ -69,7 +69,7 @@ def check_around(scene: Path, shape: MujocoGeometry, seed: int) -> float:
     """Plan with this seed, go, and give how far the flange then is from where it should be [m]."""
     physics, routes = Physics(scene, shape), MotionPlanner(KIND, shape, seed=seed)
     way = routes.plan(HOME, BEYOND, speed=1.0, ended=lambda: False)
-    passage = physics.controller.start_trajectory(physics.tenure, way)
+    passage = physics.controller.start_trajectory(physics.reservation, way)
     physics.run(way.duration_s + 1.5)
     assert passage.result is GoalResult.REACHED, passage.why
     assert passage.limited == ()
@@ -99,7 +99,7 @@ def test_a_straight_way_is_straight_in_physics_too(scene: Path, shape: MujocoGeo
     begin = shape.poses(HOME)["flange"]
     pose = (begin[0], begin[1] + 0.25, begin[2] - 0.05, *begin[3:])
     way = MotionPlanner(KIND, shape).plan_straight(HOME, "flange", pose, speed=0.5)
-    physics.controller.start_trajectory(physics.tenure, way)
+    physics.controller.start_trajectory(physics.reservation, way)
     line, off_m = np.subtract(pose[:3], begin[:3]), []
     for _ in range(round(way.duration_s / PERIOD_S) + 100):
         physics.run(PERIOD_S)

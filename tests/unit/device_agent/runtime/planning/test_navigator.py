@@ -19,7 +19,7 @@ from device_agent.runtime.planning.localization import Pose2D, PoseEstimator
 from device_agent.runtime.planning.navigator import BLOCKED_TIMEOUT_S, START_TIMEOUT_S, UPDATE_PERIOD_S, Navigator
 from device_agent.runtime.readings import Reading, ReadingCache
 from tests.fakes.drivers import BASE, PERIOD_S, robot_type
-from tests.harness.agent.controller_fixture import Rig
+from tests.harness.agent.controller_fixture import ControllerFixture
 
 LIMITS = Twist(0.3, 0.0, 1.5)
 
@@ -167,12 +167,12 @@ class Toy:
     """A base that goes as it is told, in a thread of its own."""
 
     def __init__(self, ground: OccupancyGrid | None) -> None:
-        self.rig = Rig(base=BASE)
+        self.fixture = ControllerFixture(base=BASE)
         self.at = Pose2D(0.0, 0.0, 0.0)
         self.over = threading.Event()
         body = DeviceContext(
             robot_type=robot_type(BASE),
-            controller=self.rig.controller,
+            controller=self.fixture.controller,
             observe=lambda: None,
             geometry=None,
             skills=None,
@@ -188,8 +188,8 @@ class Toy:
 
     def live(self) -> None:
         while not self.over.wait(PERIOD_S):
-            self.rig.now_s += PERIOD_S
-            twist = self.rig.controller.update(self.rig.now_s).twist
+            self.fixture.now_s += PERIOD_S
+            twist = self.fixture.controller.update(self.fixture.now_s).twist
             at = self.at
             self.at = Pose2D(
                 at.x_m + twist.forward_m_s * PERIOD_S * math.cos(at.yaw_rad),
@@ -207,7 +207,7 @@ def test_a_robot_goes_to_a_place_and_rests_there() -> None:
     toy = Toy(room())
     toy.robot.execute(GoTo(x_m=0.3, y_m=0.0, yaw_rad=0.3))
     assert math.dist((toy.at.x_m, toy.at.y_m), (0.3, 0.0)) < 0.15
-    assert not toy.rig.controller.moving
+    assert not toy.fixture.controller.moving
     toy.end()
 
 
@@ -225,7 +225,7 @@ def test_who_cannot_see_the_room_or_waits_in_vain_says_so(monkeypatch: pytest.Mo
 
 def test_an_errand_that_loses_the_device_ends() -> None:
     toy = Toy(room())
-    threading.Timer(0.3, lambda: toy.rig.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))).start()
+    threading.Timer(0.3, lambda: toy.fixture.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))).start()
     with pytest.raises(Refused, match="stopped"):
         toy.robot.execute(GoTo(x_m=1.5, y_m=0.0))
     toy.end()

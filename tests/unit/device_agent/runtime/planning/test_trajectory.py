@@ -17,7 +17,7 @@ from device_agent.runtime.planning import trajectory
 from device_agent.runtime.planning.motion_planner import MotionPlanner, quaternion_of
 from device_agent.runtime.planning.trajectory import Floats, Trajectory
 from tests.fakes.drivers import PERIOD_S, robot_type
-from tests.harness.agent.controller_fixture import Rig, Wall, interruptions, lost
+from tests.harness.agent.controller_fixture import ControllerFixture, Wall, interruptions, lost
 
 JOINTS = robot_type().joints
 CORNER = [[0.0, 0.0], [1.2, 0.0], [1.2, 1.0]]
@@ -67,13 +67,13 @@ def test_a_way_to_where_the_device_is_ends_at_once() -> None:
 def test_a_way_of_one_leg_is_straight_and_nearly_as_quick_as_a_move() -> None:
     found = along([[0.0, 0.0], [2.0, 1.0]])
     assert found.position_rad[:, 0] == pytest.approx(2 * found.position_rad[:, 1], abs=1e-9)
-    rig = Rig()
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    move = rig.controller.start_joint_goal(tenure, {"shoulder": 2.0, "elbow": 1.0}, speed=1.0)
-    began_s = rig.now_s
+    fixture = ControllerFixture()
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    move = fixture.controller.start_joint_goal(reservation, {"shoulder": 2.0, "elbow": 1.0}, speed=1.0)
+    began_s = fixture.now_s
     while not move.finished.is_set():
-        rig.run(PERIOD_S)
-    assert found.duration_s <= 1.3 * (rig.now_s - began_s)
+        fixture.run(PERIOD_S)
+    assert found.duration_s <= 1.3 * (fixture.now_s - began_s)
 
 
 def test_corners_are_rounded_off_as_widely_as_there_is_room() -> None:
@@ -91,21 +91,21 @@ def test_corners_are_rounded_off_as_widely_as_there_is_room() -> None:
 
 
 def test_the_device_goes_along_a_way_and_rests_at_its_end() -> None:
-    rig, found = Rig(), along(CORNER)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    passage = rig.controller.start_trajectory(tenure, found)
-    gone = ride(rig, found.duration_s + 0.1)
+    fixture, found = ControllerFixture(), along(CORNER)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    passage = fixture.controller.start_trajectory(reservation, found)
+    gone = ride(fixture, found.duration_s + 0.1)
     assert passage.result is GoalResult.REACHED
     assert gone[: len(found.position_rad) - 1] == pytest.approx(found.position_rad[1:], abs=1e-6)
-    assert rig.controller.commanded_rad == pytest.approx([1.2, 1.0], abs=1e-9)
-    assert not rig.controller.moving
+    assert fixture.controller.commanded_rad == pytest.approx([1.2, 1.0], abs=1e-9)
+    assert not fixture.controller.moving
 
 
-def ride(rig: Rig, seconds: float) -> Floats:
+def ride(fixture: ControllerFixture, seconds: float) -> Floats:
     gone = []
     for _ in range(round(seconds / PERIOD_S)):
-        rig.now_s += PERIOD_S
-        gone.append(rig.controller.update(rig.now_s).position_rad)
+        fixture.now_s += PERIOD_S
+        gone.append(fixture.controller.update(fixture.now_s).position_rad)
     return np.array(gone)
 
 
@@ -118,32 +118,32 @@ def check_on(found: Trajectory, gone: Floats) -> None:
 @pytest.mark.parametrize("cause", sorted(set(interruptions()) - {"expiry"}))
 @pytest.mark.parametrize("after_s", [0.1, 0.45, 0.7])
 def test_whatever_takes_the_device_away_brakes_it_on_its_way(cause: str, after_s: float) -> None:
-    rig, found = Rig(), along(CORNER)
-    rig.take(1, lease_s=5.0)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    passage = rig.controller.start_trajectory(tenure, found)
-    before = ride(rig, after_s)
+    fixture, found = ControllerFixture(), along(CORNER)
+    fixture.take(1, lease_s=5.0)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    passage = fixture.controller.start_trajectory(reservation, found)
+    before = ride(fixture, after_s)
     assert before[-1] != pytest.approx(before[-2], abs=1e-6)
-    interruptions()[cause](rig)  # type: ignore[operator]
-    gone = ride(rig, 0.3)
+    interruptions()[cause](fixture)  # type: ignore[operator]
+    gone = ride(fixture, 0.3)
     assert passage.result is GoalResult.INTERRUPTED
-    assert not rig.controller.moving
+    assert not fixture.controller.moving
     assert gone[-1] == pytest.approx(gone[-2], abs=1e-6)
     check_on(found, gone)
     assert slopes(np.concatenate((before[-4:], gone)))[1] <= 20.0 + 0.5
 
 
 def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> None:
-    rig, found = Rig(), along(CORNER)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    passage = rig.controller.start_trajectory(tenure, found)
-    gone = [ride(rig, 0.4)]
-    rig.controller.restrict("room", 0.3, "somebody is near")
-    gone.append(ride(rig, 1.5))
+    fixture, found = ControllerFixture(), along(CORNER)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    passage = fixture.controller.start_trajectory(reservation, found)
+    gone = [ride(fixture, 0.4)]
+    fixture.controller.restrict("room", 0.3, "somebody is near")
+    gone.append(ride(fixture, 1.5))
     slow = np.max(np.abs(np.diff(gone[-1][-40:], axis=0))) / PERIOD_S
     assert slow <= 0.3 * 3.0 + 1e-6
-    rig.controller.lift("room")
-    gone.append(ride(rig, 3.0))
+    fixture.controller.lift("room")
+    gone.append(ride(fixture, 3.0))
     assert passage.result is GoalResult.REACHED
     assert any("somebody is near" in one for one in passage.limited)
     whole = np.concatenate(gone)
@@ -152,10 +152,10 @@ def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> 
 
 
 def test_what_appears_on_a_way_holds_it_before() -> None:
-    rig, found = Rig(geometry=Wall(0.5)), along(CORNER)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    passage = rig.controller.start_trajectory(tenure, found)
-    gone = ride(rig, 3.0)
+    fixture, found = ControllerFixture(geometry=Wall(0.5)), along(CORNER)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    passage = fixture.controller.start_trajectory(reservation, found)
+    gone = ride(fixture, 3.0)
     assert passage.why is not None
     assert passage.why.code == "no_room"
     assert np.max(gone[:, 1]) <= 0.5 + 1e-6
@@ -163,57 +163,57 @@ def test_what_appears_on_a_way_holds_it_before() -> None:
 
 
 def test_a_late_control_loop_counts_what_it_missed_as_braked_on_a_way_too() -> None:
-    rig, found = Rig(), along(CORNER)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    rig.controller.start_trajectory(tenure, found)
-    ride(rig, 0.5)
-    rig.controller.end_reservation(tenure)
-    ride(rig, 2 * PERIOD_S)
-    rig.now_s += 0.08
-    gone = ride(rig, 0.15)
-    assert not rig.controller.moving
+    fixture, found = ControllerFixture(), along(CORNER)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    fixture.controller.start_trajectory(reservation, found)
+    ride(fixture, 0.5)
+    fixture.controller.end_reservation(reservation)
+    ride(fixture, 2 * PERIOD_S)
+    fixture.now_s += 0.08
+    gone = ride(fixture, 0.15)
+    assert not fixture.controller.moving
     check_on(found, gone)
 
 
 def test_a_move_that_follows_waits_until_the_device_rests_on_its_way() -> None:
-    rig, found = Rig(), along(CORNER)
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    passage = rig.controller.start_trajectory(tenure, found)
-    ride(rig, 0.5)
-    move = rig.controller.start_joint_goal(tenure, {"shoulder": 0.0, "elbow": 0.0}, speed=1.0)
+    fixture, found = ControllerFixture(), along(CORNER)
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    passage = fixture.controller.start_trajectory(reservation, found)
+    ride(fixture, 0.5)
+    move = fixture.controller.start_joint_goal(reservation, {"shoulder": 0.0, "elbow": 0.0}, speed=1.0)
     assert passage.result is GoalResult.INTERRUPTED
-    gone = ride(rig, 3.0)
+    gone = ride(fixture, 3.0)
     assert move.result is GoalResult.REACHED
     assert slopes(gone)[1] <= 20.5
 
 
 def test_a_way_that_begins_elsewhere_or_leaves_a_range_is_refused() -> None:
-    rig = Rig()
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
+    fixture = ControllerFixture()
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
     for corners, code in (
         ([[0.1, 0.0], [1.0, 0.0]], "moved"),
         ([[0.0, 0.0], [0.0, 3.2]], "out_of_range"),
     ):
         with pytest.raises(Refused) as refused:
-            rig.controller.start_trajectory(tenure, along(corners))
+            fixture.controller.start_trajectory(reservation, along(corners))
         assert refused.value.code == code
     broken = along([[0.0, 0.0], [1.0, 0.0]])
     broken.position_rad[3, 1] = math.nan
     with pytest.raises(Refused, match="leads elbow out of its range"):
-        rig.controller.start_trajectory(tenure, broken)
-    rig.controller.start_joint_goal(tenure, {"elbow": 1.0}, speed=1.0)
-    rig.run(0.3)
+        fixture.controller.start_trajectory(reservation, broken)
+    fixture.controller.start_joint_goal(reservation, {"elbow": 1.0}, speed=1.0)
+    fixture.run(0.3)
     with pytest.raises(Refused, match="no longer at the start of the trajectory"):
-        rig.controller.start_trajectory(tenure, along(CORNER))
-    assert rig.controller.mode is Mode.ACTION
+        fixture.controller.start_trajectory(reservation, along(CORNER))
+    assert fixture.controller.mode is Mode.ACTION
 
 
 def test_a_target_is_looked_at_before_a_way_to_it() -> None:
-    rig = Rig(geometry=Wall())
-    tenure = rig.controller.reserve(epoch=1, on_revoked=lost)
-    assert rig.controller.resolve_target(tenure, {"elbow": 0.5}) == [0.0, 0.5]
+    fixture = ControllerFixture(geometry=Wall())
+    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    assert fixture.controller.resolve_target(reservation, {"elbow": 0.5}) == [0.0, 0.5]
     with pytest.raises(Refused, match="no room there"):
-        rig.controller.resolve_target(tenure, {"elbow": 1.5})
+        fixture.controller.resolve_target(reservation, {"elbow": 1.5})
 
 
 def test_an_orientation_has_a_direction_and_is_given_once() -> None:

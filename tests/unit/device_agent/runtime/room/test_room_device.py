@@ -39,11 +39,11 @@ from device_agent.protocol.manifests.room import Control as RoomControl
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
-from tests.harness.agent.device_harness import Bench, eventually, shown
+from tests.harness.agent.device_harness import DeviceHarness, eventually, shown
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
 ENTRY = RoomDeviceManifest(
-    name="arm",  # the bench's device is called so
+    name="arm",  # the harness's device is called so
     kind="window",
     label="Window",
     driver="toy",
@@ -55,7 +55,7 @@ ENTRY = RoomDeviceManifest(
 )
 
 
-class ToySensor:
+class FakeSensor:
     """Measures how often it was asked."""
 
     simulated = True
@@ -119,9 +119,9 @@ class ToyStore:
         return "u1"
 
 
-class RoomBench(Bench):
+class RoomBench(DeviceHarness):
     def __init__(self, folder: Path, **more: Any) -> None:
-        self.sensor, self.store = ToySensor(), ToyStore()
+        self.sensor, self.store = FakeSensor(), ToyStore()
         self.uploads = more.pop("uploads", self.store)
         instrument = RoomDevice(self.sensor, more.pop("entry", ENTRY), self.uploads)
         super().__init__(folder, driver=instrument, kind=ENTRY.robot_type(), **more)  # type: ignore[arg-type]
@@ -145,10 +145,10 @@ class RoomBench(Bench):
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[RoomBench]:
-    bench = RoomBench(tmp_path)
-    yield bench
-    bench.stop()
+def harness(tmp_path: Path) -> Iterator[RoomBench]:
+    harness = RoomBench(tmp_path)
+    yield harness
+    harness.stop()
 
 
 def grows(things: Callable[[], list[Any]], by: int = 3) -> None:
@@ -156,9 +156,9 @@ def grows(things: Callable[[], list[Any]], by: int = 3) -> None:
     eventually(lambda: len(things()) >= before + by)
 
 
-def test_it_says_what_it_has_and_which_actions_it_takes(bench: RoomBench) -> None:
-    bench.device.link_changed(True)
-    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[-1]
+def test_it_says_what_it_has_and_which_actions_it_takes(harness: RoomBench) -> None:
+    harness.device.link_changed(True)
+    described: Description = eventually(lambda: harness.heard(topics.DESC, Description))[-1]
     assert described.joints == ()
     assert described.limits == ()
     assert described.robot_type == described.kind == "window"
@@ -171,81 +171,81 @@ def test_it_says_what_it_has_and_which_actions_it_takes(bench: RoomBench) -> Non
     assert described.simulated
 
 
-def test_streams_are_told_in_order_and_what_says_nothing_is_not_told(bench: RoomBench) -> None:
-    grows(bench.measured)
-    told = bench.measured()
+def test_streams_are_told_in_order_and_what_says_nothing_is_not_told(harness: RoomBench) -> None:
+    grows(harness.measured)
+    told = harness.measured()
     assert [each.sequence for each in told] == list(range(1, len(told) + 1))
     assert [each.tick_ms for each in told] == sorted(each.tick_ms for each in told)
     assert all(set(each.values) == {"reads"} for each in told)
-    eventually(lambda: bench.sensor.reads["rain"] > 1)
-    assert bench.measured("rain") == []
+    eventually(lambda: harness.sensor.reads["rain"] > 1)
+    assert harness.measured("rain") == []
 
 
-def test_numbers_that_are_none_are_left_out(bench: RoomBench) -> None:
-    bench.sensor.values = {"hot": math.nan, "cold": -math.inf, "well": True}
-    eventually(lambda: any("well" in each.values for each in bench.measured()))
-    assert not any({"hot", "cold"} & set(each.values) for each in bench.measured())
+def test_numbers_that_are_none_are_left_out(harness: RoomBench) -> None:
+    harness.sensor.values = {"hot": math.nan, "cold": -math.inf, "well": True}
+    eventually(lambda: any("well" in each.values for each in harness.measured()))
+    assert not any({"hot", "cold"} & set(each.values) for each in harness.measured())
 
 
-def test_pictures_travel_with_their_header_and_are_not_kept(bench: RoomBench) -> None:
-    grows(bench.pictures)
-    told = [camera_frames.decode(picture) for picture in bench.pictures()]
+def test_pictures_travel_with_their_header_and_are_not_kept(harness: RoomBench) -> None:
+    grows(harness.pictures)
+    told = [camera_frames.decode(picture) for picture in harness.pictures()]
     assert [each.sequence for each in told] == list(range(1, len(told) + 1))
     assert all((each.width, each.height, each.jpeg) == (4, 3, JPEG) for each in told)
-    assert not any(topics.CAM in item.topic for item in bench.outbox._incoming)
+    assert not any(topics.CAM in item.topic for item in harness.outbox._incoming)
 
 
-def test_a_camera_that_has_no_picture_yet_films_none(bench: RoomBench) -> None:
-    grows(bench.pictures)
-    bench.sensor.picture = b""
-    grows(bench.measured)
-    filmed = len(bench.pictures())
-    grows(bench.measured)
-    assert len(bench.pictures()) <= filmed + 1, "one may have been on its way"
+def test_a_camera_that_has_no_picture_yet_films_none(harness: RoomBench) -> None:
+    grows(harness.pictures)
+    harness.sensor.picture = b""
+    grows(harness.measured)
+    filmed = len(harness.pictures())
+    grows(harness.measured)
+    assert len(harness.pictures()) <= filmed + 1, "one may have been on its way"
 
 
-def test_a_picture_that_is_too_large_is_a_fault_that_says_what_to_do(bench: RoomBench) -> None:
-    bench.device.link_changed(True)
-    bench.sensor.picture = bytes(MAX_BYTES)
-    state = shown(bench, lambda state: state.faults)
+def test_a_picture_that_is_too_large_is_a_fault_that_says_what_to_do(harness: RoomBench) -> None:
+    harness.device.link_changed(True)
+    harness.sensor.picture = bytes(MAX_BYTES)
+    state = shown(harness, lambda state: state.faults)
     assert "smaller pictures" in state.faults[0].message
 
 
-def test_a_gathering_changes_the_rate_tells_how_far_it_is_and_ends_by_itself(bench: RoomBench) -> None:
-    before = bench.sensor.reads["rain"]
-    command = bench.command(CollectData(streams=("air", "rain"), rate_hz=50.0, duration_s=1.5), epoch=bench.epoch())
-    ack = bench.end(command)
+def test_a_gathering_changes_the_rate_tells_how_far_it_is_and_ends_by_itself(harness: RoomBench) -> None:
+    before = harness.sensor.reads["rain"]
+    command = harness.command(CollectData(streams=("air", "rain"), rate_hz=50.0, duration_s=1.5), epoch=harness.epoch())
+    ack = harness.end(command)
     assert ack.status is AckStatus.DONE
-    assert bench.sensor.reads["rain"] - before > 20, "ten times its own rate"
+    assert harness.sensor.reads["rain"] - before > 20, "ten times its own rate"
     assert 20 < ack.result["samples"]["air"] <= 80
     assert ack.result["samples"]["rain"] == 0, "it had nothing to say"
-    progress = [each.progress for each in bench.acks(command) if each.status is AckStatus.STARTED]
+    progress = [each.progress for each in harness.acks(command) if each.status is AckStatus.STARTED]
     assert any(share and 0 < share < 1 for share in progress)
-    assert bench.device._driver.rate_hz("air") == 20.0  # type: ignore[union-attr]
+    assert harness.device._driver.rate_hz("air") == 20.0  # type: ignore[union-attr]
 
 
-def test_a_gathering_can_be_cancelled_and_nobody_else_gathers_meanwhile(bench: RoomBench) -> None:
-    first = bench.command(CollectData(rate_hz=1.0, duration_s=3000.0), epoch=bench.epoch())
-    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in bench.acks(first)))
-    second = bench.end(bench.command(CollectData(rate_hz=2.0, duration_s=1.0), epoch=bench.given))
+def test_a_gathering_can_be_cancelled_and_nobody_else_gathers_meanwhile(harness: RoomBench) -> None:
+    first = harness.command(CollectData(rate_hz=1.0, duration_s=3000.0), epoch=harness.epoch())
+    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in harness.acks(first)))
+    second = harness.end(harness.command(CollectData(rate_hz=2.0, duration_s=1.0), epoch=harness.given))
     assert (second.status, second.reason and second.reason.code) == (AckStatus.FAILED, "busy")
-    bench.command(CancelAction(action=first), epoch=bench.given)
-    assert bench.end(first).status is AckStatus.CANCELLED
-    grows(bench.measured)
+    harness.command(CancelAction(action=first), epoch=harness.given)
+    assert harness.end(first).status is AckStatus.CANCELLED
+    grows(harness.measured)
 
 
-def test_one_shot_gives_the_values_in_its_answer(bench: RoomBench) -> None:
-    bench.sensor.values = {"temperature_c": 21.5}
-    ack = bench.done(TakePicture(streams=("air",)))
+def test_one_shot_gives_the_values_in_its_answer(harness: RoomBench) -> None:
+    harness.sensor.values = {"temperature_c": 21.5}
+    ack = harness.done(TakePicture(streams=("air",)))
     assert ack.status is AckStatus.DONE
     assert ack.result["values"]["air"]["temperature_c"] == 21.5
-    assert set(bench.done(TakePicture()).result["values"]) == {"air", "rain"}
+    assert set(harness.done(TakePicture()).result["values"]) == {"air", "rain"}
 
 
-def test_a_capture_is_stored_and_named_in_the_answer(bench: RoomBench) -> None:
-    ack = bench.done(CaptureRaw(name="image"))
+def test_a_capture_is_stored_and_named_in_the_answer(harness: RoomBench) -> None:
+    ack = harness.done(CaptureRaw(name="image"))
     assert ack.result == {"upload": "u1", "media_type": "image/png", "length": 3}
-    stored = bench.store.stored[0]
+    stored = harness.store.stored[0]
     assert {key: stored[key] for key in ("device", "stream", "media_type", "content")} == {
         "device": "arm",
         "stream": "image",
@@ -256,13 +256,13 @@ def test_a_capture_is_stored_and_named_in_the_answer(bench: RoomBench) -> None:
     assert stored["name"].endswith(".png")
 
 
-def test_a_control_is_set_within_its_limits_and_says_what_was_applied(bench: RoomBench) -> None:
-    ack = bench.done(SetControl(control="opening", value=0.4))
+def test_a_control_is_set_within_its_limits_and_says_what_was_applied(harness: RoomBench) -> None:
+    ack = harness.done(SetControl(control="opening", value=0.4))
     assert (ack.status, ack.result) == (AckStatus.DONE, {"applied": {"opening": 0.2}})
     for value, code in ((0.6, "out_of_range"), (-0.1, "out_of_range")):
-        refused = bench.done(SetControl(control="opening", value=value))
+        refused = harness.done(SetControl(control="opening", value=value))
         assert (refused.status, refused.reason and refused.reason.code) == (AckStatus.FAILED, code)
-    assert bench.sensor.set_to == [0.4]
+    assert harness.sensor.set_to == [0.4]
 
 
 @pytest.mark.parametrize(
@@ -275,8 +275,8 @@ def test_a_control_is_set_within_its_limits_and_says_what_was_applied(bench: Roo
         (MoveJoints(position_rad={"elbow": 1.0}), "cannot", "it has"),
     ],
 )
-def test_what_it_has_not_is_refused_with_what_it_has(bench: RoomBench, request_: Any, code: str, said: str) -> None:
-    ack = bench.done(request_)
+def test_what_it_has_not_is_refused_with_what_it_has(harness: RoomBench, request_: Any, code: str, said: str) -> None:
+    ack = harness.done(request_)
     assert ack.status is AckStatus.FAILED
     assert ack.reason is not None
     assert ack.reason.code == code
@@ -284,42 +284,42 @@ def test_what_it_has_not_is_refused_with_what_it_has(bench: RoomBench, request_:
 
 
 def test_an_instrument_checks_numbers_itself() -> None:
-    instrument = RoomDevice(ToySensor(), ENTRY, None)
+    instrument = RoomDevice(FakeSensor(), ENTRY, None)
     for value in (math.nan, math.inf):
         with pytest.raises(Exception, match="must be a finite number"):
             instrument.set("opening", value)
 
 
 def test_a_robot_takes_no_orders_for_room_devices(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    bench.device.start()
+    harness = DeviceHarness(tmp_path)
+    harness.device.start()
     try:
-        ack = bench.end(bench.command(TakePicture(), epoch=1))
+        ack = harness.end(harness.command(TakePicture(), epoch=1))
         assert (ack.status, ack.reason and ack.reason.code) == (AckStatus.FAILED, "cannot")
     finally:
-        bench.stop()
+        harness.stop()
 
 
 def test_a_device_without_streams_or_store_says_so(tmp_path: Path) -> None:
-    bench = RoomBench(tmp_path, uploads=None, entry=RoomDeviceManifest(
+    harness = RoomBench(tmp_path, uploads=None, entry=RoomDeviceManifest(
         name="arm", kind="window", label="Window", driver="toy", captures=("image",)
     ))  # fmt: skip
     try:
         for request, code in ((TakePicture(), "no_streams"), (CaptureRaw(name="image"), "no_store")):
-            ack = bench.done(request)
+            ack = harness.done(request)
             assert (ack.status, ack.reason and ack.reason.code) == (AckStatus.FAILED, code)
     finally:
-        bench.stop()
+        harness.stop()
 
 
-def test_what_fails_is_told_as_it_was_said(bench: RoomBench) -> None:
-    bench.store.full = True
-    ack = bench.done(CaptureRaw(name="image"))
+def test_what_fails_is_told_as_it_was_said(harness: RoomBench) -> None:
+    harness.store.full = True
+    ack = harness.done(CaptureRaw(name="image"))
     assert ack.reason is not None
     assert (ack.reason.code, ack.reason.message) == ("not_stored", "the store is full; delete something")
-    instrument = bench.device._driver
+    instrument = harness.device._driver
     assert isinstance(instrument, RoomDevice)
-    bench.sensor.broken = "it is wet"
+    harness.sensor.broken = "it is wet"
     for deed in (
         lambda: instrument.take_picture(()),
         lambda: instrument.capture_raw("image"),
@@ -329,104 +329,104 @@ def test_what_fails_is_told_as_it_was_said(bench: RoomBench) -> None:
             deed()
 
 
-def test_stop_holds_what_moves_and_refuses_until_it_is_reset_and_measuring_goes_on(bench: RoomBench) -> None:
-    gathering = bench.command(CollectData(rate_hz=20.0, duration_s=3000.0), epoch=bench.epoch())
-    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in bench.acks(gathering)))
-    bench.command(StopDevice(), epoch=0)
-    assert bench.end(gathering).status is AckStatus.FAILED
-    eventually(lambda: bench.sensor.holds == 1)
-    refused = bench.done(SetControl(control="opening", value=0.1))
+def test_stop_holds_what_moves_and_refuses_until_it_is_reset_and_measuring_goes_on(harness: RoomBench) -> None:
+    gathering = harness.command(CollectData(rate_hz=20.0, duration_s=3000.0), epoch=harness.epoch())
+    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in harness.acks(gathering)))
+    harness.command(StopDevice(), epoch=0)
+    assert harness.end(gathering).status is AckStatus.FAILED
+    eventually(lambda: harness.sensor.holds == 1)
+    refused = harness.done(SetControl(control="opening", value=0.1))
     assert (refused.status, refused.reason and refused.reason.code) == (AckStatus.FAILED, "stopped")
-    grows(bench.measured)
-    assert bench.sensor.holds == 1, "once is enough"
-    assert bench.end(bench.command(ResetStop(), epoch=bench.epoch())).status is AckStatus.DONE
-    assert bench.done(SetControl(control="opening", value=0.1)).status is AckStatus.DONE
+    grows(harness.measured)
+    assert harness.sensor.holds == 1, "once is enough"
+    assert harness.end(harness.command(ResetStop(), epoch=harness.epoch())).status is AckStatus.DONE
+    assert harness.done(SetControl(control="opening", value=0.1)).status is AckStatus.DONE
 
 
-def test_the_loss_of_the_lease_ends_a_gathering(bench: RoomBench) -> None:
-    gathering = bench.command(CollectData(rate_hz=20.0, duration_s=3000.0), epoch=bench.epoch())
-    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in bench.acks(gathering)))
-    bench.command(ReleaseLease(), epoch=bench.given)
-    assert bench.end(gathering).reason.code == "lease_lost"  # type: ignore[union-attr]
+def test_the_loss_of_the_lease_ends_a_gathering(harness: RoomBench) -> None:
+    gathering = harness.command(CollectData(rate_hz=20.0, duration_s=3000.0), epoch=harness.epoch())
+    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in harness.acks(gathering)))
+    harness.command(ReleaseLease(), epoch=harness.given)
+    assert harness.end(gathering).reason.code == "lease_lost"  # type: ignore[union-attr]
 
 
-def test_a_sensor_that_does_not_answer_is_a_fault_that_ends_when_it_answers(bench: RoomBench) -> None:
-    bench.device.link_changed(True)
-    grows(bench.measured)
-    bench.sensor.broken = "no answer on the bus; is it plugged in?"
-    state = shown(bench, lambda state: state.faults)
+def test_a_sensor_that_does_not_answer_is_a_fault_that_ends_when_it_answers(harness: RoomBench) -> None:
+    harness.device.link_changed(True)
+    grows(harness.measured)
+    harness.sensor.broken = "no answer on the bus; is it plugged in?"
+    state = shown(harness, lambda state: state.faults)
     assert state.mode is Mode.FAULT
-    assert state.faults[0].message == bench.sensor.broken
-    refused = bench.done(TakePicture())
+    assert state.faults[0].message == harness.sensor.broken
+    refused = harness.done(TakePicture())
     assert (refused.status, refused.reason and refused.reason.code) == (AckStatus.FAILED, "fault")
-    bench.sensor.broken = ""
-    shown(bench, lambda state: not state.faults)
-    grows(bench.measured)
+    harness.sensor.broken = ""
+    shown(harness, lambda state: not state.faults)
+    grows(harness.measured)
 
 
 def test_a_sensor_that_is_not_there_at_the_start_is_a_fault_and_keeps_nobody_from_starting(tmp_path: Path) -> None:
     started = threading.Event()
-    original = ToySensor.connect
+    original = FakeSensor.connect
 
-    def absent(self: ToySensor) -> None:
+    def absent(self: FakeSensor) -> None:
         if not started.is_set():
             raise SensorError("nobody at home")
         original(self)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ToySensor, "connect", absent)
-        bench = RoomBench(tmp_path)
+        patch.setattr(FakeSensor, "connect", absent)
+        harness = RoomBench(tmp_path)
         try:
-            bench.device.link_changed(True)
-            assert shown(bench, lambda state: state.faults).faults[0].message == "nobody at home"
+            harness.device.link_changed(True)
+            assert shown(harness, lambda state: state.faults).faults[0].message == "nobody at home"
             started.set()
-            grows(bench.measured)
+            grows(harness.measured)
         finally:
-            bench.stop()
+            harness.stop()
 
 
-def test_an_error_of_the_driver_is_a_fault_and_not_the_end_of_it(bench: RoomBench) -> None:
-    bench.device.link_changed(True)
+def test_an_error_of_the_driver_is_a_fault_and_not_the_end_of_it(harness: RoomBench) -> None:
+    harness.device.link_changed(True)
 
     def odd(_stream: str) -> dict[str, float]:
         raise ZeroDivisionError
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench.sensor, "read", odd)
-        assert "internal error" in shown(bench, lambda state: state.faults).faults[0].message
-    shown(bench, lambda state: not state.faults)
-    grows(bench.measured)
+        patch.setattr(harness.sensor, "read", odd)
+        assert "internal error" in shown(harness, lambda state: state.faults).faults[0].message
+    shown(harness, lambda state: not state.faults)
+    grows(harness.measured)
 
 
 def test_the_room_holds_a_room_device_too(tmp_path: Path) -> None:
     rule = InterlockRule(device="other-zone", stream="presence", field="near", equals=1.0, stale_s=5.0)
-    bench = RoomBench(tmp_path, interlocks=(rule,))
+    harness = RoomBench(tmp_path, interlocks=(rule,))
     try:
-        refused = bench.done(SetControl(control="opening", value=0.1))
+        refused = harness.done(SetControl(control="opening", value=0.1))
         assert (refused.status, refused.reason and refused.reason.code) == (AckStatus.FAILED, "interlock")
-        assert bench.sensor.holds == 1
+        assert harness.sensor.holds == 1
     finally:
-        bench.stop()
+        harness.stop()
 
 
-def test_what_it_measures_is_what_the_agents_others_read_of_the_room(bench: RoomBench) -> None:
+def test_what_it_measures_is_what_the_agents_others_read_of_the_room(harness: RoomBench) -> None:
     room = ReadingCache(space="s", agent="a", own=["arm"], named=[("arm", "air")])
-    bench.device._readings = room
+    harness.device._readings = room
     eventually(lambda: room.latest("arm", "air"))
 
 
-def test_stop_by_message_latches(bench: RoomBench) -> None:
-    bench.device.link_changed(True)
-    bench.receive(topics.STOP, b'{"id":"x","caller":"ann"}')
-    assert shown(bench, lambda state: state.stop).mode in {Mode.STOPPED, Mode.IDLE}
-    assert Stop(id="x", caller="ann").caller == shown(bench, lambda state: state.stop).stop.caller  # type: ignore[union-attr]
+def test_stop_by_message_latches(harness: RoomBench) -> None:
+    harness.device.link_changed(True)
+    harness.receive(topics.STOP, b'{"id":"x","caller":"ann"}')
+    assert shown(harness, lambda state: state.stop).mode in {Mode.STOPPED, Mode.IDLE}
+    assert Stop(id="x", caller="ann").caller == shown(harness, lambda state: state.stop).stop.caller  # type: ignore[union-attr]
 
 
 def test_it_lets_the_driver_go_at_the_end_also_when_it_is_ended_twice(tmp_path: Path) -> None:
-    bench = RoomBench(tmp_path)
-    bench.device.stop()
-    bench.stop()
-    assert bench.sensor.closed
+    harness = RoomBench(tmp_path)
+    harness.device.stop()
+    harness.stop()
+    assert harness.sensor.closed
 
 
 class ToyThermometer:

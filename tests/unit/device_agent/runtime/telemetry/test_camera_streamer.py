@@ -15,14 +15,14 @@ from device_agent.protocol import Description, Stream, camera_frames, topics
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.telemetry.camera_streamer import CameraStreamer
-from tests.fakes.drivers import ToyDriver, robot_type
-from tests.harness.agent.device_harness import Bench, eventually
+from tests.fakes.drivers import FakeDriver, robot_type
+from tests.harness.agent.device_harness import DeviceHarness, eventually
 
 EYES = Stream(name="eyes", rate_hz=100.0)
 JPEG = b"\xff\xd8 a picture"
 
 
-class Seeing(ToyDriver):
+class Seeing(FakeDriver):
     """Sees what it is told to."""
 
     def __init__(self, see: Callable[[], bytes | None]) -> None:
@@ -53,12 +53,12 @@ def watched(
 
 def test_a_device_describes_its_cameras_and_tells_what_they_see(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), cameras=(EYES,))
-    bench = Bench(tmp_path, kind=kind, driver=Seeing(lambda: JPEG))
-    bench.device.start()
-    bench.device.link_changed(True)
-    (described,) = eventually(lambda: bench.heard(topics.DESC, Description))[:1]
-    shown = eventually(lambda: [payload for topic, payload in list(bench.said) if topic.endswith("/cam/eyes")][:3])
-    bench.stop()
+    harness = DeviceHarness(tmp_path, kind=kind, driver=Seeing(lambda: JPEG))
+    harness.device.start()
+    harness.device.link_changed(True)
+    (described,) = eventually(lambda: harness.heard(topics.DESC, Description))[:1]
+    shown = eventually(lambda: [payload for topic, payload in list(harness.said) if topic.endswith("/cam/eyes")][:3])
+    harness.stop()
     assert described.cameras == (EYES,)
     first = camera_frames.decode(shown[0])
     assert (first.sequence, first.width, first.height, first.jpeg) == (1, 4, 3, JPEG)

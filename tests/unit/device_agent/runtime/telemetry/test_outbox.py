@@ -50,7 +50,7 @@ class Link:
         return [event for event in found if event.kind == kind]
 
 
-class Bench:
+class DeviceHarness:
     """An outbox whose rounds are walked by hand."""
 
     def __init__(self, folder: Path, **limits: int) -> None:
@@ -86,252 +86,254 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(tmp_path)
-    yield bench
-    bench.shelf.close()
+def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
+    harness = DeviceHarness(tmp_path)
+    yield harness
+    harness.shelf.close()
 
 
-def test_an_event_is_on_disk_before_it_is_sent_and_gone_once_it_is_confirmed(bench: Bench) -> None:
-    bench.outbox.link_changed(True)
-    bench.link.confirms = False
-    bench.event("held")
-    bench.rounds()
-    assert bench.link.payloads(topics.EVENT) == [b"held"]
-    assert bench.kept(late=False) == ["held"]
-    bench.rounds(20)
-    assert bench.link.payloads(topics.EVENT) == [b"held"], "it is under way"
-    bench.link.confirm()
-    bench.rounds()
-    assert bench.kept(late=False) == []
+def test_an_event_is_on_disk_before_it_is_sent_and_gone_once_it_is_confirmed(harness: DeviceHarness) -> None:
+    harness.outbox.link_changed(True)
+    harness.link.confirms = False
+    harness.event("held")
+    harness.rounds()
+    assert harness.link.payloads(topics.EVENT) == [b"held"]
+    assert harness.kept(late=False) == ["held"]
+    harness.rounds(20)
+    assert harness.link.payloads(topics.EVENT) == [b"held"], "it is under way"
+    harness.link.confirm()
+    harness.rounds()
+    assert harness.kept(late=False) == []
 
 
-def test_what_was_not_confirmed_when_the_link_was_lost_is_sent_again_in_order(bench: Bench) -> None:
-    bench.outbox.link_changed(True)
-    bench.link.confirms = False
+def test_what_was_not_confirmed_when_the_link_was_lost_is_sent_again_in_order(harness: DeviceHarness) -> None:
+    harness.outbox.link_changed(True)
+    harness.link.confirms = False
     for name in ("one", "two", "three"):
-        bench.event(name)
-    bench.rounds()
-    bench.link.open.pop(0)()
-    bench.outbox.link_changed(False)
-    bench.rounds()
-    bench.link.said.clear()
-    bench.link.open.clear()
-    bench.link.confirms = True
-    bench.outbox.link_changed(True)
-    bench.rounds(2)
-    assert bench.link.payloads(topics.EVENT) == [b"two", b"three"]
-    assert bench.kept(late=False) == []
+        harness.event(name)
+    harness.rounds()
+    harness.link.open.pop(0)()
+    harness.outbox.link_changed(False)
+    harness.rounds()
+    harness.link.said.clear()
+    harness.link.open.clear()
+    harness.link.confirms = True
+    harness.outbox.link_changed(True)
+    harness.rounds(2)
+    assert harness.link.payloads(topics.EVENT) == [b"two", b"three"]
+    assert harness.kept(late=False) == []
 
 
-def test_a_restart_sends_what_was_kept(bench: Bench) -> None:
-    bench.event("before")
-    bench.measure(0, 3, sent=False)
-    bench.rounds()
-    bench.shelf.close()
-    bench.renew()
-    bench.outbox.link_changed(True)
-    bench.rounds(4)
-    assert [payload for _, payload in bench.link.said] == [b"before", b"0", b"1", b"2"], "events first"
+def test_a_restart_sends_what_was_kept(harness: DeviceHarness) -> None:
+    harness.event("before")
+    harness.measure(0, 3, sent=False)
+    harness.rounds()
+    harness.shelf.close()
+    harness.renew()
+    harness.outbox.link_changed(True)
+    harness.rounds(4)
+    assert [payload for _, payload in harness.link.said] == [b"before", b"0", b"1", b"2"], "events first"
 
 
-def test_measurements_are_kept_thinned_only_while_nobody_hears_them(bench: Bench) -> None:
-    bench.outbox.link_changed(True)
-    bench.measure(0, 1000, sent=True, each_s=0.02)
-    bench.rounds()
-    assert bench.kept() == []
-    bench.measure(1000, 2000, sent=False, each_s=0.02)
-    bench.rounds()
-    assert 19 <= len(bench.kept()) <= 21, "one a second of twenty seconds"
+def test_measurements_are_kept_thinned_only_while_nobody_hears_them(harness: DeviceHarness) -> None:
+    harness.outbox.link_changed(True)
+    harness.measure(0, 1000, sent=True, each_s=0.02)
+    harness.rounds()
+    assert harness.kept() == []
+    harness.measure(1000, 2000, sent=False, each_s=0.02)
+    harness.rounds()
+    assert 19 <= len(harness.kept()) <= 21, "one a second of twenty seconds"
 
 
-def test_what_was_sent_shortly_before_the_link_was_found_lost_is_kept_too(bench: Bench) -> None:
-    bench.outbox.link_changed(True)
-    bench.rounds()
-    bench.measure(0, 30, sent=True)
-    bench.outbox.link_changed(False)
-    bench.measure(30, 32, sent=False)
-    bench.rounds()
-    assert bench.kept() == [str(number) for number in range(19, 32)], "the last ten seconds, in order"
+def test_what_was_sent_shortly_before_the_link_was_found_lost_is_kept_too(harness: DeviceHarness) -> None:
+    harness.outbox.link_changed(True)
+    harness.rounds()
+    harness.measure(0, 30, sent=True)
+    harness.outbox.link_changed(False)
+    harness.measure(30, 32, sent=False)
+    harness.rounds()
+    assert harness.kept() == [str(number) for number in range(19, 32)], "the last ten seconds, in order"
 
 
-def test_it_sends_slowly_and_more_slowly_while_something_moves(bench: Bench) -> None:
-    bench.measure(0, 500, sent=False)
-    bench.rounds()
-    bench.outbox.link_changed(True)
-    bench.rounds(4)
-    assert len(bench.link.said) <= module._WINDOW + RATE_HZ
-    before = len(bench.link.said)
-    bench.rounds(40)
-    assert 9 * RATE_HZ <= len(bench.link.said) - before <= 11 * RATE_HZ
-    bench.moves = True
-    before = len(bench.link.said)
-    bench.rounds(40)
-    assert 9 * BUSY_RATE_HZ <= len(bench.link.said) - before <= 11 * BUSY_RATE_HZ
-    assert bench.link.payloads() == [str(number).encode() for number in range(len(bench.link.said))]
+def test_it_sends_slowly_and_more_slowly_while_something_moves(harness: DeviceHarness) -> None:
+    harness.measure(0, 500, sent=False)
+    harness.rounds()
+    harness.outbox.link_changed(True)
+    harness.rounds(4)
+    assert len(harness.link.said) <= module._WINDOW + RATE_HZ
+    before = len(harness.link.said)
+    harness.rounds(40)
+    assert 9 * RATE_HZ <= len(harness.link.said) - before <= 11 * RATE_HZ
+    harness.moves = True
+    before = len(harness.link.said)
+    harness.rounds(40)
+    assert 9 * BUSY_RATE_HZ <= len(harness.link.said) - before <= 11 * BUSY_RATE_HZ
+    assert harness.link.payloads() == [str(number).encode() for number in range(len(harness.link.said))]
 
 
 def test_after_the_link_has_come_it_waits_for_whoever_stores_to_be_back_too(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    bench.outbox.settle_s = 8.0
-    bench.event("held")
+    harness = DeviceHarness(tmp_path)
+    harness.outbox.settle_s = 8.0
+    harness.event("held")
     for _ in range(2):
-        bench.outbox.link_changed(True)
-        bench.rounds(32)
-        assert bench.link.said == []
-    bench.rounds(2)
-    assert bench.link.payloads(topics.EVENT) == [b"held"]
-    bench.event("live")
-    bench.rounds()
-    assert bench.link.payloads(topics.EVENT) == [b"held", b"live"], "from then on at once"
-    bench.shelf.close()
+        harness.outbox.link_changed(True)
+        harness.rounds(32)
+        assert harness.link.said == []
+    harness.rounds(2)
+    assert harness.link.payloads(topics.EVENT) == [b"held"]
+    harness.event("live")
+    harness.rounds()
+    assert harness.link.payloads(topics.EVENT) == [b"held", b"live"], "from then on at once"
+    harness.shelf.close()
 
 
-def test_no_more_than_a_window_is_under_way(bench: Bench) -> None:
-    bench.measure(0, 100, sent=False)
-    bench.link.confirms = False
-    bench.outbox.link_changed(True)
-    bench.rounds(40)
-    assert len(bench.link.said) == module._WINDOW
-    bench.link.confirm()
-    bench.rounds(8)
-    assert len(bench.link.said) == 2 * module._WINDOW
+def test_no_more_than_a_window_is_under_way(harness: DeviceHarness) -> None:
+    harness.measure(0, 100, sent=False)
+    harness.link.confirms = False
+    harness.outbox.link_changed(True)
+    harness.rounds(40)
+    assert len(harness.link.said) == module._WINDOW
+    harness.link.confirm()
+    harness.rounds(8)
+    assert len(harness.link.said) == 2 * module._WINDOW
 
 
-def test_a_link_whose_queue_is_full_is_tried_again(bench: Bench) -> None:
-    bench.outbox.link_changed(True)
-    bench.link.takes = False
-    bench.event("held")
-    bench.rounds(3)
-    bench.link.takes = True
-    bench.rounds()
-    assert bench.link.payloads(topics.EVENT) == [b"held"]
+def test_a_link_whose_queue_is_full_is_tried_again(harness: DeviceHarness) -> None:
+    harness.outbox.link_changed(True)
+    harness.link.takes = False
+    harness.event("held")
+    harness.rounds(3)
+    harness.link.takes = True
+    harness.rounds()
+    assert harness.link.payloads(topics.EVENT) == [b"held"]
 
 
-def test_what_is_never_confirmed_is_sent_some_times_and_then_dropped_and_counted(bench: Bench) -> None:
-    bench.outbox.link_changed(True)
-    bench.link.confirms = False
-    bench.event("refused")
-    bench.rounds(int(4 * module._ACK_TIMEOUT_S * (module._MAX_ATTEMPTS + 1)))
-    assert bench.link.payloads(topics.EVENT).count(b"refused") == module._MAX_ATTEMPTS
-    assert bench.kept(late=False) == []
-    bench.outbox.link_changed(False)
-    bench.outbox.link_changed(True)
-    bench.rounds()
-    (told,) = bench.link.events(EventKind.BUFFER_DROPPED)
+def test_what_is_never_confirmed_is_sent_some_times_and_then_dropped_and_counted(harness: DeviceHarness) -> None:
+    harness.outbox.link_changed(True)
+    harness.link.confirms = False
+    harness.event("refused")
+    harness.rounds(int(4 * module._ACK_TIMEOUT_S * (module._MAX_ATTEMPTS + 1)))
+    assert harness.link.payloads(topics.EVENT).count(b"refused") == module._MAX_ATTEMPTS
+    assert harness.kept(late=False) == []
+    harness.outbox.link_changed(False)
+    harness.outbox.link_changed(True)
+    harness.rounds()
+    (told,) = harness.link.events(EventKind.BUFFER_DROPPED)
     assert told.data == {"measurements": 0, "events": 1}
 
 
 def test_what_did_not_fit_is_told_after_the_link_has_come_back(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, max_bytes=50_000)
-    bench.measure(0, 2000, sent=False)
-    bench.rounds()
-    left = len(bench.kept())
-    bench.outbox.link_changed(True)
-    bench.rounds()
-    (told,) = bench.link.events(EventKind.BUFFER_DROPPED)
+    harness = DeviceHarness(tmp_path, max_bytes=50_000)
+    harness.measure(0, 2000, sent=False)
+    harness.rounds()
+    left = len(harness.kept())
+    harness.outbox.link_changed(True)
+    harness.rounds()
+    (told,) = harness.link.events(EventKind.BUFFER_DROPPED)
     assert told.data == {"measurements": 2000 - left, "events": 0}
     assert (told.device, told.severity) == ("arm", "warning")
-    bench.shelf.close()
+    harness.shelf.close()
 
 
 def test_a_thread_that_is_stuck_costs_a_bounded_memory_and_what_it_costs_is_counted(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_MAX_INCOMING", 10)
     for number in range(14):
-        bench.event(str(number))
-    bench.rounds()
-    assert bench.kept(late=False) == [str(number) for number in range(4, 14)]
-    bench.outbox.link_changed(True)
-    bench.rounds(4)
-    (told,) = bench.link.events(EventKind.BUFFER_DROPPED)
+        harness.event(str(number))
+    harness.rounds()
+    assert harness.kept(late=False) == [str(number) for number in range(4, 14)]
+    harness.outbox.link_changed(True)
+    harness.rounds(4)
+    (told,) = harness.link.events(EventKind.BUFFER_DROPPED)
     assert told.data["events"] == 4
 
 
 class TestFullDisk:
     @pytest.fixture
-    def full(self, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    def full(self, harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
         """While its only entry is true, nothing can be put on disk."""
-        put, full = bench.shelf.put, [True]
+        put, full = harness.shelf.put, [True]
 
         def fail(items: Any, **options: Any) -> None:
             if full[0]:
                 raise OutboxStoreError("outbox.db cannot be written: is the disk full?")
             put(items, **options)
 
-        monkeypatch.setattr(bench.shelf, "put", fail)
+        monkeypatch.setattr(harness.shelf, "put", fail)
         return full
 
-    def test_events_go_out_from_memory_and_it_is_said(self, bench: Bench, full: list[bool]) -> None:
+    def test_events_go_out_from_memory_and_it_is_said(self, harness: DeviceHarness, full: list[bool]) -> None:
         assert full
-        bench.outbox.link_changed(True)
-        bench.event("held")
-        bench.rounds(2)
-        assert b"held" in bench.link.payloads(topics.EVENT)
-        (told,) = bench.link.events(EventKind.BUFFER_FAILED)
+        harness.outbox.link_changed(True)
+        harness.event("held")
+        harness.rounds(2)
+        assert b"held" in harness.link.payloads(topics.EVENT)
+        (told,) = harness.link.events(EventKind.BUFFER_FAILED)
         assert told.severity == "error"
         assert "disk full" in told.message
-        bench.event("next")
-        bench.rounds(40)
-        assert bench.link.payloads(topics.EVENT).count(b"next") == 1
-        assert len(bench.link.events(EventKind.BUFFER_FAILED)) == 1, "once"
+        harness.event("next")
+        harness.rounds(40)
+        assert harness.link.payloads(topics.EVENT).count(b"next") == 1
+        assert len(harness.link.events(EventKind.BUFFER_FAILED)) == 1, "once"
 
     def test_events_wait_in_memory_for_the_disk_and_measurements_are_counted(
-        self, bench: Bench, full: list[bool]
+        self, harness: DeviceHarness, full: list[bool]
     ) -> None:
-        bench.event("first")
-        bench.measure(0, 5, sent=False)
-        bench.rounds()
+        harness.event("first")
+        harness.measure(0, 5, sent=False)
+        harness.rounds()
         full[0] = False
-        bench.event("second")
-        bench.rounds()
-        assert bench.kept(late=False) == []
-        bench.rounds(int(4 * module._SAVE_RETRY_S))
-        assert bench.kept(late=False)[::2] == ["first", "second"], "with what was said of the disk between"
-        bench.outbox.link_changed(True)
-        bench.rounds(2)
-        (told,) = bench.link.events(EventKind.BUFFER_DROPPED)
+        harness.event("second")
+        harness.rounds()
+        assert harness.kept(late=False) == []
+        harness.rounds(int(4 * module._SAVE_RETRY_S))
+        assert harness.kept(late=False)[::2] == ["first", "second"], "with what was said of the disk between"
+        harness.outbox.link_changed(True)
+        harness.rounds(2)
+        (told,) = harness.link.events(EventKind.BUFFER_DROPPED)
         assert told.data == {"measurements": 5, "events": 0}
 
-    def test_memory_is_bounded(self, bench: Bench, full: list[bool]) -> None:
+    def test_memory_is_bounded(self, harness: DeviceHarness, full: list[bool]) -> None:
         assert full
         for number in range(module._MAX_UNSAVED + 20):
-            bench.event(str(number))
-        bench.rounds()
-        assert len(bench.outbox._unsaved) == module._MAX_UNSAVED
+            harness.event(str(number))
+        harness.rounds()
+        assert len(harness.outbox._unsaved) == module._MAX_UNSAVED
 
-    def test_what_is_only_in_memory_and_never_confirmed_is_let_go(self, bench: Bench, full: list[bool]) -> None:
+    def test_what_is_only_in_memory_and_never_confirmed_is_let_go(
+        self, harness: DeviceHarness, full: list[bool]
+    ) -> None:
         assert full
-        bench.link.confirms = False
-        bench.outbox.link_changed(True)
-        bench.event("refused")
-        bench.rounds(int(4 * module._ACK_TIMEOUT_S * (module._MAX_ATTEMPTS + 1)))
-        assert bench.link.payloads(topics.EVENT).count(b"refused") == module._MAX_ATTEMPTS
-        assert bench.outbox._unsaved == {}
+        harness.link.confirms = False
+        harness.outbox.link_changed(True)
+        harness.event("refused")
+        harness.rounds(int(4 * module._ACK_TIMEOUT_S * (module._MAX_ATTEMPTS + 1)))
+        assert harness.link.payloads(topics.EVENT).count(b"refused") == module._MAX_ATTEMPTS
+        assert harness.outbox._unsaved == {}
 
 
 def test_a_folder_that_cannot_be_used_stops_nothing(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    bench.path = tmp_path / "missing" / "outbox.db"
-    bench.renew()
-    bench.outbox.link_changed(True)
-    bench.event("held")
-    bench.rounds(2)
-    assert b"held" in bench.link.payloads(topics.EVENT)
-    bench.path.parent.mkdir()
-    bench.rounds(int(4 * module._SAVE_RETRY_S) + 1)
-    bench.event("again")
-    bench.link.takes = False
-    bench.rounds()
-    assert bench.kept(late=False) == ["again"]
-    bench.shelf.close()
+    harness = DeviceHarness(tmp_path)
+    harness.path = tmp_path / "missing" / "outbox.db"
+    harness.renew()
+    harness.outbox.link_changed(True)
+    harness.event("held")
+    harness.rounds(2)
+    assert b"held" in harness.link.payloads(topics.EVENT)
+    harness.path.parent.mkdir()
+    harness.rounds(int(4 * module._SAVE_RETRY_S) + 1)
+    harness.event("again")
+    harness.link.takes = False
+    harness.rounds()
+    assert harness.kept(late=False) == ["again"]
+    harness.shelf.close()
 
 
 def test_an_error_in_reading_is_trouble_too_and_one_nobody_thought_of_ends_nothing(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    bench.outbox.link_changed(True)
+    harness.outbox.link_changed(True)
 
     def fail(error: Exception) -> Callable[..., list[tuple[int, OutboxItem]]]:
         def after(*_: object, **__: object) -> list[tuple[int, OutboxItem]]:
@@ -340,35 +342,35 @@ def test_an_error_in_reading_is_trouble_too_and_one_nobody_thought_of_ends_nothi
         return after
 
     with monkeypatch.context() as patch:
-        patch.setattr(bench.shelf, "after", fail(OutboxStoreError("outbox.db cannot be read")))
-        bench.event("one")
-        bench.rounds()
+        patch.setattr(harness.shelf, "after", fail(OutboxStoreError("outbox.db cannot be read")))
+        harness.event("one")
+        harness.rounds()
     assert "cannot be read" in caplog.text
     with monkeypatch.context() as patch:
-        patch.setattr(bench.shelf, "after", fail(RuntimeError("a mistake")))
-        bench.rounds()
+        patch.setattr(harness.shelf, "after", fail(RuntimeError("a mistake")))
+        harness.rounds()
     assert "a mistake" in caplog.text
-    bench.rounds(int(4 * module._SAVE_RETRY_S) + 1)
-    assert b"one" in bench.link.payloads(topics.EVENT)
+    harness.rounds(int(4 * module._SAVE_RETRY_S) + 1)
+    assert b"one" in harness.link.payloads(topics.EVENT)
 
 
 def test_as_a_thread_it_sends_at_once_and_its_last_words_before_it_ends(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    bench.outbox.start()
-    bench.outbox.link_changed(True)
-    bench.event("held")
-    eventually(lambda: bench.link.payloads(topics.EVENT) == [b"held"])
-    bench.link.confirms = False
-    bench.event("goodbye")
-    later = threading.Timer(0.1, bench.link.confirm)
+    harness = DeviceHarness(tmp_path)
+    harness.outbox.start()
+    harness.outbox.link_changed(True)
+    harness.event("held")
+    eventually(lambda: harness.link.payloads(topics.EVENT) == [b"held"])
+    harness.link.confirms = False
+    harness.event("goodbye")
+    later = threading.Timer(0.1, harness.link.confirm)
     later.start()
-    bench.outbox.stop()
-    bench.outbox.stop()
+    harness.outbox.stop()
+    harness.outbox.stop()
     later.join()
-    assert bench.link.payloads(topics.EVENT) == [b"held", b"goodbye"]
-    bench.renew()
-    bench.shelf.open()
-    bench.event("x")
-    bench.rounds()
-    assert bench.kept(late=False)[-1] == "x"
-    bench.shelf.close()
+    assert harness.link.payloads(topics.EVENT) == [b"held", b"goodbye"]
+    harness.renew()
+    harness.shelf.open()
+    harness.event("x")
+    harness.rounds()
+    assert harness.kept(late=False)[-1] == "x"
+    harness.shelf.close()

@@ -15,8 +15,8 @@ from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import Measurements, Stream, codec, topics
 from device_agent.runtime.telemetry.stream_sampler import StreamSampler
-from tests.fakes.drivers import ToyDriver, robot_type
-from tests.harness.agent.device_harness import Bench, eventually
+from tests.fakes.drivers import FakeDriver, robot_type
+from tests.harness.agent.device_harness import DeviceHarness, eventually
 from tests.unit.device_agent.runtime.actions.test_robot_api import play
 
 WITHIN_S = 60.0
@@ -24,7 +24,7 @@ JOINTS, SONAR, HEALTH = (Stream(name=name, rate_hz=100.0) for name in ("joints",
 Answer = Callable[[], Mapping[str, float | bool]]
 
 
-class Gauge(ToyDriver):
+class Gauge(FakeDriver):
     """Measures what it is told to."""
 
     def __init__(self, **answers: Answer) -> None:
@@ -130,47 +130,49 @@ def test_a_driver_that_measures_only_joints_is_asked_for_nothing() -> None:
 
 def test_a_device_tells_its_streams(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
-    bench = Bench(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": 0.8}))
-    bench.device.start()
+    harness = DeviceHarness(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": 0.8}))
+    harness.device.start()
     try:
         deadline_s = time.monotonic() + WITHIN_S
-        while not any(topic.endswith("/tele/sonar") for topic, _ in list(bench.said)):
+        while not any(topic.endswith("/tele/sonar") for topic, _ in list(harness.said)):
             assert time.monotonic() < deadline_s
             time.sleep(0.01)
     finally:
-        bench.stop()
-    payload = next(payload for topic, payload in bench.said if topics.parse(topic).name == "sonar")
+        harness.stop()
+    payload = next(payload for topic, payload in harness.said if topics.parse(topic).name == "sonar")
     assert codec.decode(payload, Measurements).values == {"distance_m": 0.8}
 
 
 def test_a_script_reads_what_its_own_robot_measures(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
-    bench = Bench(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": 0.8}))
-    bench.device.start()
+    harness = DeviceHarness(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": 0.8}))
+    harness.device.start()
     lines = (
         "import time\n"
         "while 'sonar' not in robot.state()['streams']: time.sleep(0.01)\n"
         "sonar = robot.state()['streams']['sonar']\n"
         "print(sonar['values'], sonar['age_s'] >= 0)\n"
     )
-    assert play(bench, lines) == "{'distance_m': 0.8} True\n"
-    bench.stop()
+    assert play(harness, lines) == "{'distance_m': 0.8} True\n"
+    harness.stop()
 
 
 def test_an_interlock_holds_a_robot_by_what_it_measures_itself(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
     near = InterlockRule(device="arm", stream="sonar", field="distance_m", below=0.5)
     away_m = [0.8]
-    bench = Bench(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": away_m[0]}), interlocks=[near])
-    bench.device.start()
-    eventually(lambda: not bench.device._controller.restrictions)
+    harness = DeviceHarness(
+        tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": away_m[0]}), interlocks=[near]
+    )
+    harness.device.start()
+    eventually(lambda: not harness.device._controller.restrictions)
     away_m[0] = 0.2
-    (held,) = eventually(lambda: bench.device._controller.restrictions)
+    (held,) = eventually(lambda: harness.device._controller.restrictions)
     assert "distance_m" in held.why
-    bench.stop()
+    harness.stop()
 
 
-class Island(Bench):
+class Island(DeviceHarness):
     """A device whose link takes no measurement while it is down."""
 
     down = True
@@ -184,12 +186,12 @@ class Island(Bench):
 def test_what_was_measured_while_the_link_was_down_is_told_late(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
     gauge = Gauge(sonar=lambda: {"distance_m": 0.8})
-    bench = Island(tmp_path, kind=kind, driver=gauge)
-    bench.outbox.link_changed(False)
-    bench.device.start()
+    harness = Island(tmp_path, kind=kind, driver=gauge)
+    harness.outbox.link_changed(False)
+    harness.device.start()
     eventually(lambda: gauge.asked.count("sonar") > 5)
-    bench.down = False
-    bench.outbox.link_changed(True)
-    late = eventually(lambda: bench.heard(topics.LATE, Measurements, "sonar"))
+    harness.down = False
+    harness.outbox.link_changed(True)
+    late = eventually(lambda: harness.heard(topics.LATE, Measurements, "sonar"))
     assert late[0].values == {"distance_m": 0.8}
-    bench.stop()
+    harness.stop()
