@@ -208,19 +208,22 @@ def _long(condition: Condition, taken: Mapping[str, list[float]]) -> Table:
 def _why(condition: Condition, taken: Mapping[str, list[float]]) -> str:
     """Explains the order of the transports."""
     if condition.loss:
-        return "A stall holds up what follows it on the same connection. What polls hardly notices: it waits anyway."
+        return (
+            "A stall delays all following data of the same connection. Polling is hardly affected, because it waits "
+            "anyway."
+        )
     slower = [name for name in (OURS, EMBEDDED) if median(taken[name]) > claim_best(taken)]
-    told = (
-        f"A setpoint of {len(exchanges.SETPOINT)} bytes, one way. What is pushed over a connection that stands takes "
-        "half of each round trip and what its programs need. Our long poll brings a whole action (identity, role, "
-        "rows, signature), not a bare message."
+    note = (
+        f"A setpoint of {len(exchanges.SETPOINT)} bytes, one way. A message over an open connection takes half a "
+        "round trip plus processing. Telescope's long poll delivers a whole action (identity, role, rows, signature), "
+        "not a bare message."
     )
     if slower:
-        told += (
-            f" Slower than the fastest other way: {', '.join(slower)}. A WebSocket relay hands a text to whoever else "
-            "is connected; a broker looks at topics and rights for each message, and amqtt does so in Python."
+        note += (
+            f" Slower than the fastest other way: {', '.join(slower)}. A WebSocket relay forwards text to all other "
+            "clients; a broker checks topic and permissions of each message, and amqtt does so in Python."
         )
-    return told
+    return note
 
 
 def claim_best(taken: Mapping[str, list[float]]) -> float:

@@ -12,17 +12,17 @@ _ROWS: Final = (
         "all, or a list of topics",
         "access control lists",
         "API keys, roles",
-        "whoever connects",
+        "every connected client",
     ),
     ("one controller", "a lease whose number the robot itself checks", "–", "–", "–", "–"),
-    ("nobody sends any more", "holds after 300 ms", "–", "–", "after 2 s", "–"),
+    ("commands stop", "holds after 300 ms", "–", "–", "after 2 s", "–"),
     ("late setpoints", "loop age over 200 ms: dropped", "–", "–", "–", "–"),
     ("limits", "position, speed, acceleration, space, own body", "–", "–", "–", "–"),
     ("stop", "latches at the robot, reset on purpose", "–", "–", "of all parts", "–"),
     ("record", "sessions, commands, hash-chained audit", "rosbag", "storages", "data capture", "MCAP"),
 )
-_NOTE: Final = """Of the wires that are compared, and of Viam as what is built on gRPC; by what is published of them,
-not measured here. – is left to whoever builds on it. Of the figures above, only Telescope's contain any of this."""
+_NOTE: Final = """Taken from the published documentation of the compared protocols, and of Viam, which uses gRPC; not
+measured here. – means that the application must provide it. Only the Telescope values above include these functions."""
 
 
 def table() -> Table:

@@ -1,7 +1,7 @@
 """The agent with the additional driver ``light`` and an observer of its control loops.
 
-``python -m benchmarks.scale.agent RATE_HZ -- …`` passes the remaining arguments to ``device_agent``. For each line with a
-number of seconds on standard input it observes for that time and prints ``seen`` and ``LoopStatistics`` as JSON.
+``python -m benchmarks.scale.agent RATE_HZ -- …`` passes the remaining arguments to ``device_agent``. For each line
+with a number of seconds on standard input it observes for that time and prints ``seen`` and ``LoopStatistics`` as JSON.
 """
 
 import sys

@@ -201,10 +201,10 @@ def ceilings(found: list[AgentProcess]) -> list[str]:
 def table(found: list[AgentProcess]) -> Table:
     """Returns the table of results."""
     alone = {each.kind: each.mb for each in found if each.count == 1}
-    note = """An agent of the product with so many UR5, none of them moving: *light* ones are where they were
-told to be, so that what is left is what the agent itself costs; *simulated* ones have a world and its physics
-each. Late is how much more than its 8 ms a control period took; in time: less than a period, for 99 of 100. The
-functions and mosquitto run beside it and take in what is told."""
+    note = """One agent with a number of UR5 at rest. *Light* robots are always at their commanded position, so
+the values show the cost of the agent itself; *simulated* robots have a world with physics each. Late is the time by
+which a control period exceeds 8 ms; a robot is in time if 99 % of its periods are less than one period late. The
+functions and mosquitto run on the same machine and store the telemetry."""
     note = " ".join([note, *ceilings(found)])
     rows = [each.row(alone.get(each.kind)) for each in found]
     return Table(title="Robots of one agent", columns=COLUMNS, rows=rows, note=note)

@@ -206,7 +206,7 @@ class Load:
             self._ending.wait(self._hold_s)
             heard = line.received.qsize()
             line.reset()
-            self.count("messages heard", heard)
+            self.count("messages received", heard)
             if not heard:
                 raise RuntimeError("nothing is heard")
 

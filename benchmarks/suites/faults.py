@@ -25,36 +25,35 @@ _FULL_RAD_S: Final = 1.1
 _RAMP_S: Final = 0.01
 """Time until braking reaches its full deceleration (``joint_motion.py``)."""
 _WORDS: Final = dict(zip(SPEEDS, ("at rest", "at 0.1 rad/s", "at full speed of 1.1 rad/s"), strict=True))
-_ABOUT: Final = """Two simulated UR5 behind one agent; operators, agent, functions, worker and broker are processes
-of their own, the agent's link and each operator's go through proxies that do the damage. One arm is streamed to and
-fro at up to 1.1 rad/s, the other is given one order after the other over HTTP, each with the same idempotency key
-until it is answered. Something breaks, is mended, and then control is taken again."""
-_FAULTS_NOTE: Final = """*Stop*: from the last setpoint that reached the agent to the first line of the simulation's
-record (every 10 ms) from which on the arm is commanded to stand still; where its link is cut or the broker killed,
-of which the agent is told, from the cut; where functions are killed, from the end of the lease; with a full disk,
-which ends the record, by the periods of the control loop. Where the fault stops nobody (delay, loss, clock, disk,
-messages out of order), the operator dies while it lasts, or stops streaming. With the agent ends its simulation.
-*Recovery*: from mending (a start, where something was killed; the cut itself, where a link is only cut or
-forgotten) until a new lease moves the arm **and** a new order is done on the other; the bench itself looks for 0.6
-s first whether anything moves that must not. *Lost*: accepted orders without an end. *Doubled*: orders that began
-twice in the agent, or that the record shows done again, and setpoints applied after newer ones. A full disk is a
-limit of 0 bytes on what the agent's files may grow."""
-_STOP_NOTE: Final = """From just before the operator's publish, or call, to a period of the control loop ({period:g}
-ms), on one clock; the link has no proxy. *Braking*: the first period that is decided under the Stop. *Zero*: the
-first that commands no motion. Between them lies the braking ramp, which the arm's limits make: at most {braking:g}
-rad/s², reached within {ramp:g} ms; from 1.1 rad/s that is {least:.0f} ms at least, so at speed no Stop can be
-within 10 ms."""
+_ABOUT: Final = """Two simulated UR5 share one agent. Operators, agent, functions, worker and broker are separate
+processes; proxies between them inject the faults. An operator moves one arm back and forth at up to 1.1 rad/s. The
+other arm receives one action after another over HTTP; a request keeps its idempotency key until a response arrives.
+Each run injects a fault, repairs it and acquires control again."""
+_FAULTS_NOTE: Final = """*Stop*: time from the last setpoint at the agent to the first line of the simulation's trace
+(every 10 ms) without commanded motion. For a cut link or a killed broker, which the agent notices, it counts from the
+cut; for killed functions, from the end of the lease; for a full disk, which ends the trace, by control periods. If
+the fault alone does not stop the arm (delay, loss, clock, disk, reordered messages), the operator is killed or stops
+streaming during the fault. A killed agent ends its simulation. *Recovery*: time from the repair (restart after a
+kill, the cut itself otherwise) until a new lease moves one arm **and** the other arm completes a new action. It
+includes 0.6 s in which the benchmark checks that nothing moves. *Lost*: accepted actions without a terminal state.
+*Duplicated*: actions that started twice or that the trace shows twice, and setpoints applied after newer ones. The
+full disk is a limit of 0 bytes on the growth of the agent's files."""
+_STOP_NOTE: Final = """Time from just before the operator's publish or request to a control period ({period:g} ms), on
+one clock and without proxies. *Braking*: the first period computed under the Stop. *Zero*: the first period without
+commanded motion. The braking ramp between them follows from the arm's limits: at most {braking:g} rad/s², reached
+within {ramp:g} ms. From 1.1 rad/s it takes at least {least:.0f} ms, so a Stop at full speed cannot reach zero within
+10 ms."""
 
 _TRIED: Final = Table(
     title="Stop, before and after",
     columns=["what was changed", "message → braking: p99 ms", "POST → braking: p99 ms"],
     rows=[
-        ["as it was: a Stop waits for the control period that comes", 13.4, 15.5],
-        ["it begins a period of its own, in motion too; its message goes before anything is signed", 6.62, 10.9],
-        ["also right after a setpoint's own period", 1.99, 5.88],
+        ["before: a Stop waits for the next control period", 13.4, 15.5],
+        ["a Stop starts a period at once; its message is published before signing", 6.62, 10.9],
+        ["also directly after a period started by a setpoint", 1.99, 5.88],
     ],
-    note="""Quick runs of one day (2026-11-22), 30 Stops each way. The period that a Stop begins in motion brakes for
-just as long as has passed since the one before, so nothing moves faster for it.""",
+    note="""Quick runs of one day (2026-11-22), 30 Stops per method. A period started by a Stop brakes for the time
+since the previous period, so the arm never moves faster.""",
 )
 
 
@@ -194,7 +193,7 @@ def claims(found: list[FaultResult], stops: list[StopResult], orders: Counted) -
             text=f"lost, of {accepted} orders", seen=sum(each[1] for each in orders.values()), bound=0, unit="orders"
         ),
         Claim(
-            text="doubled: orders done twice, setpoints applied after newer ones",
+            text="duplicated: actions executed twice, setpoints applied after newer ones",
             seen=sum(each[2] for each in orders.values()) + undone,
             bound=0,
             unit="times",

@@ -26,37 +26,41 @@ from tests.harness.network.brokers import BROKERS
 
 SETPOINT_MOST: Final = 1.5
 ACTION_MOST: Final = 2.5
-_ABOUT: Final = """A simulated UR5, its agent, the broker, the functions and who measures are processes of their own.
-*Setpoint* runs from the operator's publish to the telemetry which says that the driver has applied it; the arm rests.
-*Action* runs from `POST actions` to its answer that the robot has started: identity, role, the row's write, signature,
-publish, the agent's checks and journal, ack. The bare ones are answered by another process: over MQTT with QoS 0 a real
-setpoint by as many bytes as telemetry has, else 150 bytes of JSON by themselves. An operator's setpoints come 25 ms
-apart, and so does everything here: after a pause processors have to wake and caches are cold, and what was 0.3 ms
-back to back takes 0.8."""
+_ABOUT: Final = """A simulated UR5, its agent, the broker, the functions and the client are separate processes.
+*Setpoint* is the time from the operator's publish to the telemetry that reports it as applied; the arm is at rest.
+*Action* is the time from `POST actions` to the response `started`: identity, role, row write, signature, publish, the
+agent's checks and journal, acknowledgement. An echo process answers the reference exchanges: with MQTT QoS 0 a real
+setpoint by as many bytes as telemetry has, otherwise 150 bytes of JSON. All exchanges are 25 ms apart, like an
+operator's setpoints. After such a pause processors wake up and caches are cold: 0.3 ms back to back become 0.8 ms."""
 _TRIED: Final = Table(
-    title="Before and after, over mosquitto",
+    title="Before and after, with mosquitto",
     columns=["what was changed", "setpoint: p50 ms", "×", "action: p50 ms", "×"],
     rows=[
-        ["as it was", 17.8, 17.3, 11.4, 4.1],
-        ["telemetry goes with setpoints; a period on the thread that brings one", 2.3, 2.3, None, None],
-        ["frames all at once and rounded, no look ahead at rest, health every 20 ms", 1.9, 2.0, None, None],
-        ["a setpoint's own period uses what the one before saw and prepared; topics are known", 1.4, 1.7, None, None],
-        ["only what must last waits for the disk; the office tells that it started", None, None, 9.3, 4.1],
-        ["two answers leave together", None, None, 9.9, 3.7],
+        ["before", 17.8, 17.3, 11.4, 4.1],
+        ["telemetry is published with setpoints; the receiving thread runs the period", 2.3, 2.3, None, None],
+        ["frames computed together and rounded, no prediction at rest, health every 20 ms", 1.9, 2.0, None, None],
+        ["a setpoint's period reuses results of the previous one; topics are cached", 1.4, 1.7, None, None],
+        ["only durable records wait for the disk; the command thread acknowledges the start", None, None, 9.3, 4.1],
+        ["two acknowledgements are sent together", None, None, 9.9, 3.7],
         ["the worker yields (nice 5)", 1.2, 1.6, 8.3, 3.5],
-        ["the disk has the command before motion, not before the answer", None, None, 8.8, 3.2],
-        ["tried, not kept: uvloop and httptools (bare HTTP 1.46 → 1.14 ms)", None, None, 7.7, 3.5],
-        ["as two rows above, on a quiet machine, as all that follows", 1.36, 1.7, 7.0, 3.3],
-        ["what is only stored is read in rounds; who speaks writes; the disk meanwhile", None, 1.6, None, 3.2],
-        ["that it was accepted is told at once", 1.16, 1.7, 6.1, 3.1],
+        ["the command is on disk before motion, not before the acknowledgement", None, None, 8.8, 3.2],
+        ["not adopted: uvloop and httptools (bare HTTP 1.46 → 1.14 ms)", None, None, 7.7, 3.5],
+        ["same as two rows above on an idle machine, like all following rows", 1.36, 1.7, 7.0, 3.3],
+        [
+            "stored messages are read in batches; the publishing thread writes; disk writes overlap",
+            None,
+            1.6,
+            None,
+            3.2,
+        ],
+        ["acceptance is acknowledged at once", 1.16, 1.7, 6.1, 3.1],
     ],
-    note="""Each row was measured when it was made, with what is above it, beside other work of the machine: medians,
-and the ratios that the claims judge, of one run each (2026-11-22). In parts: a setpoint found telemetry's regular word
-in its way, and waited for the control period; then the agent's own 0.7 ms, of which half was arithmetic that nobody had
-asked for. An action waited three times for the disk (0.7 to 1.5 ms each). With uvloop and httptools one process answers
-1.4 to 2 times as many reads, and a bare FastAPI 1.9 to 2.4 times; nothing else was tried with them, so they are not in
-yet. Of the last rows: the worker woke for each message just when somebody waited for another, an agent's messages were
-written by a thread that had to be woken, and motion waited for the disk after its start had been told.""",
+    note="""Each row was measured after its change, including the changes above it, on a machine with other load:
+medians and target ratios of one run each (2026-11-22). A setpoint waited for periodic telemetry and for the control
+period; the agent itself took 0.7 ms, half of it unnecessary arithmetic. An action waited three times for the disk (0.7
+to 1.5 ms each). With uvloop and httptools one process answers 1.4 to 2 times as many reads, and a bare FastAPI 1.9 to
+2.4 times as many; they are not used. In the last rows: the worker processed each message at once and delayed waiting
+requests, another thread wrote the agent's messages, and motion waited for the disk after its start was sent.""",
 )
 _TOPICS: Final = ("bench/limit/there", "bench/limit/back")
 

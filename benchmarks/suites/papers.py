@@ -6,9 +6,9 @@ from typing import Final
 from benchmarks.papers import figure5, figure6, table2
 from benchmarks.reporting.report import Report
 
-_ABOUT: Final = """What the papers printed was measured over their networks and on their machines; here a program of its
-own delays each direction of each connection by half of the round trip that is named, and where loss is named, that
-share of the segments comes a retransmission time later (200 ms and a round trip, as on Linux), and so does all behind
+_ABOUT: Final = """The published values were measured over the papers' networks and on their machines. Here, a proxy
+delays each direction of each connection by half of the stated round trip. With packet loss, the stated share of the
+segments arrives one retransmission time later (200 ms plus a round trip, as on Linux), and so do the segments behind
 it."""
 
 

@@ -52,10 +52,10 @@ SETPOINT: Final[Steps] = (
     ("telemetry", "telemetry: measured, encoded"),
     (ANSWERED, "broker, to the operator, decoded"),
 )
-_ABOUT: Final = """Each program tells when it has come how far, by the clock that all processes of this machine share;
-a part is the time from one such moment to the next, so the parts of one exchange add up to the whole. The product has
-no tracing in it: the bench wraps public functions of its modules, which costs some ten microseconds a mark. A simulated
-UR5 that the operator holds; an action moves its wrist by a degree. On loopback."""
+_ABOUT: Final = """Each program sends timestamps on the common clock of the machine's processes. A part is the time
+between two consecutive timestamps, so the parts of one exchange add up to its duration. The product contains no
+tracing: the benchmark wraps public functions, which costs about ten microseconds per timestamp. The operator holds a
+simulated UR5; an action moves its wrist by one degree. All connections use loopback."""
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:

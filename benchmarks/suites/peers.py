@@ -20,16 +20,15 @@ PEERS: Final = {
     "gRPC, one stream": operators.grpc,
     "Foxglove, WebSocket": operators.foxglove,
 }
-_ABOUT: Final = """A setpoint for six joints, until telemetry says that the driver has applied it, 40 a second as the
-console sends them. Robot, operator and what stands between them are processes of their own, over loopback. The robot is
-the same simulated UR5 with the same driver everywhere. With Telescope it is the product as `make up` starts it: lease,
-loop age, limits, own body, recorded. At the peers it is the least that is fair: a program of the peer's own library
-that applies what comes and tells it at once."""
-_HOW: Final = """rosbridge-style: `roslibpy` at both ends, between them a server of the rosbridge protocol without ROS
-behind it, which costs less than a real one. zenoh: two peers over TCP, without a router, `express`. gRPC: a
-bidirectional stream of bytes, asyncio at the robot, without protobuf's work. Foxglove: its SDK's server at the robot,
-to which the operator publishes. zenoh, gRPC and Foxglove connect both ends directly: nobody between them could hold
-rights, and the robot has to be reachable. Telescope and rosbridge pass a third process."""
+_ABOUT: Final = """A setpoint for six joints until telemetry reports it as applied, 40 per second like the console.
+Robot, operator and server are separate processes on loopback. The robot is the same simulated UR5 with the same driver.
+Telescope is the product as `make up` starts it, with lease, loop age, limits, self-collision check and recording. The
+other programs use their own library, apply each setpoint and report it at once."""
+_HOW: Final = """rosbridge: `roslibpy` at both ends and a server of the rosbridge protocol without ROS, which costs
+less than a real one. zenoh: two peers over TCP without a router, `express`. gRPC: a bidirectional stream of bytes
+with asyncio at the robot, without protobuf. Foxglove: the SDK's server at the robot, to which the operator publishes.
+zenoh, gRPC and Foxglove connect both ends directly: no server can check permissions, and the robot must be reachable.
+Telescope and rosbridge use a third process."""
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:

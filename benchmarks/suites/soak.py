@@ -21,30 +21,29 @@ _SLOPE_MOST: Final = 1.0
 _QUICK_S: Final = 48.0
 _WARM_UP: Final = 1 / 3
 """Warm-up share of the run, after which caches and pools are full (17 to 20 minutes of an hour)."""
-_ABOUT: Final = """The laboratory as `make up` starts it over amqtt: four robots and a room in one agent. Somebody
-streams setpoints to the arm under leases that they take, renew and give back, each time with new credentials;
-movements, which are scripts, run on all robots; one robot is stopped in the middle of every third, and released; two
-people listen to all that is measured and come back with new credentials; somebody signs in, looks round and signs out.
-`SOAK_MINUTES=10 python -m benchmarks soak` takes another length; `benchmarks/results/quick/soak.csv` has each sample as
-soon as it is taken."""
-_NOTE: Final = """Slopes by Theil and Sen over medians of a minute after a third of the run for warming up, with
-Sen's 95 % interval; a plus sign is growth. A process's own pages are the anonymous ones, its heaps and stacks;
-resident ones count libraries too, which others may share. Of descriptors and threads first and last are of the first
-and the last tenth after warm-up, and there the lowest tenth: each script that runs has some of its own. The agent's
-children are its planner and the jails of scripts: how many there are follows what runs."""
+_ABOUT: Final = """The laboratory as `make up` starts it with amqtt: four robots and a room behind one agent. One
+client streams setpoints to the arm and acquires, renews and releases leases, each time with new credentials. Movement
+scripts run on all robots; one robot is stopped during every third movement and reset. Two clients subscribe to all
+telemetry and reconnect with new credentials. One client signs in, reads resources and signs out. `SOAK_MINUTES=10
+python -m benchmarks soak` sets another duration; `benchmarks/results/quick/soak.csv` receives each sample at once."""
+_NOTE: Final = """Theil-Sen slopes over medians of one minute, after a warm-up of one third of the run, with Sen's 95
+% interval; a plus sign means growth. Own memory is anonymous memory (heap and stack); resident memory includes shared
+libraries. First and last descriptors and threads are the lowest tenth of the first and the last tenth of the run
+after warm-up, because each running script has its own. The agent's children are its planner and script sandboxes;
+their number follows the load."""
 
 _TRIED: Final = Table(
     title="Memory, before and after",
     columns=["what was changed", "minutes", "functions %/h", "worker", "broker", "agent", "all of it"],
     rows=[
-        ["as it was", 60, 6.9, 0.9, 1.6, 3.3, 3.6],
-        ["agents forget messages that were confirmed; the load reads as much each time", 34, 9.4, 0.6, 1.1, 0.6, 2.3],
-        ["cycles are collected as often as Python does by itself", 60, 1.5, 2.1, 1.1, 0.5, 1.0],
+        ["before", 60, 6.9, 0.9, 1.6, 3.3, 3.6],
+        ["agents drop confirmed messages; the load reads a constant amount", 34, 9.4, 0.6, 1.1, 0.6, 2.3],
+        ["the garbage collector runs as often as by default", 60, 1.5, 2.1, 1.1, 0.5, 1.0],
     ],
-    note="""Own memory from the fifteenth minute on, of one run each (2026-11-22). Agents remembered QoS 1 messages that
-were confirmed early; the load asked for all that was stored, so answers grew; and the functions' collector looked as
-seldom while they ran as while they import, so that what requests leave behind piled up for ten minutes and more. What
-the broker's grows by are revocations, some 300 bytes each, which it keeps for the hour that a token may live.""",
+    note="""Own memory from the fifteenth minute, one run each (2026-11-22). Agents kept QoS 1 messages that were
+confirmed early; the load requested all stored data, so responses grew; the garbage collector of the functions ran as
+rarely as during import, so garbage accumulated for ten minutes and more. The broker grows by revocations of about 300
+bytes each, which it keeps for the lifetime of a token, one hour.""",
 )
 
 
@@ -164,7 +163,7 @@ def _descriptors(held: list[DescriptorTrend]) -> Table:
 def _work(people: Load) -> Table:
     rows: list[list[str | float | int | None]] = [[what, count] for what, count in sorted(people.done.items())]
     rows += [[f"error: {what}", count] for what, count in sorted(people.errors.items())]
-    return Table(title="What was done meanwhile", columns=["", "times"], rows=rows)
+    return Table(title="Completed operations", columns=["", "times"], rows=rows)
 
 
 def charts(samples: list[Sample], warm_up_s: float) -> list[Chart]:

@@ -73,7 +73,7 @@ def test_a_thing_that_moves_again_breaks_the_claim_of_rest() -> None:
     made = {each.text.partition(",")[0]: each for each in claims(found, stops, orders)}
     assert not made["last fresh setpoint → zero commanded velocity"].holds
     assert made["lost"].holds
-    assert not made["doubled: orders done twice"].holds
+    assert not made["duplicated: actions executed twice"].holds
     assert [row[-1] for row in faults_table(found, orders).rows] == [1]
     assert len(stops_table(stops).rows) == len(stops)
 
