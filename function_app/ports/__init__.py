@@ -1,1 +1,1 @@
-"""What the services ask of the outside, as Protocols. Each page is its implementer's manual."""
+"""Ports: the protocols that adapters implement. Each module is the manual for implementers."""

@@ -1,6 +1,7 @@
-"""Bytes under a name. Azure Blob, S3, files.
+"""A store of named byte sequences: Azure Blob Storage, S3 or files.
 
-Names are non-empty Unicode text up to 512 characters; ``/`` only groups, adapters encode what their store cannot take.
+Names are non-empty Unicode text of at most 512 characters. ``/`` only groups names. Adapters encode characters that
+their store does not accept.
 """
 
 from collections.abc import AsyncIterator, Mapping
@@ -9,16 +10,16 @@ from typing import Protocol
 
 MAX_NAME_LENGTH = 512
 MAX_BYTES = 64 * 1024 * 1024
-"""Most that passes through the functions; what is larger goes straight to the store."""
+"""Largest blob that passes through the functions [bytes]. Larger blobs are uploaded directly to the store."""
 
 
 MAX_UPLOAD_BYTES = 4 * 1024**3
-"""Most that goes straight to the store in one request: S3 takes 5 GB, Azure a little less."""
+"""Largest direct upload in one request [bytes]. S3 accepts 5 GB, Azure slightly less."""
 
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """A request that whoever has it may make once: exactly these ``headers`` and a body of the length agreed upon."""
+    """A single-use upload request: exactly these ``headers`` and a body of the agreed length."""
 
     method: str
     url: str
@@ -26,49 +27,56 @@ class Upload:
 
 
 class Blobs(Protocol):
-    """A store of blobs. Every call is atomic: a reader sees the old content or the new, never half.
+    """Stores blobs. Every call is atomic: a reader gets the old content or the new content.
 
-    All methods raise ``tables.StoreError`` when the store cannot be used, and ``ValueError`` for an empty or too long
-    name, or where a blob would have more than ``MAX_BYTES``.
+    Idempotent: ``put``, ``delete`` and the reading methods. ``append`` is not: a retry may append twice. When the store
+    is not reachable, every method raises ``tables.StoreError``; the state of a failed write is unknown.
+
+    All methods raise ``ValueError`` for an empty or too long name, and for a blob larger than ``MAX_BYTES``.
+
+    Example::
+
+        await blobs.put("drawings/ur5", content)
+        assert await blobs.get("drawings/ur5") == content
     """
 
     async def put(self, name: str, content: bytes) -> None:
-        """Write, over what was there."""
+        """Write a blob and replace earlier content."""
 
     async def get(self, name: str) -> bytes | None:
-        """Read, or ``None`` when there is none."""
+        """Read a blob, or ``None`` if it does not exist."""
 
     async def append(self, name: str, content: bytes) -> None:
-        """Add at the end; the first append creates. Parallel appends do not mix, their order is not promised."""
+        """Append bytes; the first call creates the blob. Concurrent appends do not interleave."""
 
     async def delete(self, name: str) -> None:
-        """Delete; nothing happens when there is none."""
+        """Delete a blob. No error if it does not exist."""
 
     async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
-        """Names that start with ``prefix``, sorted, at most ``limit``."""
+        """At most ``limit`` names that start with ``prefix``, sorted."""
 
     async def size(self, name: str) -> int | None:
-        """How many bytes there are, or ``None`` when there is no such blob."""
+        """Size [bytes], or ``None`` if the blob does not exist."""
 
     async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
-        """A request that puts a blob of ``length`` bytes straight into the store, past the functions.
+        """A request that uploads a blob of ``length`` bytes directly to the store.
 
-        It ends with ``lifetime_s`` [s] and never writes over what is there. Azure takes another length as well: who
-        asked for it compares ``size`` before anybody relies on the blob.
+        It expires after ``lifetime_s`` [s] and never replaces an existing blob. Azure accepts other lengths too, so
+        compare ``size`` before you use the blob.
 
         Raises:
             ValueError: ``length`` is not 0…``MAX_UPLOAD_BYTES``.
         """
 
     async def presign_download(self, name: str, *, content_type: str, lifetime_s: int) -> str:
-        """An address from which the blob can be read for ``lifetime_s`` [s]; a browser saves rather than runs it."""
+        """A URL to download the blob for ``lifetime_s`` [s]; a browser saves the content and does not run it."""
 
     async def close(self) -> None:
-        """Let go of connections."""
+        """Close all connections."""
 
 
 class TransferRefused(Exception):  # noqa: N818 (an answer to whoever tries)
-    """An address is not, or no longer, good for what is tried; ``status`` is HTTP's word for it."""
+    """A presigned URL is not valid for this request; ``status`` is the HTTP status."""
 
     def __init__(self, status: int, message: str) -> None:
         super().__init__(message)
@@ -77,7 +85,7 @@ class TransferRefused(Exception):  # noqa: N818 (an answer to whoever tries)
 
 @dataclass(frozen=True, slots=True)
 class Download:
-    """A blob on its way out."""
+    """The content of a presigned download."""
 
     content: AsyncIterator[bytes]
     length: int
@@ -85,30 +93,30 @@ class Download:
 
 
 class Transfers(Protocol):
-    """The other end of presigned addresses, where it is the functions' own: of a store that has no HTTP itself."""
+    """Serves presigned URLs, for a store without an HTTP interface of its own."""
 
     async def receive(self, token: str, headers: Mapping[str, str], content: AsyncIterator[bytes]) -> None:
-        """Take an upload in, however large, without holding it in memory.
+        """Store an upload as a stream, without holding it in memory.
 
         Raises:
-            TransferRefused: Not signed by us, over, another length or type, or there is such a blob already.
-            StoreError: The store cannot be used.
+            TransferRefused: The token is not ours or expired, length or type differ, or the blob exists already.
+            StoreError: The store is not available.
         """
 
     async def send(self, token: str) -> Download:
-        """What an address of a download leads to.
+        """The content that a download URL refers to.
 
         Raises:
-            TransferRefused: Not signed by us, over, or there is no such blob.
-            StoreError: The store cannot be used.
+            TransferRefused: The token is not ours or expired, or the blob does not exist.
+            StoreError: The store is not available.
         """
 
 
 def check_upload(length: int) -> None:
-    """Refuse what no store takes in one request.
+    """Check the length of an upload.
 
     Raises:
-        ValueError: It is so.
+        ValueError: No store accepts an upload of this length in one request.
     """
     if not 0 <= length <= MAX_UPLOAD_BYTES:
         raise ValueError(f"an upload has 0 to {MAX_UPLOAD_BYTES} bytes, not {length}")

@@ -1,7 +1,7 @@
-"""Who may say and hear what on the broker: credentials made from grants, and taken back.
+"""Broker permissions: credentials issued from grants, and their revocation.
 
-A grant (``device_agent.protocol.security.grants``) names one connection's exact topics. How it reaches the broker differs: the
-embedded broker reads a signed token, mosquitto gets a client and a role written into it. Callers see neither.
+A grant (``device_agent.protocol.security.grants``) names the exact topics of one connection. The embedded broker reads
+it as a signed token. For mosquitto it becomes a client with a role. Callers see no difference.
 """
 
 from collections.abc import Sequence
@@ -11,83 +11,88 @@ from device_agent.protocol.security.grants import Grant
 
 
 class BrokerAccessError(Exception):
-    """The broker does not answer or refuses to be told; nothing is known of what was asked. Fit for an operator."""
+    """The broker does not respond or rejects the change; its state is unknown. The text is for operators."""
 
 
 class Credentials(NamedTuple):
-    """What a client gives in its CONNECT, beside the client id of its grant."""
+    """Username and password for CONNECT; the grant contains the client id."""
 
     username: str
     password: str
 
 
 class ServiceCredentials(NamedTuple):
-    """What the functions give in a CONNECT of their own."""
+    """Credentials for a connection of the functions themselves."""
 
     client_id: str
     username: str
     password: str
     expires_at: float
-    """When a new connection has to be made with new ones [s since 1970]; ``math.inf`` where they do not run out."""
+    """Time to reconnect with new credentials [s since 1970]; ``math.inf`` if they do not expire."""
 
 
 class BrokerAccess(Protocol):
-    """Gives and takes rights on one broker.
+    """Grants and revokes permissions on one broker.
 
-    Any number of instances, in any number of processes, may serve one broker: nothing that matters is kept in them.
-    The constructor opens nothing; the first call that needs a connection makes it. All calls are safe to repeat.
+    Any number of instances and processes may serve one broker; an instance holds no state that matters. The constructor
+    opens nothing; the first call that needs a connection opens it. All calls are idempotent. If the broker is not
+    reachable, a call raises ``BrokerAccessError`` and may be retried.
+
+    Example::
+
+        credentials = await access.issue(grant)
+        await access.revoke(client_id=grant.client_id)
     """
 
     async def issue(self, grant: Grant) -> Credentials:
         """Credentials for exactly what ``grant`` allows, until ``grant.expires_at``.
 
-        They work from the moment of return. Issuing again for the same client id gives other credentials and leaves
-        the earlier ones, and a connection made with them, as they are: an agent renews before it must.
+        They are valid on return. Issuing again for the same client id keeps earlier credentials and their connection
+        valid, so that an agent can renew early.
 
         Args:
             grant: ``token_id`` must never have been used before.
 
         Raises:
-            ProtocolError: The grant holds a client id or filter that not every broker takes. Nothing was written.
-            BrokerAccessError: The broker cannot be told. Nothing usable was left behind; ask again.
+            ProtocolError: A client id or filter in the grant is not valid on every broker. Nothing was written.
+            BrokerAccessError: The broker is not reachable. No valid credentials remain; retry.
         """
 
     def accepts(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:
-        """Whether one grant may hold so much on this broker; nobody is asked."""
+        """Whether this broker accepts a grant with these filters. Makes no request."""
 
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
-        """Cut the live connections of a client id or of a principal, and refuse what was issued for it so far.
+        """Close the connections of a client id or principal, and invalidate all credentials issued for it so far.
 
-        A principal stands for what is part of it too, and a part may be ``+`` for any one: ``grants.covering``.
-
-        On return the broker has done so. Credentials issued afterwards work. Revoking what does not exist is no error.
+        A principal also covers its parts; a part may be the wildcard ``+``: see ``grants.covering``. On return the
+        revocation is effective. Credentials issued later are valid. No error if the target does not exist.
 
         Raises:
-            ValueError: Not exactly one of the two was given.
-            BrokerAccessError: The broker cannot be told: the rights may still stand. Ask again.
+            ValueError: Not exactly one of the two arguments was given.
+            BrokerAccessError: The broker is not reachable; the permissions may still be valid. Retry.
         """
 
     async def expire(self, now_s: float) -> None:
-        """Forget credentials whose time is over, and end their connections, where the broker does not by itself.
+        """Delete expired credentials and close their connections, where the broker does not do this itself.
 
-        To be called every few seconds, by any number of instances.
+        Call it every few seconds, from any number of instances.
 
         Args:
-            now_s: The time to judge by [s since 1970].
+            now_s: Current time [s since 1970].
 
         Raises:
-            BrokerAccessError: The broker cannot be told; the next call does what this one did not.
+            BrokerAccessError: The broker is not reachable; the next call catches up.
         """
 
     def service_credentials(self) -> ServiceCredentials:
-        """Credentials for a new connection of the functions themselves, with a client id nobody else has.
+        """Credentials with a unique client id for a new connection of the functions.
 
-        They may publish commands and stops to every device, and hear every agent, and speak for one that has told them
-        over HTTP, except camera pictures and setpoints.
+        They allow publishing commands and Stop to every device, subscribing to every agent, and publishing for agents
+        that use HTTP. Camera images and setpoints are excluded.
 
         Raises:
-            BrokerAccessError: The key or password file is not there; the text says what to start first.
+            BrokerAccessError: The key or password file is missing; the text says what to start first.
         """
 
     async def close(self) -> None:
-        """Let go of the connection. May be called twice."""
+        """Close the connection. May be called twice."""

@@ -1,51 +1,59 @@
-"""X.509 for agents, where the broker wants to see a certificate before it hears a word."""
+"""X.509 certificates for agents, for brokers that require client certificates."""
 
 from typing import NamedTuple, Protocol
 
 
 class CertificateRefused(Exception):  # noqa: N818 (an answer)
-    """The request cannot be signed; the text says why."""
+    """The request cannot be signed; the text states the reason."""
 
 
 class Issued(NamedTuple):
-    """A client certificate: PEM, with what stands between it and the authority."""
+    """A client certificate with its chain (PEM)."""
 
     chain: str
     expires_ms: int
 
 
 class Certificates(Protocol):
-    """The authority for agents. What a certificate lets its holder do, the broker's rights still say."""
+    """The certificate authority for agents. Broker permissions still decide what a certificate holder may do.
+
+    All calls are idempotent and atomic. If the broker or authority is not reachable, a call raises
+    ``BrokerAccessError`` and may be retried.
+
+    Example::
+
+        issued = await certificates.issue(agent.id, csr_pem)
+    """
 
     @property
     def wanted(self) -> bool:
-        """Whether the broker lets in nobody without one."""
+        """Whether the broker requires a client certificate."""
 
     async def issue(self, agent: str, request: str) -> Issued:
-        """A certificate for an agent: with its id as the common name, whatever the request says.
+        """Issue a certificate with the agent's id as common name, regardless of the subject in the request.
 
         Args:
-            agent: Its id.
-            request: PKCS 10, PEM, signed by the key that it is for.
+            agent: Agent id.
+            request: PKCS #10 request (PEM), signed by its own key.
 
         Raises:
-            CertificateRefused: No such request, a wrong signature, or a kind of key that brokers do not take.
-            BrokerAccessError: It cannot be made or kept.
+            CertificateRefused: The request or its signature is not valid, or brokers do not support the key type.
+            BrokerAccessError: The certificate cannot be issued or stored.
         """
 
     async def place(self, agent: str, space: str) -> None:
-        """Where the broker goes by certificates alone: they are good for this space, and for no other from now on.
+        """Restrict the agent's certificates to one space, where the broker authorizes by certificate alone.
 
         Raises:
-            BrokerAccessError: It is not known whether that is so.
+            BrokerAccessError: The state is unknown.
         """
 
     async def revoke(self, agent: str) -> None:
-        """No certificate of this agent counts any more. Safe to repeat.
+        """Revoke all certificates of an agent. Idempotent.
 
         Raises:
-            BrokerAccessError: It is not known whether that is so.
+            BrokerAccessError: The state is unknown.
         """
 
     async def close(self) -> None:
-        """Let go of connections."""
+        """Close all connections."""

@@ -1,10 +1,15 @@
-"""The time of day."""
+"""The wall clock."""
 
 from typing import Protocol
 
 
 class Clock(Protocol):
-    """Wall clock."""
+    """Wall clock. Never blocks.
+
+    Example::
+
+        expires_ms = clock.now_ms() + 5_000
+    """
 
     def now_ms(self) -> int:
-        """Milliseconds since 1970, UTC."""
+        """Current time [ms since 1970, UTC]."""

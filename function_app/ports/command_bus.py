@@ -1,7 +1,7 @@
-"""The way from the cloud to devices. paho (warm connection), ``iot-data``, Event Grid HTTP publish.
+"""Publishes commands to devices through MQTT (paho), AWS ``iot-data`` or Event Grid.
 
-At least once at best: a message may be lost after ``publish`` returned (an offline device) and may arrive twice. The
-device drops doubles by id, and a timer sends again what nobody answered.
+Delivery is not guaranteed: a message may be lost after ``publish`` returned and may arrive twice. The device drops
+duplicates by id, and a timer republishes unanswered commands.
 """
 
 from collections.abc import AsyncIterator
@@ -12,23 +12,32 @@ from device_agent.protocol import Ack
 
 
 class BusUnavailable(Exception):  # noqa: N818 (an outcome that callers expect)
-    """The broker cannot be reached or did not confirm in time; the message may or may not have gone out."""
+    """The broker is not reachable or did not confirm in time; the message may have been sent."""
 
 
 class CommandBus(Protocol):
-    """Publishes towards devices and, where it can, hears their acks. Connects at first use and stays connected."""
+    """Publishes to devices and, if supported, receives their acks. Connects at first use.
+
+    Publishing is atomic for each message and safe to retry. Without a connection, ``publish`` raises
+    ``BusUnavailable``; the connection is retried in the background.
+
+    Example::
+
+        async with bus.acks(topic, command.id) as acks:
+            await bus.publish(f"{topic}/cmd", payload)
+    """
 
     async def start(self) -> None:
-        """Connect now rather than at first use. Never raises: a broker that is away is tried again."""
+        """Connect now. Never raises: an unreachable broker is retried."""
 
     async def publish(self, topic: str, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
-        """Send; returns once the broker has confirmed (QoS 1) or the bytes are on their way (QoS 0).
+        """Publish a message; returns when the broker confirmed it (QoS 1) or the bytes were sent (QoS 0).
 
         Args:
-            topic: Where to.
-            payload: At most 128 KB, 64 KB where it is retained.
+            topic: Topic.
+            payload: At most 128 KB; 64 KB if retained.
             qos: 0 or 1.
-            retain: Keep it for whoever subscribes later, instead of what was kept there before.
+            retain: Store the message for later subscribers in place of the previous one.
 
         Raises:
             BusUnavailable: Not confirmed within a few seconds.
@@ -37,14 +46,12 @@ class CommandBus(Protocol):
     def acks(self, device_topic: str, command: str) -> AbstractAsyncContextManager[AsyncIterator[Ack] | None]:
         """Acks of one command from now on, in order of arrival.
 
-        A wait for the next one may be given up and begun again.
-
-        Enter it before publishing the command. Gives ``None`` where the bus only publishes (or cannot connect): then
-        the answer is to be read from the tables, where the ingest entry point writes it.
+        Enter the context before publishing the command. Waiting for the next ack may be cancelled and resumed. Yields
+        ``None`` if the bus can only publish or is not connected: then read the acks from the tables.
         """
 
     async def status(self) -> str:
-        """``ok``, or a sentence about what is wrong."""
+        """``ok``, or one sentence that describes the problem."""
 
     async def close(self) -> None:
         """Disconnect."""

@@ -1,24 +1,33 @@
-"""What is addressed to agents that a program speaks for, as it passes on the broker: quick, not sure."""
+"""Commands for agents that another program represents, as published on the broker. Best effort."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
 OnMessage = Callable[[str, bytes], None]
-"""Given topic and payload; must not block."""
+"""Called with topic and payload; must not block."""
 
 
 class CommandFeed(Protocol):
-    """Commands, Stop and setpoints to chosen agents. What is missed here is in the mailbox, setpoints excepted."""
+    """Receives commands, Stop and setpoints for chosen agents.
+
+    Messages may be lost while disconnected. Missed commands remain in the mailbox; missed setpoints are lost. ``add``
+    and ``drop`` are idempotent.
+
+    Example::
+
+        await feed.add(space, agent)
+        await feed.run(on_message)
+    """
 
     @property
     def up(self) -> bool:
-        """Whether they are heard now."""
+        """Whether the feed is connected and subscribed."""
 
     async def run(self, hear: OnMessage) -> None:
-        """Deliver until cancelled; reconnects for ever."""
+        """Deliver messages until cancelled; reconnects without limit."""
 
     async def add(self, space: str, agent: str, listen: Sequence[str] = ()) -> None:
-        """OnMessage what is for this agent too, and the topics that it listens to, instead of those before."""
+        """Subscribe to the messages of an agent, and to ``listen`` in place of its earlier topics."""
 
     def drop(self, space: str, agent: str) -> None:
-        """OnMessage it no longer."""
+        """Unsubscribe from the messages of an agent."""

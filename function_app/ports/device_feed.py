@@ -1,29 +1,42 @@
-"""What devices say, on its way into the tables, where a worker of ours subscribes to it (elsewhere the cloud calls)."""
+"""Messages of devices, from a broker subscription of a worker. Cloud brokers call the ingest instead."""
 
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol
 
 Handler = Callable[[str, bytes], Awaitable[None]]
-"""Given topic and payload. Returns once it is stored: only then is the message confirmed to the broker."""
+"""Called with topic and payload. Returns when the message is stored; only then is it acknowledged to the broker."""
 
 
 class DeviceFeed(Protocol):
-    """A subscription of the functions' own."""
+    """A subscription of the functions to state and events of devices.
+
+    At-least-once: a message may be delivered twice, so the handler must be idempotent. While disconnected, the broker
+    queues messages within its limits.
+
+    Example::
+
+        await feed.run(handler)
+    """
 
     async def run(self, handler: Handler) -> None:
-        """Deliver until cancelled; reconnects for ever. Messages of one topic arrive in order, one at a time.
+        """Deliver until cancelled; reconnects without limit. Messages of one topic arrive in order, one at a time.
 
-        A handler that raises ``StoreError`` or ``Problem`` is given its message again a few times; what still cannot be
-        stored then, or fails in another way, is logged and let go, so that the others go on.
+        If the handler raises ``StoreError`` or ``Problem``, the message is retried a few times. Messages that still
+        fail are logged and dropped.
         """
 
 
 BatchHandler = Callable[[Sequence[tuple[str, bytes]]], Awaitable[None]]
-"""Given topics and payloads of what arrived in a short while."""
+"""Called with topics and payloads of a short time window."""
 
 
 class TelemetryFeed(Protocol):
-    """A subscription to measurements: many, each of little worth, and never in the way of the others."""
+    """A best-effort subscription to telemetry, separate from other messages.
+
+    Example::
+
+        await feed.run(batch_handler)
+    """
 
     async def run(self, handler: BatchHandler) -> None:
-        """Deliver until cancelled, about every two seconds; reconnects for ever. What cannot be kept is dropped."""
+        """Deliver batches about every two seconds until cancelled; reconnects. Drops messages on overload."""

@@ -1,4 +1,4 @@
-"""Compiles models as a robot's driver will. MuJoCo in a process of its own."""
+"""Compiles robot models in a separate process, with the same compiler as the driver (MuJoCo)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,14 +10,14 @@ from device_agent.protocol.manifests.robot_type import RobotType
 
 @dataclass(frozen=True, slots=True)
 class ModelReport:
-    """What a model was found to be.
+    """The result of compiling a model.
 
     Attributes:
-        errors: What is wrong, in the compiler's own words with file and line; nothing when all is well.
-        warnings: What its author may want to know, and is free to leave as it is.
-        twin: The robot as a page draws it, in the frame of its base; ``None`` where it cannot be drawn.
-        actuators: Of the model, by name.
-        cameras: Of the scene, by name.
+        errors: Compiler errors with file and line; empty for a valid model.
+        warnings: Notes for the author that do not prevent use.
+        twin: The geometry for display in the frame of the base; ``None`` if it cannot be drawn.
+        actuators: Names of the model's actuators.
+        cameras: Names of the scene's cameras.
     """
 
     errors: tuple[str, ...] = ()
@@ -28,17 +28,22 @@ class ModelReport:
 
 
 class CompilerMissingError(Exception):
-    """Nothing here can compile a model; the text says what to install."""
+    """No model compiler is available; the text says what to install."""
 
 
 class ModelCompiler(Protocol):
-    """The files may be hostile: they are read by nothing else, and cannot reach anything but themselves."""
+    """Compiles untrusted model files in a sandbox that reads nothing else. Stateless; safe to retry.
+
+    Example::
+
+        report = await compiler.check(robot_type, files)
+    """
 
     def require(self) -> None:
-        """See that it can be used.
+        """Check that the compiler is available.
 
         Raises:
-            CompilerMissingError: It cannot.
+            CompilerMissingError: It is not available.
         """
 
     async def check(
@@ -47,13 +52,13 @@ class ModelCompiler(Protocol):
         """Compile model and scene and compare them with the manifest.
 
         Args:
-            robot_type: What the manifest says.
+            robot_type: The manifest.
             files: Name → content.
-            missing: Names of files that the model wants and that are not there; the rest is looked at without them.
+            missing: Referenced files that do not exist; the rest is checked without them.
 
         Returns:
-            What it is. A model that takes too long or too much memory is wrong as well.
+            The report. Exceeding time or memory limits is an error in the report.
 
         Raises:
-            CompilerMissingError: It cannot be used.
+            CompilerMissingError: The compiler is not available.
         """

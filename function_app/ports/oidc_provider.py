@@ -1,16 +1,16 @@
-"""Somebody else's word on who somebody is: an OpenID Connect provider."""
+"""An OpenID Connect provider."""
 
 from dataclasses import dataclass
 from typing import Protocol
 
 
 class OidcError(Exception):
-    """The provider cannot be used, or what came from it is not believed. Fit for an operator, never for the page."""
+    """The provider is not usable, or its response is not trusted. The text is for operators, not for the page."""
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """Whom the provider says this is. ``issuer`` and ``id`` are theirs for ever; the name may be anybody's."""
+    """The signed-in person. ``issuer`` and ``id`` are stable; the name is not verified."""
 
     issuer: str
     id: str
@@ -18,31 +18,40 @@ class Subject:
 
 
 class OidcProvider(Protocol):
-    """One provider, by the code flow with PKCE. The constructor reaches nobody; what is fetched is kept for a while."""
+    """One provider, used with the code flow and PKCE. The constructor makes no request; metadata are cached.
+
+    If the provider is not reachable, calls raise ``OidcError``. ``address`` may be retried; a code can be redeemed
+    once.
+
+    Example::
+
+        url = await provider.address(state=state, nonce=nonce, challenge=challenge, redirect=callback)
+    """
 
     async def address(self, *, state: str, nonce: str, challenge: str, redirect: str) -> str:
-        """Where to send a browser that is to sign in.
+        """The URL to which a browser is redirected for sign-in.
 
         Args:
-            state: Comes back with the browser.
-            nonce: Comes back in the signed word.
-            challenge: Of the verifier that ``redeem`` will show (S256).
-            redirect: Where the browser is sent back to.
+            state: Returned by the browser.
+            nonce: Returned in the signed token.
+            challenge: S256 challenge of the verifier passed to ``redeem``.
+            redirect: Callback URL.
 
         Raises:
-            OpenIdError: The provider is not reached, or not what it should be.
+            OidcError: The provider is not reachable or its metadata are not valid.
         """
 
     async def redeem(self, *, code: str, verifier: str, nonce: str, redirect: str, issuer: str | None) -> Subject:
-        """Whom the provider has signed in.
+        """The person whom the provider signed in.
 
         Args:
-            code: As it came back.
-            verifier: Whose hash was the challenge.
-            nonce: As it was sent.
-            redirect: As it was sent.
-            issuer: Who says it sent the browser back, where that was said (RFC 9207).
+            code: Authorization code from the callback.
+            verifier: PKCE verifier.
+            nonce: As sent.
+            redirect: As sent.
+            issuer: ``iss`` parameter of the callback, if present (RFC 9207).
 
         Raises:
-            OpenIdError: It is refused, or is not signed, or not for us, now and this very sign-in.
+            OidcError: The code is rejected, or the token is not signed, not for this client, expired, or of another
+                sign-in.
         """

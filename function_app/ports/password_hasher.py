@@ -1,21 +1,27 @@
-"""Passwords as they are stored: by a function that is slow on purpose, so that a stolen table tells none soon."""
+"""Hashes passwords with a slow function, so that a stolen table does not reveal them."""
 
 from typing import Protocol
 
 
 class PasswordHasher(Protocol):
-    """Makes and checks them. Each call takes tens of milliseconds of a processor; none of them blocks the others."""
+    """Creates and verifies password hashes. Each call takes tens of milliseconds of CPU and does not block others.
+
+    Example::
+
+        stored = await hasher.make(password)
+        assert await hasher.check(stored, password)
+    """
 
     async def make(self, password: str) -> str:
-        """A salted hash that names its own parameters."""
+        """A salted hash that contains its parameters."""
 
     async def check(self, stored: str | None, password: str) -> bool:
-        """Whether it is this password.
+        """Whether the password matches.
 
         Args:
-            stored: What ``make`` gave; ``None`` where there is none: it takes as long, and is never right.
-            password: What somebody says.
+            stored: Result of ``make``; ``None`` takes equally long and never matches.
+            password: Password to verify.
         """
 
     def outdated(self, stored: str) -> bool:
-        """Whether ``make`` would use other parameters today."""
+        """Whether ``make`` would use other parameters now."""

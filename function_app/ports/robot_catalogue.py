@@ -1,4 +1,4 @@
-"""Robot types that come with the installation, and their movements."""
+"""Robot types of the installation, and their movements."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 
 @dataclass(frozen=True, slots=True)
 class BuiltInMovement:
-    """One movement of a robot type's folder."""
+    """A movement from a robot type's folder."""
 
     name: str
     description: str
@@ -20,20 +20,25 @@ class BuiltInMovement:
 
 
 class RobotCatalogue(Protocol):
-    """Read once and kept; what is on disk changes with an installation, not while it runs."""
+    """Robot types of the installation. Read once and cached: files change only with an installation.
+
+    Example::
+
+        robot_type = (await catalogue.types())["ur5"]
+    """
 
     async def types(self) -> Mapping[str, RobotType]:
         """Robot types by id.
 
         Raises:
-            StoreError: A folder is broken; the text names file and field.
+            StoreError: A folder is not valid; the text names file and field.
         """
 
     async def files(self, robot_type: str) -> Mapping[str, bytes]:
-        """What a type's folder holds, movements too: name → content; empty for a type that is not known."""
+        """Files of a type's folder including movements: name → content. Empty for an unknown type."""
 
     async def movements(self, robot_type: str) -> Mapping[str, BuiltInMovement]:
-        """Movements of a type by name; empty for a type that is not known."""
+        """Movements of a type by name. Empty for an unknown type."""
 
     async def drawing(self, robot_type: str) -> bytes | None:
-        """What a checker finds in a type's model (``Looked`` as JSON); ``None`` where nobody has drawn it."""
+        """The compiled drawing of a type (``ModelReport`` as JSON), or ``None`` if there is none."""

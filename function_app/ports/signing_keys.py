@@ -1,7 +1,7 @@
-"""The cloud's own signing keys: for orders, access tokens and broker tokens. Files here, a vault in the cloud.
+"""The cloud's signing keys for commands, access tokens and broker tokens: files, or a vault in the cloud.
 
-Keys follow one another with an overlap. From the moment of a rotation the new key signs tokens, and what is stored;
-orders to devices only once these have had the time to learn it. The old one counts until the overlap is over.
+Keys rotate with an overlap. After a rotation the new key immediately signs tokens and stored data. It signs commands
+only after devices had time to learn it. The old key is valid until the overlap ends.
 """
 
 from collections.abc import Mapping
@@ -11,13 +11,13 @@ from typing import Protocol
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 LEARN_MS = 2 * 3_600_000
-"""Agents ask for broker credentials, and so for news of keys, once an hour at least; they are told by an order, too."""
+"""Time for devices to learn a key. Agents request broker credentials, and with them keys, at least hourly."""
 OVERLAP_MS = 7 * 24 * 3_600_000
-"""An agent that is off for longer must be told by hand."""
+"""Overlap of two keys. An agent that is offline for longer must be updated manually."""
 
 
 class RotationRefused(Exception):  # noqa: N818 (an answer, not always a fault)
-    """Devices are still learning the last key, until ``until_ms``."""
+    """A rotation is already in progress until ``until_ms``."""
 
     def __init__(self, until_ms: int) -> None:
         super().__init__("devices are still learning the last key")
@@ -26,7 +26,7 @@ class RotationRefused(Exception):  # noqa: N818 (an answer, not always a fault)
 
 @dataclass(frozen=True, slots=True)
 class PinnedKey:
-    """A key as a device pins it: its place in the order of keys, and until when it counts (0: no end)."""
+    """A key as devices pin it: its serial number, and the end of its validity (0: no end)."""
 
     id: str
     key: Ed25519PublicKey
@@ -36,12 +36,12 @@ class PinnedKey:
 
 @dataclass(frozen=True, slots=True)
 class KeyAnnouncement:
-    """What agents are told of keys.
+    """The keys that are announced to agents.
 
     Attributes:
-        pins: Keys whose orders a device is to obey, the newest last.
-        statements: What leads a device from an older of them to the newest, each signed by the one before.
-        signing: Id of the key that orders are signed with now.
+        pins: Keys whose commands a device accepts, newest last.
+        statements: Signed transitions from older keys to the newest, each signed by the previous key.
+        signing: Id of the key that signs commands now.
     """
 
     pins: tuple[PinnedKey, ...]
@@ -50,50 +50,58 @@ class KeyAnnouncement:
 
     @property
     def serial(self) -> int:
-        """The newest key's."""
+        """Serial number of the newest key."""
         return self.pins[-1].serial
 
 
 class SigningKeys(Protocol):
-    """Ed25519 keys. Any number of processes use the same; each follows a rotation without a restart."""
+    """Ed25519 keys, shared by any number of processes. Each process follows a rotation without a restart.
+
+    Rotation is atomic: a concurrent rotation raises ``RotationRefused``. Reading is cached. If the store is not
+    reachable, calls raise ``StoreError``.
+
+    Example::
+
+        token = signing.sign(payload, await keys.current())
+    """
 
     async def current(self) -> Ed25519PrivateKey:
-        """The key to sign tokens with, and what is stored.
+        """The key that signs tokens and stored data.
 
         Raises:
-            StoreError: It cannot be read or written; the text names it.
+            StoreError: The key cannot be read or written; the text names it.
         """
 
     async def for_devices(self) -> Ed25519PrivateKey:
-        """The key to sign orders with: the newest that devices have had the time to learn."""
+        """The key that signs commands: the newest key that devices had time to learn."""
 
     async def public(self, wanted: str = "") -> Mapping[str, Ed25519PublicKey]:
-        """Every key whose signature counts now, by ``signing.key_id``.
+        """All keys whose signatures are valid now, by ``signing.key_id``.
 
         Args:
-            wanted: Id of a key that is looked for: where it is not known, it is looked whether there are new ones.
+            wanted: Id of the key to look up; an unknown id causes the store to be read again.
         """
 
     async def archive(self) -> Mapping[str, Ed25519PublicKey]:
-        """Every key whose signature on what is stored counts: former ones too, unless they have leaked."""
+        """All keys whose signatures on stored data are valid: also former keys, except leaked ones."""
 
     async def news(self) -> KeyAnnouncement:
-        """What agents are told."""
+        """The keys to announce to agents."""
 
     async def rotate(
         self, *, learn_ms: int = LEARN_MS, overlap_ms: int = OVERLAP_MS, leaked: bool = False
     ) -> KeyAnnouncement:
-        """Make a new key, and let the present one end.
+        """Create a new key and schedule the end of the current one.
 
         Args:
-            learn_ms: How long devices are given to learn it [ms].
-            overlap_ms: How long the present one counts beside it [ms].
-            leaked: It has leaked: it ends at once, and devices are told by nobody.
+            learn_ms: Time for devices to learn the new key [ms].
+            overlap_ms: Time during which both keys are valid [ms].
+            leaked: The current key has leaked: it becomes invalid immediately and is not announced.
 
         Raises:
-            RotationRefused: Devices are still learning the last one.
-            StoreError: It cannot be written.
+            RotationRefused: Devices are still learning the last key.
+            StoreError: The key cannot be written.
         """
 
     async def close(self) -> None:
-        """Let go of connections."""
+        """Close all connections."""

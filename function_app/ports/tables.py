@@ -1,7 +1,7 @@
-"""Rows in tables: partition and key, optimistic concurrency by ETag. Azure Tables, DynamoDB, SQLite.
+"""Tables of rows with partition, key and ETag: Azure Tables, DynamoDB or SQLite.
 
-Partitions and keys are any non-empty Unicode text up to 512 characters; adapters encode them for their store such that
-keys of one partition still sort as their UTF-8 bytes do. ``data`` is a JSON object of at most 256 KB.
+Partitions and keys are non-empty Unicode text of at most 512 characters. Adapters encode them so that the keys of a
+partition sort by their UTF-8 bytes. ``data`` is a JSON object of at most 256 KB.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,25 +9,25 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 MAX_BATCH = 100
-"""Most writes in one batch: Azure Tables' and DynamoDB's limit."""
+"""Maximum number of writes in a batch: the limit of Azure Tables and DynamoDB."""
 MAX_BATCH_BYTES = 1_000_000
-"""Most data in one batch, as JSON. Azure takes 4 MiB of request; its SDK's escapes make up to three bytes of one, and
-keys and headers of 100 writes take up to 750 KB. DynamoDB takes 4 MB."""
+"""Maximum size of a batch as JSON [bytes]. Azure accepts 4 MiB per request; its SDK escapes up to three bytes for
+one, and keys and headers of 100 writes take up to 750 KB. DynamoDB accepts 4 MB."""
 MAX_DATA_BYTES = 256 * 1024
 MAX_KEY_LENGTH = 512
 
 
 class Conflict(Exception):  # noqa: N818 (an outcome that callers expect, not a fault)
-    """The row is not as the writer believed: it exists already, is gone, or has another ETag."""
+    """The row exists already, does not exist, or has another ETag."""
 
 
 class StoreError(Exception):
-    """The store cannot be used; its text says what to do."""
+    """The store is not available; the text says what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One row. ``etag`` is empty until the store has given one."""
+    """One row. ``etag`` is empty until the store assigns one."""
 
     partition: str
     key: str
@@ -37,7 +37,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """Rows in key order, and where to go on (``None``: that was all)."""
+    """Rows in key order, and the cursor of the next page (``None``: last page)."""
 
     rows: tuple[Row, ...]
     cursor: str | None
@@ -45,40 +45,49 @@ class Page:
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """One change in a batch: ``create`` wants no such row, ``replace`` and ``delete`` want ``row.etag``."""
+    """One change in a batch: ``create`` requires that the row does not exist, the others require ``row.etag``."""
 
     kind: Literal["create", "replace", "delete"]
     row: Row
 
 
 class Tables(Protocol):
-    """A store of tables. Every call is atomic; reads after a write see it."""
+    """Stores rows. Every call is atomic, and reads see all earlier writes.
+
+    A retried ``create``, ``replace`` or ``delete`` raises ``Conflict`` if the first call succeeded. If the store is not
+    reachable, every method raises ``StoreError``; the state of a failed write is unknown.
+
+    Example::
+
+        row = await tables.create("Devices", Row("agent", "arm", {"label": "Arm"}))
+        await tables.replace("Devices", dataclasses.replace(row, data={"label": "Left arm"}))
+    """
 
     async def get(self, table: str, partition: str, key: str) -> Row | None:
         """One row, or ``None``."""
 
     async def create(self, table: str, row: Row) -> Row:
-        """Write a row that must not exist yet.
+        """Create a row that does not exist yet.
 
         Returns:
             The row with its new ETag.
 
         Raises:
-            Conflict: It exists.
+            Conflict: The row exists.
         """
 
     async def replace(self, table: str, row: Row) -> Row:
-        """Write over the row that has ``row.etag``.
+        """Replace the row that has ``row.etag``.
 
         Raises:
-            Conflict: It is gone or has changed since it was read.
+            Conflict: The row was deleted or changed since it was read.
         """
 
     async def delete(self, table: str, row: Row) -> None:
         """Delete the row that has ``row.etag``.
 
         Raises:
-            Conflict: It is gone or has changed since it was read.
+            Conflict: The row was deleted or changed since it was read.
         """
 
     async def query(
@@ -91,18 +100,18 @@ class Tables(Protocol):
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page:
-        """Rows of one partition with ``first`` ≤ key < ``last`` (``None``: to the end), at most ``limit`` (1…1,000)."""
+        """At most ``limit`` (1…1,000) rows of a partition with ``first`` ≤ key < ``last`` (``None``: to the end)."""
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
-        """All writes or none; 1…``MAX_BATCH`` of them, one partition, each key once.
+        """Apply all writes or none: 1…``MAX_BATCH`` writes in one partition, each key once.
 
         Returns:
-            The rows as written, in order (a deleted row as it was given).
+            The rows as written, in order (a deleted row as passed).
 
         Raises:
-            Conflict: One of them does not fit; nothing was written.
-            ValueError: Empty, too many, over ``MAX_BATCH_BYTES``, two partitions, or a key twice.
+            Conflict: One write does not match; nothing was written.
+            ValueError: No writes, too many, over ``MAX_BATCH_BYTES``, two partitions, or a repeated key.
         """
 
     async def close(self) -> None:
-        """Let go of connections."""
+        """Close all connections."""

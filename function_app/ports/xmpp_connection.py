@@ -1,36 +1,41 @@
-"""The cloud's own connection to the XMPP server."""
+"""The connection of the cloud to the XMPP server."""
 
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element  # functions that speak no XMPP load no XML
+    from xml.etree.ElementTree import Element  # imported only by programs that use XMPP
 
 
 class Listener(Protocol):
-    """Who is told what comes; quick, on the event loop's own thread."""
+    """Receives stanzas on the event loop; must not block."""
 
     def message(self, stanza: "Element") -> None:
-        """A ``<message>`` came."""
+        """Handle a ``<message>``."""
 
     def presence(self, stanza: "Element") -> None:
-        """A ``<presence>`` came."""
+        """Handle a ``<presence>``."""
 
     def lost(self) -> None:
-        """The connection is gone: nobody is known to be there any more."""
+        """The connection was lost; the presence of all contacts is unknown."""
 
 
 class XmppConnection(Protocol):
-    """One connection at a time."""
+    """One connection to the XMPP server. Messages sent while disconnected are dropped.
+
+    Example::
+
+        await connection.run(listener)
+    """
 
     @property
     def domain(self) -> str:
-        """The part of every JID after the ``@``."""
+        """The domain part of every JID."""
 
     async def run(self, listener: Listener) -> None:
-        """Be connected until cancelled; reconnects for ever."""
+        """Stay connected until cancelled; reconnects without limit."""
 
     def send(self, stanza: str) -> bool:
-        """Write a stanza; ``False`` where there is no connection, and it is dropped."""
+        """Send a stanza; returns ``False`` and drops it if there is no connection."""
 
     def congested(self) -> bool:
-        """Whether so much waits to be sent that what is worth nothing later had better be dropped."""
+        """Whether the send queue is full, so that expendable messages should be dropped."""

@@ -1,1 +1,1 @@
-"""Actions."""
+"""Actions and the queue of a device."""

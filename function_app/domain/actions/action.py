@@ -1,7 +1,7 @@
-"""An action's life: ``created → published → received → accepted → started → done | failed | expired | cancelled``.
+"""The life cycle of an action.
 
-One that waits for its turn is ``queued`` before. Steps may be skipped, never taken back. The first terminal state
-stays, whoever reports another one later.
+``created → published → received → accepted → started → done | failed | expired | cancelled``; a waiting action is first
+``queued``. Steps may be skipped but not reversed. The first terminal status is final.
 """
 
 from dataclasses import dataclass, field, replace
@@ -42,29 +42,29 @@ class Status(StrEnum):
 
 
 RETRY_MS = 1_000
-"""A command that nobody has answered is published again after this time."""
+"""Interval after which an unanswered command is published again."""
 GRACE_MS = 3_000
-"""An ack may be this late: until then a command whose time ran out is not called expired."""
+"""Allowed delay of an ack. Only after it does an unanswered command count as expired."""
 
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """One run of something on one device.
+    """One execution of an operation on one device.
 
     Attributes:
-        request: What was asked, as it was asked.
-        pinned: For a movement: version and SHA-256 of the script, so that a re-published command is the same one.
-        pairing: The agent's pairing that it belongs to.
-        session: The sign-in session that started it: a lease for it will be that session's.
-        epoch: Of its lease; 0 while it waits for its turn and was started without one.
-        timeout_ms: From its turn to ``deadline_ms``.
-        queued_until_ms: As long as it may wait for its turn [ms since 1970]; 0 for one that never waited.
-        turn_ms: When its turn came, for one that has waited [ms since 1970].
-        times: Status → when [ms since 1970]; ``published`` by the cloud's clock, the later ones by the agent's.
-        heard: Status → when the cloud heard of it, by its own clock [ms since 1970].
-        sequence: Of the newest ack seen.
-        cancel_id: Of the command that shall end it, once somebody wants that.
-        once: Key of the row that holds the idempotency key it was started with, or empty.
+        request: The request as received.
+        pinned: For a movement: version and SHA-256 of the script, so that a republished command is identical.
+        pairing: Pairing of the agent.
+        session: Sign-in session that started it; its own lease belongs to this session.
+        epoch: Epoch of its lease; 0 while queued without a lease.
+        timeout_ms: Time from its start in the slot to ``deadline_ms``.
+        queued_until_ms: End of the queueing time [ms since 1970]; 0: was never queued.
+        turn_ms: When it left the queue [ms since 1970].
+        times: Status → time [ms since 1970]; ``published`` by the cloud clock, later ones by the agent clock.
+        heard: Status → time of reception in the cloud, by the cloud clock [ms since 1970].
+        sequence: Sequence number of the newest ack.
+        cancel_id: Id of the command that cancels it; empty: not cancelled.
+        once: Key of the row with its idempotency key, or empty.
     """
 
     id: str
@@ -95,25 +95,25 @@ class Action:
 
     @property
     def issued_ms(self) -> int:
-        """When its command was issued [ms since 1970]: a repeated one says the same."""
+        """When its command was issued [ms since 1970]; equal for republished commands."""
         return self.turn_ms or self.created_ms
 
     @property
     def ended_ms(self) -> int:
-        """When it ended, as far as that can be believed [ms since 1970]: an agent's clock may be anywhere."""
+        """When it ended [ms since 1970], limited to plausible times because agent clocks may be wrong."""
         return min(max(self.times.get(self.status.value, self.created_ms), self.created_ms), self.deadline_ms)
 
     @property
     def expires_ms(self) -> int:
-        """From here on the device must not begin it any more."""
+        """From this time on the device must not start it."""
         return self.issued_ms + self.ttl_ms
 
 
 @dataclass(frozen=True, slots=True)
 class AckReport:
-    """One ack about an action. ``output`` is all the script has printed so far, not what is new.
+    """An ack of an action. ``output`` is the complete output of the script so far.
 
-    ``heard_ms`` is when it was heard, by the cloud's clock [ms since 1970]; 0: nobody has looked.
+    ``heard_ms``: reception in the cloud, by the cloud clock [ms since 1970]; 0: unknown.
     """
 
     status: Status
@@ -127,12 +127,12 @@ class AckReport:
 
 
 def apply_report(action: Action, report: AckReport) -> Action:
-    """The action after a report: the same object when it brings nothing new.
+    """The action after an ack; the same object if the ack changes nothing.
 
-    Idempotent and monotone: doubled, late and disordered reports never take a step back.
+    Idempotent and monotonic: duplicate, late and reordered acks never revert a step.
     """
     if action.status.terminal or action.status is Status.QUEUED:
-        return action  # a queued one was never sent: whoever reports about it makes it up
+        return action  # a queued action was never sent, so this ack is not genuine
     times = action.times if report.status.value in action.times else {**action.times, report.status.value: report.at_ms}
     heard, first_ms = action.heard, action.heard.get(report.status.value)
     if report.heard_ms and (first_ms is None or report.heard_ms < first_ms):
@@ -156,7 +156,7 @@ def apply_report(action: Action, report: AckReport) -> Action:
 
 
 def mark_published(action: Action, now_ms: int) -> Action:
-    """The action, published; the same object when that is known. A device's ack may be written down before this is."""
+    """The action, marked as published; the same object if already marked. An ack may be stored earlier."""
     if Status.PUBLISHED.value in action.times:
         return action
     status = Status.PUBLISHED if action.status is Status.CREATED else action.status
@@ -164,14 +164,14 @@ def mark_published(action: Action, now_ms: int) -> Action:
 
 
 def give_turn(action: Action, epoch: int, now_ms: int) -> Action:
-    """A queued action that is to be sent now: its time to live and its time limit begin."""
+    """The action when it leaves the queue: its time to live and time limit start."""
     times = {**action.times, Status.CREATED.value: now_ms}
     deadline_ms = now_ms + action.timeout_ms
     return replace(action, status=Status.CREATED, epoch=epoch, turn_ms=now_ms, deadline_ms=deadline_ms, times=times)
 
 
 def end(action: Action, status: Status, code: str, message: str, now_ms: int) -> Action:
-    """The action, ended by the cloud; the same object when it already has an end."""
+    """The action, ended by the cloud; the same object if it has already ended."""
     if action.status.terminal:
         return action
     return replace(
@@ -183,12 +183,12 @@ def end(action: Action, status: Status, code: str, message: str, now_ms: int) ->
 
 
 def reached(action: Action, wanted: Status) -> bool:
-    """Whether waiting for ``wanted`` is over."""
+    """Whether a wait for ``wanted`` is over."""
     return action.status.terminal or action.status.rank >= wanted.rank
 
 
 def next_check_ms(action: Action, now_ms: int) -> int:
-    """When a timer has to look at an open action again [ms since 1970]."""
+    """When the timer must check an open action again [ms since 1970]."""
     if action.status is Status.QUEUED:
         return action.queued_until_ms
     if action.status.rank < Status.RECEIVED.rank and now_ms < action.expires_ms + GRACE_MS:
@@ -197,7 +197,7 @@ def next_check_ms(action: Action, now_ms: int) -> int:
 
 
 class NextStep(StrEnum):
-    """What a timer has to do about an open action."""
+    """What the timer must do with an open action."""
 
     WAIT = "wait"
     PUBLISH = "publish"
@@ -208,9 +208,9 @@ class NextStep(StrEnum):
 
 
 def next_step(action: Action, now_ms: int) -> NextStep:
-    """What is due. An unanswered command is sent again until its time to live ends: the device drops doubles by id.
+    """The next step of the timer. An unanswered command is republished until its time to live ends.
 
-    Once somebody wants it cancelled, that is what is sent again: it must not begin because a message was lost.
+    The device drops duplicates by id. After a cancellation the cancel command is republished instead.
     """
     if action.status.terminal:
         return NextStep.ENDED

@@ -1,7 +1,6 @@
-"""The queue of a device: actions that wait for its slot, first come, first served.
+"""The queue of a device: actions that wait for its slot, in order of arrival.
 
-Nothing starts by itself after something went wrong: when an action fails, or somebody stops the device, those behind it
-are dropped, each with the reason.
+After a failure or a Stop, all waiting actions are cancelled, each with the reason.
 """
 
 from collections.abc import Collection
@@ -12,7 +11,7 @@ from function_app.domain.actions.action import Status
 from function_app.domain.common.problems import Problem
 
 MAX_QUEUED: Final = 32
-"""Actions that may wait for one device."""
+"""Maximum number of actions that wait for one device."""
 FAILED_BEFORE = "earlier-failed"
 STOPPED = "stopped"
 UNPAIRED = "unpaired"
@@ -24,33 +23,33 @@ SIGNED_OUT = "signed-out"
 DROPPED: Final = {
     FAILED_BEFORE: (
         Status.CANCELLED,
-        "An action before it failed, and nothing goes on by itself then. Look at the device, and start it again.",
+        "An earlier action failed, so the queued actions were cancelled. Check the device, then start it again.",
     ),
     STOPPED: (
         Status.CANCELLED,
-        "The device was stopped, and nothing resumes by itself. Reset it, and start it again.",
+        "The device was stopped, so the queued actions were cancelled. Reset it, then start it again.",
     ),
     UNPAIRED: (Status.FAILED, "The device was un-paired before it ended."),
     MOVED: (Status.FAILED, "The device's agent was moved to another space before it ended. Start it again."),
     REMOVED: (Status.FAILED, "Its agent no longer has this device."),
-    UNSHARED: (Status.FAILED, "The device is no longer shared with who started it."),
+    UNSHARED: (Status.FAILED, "The device is no longer shared with the account that started it."),
     KEY_ENDED: (
         Status.FAILED,
-        "The API key that started it has ended, or may not operate this device any more. Make another one.",
+        "The API key that started it was revoked, expired or may no longer operate this device. Create a new key.",
     ),
-    SIGNED_OUT: (Status.FAILED, "Who started it has signed out, which ends what they had begun. Start it again."),
+    SIGNED_OUT: (Status.FAILED, "The session that started it has signed out. Start it again."),
 }
-"""Why a waiting action ends without its turn: code → its end and what people read."""
+"""Reasons to end a waiting action: code → terminal status and message."""
 
 
 @dataclass(frozen=True, slots=True)
 class ActionQueue:
-    """Who waits.
+    """The waiting actions of a device.
 
     Attributes:
-        pairing: Of the agent. A queue of an earlier owner's pairing is nobody's.
-        actions: Ids, the next one first.
-        dropped: Ids that have lost their place and are still to be ended → the code of the reason.
+        pairing: Pairing of the agent. A queue of an earlier pairing is ignored.
+        actions: Action ids, next one first.
+        dropped: Ids of cancelled actions that must still be ended → reason code.
     """
 
     pairing: str
@@ -63,15 +62,15 @@ class ActionQueue:
         return not self.actions and not self.dropped
 
     def contains(self, action: str) -> bool:
-        """Whether ``action`` is in it in one way or the other."""
+        """Whether ``action`` is waiting or dropped."""
         return action in self.actions or action in self.dropped
 
     def position(self, action: str) -> int | None:
-        """1 for the next one."""
+        """Position in the queue; 1 is next."""
         return self.actions.index(action) + 1 if action in self.actions else None
 
     def with_last(self, action: str) -> "ActionQueue":
-        """With ``action`` as the last.
+        """The queue with ``action`` at the end.
 
         Raises:
             Problem: ``queue-full``.
@@ -82,12 +81,12 @@ class ActionQueue:
         return replace(self, actions=(*self.actions, action))
 
     def without(self, action: str) -> "ActionQueue":
-        """After ``action`` got its turn or its end."""
+        """The queue without ``action``, after it was started or ended."""
         actions = tuple(other for other in self.actions if other != action)
         return replace(self, actions=actions, dropped={id_: why for id_, why in self.dropped.items() if id_ != action})
 
     def with_cancelled(self, actions: Collection[str], why: str) -> "ActionQueue":
-        """Some of them dropped; the same object when none of these waits."""
+        """The queue with some actions cancelled; the same object if none of them waits."""
         lost = [action for action in self.actions if action in actions]
         if not lost:
             return self
@@ -95,5 +94,5 @@ class ActionQueue:
         return replace(self, actions=kept, dropped={**self.dropped, **dict.fromkeys(lost, why)})
 
     def with_all_cancelled(self, why: str) -> "ActionQueue":
-        """All of them dropped; the same object when nobody waits."""
+        """The queue with all actions cancelled; the same object if none waits."""
         return self.with_cancelled(self.actions, why)

@@ -1,1 +1,1 @@
-"""Audit."""
+"""The hash chain of the audit log."""

@@ -1,7 +1,7 @@
-"""The chain that keeps what was done in an account: each record's hash covers the record and the hash before it.
+"""A hash chain of audit records: each hash covers the record and the previous hash.
 
-Whoever changes, deletes, swaps or inserts a record breaks the chain at that place. Only its end can be cut off without
-a trace in the chain itself; against that its head is signed, and noted elsewhere (``services/audit_chain.py``).
+A changed, deleted, swapped or inserted record breaks the chain at that place. Truncation is detected by signed heads
+that are also stored elsewhere (``services/audit/audit_log.py``).
 """
 
 import hashlib
@@ -15,18 +15,18 @@ from typing import Any, Final, Literal
 from function_app.domain.identity.accounts import Identity
 
 Outcome = Literal["done", "rejected", "failed", "unknown"]
-"""``unknown``: whoever did it was killed in the middle; look at what it is about."""
+"""``unknown``: the process was killed during the operation; check its target."""
 CLOUD: Final = "cloud"
-"""The chain of what belongs to no account."""
+"""The chain of records without an account."""
 FIRST: Final = 1
-"""The number of a chain's first record."""
+"""Number of the first record of a chain."""
 _GENESIS: Final = b"telescope/v1/audit\n"
 _HEAD: Final = b"telescope/v1/audit-head\n"
 _EXPECTED: Final = re.compile(r"\A([0-9]{1,12}):([0-9a-f]{64})\Z")
 
 
 class AccountEvent(StrEnum):
-    """What is done to an account rather than to control over a device; for that see ``authority.Fact``."""
+    """Audited operations on an account. For operations on control see ``control_events.Fact``."""
 
     SIGNED_IN = "signed-in"
     SIGN_IN_REFUSED = "sign-in-refused"
@@ -56,7 +56,7 @@ class AccountEvent(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What is to be recorded. ``on`` names a device, agent or whatever else it was done to; ``data`` is plain JSON."""
+    """A record to append. ``on`` names the target; ``data`` is plain JSON."""
 
     id: str
     at_ms: int
@@ -70,7 +70,7 @@ class Entry:
     data: Mapping[str, Any] = field(default_factory=dict)
 
     def fields(self) -> dict[str, Any]:
-        """As it is kept."""
+        """The fields as stored."""
         return {
             "id": self.id,
             "at_ms": self.at_ms,
@@ -87,7 +87,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """Where a chain ends: the number and the hash of its newest record."""
+    """The end of a chain: number and hash of its newest record."""
 
     seq: int
     hash: str
@@ -106,45 +106,45 @@ def entry(
     outcome: Outcome = "done",
     **data: Any,
 ) -> Entry:
-    """An entry of what ``caller`` did (``None``: somebody unknown, or the cloud by itself)."""
+    """An entry for an operation of ``caller`` (``None``: an unknown caller, or the cloud itself)."""
     by = {} if caller is None else {"who": caller.name, "account": caller.account, "session": caller.session}
     return Entry(entry_id, at_ms, what, outcome, on, **by, key="" if caller is None else caller.key, data=data)
 
 
 def genesis(chain: str) -> Head:
-    """The head of a chain without records; it differs from account to account, so that none stands in for another."""
+    """The head of an empty chain. It differs between accounts, so that chains are not interchangeable."""
     return Head(FIRST - 1, hashlib.sha256(_GENESIS + chain.encode()).hexdigest())
 
 
 def append(head: Head, fields: Mapping[str, Any]) -> tuple[Head, dict[str, Any]]:
-    """The head once ``fields`` are recorded behind it, and the record as it is stored."""
+    """The head after ``fields`` are appended, and the record as stored."""
     numbered = {**fields, "seq": head.seq + 1}
     after = Head(head.seq + 1, _hash(head.hash, numbered))
     return after, {**numbered, "hash": after.hash}
 
 
 def record_error(head: Head, record: Mapping[str, Any]) -> str:
-    """What is wrong with ``record`` as the one behind ``head``; empty where nothing is."""
+    """Why ``record`` is not valid after ``head``; empty if it is valid."""
     if record.get("seq") != head.seq + 1 or isinstance(record["seq"], bool):
-        return f"it calls itself number {record.get('seq')!r}"
+        return f"its number is {record.get('seq')!r}"
     rest = {name: value for name, value in record.items() if name != "hash"}
     if _hash(head.hash, rest) != record.get("hash"):
-        return "it, or its hash, is not what was recorded"
+        return "the record or its hash was modified"
     return ""
 
 
 def signed_bytes(chain: str, head: Head, at_ms: int) -> bytes:
-    """What the cloud signs of a head."""
+    """The bytes of a head that the cloud signs."""
     return _HEAD + f"{chain}\n{head}\n{at_ms}".encode()
 
 
 def parse_head(text: str) -> Head | None:
-    """A head as it was noted (``<number>:<hash>``); ``None`` where it is none."""
+    """A head from its text form ``<number>:<hash>``; ``None`` if it is not valid."""
     result = _EXPECTED.match(text.strip())
     return Head(int(result[1]), result[2]) if result else None
 
 
 def _hash(before: str, fields: Mapping[str, Any]) -> str:
-    # Sorted, without spaces, in ASCII: the same record is the same bytes in every store.
+    # Sorted, without spaces, in ASCII: a record has the same bytes in every store.
     text = json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(bytes.fromhex(before) + text.encode()).hexdigest()

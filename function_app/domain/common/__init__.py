@@ -1,1 +1,1 @@
-"""Common."""
+"""Ids, errors, timestamps and rate limits that all capabilities use."""

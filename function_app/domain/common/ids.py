@@ -1,15 +1,15 @@
-"""Ids: short, unguessable where it matters, and readable back into their parts. All match ``[A-Za-z0-9_-]{1,64}``."""
+"""Ids that contain their parts. All ids match ``[A-Za-z0-9_-]{1,64}``."""
 
 import re
 import secrets
 
 ID = re.compile(r"\A[A-Za-z0-9_-]{1,64}\Z")
 DEVICE_NAME = re.compile(r"\A[A-Za-z0-9_-]{1,32}\Z")
-"""A device's name at its agent: short enough that an action's id, which holds it, stays within 64 characters."""
+"""Name of a device at its agent. The limit keeps action ids, which contain the name, within 64 characters."""
 AGENT_LENGTH = 10
 SUFFIX_LENGTH = 20
 CLAIM_ALPHABET = "BCDFGHJKLMNPQRSTVWXZ"
-"""Twenty consonants: nothing that reads as a word, nothing to mistake for a digit."""
+"""Twenty consonants: codes form no words and contain no character similar to a digit."""
 CLAIM_LENGTH = 8
 
 _BASE32 = "abcdefghijklmnopqrstuvwxyz234567"
@@ -20,15 +20,15 @@ _TIME_END = 32**_TIME_LENGTH - 1
 
 
 def new_id(length: int = 16) -> str:
-    """A random id: 5 bits a character."""
+    """A random id with 5 bits per character."""
     return "".join(secrets.choice(_BASE32) for _ in range(length))
 
 
 def agent_id(key_id: str) -> str:
-    """The id of the agent that owns a key, from ``signing.key_id`` (hex): the first 50 bits of the key's hash.
+    """The id of the agent that owns a key: the first 50 bits of the key's hash.
 
-    One key is one agent, for ever: no second row is needed to find it again, and a replayed enrolment changes nothing.
-    The agent's row holds the whole key, so a second key with the same 50 bits is refused, not confused.
+    A key always has the same agent id, so a replayed enrolment changes nothing. The agent's row contains the whole key,
+    so a second key with the same 50 bits is rejected.
     """
     bits = int(key_id[:16], 16) >> 14
     return "".join(_BASE32[(bits >> shift) & 31] for shift in range(45, -5, -5))
@@ -40,7 +40,7 @@ def device_id(agent: str, name: str) -> str:
 
 
 def split_device(device: str) -> tuple[str, str] | None:
-    """Agent and name in a device id, or ``None`` where the text cannot be one."""
+    """Agent and name of a device id, or ``None`` for an invalid id."""
     agent, dash, name = device.partition("-")
     if not dash or len(agent) != AGENT_LENGTH or not agent.isalnum() or not DEVICE_NAME.match(name):
         return None
@@ -59,17 +59,17 @@ def new_suffix(now_ms: int) -> str:
 
 
 def oldest_first(suffix: str) -> str:
-    """The last part of a command's id such that it sorts the other way round."""
+    """The last part of a command id, transformed so that the oldest sorts first."""
     return suffix.translate(_REVERSED)
 
 
 def command_id(device: str, now_ms: int) -> str:
-    """A new id of an action, or of another command to a device."""
+    """A new id of an action or of another command to a device."""
     return f"{device}-{new_suffix(now_ms)}"
 
 
 def split_command(command: str) -> tuple[str, str] | None:
-    """Device id and suffix in a command's id, or ``None`` where the text cannot be one."""
+    """Device id and suffix of a command id, or ``None`` for an invalid id."""
     device, dash, suffix = command.rpartition("-")
     if not dash or len(suffix) != SUFFIX_LENGTH or not suffix.isalnum() or split_device(device) is None:
         return None
@@ -77,18 +77,18 @@ def split_command(command: str) -> tuple[str, str] | None:
 
 
 def new_claim_code() -> str:
-    """Eight characters of base 20: 2.56·10¹⁰ codes."""
+    """A random code of eight characters in base 20: 2.56·10¹⁰ codes."""
     return "".join(secrets.choice(CLAIM_ALPHABET) for _ in range(CLAIM_LENGTH))
 
 
 def format_claim_code(code: str) -> str:
-    """As people see it: ``XXXX-XXXX``."""
+    """The code in the displayed format ``XXXX-XXXX``."""
     half = CLAIM_LENGTH // 2
     return f"{code[:half]}-{code[half:]}"
 
 
 def parse_claim_code(text: str) -> str | None:
-    """What a person typed, as it is stored; ``None`` when it cannot be a code."""
+    """The code that a person typed, as stored, or ``None`` if it is not valid."""
     code = "".join(text.split()).replace("-", "").upper()
     if len(code) != CLAIM_LENGTH or any(letter not in CLAIM_ALPHABET for letter in code):
         return None

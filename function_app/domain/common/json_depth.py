@@ -1,13 +1,13 @@
-"""How deep free-form JSON may be: what one program can read, every other must be able to write and read again."""
+"""Maximum nesting of free-form JSON, so that every program can read and write it."""
 
 from typing import Any
 
 MAX_LEVELS = 64
-"""Far more than parameters or results need, far less than any program's stack."""
+"""Maximum depth: more than parameters and results need, less than the stack of any program."""
 
 
 def too_deep(value: Any, levels: int = MAX_LEVELS) -> bool:
-    """Whether lists and objects are nested in one another more than ``levels`` times."""
+    """Whether lists and objects are nested more than ``levels`` deep."""
     if not isinstance(value, list | tuple | dict):
         return False
     if levels == 0:

@@ -1,18 +1,18 @@
-"""What can be refused, each with one code, one HTTP status and a sentence that says what to do (RFC 9457)."""
+"""Errors of the API: each has a code, an HTTP status and a text that says what to do (RFC 9457)."""
 
 from typing import Any
 
 
 class Problem(Exception):  # noqa: N818 (named as in RFC 9457)
-    """A request that is refused.
+    """A rejected request.
 
     Attributes:
         code: Stable name for programs; the last part of the problem's ``type``.
         status: HTTP status.
-        title: What is wrong, the same for every occurrence.
-        detail: What is wrong this time and what to do.
-        extras: Further members of the answer.
-        retry_after_s: When it may be worth trying again [s].
+        title: What is wrong; equal for all occurrences.
+        detail: What is wrong in this case, and what to do.
+        extras: Further members of the response.
+        retry_after_s: When a retry may succeed [s].
     """
 
     def __init__(
@@ -35,35 +35,35 @@ class Problem(Exception):  # noqa: N818 (named as in RFC 9457)
 
 
 def unauthorized(detail: str) -> Problem:
-    """Nobody we know is asking."""
+    """The caller is not authenticated."""
     return Problem("unauthorized", 401, "Sign in first", detail)
 
 
 def forbidden(detail: str) -> Problem:
-    """Known, and not allowed."""
+    """The caller is authenticated but not allowed to do this."""
     return Problem("forbidden", 403, "Not allowed", detail)
 
 
 def not_found(what: str, name: str) -> Problem:
-    """There is none, or none that this account may know of: the answer is the same."""
+    """The item does not exist, or is not visible to this account: the response is the same."""
     return Problem(f"{what}-unknown", 404, f"No such {what.replace('-', ' ')}", f"There is no {what} '{name[:80]}'.")
 
 
 def invalid(detail: str, *, code: str = "invalid", **extras: Any) -> Problem:
-    """The request cannot be understood."""
+    """The request is not valid."""
     return Problem(code, 422, "The request is not valid", detail, extras=extras)
 
 
 def busy_store() -> Problem:
-    """Too many writers wanted the same row at the same moment."""
+    """Too many concurrent writers changed the same row."""
     return Problem("busy", 503, "Busy", "Too many requests changed this at once. Try again.", retry_after_s=1)
 
 
 def broker_unavailable(detail: str) -> Problem:
-    """The message broker cannot be reached, so nothing reaches the device."""
+    """The message broker is not reachable, so no message reaches the device."""
     return Problem("broker-unavailable", 503, "The broker cannot be reached", detail, retry_after_s=2)
 
 
 def store_unavailable(detail: str) -> Problem:
-    """The tables cannot be used."""
+    """The tables are not available."""
     return Problem("store-unavailable", 503, "The store cannot be used", detail, retry_after_s=5)

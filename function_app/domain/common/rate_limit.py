@@ -1,8 +1,8 @@
-"""How often somebody may ask: the generic cell rate algorithm, whose whole state is one time.
+"""Rate limiting with the generic cell rate algorithm, whose whole state is one timestamp.
 
-Each request pushes a theoretical arrival time on by the time that it is worth; who is further ahead of the clock than a
-burst allows has to wait. Written here in ten lines because libraries for it keep their state in Redis or threads of
-their own, and all there is to keep is a number (ATM Forum, Traffic Management 4.0, 1996).
+Each request advances a theoretical arrival time. A request that is further ahead of the clock than a burst allows must
+wait (ATM Forum, Traffic Management 4.0, 1996). Libraries for this algorithm keep their state in Redis or in own
+threads.
 """
 
 from dataclasses import dataclass
@@ -10,22 +10,22 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """So many a second, and so many at once after a rest. ``per_s`` 0: any number."""
+    """A rate per second and a burst size. ``per_s`` 0: no limit."""
 
     per_s: float
     burst: int
 
 
 def request(rate: Rate, arrival_ms: float, now_ms: float) -> tuple[float, float]:
-    """Judge one request.
+    """Admit or delay one request.
 
     Args:
-        rate: What is allowed.
-        arrival_ms: What the last call gave; 0 at first.
-        now_ms: The time. One that jumps back locks nobody out for longer than a burst takes.
+        rate: The limit.
+        arrival_ms: First value of the previous result; 0 initially.
+        now_ms: Current time. A clock that jumps back delays requests by at most one burst.
 
     Returns:
-        The new arrival time, and how long to wait [ms]: 0 where the request is let through.
+        The new arrival time, and the time to wait [ms]; 0: the request is admitted.
     """
     if rate.per_s <= 0:
         return 0.0, 0.0

@@ -1,11 +1,11 @@
-"""Time as text."""
+"""Timestamps as text."""
 
 from datetime import UTC, datetime
 
 LAST_MS = 9_999_999_999_999
-"""The last moment that is taken for one, in the year 2286 [ms since 1970]: as thirteen digits it sorts as text."""
+"""Latest accepted time, in the year 2286 [ms since 1970]: thirteen digits sort as text."""
 NEVER_MS = 2**53
-"""The end of what has none [ms since 1970]."""
+"""Expiry time of what does not expire [ms since 1970]."""
 
 
 def rfc3339(at_ms: int) -> str:

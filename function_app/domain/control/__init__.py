@@ -1,1 +1,1 @@
-"""Control."""
+"""Leases, control requests and control events."""

@@ -1,7 +1,7 @@
-"""What is told of control over a device: who took, gave, asked, stopped, and who was refused.
+"""Events about control of a device: acquired, released, requested, stopped, rejected.
 
-These are the cloud's decisions; what became of them at the device the agent tells in events of its own. Facts follow
-from a lease before and after one write, and have ids that follow from it too: told twice, they are one.
+They record decisions of the cloud; the agent reports their effects in its own events. Event ids derive from the lease,
+so a repeated event is stored once.
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,7 +13,7 @@ from function_app.domain.control.lease import ControlRequest, Lease
 
 
 class Fact(StrEnum):
-    """Kinds of events, in the past tense."""
+    """Kinds of control events."""
 
     TAKEN = "control-taken"
     TAKEN_OVER = "control-taken-over"
@@ -34,7 +34,7 @@ class Fact(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ControlEvent:
-    """One fact. ``id`` is unique for the device; ``data`` is for programs, ``message`` for people."""
+    """One event. ``id`` is unique for the device; ``data`` is for programs, ``message`` for people."""
 
     id: str
     fact: Fact
@@ -44,7 +44,7 @@ class ControlEvent:
     severity: Literal["info", "warning"] = "info"
 
     def event(self, device_name: str) -> dict[str, Any]:
-        """As it is stored among the device's events."""
+        """The event as stored among the device's events."""
         return {
             "id": self.id,
             "device": device_name,
@@ -57,25 +57,25 @@ class ControlEvent:
 
 
 def timed_out(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
-    """What time alone has brought: a lease that ran out, a request that nobody answered."""
+    """Transitions due to timeouts: an expired lease, an unanswered request."""
     if lease is None:
         return
     asked = lease.request
     if asked is not None and asked.outcome == "open" and asked.current_outcome(lease, now_ms) == "expired":
-        yield _of_request(asked, Fact.REQUEST_LAPSED, asked.expires_ms, f"Nobody answered {asked.by} in time.")
+        yield _of_request(asked, Fact.REQUEST_LAPSED, asked.expires_ms, f"The request of {asked.by} timed out.")
     if lease.account and not lease.action and not lease.is_live(now_ms):
-        message = f"The lease of {lease.holder} ran out."
+        message = f"The lease of {lease.holder} expired."
         yield _of_lease(lease, Fact.EXPIRED, lease.expires_ms, message, {"holder": lease.holder})
 
 
 def lease_changes(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
-    """What one write has changed.
+    """The events that one write of the lease causes.
 
     Args:
-        before: The lease that was read.
-        after: The lease that was written in its place.
-        by: Who did it, by name.
-        now_ms: When.
+        before: The lease before the write.
+        after: The lease after the write.
+        by: Name of the account that changed it.
+        now_ms: Current time.
     """
     if before is not None and (after.epoch != before.epoch or not after.account):
         yield from timed_out(before, now_ms)
@@ -90,8 +90,8 @@ def lease_changes(before: Lease | None, after: Lease, *, by: str, now_ms: int) -
 
 
 def control_ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> ControlEvent:
-    """Control has ended because the device was ``unpaired``, ``moved``, ``removed``, or is ``unshared``."""
-    how = "is shared with them no longer" if why == "unshared" else f"was {why}"
+    """The event for control that ended because the device was ``unpaired``, ``moved``, ``removed`` or ``unshared``."""
+    how = "is no longer shared with them" if why == "unshared" else f"was {why}"
     message = f"Control of {before.holder} ended: the device {how}."
     return _of_lease(after, Fact.ENDED, now_ms, message, {"holder": before.holder, "reason": why})
 

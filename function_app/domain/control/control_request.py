@@ -1,8 +1,7 @@
-"""Asking for control: a request that the holder accepts or refuses, that who asks withdraws, or that lapses.
+"""Requests for control, which the holder accepts or rejects, the requester withdraws, or which time out.
 
-It is part of the lease's row, so one write decides what becomes of both, and of all that happens at once one thing
-does. Silence takes control from nobody. A request asks for one epoch and ends with it: a lease that is released or runs
-out is free, and given to nobody by itself, so that nothing begins in the moment in which somebody lets go.
+The request is part of the lease's row, so one write decides both. A timeout never transfers control. A request refers
+to one epoch and ends with it: a released or expired lease is free and is not assigned automatically.
 """
 
 from dataclasses import replace
@@ -16,16 +15,16 @@ from function_app.domain.identity.accounts import Identity
 def request_control(
     lease: Lease | None, caller: Identity, *, request: str, within_ms: int, lease_ms: int, now_ms: int
 ) -> Lease:
-    """The lease with a request of ``caller``; as it is when they ask already.
+    """The lease with a request of ``caller``; unchanged if the caller's request is already open.
 
     Raises:
-        Problem: ``lease-free``, ``lease-already-held``, ``lease-requested``: somebody else was first.
+        Problem: ``lease-free``, ``lease-yours``, or ``lease-requested``: another request is open.
     """
     if lease is None or not lease.is_live(now_ms):
-        detail = "Nobody controls this device. Take the lease; there is nobody to ask."
-        raise Problem("lease-free", 409, "Nobody holds the lease", detail)
+        detail = "No session controls this device. Acquire the lease; no request is needed."
+        raise Problem("lease-free", 409, "The lease is free", detail)
     if lease.held_by(caller):
-        detail = "You control this device already, in this very session."
+        detail = "This session already controls the device."
         raise Problem("lease-already-held", 409, "The lease is yours", detail, extras={"epoch": lease.epoch})
     existing = lease.request
     if existing is not None and existing.current_outcome(lease, now_ms) == "open":
@@ -35,7 +34,7 @@ def request_control(
             f"{existing.by} asks for control already. Wait for the answer, or until {rfc3339(existing.expires_ms)}."
         )
         extras = {"requester": existing.by, "expires_at": rfc3339(existing.expires_ms)}
-        raise Problem("lease-requested", 409, "Somebody else asks already", detail, extras=extras)
+        raise Problem("lease-requested", 409, "Another request is open", detail, extras=extras)
     asked = ControlRequest(
         id=request,
         epoch=lease.epoch,
@@ -52,10 +51,10 @@ def request_control(
 
 
 def accept(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
-    """The lease of whoever asked, with the next epoch; as it is when that was done already.
+    """The lease of the requester with the next epoch; unchanged if already accepted.
 
     Raises:
-        Problem: ``request-unknown``, ``forbidden``, ``control-request-closed``.
+        Problem: ``request-unknown``, ``forbidden``, ``request-over``.
     """
     current, asked = _to_answer(lease, caller, request)
     if not _still(current, asked, "accepted", now_ms):
@@ -73,10 +72,10 @@ def accept(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) 
 
 
 def refuse(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
-    """The lease as it is, the request refused; the same when that was done already.
+    """The lease with the request rejected; unchanged if already rejected.
 
     Raises:
-        Problem: ``request-unknown``, ``forbidden``, ``control-request-closed``.
+        Problem: ``request-unknown``, ``forbidden``, ``request-over``.
     """
     current, asked = _to_answer(lease, caller, request)
     if not _still(current, asked, "rejected", now_ms):
@@ -85,14 +84,14 @@ def refuse(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) 
 
 
 def withdraw(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
-    """The lease as it is, the request gone; the same when it was over already, unless it was accepted.
+    """The lease with the request withdrawn; unchanged if the request is over, unless it was accepted.
 
     Raises:
-        Problem: ``request-unknown``, ``forbidden``, ``control-request-closed``.
+        Problem: ``request-unknown``, ``forbidden``, ``request-over``.
     """
     current, asked = find(lease, request)
     if not asked.requested_by(caller):
-        raise forbidden("Only who asked for control may withdraw that, in the same session.")
+        raise forbidden("Only the session that requested control may withdraw the request.")
     how = asked.current_outcome(current, now_ms)
     if how == "accepted":
         raise _over(how)
@@ -102,7 +101,7 @@ def withdraw(lease: Lease | None, caller: Identity, *, request: str, now_ms: int
 
 
 def find(lease: Lease | None, request: str) -> tuple[Lease, ControlRequest]:
-    """The lease with the request of this id: the last one is known, whatever has become of it.
+    """The lease and the request with this id. The last request stays available after it is over.
 
     Raises:
         Problem: ``request-unknown``.
@@ -115,12 +114,12 @@ def find(lease: Lease | None, request: str) -> tuple[Lease, ControlRequest]:
 def _to_answer(lease: Lease | None, caller: Identity, request: str) -> tuple[Lease, ControlRequest]:
     current, asked = find(lease, request)
     if not asked.addressed_to(caller):
-        raise forbidden("Only who holds the lease may answer that, in the same session.")
+        raise forbidden("Only the session that holds the lease may answer the request.")
     return current, asked
 
 
 def _still(lease: Lease, asked: ControlRequest, wanted: Outcome, now_ms: int) -> bool:
-    """Whether it can still be answered; not when it was answered so already."""
+    """Whether the request can still be answered; ``False`` if it already has this answer."""
     how = asked.current_outcome(lease, now_ms)
     if how not in {"open", wanted}:
         raise _over(how)
@@ -128,11 +127,11 @@ def _still(lease: Lease, asked: ControlRequest, wanted: Outcome, now_ms: int) ->
 
 
 _ENDS: dict[Outcome, str] = {
-    "accepted": "It was accepted: whoever asked has control.",
-    "rejected": "It was refused: control stays where it is.",
-    "withdrawn": "Whoever asked has withdrawn it.",
-    "expired": "It was not answered in time: control stays where it is. Ask again if need be.",
-    "ended": "The lease that it asked for has ended. Look who has control now.",
+    "accepted": "It was accepted: the requester has control.",
+    "rejected": "It was rejected: control did not change.",
+    "withdrawn": "The requester has withdrawn it.",
+    "expired": "It timed out: control did not change. Send a new request if needed.",
+    "ended": "The requested lease has ended. Check who has control now.",
 }
 
 

@@ -1,4 +1,4 @@
-"""Lease rules: one holder, a time limit, and an epoch that only rises."""
+"""Lease rules: one holder, an expiry time, and an epoch that only increases."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -8,21 +8,21 @@ from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.identity.accounts import Identity
 
 Outcome = Literal["open", "accepted", "rejected", "withdrawn", "expired", "ended"]
-"""Of a request for control. ``ended``: the lease that it asks for has ended otherwise; look who has control now."""
+"""Outcome of a control request. ``ended``: the requested lease ended in another way."""
 
 
 @dataclass(frozen=True, slots=True)
 class ControlRequest:
-    """Somebody asks the holder of one epoch for control; see ``domain/handover.py``.
+    """A request to the holder of one epoch for control; see ``control_request``.
 
     Attributes:
-        epoch: The lease that is asked for.
-        by: Who asks, by name.
-        holder_account: Who was asked,
-        holder_session: and alone may answer.
-        expires_ms: Until then the holder may answer: silence takes control from nobody.
-        lease_ms: How long control is wanted for.
-        outcome: As it was written down; ``how`` knows what time has made of it.
+        epoch: Epoch of the requested lease.
+        by: Name of the requester.
+        holder_account: Account of the holder at the time of the request.
+        holder_session: Session of that holder; only this session may answer.
+        expires_ms: End of the time to answer. A timeout does not transfer control.
+        lease_ms: Duration of the requested lease.
+        outcome: Stored outcome; ``current_outcome`` also considers timeouts.
     """
 
     id: str
@@ -38,7 +38,7 @@ class ControlRequest:
     outcome: Outcome = "open"
 
     def current_outcome(self, lease: "Lease", now_ms: int) -> Outcome:
-        """How it stands now with the request to the holder of ``lease``."""
+        """The outcome now, given the current lease."""
         if self.outcome != "open":
             return self.outcome
         if now_ms >= self.expires_ms:
@@ -46,23 +46,23 @@ class ControlRequest:
         return "open" if lease.epoch == self.epoch and lease.is_live(now_ms) else "ended"
 
     def requested_by(self, caller: Identity) -> bool:
-        """Whether this very sign-in session asks."""
+        """Whether this sign-in session made the request."""
         return self.account == caller.account and self.session == caller.session
 
     def addressed_to(self, caller: Identity) -> bool:
-        """Whether this very sign-in session was asked."""
+        """Whether the request is addressed to this sign-in session."""
         return self.holder_account == caller.account and self.holder_session == caller.session
 
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """The right to move one device. ``account`` is empty when nobody has it: the row stays, for the epoch.
+    """The right to move one device. ``account`` is empty if the lease is free; the row remains because of the epoch.
 
     Attributes:
-        action: Id of the one action for whose time it was given, where its holder took none on purpose.
-        pairing: Of the agent, when it was given. A lease of an earlier owner's pairing is nobody's.
-        reason: Why it was taken from somebody else, if it was.
-        asked: The last request for control, whatever has become of it.
+        action: Id of the action for which the lease was created automatically.
+        pairing: Pairing of the agent. A lease of an earlier pairing is ignored.
+        reason: Why it was taken over from another holder.
+        request: The last request for control, open or over.
     """
 
     epoch: int
@@ -77,19 +77,19 @@ class Lease:
     request: ControlRequest | None = None
 
     def is_live(self, now_ms: int) -> bool:
-        """Whether somebody holds it."""
+        """Whether a session holds the lease."""
         return bool(self.account) and now_ms < self.expires_ms
 
     def held_by(self, caller: Identity) -> bool:
-        """Whether this very sign-in session is its holder, live or not."""
+        """Whether this sign-in session is the holder, also after expiry."""
         return self.account == caller.account and self.session == caller.session
 
     def held_by_other(self, caller: Identity, now_ms: int) -> bool:
-        """Whether somebody else holds it (another sign-in session of the same account is somebody else)."""
+        """Whether another session holds the lease; sessions of the same account count as different."""
         return self.is_live(now_ms) and not self.held_by(caller)
 
     def closed_request(self, now_ms: int) -> ControlRequest | None:
-        """The last request, which is open no longer: what it asked for ends at this moment."""
+        """The last request, which ends with this lease."""
         if self.request is None:
             return None
         how = self.request.current_outcome(self, now_ms)
@@ -97,11 +97,11 @@ class Lease:
 
 
 MIN_MS = 1_000
-"""The shortest lease."""
+"""Shortest lease [ms]."""
 
 
 def granted_ms(lease_ms: int, left_ms: int) -> int:
-    """How long a lease is given to whom the right to it is left for so long [ms]."""
+    """Duration of a lease for a caller whose permission ends in ``left_ms`` [ms]."""
     return max(MIN_MS, min(lease_ms, left_ms))
 
 
@@ -115,22 +115,22 @@ def acquire(
     action: str = "",
     over: str = "",
 ) -> Lease:
-    """A lease for ``caller``, always with the next epoch.
+    """A lease for ``caller`` with the next epoch.
 
-    Whoever holds it already gets a new one too: that is how control is taken again after the device has ended the
-    lease by itself (a hold, a Stop, a restart), which the cloud need not know.
+    The current holder also gets a new epoch. This way a holder acquires control again after the device ended the lease
+    (hold, Stop, restart), which the cloud may not know.
 
     Args:
-        lease: As it is.
-        caller: Who takes it.
-        lease_ms: For how long.
-        now_ms: The time.
-        pairing: Of the device's agent.
-        action: The one action that it is for.
-        over: Why it is taken even from somebody else; empty: it is not. Only an owner may.
+        lease: Current lease.
+        caller: New holder.
+        lease_ms: Duration.
+        now_ms: Current time.
+        pairing: Pairing of the device's agent.
+        action: The only action that the lease is for; empty: any.
+        over: Reason for a takeover, which only owners may request; empty: no takeover.
 
     Raises:
-        Problem: ``lease-held`` by somebody else.
+        Problem: ``lease-held``: another session is the holder.
     """
     taken = lease is not None and lease.held_by_other(caller, now_ms)
     if lease is not None and taken and not over:
@@ -150,43 +150,43 @@ def acquire(
 
 
 def renew(lease: Lease | None, caller: Identity, *, epoch: int, lease_ms: int, now_ms: int) -> Lease:
-    """The same lease with a later end.
+    """The same lease with a later expiry time.
 
     Raises:
-        Problem: ``lease-lost``: it ran out, or it is another's by now.
+        Problem: ``lease-lost``: it expired or has another holder.
     """
     current = require_held(lease, caller, epoch=epoch, now_ms=now_ms)
     return replace(current, expires_ms=now_ms + lease_ms, lease_ms=lease_ms, action="")
 
 
 def require_held(lease: Lease | None, caller: Identity, *, epoch: int, now_ms: int) -> Lease:
-    """The lease, once it is seen that ``caller`` holds this epoch of it now.
+    """The lease, if ``caller`` holds this epoch now.
 
     Raises:
         Problem: ``lease-lost``.
     """
     if lease is None or lease.epoch != epoch or not lease.held_by(caller) or not lease.is_live(now_ms):
         extras = {"epoch": epoch, "current_epoch": lease.epoch if lease else 0}
-        detail = f"Epoch {epoch} of the lease is not yours any more. Take the lease again."
+        detail = f"This session no longer holds epoch {epoch} of the lease. Acquire the lease again."
         raise Problem("lease-lost", 409, "The lease is lost", detail, extras=extras)
     return lease
 
 
 def release(lease: Lease, *, now_ms: int) -> Lease:
-    """Nobody's lease; the epoch stays, so that the next one is higher."""
+    """A free lease with the same epoch, so that the next epoch is higher."""
     return Lease(epoch=lease.epoch, pairing=lease.pairing, request=lease.closed_request(now_ms))
 
 
 def invalidate(lease: Lease | None, *, pairing: str, now_ms: int) -> Lease:
-    """Nobody's lease with the next epoch: all that was ordered under the one before is old."""
+    """A free lease with the next epoch, which fences all earlier commands."""
     if lease is None:
         return Lease(epoch=1, pairing=pairing)
     return Lease(epoch=lease.epoch + 1, pairing=pairing, request=lease.closed_request(now_ms))
 
 
 def lease_held(lease: Lease) -> Problem:
-    """The refusal that names the holder."""
+    """The rejection that names the holder."""
     ends = rfc3339(lease.expires_ms)
-    detail = f"{lease.holder} controls this device until {ends}. Ask for control at lease/requests, or wait."
+    detail = f"{lease.holder} controls this device until {ends}. Request control at lease/requests, or wait."
     extras = {"holder": lease.holder, "expires_at": ends, "mine": False}
-    return Problem("lease-held", 409, "Somebody else controls the device", detail, extras=extras)
+    return Problem("lease-held", 409, "Another session controls the device", detail, extras=extras)

@@ -1,1 +1,1 @@
-"""Devices."""
+"""Agents, devices, shares and invitations."""

@@ -1,8 +1,8 @@
-"""Who may do what with a device, and until when: its owner, and those with whom the device or its space is shared.
+"""Permissions on a device: of its owner, and of accounts with which the device or its space is shared.
 
-A share gives ``operator`` or ``viewer``, never ``owner``: there is one owner, and a device changes hands by a transfer
-alone. A share of a device belongs to one pairing of its agent, a share of a space to the account that owns the space:
-un-pairing, moving away and a new owner end it without anything being deleted.
+A share grants ``operator`` or ``viewer``. Ownership changes only by a transfer. A share of a device belongs to one
+pairing of the agent; a share of a space belongs to the owner's account. Unpairing, moving and transferring end a share
+without deleting it.
 """
 
 from collections.abc import Iterable
@@ -16,24 +16,24 @@ from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity, Role
 
 Kind = Literal["device", "space", "agent"]
-"""What is shared is a device or a space; what is handed over is an agent."""
+"""A share refers to a device or a space; a transfer refers to a space or an agent."""
 MAX_SHARES: Final = 100
-"""Accounts with whom one device or space is shared."""
+"""Maximum number of accounts with access to one device or space."""
 _RANKS: Final = {Role.VIEWER: 0, Role.OPERATOR: 1, Role.OWNER: 2}
 
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """One account's part in something.
+    """The access of one account to a device or space.
 
     Attributes:
         on: ``device:<id>`` or ``space:<id>``.
-        account: With whom it is shared.
+        account: The account with access.
         role: ``operator`` or ``viewer``.
-        owner: The account it belonged to then.
-        by: Who shared it, by name.
-        expires_ms: From then on it is over [ms since 1970].
-        pairing: Of the device's agent then; empty for a space.
+        owner: The owner's account at the time of sharing.
+        by: Name of the account that shared it.
+        expires_ms: Expiry time [ms since 1970].
+        pairing: Pairing of the device's agent; empty for a space.
     """
 
     on: str
@@ -46,11 +46,11 @@ class Share:
     pairing: str = ""
 
     def is_live(self, now_ms: int) -> bool:
-        """Whether its time is not over."""
+        """Whether the share has not expired."""
         return now_ms < self.expires_ms
 
     def applies_to(self, agent: Agent, now_ms: int) -> bool:
-        """Whether it is live, and the agent still belongs to where it was shared."""
+        """Whether the share is live and the agent has not changed owner, space or pairing."""
         if not self.is_live(now_ms) or self.owner != agent.account:
             return False
         return self.on == space_target(agent.space or "") or (bool(self.pairing) and self.pairing == agent.pairing)
@@ -61,9 +61,9 @@ class Permissions:
     """What an account may do with a device.
 
     Attributes:
-        role: The highest that it has.
-        until_ms: When that changes by itself, or who asks is signed in no longer [ms since 1970].
-        space: Its role in the whole space; ``None`` where it has a part in this device alone.
+        role: The highest role.
+        until_ms: When the role changes, or the caller's session ends [ms since 1970].
+        space: Role in the whole space; ``None`` for access to this device only.
     """
 
     role: Role
@@ -75,14 +75,14 @@ OWNER_PERMISSIONS: Final = Permissions(Role.OWNER, space=Role.OWNER)
 
 
 def permissions(caller: Identity, agent: Agent, name: str, shares: Iterable[Share], now_ms: int) -> Permissions | None:
-    """What ``caller`` may do with a device; ``None``: there is no such device for them.
+    """The permissions of ``caller`` on a device; ``None``: the device is not visible to the caller.
 
     Args:
-        caller: Who asks. No role above ``who.most``, nothing outside ``who.only``.
-        agent: The device's agent.
-        name: The device's name there.
-        shares: What is shared with the account: of this device and of its space.
-        now_ms: The time.
+        caller: Limited to the role ``caller.most`` and to the targets in ``caller.only``.
+        agent: Agent of the device.
+        name: Device name at the agent.
+        shares: The caller's shares of this device and its space.
+        now_ms: Current time.
     """
     if agent.account is None:
         return None
@@ -104,44 +104,44 @@ def permissions(caller: Identity, agent: Agent, name: str, shares: Iterable[Shar
 
 
 def capped(caller: Identity, role: Role) -> Role:
-    """The role, or the highest that ``caller`` may have."""
+    """The role, limited to the highest role of ``caller``."""
     return min(role, caller.most, key=_RANKS.__getitem__)
 
 
 def outranks(one: Role, other: Role) -> bool:
-    """Whether ``one`` may do more than ``other``."""
+    """Whether ``one`` has more permissions than ``other``."""
     return _RANKS[one] > _RANKS[other]
 
 
 def device_target(device: str) -> str:
-    """What a share of a device is on."""
+    """The target of a share of a device."""
     return f"device:{device}"
 
 
 def space_target(space: str) -> str:
-    """What a share of a space is on; also how ``Identity.only`` names it."""
+    """The target of a share of a space; also used in ``Identity.only``."""
     return f"space:{space}"
 
 
 def split_target(on: str) -> tuple[str, str]:
-    """Kind and id of what is shared."""
+    """Kind and id of a target."""
     kind, _, name = on.partition(":")
     return kind, name
 
 
 def expiry_ms(for_s: int | None, now_ms: int) -> int:
-    """The end of what begins now and lasts so long [s]; ``None``: until somebody ends it."""
+    """Expiry time of a duration that starts now [s]; ``None``: does not expire."""
     return NEVER_MS if for_s is None else now_ms + for_s * 1000
 
 
 def require_shareable(role: Role) -> Role:
-    """The role, once it is seen that it can be shared.
+    """The role, if it can be shared.
 
     Raises:
         Problem: ``invalid``.
     """
     if role is Role.OWNER:
-        raise invalid("A role is operator or viewer. To make somebody else the owner, transfer the agent or the space.")
+        raise invalid("A role is operator or viewer. To change the owner, transfer the agent or the space.")
     return role
 
 

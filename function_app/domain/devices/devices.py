@@ -1,4 +1,4 @@
-"""Agents, their devices, and what is known of them at this moment."""
+"""Agents, their devices, and their last reported state."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -7,22 +7,22 @@ from function_app.domain.common.timestamps import NEVER_MS
 from function_app.domain.identity.accounts import Role
 
 SILENT_MS = 90_000
-"""An agent sends state every 30 s; after three missed ones a last word of "online" is no longer believed."""
+"""An agent publishes state every 30 s; after three missed messages it counts as offline."""
 POLL_SILENT_MS = 45_000
-"""An agent that polls asks at least every 30 s."""
+"""A polling agent sends a request at least every 30 s."""
 POLL_MARK_MS = 15_000
-"""How often at most it is written down that an agent has polled."""
+"""Minimum interval between two stored polls of an agent."""
 
 _MOST_LEAVING = 16
-"""Only a broker that is away for long lets so many come together; the oldest then keep what is retained of them."""
+"""Departures accumulate only while a broker is unreachable; beyond this limit the oldest are dropped."""
 
 Transport = Literal["mqtt", "http", "xmpp"]
-"""How an agent hears what is addressed to it. Not over MQTT: it, or who speaks XMPP for it, fetches it by HTTP."""
+"""How an agent receives commands. Agents without MQTT, and the XMPP gateway, fetch them by HTTP."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceSpec:
-    """What an agent says about one of its devices when it enrolls."""
+    """A device as its agent describes it at enrolment."""
 
     name: str
     kind: str
@@ -32,7 +32,7 @@ class DeviceSpec:
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """What was left and is still to be tidied up: whose it was, where, and which devices."""
+    """Devices that left an account or space, and whose data must still be cleaned up."""
 
     why: Literal["unpaired", "moved", "removed"]
     account: str
@@ -43,14 +43,14 @@ class Departure:
 
 @dataclass(frozen=True, slots=True)
 class Agent:
-    """One identity: a key pair that the agent made itself. Waiting until an account claims it.
+    """An agent, identified by its own key pair. It is unclaimed until an account claims it.
 
     Attributes:
-        pairing: Changes with each claim: what belongs to an earlier owner's pairing is no longer shown.
-        claim_code: The code that claims it now; empty when claimed.
-        leaving: What ``services/leave.py`` has to tidy up.
-        expires_ms: From then on it may be forgotten, if nobody has claimed it [ms since 1970].
-        labels: What its owner calls its devices, by their names; the others are called as it says itself.
+        pairing: Changes with each claim; data of earlier pairings are not visible.
+        claim_code: Current claim code; empty if claimed.
+        leaving: Departures that ``Offboarding`` must clean up.
+        expires_ms: When an unclaimed agent may be deleted [ms since 1970].
+        labels: Labels set by the owner, by device name. Other devices keep the label of the agent.
     """
 
     id: str
@@ -72,24 +72,24 @@ class Agent:
 
     @property
     def claimed(self) -> bool:
-        """Whether it belongs to somebody."""
+        """Whether an account owns the agent."""
         return self.account is not None
 
     def device(self, name: str) -> DeviceSpec | None:
-        """The device of this name."""
+        """The device with this name, or ``None``."""
         return next((spec for spec in self.devices if spec.name == name), None)
 
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """One device, as one account may see it.
+    """A device as visible to one account.
 
     Attributes:
-        role: The highest that the account has here.
-        topic: The first levels of all its topics.
-        owner: The account that its agent belongs to; its movements and robot types count here, whoever asks.
-        until_ms: When the role changes by itself [ms since 1970].
-        space_role: The account's role in the whole space; ``None`` where it has a part in this device alone.
+        role: Highest role of the account.
+        topic: Prefix of all topics of the device.
+        owner: Account of the agent. Its movements and robot types apply, for every caller.
+        until_ms: When the role changes [ms since 1970].
+        space_role: Role in the whole space; ``None`` for access to this device only.
     """
 
     id: str
@@ -109,7 +109,7 @@ class Device:
 
 
 def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:
-    """The agent, now of ``account``; its code is used up."""
+    """The agent, claimed by ``account``. The claim code is consumed."""
     return replace(
         agent,
         account=account,
@@ -124,13 +124,13 @@ def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) 
 
 
 def rename(agent: Agent, name: str, label: str | None) -> Agent:
-    """The agent with one of its devices called ``label``; ``None``: as it says itself."""
+    """The agent with a new label for one device; ``None`` restores the agent's own label."""
     others = {existing: given for existing, given in agent.labels.items() if existing != name}
     return replace(agent, labels=others if label is None else {**others, name: label})
 
 
 def unpair(agent: Agent) -> Agent:
-    """The agent, of nobody."""
+    """The agent without an owner."""
     return replace(
         _leaves(agent, "unpaired", [spec.name for spec in agent.devices]),
         account=None,
@@ -144,21 +144,20 @@ def unpair(agent: Agent) -> Agent:
 
 
 def transfer(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:
-    """The agent, from one account to another in one step: it is nobody's at no time.
+    """The agent, transferred to another account in one step.
 
-    A new pairing, as if it had been un-paired and claimed: nothing that was seen, said or shared under the owner before
-    goes with it.
+    The agent gets a new pairing, so no data or shares of the previous owner remain visible.
     """
     return claim(unpair(agent), account=account, space=space, pairing=pairing, now_ms=now_ms)
 
 
 def move(agent: Agent, space: str) -> Agent:
-    """The agent in another space of its account, with all that is known of its devices."""
+    """The agent in another space of the same account, with its data."""
     return replace(_leaves(agent, "moved", [spec.name for spec in agent.devices]), space=space)
 
 
 def with_devices(agent: Agent, devices: tuple[DeviceSpec, ...]) -> Agent:
-    """The agent with the devices that it says it has now."""
+    """The agent with the devices that it reports now."""
     names = {spec.name for spec in devices}
     removed = [spec.name for spec in agent.devices if spec.name not in names]
     labels = {name: label for name, label in agent.labels.items() if name in names}
@@ -174,13 +173,13 @@ def _leaves(agent: Agent, why: Literal["unpaired", "moved", "removed"], names: l
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """The last word about an agent's connection.
+    """The last reported connection state of an agent.
 
     Attributes:
-        session: Number of the agent's connection; it rises each time.
-        seen_ms: When the cloud took notice [ms since 1970, cloud's clock].
-        polled: The agent has no connection but asks again and again; nobody says so when it stops.
-        pairing: Of the agent then: what was said under an earlier owner is not shown.
+        session: Number of the agent's connection; increases with each connection.
+        seen_ms: When the cloud received it [ms since 1970, cloud clock].
+        polled: The agent polls; it sends no message when it stops.
+        pairing: Pairing of the agent at that time.
     """
 
     online: bool
@@ -191,10 +190,10 @@ class Link:
 
 
 def newer_link(existing: Link | None, incoming: Link) -> Link | None:
-    """What to store, or ``None`` when the news is old.
+    """The link to store, or ``None`` if ``incoming`` is outdated.
 
-    An old connection's will may arrive after the new connection's "online": the lower session number gives it away.
-    Within one session "offline" is final.
+    The will of an old connection may arrive after "online" of a new one: its session number is lower. Within one
+    session "offline" is final.
     """
     if existing is None or incoming.session > existing.session or incoming.pairing != existing.pairing:
         return incoming
@@ -205,7 +204,7 @@ def newer_link(existing: Link | None, incoming: Link) -> Link | None:
 
 @dataclass(frozen=True, slots=True)
 class LastState:
-    """The newest ``state`` message of a device, as it came, and the agent's pairing then."""
+    """The newest ``state`` message of a device, and the agent's pairing at that time."""
 
     state: dict[str, Any]
     seen_ms: int
@@ -213,21 +212,21 @@ class LastState:
 
     @property
     def ended_epoch(self) -> int:
-        """The highest epoch that the device says it never obeys again."""
+        """The highest epoch that the device has ended."""
         return int(self.state.get("ended_epoch", 0))
 
 
 def online(link: Link | None, last_seen_ms: int, now_ms: int) -> bool:
-    """Whether the agent may be believed to be there."""
+    """Whether the agent counts as online."""
     if link is None or not link.online:
         return False
     return now_ms - last_seen_ms <= (POLL_SILENT_MS if link.polled else SILENT_MS)
 
 
 def polled(existing: Link | None, now_ms: int, pairing: str) -> Link | None:
-    """What to store when an agent has polled, or ``None`` when that was noted a moment ago.
+    """The link to store after a poll, or ``None`` if the last poll was stored recently.
 
-    Asking is better evidence than any earlier word of "offline".
+    A poll overrides any earlier "offline".
     """
     created = existing is not None and now_ms - existing.seen_ms < POLL_MARK_MS and existing.pairing == pairing
     if existing is not None and existing.online and existing.polled and created:

@@ -1,1 +1,1 @@
-"""Health."""
+"""Fault detectors, diagnosis and fault records."""

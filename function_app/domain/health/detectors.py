@@ -1,9 +1,9 @@
-"""Is a measurement as it should be? Online detectors of small, fixed state, fed with means of ten seconds.
+"""Online detectors with small, fixed state for measurements averaged over 10 s.
 
-Four questions, each with its own answer: *level* (beyond a limit now), *trend* (on its way to a limit), *change*
-(settled elsewhere: Page and Hinkley's), *outlier* (far from its own past). What is far is measured by the noise it has
-shown and, where there are limits, by the room that is left to them: a joint that warms by ten kelvin at work is well, a
-joint that cannot stop warming is not. Without noise there is no measure, and nothing is unusual.
+There are four detectors: *level* (beyond a limit), *trend* (moving towards a limit), *change* (a lasting shift,
+Page-Hinkley) and *outlier* (far from its baseline). Distances are measured relative to the observed noise and to the
+distance from the limits. A joint that warms by ten kelvin at work is normal; a joint that does not stop warming is not.
+Without noise there is no scale, and no detector triggers.
 """
 
 import math
@@ -25,11 +25,11 @@ from function_app.domain.health.estimators import (
 WINDOW_MS = 10_000
 MINUTE_MS = 60_000
 GAP_MS = 5 * MINUTE_MS
-"""After such a silence trends begin anew;"""
+"""After a gap of this length trends restart."""
 ABSENCE_MS = 30 * MINUTE_MS
-"""after such a one everything does: the robot may have been off, and be cold."""
+"""After a gap of this length all detectors restart: the robot may have been off."""
 LARGEST = 1e15
-"""Larger values are taken as this, so that sums and squares stay finite."""
+"""Larger values are clipped to this, so that sums and squares stay finite."""
 
 LEVEL = "level"
 TREND = "trend"
@@ -40,14 +40,14 @@ KINDS = (LEVEL, TREND, CHANGE, OUTLIER)
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What is known beforehand of one field; ``None`` where nothing is.
+    """Known limits of one field; ``None``: unknown.
 
     Attributes:
-        low: Below this something breaks; ``high``: above.
-        warning_low: Below this somebody should look; ``warning_high``: above.
-        change: A lasting shift that is worth a word; without it half of the room to the limits.
-        horizon_s: How long before a limit a trend towards it is worth a word [s].
-        kinds: The questions to ask.
+        low: Below it damage occurs; ``high``: above it.
+        warning_low: Below it a warning is raised; ``warning_high``: above it.
+        change: Lasting shift that is reported; default: half of the distance to the limits.
+        horizon_s: A trend is reported if it reaches a limit within this time [s].
+        kinds: Enabled detectors.
     """
 
     low: float | None = None
@@ -60,16 +60,16 @@ class Limits:
 
     @property
     def lowest(self) -> float | None:
-        """The limit below that counts for trends and room."""
+        """The lower limit for trends and distances."""
         return self.warning_low if self.low is None else self.low
 
     @property
     def highest(self) -> float | None:
-        """The limit above."""
+        """The upper limit for trends and distances."""
         return self.warning_high if self.high is None else self.high
 
     def room(self, value: float) -> float | None:
-        """How far the nearest limit is from ``value``; ``None`` without limits, 0 beyond them."""
+        """Distance of ``value`` to the nearest limit; ``None`` without limits, 0 beyond them."""
         rooms = []
         if self.highest is not None:
             rooms.append(self.highest - value)
@@ -79,25 +79,25 @@ class Limits:
 
 
 SPAN = 10
-"""Minutes that a trend is read from; as many before them say whether it lasts."""
+"""Minutes in the window of a trend; the window before it shows whether the trend lasts."""
 SURE = 4.0
-"""A slope, or the difference of two, of so many standard errors is one."""
+"""A slope is significant beyond this number of standard errors."""
 SLOWING = 0.9
-"""A slope that is less than this share of the one before is on its way to rest, not to the limit."""
+"""A slope below this share of the previous slope is decaying."""
 PROVEN = 0.75
-"""A slope that was this share of today's one ten minutes before is no beginning any more."""
+"""A trend is proven if the previous slope was at least this share of the current one."""
 SOON = 1 / 4
-"""Of a trend that has only begun, this share of the horizon counts: it may be a warming that comes to rest."""
+"""Share of the horizon for a new trend, which may still be a warm-up."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trend:
-    """Where a field is going.
+    """The trend of a field.
 
     Attributes:
-        per_s: Its slope [unit/s].
-        limit_in_s: Time until it meets a limit [s]; ``None``: it does not.
-        proven: It has lasted for longer than the span it is read from.
+        per_s: Slope [unit/s].
+        limit_in_s: Time until it reaches a limit [s]; ``None``: never.
+        proven: It has lasted longer than its window.
     """
 
     per_s: float
@@ -106,10 +106,10 @@ class Trend:
 
 
 def trend(minutes: Sequence[float], limits: Limits) -> Trend | None:
-    """The trend of the newest minutes' means; ``None`` for too few.
+    """The trend of the newest one-minute means; ``None`` for too few values.
 
-    What warms at work comes to rest like e^(-t/τ); what has lost its cooling does not. So a slope that decreases is
-    followed to where it ends, and any other is taken to last.
+    Warming at work decays like e^(-t/τ); warming after a loss of cooling does not. A decreasing slope is therefore
+    extrapolated to its end value, any other slope linearly.
     """
     if len(minutes) < SPAN:
         return None
@@ -127,7 +127,7 @@ def trend(minutes: Sequence[float], limits: Limits) -> Trend | None:
     slower = abs(before.per_s) - abs(now.per_s) > SURE / 2 * math.hypot(now.error_per_s, before.error_per_s)
     if 0 < share < SLOWING and slower:
         decay_s = SPAN * MINUTE_MS / 1000 / -math.log(share)
-        # The slope is that of the middle of its span.
+        # The slope applies to the middle of its window.
         rest = now.per_s * math.exp(-SPAN * MINUTE_MS / 2000 / decay_s) * decay_s
         return Trend(now.per_s, -decay_s * math.log1p(-left / rest) if left / rest < 1 else None, proven=True)
     return Trend(now.per_s, left / now.per_s, proven=0 < share < 1 / PROVEN)
@@ -135,17 +135,17 @@ def trend(minutes: Sequence[float], limits: Limits) -> Trend | None:
 
 @dataclass(frozen=True, slots=True)
 class DetectorState:
-    """All that is kept of one field between two windows.
+    """State of the detectors of one field between two windows.
 
     Attributes:
         seen_ms: Start of the newest window [ms since 1970].
         value: Its mean.
         minutes: Means of the newest whole minutes.
-        minute: Sum and count of the open minute's windows.
-        slope_per_s: The trend [unit/s].
-        limit_in_s: Time until it meets a limit [s].
+        minute: Sum and count of the windows of the current minute.
+        slope_per_s: Slope [unit/s].
+        limit_in_s: Time until a limit is reached [s].
         level: Beyond a warning; ``breach``: beyond a limit.
-        settled_at: Where it was before the change that is open.
+        settled_at: Value before the current change.
     """
 
     seen_ms: int = 0
@@ -165,7 +165,7 @@ class DetectorState:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What is wrong."""
+        """The triggered detectors."""
         return tuple(
             kind
             for kind, on in (
@@ -179,33 +179,33 @@ class DetectorState:
 
 
 ROOM_SHARE = 0.05
-"""Where there are limits, a standard deviation is at least this share of the room to them."""
+"""With limits, the standard deviation is at least this share of the distance to them."""
 FAR = 8.0
-"""An outlier is so many standard deviations away;"""
+"""An outlier is this number of standard deviations away."""
 NEAR = 4.0
-"""and is none any more so near."""
+"""An outlier ends within this number of standard deviations."""
 PATIENCE = 60
-"""Windows for which a shift must last that is worth a word: ten minutes. A larger one is told sooner."""
+"""Windows for which a minimal shift must last: ten minutes. Larger shifts are reported earlier."""
 SHIFT = 6.0
-"""Without limits a lasting shift is one of so many standard deviations."""
+"""Without limits, a lasting shift has this number of standard deviations."""
 
 
 def scale(previous: DetectorState, limits: Limits) -> float:
-    """What a standard deviation of this field is taken to be; 0: it has not shown any."""
+    """Assumed standard deviation of the field; 0: no noise observed yet."""
     if previous.baseline.varied < VARIED or previous.baseline.distance <= 0:
         return 0.0
     room = limits.room(previous.baseline.mean)
-    # Rounding of a large value is no noise.
+    # The rounding error of a large value is not noise.
     least = 1e-9 * abs(previous.baseline.mean)
     return max(previous.baseline.noise, least, ROOM_SHARE * room if room is not None else 0.0)
 
 
 def update(previous: DetectorState, limits: Limits, at_ms: int, value: float) -> DetectorState:
-    """The watch after one more window; the same object for a window that is not newer.
+    """The state after one more window; the same object for an old window.
 
     Args:
-        previous: The watch before.
-        limits: What is known of the field.
+        previous: State before.
+        limits: Limits of the field.
         at_ms: Start of the window [ms since 1970].
         value: Mean of the window; finite.
     """
@@ -240,7 +240,7 @@ def _after_gap(previous: DetectorState, at_ms: int) -> DetectorState:
 
 
 def _level(streak: Streak, low: float | None, high: float | None, limits: Limits, value: float) -> Streak:
-    """Beyond for 20 s; inside again, by a fiftieth of the limit or of the band, for a minute."""
+    """Triggers after 20 s beyond the limit; ends after one minute inside, with 2 % hysteresis."""
     if low is None and high is None:
         return Streak()
     ends = [end for end in (limits.lowest, limits.highest) if end is not None]
@@ -256,7 +256,7 @@ def _outlier(previous: DetectorState, value: float, spread: float) -> Streak:
 
 
 def _changed(after: DetectorState, limits: Limits, value: float, spread: float) -> DetectorState:
-    """A shift that lasts about ten minutes; over when the value is back, or has been the new normal for an hour."""
+    """Detects a shift of about ten minutes. Ends when the value is back, or after one hour at the new value."""
     room = limits.room(after.hinkley.mean)
     shift = limits.change or (None if room is None else room / 2)
     shift = SHIFT * spread if shift is None else max(shift, SHIFT * after.baseline.noise)
@@ -274,7 +274,7 @@ def _changed(after: DetectorState, limits: Limits, value: float, spread: float) 
 
 
 def _minute(previous: DetectorState, after: DetectorState, limits: Limits, at_ms: int, value: float) -> DetectorState:
-    """Close the minute that is over, and look where its trend leads."""
+    """Close a completed minute and update its trend."""
     total, count = previous.minute
     if not count or at_ms // MINUTE_MS == previous.seen_ms // MINUTE_MS:
         return replace(after, minute=(total + value, count + 1))

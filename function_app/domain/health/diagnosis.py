@@ -1,4 +1,4 @@
-"""What the detectors find, as faults with words; and the health that follows from faults."""
+"""Converts detector results to fault reports, and faults to a health status."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ _FIVE_DIGITS = 10_000.0
 
 
 class Health(StrEnum):
-    """How a device is: unknown when nothing is heard of it."""
+    """Health of a device; unknown if it is offline."""
 
     OK = "ok"
     UNKNOWN = "unknown"
@@ -26,14 +26,13 @@ class Health(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """How one field is to be judged.
+    """Diagnosis settings of one field.
 
     Attributes:
-        label: What is measured, for people.
-        unit: Of its values, for people.
-        advice: What to do when something is wrong with it.
-        listed: It is named by the robot type. Of any other field nobody has said what it should be: what is found there
-            is worth knowing, and no warning.
+        label: Display name.
+        unit: Display unit.
+        advice: What to do about a fault.
+        listed: The robot type lists the field. Findings on other fields are informational.
     """
 
     label: str
@@ -44,7 +43,7 @@ class Rule:
 
 
 def health(faults: Iterable[Fault], *, online: bool) -> Health:
-    """The worst of the open faults; without any it is well if it is there."""
+    """The health that follows from the open faults and the connection."""
     worst = max((fault.severity.rank for fault in faults), default=0)
     if worst >= Severity.ERROR.rank:
         return Health.FAULT
@@ -54,7 +53,7 @@ def health(faults: Iterable[Fault], *, online: bool) -> Health:
 
 
 def usual_range(watch: DetectorState, limits: Limits) -> tuple[float, float] | None:
-    """Where values usually are; ``None`` as long as that is not known."""
+    """The usual range of values; ``None`` if unknown."""
     spread = scale(watch, limits)
     if spread <= 0:
         return None
@@ -62,7 +61,7 @@ def usual_range(watch: DetectorState, limits: Limits) -> tuple[float, float] | N
 
 
 def diagnose(rule: Rule, stream: str, name: str, watch: DetectorState) -> Report | None:
-    """The one fault of a field: what is worst of all that is found."""
+    """The most severe fault of a field."""
     result = watch.findings
     if not result:
         return None
@@ -78,7 +77,7 @@ def diagnose(rule: Rule, stream: str, name: str, watch: DetectorState) -> Report
         source=Source.DETECTOR,
         kind=kind,
         severity=severity,
-        message=f"{_words(kind, rule, name, watch, limit)} {rule.advice or 'Look at the device.'}",
+        message=f"{_words(kind, rule, name, watch, limit)} {rule.advice or 'Check the device.'}",
         stream=stream,
         field=name,
         value=watch.value,
@@ -88,7 +87,7 @@ def diagnose(rule: Rule, stream: str, name: str, watch: DetectorState) -> Report
 
 
 def _limit(kind: str, limits: Limits, watch: DetectorState) -> float | None:
-    """The limit that a level is beyond or a trend leads to."""
+    """The exceeded limit, or the limit that a trend approaches."""
     if kind == TREND:
         return limits.highest if (watch.slope_per_s or 0) > 0 else limits.lowest
     if kind != LEVEL:
@@ -118,5 +117,5 @@ def _words(kind: str, rule: Rule, name: str, watch: DetectorState, limit: float 
 
 
 def _show(value: float, unit: str) -> str:
-    """Four digits; what has more is not written in powers of ten, which people would have to count."""
+    """The value with four digits, without scientific notation."""
     return f"{value:.0f} {unit}".strip() if abs(value) >= _FIVE_DIGITS else f"{value:.4g} {unit}".strip()

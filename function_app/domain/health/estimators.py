@@ -1,7 +1,4 @@
-"""What one number after another tells: a mean that has moved, what is usual, a slope, an answer that lasts.
-
-Each is a few numbers that are kept between two values, and a function that gives the next few.
-"""
+"""Estimators for change, baseline, slope and hysteresis, each with a state of a few numbers."""
 
 import math
 from collections.abc import Sequence
@@ -10,24 +7,24 @@ from itertools import combinations
 from statistics import median
 
 WARM_UP = 60
-"""Values before anything is called unusual: of ten seconds each, ten minutes;"""
+"""Values before a detector triggers: ten minutes of 10 s values."""
 VARIED = 30
-"""and among them so many that show how it varies."""
+"""Required number of values that differ from the previous one."""
 MEMORY = 360
-"""Values that the baseline remembers: it follows what lasts for an hour."""
+"""Memory of the baseline: one hour of 10 s values."""
 DAY = 8_640
 """Values of ten seconds in a day."""
 SETTLED = 30
-"""Values before a change can be told: five minutes."""
+"""Values before a change can be detected: five minutes."""
 
 
 @dataclass(frozen=True, slots=True)
 class PageHinkley:
-    """Page's cumulative sums about a running mean, one up and one down.
+    """Cumulative sums about a running mean, upwards and downwards.
 
-    Up to a day's values they are those of ``river.drift.PageHinkley`` with ``alpha=1``. Its own choice for ``alpha``
-    forgets the sums, and with them ``delta``, within some 10,000 values: then every day's warmth is a change. Here the
-    mean forgets instead, what is older than a day.
+    For up to one day of values this equals ``river.drift.PageHinkley`` with ``alpha=1``. The default ``alpha`` of river
+    forgets the sums within 10,000 values, so daily warming would count as change. Here the mean forgets values older
+    than one day instead.
     """
 
     count: int = 0
@@ -37,13 +34,13 @@ class PageHinkley:
 
 
 def page_hinkley(previous: PageHinkley, value: float, *, delta: float, threshold: float) -> tuple[PageHinkley, bool]:
-    """One more value; and whether the mean has changed. The caller begins anew with an empty state then.
+    """Add one value; return the new state and whether the mean has changed. After a change start with an empty state.
 
     Args:
-        previous: The state so far.
-        value: The value.
-        delta: Shifts smaller than this are none.
-        threshold: What the sum of shifts beyond ``delta`` may come to.
+        previous: State before.
+        value: New value.
+        delta: Shifts below this are ignored.
+        threshold: Limit of the cumulative sum beyond ``delta``.
     """
     count = min(previous.count + 1, DAY)
     mean = previous.mean + (value - previous.mean) / count
@@ -54,11 +51,11 @@ def page_hinkley(previous: PageHinkley, value: float, *, delta: float, threshold
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """What is usual: a mean and a mean distance from it, each forgetting, none led astray by single values.
+    """Exponentially weighted mean and mean absolute deviation, robust against single outliers.
 
     Attributes:
-        count: Values that the mean is of, at most ``MEMORY``.
-        varied: Those among them that were not the one before again, which the distance is of.
+        count: Number of values in the mean, at most ``MEMORY``.
+        varied: Number of values in the deviation: those that differ from their predecessor.
     """
 
     count: int = 0
@@ -68,28 +65,28 @@ class Baseline:
 
     @property
     def noise(self) -> float:
-        """Standard deviation, from the mean distance (of a normal distribution)."""
+        """Standard deviation derived from the mean deviation of a normal distribution."""
         return self.distance * math.sqrt(math.pi / 2)
 
 
 CLIP = 3.0
-"""Standard deviations beyond which a value counts as if it were so many."""
+"""Values are clipped to this number of standard deviations."""
 
 
 def learn(previous: Baseline, value: float, *, scale: float, repeated: bool) -> Baseline:
     """The baseline after one more value.
 
     Args:
-        previous: The baseline before.
-        value: The value.
-        scale: What a standard deviation is taken to be at least.
-        repeated: It is exactly the one before: a sensor that is stuck is no sensor without noise.
+        previous: Baseline before.
+        value: New value.
+        scale: Lower bound of the standard deviation.
+        repeated: The value equals its predecessor: a stuck sensor is not a sensor without noise.
     """
     count = min(previous.count + 1, MEMORY)
     shift = value - previous.mean
     if previous.count >= WARM_UP:
         reach = CLIP * max(scale, previous.noise)
-        # Without any noise there is nothing to clip by.
+        # Without noise there is no scale for clipping.
         shift = max(-reach, min(reach, shift)) if reach > 0 else shift
     mean = previous.mean + shift / count
     if repeated or previous.count == 0:
@@ -103,9 +100,9 @@ class Slope:
     """A line through the newest minutes.
 
     Attributes:
-        per_s: Its slope [unit/s].
-        error_per_s: The slope's standard error [unit/s].
-        end: Its value at the newest minute.
+        per_s: Slope [unit/s].
+        error_per_s: Standard error of the slope [unit/s].
+        end: Value at the newest minute.
     """
 
     per_s: float
@@ -114,7 +111,7 @@ class Slope:
 
 
 def theil_sen(values: Sequence[float], step_s: float) -> Slope:
-    """The median of the slopes of all pairs: a third of the values may be anything."""
+    """Theil-Sen estimator: the median of all pairwise slopes tolerates 29 % outliers."""
     slopes = [(later - earlier) / (j - i) for (i, earlier), (j, later) in combinations(enumerate(values), 2)]
     per_step = median(slopes)
     rests = [value - per_step * place for place, value in enumerate(values)]
@@ -127,14 +124,14 @@ def theil_sen(values: Sequence[float], step_s: float) -> Slope:
 
 @dataclass(frozen=True, slots=True)
 class Streak:
-    """Whether something is so, once it was so for long enough; and no longer, once it was not for long enough."""
+    """Hysteresis: a state that changes after a number of equal observations."""
 
     on: bool = False
     length: int = 0
-    """How often in a row the answer was the other one."""
+    """Number of consecutive observations of the other state."""
 
     def step(self, *, bad: bool, good: bool, after: int, until: int) -> "Streak":
-        """One more answer; neither bad nor good leaves all as it is."""
+        """Add one observation; neither good nor bad resets the count."""
         against = good if self.on else bad
         if not against:
             return Streak(self.on)

@@ -1,7 +1,7 @@
-"""A fault's life: ``raised → acknowledged → cleared``. It may get worse; it clears with or without acknowledgement.
+"""The life cycle of a fault: ``raised → acknowledged → cleared``. It may clear without acknowledgement.
 
-Open faults of one device have one code each: what is reported again is the same fault, and what comes back after it was
-cleared is the next one, with a count that is one higher.
+A device has at most one open fault per code: a repeated report refers to the same fault. A fault that occurs again
+after it was cleared is a new fault with a higher count.
 """
 
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ from enum import StrEnum
 
 
 class Severity(StrEnum):
-    """How bad it is, mildest first: to know, to look at, to act on."""
+    """Severity of a fault, mildest first."""
 
     INFO = "info"
     WARNING = "warning"
@@ -22,7 +22,7 @@ class Severity(StrEnum):
 
 
 class Source(StrEnum):
-    """Who noticed: the device itself, the detectors, or the cloud, which no longer hears of the device."""
+    """Who detected the fault: the device, a detector, or the cloud because the device is silent."""
 
     DEVICE = "device"
     DETECTOR = "detector"
@@ -31,13 +31,13 @@ class Source(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Something that is wrong now.
+    """A report of a fault that exists now.
 
     Attributes:
-        code: What, for programs: one open fault for each.
-        kind: Which question found it: ``level``, ``trend``, ``change``, ``outlier``; ``reported``; ``silent``.
-        message: What is wrong and what to do, for people.
-        value: What was measured; ``baseline``: what is usual; ``limit``: what it must not pass.
+        code: Code for programs; one open fault for each.
+        kind: Detector: ``level``, ``trend``, ``change``, ``outlier``; or ``reported``, ``silent``.
+        message: What is wrong and what to do.
+        value: Measured value; ``baseline``: usual value; ``limit``: allowed limit.
     """
 
     code: str
@@ -54,12 +54,12 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault of one device, from its first report to its end.
+    """One fault of a device, from its first report until it is cleared.
 
     Attributes:
-        id: Counts down with time: of all faults the newest sorts first.
-        count: The first, second … fault of this code.
-        worse: How often it got worse.
+        id: Decreases with time, so that the newest fault sorts first.
+        count: Number of this fault among the faults with the same code.
+        worse: How often the severity increased.
     """
 
     id: str
@@ -101,9 +101,9 @@ def raised(report: Report, *, fault: str, now_ms: int, count: int) -> Fault:
 
 
 def reported(fault: Fault, report: Report) -> Fault:
-    """The open fault after one more report: the same object unless that is worse.
+    """The fault after another report; the same object unless the severity increased.
 
-    What got worse wants to be acknowledged again.
+    A higher severity removes the acknowledgement.
     """
     if report.severity.rank <= fault.severity.rank:
         return fault
@@ -122,12 +122,12 @@ def reported(fault: Fault, report: Report) -> Fault:
 
 
 def acknowledged(fault: Fault, *, by: str, now_ms: int) -> Fault:
-    """The fault, seen by somebody; the same object when somebody else was first."""
+    """The fault, acknowledged; the same object if already acknowledged."""
     if fault.acknowledged_ms is not None:
         return fault
     return replace(fault, acknowledged_ms=now_ms, acknowledged_by=by)
 
 
 def cleared(fault: Fault, *, now_ms: int) -> Fault:
-    """The fault at its end."""
+    """The cleared fault."""
     return replace(fault, cleared_ms=now_ms)

@@ -1,1 +1,1 @@
-"""Identity."""
+"""Accounts, API keys and passwords."""

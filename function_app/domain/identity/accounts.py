@@ -1,4 +1,4 @@
-"""People: accounts, who is asking, and what they may do to a device."""
+"""Accounts, roles and the identity of a caller."""
 
 import unicodedata
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from function_app.domain.common.timestamps import NEVER_MS
 
 
 class Role(StrEnum):
-    """What an account may do with a device."""
+    """The role of an account on a device."""
 
     OWNER = "owner"
     OPERATOR = "operator"
@@ -16,12 +16,12 @@ class Role(StrEnum):
 
     @property
     def may_operate(self) -> bool:
-        """Take control and ask for it, start actions, stop, reset. A viewer watches: a shared link stops no room."""
+        """Whether the role may control the device, start actions, stop and reset. Viewers cannot stop devices."""
         return self is not Role.VIEWER
 
     @property
     def may_own(self) -> bool:
-        """Un-pair, share, take control over from somebody."""
+        """Whether the role may unpair, share and take over control."""
         return self is Role.OWNER
 
 
@@ -34,20 +34,20 @@ class Account:
 
 
 def fold_name(name: str) -> str:
-    """A name as names are compared: "Anna", "ANNA" and " anna" are one person, however a keyboard makes the letters."""
+    """The name in the form that is compared: "Anna", "ANNA" and " anna" are equal."""
     plain = unicodedata.normalize("NFKC", name).casefold()
     return " ".join(unicodedata.normalize("NFKC", plain).split())
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who is asking: an account in one sign-in session. Two browsers of one person are two identities.
+    """An account in one sign-in session. Two browsers of one person are two identities.
 
     Attributes:
-        key: The id of the API key it came by; empty for a person. Such an identity's session is the key's.
-        most: No role above this, whatever it owns or is shared with it.
-        only: The devices (their ids) and spaces (``space:<id>``) it is kept to; empty: all of them.
-        until_ms: The end of its session, or of its key [ms since 1970]: what it is given ends then at the latest.
+        key: Id of the API key; empty for a person. An API key has its own session.
+        most: Highest role, regardless of ownership and shares.
+        only: Allowed devices (ids) and spaces (``space:<id>``); empty: all.
+        until_ms: End of the session or key [ms since 1970]; nothing granted lasts longer.
     """
 
     account: str
@@ -59,13 +59,13 @@ class Identity:
     until_ms: int = NEVER_MS
 
     def lifetime_s(self, wanted_s: int, now_ms: int) -> int:
-        """For how long something is given to it that could be good for so long [s]; one second at least."""
+        """The lifetime of a grant that may last ``wanted_s`` [s], limited by the session; at least 1 s."""
         return max(1, min(wanted_s, (self.until_ms - now_ms) // 1000))
 
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """A room: a place for agents and devices. Belongs to one account, whose first has ``created_ms`` 0."""
+    """A room for agents and devices, owned by one account. The account's first space has ``created_ms`` 0."""
 
     id: str
     name: str

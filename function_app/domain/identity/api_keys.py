@@ -1,4 +1,4 @@
-"""API keys: what a program of somebody else's shows instead of signing in, and how little it may then do."""
+"""API keys: credentials for programs, with limited permissions."""
 
 import hashlib
 import hmac
@@ -18,17 +18,17 @@ _SESSION: Final = "key-"
 
 @dataclass(frozen=True, slots=True)
 class ApiKey:
-    """A key, of which only the hash of the secret is kept.
+    """An API key. Only the hash of its secret is stored.
 
-    That needs no slow function as a password does: nobody guesses 256 random bits, however quick each guess.
+    A fast hash is sufficient because the secret has 256 random bits.
 
     Attributes:
         owner: Name of the account.
-        label: What it is for, in its maker's words.
-        most: No role above this; never ``owner``.
-        only: The devices (their ids) and spaces (``space:<id>``) that it is kept to; empty: all of the account's.
-        expires_ms: From then on it is refused.
-        used_ms: When it was last used, to the hour; 0: never.
+        label: Purpose, as entered by the owner.
+        most: Highest role; never ``owner``.
+        only: Allowed devices (ids) and spaces (``space:<id>``); empty: all of the account.
+        expires_ms: Expiry time [ms since 1970].
+        used_ms: Last use, with a resolution of one hour; 0: never.
     """
 
     id: str
@@ -44,7 +44,7 @@ class ApiKey:
 
     @property
     def identity(self) -> Identity:
-        """Who asks by it. People read beside the account which program it was."""
+        """The identity of a caller with this key. Its name contains the label of the key."""
         return Identity(
             account=self.account,
             name=f"{self.owner} ({self.label})",
@@ -56,7 +56,7 @@ class ApiKey:
         )
 
     def matches(self, secret: str) -> bool:
-        """Whether it is this key's secret. Takes as long for any."""
+        """Whether this is the secret of the key. Takes constant time."""
         return hmac.compare_digest(self.hash, hashed(secret))
 
 
@@ -66,21 +66,21 @@ def new_key_id() -> str:
 
 
 def key_of(session: str) -> str:
-    """The id of the key whose session this is; empty for a person's."""
+    """The id of the key that owns a session; empty for a person's session."""
     return session.removeprefix(_SESSION) if session.startswith(_SESSION) else ""
 
 
 def token(key: str, secret: str) -> str:
-    """What a program shows: its beginning is what scanners for leaked secrets look for."""
+    """The token of a key. Its prefix allows scanners for leaked secrets to find it."""
     return f"{PREFIX}{key}_{secret}"
 
 
 def split(text: str) -> tuple[str, str] | None:
-    """Id and secret in a token, or ``None`` where it cannot be one."""
+    """Id and secret of a token, or ``None`` for an invalid token."""
     result = _TOKEN.match(text)
     return (result[1], result[2]) if result else None
 
 
 def hashed(secret: str) -> str:
-    """What is stored of a secret."""
+    """The stored form of a secret."""
     return hashlib.sha256(secret.encode()).hexdigest()

@@ -1,8 +1,7 @@
-"""Which passwords are good enough: length, and nothing that is guessed first.
+"""Password rules: a minimum length, and no passwords that are guessed first.
 
-As NIST SP 800-63B asks: a least length, a list of what is known to be chosen, and no rules about kinds of characters,
-which make passwords worse. Its eight characters are the least there; few guesses are allowed here and each is slow, but
-who steals the table may guess on.
+Follows NIST SP 800-63B: a minimum length and a list of common passwords, without rules about character classes. The
+minimum is higher than eight characters because a stolen table can be searched offline.
 """
 
 import re
@@ -12,7 +11,7 @@ from typing import Final
 LEAST: Final = 12
 MOST: Final = 256
 _DIFFERENT: Final = 5
-"""Fewer different characters are one pattern, repeated."""
+"""Fewer different characters indicate a repeated pattern."""
 _COMMON: Final = frozenset(
     {
         "password",
@@ -29,7 +28,7 @@ _COMMON: Final = frozenset(
     | {"default", "secret", "qwerty", "qwertyuiop", "qwertz", "asdfghjkl", "trustno", "football", "baseball", "monkey"}
     | {"dragon", "sunshine", "princess", "superman", "batman", "master", "login", "robot", "robots", "telescope"}
 )
-"""What leaked lists are full of, without the digits and signs that people put around it; and this product's name."""
+"""Words of leaked password lists without digits and symbols, and the name of this product."""
 _ROWS: Final = (
     "abcdefghijklmnopqrstuvwxyz",
     "01234567890123456789",
@@ -43,16 +42,16 @@ _AS_LETTERS: Final = str.maketrans("0134578@$!", "oleastbasi")
 
 
 def normalize(password: str) -> str:
-    """The same text in one of the ways in which it can be written: keyboards differ in how they make an ``é``."""
+    """The password in Unicode normal form NFKC: keyboards encode letters such as ``é`` differently."""
     return unicodedata.normalize("NFKC", password)
 
 
 def weakness(password: str, *, name: str) -> str:
-    """What is wrong with a password that somebody wants to have, as a sentence; empty: nothing.
+    """Why a password is too weak, as a sentence; empty: it is accepted.
 
     Args:
-        password: In its normal form.
-        name: Of the account.
+        password: In normal form.
+        name: Name of the account.
     """
     if len(password) < LEAST:
         return f"A password has at least {LEAST} characters; a sentence of a few words is a good one."
@@ -72,6 +71,6 @@ def weakness(password: str, *, name: str) -> str:
 
 
 def _once(word: str) -> str:
-    """A word without its repetitions."""
+    """The word without repetitions."""
     again = (word + word).find(word, 1)
     return word[:again]

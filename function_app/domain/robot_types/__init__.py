@@ -1,1 +1,1 @@
-"""Robot types."""
+"""Robot types and movements."""

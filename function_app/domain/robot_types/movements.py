@@ -1,4 +1,4 @@
-"""Movements as the tables hold them."""
+"""Movements as stored in the tables."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,11 +9,11 @@ class Movement:
     """One version of a movement; the row of the name holds the newest.
 
     Attributes:
-        since: The first version since it was last made new. A version number is never used twice, so the row of a
-            ``deleted`` one stays.
+        since: First version since the last deletion. Version numbers are never reused, so the row of a ``deleted``
+            movement remains.
         author: Account that saved it, or ``SHIPPED`` of the wire contract.
         key: Id of the key that signed robot type, name, version and hash.
-        parameters_schema: What an operator may set; ``None``: anything.
+        parameters_schema: Schema of the parameters; ``None``: any parameters.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Robot types of an account, as the tables hold them."""
+"""Robot types of an account, as stored in the tables."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -8,7 +8,7 @@ State = Literal["uploading", "checking", "ready", "rejected"]
 
 @dataclass(frozen=True, slots=True)
 class Seal:
-    """That what is stored is what was uploaded: a key's id, its signature, and each file's hash (SHA-256, hex)."""
+    """Integrity proof of a stored upload: key id, signature, and SHA-256 of each file (hex)."""
 
     key: str = ""
     signature: str = ""
@@ -20,13 +20,13 @@ class TypeVersion:
     """One upload of a robot type.
 
     Attributes:
-        state: ``uploading`` until all files are stored, ``checking`` until a checker has a verdict.
-        manifest: The fields of ``RobotType``.
-        files: Name → bytes.
-        errors: Why it is refused; until there is a verdict what was found before it.
-        warnings: What its author may want to know.
-        checked_ms: When the verdict came [ms since 1970].
-        seal: On manifest and files.
+        state: ``uploading`` until all files are stored, ``checking`` until the validator has finished.
+        manifest: Fields of ``RobotType``.
+        files: Name → size [bytes].
+        errors: Reasons for rejection; before the validation has finished, problems found so far.
+        warnings: Notes for the author.
+        checked_ms: End of the validation [ms since 1970].
+        seal: Integrity proof of manifest and files.
     """
 
     version: int
@@ -41,21 +41,21 @@ class TypeVersion:
 
     @property
     def open(self) -> bool:
-        """Whether a verdict is still to come."""
+        """Whether the validation has not finished."""
         return self.state in {"uploading", "checking"}
 
 
 @dataclass(frozen=True, slots=True)
 class TypeHead:
-    """A robot type of an account: which of its versions is in use.
+    """A robot type of an account, and its active version.
 
     Attributes:
-        last: The highest version ever given; none is given twice.
-        since: The first version since it was last made new.
-        ready: The newest version that is ready, 0 when none is; it never goes back.
-        manifest: Of the version that is ready, and
-        seal: what says so.
-        ready_ms: When that became ready [ms since 1970].
+        last: Highest assigned version; versions are never reused.
+        since: First version since the last deletion.
+        ready: Newest valid version, 0 if there is none; never decreases.
+        manifest: Manifest of the ready version.
+        seal: Integrity proof of that version.
+        ready_ms: When it became ready [ms since 1970].
     """
 
     type: str
@@ -68,12 +68,12 @@ class TypeHead:
     seal: Seal = field(default_factory=Seal)
 
     def needs(self, version: int) -> bool:
-        """Whether a version may still be used, or become so."""
+        """Whether a version is or may become active."""
         return not self.deleted and version >= max(self.since, self.ready)
 
 
 def next_version(head: TypeHead | None, wanted: int, robot_type: str) -> TypeHead:
-    """The type with one version more: the one its author calls it, where that is new."""
+    """The type with one more version: the requested number if it is new."""
     if head is None:
         return TypeHead(robot_type, last=wanted, since=wanted)
     version = max(head.last + 1, wanted)
@@ -83,7 +83,7 @@ def next_version(head: TypeHead | None, wanted: int, robot_type: str) -> TypeHea
 
 
 def with_ready(head: TypeHead, version: TypeVersion) -> TypeHead:
-    """The type after one of its versions was found good; the newest good one counts."""
+    """The type after one of its versions became valid; the newest valid version is active."""
     if version.version <= head.ready:
         return head
     return replace(

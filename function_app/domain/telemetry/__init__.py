@@ -1,1 +1,1 @@
-"""Telemetry."""
+"""Time series and latency histograms."""

@@ -1,9 +1,8 @@
-"""Histograms of times that can be merged, with quantiles of a promised relative error.
+"""Mergeable latency histograms with quantiles of bounded relative error.
 
-The buckets are those of DDSketch (Masson, Rim, Lee: "DDSketch", VLDB 2019): powers of ``GAMMA``, so that every value
-in one is within ``ERROR`` of the bucket's own. Nothing is kept but counts: the histogram of two sets of samples is the
-sum of theirs, in any order. The library of that name keeps its counts in objects of its own and writes them with
-protobuf; a row wants plain numbers, and then these few lines are all that is left of it.
+The buckets follow DDSketch (Masson, Rim, Lee: "DDSketch", VLDB 2019): powers of ``GAMMA``, so every value is within
+``ERROR`` of its bucket. Only counts are stored, so merging is addition. The ``ddsketch`` library uses own objects and
+protobuf; rows need plain numbers.
 """
 
 import math
@@ -14,9 +13,9 @@ ERROR = 0.01
 """Relative error of a quantile: 1 %."""
 GAMMA = (1 + ERROR) / (1 - ERROR)
 SHORTEST_MS = 0.001
-"""Shorter times count as this."""
+"""Shorter times are clipped to this [ms]."""
 LONGEST_MS = 86_400_000.0
-"""Nothing takes longer than a day."""
+"""Longest accepted time: one day [ms]."""
 
 _LOG_GAMMA = math.log(GAMMA)
 
@@ -26,8 +25,8 @@ class Histogram:
     """Counts of times [ms].
 
     Attributes:
-        buckets: Numbers of the buckets that hold something, rising.
-        counts: How many each of them holds.
+        buckets: Numbers of the non-empty buckets, ascending.
+        counts: Count of each of these buckets.
     """
 
     count: int = 0
@@ -39,11 +38,11 @@ class Histogram:
 
     @property
     def mean_ms(self) -> float:
-        """The mean, without the buckets' error."""
+        """The exact mean [ms]."""
         return self.sum_ms / self.count if self.count else 0.0
 
     def quantile(self, share: float) -> float:
-        """The time that ``share`` (0…1) of the samples do not exceed: the one of rank ⌈share·count⌉, within 1 %.
+        """The time that ``share`` (0…1) of the samples do not exceed: rank ⌈share·count⌉, within 1 % [ms].
 
         Raises:
             ValueError: There are no samples.
@@ -61,7 +60,7 @@ class Histogram:
         return self.max_ms
 
     def bins(self) -> list[tuple[float, float, int]]:
-        """Lower bound, upper bound [ms] and count of each bucket that holds something."""
+        """Lower bound, upper bound [ms] and count of each non-empty bucket."""
         return [
             (GAMMA ** (bucket - 1), GAMMA**bucket, count)
             for bucket, count in zip(self.buckets, self.counts, strict=True)
@@ -69,10 +68,10 @@ class Histogram:
 
 
 def of(samples_ms: Iterable[float]) -> Histogram:
-    """The histogram of some times [ms].
+    """The histogram of samples [ms].
 
     Raises:
-        ValueError: One is negative, longer than a day, or no number.
+        ValueError: A sample is negative, longer than a day, or not a number.
     """
     result: dict[int, int] = {}
     values = list(samples_ms)
@@ -89,7 +88,7 @@ def of(samples_ms: Iterable[float]) -> Histogram:
 
 
 def merge(histograms: Iterable[Histogram]) -> Histogram:
-    """The histogram of all their samples together."""
+    """The histogram of all samples of the given histograms."""
     parts = [part for part in histograms if part.count]
     if not parts:
         return Histogram()
@@ -114,5 +113,5 @@ def _bucket(value_ms: float) -> int:
 
 
 def _middle_ms(bucket: int) -> float:
-    """The value whose relative distance to both ends of the bucket is the same."""
+    """The value with equal relative distance to both bounds of the bucket."""
     return float(2 * GAMMA**bucket / (GAMMA + 1))

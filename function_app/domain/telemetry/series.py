@@ -1,7 +1,6 @@
-"""Measurements as time series: samples are a set by time, held in windows of 10 s and in coarser buckets.
+"""Time series: samples in windows of 10 s, and aggregates in coarser buckets.
 
-What is worked through here comes in columns: a robot sends a million values in an hour, and each costs about as little
-as Python's own loops over arrays do.
+Samples are stored by column, because a robot sends a million values per hour.
 """
 
 import base64
@@ -15,18 +14,18 @@ from typing import Any, NamedTuple
 
 WINDOW_MS = 10_000
 MAX_VALUES = 16_000
-"""Values in one window: their row stays below 256 KB however badly they compress."""
+"""Maximum number of values in a window, so that a row stays below 256 KB even if incompressible."""
 MAX_FIELDS = 256
-"""Fields of one sample."""
+"""Maximum number of fields of a sample."""
 MAX_MAGNITUDE = 1e300
-"""Sums of a century of such values are still finite."""
+"""Largest value: sums over a century of such values stay finite."""
 _COMPRESSION = 1
 _BYTES = 8
 _NAN = math.nan
 
 
 class Level(NamedTuple):
-    """Buckets of one length. ``name`` begins their keys."""
+    """A bucket length. Row keys start with ``name``."""
 
     name: str
     span_ms: int
@@ -47,25 +46,25 @@ DAY = LEVELS[-1]
 
 @dataclass(slots=True)
 class Samples:
-    """Samples of one stream by time, ascending, each time once; in a column NaN where a sample has no such field."""
+    """Samples of one stream in ascending order of unique times; NaN marks a missing field."""
 
     at_ms: "array[int]" = field(default_factory=lambda: array("q"))
     columns: "dict[str, array[float]]" = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """How many."""
+        """Number of samples."""
         return len(self.at_ms)
 
     def part(self, start: int, end: int) -> "Samples":
-        """Those from index ``start`` up to before ``end``."""
+        """Samples from index ``start`` up to, but not including, ``end``."""
         return Samples(self.at_ms[start:end], {name: values[start:end] for name, values in self.columns.items()})
 
     def between(self, first_ms: int, last_ms: int) -> "Samples":
-        """Those with ``first_ms`` ≤ time < ``last_ms``."""
+        """Samples with ``first_ms`` ≤ time < ``last_ms``."""
         return self.part(bisect_left(self.at_ms, first_ms), bisect_left(self.at_ms, last_ms))
 
     def windows(self) -> Iterator[tuple[int, "Samples"]]:
-        """Start of each window, and what is in it."""
+        """Start of each window, and its samples."""
         begin, count = 0, len(self.at_ms)
         while begin < count:
             start_ms = floor(self.at_ms[begin], WINDOW_MS)
@@ -75,7 +74,7 @@ class Samples:
 
 
 def from_rows(rows: Iterable[tuple[int, Mapping[str, float]]]) -> Samples:
-    """Samples from times and values in any order; of two at one time the first counts."""
+    """Samples from rows in any order; the first of two rows with the same time is used."""
     by_time: dict[int, Mapping[str, float]] = {}
     for at_ms, values in rows:
         by_time.setdefault(at_ms, values)
@@ -86,7 +85,7 @@ def from_rows(rows: Iterable[tuple[int, Mapping[str, float]]]) -> Samples:
 
 
 def new_samples(samples: Samples, existing: Samples) -> Samples:
-    """Those whose time is not among the known."""
+    """Samples whose time is not in ``existing``."""
     if not existing.at_ms or not samples.at_ms or samples.at_ms[0] > existing.at_ms[-1]:
         return samples
     times = set(existing.at_ms)
@@ -100,7 +99,7 @@ def new_samples(samples: Samples, existing: Samples) -> Samples:
 
 
 def merge(one: Samples, other: Samples) -> Samples:
-    """Both. They have no time in common."""
+    """Both sets of samples, which have no time in common."""
     if not one.at_ms or not other.at_ms:
         return other if not one.at_ms else one
     if one.at_ms[0] > other.at_ms[0]:
@@ -117,7 +116,7 @@ def merge(one: Samples, other: Samples) -> Samples:
 
 
 def fit_window(samples: Samples, existing: Samples) -> Samples:
-    """As many of the samples as their window still takes."""
+    """The samples that still fit into their window."""
     names = len({*samples.columns, *existing.columns}) or 1
     left = max(0, MAX_VALUES // names - len(existing))
     return samples if len(samples) <= left else samples.part(0, left)
@@ -127,33 +126,33 @@ def fit_window(samples: Samples, existing: Samples) -> Samples:
 
 
 def floor(at_ms: int, span_ms: int) -> int:
-    """The start of the bucket in which a moment is."""
+    """Start of the bucket that contains a time."""
     return at_ms - at_ms % span_ms
 
 
 def key(level: Level, start_ms: int) -> str:
-    """The key of a row: those of one level sort by time."""
+    """Row key; the keys of one level sort by time."""
     return f"{level.name}:{start_ms:013d}"
 
 
 def start_of(row_key: str) -> int:
-    """The start in a row's key."""
+    """Start time in a row key."""
     return int(row_key.partition(":")[2])
 
 
 def pack(samples: Samples) -> dict[str, Any]:
-    """Samples as JSON: columns of binary numbers, compressed."""
+    """Samples as JSON: compressed columns of binary numbers."""
     base_ms = samples.at_ms[0] if samples.at_ms else 0
     offsets = array("q", [at_ms - base_ms for at_ms in samples.at_ms])
     data = b"".join((offsets.tobytes(), *(values.tobytes() for values in samples.columns.values())))
-    # First all first bytes, then all second ones: what hardly changes compresses, and noise does not stand between.
+    # Group the bytes of equal significance: the slowly changing ones compress better.
     planes = b"".join(data[plane::_BYTES] for plane in range(_BYTES))
     text = base64.b64encode(zlib.compress(planes, _COMPRESSION)).decode()
     return {"base_ms": base_ms, "count": len(samples), "fields": list(samples.columns), "data": text}
 
 
 def unpack(data: Mapping[str, Any]) -> Samples:
-    """The samples that ``pack`` was given."""
+    """The samples from the result of ``pack``."""
     planes = zlib.decompress(base64.b64decode(data["data"]))
     length = len(planes) // _BYTES
     content = bytearray(len(planes))
@@ -171,7 +170,7 @@ def unpack(data: Mapping[str, Any]) -> Samples:
 
 
 class Summary(NamedTuple):
-    """What is left of the values of one field: the last one is that of the latest time, whenever it came."""
+    """Aggregate of one field; ``last`` is the value with the latest time."""
 
     samples: int
     total: float
@@ -182,19 +181,19 @@ class Summary(NamedTuple):
 
     @property
     def mean(self) -> float:
-        """Their arithmetic mean."""
+        """Arithmetic mean."""
         return self.total / self.samples
 
 
 @dataclass(slots=True)
 class Bucket:
-    """What is left of the samples of one stretch of time."""
+    """Aggregate of the samples in a time span."""
 
     count: int = 0
     fields: dict[str, Summary] = field(default_factory=dict)
 
     def add(self, other: "Bucket") -> None:
-        """Take in what is left of other samples."""
+        """Merge another aggregate."""
         self.count += other.count
         fields = self.fields
         for name, new in other.fields.items():
@@ -202,17 +201,17 @@ class Bucket:
             fields[name] = new if old is None else _together(old, new)
 
     def data(self) -> dict[str, Any]:
-        """As a row holds it."""
+        """The row data."""
         return {"count": self.count, "fields": self.fields}
 
 
 def bucket(data: Mapping[str, Any]) -> Bucket:
-    """The bucket in a row."""
+    """The bucket from row data."""
     return Bucket(data["count"], {name: Summary(*values) for name, values in data["fields"].items()})
 
 
 def summarize(samples: Samples) -> Bucket:
-    """What is left of some samples."""
+    """The aggregate of samples."""
     times = samples.at_ms
     made = Bucket(len(times))
     for name, values in samples.columns.items():
@@ -248,10 +247,10 @@ def _nothing(count: int) -> "array[float]":
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RetentionPolicy:
-    """How long what is kept [ms]; what is not named is kept for ever.
+    """How long rows are stored [ms]; levels without an entry are stored without limit.
 
-    The times that a window has seen are in its raw row: with it goes the promise that a sample counts once, so nothing
-    older than that may still come.
+    The raw row records which times are stored. After its deletion duplicates cannot be detected, so older samples are
+    rejected.
     """
 
     raw_ms: int = 24 * 3_600_000
@@ -260,7 +259,7 @@ class RetentionPolicy:
     )
 
     def of(self, level: Level) -> int | None:
-        """How long the rows of a level are kept at least, from the end of their day; ``None``: for ever."""
+        """Minimum time that rows of a level are stored after the end of their day; ``None``: without limit."""
         if level == RAW:
             return self.raw_ms
         kept_ms = self.levels_ms.get(level.name)
@@ -268,7 +267,7 @@ class RetentionPolicy:
 
 
 def finest_level(first_ms: int, last_ms: int, *, points: int, now_ms: int, keep: RetentionPolicy) -> Level:
-    """The finest buckets of which no more than ``points`` cover the time, and which are still there for all of it."""
+    """The finest level with at most ``points`` buckets in the time span, whose rows still exist."""
     for level in LEVELS:
         covering = (floor(last_ms - 1, level.span_ms) - floor(first_ms, level.span_ms)) // level.span_ms + 1
         kept_ms = keep.of(level)
