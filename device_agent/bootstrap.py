@@ -99,15 +99,15 @@ def load_geometry(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
         GeometryError: The model cannot be used.
         ConfigError: The room is unknown.
     """
-    scene, standing = str(entry.options.get("scene", "")), None
+    scene, base_pose = str(entry.options.get("scene", "")), None
     if entry.room:
         room = ROOMS.load(entry.room)
         robot = room.robot(entry.name)
         if robot is not None and room.model:
-            standing = geometry.BasePose(
+            base_pose = geometry.BasePose(
                 room=ROOMS.folder(room.room) / room.model, position_m=robot.position_m, yaw_rad=robot.yaw_rad
             )
-    return geometry.load(kind, _folder(kind), scene=scene, standing=standing)
+    return geometry.load(kind, _folder(kind), scene=scene, base_pose=base_pose)
 
 
 def create_driver(
@@ -176,7 +176,7 @@ def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundin
     from device_agent.simulation import world_registry  # noqa: PLC0415 (a real room needs no simulation)
 
     try:
-        return Surroundings(neighbours=neighbours, world=world_registry.of(ROOMS.folder(room)))
+        return Surroundings(neighbours=neighbours, world=world_registry.get_world(ROOMS.folder(room)))
     except DriverError as error:
         raise ConfigError(str(error)) from error
 

@@ -1,1 +1,1 @@
-"""What runs around the code: brokers, and the start of one machine. Each is a program of its own."""
+"""Brokers, servers and packaging around the code; each is a program of its own."""

@@ -1,4 +1,4 @@
-"""Programs from outside that are run in the foreground: found, given ports, started, watched and ended in order."""
+"""Runs third-party servers in the foreground: find, reserve ports, start, monitor and stop."""
 
 import contextlib
 import ctypes
@@ -13,32 +13,32 @@ from pathlib import Path
 from types import FrameType
 
 ENDED, BAD_INPUT, CANNOT_START = 1, 2, 3
-"""Exit codes: it ended by itself; a folder or address cannot be used; a port is taken or it is not installed."""
+"""Exit codes: the server exited; a folder or address is invalid; a port is in use or the server is not installed."""
 _START_S = 10.0
 _STOP_S = 1.5
-_LOOK_S = 0.25
+_POLL_S = 0.25
 _PR_SET_PDEATHSIG = 1
 _PATH_BESIDE = "/usr/local/sbin:/usr/sbin:/sbin:/opt/homebrew/sbin"
 
 
 class NotInstalledError(Exception):
-    """A program is not on this machine; the text names the package."""
+    """A program is not installed; the message names the package."""
 
 
 class PortTakenError(Exception):
-    """A port that cannot be listened on."""
+    """A port cannot be used."""
 
 
 def find(program: str, *, package: str) -> str:
-    """Path of a program, also where the user's PATH leaves out the folders of servers.
+    """Path of a program; also searches folders of servers that a user's PATH omits.
 
     Raises:
-        NotInstalledError: There is none.
+        NotInstalledError: Not found.
     """
-    found = shutil.which(program) or shutil.which(program, path=_PATH_BESIDE)
-    if found is None:
+    path = shutil.which(program) or shutil.which(program, path=_PATH_BESIDE)
+    if path is None:
         raise NotInstalledError(f"{program} is not installed; on Debian: apt-get install {package}")
-    return found
+    return path
 
 
 def address(host: str) -> str:
@@ -51,38 +51,41 @@ def address(host: str) -> str:
 
 
 def free_ports(host: str, *ports: int) -> list[int]:
-    """The ports, seen to be free. All are held until the last is known, so that two zeros become two ports.
+    """The ports, with 0 replaced by free ports. All are bound at the same time, so that two zeros give different ports.
 
     Raises:
-        PortTakenError: One is not.
+        PortTakenError: A port is in use.
     """
     with contextlib.ExitStack() as stack:
-        held: list[socket.socket] = []
+        sockets: list[socket.socket] = []
         for port in ports:
             try:
-                each = stack.enter_context(socket.socket())
-                each.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                each.bind((host, port))
-                each.listen()
+                listening_socket = stack.enter_context(socket.socket())
+                listening_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                listening_socket.bind((host, port))
+                listening_socket.listen()
             except (OSError, OverflowError) as error:
-                why = getattr(error, "strerror", None) or error
-                raise PortTakenError(f"cannot listen on {host}:{port}: {why}") from error
-            held.append(each)
-        return [each.getsockname()[1] for each in held]
+                reason = getattr(error, "strerror", None) or error
+                raise PortTakenError(f"cannot listen on {host}:{port}: {reason}") from error
+            sockets.append(listening_socket)
+        return [listening_socket.getsockname()[1] for listening_socket in sockets]
 
 
 def supervise(
     name: str, command: Sequence[str], *, host: str, ports: Sequence[int], ready: str, watched: Path | None = None
 ) -> int:
-    """Run a server until SIGTERM or SIGINT; prints ``ready`` once it answers on every port; the exit code.
+    """Run a server until SIGTERM or SIGINT; print ``ready`` once it accepts connections on every port.
 
     Args:
-        name: For people.
+        name: For messages.
         command: Program and arguments.
         host: The address it listens on.
         ports: Its ports.
         ready: The line to print.
-        watched: A file of the server's; when it changes the server is told to read again (SIGHUP).
+        watched: A file of the server; a change sends SIGHUP to the server.
+
+    Returns:
+        The exit code.
     """
     stopping = False
     child: subprocess.Popen[bytes] | None = None
@@ -95,72 +98,72 @@ def supervise(
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, stop)
-    child = subprocess.Popen(  # noqa: S603 (a path that was looked up, and files that were written here)
+    child = subprocess.Popen(  # noqa: S603 (resolved path, generated files)
         command,
         stdin=subprocess.DEVNULL,
-        stdout=sys.stderr.fileno(),  # our own output is for the line that says it is ready
-        preexec_fn=_die_with_parent,  # noqa: PLW1509 (there is one thread)
-        start_new_session=True,  # Ctrl-C reaches this program only, which then ends it in order
+        stdout=sys.stderr.fileno(),  # standard output is reserved for the ready line
+        preexec_fn=_die_with_parent,  # noqa: PLW1509 (single-threaded)
+        start_new_session=True,  # Ctrl-C only reaches this program, which stops the server
     )
     if stopping:
         child.terminate()
-    elif _answers(name, child, host, ports):
-        print(ready, flush=True)  # noqa: T201 (a terminal program prints)
-    changes = _Changes(watched)
+    elif _wait_for_ports(name, child, host, ports):
+        print(ready, flush=True)  # noqa: T201 (command-line program)
+    changes = _FileChanges(watched)
     while child.poll() is None:
         try:
-            child.wait(_STOP_S if stopping else _LOOK_S if watched else None)
+            child.wait(_STOP_S if stopping else _POLL_S if watched else None)
         except subprocess.TimeoutExpired:
-            if stopping or changes.seen():
+            if stopping or changes.detect():
                 child.send_signal(signal.SIGKILL if stopping else signal.SIGHUP)
     if stopping:
         return 0
-    _complain(f"{name} ended by itself with code {child.returncode}; its own words are above")
+    _print_error(f"{name} exited with code {child.returncode}; see its output above")
     return ENDED
 
 
-class _Changes:
-    """Whether a file is another than it was."""
+class _FileChanges:
+    """Detects changes of a file."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
-        self._stamp = self._look()
+        self._stamp = self._read_stamp()
 
-    def seen(self) -> bool:
-        """Since the last time that this was asked."""
-        before, self._stamp = self._stamp, self._look()
-        return self._stamp != before
+    def detect(self) -> bool:
+        """Whether the file has changed since the last call."""
+        previous, self._stamp = self._stamp, self._read_stamp()
+        return self._stamp != previous
 
-    def _look(self) -> tuple[int, int] | None:
+    def _read_stamp(self) -> tuple[int, int] | None:
         try:
-            found = self._path.stat() if self._path else None
+            path = self._path.stat() if self._path else None
         except OSError:
             return None
-        return None if found is None else (found.st_mtime_ns, found.st_ino)
+        return None if path is None else (path.st_mtime_ns, path.st_ino)
 
 
-def _answers(name: str, child: "subprocess.Popen[bytes]", host: str, ports: Sequence[int]) -> bool:
-    """Wait until every port takes a connection, or the server has ended."""
+def _wait_for_ports(name: str, child: "subprocess.Popen[bytes]", host: str, ports: Sequence[int]) -> bool:
+    """Wait until every port accepts a connection, or the server has exited."""
     deadline = time.monotonic() + _START_S
-    waiting = list(ports)
-    while waiting and child.poll() is None:
+    pending = list(ports)
+    while pending and child.poll() is None:
         try:
-            socket.create_connection((host, waiting[0]), timeout=1.0).close()
-            del waiting[0]
+            socket.create_connection((host, pending[0]), timeout=1.0).close()
+            del pending[0]
         except OSError:
             if time.monotonic() > deadline:
-                _complain(f"{name} does not listen on {host}:{waiting[0]}")
+                _print_error(f"{name} does not listen on {host}:{pending[0]}")
                 child.terminate()
                 return False
             time.sleep(0.02)
-    return not waiting
+    return not pending
 
 
-def _complain(text: str) -> None:
-    print(f"broker: {text}", file=sys.stderr)  # noqa: T201 (a terminal program prints)
+def _print_error(text: str) -> None:
+    print(f"broker: {text}", file=sys.stderr)  # noqa: T201 (command-line program)
 
 
 def _die_with_parent() -> None:
-    """Let the kernel end the server when this program is killed, so that none is left behind on the port."""
+    """Linux: kill the server when this program exits, so that it does not keep the port."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -1,7 +1,7 @@
-"""Write what pages need to show each built-in robot type without a robot: ``drawing.json`` in its folder.
+"""Write ``drawing.json`` for each built-in robot type, from which the console draws it without a device.
 
-``python robots/draw.py`` after a model or manifest has changed; ``--check`` says whether one has.
-"""  # noqa: INP001 - a script beside the folders it draws, not a package
+Run ``python robots/draw.py`` after changing a model or manifest; ``--check`` reports outdated files.
+"""  # noqa: INP001 - a script, not a package
 
 import asyncio
 import sys
@@ -19,30 +19,30 @@ _MODEL_FILES = frozenset({".xml", ".stl", ".obj", ".png"})
 
 
 def drawing(folder: Path) -> bytes:
-    """What the checker finds in a folder's model."""
+    """The drawing of a robot type, from the model compiler."""
     files = {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
         if path.suffix in _MODEL_FILES
     }
-    looked = asyncio.run(MujocoCompiler().check(robot_type.load(folder), files))
-    if looked.errors:
-        raise SystemExit("\n".join(looked.errors))
-    return msgspec.json.encode(looked) + b"\n"
+    result = asyncio.run(MujocoCompiler().check(robot_type.load(folder), files))
+    if result.errors:
+        raise SystemExit("\n".join(result.errors))
+    return msgspec.json.encode(result) + b"\n"
 
 
 def main() -> int:
-    """Write all, or tell which are old; the exit code says whether there were any."""
-    old = 0
+    """Write all drawings, or check them; returns the exit code."""
+    outdated = 0
     for folder in sorted(path.parent for path in Path(__file__).parent.glob(f"*/{robot_type.MANIFEST}")):
-        made, file = drawing(folder), folder / DRAWING
-        if not file.is_file() or file.read_bytes() != made:
-            old += 1
+        content, file = drawing(folder), folder / DRAWING
+        if not file.is_file() or file.read_bytes() != content:
+            outdated += 1
             if "--check" in sys.argv:
-                print(f"{file} is old: python robots/draw.py")  # noqa: T201
+                print(f"{file} is outdated; run python robots/draw.py")  # noqa: T201
             else:
-                file.write_bytes(made)
-    return int("--check" in sys.argv and old > 0)
+                file.write_bytes(content)
+    return int("--check" in sys.argv and outdated > 0)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Draw a robot type's scene: ``python robots/render.py ur5 docs/pictures/ur5.png``.
+"""Render a robot type's scene: ``python robots/render.py ur5 docs/pictures/ur5.png``.
 
-At home, unless told otherwise: ``joint=position`` [rad], ``--expression happy``, ``--posture Sit``, ``--viseme aa``.
-Looks through the scene's camera ``picture``, unless ``--camera`` names another.
+The robot is at home by default. Pose it with ``joint=position`` [rad], ``--expression happy``, ``--posture Sit`` or
+``--viseme aa``. The default camera is the scene's ``render``; ``--camera`` selects another.
 
-Sheets of several pictures: ``--turntable`` goes round the robot, ``--all expressions`` shows all that the manifest has.
+Contact sheets: ``--turntable`` shows the robot from all sides, ``--all expressions`` all expressions of the manifest.
 
-Needs a software renderer (Debian: ``libosmesa6``), no display.
-"""  # noqa: INP001 - a script beside the folders it draws, not a package
+Requires a software renderer (Debian: ``libosmesa6``), but no display.
+"""  # noqa: INP001 - a script, not a package
 
 import argparse
 import math
@@ -35,19 +35,19 @@ VIEWS = 8
 POSES = ("expressions", "postures", "visemes")
 
 
-class Studio:
-    """One robot type's scene, and a renderer. Use as ``with Studio(folder, size) as studio``.
+class SceneRenderer:
+    """One robot type's scene and a renderer; use it as a context manager.
 
     Args:
         folder: The robot type's folder.
-        width: Of a picture; ``height`` likewise.
+        width: Image width [px]; ``height`` likewise.
     """
 
     def __init__(self, folder: Path, width: int, height: int) -> None:
         self.manifest = robot_type.load(folder)
         self.model = mujoco.MjModel.from_xml_path(str(folder / self.manifest.scene))
         self.data = mujoco.MjData(self.model)
-        self._ties = EqualityJoints(self.model)
+        self._equality_joints = EqualityJoints(self.model)
         drawing = self.model.vis.global_
         drawing.offwidth, drawing.offheight = max(drawing.offwidth, width), max(drawing.offheight, height)
         self._renderer = mujoco.Renderer(self.model, height, width)
@@ -58,27 +58,27 @@ class Studio:
     def __exit__(self, *_: object) -> None:
         self._renderer.close()
 
-    def named(self, kind: str, name: str) -> dict[str, float]:
-        """The joints [rad] of an expression, posture or viseme."""
-        known: Mapping[str, Mapping[str, float]] = getattr(self.manifest, kind, {})
-        if name not in known:
-            sys.exit(f"{self.manifest.type} has no '{name}' in its {kind}; it has: {', '.join(known) or 'none'}")
-        return dict(known[name])
+    def joints_of(self, kind: str, name: str) -> dict[str, float]:
+        """Joint positions [rad] of an expression, posture or viseme."""
+        poses: Mapping[str, Mapping[str, float]] = getattr(self.manifest, kind, {})
+        if name not in poses:
+            sys.exit(f"{self.manifest.type} has no '{name}' in {kind}; available: {', '.join(poses) or 'none'}")
+        return dict(poses[name])
 
     def pose(self, position_rad: Mapping[str, float]) -> None:
-        """Put the robot somewhere; joints not named are at home."""
+        """Set joint positions; other joints are at home."""
         for joint, position in (self.manifest.home_rad | dict(position_rad)).items():
             self.data.joint(joint).qpos[0] = position
-        self._ties.settle(self.data.qpos)
+        self._equality_joints.apply(self.data.qpos)
         mujoco.mj_forward(self.model, self.data)
 
-    def picture(self, camera: Any) -> Any:
-        """What a camera sees, shape (height, width, 3), 8 bits a colour."""
+    def render(self, camera: Any) -> Any:
+        """The view of a camera, shape (height, width, 3), 8 bits per channel."""
         self._renderer.update_scene(self.data, camera)
         return self._renderer.render()
 
-    def round(self, azimuth_rad: float) -> Any:
-        """A camera somewhere around the robot, as far away as the scene says."""
+    def orbit_camera(self, azimuth_rad: float) -> Any:
+        """A camera that looks at the scene's centre from this direction."""
         camera = mujoco.MjvCamera()
         camera.lookat[:] = self.model.stat.center
         camera.distance = 2.2 * self.model.stat.extent
@@ -86,11 +86,11 @@ class Studio:
         return camera
 
 
-def sheet(pictures: Sequence[Any]) -> Any:
-    """Pictures of one size side by side, in about as many rows as columns."""
-    columns = math.ceil(math.sqrt(len(pictures)))
-    blank = np.full_like(pictures[0], 255)
-    filled = [*pictures, *[blank] * (-len(pictures) % columns)]
+def sheet(images: Sequence[Any]) -> Any:
+    """A contact sheet of equally sized images, about square."""
+    columns = math.ceil(math.sqrt(len(images)))
+    blank = np.full_like(images[0], 255)
+    filled = [*images, *[blank] * (-len(images) % columns)]
     rows = [np.concatenate(filled[start : start + columns], axis=1) for start in range(0, len(filled), columns)]
     return np.concatenate(rows, axis=0)
 
@@ -98,7 +98,7 @@ def sheet(pictures: Sequence[Any]) -> Any:
 def png(image: Any) -> bytes:
     """An image as PNG: signature, header, one compressed block of rows, end.
 
-    Each row is written as what it differs from the one above (filter 2), which is little in a drawing.
+    Rows are stored as differences to the row above (filter 2), which compress well for drawings.
     """
     height, width, _ = image.shape
     above = np.vstack([np.zeros_like(image[:1]), image[:-1]])
@@ -113,36 +113,36 @@ def png(image: Any) -> bytes:
 def main() -> None:
     """Command line."""
     types = catalogue.TYPES.folders()
-    parser = argparse.ArgumentParser(description="Draw a robot type's scene.")
+    parser = argparse.ArgumentParser(description="Render a robot type's scene.")
     parser.add_argument("type", choices=sorted(types))
     parser.add_argument("file", type=Path)
-    parser.add_argument("position", nargs="*", metavar="joint=position", help="[rad]; the others are at home")
-    parser.add_argument("--expression", help="one of the manifest's")
-    parser.add_argument("--posture", help="one of the manifest's")
-    parser.add_argument("--viseme", help="one of the manifest's")
-    parser.add_argument("--camera", default=CAMERA, help="of the scene (default: %(default)s)")
-    parser.add_argument("--turntable", action="store_true", help="eight views, from all around")
-    parser.add_argument("--all", choices=POSES, help="a picture of each that the manifest has, in its order")
+    parser.add_argument("position", nargs="*", metavar="joint=position", help="[rad]; other joints are at home")
+    parser.add_argument("--expression", help="name in the manifest")
+    parser.add_argument("--posture", help="name in the manifest")
+    parser.add_argument("--viseme", help="name in the manifest")
+    parser.add_argument("--camera", default=CAMERA, help="camera of the scene (default: %(default)s)")
+    parser.add_argument("--turntable", action="store_true", help="eight views around the robot")
+    parser.add_argument("--all", choices=POSES, help="one image for each in the manifest")
     arguments = parser.parse_args()
     single = not (arguments.turntable or arguments.all)
     width, height = (WIDTH, HEIGHT) if single else (TILE, TILE)
-    with Studio(types[arguments.type], width, height) as studio:
+    with SceneRenderer(types[arguments.type], width, height) as scene:
         position_rad: dict[str, float] = {}
         for kind in POSES:
             name = getattr(arguments, kind.removesuffix("s"))
-            position_rad |= studio.named(kind, name) if name else {}
+            position_rad |= scene.joints_of(kind, name) if name else {}
         position_rad |= {joint: float(at) for joint, _, at in (text.partition("=") for text in arguments.position)}
-        studio.pose(position_rad)
+        scene.pose(position_rad)
         if arguments.turntable:
-            image = sheet([studio.picture(studio.round(2 * math.pi * view / VIEWS)) for view in range(VIEWS)])
+            image = sheet([scene.render(scene.orbit_camera(2 * math.pi * view / VIEWS)) for view in range(VIEWS)])
         elif arguments.all:
-            pictures = []
-            for name in getattr(studio.manifest, arguments.all):
-                studio.pose(studio.named(arguments.all, name) | position_rad)
-                pictures.append(studio.picture(arguments.camera))
-            image = sheet(pictures)
+            images = []
+            for name in getattr(scene.manifest, arguments.all):
+                scene.pose(scene.joints_of(arguments.all, name) | position_rad)
+                images.append(scene.render(arguments.camera))
+            image = sheet(images)
         else:
-            image = studio.picture(arguments.camera)
+            image = scene.render(arguments.camera)
     arguments.file.write_bytes(png(image))
 
 

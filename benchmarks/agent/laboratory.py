@@ -79,7 +79,7 @@ def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
 
 def _watch(report: Path, for_s: float, gaps: dict[str, list[float]]) -> None:
     time.sleep(WARM_UP_S)
-    world = world_registry.of(ROOMS.folder(ROOM))
+    world = world_registry.get_world(ROOMS.folder(ROOM))
     gaps.clear()
     before, busy, began_s = _threads(), _busy_s(), time.monotonic()
     first, process_s = world.snapshot(), time.process_time()
@@ -147,7 +147,7 @@ def _at(values: Iterable[float], mark: float) -> float:
 # ------------------------------------------------------------ beside it
 
 
-class Laboratory(local.Machine):
+class Laboratory(local.LocalStack):
     """The product with an observed agent."""
 
     def __init__(self, chosen: settings.Settings, report: Path, for_s: float) -> None:

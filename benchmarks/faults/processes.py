@@ -83,7 +83,7 @@ class ProductProcesses(Stack):
         """Restarts the agent with a direct connection to the broker."""
         self.agent.stop()
         self.agent = self._child("agent", self.AGENT, *self.agent_arguments(self.port + 1))
-        self.agent.await_line("running", 60)
+        self.agent.wait_for_line("running", 60)
         deadline_s = time.monotonic() + 60
         while not all(each["online"] for each in self.devices()):
             if time.monotonic() > deadline_s:

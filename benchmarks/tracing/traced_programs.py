@@ -36,7 +36,7 @@ def machine() -> int:
     """Runs the product as ``make up`` does."""
     from infra.local import __main__ as local
 
-    class Traced(local.Machine):
+    class Traced(local.LocalStack):
         """Starts the traced programs instead of the product's."""
 
         def _run(self, name: str, *arguments: str) -> Any:
@@ -46,7 +46,7 @@ def machine() -> int:
 
     if device := os.environ.get(DEVICE):
         setattr(local, "_ARM", ("--device", f"{device}={device}"))  # noqa: B010 (as below)
-    setattr(local, "Machine", Traced)  # noqa: B010 (a type checker would not have it)
+    setattr(local, "LocalStack", Traced)  # noqa: B010 (a type checker would not have it)
     return local.main()
 
 

@@ -32,11 +32,11 @@ def add_commands(commands: Commands, _home: Path) -> None:
 
 def _import_model(options: argparse.Namespace) -> int:
     # Imported here: agents of real robots may have no MuJoCo.
-    from device_agent.simulation.mjcf.import_model import AdoptError, adopt  # noqa: PLC0415
+    from device_agent.simulation.mjcf.import_model import ImportModelError, import_model  # noqa: PLC0415
 
     try:
-        folder = adopt(options.model, options.name, options.into, without=options.without)
-    except AdoptError as error:
+        folder = import_model(options.model, options.name, options.into, without=options.without)
+    except ImportModelError as error:
         raise ConfigError(str(error)) from error
     print(f"created {folder.resolve()}; check the values that its robot.toml marks as guessed")
     try:

@@ -1,8 +1,7 @@
-"""Drivers, one folder each, found by name.
+"""Robot drivers, one folder each, found by name.
 
-Built-in drivers stand in a table of import paths and are imported when asked for, so an agent needs only the libraries
-of the drivers it uses. Third parties add theirs by the entry point group ``telescope.drivers``; the entry point is a
-``Factory``.
+Built-in drivers are listed with their import paths and imported on first use, so an agent needs only the libraries of
+its own drivers. Third parties register a ``Factory`` in the entry point group ``telescope.drivers``.
 """
 
 from collections.abc import Mapping
@@ -17,11 +16,11 @@ __all__ = ["GROUP", "Factory", "load", "names"]
 
 GROUP = "telescope.drivers"
 _BUILT_IN: Mapping[str, str] = {"mujoco": "device_agent.drivers.mujoco"}
-"""Name → module that has ``create``."""
+"""Name → module that defines ``create``."""
 
 
 class Factory(Protocol):
-    """Makes the driver of one device. Opens nothing: that is ``Driver.connect``."""
+    """Creates the driver of one device; ``Driver.connect`` opens the hardware."""
 
     def __call__(self, robot_type: RobotType, folder: Path, options: Mapping[str, object], device: str) -> Driver:
         """The driver of one device.
@@ -29,26 +28,26 @@ class Factory(Protocol):
         Args:
             robot_type: The device's manifest.
             folder: The robot type's folder; paths in the manifest are relative to it.
-            options: The ``[driver]`` part of the agent's configuration, without the driver's name.
+            options: The ``[driver]`` section of the agent's configuration, without the driver's name.
             device: Id of the device at its agent.
 
         Raises:
-            DriverError: An option is unknown or has the wrong type; the text lists the valid ones.
+            DriverError: An option is unknown or has the wrong type; the message lists the valid ones.
         """
 
 
 def names() -> tuple[str, ...]:
-    """All names that ``load`` takes, sorted."""
-    return _KNOWN.names()
+    """All names that ``load`` accepts, sorted."""
+    return _PLUG_INS.names()
 
 
 def load(name: str) -> Factory:
-    """The factory of the driver with this name. A built-in driver wins over an entry point of the same name.
+    """The factory of the driver with this name; built-in drivers take precedence over entry points.
 
     Raises:
-        DriverError: There is no such driver, or a library that it needs is not installed.
+        DriverError: Unknown driver, or a library that it needs is not installed.
     """
-    return _KNOWN.load(name)
+    return _PLUG_INS.load(name)
 
 
-_KNOWN: PlugIns[Factory] = PlugIns(what="driver", group=GROUP, built_in=_BUILT_IN, error=DriverError)
+_PLUG_INS: PlugIns[Factory] = PlugIns(what="driver", group=GROUP, built_in=_BUILT_IN, error=DriverError)

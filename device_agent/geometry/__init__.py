@@ -1,4 +1,4 @@
-"""What is known of a robot's shape: from its model, in MuJoCo, without stepping any physics."""
+"""Robot geometry from MuJoCo models, without physics: poses, clearance, IK, planning."""
 
 from pathlib import Path
 
@@ -10,18 +10,18 @@ __all__ = ["BasePose", "load"]
 
 
 def load(
-    robot_type: RobotType, folder: Path, *, scene: str = "", standing: BasePose | None = None
+    robot_type: RobotType, folder: Path, *, scene: str = "", base_pose: BasePose | None = None
 ) -> RobotGeometry | None:
-    """The geometry of a robot type; ``None`` where its manifest names no model.
+    """The geometry of a robot type; ``None`` if its manifest names no model.
 
     Args:
         robot_type: The manifest.
         folder: The robot type's folder.
-        scene: MJCF file of what stands around the robot instead of the manifest's, relative to the folder.
-        standing: The room that it stands in and where, instead of a scene.
+        scene: MJCF file to use instead of the manifest's scene, relative to the folder.
+        base_pose: The room and the robot's pose in it, instead of a scene.
 
     Raises:
-        GeometryError: The model cannot be read or does not fit the manifest, or MuJoCo is not installed.
+        GeometryError: The model cannot be read or does not match the manifest, or MuJoCo is not installed.
     """
     if not robot_type.model:
         return None
@@ -29,8 +29,8 @@ def load(
         from device_agent.geometry.mujoco_geometry import MujocoGeometry  # noqa: PLC0415 (agents without a model need no MuJoCo)
     except ImportError as error:
         raise GeometryError(
-            f"'{robot_type.type}' has a model, and nothing here can read it ({error}); install mujoco-core"
+            f"'{robot_type.type}' has a model, but MuJoCo is not installed ({error}); install mujoco-core"
         ) from error
-    if standing is not None:
-        return MujocoGeometry(robot_type, folder / robot_type.model, standing=standing)
+    if base_pose is not None:
+        return MujocoGeometry(robot_type, folder / robot_type.model, base_pose=base_pose)
     return MujocoGeometry(robot_type, folder / (scene or robot_type.scene or robot_type.model))

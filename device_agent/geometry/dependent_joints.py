@@ -1,4 +1,4 @@
-"""What moves with the joints that may be chosen: rods and threads (``mjcf.ties``), and joints of one motor."""
+"""Maps independent joints to all joints that move with them: mirrored and equality joints."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,22 +15,24 @@ Ints = npt.NDArray[np.intp]
 _NOTHING = 1e-9
 
 
-class Carried:
-    """How a whole model moves when the joints of one robot do.
+class DependentJoints:
+    """How a whole model moves with the joints of one robot.
 
     Args:
         model: ``MjModel``.
-        robot_type: Its joints, and which of them mirror others.
+        robot_type: Its joints and mirrors.
         joints: Their indices in the model, in the type's order.
-        ties: Which joints of the model go with these.
+        equality_joints: Dependent joints of the model.
 
     Attributes:
         leading: Indices, among the robot's joints, of those that mirror none, shape (m,).
-        spread: What each of the robot's joints does per unit of each leading one, shape (n, m).
-        whole: The same of each of the model's degrees of freedom, shape (nv, m): 0 of what the robot does not move.
+        spread: Motion of each robot joint per unit of each leading one, shape (n, m).
+        whole: The same for each degree of freedom of the model, shape (nv, m); 0 if the robot does not move it.
     """
 
-    def __init__(self, model: Any, robot_type: RobotType, joints: Sequence[int], ties: EqualityJoints) -> None:
+    def __init__(
+        self, model: Any, robot_type: RobotType, joints: Sequence[int], equality_joints: EqualityJoints
+    ) -> None:
         names = [joint.name for joint in robot_type.joints]
         mirrors = {mirror.joint: mirror for mirror in robot_type.mimic_joints}
         self.leading: Ints = np.array([index for index, name in enumerate(names) if name not in mirrors], dtype=np.intp)
@@ -41,21 +43,21 @@ class Carried:
         own = np.zeros((model.nv, len(names)))
         for index, joint in enumerate(joints):
             own[model.jnt_dofadr[joint], index] = 1.0
-        for tie in ties.all:
-            for other, factor in ties.of(tie.joint).items():
-                if other in joints and tie.joint not in joints:
-                    own[model.jnt_dofadr[tie.joint], list(joints).index(other)] = factor
+        for dependent in equality_joints.all:
+            for other, factor in equality_joints.factors_of(dependent.joint).items():
+                if other in joints and dependent.joint not in joints:
+                    own[model.jnt_dofadr[dependent.joint], list(joints).index(other)] = factor
         self.whole: Floats = own @ self.spread
 
     def together(self, position_rad: Floats) -> Floats:
-        """The robot's joints where the leading ones are there, shape (n,) [rad]."""
-        placed: Floats = self.spread @ position_rad[self.leading]
-        return placed
+        """The joint position with mirrored joints set from the leading ones, shape (n,) [rad]."""
+        position: Floats = self.spread @ position_rad[self.leading]
+        return position
 
     def held(self) -> Floats:
-        """Rows that a motion of the whole model times is 0 for: what is carried goes along, the rest stays, (k, nv).
+        """Rows whose product with every permitted model motion is 0, shape (k, nv).
 
-        Empty where the robot's joints are all there is and each is free.
+        Empty if the model has only the robot's joints and all are independent.
         """
         basis, sizes, _ = np.linalg.svd(self.whole, full_matrices=True)
         rank = int((sizes > _NOTHING).sum())

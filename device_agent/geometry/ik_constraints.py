@@ -1,4 +1,4 @@
-"""A constraint for ``mink``: only motions that the robot's own joints can make, with all that they carry."""
+"""A ``mink`` constraint: only motions that the robot's own joints can make."""
 
 import mink
 import numpy as np
@@ -7,8 +7,8 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 
 
-class Holding(mink.Task):  # type: ignore[misc]  # it has no types
-    """No motion along some directions of the whole model.
+class FixedDirections(mink.Task):  # type: ignore[misc]  # it has no types
+    """Forbids motion along some directions of the whole model.
 
     Args:
         rows: The directions, shape (k, nv).
@@ -19,7 +19,7 @@ class Holding(mink.Task):  # type: ignore[misc]  # it has no types
         self._rows = rows
 
     def compute_error(self, configuration: mink.Configuration) -> Floats:
-        """See ``mink.Task``: none, for it begins where all is together."""
+        """See ``mink.Task``; 0, because the start satisfies the constraint."""
         del configuration
         return np.zeros(len(self._rows))
 

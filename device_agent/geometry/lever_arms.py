@@ -1,4 +1,4 @@
-"""How far a joint can carry a point: the lever arms that bound speeds and ways, in whatever position."""
+"""Lever arms of joints: upper bounds of speeds and distances in any position."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,41 +17,41 @@ _ROUND = frozenset(
 _SAME = 1e-6
 
 
-class Levers:
+class LeverArms:
     """Upper bounds of metres per radian (or per metre, for a slide), joint by joint.
 
-    A joint that is tied to others counts for those, by as much as it moves with them.
+    A dependent joint counts for the joints that it follows, scaled by its factors.
 
     Args:
         model: ``MjModel``.
-        joints: The joints' indices in the model.
-        ties: Which joints go with these.
+        joints: Joint indices in the model.
+        equality_joints: Dependent joints of the model.
     """
 
-    def __init__(self, model: Any, joints: Sequence[int], ties: EqualityJoints) -> None:
+    def __init__(self, model: Any, joints: Sequence[int], equality_joints: EqualityJoints) -> None:
         self._model = model
-        tied = [tie.joint for tie in ties.all if tie.joint not in joints]
-        self._joints = [*joints, *tied]
+        dependents = [dependent.joint for dependent in equality_joints.all if dependent.joint not in joints]
+        self._joints = [*joints, *dependents]
         self._share = np.zeros((len(self._joints), len(joints)))
         self._share[: len(joints)] = np.eye(len(joints))
-        for row, joint in enumerate(tied, len(joints)):
-            for other, factor in ties.of(joint).items():
+        for row, joint in enumerate(dependents, len(joints)):
+            for other, factor in equality_joints.factors_of(joint).items():
                 if other in joints:
                     self._share[row, self._joints.index(other)] = abs(factor)
 
     def of_geoms(self, geoms: Sequence[int]) -> Floats:
-        """Of every point of each shape, shape (geoms, joints)."""
+        """For every point of each shape, shape (geoms, joints)."""
         levers = np.array([self._of_ball(int(geom)) for geom in dict.fromkeys(geoms)])
         return levers.reshape(-1, len(self._joints)) @ self._share
 
     def of_frame(self, is_site: bool, index: int) -> Floats:
-        """Of the origin of a site or body, shape (joints,)."""
+        """For the origin of a site or body, shape (joints,)."""
         model = self._model
         body = int(model.site_bodyid[index]) if is_site else index
         return self._of_point(body, model.site_pos[index] if is_site else np.zeros(3), 0.0) @ self._share
 
     def reach_m(self, geom: int, base: int) -> float:
-        """How far any point of a shape can come from the origin of the robot's base, whatever its joints do [m]."""
+        """Largest distance of any point of a shape from the origin of the robot's base [m]."""
         model = self._model
         box = model.geom_aabb[geom]
         reach = float(np.linalg.norm(box[:3]) + np.linalg.norm(box[3:]) + np.linalg.norm(model.geom_pos[geom]))
@@ -66,14 +66,14 @@ class Levers:
         return reach
 
     def between(self, a: int, b: int) -> Floats:
-        """How fast two shapes can near each other, shape (joints,): joints that carry both do not count."""
+        """How fast two shapes can approach, shape (joints,); joints that carry both do not count."""
         first, second = self._of_geom(a), self._of_geom(b)
         both = np.array([self._carries(joint, a) and self._carries(joint, b) for joint in self._joints], dtype=bool)
         lever: Floats = np.where(both, 0.0, first + second) @ self._share
         return lever
 
     def _of_geom(self, geom: int) -> Floats:
-        """How far a joint can move where a shape is; turning it about its own axis does not."""
+        """For a shape; a joint that only turns it about its own axis counts as 0."""
         lever = self._of_ball(geom)
         for index, joint in enumerate(self._joints):
             if self._model.jnt_bodyid[joint] == self._model.geom_bodyid[geom] and self._turns_in_place(geom, joint):
@@ -81,14 +81,14 @@ class Levers:
         return lever
 
     def _of_ball(self, geom: int) -> Floats:
-        """Of the ball around a shape."""
+        """For the bounding sphere of a shape."""
         model = self._model
         box = model.geom_aabb[geom]
         radius_m = float(np.linalg.norm(box[:3]) + np.linalg.norm(box[3:]))
         return self._of_point(int(model.geom_bodyid[geom]), model.geom_pos[geom], radius_m)
 
     def _of_point(self, body: int, position: Floats, radius_m: float) -> Floats:
-        """Of a ball that is fixed in a body."""
+        """For a sphere fixed in a body."""
         model = self._model
         lever = np.zeros(len(self._joints))
         reach, at = float(np.linalg.norm(position)) + radius_m, body
@@ -110,7 +110,7 @@ class Levers:
         return at > 0
 
     def _turns_in_place(self, geom: int, joint: int) -> bool:
-        """Whether a shape is round about the joint's own axis, so that the joint does not change where it is."""
+        """Whether a shape is symmetric about the joint's axis, so that the joint does not move it."""
         model = self._model
         if model.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_HINGE) or int(model.geom_type[geom]) not in _ROUND:
             return False

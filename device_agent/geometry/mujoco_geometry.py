@@ -1,4 +1,4 @@
-"""A robot's shape in MuJoCo: where its frames are, how near things are, how far a way is clear."""
+"""Robot geometry in MuJoCo: frame poses, clearance, speed bounds, IK and planning."""
 
 import math
 import threading
@@ -11,46 +11,46 @@ import numpy as np
 import numpy.typing as npt
 
 from device_agent.geometry.base_pose import BasePose
-from device_agent.geometry.collision_checker import Probe
-from device_agent.geometry.collision_pairs import ROOM_PREFIX, Pairs
-from device_agent.geometry.dependent_joints import Carried
-from device_agent.geometry.inverse_kinematics import Solver
-from device_agent.geometry.joint_bounds import Bounds
-from device_agent.geometry.planner_process import PlanningProcess, Site
-from device_agent.geometry.rrt_planner import Planner
+from device_agent.geometry.collision_checker import CollisionChecker
+from device_agent.geometry.collision_pairs import ROOM_PREFIX, CollisionPairs
+from device_agent.geometry.dependent_joints import DependentJoints
+from device_agent.geometry.inverse_kinematics import InverseKinematics
+from device_agent.geometry.joint_bounds import JointBounds
+from device_agent.geometry.planner_process import PlannerProcess, PlannerScene
+from device_agent.geometry.rrt_planner import RrtPlanner
 from device_agent.ports.geometry import Clearance, GeometryError, Sweep, never
 from device_agent.protocol import Pose
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation.mjcf.equality_joints import EqualityJoints
-from device_agent.simulation.mjcf.options import agree
+from device_agent.simulation.mjcf.options import copy_options
 
 Floats = npt.NDArray[np.float64]
 
 
 class MujocoGeometry:
-    """The robot of one type in its scene. Joints without a motor of their own go with those that they are tied to.
+    """The robot of one type in its scene. Joints without a motor follow the joints that they depend on.
 
-    Distances are between collision shapes (``mj_geomDistance``), so what the picture shows may be smaller, not larger.
+    Distances are between collision shapes (``mj_geomDistance``), which enclose the visible shapes.
 
     Args:
         robot_type: Joints, frames, workspace, margin.
-        scene: MJCF file that holds the robot.
-        standing: The room to put it into.
+        scene: MJCF file that contains the robot.
+        base_pose: The room and the robot's pose in it.
 
     Raises:
         GeometryError: The scene cannot be read, lacks a joint or frame of the manifest, or the robot touches something
             in its home position.
     """
 
-    def __init__(self, robot_type: RobotType, scene: Path, *, standing: BasePose | None = None) -> None:
+    def __init__(self, robot_type: RobotType, scene: Path, *, base_pose: BasePose | None = None) -> None:
         try:
-            self._model: Any = _spec(scene, standing).compile()
+            self._model: Any = _spec(scene, base_pose).compile()
         except (ValueError, OSError, mujoco.FatalError) as error:
-            where = scene if standing is None else f"{scene} in {standing.room}"
+            where = scene if base_pose is None else f"{scene} in {base_pose.room}"
             raise GeometryError(f"{where}: MuJoCo cannot build this model: {error}") from error
         self._lock = threading.Lock()
         self._type = robot_type
-        self._ties = EqualityJoints(self._model)
+        self._equality_joints = EqualityJoints(self._model)
         joints = [self._find(mujoco.mjtObj.mjOBJ_JOINT, "joint", joint.name) for joint in robot_type.joints]
         self._qpos = np.array([self._model.jnt_qposadr[joint] for joint in joints], dtype=np.intp)
         self._base = int(self._model.body_rootid[self._model.jnt_bodyid[joints[0]]]) if joints else 0
@@ -58,18 +58,26 @@ class MujocoGeometry:
         self._home = np.array([robot_type.home_rad[joint.name] for joint in robot_type.joints])
         lower = np.array([joint.lower_rad for joint in robot_type.joints])
         upper = np.array([joint.upper_rad for joint in robot_type.joints])
-        self._pairs = Pairs(self._model, robot_type, joints, self._frames, base=self._base, ties=self._ties)
-        self._probe = Probe(self._model, self._qpos, self._pairs, self._ties, self._home)
-        self._pairs.calibrate(self._probe.data, self._probe.place, home=self._home, lower=lower, upper=upper)
-        self._probe = Probe(self._model, self._qpos, self._pairs, self._ties, self._home)
-        carried = Carried(self._model, robot_type, joints, self._ties)
-        self._carried = carried
-        self._solver = Solver(
-            self._model, self._qpos, self._frames, carried=carried, ties=self._ties, lower=lower, upper=upper
+        self._pairs = CollisionPairs(
+            self._model, robot_type, joints, self._frames, base=self._base, equality_joints=self._equality_joints
         )
-        bounds = Bounds(robot_type)
-        self._planner = Planner(self._model, joints, self._pairs, self._ties, bounds)
-        self._planning = PlanningProcess(Site.of(robot_type, scene, standing))
+        self._checker = CollisionChecker(self._model, self._qpos, self._pairs, self._equality_joints, self._home)
+        self._pairs.calibrate(self._checker.data, self._checker.place, home=self._home, lower=lower, upper=upper)
+        self._checker = CollisionChecker(self._model, self._qpos, self._pairs, self._equality_joints, self._home)
+        dependent = DependentJoints(self._model, robot_type, joints, self._equality_joints)
+        self._dependent = dependent
+        self._ik = InverseKinematics(
+            self._model,
+            self._qpos,
+            self._frames,
+            dependent=dependent,
+            equality_joints=self._equality_joints,
+            lower=lower,
+            upper=upper,
+        )
+        bounds = JointBounds(robot_type)
+        self._planner = RrtPlanner(self._model, joints, self._pairs, self._equality_joints, bounds)
+        self._planner_process = PlannerProcess(PlannerScene.of(robot_type, scene, base_pose))
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -79,23 +87,23 @@ class MujocoGeometry:
     def poses(self, position_rad: Sequence[float]) -> Mapping[str, Pose]:
         """Pose of each frame in the robot's base frame."""
         with self._lock:
-            self._probe.place(position_rad)
+            self._checker.place(position_rad)
             return {name: self._pose(is_site, index) for name, (is_site, index) in self._frames.items()}
 
     def clearance(self, position_rad: Sequence[float]) -> Clearance:
-        """The tightest place of the robot in one position."""
+        """The smallest clearance of the robot in one position."""
         with self._lock:
-            return self._probe.clearance(position_rad)
+            return self._checker.clearance(position_rad)
 
     def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
-        """Go from one joint position straight to the next until something is too near, or nearer than it was."""
+        """Follow straight segments until a pair violates its margin or worsens a violation."""
         with self._lock:
-            return self._probe.sweep(path_rad)
+            return self._checker.sweep(path_rad)
 
     def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
-        """The share of a straight way that seems clear, by six places on it, and three where it ends."""
+        """Clear share of a straight segment, estimated from a few samples."""
         with self._lock:
-            return self._probe.glance(start_rad, end_rad)
+            return self._checker.glance(start_rad, end_rad)
 
     def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
         """A speed that no point of the robot exceeds [m/s]."""
@@ -104,35 +112,35 @@ class MujocoGeometry:
     def rates(
         self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
     ) -> tuple[float, ...]:
-        """Joint velocities that move a frame: damped least squares, damped where the robot is near a singularity."""
+        """Joint velocities that move a frame: least squares, damped near singularities."""
         is_site, index = self._frames[frame]
         with self._lock:
-            return self._probe.rates(
-                self._base, is_site, index, np.array(twist), position_rad, carried=self._carried, tool=tool
+            return self._checker.rates(
+                self._base, is_site, index, np.array(twist), position_rad, dependent=self._dependent, tool=tool
             )
 
     def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
         """Joint positions that bring a frame to a pose in the robot's base frame.
 
         Raises:
-            GeometryError: No such frame, out of reach, or only by coming too near to something.
+            GeometryError: Unknown frame, pose out of reach, or every solution is too close to something.
         """
         if frame not in self._frames:
-            raise GeometryError(f"no frame '{frame[:80]}'; there are: {', '.join(self._frames)}")
+            raise GeometryError(f"no frame '{frame[:80]}'; available frames: {', '.join(self._frames)}")
         if not all(map(math.isfinite, pose)):
-            raise GeometryError("a pose must be made of finite numbers")
+            raise GeometryError("a pose must consist of finite numbers")
         world = self._in_world(pose)
-        tight: Clearance | None = None
-        for found in self._solver.solutions(frame, world, starts=(np.asarray(start_rad, dtype=np.float64), self._home)):
-            clearance = self.clearance(found.tolist())
+        blocked: Clearance | None = None
+        for solution in self._ik.solutions(frame, world, starts=(np.asarray(start_rad, dtype=np.float64), self._home)):
+            clearance = self.clearance(solution.tolist())
             if clearance.room_m >= 0:
-                return tuple(found.tolist())
-            tight = clearance
-        if tight is not None:
-            raise GeometryError(f"{frame} cannot go there: {tight.text} would be too near")
-        miss_m, miss_rad = self._solver.missed
+                return tuple(solution.tolist())
+            blocked = clearance
+        if blocked is not None:
+            raise GeometryError(f"{frame} cannot reach this pose: {blocked.text} would be too close")
+        miss_m, miss_rad = self._ik.error
         raise GeometryError(
-            f"found no way to bring {frame} there: the nearest it comes is {miss_m * 1000:.0f} mm and "
+            f"found no joint position for {frame}: the closest one is {miss_m * 1000:.0f} mm and "
             f"{math.degrees(miss_rad):.0f} degrees away"
         )
 
@@ -145,35 +153,35 @@ class MujocoGeometry:
         within_s: float = 5.0,
         ended: Callable[[], bool] = never,
     ) -> tuple[tuple[float, ...], ...]:
-        """A way around what is near, looked for in a process of its own.
+        """A collision-free path, planned in a separate process.
 
         Raises:
-            GeometryError: None was found in time, or there is no room at its end.
-            PlannerLostError: That process has ended or does not answer.
+            GeometryError: No path was found in time, or the goal is not clear.
+            PlannerLostError: The planner process has ended or does not respond.
         """
-        return self._planning.plan(start_rad, goal_rad, seed=seed, within_s=within_s, ended=ended)
+        return self._planner_process.plan(start_rad, goal_rad, seed=seed, within_s=within_s, ended=ended)
 
     def plan_here(
         self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int, within_s: float
     ) -> tuple[tuple[float, ...], ...]:
-        """The same in this process, which it keeps busy.
+        """Plan in this process, which blocks other threads.
 
         Raises:
-            GeometryError: As ``plan`` does.
+            GeometryError: As for ``plan``.
         """
         return self._planner.plan(start_rad, goal_rad, seed=seed, within_s=within_s)
 
     # ------------------------------------------------------------ positions and names
 
     def _pose(self, is_site: bool, index: int) -> Pose:
-        data = self._probe.data
+        data = self._checker.data
         back = data.xmat[self._base].reshape(3, 3).T
         position = data.site_xpos[index] if is_site else data.xpos[index]
         matrix = (data.site_xmat[index] if is_site else data.xmat[index]).reshape(3, 3)
         quaternion = np.empty(4)
         mujoco.mju_mat2Quat(quaternion, (back @ matrix).ravel())
         x, y, z = (back @ (position - data.xpos[self._base])).tolist()
-        # A rotation has two quaternions; give the one with w >= 0.
+        # Of the two quaternions of a rotation return the one with w >= 0.
         w, i, j, k = (quaternion if quaternion[0] >= 0 else -quaternion).tolist()
         return (x, y, z, w, i, j, k)
 
@@ -182,7 +190,7 @@ class MujocoGeometry:
         size = math.hypot(*pose[3:])
         if size <= 0:
             raise GeometryError("a quaternion must not be all zeros")
-        data = self._probe.data
+        data = self._checker.data
         with self._lock:
             base_position, base_quaternion = data.xpos[self._base].copy(), data.xquat[self._base].copy()
         position, quaternion = np.empty(3), np.empty(4)
@@ -196,27 +204,27 @@ class MujocoGeometry:
             return True, int(site)
         return False, self._find(mujoco.mjtObj.mjOBJ_BODY, "site or body", name)
 
-    def _find(self, kind: Any, word: str, name: str) -> int:
+    def _find(self, kind: Any, label: str, name: str) -> int:
         index = int(mujoco.mj_name2id(self._model, kind, name))
         if index < 0:
-            raise GeometryError(f"the model of '{self._type.type}' has no {word} '{name}'")
+            raise GeometryError(f"the model of '{self._type.type}' has no {label} '{name}'")
         return index
 
 
-def _spec(scene: Path, standing: BasePose | None) -> Any:
-    """The robot where it stands; a room is put around it, so that the robot's own names stay as they are."""
+def _spec(scene: Path, base_pose: BasePose | None) -> Any:
+    """The robot's model, with a room around it; the robot's own names stay unchanged."""
     robot = mujoco.MjSpec.from_file(str(scene))
-    if standing is None:
+    if base_pose is None:
         return robot
-    room = mujoco.MjSpec.from_file(str(standing.room))
-    agree(room.option, robot.option)
-    agree(room.visual, robot.visual)
+    room = mujoco.MjSpec.from_file(str(base_pose.room))
+    copy_options(room.option, robot.option)
+    copy_options(room.visual, robot.visual)
     position, quaternion = np.empty(3), np.empty(4)
-    half_rad = standing.yaw_rad / 2
+    half_rad = base_pose.yaw_rad / 2
     mujoco.mju_negPose(
         position,
         quaternion,
-        np.array(standing.position_m),
+        np.array(base_pose.position_m),
         np.array((math.cos(half_rad), 0.0, 0.0, math.sin(half_rad))),
     )
     robot.attach(room, prefix=ROOM_PREFIX, frame=robot.worldbody.add_frame(pos=position, quat=quaternion))

@@ -1,8 +1,7 @@
-"""Plans in a process of its own: a search keeps the interpreter busy, and control loops of this one must not wait.
+"""Client of the planner process: planning holds the interpreter lock, which would delay the control loops.
 
-It is started when the first plan is asked for and kept, because starting it takes as long as several plans. It is
-killed when its work is no longer wanted, and ends by itself when the agent is gone, however that ended: what is
-between them is a socket.
+The process starts with the first request and keeps running, because starting it takes as long as several plans. The
+client kills it when a request is cancelled. It exits by itself when the socket to the agent closes.
 """
 
 import os
@@ -23,50 +22,50 @@ from device_agent.ports.geometry import GeometryError, PlannerLostError
 from device_agent.protocol.manifests.robot_type import RobotType
 
 _ROOT = Path(__file__).resolve().parents[2]
-_LOOK_S = 0.02
-"""How often it is asked whether the plan is still wanted."""
-_SLOW_S = 30.0
-"""For starting and answering, besides the search: no machine that can run an agent takes longer."""
+_POLL_S = 0.02
+"""Interval at which cancellation is checked."""
+_STARTUP_S = 30.0
+"""Time for start-up and response, in addition to the planning time."""
 _LENGTH = 4
-"""Bytes of a message's length, before it."""
-NOBODY = "nobody waits for a way any more"
+"""Size of the length field before each message [bytes]."""
+CANCELLED = "the plan was cancelled"
 
 
-class Site(msgspec.Struct, frozen=True, kw_only=True):
-    """What is to be planned in: the first message to the process.
+class PlannerScene(msgspec.Struct, frozen=True, kw_only=True):
+    """The scene to plan in: the first message to the process.
 
     Attributes:
         robot_type: Joints, margin.
-        scene: MJCF file that holds the robot.
-        standing: The room around it, if any: its model, the robot's place [m] and yaw [rad].
+        scene: MJCF file that contains the robot.
+        base_pose: The room around it, if any: its model, the robot's position [m] and yaw [rad].
     """
 
     robot_type: RobotType
     scene: str
-    standing: tuple[str, tuple[float, float, float], float] | None = None
+    base_pose: tuple[str, tuple[float, float, float], float] | None = None
 
     @classmethod
-    def of(cls, robot_type: RobotType, scene: Path, standing: BasePose | None) -> "Site":
-        """As it is handed over."""
-        around = None if standing is None else (str(standing.room), standing.position_m, standing.yaw_rad)
-        return cls(robot_type=robot_type, scene=str(scene), standing=around)
+    def of(cls, robot_type: RobotType, scene: Path, base_pose: BasePose | None) -> "PlannerScene":
+        """The scene in serializable form."""
+        around = None if base_pose is None else (str(base_pose.room), base_pose.position_m, base_pose.yaw_rad)
+        return cls(robot_type=robot_type, scene=str(scene), base_pose=around)
 
     @property
     def scene_path(self) -> Path:
-        """The scene's file."""
+        """The scene file."""
         return Path(self.scene)
 
     @property
     def room(self) -> BasePose | None:
-        """The room, as geometry takes it."""
-        if self.standing is None:
+        """The room as a ``BasePose``."""
+        if self.base_pose is None:
             return None
-        room, position_m, yaw_rad = self.standing
+        room, position_m, yaw_rad = self.base_pose
         return BasePose(room=Path(room), position_m=position_m, yaw_rad=yaw_rad)
 
 
-class Order(msgspec.Struct, frozen=True, kw_only=True):
-    """One plan that is asked for: see ``Geometry.plan``."""
+class PlanRequest(msgspec.Struct, frozen=True, kw_only=True):
+    """One planning request, see ``RobotGeometry.plan``."""
 
     start_rad: tuple[float, ...]
     goal_rad: tuple[float, ...]
@@ -74,88 +73,88 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     within_s: float
 
 
-class Answer(msgspec.Struct, frozen=True, kw_only=True):
-    """The corners of a way; where there is none, why."""
+class PlanResponse(msgspec.Struct, frozen=True, kw_only=True):
+    """The corners of a path, or the reason why there is none."""
 
     corners_rad: tuple[tuple[float, ...], ...] = ()
     error: str = ""
 
 
-class Link:
-    """Messages over a socket: the length, then MessagePack, which has the infinite numbers that JSON has not."""
+class MessageSocket:
+    """Length-prefixed MessagePack messages over a socket; unlike JSON it can encode infinities."""
 
-    def __init__(self, end: socket.socket) -> None:
-        self._socket = end
-        self._heard = b""
+    def __init__(self, connection: socket.socket) -> None:
+        self._socket = connection
+        self._buffer = b""
 
     def send(self, message: msgspec.Struct) -> None:
-        """Send all of it."""
+        """Send one message."""
         content = msgspec.msgpack.encode(message)
         self._socket.settimeout(None)
         self._socket.sendall(len(content).to_bytes(_LENGTH, "big") + content)
 
     def receive(self, timeout_s: float | None) -> bytes | None:
-        """The next message; ``None`` when it was not there in time.
+        """The next message; ``None`` after the timeout.
 
         Raises:
-            EOFError: The other side has gone.
+            EOFError: The peer closed the connection.
         """
         self._socket.settimeout(timeout_s)
         while True:
-            length = _LENGTH + int.from_bytes(self._heard[:_LENGTH], "big")
-            if len(self._heard) >= max(length, _LENGTH + 1):
-                content, self._heard = self._heard[_LENGTH:length], self._heard[length:]
+            length = _LENGTH + int.from_bytes(self._buffer[:_LENGTH], "big")
+            if len(self._buffer) >= max(length, _LENGTH + 1):
+                content, self._buffer = self._buffer[_LENGTH:length], self._buffer[length:]
                 return content
             try:
-                heard = self._socket.recv(1 << 16)
+                received = self._socket.recv(1 << 16)
             except TimeoutError:
                 return None
             except OSError as error:
                 raise EOFError from error
-            if not heard:
+            if not received:
                 raise EOFError
-            self._heard += heard
+            self._buffer += received
 
     def close(self) -> None:
-        """Let go."""
+        """Close the socket."""
         self._socket.close()
 
 
 class _Process:
-    """The process, while there is one."""
+    """The planner process, if it runs."""
 
     def __init__(self) -> None:
         self.running: subprocess.Popen[bytes] | None = None
-        self.link: Link | None = None
+        self.link: MessageSocket | None = None
 
-    def begin(self, site: Site) -> Link:
-        """Start it unless it runs.
+    def start(self, scene: PlannerScene) -> MessageSocket:
+        """Start the process unless it runs.
 
         Raises:
             PlannerLostError: It cannot be started.
         """
         if self.link is not None and self.running is not None and self.running.poll() is None:
             return self.link
-        self.end()
-        ours, theirs = socket.socketpair()
-        with theirs:
+        self.stop()
+        own_end, child_end = socket.socketpair()
+        with child_end:
             try:
                 self.running = subprocess.Popen(
                     [sys.executable, "-m", "device_agent.geometry.planner_worker"],
-                    stdin=theirs.fileno(),
+                    stdin=child_end.fileno(),
                     stdout=subprocess.DEVNULL,
                     env=os.environ | {"PYTHONPATH": str(_ROOT)},
                     start_new_session=True,
                 )
             except OSError as error:
-                ours.close()
-                raise PlannerLostError(f"the program that looks for ways does not start: {error}") from error
-        self.link = Link(ours)
-        self.link.send(site)
+                own_end.close()
+                raise PlannerLostError(f"the planner process does not start: {error}") from error
+        self.link = MessageSocket(own_end)
+        self.link.send(scene)
         return self.link
 
-    def end(self) -> int:
-        """Kill it, if it runs; gives how it ended."""
+    def stop(self) -> int:
+        """Kill the process if it runs; returns its exit code."""
         running, link, self.running, self.link = self.running, self.link, None, None
         if link is not None:
             link.close()
@@ -165,18 +164,18 @@ class _Process:
         return running.wait()
 
 
-class PlanningProcess:
-    """Plans for one robot in its scene, elsewhere. Thread-safe: one plan after the other.
+class PlannerProcess:
+    """Plans for one robot in its scene. Thread-safe; requests run one after the other.
 
     Args:
-        site: What to plan in.
+        scene: The scene.
     """
 
-    def __init__(self, site: Site) -> None:
-        self._site = site
-        self._one = threading.Lock()
+    def __init__(self, scene: PlannerScene) -> None:
+        self._scene = scene
+        self._lock = threading.Lock()
         self._process = _Process()
-        weakref.finalize(self, self._process.end)
+        weakref.finalize(self, self._process.stop)
 
     def plan(
         self,
@@ -187,36 +186,35 @@ class PlanningProcess:
         within_s: float,
         ended: Callable[[], bool],
     ) -> tuple[tuple[float, ...], ...]:
-        """See ``Geometry.plan``."""
-        order = Order(start_rad=tuple(start_rad), goal_rad=tuple(goal_rad), seed=seed, within_s=within_s)
-        with self._one:
+        """See ``RobotGeometry.plan``."""
+        request = PlanRequest(start_rad=tuple(start_rad), goal_rad=tuple(goal_rad), seed=seed, within_s=within_s)
+        with self._lock:
             if ended():
-                raise GeometryError(NOBODY)
+                raise GeometryError(CANCELLED)
             try:
-                answer = self._ask(order, ended)
+                response = self._request(request, ended)
             except BaseException:
-                self._process.end()
+                self._process.stop()
                 raise
-        if answer.error:
-            raise GeometryError(answer.error)
-        return answer.corners_rad
+        if response.error:
+            raise GeometryError(response.error)
+        return response.corners_rad
 
-    def _ask(self, order: Order, ended: Callable[[], bool]) -> Answer:
-        until_s = time.monotonic() + order.within_s + _SLOW_S
+    def _request(self, request: PlanRequest, ended: Callable[[], bool]) -> PlanResponse:
+        until_s = time.monotonic() + request.within_s + _STARTUP_S
         try:
-            link = self._process.begin(self._site)
-            link.send(order)
-            while (heard := link.receive(_LOOK_S)) is None:
+            link = self._process.start(self._scene)
+            link.send(request)
+            while (received := link.receive(_POLL_S)) is None:
                 if ended():
-                    raise GeometryError(NOBODY)
+                    raise GeometryError(CANCELLED)
                 if time.monotonic() > until_s:
-                    raise PlannerLostError("the program that looks for ways does not answer; try again")
+                    raise PlannerLostError("the planner process does not respond; try again")
         except (EOFError, OSError) as error:
-            how = _how(self._process.end())
-            raise PlannerLostError(f"the program that looks for ways has ended ({how}); try again") from error
-        return msgspec.msgpack.decode(heard, type=Answer)
+            reason = _exit_reason(self._process.stop())
+            raise PlannerLostError(f"the planner process has ended ({reason}); try again") from error
+        return msgspec.msgpack.decode(received, type=PlanResponse)
 
 
-def _how(code: int) -> str:
-    """How a process ended."""
+def _exit_reason(code: int) -> str:
     return f"signal {signal.Signals(-code).name}" if code < 0 else f"code {code}; see the agent's log"

@@ -1,4 +1,4 @@
-"""The process that plans for an agent (``planning``): its standard input is a socket to it. Not for people."""
+"""The planner process (see ``planner_process``); its standard input is a socket to the agent."""
 
 import os
 import queue
@@ -8,50 +8,50 @@ import threading
 import msgspec
 
 from device_agent.geometry.mujoco_geometry import MujocoGeometry
-from device_agent.geometry.planner_process import Answer, Link, Order, Site
+from device_agent.geometry.planner_process import MessageSocket, PlannerScene, PlanRequest, PlanResponse
 from device_agent.ports.geometry import GeometryError
 
 _NICE = 10
-"""The agent's control loops go first where there are few cores."""
+"""The agent's control loops have priority."""
 
 
 def main() -> None:
-    """Serve until the agent goes."""
+    """Serve requests until the agent closes the socket."""
     os.nice(_NICE)
-    link = Link(socket.socket(fileno=0))
-    orders: queue.SimpleQueue[Order] = queue.SimpleQueue()
-    site = msgspec.msgpack.decode(_heard(link), type=Site)
-    threading.Thread(target=_listen, args=(link, orders), daemon=True).start()
-    shape, wrong = None, ""
+    link = MessageSocket(socket.socket(fileno=0))
+    requests: queue.SimpleQueue[PlanRequest] = queue.SimpleQueue()
+    scene = msgspec.msgpack.decode(_receive(link), type=PlannerScene)
+    threading.Thread(target=_listen, args=(link, requests), daemon=True).start()
+    geometry, error_text = None, ""
     try:
-        shape = MujocoGeometry(site.robot_type, site.scene_path, standing=site.room)
+        geometry = MujocoGeometry(scene.robot_type, scene.scene_path, base_pose=scene.room)
     except GeometryError as error:
-        wrong = str(error)
+        error_text = str(error)
     while True:
-        order = orders.get()
-        link.send(Answer(error=wrong) if shape is None else _answer(shape, order))
+        request = requests.get()
+        link.send(PlanResponse(error=error_text) if geometry is None else _respond(geometry, request))
 
 
-def _listen(link: Link, orders: queue.SimpleQueue[Order]) -> None:
-    """Also while a way is looked for: nobody is left to look for when the agent has gone."""
+def _listen(link: MessageSocket, requests: queue.SimpleQueue[PlanRequest]) -> None:
+    """Receive requests during planning, too, so that the process exits as soon as the agent does."""
     while True:
-        orders.put(msgspec.msgpack.decode(_heard(link), type=Order))
+        requests.put(msgspec.msgpack.decode(_receive(link), type=PlanRequest))
 
 
-def _heard(link: Link) -> bytes:
+def _receive(link: MessageSocket) -> bytes:
     try:
-        heard = link.receive(None)
+        content = link.receive(None)
     except EOFError:
         os._exit(0)
-    return heard or b""
+    return content or b""
 
 
-def _answer(shape: MujocoGeometry, order: Order) -> Answer:
+def _respond(geometry: MujocoGeometry, request: PlanRequest) -> PlanResponse:
     try:
-        corners = shape.plan_here(order.start_rad, order.goal_rad, seed=order.seed, within_s=order.within_s)
+        corners = geometry.plan_here(request.start_rad, request.goal_rad, seed=request.seed, within_s=request.within_s)
     except GeometryError as error:
-        return Answer(error=str(error))
-    return Answer(corners_rad=corners)
+        return PlanResponse(error=str(error))
+    return PlanResponse(corners_rad=corners)
 
 
 main()

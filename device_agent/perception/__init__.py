@@ -1,1 +1,1 @@
-"""What a room's sensors say together: where things stand, who moves where. NumPy alone; no simulation, no driver."""
+"""Occupancy grid, object tracking and sensor fusion of a room."""

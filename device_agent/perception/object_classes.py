@@ -1,4 +1,4 @@
-"""Whom a room may hold, and how to tell them apart by what sensors see."""
+"""Classes of objects in a room, and how sensors distinguish them."""
 
 import math
 from dataclasses import dataclass
@@ -7,16 +7,16 @@ from msgspec import Struct
 
 
 class ObjectClass(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Somebody who stands on the floor and may move.
+    """Objects that stand on the floor and may move.
 
     Attributes:
-        name: As the positions call it; of several at a time the others are ``person_2``, ``person_3`` …
-        lowest_m: How high it is at least, sitting or crouching [m]; ``highest_m``: at most. Kinds may overlap: where
-            they do, it tells them apart where each was last, and began.
-        radius_m: From its middle to the side that sensors see [m].
-        fastest_m_s: How fast it goes [m/s]; it gets there in about a second.
+        name: Name in the positions; further objects of the class are ``person_2``, ``person_3`` …
+        lowest_m: Smallest height, sitting or crouching [m]; ``highest_m``: largest height. Ranges may overlap; then the
+            last or start position decides.
+        radius_m: From the centre to the visible surface [m].
+        fastest_m_s: Maximum speed [m/s], reached within about a second.
         several: Whether there may be more than one.
-        start_m: x, y where it was put at the beginning [m]; ``None`` where nobody knows.
+        start_m: Initial x, y [m]; ``None`` if unknown.
     """
 
     name: str
@@ -29,27 +29,27 @@ class ObjectClass(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def __post_init__(self) -> None:
         if not 0 <= self.lowest_m < self.highest_m or self.radius_m < 0 or self.fastest_m_s <= 0:
-            raise ValueError(f"'{self.name}': its heights rise from 0 on, its radius and speed are above 0")
+            raise ValueError(f"'{self.name}': heights must increase from 0, radius and speed must be above 0")
 
     def misfit(self, height_m: float) -> float:
-        """How far a height is from the middle of its own, as a share of half their range: up to 1 it fits."""
+        """Deviation of a height from the middle of the range, relative to half the range; up to 1 it fits."""
         middle, half = (self.lowest_m + self.highest_m) / 2, (self.highest_m - self.lowest_m) / 2
         return abs(height_m - middle) / half
 
     def beyond_m(self, height_m: float) -> float:
-        """How far a height is outside of its own [m]; negative inside."""
+        """Distance of a height from the range [m]; negative inside."""
         return max(self.lowest_m - height_m, height_m - self.highest_m)
 
 
 class Mount(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A robot that is fixed to something, and moves above it.
+    """A robot with a fixed base.
 
     Attributes:
-        name: As the positions call it.
-        lowest_m: Of the part that never moves, its base: from here [m]; ``highest_m``: to here.
-        radius_m: From the base's middle to the side that sensors see [m].
-        near_m: x, y where it was said to stand [m]: tells which of several it is, never where it is.
-        reach_m: What belongs to it is not further from there [m].
+        name: Name in the positions.
+        lowest_m: Height of the base's lower end [m]; ``highest_m``: of its upper end.
+        radius_m: From the base's centre to the visible surface [m].
+        near_m: Nominal x, y [m]: identifies the robot; its position is measured.
+        reach_m: Largest distance of the robot's points from the nominal position [m].
     """
 
     name: str
@@ -61,18 +61,18 @@ class Mount(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if not 0 <= self.lowest_m < self.highest_m or self.radius_m < 0 or self.reach_m <= 0:
-            raise ValueError(f"'{self.name}': its heights rise from 0 on, its radius and reach are above 0")
+            raise ValueError(f"'{self.name}': heights must increase from 0, radius and reach must be above 0")
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where somebody is.
+class ObjectPosition:
+    """Position of an object.
 
     Attributes:
         x_m: In the room [m]; ``y_m``: the same.
-        age_s: Since a sensor last saw it [s].
-        yaw_rad: Where it goes, or last went; ``None`` before its first step. Who drives backwards looks the other way.
-        speed_m_s: Over the floor [m/s].
+        age_s: Time since the last detection [s].
+        yaw_rad: Direction of its last motion; ``None`` before the first one. Opposite to the heading in reverse.
+        speed_m_s: Horizontal speed [m/s].
     """
 
     x_m: float
@@ -83,5 +83,5 @@ class Place:
 
     @property
     def finite(self) -> bool:
-        """Whether all of it is a number."""
+        """Whether all values are finite."""
         return all(map(math.isfinite, (self.x_m, self.y_m, self.age_s, self.yaw_rad or 0.0, self.speed_m_s)))

@@ -1,7 +1,7 @@
 """Drivers of room devices, one folder each, found by name.
 
-As with robots' drivers: built-in ones stand in a table of import paths and are imported when asked for; third parties
-add theirs by the entry point group ``telescope.sensors``; the entry point is a ``Factory``.
+Built-in drivers are listed with their import paths and imported on first use. Third parties register a ``Factory`` in
+the entry point group ``telescope.sensors``.
 """
 
 from collections.abc import Mapping
@@ -19,11 +19,11 @@ _BUILT_IN: Mapping[str, str] = {
     "mujoco": "device_agent.sensors.mujoco",
     "perception": "device_agent.sensors.perception",
 }
-"""Name → module that has ``create``."""
+"""Name → module that defines ``create``."""
 
 
 class Factory(Protocol):
-    """Makes the driver of one room device. Opens nothing: that is ``RoomDriver.connect``."""
+    """Creates the driver of one room device; ``RoomDriver.connect`` opens the hardware."""
 
     def __call__(self, device: RoomDeviceManifest, folder: Path, surroundings: Surroundings) -> RoomDriver:
         """The driver of one room device.
@@ -31,25 +31,25 @@ class Factory(Protocol):
         Args:
             device: Its entry in the room's manifest, with its ``options``.
             folder: The room's folder; paths in the manifest are relative to it.
-            surroundings: The agent's other room drivers, and the simulated world where there is one.
+            surroundings: The agent's other room drivers, and the simulated world if there is one.
 
         Raises:
-            SensorError: An option is unknown or has the wrong type; the text lists the valid ones.
+            SensorError: An option is unknown or has the wrong type; the message lists the valid ones.
         """
 
 
 def names() -> tuple[str, ...]:
-    """All names that ``load`` takes, sorted."""
-    return _KNOWN.names()
+    """All names that ``load`` accepts, sorted."""
+    return _PLUG_INS.names()
 
 
 def load(name: str) -> Factory:
-    """The factory of the driver with this name. A built-in driver wins over an entry point of the same name.
+    """The factory of the driver with this name; built-in drivers take precedence over entry points.
 
     Raises:
-        SensorError: There is no such driver, or a library that it needs is not installed.
+        SensorError: Unknown driver, or a library that it needs is not installed.
     """
-    return _KNOWN.load(name)
+    return _PLUG_INS.load(name)
 
 
-_KNOWN: PlugIns[Factory] = PlugIns(what="sensor driver", group=GROUP, built_in=_BUILT_IN, error=SensorError)
+_PLUG_INS: PlugIns[Factory] = PlugIns(what="sensor driver", group=GROUP, built_in=_BUILT_IN, error=SensorError)

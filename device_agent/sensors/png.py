@@ -1,4 +1,4 @@
-"""Lossless pictures: the few parts of PNG (ISO/IEC 15948) that captures need."""
+"""A minimal PNG encoder (ISO/IEC 15948) for captures."""
 
 import struct
 import zlib
@@ -6,20 +6,20 @@ from typing import Any
 
 _COLOUR, _GREY = 2, 0
 _LEVEL = 4
-"""Of ``zlib``: twice as fast as 6, and a tenth larger."""
+"""``zlib`` level: twice as fast as 6, and 10 % larger."""
 _RGB_DIMENSIONS = 3
 
 
 def encode(image: Any) -> bytes:
-    """An image as PNG: signature, header, one compressed block of rows without filter, end.
+    """An image as PNG: signature, header, one compressed block of unfiltered rows, end.
 
     Args:
-        image: Either colours of 8 bits, shape (height, width, 3), or grey of 8 or 16 bits, shape (height, width).
+        image: 8-bit colours, shape (height, width, 3), or 8- or 16-bit grey, shape (height, width).
     """
     colour = image.ndim == _RGB_DIMENSIONS
     height, width = image.shape[:2]
     if image.dtype.itemsize > 1:
-        image = image.astype(">u2")  # PNG's order of bytes
+        image = image.astype(">u2")  # PNG is big-endian
     rows = b"".join(b"\0" + row.tobytes() for row in image)
     header = struct.pack(">IIBBBBB", width, height, 8 * image.dtype.itemsize, _COLOUR if colour else _GREY, 0, 0, 0)
     parts = ((b"IHDR", header), (b"IDAT", zlib.compress(rows, _LEVEL)), (b"IEND", b""))

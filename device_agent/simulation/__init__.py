@@ -1,1 +1,1 @@
-"""Simulation."""
+"""Real-time MuJoCo simulation of robots and rooms."""

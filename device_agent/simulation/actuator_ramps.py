@@ -1,4 +1,4 @@
-"""The newest command of each driver of a world, and how its actuators go there: in a straight line, without a jump."""
+"""Linear interpolation from each driver's last actuator command to its newest one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from device_agent.simulation.snapshot import Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class _Command:
-    """A target [rad or m] for some actuators, to be reached in a straight line within ``ramp_s``."""
+    """A target [rad or m] for some actuators, reached linearly within ``ramp_s``."""
 
     actuators: Ints
     target: Floats
@@ -24,46 +24,46 @@ class _Ramp:
     remaining_s: float
 
 
-class Ramps:
-    """Handed in by any thread, followed by the world's."""
+class ActuatorRamps:
+    """The newest command of each driver. Any thread submits commands; the world's thread follows them."""
 
     def __init__(self) -> None:
         self._commands: dict[str, _Command] = {}
         self._ramps: dict[str, _Ramp] = {}
 
-    def command(self, who: str, actuators: Ints, target: Sequence[float] | Floats, ramp_s: float) -> None:
-        """Put the newest target of one driver in the place of its last. Never blocks."""
-        self._commands[who] = _Command(actuators, np.array(target, dtype=np.float64), ramp_s)
+    def command(self, driver: str, actuators: Ints, target: Sequence[float] | Floats, ramp_s: float) -> None:
+        """Replace the driver's target. Never blocks."""
+        self._commands[driver] = _Command(actuators, np.array(target, dtype=np.float64), ramp_s)
 
     def clear(self) -> None:
-        """Forget all of them."""
+        """Discard all commands."""
         self._commands.clear()
         self._ramps.clear()
 
     def targets(self, ctrl: Floats) -> Floats:
-        """Where each actuator shall go in the end; without a command where it is, shape (nu,)."""
+        """Final target of each actuator, shape (nu,); the current control where there is no command."""
         target: Floats = ctrl.copy()
         for command in list(self._commands.values()):
             target[command.actuators] = command.target
         return target
 
-    def take(self, ctrl: Floats) -> list[_Ramp]:
-        """Begin with what is new; those that are not there yet."""
-        for who, command in list(self._commands.items()):
-            ramp = self._ramps.get(who)
+    def update(self, ctrl: Floats) -> list[_Ramp]:
+        """Start ramps for new commands; return the unfinished ramps."""
+        for driver, command in list(self._commands.items()):
+            ramp = self._ramps.get(driver)
             if ramp is None or ramp.command is not command:
-                there = np.array_equal(ctrl[command.actuators], command.target)
-                self._ramps[who] = _Ramp(command, 0.0 if there else max(command.ramp_s, TIMESTEP_S))
+                reached = np.array_equal(ctrl[command.actuators], command.target)
+                self._ramps[driver] = _Ramp(command, 0.0 if reached else max(command.ramp_s, TIMESTEP_S))
         return [ramp for ramp in self._ramps.values() if ramp.remaining_s > 0]
 
 
-def controls(ramps: Sequence[_Ramp], ctrl: Floats, count: int) -> Floats:
+def control_rows(ramps: Sequence[_Ramp], ctrl: Floats, count: int) -> Floats:
     """Follow the ramps for some steps.
 
     Args:
-        ramps: They know then that they have been followed.
-        ctrl: The controls of now, shape (nu,).
-        count: Of the steps.
+        ramps: Advanced in place.
+        ctrl: Current controls, shape (nu,).
+        count: Number of steps.
 
     Returns:
         The controls of each step, shape (count, nu).

@@ -1,4 +1,4 @@
-"""A file of faults for something simulated, looked at again and again: whoever may write there can make it ill."""
+"""A file of injected faults that is re-read when it changes."""
 
 import logging
 import tomllib
@@ -17,38 +17,38 @@ _log = logging.getLogger(__name__)
 
 
 class FaultFile(Generic[T]):
-    """The file; it need not be there, and may come, change and go.
+    """The file. It may be missing, and may be created, changed or deleted at any time.
 
     Args:
-        path: Where it may be; ``None``: nowhere.
-        read: Makes something of its text, and of none where it is not there.
+        path: The file; ``None`` disables polling.
+        read: Parses its text; receives an empty text when the file is missing.
 
     Attributes:
-        seen: Time and size of what was read last; zeros for none.
+        version: Modification time and size of the content read last; zeros for a missing file.
     """
 
     def __init__(self, path: Path | None, read: Callable[[str], T]) -> None:
         self._path = path
         self._read = read
-        self.seen = (0, 0)
+        self.version = (0, 0)
 
-    def news(self) -> T | None:
-        """What it says now, when that has changed; a wrong file changes nothing, and is logged."""
+    def poll(self) -> T | None:
+        """The parsed content if the file has changed, else ``None``. An invalid file is logged and ignored."""
         if self._path is None:
             return None
         try:
             stat = self._path.stat()
-            seen, text = (stat.st_mtime_ns, stat.st_size), ""
-            if seen != self.seen:
+            version, text = (stat.st_mtime_ns, stat.st_size), ""
+            if version != self.version:
                 text = self._path.read_text(encoding="utf-8")
         except FileNotFoundError:
-            seen, text = (0, 0), ""
+            version, text = (0, 0), ""
         except (OSError, UnicodeDecodeError) as error:
             _log.warning("%s: %s", self._path, error)
             return None
-        if seen == self.seen:
+        if version == self.version:
             return None
-        self.seen = seen
+        self.version = version
         try:
             return self._read(text)
         except ProtocolError as error:
@@ -57,12 +57,12 @@ class FaultFile(Generic[T]):
 
 
 def read(text: str, kind: type[S]) -> S:
-    """What a file's text says.
+    """Parse a fault file.
 
     Raises:
-        ProtocolError: Not TOML, or a field is unknown or wrong; the text lists those there are.
+        ProtocolError: Not TOML, or a field is unknown or invalid; the message lists the valid fields.
     """
     try:
         return msgspec.convert(tomllib.loads(text), kind)
     except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-        raise ProtocolError(f"{error}; there are: {', '.join(kind.__struct_fields__)}") from error
+        raise ProtocolError(f"{error}; valid fields: {', '.join(kind.__struct_fields__)}") from error

@@ -1,4 +1,4 @@
-"""A world from its parts: a scene, the robots placed in it, everybody at home."""
+"""Builds a world from a scene and robots placed in it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import mujoco
 
 from device_agent.ports.driver import DriverError
 from device_agent.simulation.mjcf.equality_joints import EqualityJoints
-from device_agent.simulation.mjcf.options import agree
+from device_agent.simulation.mjcf.options import copy_options
 
 TIMESTEP_S = 0.002
 SCALAR_JOINTS = frozenset({int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)})
@@ -18,13 +18,13 @@ SCALAR_JOINTS = frozenset({int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Placement:
-    """One robot put into a scene.
+    """One robot placed in a scene.
 
     Attributes:
-        prefix: Put before every name of the robot's model, ``arm/`` for example; unique in its world.
+        prefix: Prepended to every name of the robot's model, for example ``arm/``; unique in its world.
         model: MJCF file of the robot alone.
-        position_m: Of the robot's origin in the world [m]. A robot that stands on a free joint starts there.
-        quaternion: Of the robot in the world (w, x, y, z).
+        position_m: Robot origin in the world [m]. A robot on a free joint starts there.
+        quaternion: Robot orientation in the world (w, x, y, z).
     """
 
     prefix: str
@@ -37,37 +37,37 @@ def assemble(scene: Path, robots: Sequence[Placement]) -> Any:
     """The compiled ``MjModel`` of a scene with robots in it.
 
     Raises:
-        DriverError: A file is missing or MuJoCo refuses it.
+        DriverError: A file is missing or MuJoCo rejects it.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(scene))
         # One world has one time step and one integrator; the robots' servos are tuned for this pair.
         spec.option.timestep = TIMESTEP_S
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        # A diverged world must stop and say so. MuJoCo's own answer is to jump back to the start.
+        # A diverged world must stop with a fault. By default MuJoCo resets it to the start.
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         for robot in robots:
             frame = spec.worldbody.add_frame(pos=robot.position_m, quat=robot.quaternion)
             model = mujoco.MjSpec.from_file(str(robot.model))
-            agree(model.option, spec.option)
-            agree(model.visual, spec.visual)
+            copy_options(model.option, spec.option)
+            copy_options(model.visual, spec.visual)
             spec.attach(model, prefix=robot.prefix, frame=frame)
         return spec.compile()
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise DriverError(f"{scene}: MuJoCo cannot build this world: {error}") from error
 
 
-def at_home(model: Any, home: Mapping[str, float], settings: Mapping[str, float], *, scene: Path) -> Any:
-    """A fresh state: joints at home, every position servo holding where its joint starts.
+def home_state(model: Any, home: Mapping[str, float], settings: Mapping[str, float], *, scene: Path) -> Any:
+    """A new state: joints at home, every position servo holding its joint's start position.
 
     Args:
         model: ``MjModel``.
-        home: Full joint name → position [rad or m]; others start at the model's reference.
-        settings: Actuator's name → where its joint starts [rad or m]; other names are left alone.
-        scene: For the error's text.
+        home: Full joint name → position [rad or m]; other joints start at the model's reference.
+        settings: Actuator name → start position of its joint [rad or m]; unknown names are ignored.
+        scene: For error messages.
 
     Raises:
-        DriverError: ``home`` names a joint that is not there.
+        DriverError: ``home`` names an unknown joint.
     """
     data = mujoco.MjData(model)
     for name, position in home.items():
@@ -80,7 +80,7 @@ def at_home(model: Any, home: Mapping[str, float], settings: Mapping[str, float]
         actuator = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
         if actuator >= 0:
             data.qpos[model.jnt_qposadr[model.actuator_trnid[actuator, 0]]] = position
-    EqualityJoints(model).settle(data.qpos)
+    EqualityJoints(model).apply(data.qpos)
     for actuator in range(model.nu):
         joint = model.actuator_trnid[actuator, 0]
         by_joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)

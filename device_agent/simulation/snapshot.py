@@ -1,4 +1,4 @@
-"""What a world looked like at one moment."""
+"""The state of a world at one moment."""
 
 import time
 from collections.abc import Mapping
@@ -14,22 +14,22 @@ Ints = npt.NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Snapshot:
-    """The world after a group of steps, all of one moment. The arrays are read-only copies.
+    """The world after a group of steps. The arrays are read-only copies.
 
     Attributes:
         time_s: Simulated time [s].
-        taken_s: ``time.monotonic()`` when it was taken [s].
+        taken_s: ``time.monotonic()`` of the snapshot [s].
         qpos: Generalised positions, shape (nq,).
         qvel: Generalised velocities, shape (nv,).
-        effort: Torque or force of the motors at each degree of freedom with what holds it against gravity, (nv,).
-        ctrl: What the actuators follow, shape (nu,).
-        body_position_m: Of each body in the world, shape (nbody, 3) [m].
-        body_quaternion: Of each body in the world, shape (nbody, 4).
-        site_position_m: Of each site in the world, shape (nsite, 3) [m].
-        mocap_position_m: Of what is moved by hand rather than by physics, shape (nmocap, 3) [m].
-        mocap_quaternion: The same's orientation, shape (nmocap, 4).
+        effort: Motor torque or force per degree of freedom including gravity compensation, shape (nv,).
+        ctrl: Actuator controls, shape (nu,).
+        body_position_m: Body positions in the world, shape (nbody, 3) [m].
+        body_quaternion: Body orientations in the world, shape (nbody, 4).
+        site_position_m: Site positions in the world, shape (nsite, 3) [m].
+        mocap_position_m: Positions of mocap bodies, shape (nmocap, 3) [m].
+        mocap_quaternion: Orientations of mocap bodies, shape (nmocap, 4).
         lag_ms: Simulated time lost so far because the machine could not keep up [ms].
-        fault: Why the world stands still, empty while it is well.
+        fault: Why the world has stopped; empty while it runs.
     """
 
     time_s: float
@@ -49,19 +49,19 @@ class Snapshot:
 
     @property
     def position_rad(self) -> dict[str, float]:
-        """True position of every hinge [rad] and slide [m] by the joint's full name."""
+        """True position of every hinge [rad] and slide [m] by full joint name."""
         return {name: float(self.qpos[address]) for name, address in self.addresses.items()}
 
 
 def take(data: Any, *, passive_gravity: Floats, addresses: Mapping[str, int], lag_s: float, fault: str) -> Snapshot:
-    """A snapshot of now.
+    """A snapshot of the current state.
 
     Args:
         data: The world's ``MjData``.
-        passive_gravity: Share of gravity compensation that counts beside the motors' work, at each degree of freedom.
-        addresses: Full name of each joint → its place in ``qpos``.
+        passive_gravity: Share of gravity compensation to add to the motor effort, per degree of freedom.
+        addresses: Full joint name → index in ``qpos``.
         lag_s: Simulated time lost so far [s].
-        fault: Why the world stands still.
+        fault: Why the world has stopped.
     """
     arrays = [
         np.array(source)

@@ -1,7 +1,7 @@
-"""Several steps of MuJoCo with controls of their own, in one call.
+"""Several MuJoCo steps with different controls in one call.
 
-Each call of MuJoCo lets other threads have the interpreter, and may wait for it longer than the steps take: with a call
-for each step the laboratory's world, on a slow machine, stepped for a fifth of its time and waited for two.
+Each MuJoCo call releases the interpreter lock and may wait to regain it for longer than the steps take. On a slow
+machine, one call per step made the laboratory world wait twice as long as it computed.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ _USER = mujoco.mjtState.mjSTATE_USER.value
 
 
 class Stepper:
-    """Of one model; what it does is equal, bit by bit, to ``mj_step`` after each row of controls."""
+    """Steps one model; bit-identical to ``mj_step`` after each row of controls."""
 
     def __init__(self, model: Any) -> None:
         self._model = model
@@ -25,18 +25,18 @@ class Stepper:
         self._state = np.empty((1, mujoco.mj_stateSize(model, _PHYSICS)))
         self._user = np.empty(mujoco.mj_stateSize(model, _USER))
 
-    def go(self, data: Any, controls: Floats) -> None:
-        """Advance.
+    def step(self, data: Any, controls: Floats) -> None:
+        """Advance the simulation.
 
         Args:
-            data: Of the model.
-            controls: One row for each step, shape (steps, nu); the last stays.
+            data: ``MjData`` of the model.
+            controls: One row per step, shape (steps, nu); the last row stays in effect.
         """
         count = len(controls)
         mujoco.mj_getState(self._model, data, self._state[0], _PHYSICS)
         mujoco.mj_getState(self._model, data, self._user, _USER)
         inputs = np.tile(self._user, (1, count, 1))
-        inputs[0, :, : self._model.nu] = controls  # the first of the user's part of a state
+        inputs[0, :, : self._model.nu] = controls  # controls come first in the user state
         self._rollout.rollout(
             [self._model],
             [data],

@@ -1,4 +1,4 @@
-"""The ground truth of a world as lines of JSON, for tests that cannot reach into the process."""
+"""Ground truth of a world as JSON lines, for tests outside the process."""
 
 import json
 import logging
@@ -19,21 +19,21 @@ PERIOD_S = 0.01
 
 
 class Trace:
-    """Appends to a file: at each start a line that names the columns, then 100 lines per second of simulated time.
+    """Appends to a file: a header line per start, then 100 lines per second of simulated time.
 
-    The first line has ``joints`` and ``actuators``. Each other has ``tick_ms`` (monotonic clock), ``at_ms`` (wall
+    The header has ``joints`` and ``actuators``. Each other line has ``tick_ms`` (monotonic clock), ``at_ms`` (wall
     clock), ``time_s``, ``lag_ms``, ``qpos`` and ``qvel`` by joint, and by actuator ``target`` (the newest command) and
-    ``ctrl`` (what the actuator follows). Writing is part of stepping: slow disks show as lag, full ones end the trace.
+    ``ctrl`` (the interpolated control). Writing is part of stepping: slow disks appear as lag, full ones end the trace.
     """
 
     def __init__(self, path: Path, model: Any, joints: Sequence[str], *, prefix: str = "") -> None:
-        """Open the file and write the first line.
+        """Open the file and write the header.
 
         Args:
             path: The file.
             model: ``MjModel``.
             joints: Names of all hinges and slides.
-            prefix: Of one robot's joints and actuators: only they are told, without it.
+            prefix: Write only joints and actuators with this prefix, without the prefix.
 
         Raises:
             DriverError: The file cannot be written.
@@ -59,7 +59,7 @@ class Trace:
             raise DriverError(f"cannot write the trace file: {error}") from error
 
     def write(self, snapshot: Snapshot, target: Floats) -> None:
-        """Add a line if one is due."""
+        """Append a line if one is due."""
         if snapshot.time_s < self._next_s or self._file.closed:
             return
         self._next_s = max(self._next_s + PERIOD_S, snapshot.time_s + PERIOD_S / 2)
@@ -76,10 +76,10 @@ class Trace:
         try:
             self._file.write(json.dumps(row) + "\n")
         except OSError as error:
-            log.warning("the trace ends here: %s", error)
+            log.warning("cannot write the trace file; tracing stopped: %s", error)
             self.close()
 
     def close(self) -> None:
-        """End it. May be called twice."""
+        """Close the file. May be called twice."""
         with suppress(OSError):
             self._file.close()

@@ -1,8 +1,7 @@
-"""One MuJoCo world, stepped in real time in a thread of its own, shared by any number of drivers and sensors.
+"""One MuJoCo world, stepped in real time by its own thread and shared by drivers and sensors.
 
-No lock is held while stepping. A driver hands in its newest command by swapping one reference, and reads an immutable
-``Snapshot`` that the thread puts in place after each group of steps. What goes on in it by itself (``Process``) is done
-in the thread before each group.
+No lock is held while stepping. A driver submits its newest command by swapping one reference and reads an immutable
+``Snapshot`` that the thread replaces after each group of steps. The thread runs each ``Process`` before each group.
 """
 
 import logging
@@ -18,8 +17,8 @@ import numpy as np
 
 from device_agent.ports.driver import DriverError
 from device_agent.ports.simulation import Process
-from device_agent.simulation.actuator_ramps import Ramps, controls
-from device_agent.simulation.scene_assembly import SCALAR_JOINTS, TIMESTEP_S, Placement, assemble, at_home
+from device_agent.simulation.actuator_ramps import ActuatorRamps, control_rows
+from device_agent.simulation.scene_assembly import SCALAR_JOINTS, TIMESTEP_S, Placement, assemble, home_state
 from device_agent.simulation.snapshot import Floats, Ints, Snapshot, take
 from device_agent.simulation.stepper import Stepper
 from device_agent.simulation.trace import Trace
@@ -29,15 +28,15 @@ log = logging.getLogger(__name__)
 GROUP_STEPS = 2
 """Steps between two snapshots: half of the shortest control period in use (8 ms)."""
 LATE_STEPS = 4
-"""The same while the world is behind real time by a group: what stands beside the steps is then paid half as often."""
+"""Steps per group while the world is behind real time by a group; halves the overhead per step."""
 MAX_CATCH_UP_S = 0.1
-"""Furthest that simulated time may fall behind before it slips."""
+"""Largest delay that the simulation catches up; beyond it, simulated time is lost."""
 STALE_S = 2.0
 """Age at which a snapshot of a running world means that its thread hangs."""
 WARN_EVERY_S = 10.0
 _STOP_TIMEOUT_S = 5.0
 _SET_S = 3.0
-"""Time in which something of the room goes through the whole of its range: a door, blinds, a camera that turns."""
+"""Time in which a room actuator (door, blinds, pan-tilt camera) crosses its whole range."""
 _DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_BADCTRL")
 
 
@@ -45,8 +44,8 @@ class World:
     """A scene and the robots placed in it.
 
     ``open`` and ``close`` count users: the first ``open`` compiles the model and starts real time, the last ``close``
-    stops it, and a later ``open`` goes on where it stopped. For tests, ``build`` then ``step`` drive it by hand; the
-    same commands then give the same numbers.
+    stops it, and a later ``open`` resumes. In tests, call ``build`` and then ``step``; equal commands then give equal
+    numbers.
     """
 
     def __init__(
@@ -58,14 +57,14 @@ class World:
         settings: Mapping[str, float] | None = None,
         trace: Path | None = None,
     ) -> None:
-        """Describe a world; nothing is read before ``build`` or ``open``.
+        """Describe a world; no file is read before ``build`` or ``open``.
 
         Args:
-            scene: MJCF file. It may hold a robot already.
-            robots: Robots to put into it.
-            home: Full joint name → position [rad or m] at the start; others start at the model's reference.
-            settings: What the room is set to at the start.
-            trace: File to append the truth to, see ``Trace``.
+            scene: MJCF file. It may already contain a robot.
+            robots: Robots to place in it.
+            home: Full joint name → start position [rad or m]; other joints start at the model's reference.
+            settings: Initial settings of the room.
+            trace: File for the ground truth, see ``Trace``.
         """
         self._scene = scene
         self._robots = tuple(robots)
@@ -85,16 +84,16 @@ class World:
         self._data: Any = None
         self._stepper: Stepper
         self._snapshot: Snapshot | None = None
-        self._ramps = Ramps()
+        self._ramps = ActuatorRamps()
         self._addresses: dict[str, int] = {}
         self._passive_gravity = np.zeros(0)
         self._lag_s = 0.0
         self._fault = ""
 
-    # ------------------------------------------------------------ life
+    # ------------------------------------------------------------ lifecycle
 
     def open(self) -> None:
-        """Take part; the first to do so starts real time.
+        """Register a user; the first one starts real time.
 
         Raises:
             DriverError: The model cannot be read or compiled, or the trace file cannot be written.
@@ -102,40 +101,40 @@ class World:
         with self._life:
             self.build()
             if self._thread is None:
-                self._begin()
+                self._start_thread()
             self._users += 1
 
     def close(self) -> None:
-        """Leave; the last to do so stops real time. One call for each ``open``."""
+        """Unregister a user; the last one stops real time. One call for each ``open``."""
         with self._life:
             self._users = max(0, self._users - 1)
             if not self._users:
-                self._end()
+                self._stop_thread()
 
     def build(self) -> None:
-        """Compile the model and put every robot at home. Does nothing when that has been done.
+        """Compile the model and put every robot at home. Does nothing if already built.
 
         Raises:
-            DriverError: A file is missing or MuJoCo refuses it, or ``home`` names a joint that is not there.
+            DriverError: A file is missing or MuJoCo rejects it, or ``home`` names an unknown joint.
         """
         if self._model is not None:
             return
-        # Else MuJoCo writes its warnings into a file in whatever folder the agent was started.
+        # Otherwise MuJoCo writes warnings to a file in the working folder.
         mujoco.set_mju_user_warning(_warn)
         model = assemble(self._scene, self._robots)
-        data = at_home(model, self._home, self._start, scene=self._scene)
+        data = home_state(model, self._home, self._start, scene=self._scene)
         self._addresses = {
             model.joint(index).name: int(model.jnt_qposadr[index])
             for index in range(model.njnt)
             if model.jnt_type[index] in SCALAR_JOINTS
         }
-        # Gravity compensation that the model does not already count as the motors' work.
+        # Gravity compensation that the model does not already count as motor effort.
         self._passive_gravity = np.where(model.jnt_actgravcomp[model.dof_jntid], 0.0, 1.0)
         self._model, self._data, self._stepper = model, data, Stepper(model)
         self._publish()
 
     def recover(self) -> None:
-        """Begin again after a fault, with every robot at home. Does nothing in a world that is well.
+        """Restart after a fault, with every robot at home. Does nothing without a fault.
 
         Raises:
             DriverError: As for ``open``.
@@ -144,22 +143,22 @@ class World:
             if not self._fault:
                 return
             running = self._thread is not None
-            self._end()
+            self._stop_thread()
             time_s = self.snapshot().time_s
             self._ramps.clear()
             self._settings = dict(self._start)
-            self._data = at_home(self._model, self._home, self._start, scene=self._scene)
-            self._data.time = time_s  # time only ever rises
+            self._data = home_state(self._model, self._home, self._start, scene=self._scene)
+            self._data.time = time_s  # simulated time never decreases
             self._fault = ""
             self._publish()
             if running:
-                self._begin()
+                self._start_thread()
 
     # ------------------------------------------------------------ for drivers and tests
 
     @property
     def model(self) -> Any:
-        """The compiled ``MjModel``, to look names up in. Do not write to it.
+        """The compiled ``MjModel``, read-only.
 
         Raises:
             DriverError: Not built yet.
@@ -170,11 +169,11 @@ class World:
 
     @property
     def shared(self) -> bool:
-        """Whether robots were placed into the scene, rather than standing in a scene of their own."""
+        """Whether robots were placed into the scene, instead of being part of it."""
         return bool(self._robots)
 
     def snapshot(self) -> Snapshot:
-        """The newest snapshot. Costs one reference.
+        """The newest snapshot, without copying.
 
         Raises:
             DriverError: Not built yet.
@@ -183,23 +182,22 @@ class World:
             raise DriverError("the world is not built; open it first")
         return self._snapshot
 
-    def command(self, who: str, actuators: Ints, target: Sequence[float] | Floats, *, ramp_s: float = 0.0) -> None:
-        """Hand in the newest target of one driver; the one before is dropped. Never blocks.
+    def command(self, driver: str, actuators: Ints, target: Sequence[float] | Floats, *, ramp_s: float = 0.0) -> None:
+        """Replace the target of one driver. Never blocks.
 
         Args:
-            who: The driver; each has one command at a time.
+            driver: Name of the driver; each has one command at a time.
             actuators: Indices of its actuators, shape (n,).
-            target: Where they shall go, shape (n,) [rad or m].
-            ramp_s: Time in which to get there in a straight line, so that a target every control period gives an
-                even motion rather than steps [s].
+            target: Their targets, shape (n,) [rad or m].
+            ramp_s: Time for a linear approach, so that one target per control period gives smooth motion [s].
         """
-        self._ramps.command(who, actuators, target, ramp_s)
+        self._ramps.command(driver, actuators, target, ramp_s)
 
     def trace(self, path: Path, *, prefix: str) -> None:
-        """Append the truth of one robot to a file while the world runs; its joints are those with this prefix.
+        """Append the ground truth of one robot to a file; its joints have this prefix.
 
         Raises:
-            DriverError: The world runs already, and the file cannot be written.
+            DriverError: The world is running and the file cannot be written.
         """
         with self._life:
             if path in self._trace_files:
@@ -211,16 +209,16 @@ class World:
     # ------------------------------------------------------------ for the room
 
     def add(self, process: Process) -> None:
-        """Have something go on in it, from the next group of steps."""
+        """Run a process from the next group of steps on."""
         self._processes = (*self._processes, process)
 
     def copy(self, into: Any) -> None:
-        """The newest snapshot as an ``MjData`` of the caller's own, with the poses of all that can be seen.
+        """Copy the newest snapshot, with the poses of all visible objects, into the caller's ``MjData``.
 
         Contacts and sensors are not computed.
 
         Raises:
-            DriverError: Not built yet, or the simulation has stopped; the text says why.
+            DriverError: Not built yet, or the simulation has stopped; the message gives the reason.
         """
         snapshot = self.snapshot()
         if snapshot.fault:
@@ -234,23 +232,23 @@ class World:
 
     @property
     def quantities(self) -> Mapping[str, float]:
-        """What has no place in MuJoCo's state, the newest of each."""
+        """The newest value of each quantity outside MuJoCo's state."""
         return self._quantities
 
-    def tell(self, quantities: Mapping[str, float]) -> None:
-        """Put new values of some quantities in place. For processes."""
+    def set_quantities(self, quantities: Mapping[str, float]) -> None:
+        """Replace some quantities. Called by processes."""
         self._quantities = {**self._quantities, **quantities}
 
     @property
     def settings(self) -> Mapping[str, float]:
-        """What was ``set`` last."""
+        """The last ``set`` value of each setting."""
         return self._settings
 
     def set(self, name: str, value: float) -> float:
-        """Set something of the room; an actuator of its model goes there at its own pace.
+        """Set a room setting; the model's actuator of this name moves there at a limited speed.
 
         Raises:
-            DriverError: Not finite.
+            DriverError: The value is not finite.
         """
         if not math.isfinite(value):
             raise DriverError(f"'{name}' cannot be set to a number that is not finite")
@@ -265,23 +263,23 @@ class World:
 
     @property
     def sounds(self) -> Mapping[str, tuple[float, float]]:
-        """What is or was to be heard: level a metre away [dB], and until when [s of simulated time]."""
+        """Source → level at 1 m [dB] and end in simulated time [s]."""
         return self._sounds
 
     def sound(self, name: str, level_db: float, *, for_s: float) -> None:
-        """Let something be heard from now on; the same name again takes its place."""
+        """Start a sound; it replaces an earlier one of the same name."""
         self._sounds[name] = (level_db, self.snapshot().time_s + for_s)
 
-    # ------------------------------------------------------------ by hand
+    # ------------------------------------------------------------ manual stepping
 
     def step(self, count: int) -> Snapshot:
-        """Advance by ``count`` steps of 2 ms, by hand.
+        """Advance by ``count`` steps of 2 ms without real time.
 
         Raises:
             DriverError: Not built, running in real time, or diverged (see ``Snapshot.fault``).
         """
         if self._thread is not None:
-            raise DriverError("the world runs in real time; step is for a world driven by hand")
+            raise DriverError("the world runs in real time and cannot be stepped manually")
         _ = self.model
         while count > 0:
             self._advance(min(count, GROUP_STEPS))
@@ -293,7 +291,7 @@ class World:
 
     # ------------------------------------------------------------ stepping
 
-    def _begin(self) -> None:
+    def _start_thread(self) -> None:
         traces: list[Trace] = []
         try:
             for path, prefix in self._trace_files.items():
@@ -308,7 +306,7 @@ class World:
         self._thread = threading.Thread(target=self._run, name="mujoco-world", daemon=True)
         self._thread.start()
 
-    def _end(self) -> None:
+    def _stop_thread(self) -> None:
         if self._thread is None:
             return
         self._stopping.set()
@@ -319,14 +317,14 @@ class World:
 
     def _advance(self, count: int) -> None:
         model, data = self._model, self._data
-        active = self._ramps.take(data.ctrl)
+        active = self._ramps.update(data.ctrl)
         for process in self._processes:
             process.step(model, data, data.time)
         if active:
-            self._stepper.go(data, controls(active, data.ctrl, count))
+            self._stepper.step(data, control_rows(active, data.ctrl, count))
         else:
             mujoco.mj_step(model, data, nstep=count)
-        mujoco.mj_kinematics(model, data)  # poses of the positions just reached, not of those a step ago
+        mujoco.mj_kinematics(model, data)  # poses of the new positions; mj_step leaves those of the previous step
         for name in _DIVERGED:
             if not self._fault and data.warning[int(getattr(mujoco.mjtWarning, name))].number:
                 self._fault = f"the simulation became unstable at {data.time:.3f} s ({name}) and was stopped"
@@ -347,8 +345,8 @@ class World:
 
     def _run(self) -> None:
         try:
-            self._keep_time()
-        except Exception as error:  # nothing may end this thread unseen: drivers read the fault
+            self._run_in_real_time()
+        except Exception as error:  # drivers read the fault of a failed thread
             log.exception("the simulation stopped")
             self._fault = f"the simulation stopped: {error}"
             self._publish()
@@ -356,7 +354,7 @@ class World:
             for trace in self._traces:
                 trace.close()
 
-    def _keep_time(self) -> None:
+    def _run_in_real_time(self) -> None:
         due = time.monotonic()
         count = GROUP_STEPS
         warned = -WARN_EVERY_S

@@ -1,4 +1,4 @@
-"""The simulated rooms of this process: one ``World`` for each, shared by all that is in it."""
+"""The simulated rooms of this process: one shared ``World`` per room."""
 
 import math
 import threading
@@ -11,7 +11,7 @@ from device_agent.protocol.manifests import robot_type, room
 from device_agent.protocol.manifests.room import Room, RoomRobot
 from device_agent.simulation.room.climate import Climate
 from device_agent.simulation.room.light import Light
-from device_agent.simulation.room.pedestrian import Walker
+from device_agent.simulation.room.pedestrian import Pedestrian
 from device_agent.simulation.room.sound import Sound
 from device_agent.simulation.scene_assembly import Placement
 from device_agent.simulation.world import World
@@ -20,16 +20,16 @@ _worlds: WeakValueDictionary[Path, World] = WeakValueDictionary()
 _lock = threading.Lock()
 
 
-def of(folder: Path) -> World:
-    """The world of a room; the same one for as long as somebody keeps it.
+def get_world(folder: Path) -> World:
+    """The world of a room; the same object as long as it is referenced.
 
-    Every robot of the room's manifest stands in it, whether an agent runs it or not. Nothing of MuJoCo is built yet.
+    Every robot of the room's manifest stands in it, whether an agent runs it or not. The model is not built yet.
 
     Args:
-        folder: The room's, ``robots/rooms/<room>``; robot types are looked for in ``robots``.
+        folder: The room's folder, ``robots/rooms/<room>``; robot types are in ``robots``.
 
     Raises:
-        DriverError: The room's manifest or that of one of its robots is missing or wrong, or the room has no model.
+        DriverError: The manifest of the room or of one of its robots is missing or invalid, or the room has no model.
     """
     folder = folder.resolve()
     with _lock:
@@ -40,7 +40,7 @@ def of(folder: Path) -> World:
 
 
 def prefix(name: str) -> str:
-    """What stands before every name of the model of the robot that is called so."""
+    """Prefix of all model names of this robot."""
     return f"{name}/"
 
 
@@ -51,16 +51,16 @@ def _make(folder: Path) -> World:
     except ProtocolError as error:
         raise DriverError(str(error)) from error
     if not manifest.model:
-        raise DriverError(f"room '{manifest.room}' has no model: it is a real one and cannot be simulated")
+        raise DriverError(f"room '{manifest.room}' is a real room without a model and cannot be simulated")
     return make(manifest, folder, types)
 
 
 def make(manifest: Room, folder: Path, types: dict[str, robot_type.RobotType]) -> World:
-    """A new world of a room, with all that goes on in it by itself.
+    """A new world of a room, with its people, climate, light and sound.
 
     Args:
-        manifest: The room's.
-        folder: Where its model is; robot types are in ``folder/../..``.
+        manifest: The room's manifest.
+        folder: Folder of its model; robot types are in ``folder/../..``.
         types: The robot types that it names.
     """
     home = {
@@ -76,14 +76,14 @@ def make(manifest: Room, folder: Path, types: dict[str, robot_type.RobotType]) -
         home=home,
         settings=manifest.start,
     )
-    # What goes on in it does not keep it alive: it ends when nobody who takes part is left.
-    its = proxy(world)
-    people = [Walker(person) for person in manifest.people]
+    # Weak reference: processes must not keep the world alive.
+    reference = proxy(world)
+    people = [Pedestrian(person) for person in manifest.people]
     for person in people:
         world.add(person)
-    world.add(Climate(manifest, its, people))
-    world.add(Light(manifest, its))
-    world.add(Sound(manifest, its, people))
+    world.add(Climate(manifest, reference, people))
+    world.add(Light(manifest, reference))
+    world.add(Sound(manifest, reference, people))
     return world
 
 

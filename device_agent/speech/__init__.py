@@ -1,4 +1,4 @@
-"""Voices: programs of this machine that turn text into sound."""
+"""Speech synthesizers that run on this machine."""
 
 from device_agent.speech.espeak import Espeak
 

@@ -1,4 +1,4 @@
-"""``espeak-ng``, where the machine has it: a small voice in a hundred languages, without a network."""
+"""Speech synthesis by ``espeak-ng``, if installed; works offline."""
 
 import io
 import shutil
@@ -8,13 +8,13 @@ import wave
 from device_agent.ports.speech import SpeechError, Spoken
 
 PROGRAM = "espeak-ng"
-_WITHIN_S = 20.0
+_TIMEOUT_S = 20.0
 _HEADER_BYTES = 44
 _OWN_LANGUAGE = "en"
 
 
 class Espeak:
-    """``Speech`` by a program, started for each text."""
+    """``Speech`` that starts ``espeak-ng`` for each text."""
 
     def speak(self, text: str, language: str) -> Spoken | None:
         """See ``Speech``."""
@@ -22,21 +22,21 @@ class Espeak:
         if program is None:
             return None
         for voice in dict.fromkeys((language or _OWN_LANGUAGE, _OWN_LANGUAGE)):
-            # The text goes by standard input: none of it can be taken for an option.
+            # Pass the text on standard input, so that it cannot be parsed as an option.
             command = [program, "--stdin", "--stdout", "-v", voice.lower()]
             try:
-                done = subprocess.run(  # noqa: S603 (a fixed program; the language is letters, digits and hyphens)
-                    command, input=text.encode(errors="replace"), capture_output=True, timeout=_WITHIN_S, check=False
+                result = subprocess.run(  # noqa: S603 (a fixed program; the language is letters, digits and hyphens)
+                    command, input=text.encode(errors="replace"), capture_output=True, timeout=_TIMEOUT_S, check=False
                 )
             except (OSError, subprocess.TimeoutExpired) as error:
-                raise SpeechError(f"{PROGRAM} did not speak: {error}") from error
-            if done.returncode == 0 and len(done.stdout) > _HEADER_BYTES:
-                return _whole(done.stdout)
-        raise SpeechError(f"{PROGRAM} did not speak: {done.stderr.decode(errors='replace').strip()[:300]}")
+                raise SpeechError(f"{PROGRAM} failed: {error}") from error
+            if result.returncode == 0 and len(result.stdout) > _HEADER_BYTES:
+                return _with_header(result.stdout)
+        raise SpeechError(f"{PROGRAM} failed: {result.stderr.decode(errors='replace').strip()[:300]}")
 
 
-def _whole(stream: bytes) -> Spoken:
-    """A file from what a stream began with and has: its header names no true length."""
+def _with_header(stream: bytes) -> Spoken:
+    """A WAV file with a correct length in its header; the streamed header has none."""
     rate_hz = int.from_bytes(stream[24:28], "little")
     samples = stream[_HEADER_BYTES:]
     samples = samples[: len(samples) // 2 * 2]

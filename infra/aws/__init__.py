@@ -1,1 +1,1 @@
-"""Telescope at Amazon: what a Lambda function is made of."""
+"""Deployment package for AWS Lambda."""

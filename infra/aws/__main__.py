@@ -1,8 +1,8 @@
-"""``python -m infra.aws FOLDER``: puts everything that the Lambda function needs into a folder, and nothing else.
+"""``python -m infra.aws FOLDER``: create the deployment package of the Lambda function in a folder.
 
-botocore comes with descriptions of over four hundred services, 23 MB; those that the functions call stay. Options that
-are not known here go to pip: on a machine that is not as Amazon's, ``--platform manylinux2014_x86_64
---only-binary=:all: --python-version 3.13``.
+botocore contains descriptions of over four hundred services (23 MB); only those in use are kept. Unknown options are
+passed to pip: on a machine of another platform, ``--platform manylinux2014_x86_64 --only-binary=:all:
+--python-version 3.13``.
 """
 
 import argparse
@@ -16,21 +16,21 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PARTS = ("function_app", "device_agent/__init__.py", "device_agent/protocol", "robots", "web/dist")
-"""Of the project. The console (``web/dist``) where it has been built."""
+"""Included parts of the project. The console (``web/dist``) is included if built."""
 SERVICES = frozenset({"dynamodb", "iot", "iot-data", "s3", "secretsmanager", "sts"})
-"""What the functions call at Amazon; sts is how a role is taken."""
+"""AWS services that the functions call; sts is for assuming roles."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Make the folder; returns the exit code."""
+    """Create the folder; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m infra.aws", description="Package the functions for AWS Lambda.")
-    parser.add_argument("folder", type=Path, help="where to; must be empty or not there")
+    parser.add_argument("folder", type=Path, help="target folder; must be empty or missing")
     parser.add_argument(
-        "--compile", action="store_true", help="with byte code for this Python: Lambda then starts twice as fast"
+        "--compile", action="store_true", help="include byte code for this Python version; halves Lambda's start time"
     )
     options, for_pip = parser.parse_known_args(arguments)
     if options.folder.exists() and any(options.folder.iterdir()):
-        print(f"telescope: {options.folder} is not empty; give a new folder", file=sys.stderr)
+        print(f"telescope: {options.folder} is not empty; choose a new folder", file=sys.stderr)
         return 1
     try:
         package(options.folder, for_pip)
@@ -38,17 +38,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"telescope: pip could not install the packages (exit code {error.returncode})", file=sys.stderr)
         return 1
     if options.compile:
-        # By hash and unchecked: what unpacks the archive changes the files' times.
+        # Unchecked hash-based pyc files: unpacking the archive changes the modification times.
         unchecked = py_compile.PycInvalidationMode.UNCHECKED_HASH
         compileall.compile_dir(options.folder, quiet=2, workers=0, invalidation_mode=unchecked)
     return 0
 
 
 def package(folder: Path, for_pip: Sequence[str] = ()) -> None:
-    """Libraries without what is never used, and the project's own code.
+    """Install the libraries without unused parts, and copy the project's code.
 
     Raises:
-        subprocess.CalledProcessError: pip failed; it has said why.
+        subprocess.CalledProcessError: pip failed and has printed the reason.
     """
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"]
     requirements = ROOT / "requirements" / "aws.txt"

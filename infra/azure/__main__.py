@@ -1,9 +1,9 @@
-"""``python -m infra.azure``: prints what an Event Grid namespace has to be told, as an ARM template.
+"""``python -m infra.azure``: print the configuration of an Event Grid namespace as an ARM template.
 
-``az deployment group create --resource-group GROUP --template-file FILE --parameters namespace=NAME functions=ID``: the
-client groups, topic spaces and permission bindings of ``function_app.adapters.azure.topic_spaces``, into a namespace
-that is there; and the functions' right to publish, to their own topic space alone. It can be done again at any time.
-What else the namespace has stays as it is: give it nothing that lets ``$all`` speak or hear.
+``az deployment group create --resource-group GROUP --template-file FILE --parameters namespace=NAME functions=ID``
+deploys it into an existing namespace and may be repeated. It contains the client groups, topic spaces and permission
+bindings of ``function_app.adapters.azure.topic_spaces``, and the functions' right to publish to their own topic space.
+Other resources of the namespace stay unchanged: they must not grant ``$all`` any access.
 
 API version and role: Microsoft, "Microsoft.EventGrid namespaces" (ARM templates) and "Azure built-in roles".
 """
@@ -26,11 +26,11 @@ _NAMESPACE = "Microsoft.EventGrid/namespaces"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the template, or write it; returns the exit code."""
+    """Print or write the template; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m infra.azure", description="Topic spaces, client groups and permission bindings for Event Grid."
     )
-    parser.add_argument("file", type=Path, nargs="?", help="where to; without it, to the terminal")
+    parser.add_argument("file", type=Path, nargs="?", help="output file (default: standard output)")
     options = parser.parse_args(arguments)
     text = json.dumps(template(), indent=2) + "\n"
     if options.file is None:

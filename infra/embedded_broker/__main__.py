@@ -1,7 +1,7 @@
 """``python -m infra.embedded_broker``: run the embedded broker until SIGTERM or SIGINT.
 
-Prints ``ready tcp=PORT websocket=PORT`` once it listens. Exits 0 when told to stop, 3 when a port is taken, 2 when a
-file or an argument is wrong; then with one line that says what to do.
+Prints ``ready tcp=PORT websocket=PORT`` once it listens. Exit codes: 0 on a signal, 3 if a port is in use, 2 for an
+invalid file or argument; errors print one line with advice.
 """
 
 import argparse
@@ -25,7 +25,7 @@ BAD_INPUT, PORT_TAKEN = 2, 3
 
 
 def main() -> int:
-    """Run; the exit code."""
+    """Run the broker; returns the exit code."""
     arguments = _arguments()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     revocations_path: Path = arguments.revocations or arguments.keys.with_name(f"{arguments.keys.name}.revoked")
@@ -48,8 +48,8 @@ def main() -> int:
         try:
             sockets[name] = _bind(arguments.host, port)
         except (OSError, OverflowError) as error:
-            why = getattr(error, "strerror", None) or error
-            print(f"broker: cannot listen on {arguments.host}:{port}: {why}; choose another port", file=sys.stderr)
+            reason = getattr(error, "strerror", None) or error
+            print(f"broker: cannot listen on {arguments.host}:{port}: {reason}; choose another port", file=sys.stderr)
             return PORT_TAKEN
     asyncio.run(_run(sockets, keys, revocations, limits, tls))
     return 0
@@ -58,27 +58,25 @@ def main() -> int:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m infra.embedded_broker", description="The embedded MQTT broker.")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: loopback only)")
-    parser.add_argument("--tcp-port", type=int, required=True, help="MQTT; 0 takes a free one")
-    parser.add_argument("--websocket-port", type=int, required=True, help="MQTT over WebSocket; 0 takes a free one")
+    parser.add_argument("--tcp-port", type=int, required=True, help="MQTT; 0 selects a free port")
+    parser.add_argument("--websocket-port", type=int, required=True, help="MQTT over WebSocket; 0 selects a free port")
     parser.add_argument(
         "--keys", type=Path, required=True, help='JSON {"key id": "Ed25519 public key in base64url"}, read on change'
     )
-    parser.add_argument("--certificate", type=Path, help="speak TLS alone, with this certificate and its chain (PEM)")
+    parser.add_argument("--certificate", type=Path, help="use TLS only, with this certificate and its chain (PEM)")
     parser.add_argument("--certificate-key", type=Path, help="its key (PEM)")
-    parser.add_argument(
-        "--revocations", type=Path, help="file in which revoked tokens are remembered (default: beside the keys)"
-    )
-    found = parser.parse_args()
-    if bool(found.certificate) != bool(found.certificate_key):
-        parser.error("--certificate and --certificate-key belong together")
-    return found
+    parser.add_argument("--revocations", type=Path, help="file for revoked tokens (default: beside the keys)")
+    arguments = parser.parse_args()
+    if bool(arguments.certificate) != bool(arguments.certificate_key):
+        parser.error("--certificate and --certificate-key must be given together")
+    return arguments
 
 
 def _tls(arguments: argparse.Namespace) -> ssl.SSLContext | None:
-    """What the listeners show; ``None`` where they speak in the clear.
+    """The TLS context of the listeners; ``None`` without TLS.
 
     Raises:
-        OSError: A file cannot be read, or is not what it should be.
+        OSError: A file cannot be read or is invalid.
     """
     if arguments.certificate is None:
         return None
@@ -110,7 +108,7 @@ async def _run(
     tls: ssl.SSLContext | None,
 ) -> None:
     loop = asyncio.get_running_loop()
-    loop.set_exception_handler(_one_line)
+    loop.set_exception_handler(_log_exception)
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
@@ -122,9 +120,9 @@ async def _run(
     await broker.shutdown()
 
 
-def _one_line(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+def _log_exception(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     error = context.get("exception")
-    log.error("%s%s", context.get("message", "fault"), f": {type(error).__name__}: {error}" if error else "")
+    log.error("%s%s", context.get("message", "error"), f": {type(error).__name__}: {error}" if error else "")
 
 
 if __name__ == "__main__":

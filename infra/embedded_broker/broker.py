@@ -1,10 +1,10 @@
 """amqtt's broker, hardened.
 
-Of amqtt stay the life cycle, the listeners' configuration and the packet codec. What lies between a socket and a
-subscriber is ours: there amqtt 0.12 drops the victim's session before it authenticates whoever claims its client id,
-leaves the old socket open on a takeover, sends a new client what is retained for everybody's filters, says wills that
-nobody checked, never notices a lost keep-alive, acknowledges what it refuses, raises QoS 0 to the subscription's QoS,
-and queues without bound for clients that are away. ``tests/contract/brokers`` has each of them by name.
+amqtt provides the life cycle, the listener configuration and the packet codec. Everything between socket and
+subscriber is replaced, because amqtt 0.12 drops an existing session before it authenticates a client with the same id,
+leaves the old socket open on a takeover, sends retained messages of all filters to a new client, publishes unchecked
+wills, never notices a lost keep-alive, acknowledges rejected messages, raises QoS 0 to the subscription's QoS, and
+queues without limit for offline clients. ``tests/contract/brokers`` has a test for each.
 """
 
 import asyncio
@@ -27,19 +27,19 @@ from device_agent.protocol.security.revocation import Control
 from infra.embedded_broker import packets
 from infra.embedded_broker.connection import Admission, Connection, Refused
 from infra.embedded_broker.limits import Limits
-from infra.embedded_broker.listeners import CLOSE_S, Link, TcpLink, WebSocketLink
+from infra.embedded_broker.listeners import CLOSE_S, TcpTransport, Transport, WebSocketTransport
 from infra.embedded_broker.packets import Connect
 from infra.embedded_broker.public_keys import KeyRing, KeysError
 from infra.embedded_broker.revocations import Revocations
-from infra.embedded_broker.routing import Kept, Retained, Subscriptions
+from infra.embedded_broker.routing import RetainedMessage, RetainedMessages, Subscriptions
 
 log = logging.getLogger("telescope.broker")
 
 TCP, WEBSOCKET = "default", "websocket"
-"""The listeners, by amqtt's name for the first."""
+"""Listener names; the first is amqtt's default."""
 _TICK_S = 0.25
 _FRAME_BYTES = 1024 * 1024
-"""Largest WebSocket frame [bytes]: it may carry several packets, each of which is bounded by itself."""
+"""Largest WebSocket frame [bytes]; it may contain several packets, each with its own limit."""
 
 
 class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
@@ -54,20 +54,20 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         limits: Limits | None = None,
         tls: ssl.SSLContext | None = None,
     ) -> None:
-        """Prepare; ``start`` listens.
+        """Prepare the broker; ``start`` listens.
 
         Args:
-            sockets: Bound sockets for ``TCP`` and ``WEBSOCKET``: whoever starts the broker finds out about taken ports.
-            keys: Read already.
-            revocations: Opened already; closed by ``shutdown``.
-            limits: Bounds, where the usual ones do not fit.
-            tls: What the listeners show; ``None`` where they speak in the clear.
+            sockets: Bound sockets for ``TCP`` and ``WEBSOCKET``; the caller thus detects ports in use.
+            keys: The key ring, already read.
+            revocations: Already open; ``shutdown`` closes it.
+            limits: Limits other than the defaults.
+            tls: TLS context of the listeners; ``None`` without TLS.
         """
         kinds = {TCP: ListenerType.TCP, WEBSOCKET: ListenerType.WS}
         super().__init__(
             BrokerConfig(
                 listeners={name: ListenerConfig(type=kind, bind="127.0.0.1:0") for name, kind in kinds.items()},
-                plugins={},  # the usual ones let anybody in and publish $SYS
+                plugins={},  # the default plugins allow anonymous clients and publish $SYS
             )
         )
         self.limits = limits or Limits()
@@ -78,10 +78,10 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         self._connections: set[Connection] = set()
         self._clients: dict[str, Connection] = {}
         self._subscriptions_table: Subscriptions[Connection] = Subscriptions()
-        self._retained_table = Retained(
+        self._retained_table = RetainedMessages(
             per_client=self.limits.retained_per_client, total_bytes=self.limits.retained_total_bytes
         )
-        self._clock: asyncio.Task[None] | None = None
+        self._timer_task: asyncio.Task[None] | None = None
 
     # ------------------------------------------------------------ life cycle
 
@@ -92,15 +92,15 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
             BrokerError: amqtt could not start.
         """
         await super().start()
-        self._clock = asyncio.create_task(self._watch_clocks())
+        self._timer_task = asyncio.create_task(self._run_timers())
 
     async def shutdown(self) -> None:
-        """Cut everybody off and stop. Wills are not said: there is nobody left to hear them."""
-        if self._clock is not None:
-            self._clock.cancel()
-            await asyncio.gather(self._clock, return_exceptions=True)
+        """Close all connections, without wills, and stop."""
+        if self._timer_task is not None:
+            self._timer_task.cancel()
+            await asyncio.gather(self._timer_task, return_exceptions=True)
         for connection in list(self._connections):
-            connection.end("", say_will=False)
+            connection.close("", publish_will=False)
         await super().shutdown()
         self._revocations.close()
 
@@ -112,13 +112,13 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         port: int,
         ssl_context: Any,
     ) -> Any:
-        """Make the server of one listener: the seam that amqtt offers. Where it listens, the bound socket says."""
+        """Create the server of one listener on its bound socket; overrides amqtt."""
         del address, port, ssl_context
-        bound = self._sockets[listener_name]
+        listening_socket = self._sockets[listener_name]
         if listener_type == ListenerType.TCP:
             return await asyncio.get_running_loop().create_server(
-                lambda: TcpLink(self._connected, congested_bytes=self.limits.congested_bytes),
-                sock=bound,
+                lambda: TcpTransport(self._connected, congested_bytes=self.limits.congested_bytes),
+                sock=listening_socket,
                 ssl=self._tls,
                 ssl_handshake_timeout=None if self._tls is None else self.limits.connect_timeout_s,
             )
@@ -126,30 +126,30 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         quiet.setLevel(logging.CRITICAL + 1)  # it logs every failed handshake with a traceback
         return await websockets.serve(
             self._websocket_connected,
-            sock=bound,
+            sock=listening_socket,
             ssl=self._tls,
             subprotocols=[websockets.Subprotocol("mqtt")],
-            compression=None,  # costs time for each small message, and lets a small frame become a huge one
+            compression=None,  # slow for small messages, and permits decompression bombs
             max_size=_FRAME_BYTES,
-            ping_interval=None,  # MQTT has its own
+            ping_interval=None,  # MQTT has its own keep-alive
             close_timeout=CLOSE_S,
             open_timeout=self.limits.connect_timeout_s,
             logger=quiet,
         )
 
     async def _websocket_connected(self, websocket: ServerConnection) -> None:
-        link = WebSocketLink(websocket, self._connected, congested_bytes=self.limits.congested_bytes)
-        await link.serve()
+        transport = WebSocketTransport(websocket, self._connected, congested_bytes=self.limits.congested_bytes)
+        await transport.serve()
 
-    def _connected(self, link: Link) -> Connection:
-        kind = "TCP" if isinstance(link, TcpLink) else "WebSocket"
-        connection = Connection(self, link, asyncio.get_running_loop().time(), kind)
+    def _connected(self, transport: Transport) -> Connection:
+        kind = "TCP" if isinstance(transport, TcpTransport) else "WebSocket"
+        connection = Connection(self, transport, asyncio.get_running_loop().time(), kind)
         self._connections.add(connection)
         if len(self._connections) > self.limits.connections:
-            connection.end(f"more than {self.limits.connections} connections")
+            connection.close(f"more than {self.limits.connections} connections")
         return connection
 
-    async def _watch_clocks(self) -> None:
+    async def _run_timers(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
             await asyncio.sleep(_TICK_S)
@@ -158,16 +158,16 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
                 now_s, wall_s = loop.time(), time.time()
                 for connection in list(self._connections):
                     connection.tick(now_s, wall_s)
-            except Exception as error:  # noqa: BLE001 (the clocks have to be looked at again, whatever went wrong)
-                log.error("fault in the broker: %s: %s", type(error).__name__, error)  # noqa: TRY400 (no traceback)
+            except Exception as error:  # noqa: BLE001 (the loop must continue after any error)
+                log.error("internal error: %s: %s", type(error).__name__, error)  # noqa: TRY400 (no traceback)
 
-    # ------------------------------------------------------------ rights
+    # ------------------------------------------------------------ authentication
 
-    def admit(self, connect: Connect) -> Admission:
-        """Judge a CONNECT by its token alone.
+    def authenticate(self, connect: Connect) -> Admission:
+        """Authenticate a CONNECT by its token.
 
         Raises:
-            Refused: No token, not for this client id or user, run out, or taken back.
+            Refused: No token, a token for another client or user, or an expired or revoked token.
         """
         if not connect.client_id:
             raise Refused(packets.BAD_CLIENT_ID, "no client id")
@@ -177,58 +177,58 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         except SignatureError as error:
             raise Refused(packets.NOT_AUTHORISED, str(error)) from error
         if (grant.client_id, grant.principal) != (connect.client_id, connect.username):
-            raise Refused(packets.NOT_AUTHORISED, "its token is for another client id or user name")
+            raise Refused(packets.NOT_AUTHORISED, "the token belongs to another client id or user name")
         now_s = time.time()
         if now_s >= grant.expires_at:
-            raise Refused(packets.NOT_AUTHORISED, "its token has run out")
+            raise Refused(packets.NOT_AUTHORISED, "the token has expired")
         if grant.expires_at - now_s > self.limits.token_s:
-            raise Refused(packets.NOT_AUTHORISED, f"its token runs longer than {self.limits.token_s:.0f} s")
+            raise Refused(packets.NOT_AUTHORISED, f"the token's lifetime exceeds {self.limits.token_s:.0f} s")
         admission = Admission(grant, connect.password, issued_at(connect.password))
         if self._revocations.covers(grant, admission.issued_at):
-            raise Refused(packets.NOT_AUTHORISED, "its token has been revoked")
+            raise Refused(packets.NOT_AUTHORISED, "the token has been revoked")
         return admission
 
-    def instruct(self, payload: bytes) -> None:
-        """Do what a message on the control topic says: remember a revocation, and cut what it covers.
+    def revoke(self, payload: bytes) -> None:
+        """Apply a message of the control topic: store the revocation and close the connections that it covers.
 
         Raises:
-            ValueError: It cannot be read.
+            ValueError: The message is invalid.
         """
         revoke = codec.decode(payload, Control).revoke
         try:
             self._revocations.add(revoke)
         except OSError as error:
-            log.error("a revocation holds only until the broker's next start: %s", error.strerror)  # noqa: TRY400
+            log.error("cannot store a revocation; it is lost at the next start of the broker: %s", error.strerror)  # noqa: TRY400
         for connection in list(self._clients.values()):
             admission = connection.admission
             if admission is not None and self._revocations.covers(admission.grant, admission.issued_at):
-                connection.end("its token has been revoked")
+                connection.close("the token has been revoked")
 
     def _refresh_keys(self) -> None:
         try:
             if not self._keys.refresh():
                 return
         except KeysError as error:
-            log.error("%s; the keys from before stay in force", error)  # noqa: TRY400 (its text is all there is)
+            log.error("%s; the previous keys stay in use", error)  # noqa: TRY400 (no traceback)
             return
         for connection in list(self._clients.values()):
             try:
                 if connection.admission is not None:
                     self._keys.read(connection.admission.token)
             except SignatureError:
-                connection.end("the key of its token has been withdrawn")
+                connection.close("the key of the token has been withdrawn")
 
-    # ------------------------------------------------------------ the exchange
+    # ------------------------------------------------------------ for connections
 
-    def enter(self, connection: Connection) -> None:
-        """Make an admitted connection the one of its client id; whoever had it before is cut off."""
-        before = self._clients.get(connection.client_id)
-        if before is not None:
-            before.end("its client id connected again")
+    def register(self, connection: Connection) -> None:
+        """Register an admitted connection under its client id; closes the previous one."""
+        previous = self._clients.get(connection.client_id)
+        if previous is not None:
+            previous.close("another connection uses its client id")
         self._clients[connection.client_id] = connection
 
-    def leave(self, connection: Connection) -> None:
-        """Forget a connection."""
+    def unregister(self, connection: Connection) -> None:
+        """Unregister a connection."""
         self._connections.discard(connection)
         if self._clients.get(connection.client_id) is connection:
             del self._clients[connection.client_id]
@@ -237,26 +237,26 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         connection.filters.clear()
 
     def subscribe(self, connection: Connection, pattern: str, qos: int) -> None:
-        """Add a filter, and tell this connection, and no other, what is retained for it."""
+        """Add a filter and send its retained messages to this connection only."""
         self._subscriptions_table.add(connection, pattern, qos)
-        for topic, kept in self._retained_table.matching(pattern):
-            connection.deliver(topic, kept.payload, qos=min(qos, kept.qos), retain=True)
+        for topic, message in self._retained_table.matching(pattern):
+            connection.deliver(topic, message.payload, qos=min(qos, message.qos), retain=True)
 
     def unsubscribe(self, connection: Connection, pattern: str) -> None:
-        """Take a filter back."""
+        """Remove a filter."""
         self._subscriptions_table.remove(connection, pattern)
 
     def publish(self, topic: str, payload: bytes, *, qos: int, retain: bool, owner: str) -> bool:
-        """Hand a message to all who hear it, at the lower of its QoS and theirs, and keep it where it is retained.
+        """Send a message to all subscribers, at the lower of its QoS and theirs, and retain it if requested.
 
         Returns:
-            False where the bounds of what is kept are reached; it was then handed on and not kept.
+            False if the limits for retained messages are reached; the message was then sent but not retained.
         """
         packet = b""
-        for connection, granted in self._subscriptions_table.hearers(topic):
+        for connection, granted in self._subscriptions_table.subscribers(topic):
             if qos and granted:
                 connection.deliver(topic, payload, qos=1)
             else:
                 packet = packet or packets.publish(topic, payload)
                 connection.deliver_packet(packet)
-        return not retain or self._retained_table.keep(topic, Kept(payload, qos, owner))
+        return not retain or self._retained_table.store(topic, RetainedMessage(payload, qos, owner))

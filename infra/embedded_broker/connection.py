@@ -1,13 +1,12 @@
-"""One client, from its first byte to its last: what MQTT 3.1.1 says, and what its grant allows.
+"""One client connection: MQTT 3.1.1 within the client's grant.
 
-Decisions where the specification leaves room, all of them towards refusing:
+Where the specification leaves a choice, the broker is strict:
 
-- A publish that the grant does not cover, that is too long, or at QoS 2 ends the connection, as AWS IoT Core does.
-  MQTT 3.1.1 has no way to refuse one message, and acknowledging it would be a lie.
-- All sessions are clean: nothing is queued for somebody who is not there. A client that falls too far behind loses
-  QoS 0 messages first and then its connection, never a QoS 1 message in silence.
-- Whatever ends a connection other than DISCONNECT lets its will be said, a revocation too: an agent that was cut off
-  is offline.
+- A publish that the grant does not cover, that is too long, or at QoS 2 closes the connection, as in AWS IoT Core.
+  MQTT 3.1.1 cannot reject a single message, and an acknowledgement would be false.
+- All sessions are clean: nothing is queued for offline clients. A slow client first loses QoS 0 messages and then its
+  connection, but never a QoS 1 message silently.
+- Every end of a connection other than DISCONNECT publishes its will, also a revocation: the agent is then offline.
 """
 
 import logging
@@ -20,85 +19,85 @@ from device_agent.protocol.security import revocation
 from device_agent.protocol.security.grants import Grant
 from infra.embedded_broker import packets
 from infra.embedded_broker.limits import Limits
-from infra.embedded_broker.listeners import Link
+from infra.embedded_broker.listeners import Transport
 from infra.embedded_broker.packets import Connect, Frame, MalformedPacket, Publish
 from infra.embedded_broker.routing import valid_filter, valid_topic
 
 log = logging.getLogger("telescope.broker")
 
-_REMEMBERED_TOPICS = 1_024
+_CACHED_TOPICS = 1_024
 KEEP_ALIVE_FACTOR = 1.5
-"""How often the promised interval a client may be silent [MQTT-3.1.2-24]."""
+"""Permitted silence relative to the keep-alive interval [MQTT-3.1.2-24]."""
 
 
 class Admission(NamedTuple):
-    """What an accepted CONNECT is worth; the token is kept to be judged again when the keys change."""
+    """The result of an accepted CONNECT; the token is checked again when the keys change."""
 
     grant: Grant
     token: str
     issued_at: float
 
 
-class Refused(Exception):  # noqa: N818 (an answer, not a fault)
-    """A CONNECT that is answered with ``code`` and the end of the connection."""
+class Refused(Exception):  # noqa: N818 (a response, not an error)
+    """A CONNECT that is answered with ``code`` before the connection is closed."""
 
-    def __init__(self, code: int, why: str) -> None:
-        super().__init__(why)
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
         self.code = code
 
 
-class Exchange(Protocol):
-    """What a connection asks of the broker around it."""
+class ConnectionBroker(Protocol):
+    """Operations of the broker that a connection uses."""
 
     limits: Limits
 
-    def admit(self, connect: Connect) -> Admission:
-        """Judge a CONNECT; nobody else notices one that is ``Refused``."""
+    def authenticate(self, connect: Connect) -> Admission:
+        """Authenticate a CONNECT; raises ``Refused``, without effect on other connections."""
 
-    def enter(self, connection: "Connection") -> None:
-        """Make an admitted connection the one of its client id; whoever had it before is cut off."""
+    def register(self, connection: "Connection") -> None:
+        """Register an admitted connection under its client id; closes the previous one."""
 
-    def leave(self, connection: "Connection") -> None:
-        """Forget a connection. Called once for each, admitted or not."""
+    def unregister(self, connection: "Connection") -> None:
+        """Unregister a connection. Called once for each, admitted or not."""
 
     def publish(self, topic: str, payload: bytes, *, qos: int, retain: bool, owner: str) -> bool:
-        """Hand a message to all who hear it, and keep it where it is retained; False where that is full."""
+        """Send a message to all subscribers and retain it if requested; False if it cannot be retained."""
 
     def subscribe(self, connection: "Connection", pattern: str, qos: int) -> None:
-        """Add a filter, and tell the connection what is retained for it."""
+        """Add a filter and send its retained messages to the connection."""
 
     def unsubscribe(self, connection: "Connection", pattern: str) -> None:
-        """Take a filter back."""
+        """Remove a filter."""
 
-    def instruct(self, payload: bytes) -> None:
-        """Do what a message on ``control.TOPIC`` says.
+    def revoke(self, payload: bytes) -> None:
+        """Apply a message of the control topic.
 
         Raises:
-            ValueError: It says nothing that can be done.
+            ValueError: The message is invalid.
         """
 
 
 class Connection:
-    """The state of one client. All its methods run on the broker's loop and none of them waits."""
+    """The state of one client. All methods run on the broker's event loop and never block."""
 
-    def __init__(self, exchange: Exchange, link: Link, now_s: float, peer: str) -> None:
+    def __init__(self, broker: ConnectionBroker, transport: Transport, now_s: float, peer: str) -> None:
         self.admission: Admission | None = None
         self.filters: set[str] = set()
-        self._exchange = exchange
-        self._limits = exchange.limits
-        self._link = link
+        self._broker = broker
+        self._limits = broker.limits
+        self._transport = transport
         self._peer = peer
         self._framer = packets.Framer(self._limits)
-        self._over = False
+        self._closed = False
         self._will: packets.Will | None = None
         self._keep_alive_s = 0.0
-        self._since_s = self._heard_s = now_s
-        self._heard = False
+        self._opened_s = self._active_s = now_s
+        self._active = False
         self._publishable: set[str] = set()
         self._packet_id = 0
         self._inflight: set[int] = set()
-        self._waiting: deque[tuple[str, bytes, int, bool]] = deque()
-        self._waiting_bytes = 0
+        self._queue: deque[tuple[str, bytes, int, bool]] = deque()
+        self._queue_bytes = 0
 
     @property
     def client_id(self) -> str:
@@ -106,182 +105,182 @@ class Connection:
         return "" if self.admission is None else self.admission.grant.client_id
 
     def received(self, data: bytes) -> None:
-        """Bytes from the client. Whatever they are, nothing is raised."""
-        self._heard = True
+        """Process bytes from the client. Never raises."""
+        self._active = True
         try:
             for frame in self._framer.feed(data):
-                if self._over:
+                if self._closed:
                     return
-                self._take(frame)
+                self._handle(frame)
         except MalformedPacket as error:
-            self.end(f"malformed: {error}")
-        except Exception as error:  # noqa: BLE001 (a fault in serving one client must not reach the others)
-            self.end(f"fault in the broker: {type(error).__name__}: {error}")
+            self.close(f"malformed packet: {error}")
+        except Exception as error:  # noqa: BLE001 (an error of one client must not affect others)
+            self.close(f"internal error: {type(error).__name__}: {error}")
 
     def drained(self) -> None:
-        """The link has room again."""
-        self._pump()
+        """The transport accepts data again."""
+        self._send_queued()
 
     def lost(self) -> None:
-        """The link is gone."""
-        self.end("")
+        """The transport has closed."""
+        self.close("")
 
     def tick(self, now_s: float, wall_s: float) -> None:
-        """Look at the clocks: monotonic for silence, wall clock [s since 1970] for the token."""
-        if self._heard:
-            self._heard = False
-            self._heard_s = now_s
+        """Check timeouts: monotonic clock for silence, wall clock [s since 1970] for the token."""
+        if self._active:
+            self._active = False
+            self._active_s = now_s
         if self.admission is None:
-            if now_s - self._since_s > self._limits.connect_timeout_s:
-                self.end("no CONNECT")
+            if now_s - self._opened_s > self._limits.connect_timeout_s:
+                self.close("no CONNECT in time")
         elif wall_s >= self.admission.grant.expires_at:
-            self.end("its token has run out")
-        elif self._keep_alive_s and now_s - self._heard_s > self._keep_alive_s:
-            self.end("no sign of life within its keep-alive")
+            self.close("the token has expired")
+        elif self._keep_alive_s and now_s - self._active_s > self._keep_alive_s:
+            self.close("keep-alive timeout")
 
     def deliver(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> None:
-        """A message that must arrive or end the connection: QoS 1, or retained."""
-        if self._over:
+        """Send a message that must not be dropped (QoS 1 or retained), or close the connection."""
+        if self._closed:
             return
-        if not self._waiting and self._may_send(qos):
+        if not self._queue and self._may_send(qos):
             self._send(topic, payload, qos=qos, retain=retain)
             return
-        self._waiting.append((topic, payload, qos, retain))
-        self._waiting_bytes += len(payload)
-        if len(self._waiting) > self._limits.waiting or self._waiting_bytes > self._limits.waiting_bytes:
-            self.end("it does not keep up with what it subscribed to")
+        self._queue.append((topic, payload, qos, retain))
+        self._queue_bytes += len(payload)
+        if len(self._queue) > self._limits.queued or self._queue_bytes > self._limits.queued_bytes:
+            self.close("the client is too slow for its subscriptions")
 
     def deliver_packet(self, packet: bytes) -> None:
-        """A QoS 0 PUBLISH, ready made; dropped when the client does not keep up."""
-        if not self._link.congested:
-            self._link.write(packet)
+        """Send an encoded QoS 0 PUBLISH; dropped if the client is too slow."""
+        if not self._transport.congested:
+            self._transport.write(packet)
 
-    def end(self, why: str, *, flush: bool = False, say_will: bool = True) -> None:
-        """End the connection, and say its will. May be called at any time and more than once.
+    def close(self, reason: str, *, flush: bool = False, publish_will: bool = True) -> None:
+        """Close the connection and publish its will. May be called at any time and repeatedly.
 
         Args:
-            why: For the log; empty for what is nobody's fault.
-            flush: Whether what was written is still to be sent.
-            say_will: False after DISCONNECT.
+            reason: For the log; empty for a normal end.
+            flush: Whether to send pending data first.
+            publish_will: False after DISCONNECT.
         """
-        if self._over:
+        if self._closed:
             return
-        self._over = True
-        if why:
-            log.warning("%s (%s): %s", self.client_id or "unknown client", self._peer, why)
+        self._closed = True
+        if reason:
+            log.warning("%s (%s): %s", self.client_id or "unknown client", self._peer, reason)
         if flush:
-            self._link.close()
+            self._transport.close()
         else:
-            self._link.abort()
-        self._exchange.leave(self)
-        self._waiting.clear()
-        if say_will and self._will is not None:
+            self._transport.abort()
+        self._broker.unregister(self)
+        self._queue.clear()
+        if publish_will and self._will is not None:
             will, self._will = self._will, None
-            self._exchange.publish(will.topic, will.payload, qos=will.qos, retain=will.retain, owner=self.client_id)
+            self._broker.publish(will.topic, will.payload, qos=will.qos, retain=will.retain, owner=self.client_id)
 
-    def _take(self, frame: Frame) -> None:
+    def _handle(self, frame: Frame) -> None:
         if frame.kind == PUBLISH:
-            self._take_publish(packets.read_publish(frame))
+            self._handle_publish(packets.read_publish(frame))
         elif frame.kind == PUBACK:
             self._inflight.discard(packets.read_puback(frame))
-            self._pump()
+            self._send_queued()
         elif frame.kind == PINGREQ:
             self._reply(packets.PINGRESP)
         elif frame.kind == SUBSCRIBE:
-            self._take_subscribe(*packets.read_subscribe(frame))
+            self._handle_subscribe(*packets.read_subscribe(frame))
         elif frame.kind == UNSUBSCRIBE:
             packet_id, filters = packets.read_unsubscribe(frame)
             for pattern in filters:
                 self.filters.discard(pattern)
-                self._exchange.unsubscribe(self, pattern)
+                self._broker.unsubscribe(self, pattern)
             self._reply(packets.unsuback(packet_id))
         elif frame.kind == DISCONNECT:
-            self.end("", flush=not self._link.congested, say_will=False)
+            self.close("", flush=not self._transport.congested, publish_will=False)
         elif frame.kind == CONNECT:
-            self._take_connect(frame)
+            self._handle_connect(frame)
 
-    def _take_connect(self, frame: Frame) -> None:
-        claimed = ""
+    def _handle_connect(self, frame: Frame) -> None:
+        client_id = ""
         try:
             connect = packets.read_connect(frame.body)
-            claimed = connect.client_id[:64]
-            admission = self._exchange.admit(connect)
+            client_id = connect.client_id[:64]
+            admission = self._broker.authenticate(connect)
             self._check_will(connect.will, admission.grant)
         except packets.UnacceptableProtocol:
-            # Clients of MQTT 5 try 3.1.1 next: they need this answer at once, and in the form of 3.1.1.
-            self._link.write(packets.connack(packets.BAD_PROTOCOL))
-            self.end("", flush=True)
+            # MQTT 5 clients fall back to 3.1.1 on this response, which must have the 3.1.1 format.
+            self._transport.write(packets.connack(packets.BAD_PROTOCOL))
+            self.close("", flush=True)
             return
         except Refused as refusal:
-            self._link.write(packets.connack(refusal.code))
-            self.end(f"CONNECT as {claimed!r} refused: {refusal}", flush=True)
+            self._transport.write(packets.connack(refusal.code))
+            self.close(f"CONNECT as {client_id!r} refused: {refusal}", flush=True)
             return
         self.admission = admission
         self._will = connect.will
         self._keep_alive_s = connect.keep_alive_s * KEEP_ALIVE_FACTOR
-        self._framer.open_up()
-        self._exchange.enter(self)
-        self._link.write(packets.connack(packets.ACCEPTED))
+        self._framer.accept_all()
+        self._broker.register(self)
+        self._transport.write(packets.connack(packets.ACCEPTED))
 
     def _check_will(self, will: packets.Will | None, grant: Grant) -> None:
         if will is None:
             return
         if not valid_topic(will.topic, self._limits.topic_bytes) or not grant.may_publish(will.topic):
-            raise Refused(packets.NOT_AUTHORISED, "its will is on a topic that it may not publish to")
+            raise Refused(packets.NOT_AUTHORISED, "the grant does not permit the topic of the will")
         if len(will.payload) > (self._limits.retained_bytes if will.retain else self._limits.payload_bytes):
-            raise Refused(packets.NOT_AUTHORISED, "its will is too long")
+            raise Refused(packets.NOT_AUTHORISED, "the will is too long")
 
-    def _take_publish(self, message: Publish) -> None:
+    def _handle_publish(self, message: Publish) -> None:
         topic = message.topic
         if message.qos > packets.MAX_QOS:
-            self.end(f"published at QoS {message.qos}; {packets.MAX_QOS} is the most")
+            self.close(f"published at QoS {message.qos}; the maximum is {packets.MAX_QOS}")
         elif len(message.payload) > self._limits.payload_bytes:
-            self.end(f"published {len(message.payload)} bytes; {self._limits.payload_bytes} is the most")
+            self.close(f"published {len(message.payload)} bytes; the maximum is {self._limits.payload_bytes}")
         elif message.retain and len(message.payload) > self._limits.retained_bytes:
-            self.end(f"published {len(message.payload)} bytes retained; {self._limits.retained_bytes} is the most")
+            self.close(f"published {len(message.payload)} bytes retained; the maximum is {self._limits.retained_bytes}")
         elif topic not in self._publishable and not self._may_publish(topic):
-            self.end(f"published to {topic[:200]!r}, which its token does not allow")
+            self.close(f"published to {topic[:200]!r}, which its grant does not permit")
         elif topic == revocation.TOPIC:
-            self._take_instruction(message)
-        elif not self._exchange.publish(
+            self._handle_control(message)
+        elif not self._broker.publish(
             topic, message.payload, qos=message.qos, retain=message.retain, owner=self.client_id
         ):
-            self.end(f"retained more than the broker keeps for one client, at {topic[:200]!r}")
+            self.close(f"exceeded the limit of retained messages, at {topic[:200]!r}")
         elif message.qos:
             self._reply(packets.puback(message.packet_id))
 
-    def _take_instruction(self, message: Publish) -> None:
+    def _handle_control(self, message: Publish) -> None:
         try:
-            self._exchange.instruct(message.payload)
+            self._broker.revoke(message.payload)
         except ValueError as error:
-            self.end(f"an instruction that cannot be followed: {error}")
+            self.close(f"invalid control message: {error}")
             return
         if message.qos:
             self._reply(packets.puback(message.packet_id))
 
     def _may_publish(self, topic: str) -> bool:
-        """Judge a topic by the grant; what is allowed is remembered, so that it is judged once."""
-        assert self.admission is not None  # noqa: S101 (the framer lets nothing but CONNECT through before)
+        """Check a topic against the grant; permitted topics are cached."""
+        assert self.admission is not None  # noqa: S101 (the framer rejects all other packets before CONNECT)
         if topic != revocation.TOPIC and not valid_topic(topic, self._limits.topic_bytes):
             return False
         if not self.admission.grant.may_publish(topic):
             return False
-        if len(self._publishable) >= _REMEMBERED_TOPICS:
+        if len(self._publishable) >= _CACHED_TOPICS:
             self._publishable.clear()
         self._publishable.add(topic)
         return True
 
-    def _take_subscribe(self, packet_id: int, filters: list[tuple[str, int]]) -> None:
+    def _handle_subscribe(self, packet_id: int, filters: list[tuple[str, int]]) -> None:
         if len(filters) > self._limits.filters_per_subscribe:
-            self.end(f"{len(filters)} filters in one SUBSCRIBE; {self._limits.filters_per_subscribe} is the most")
+            self.close(f"{len(filters)} filters in one SUBSCRIBE; the maximum is {self._limits.filters_per_subscribe}")
             return
         granted = [(pattern, min(qos, packets.MAX_QOS)) for pattern, qos in filters if self._may_subscribe(pattern)]
         allowed = dict(granted)
         self._reply(packets.suback(packet_id, [allowed.get(pattern, packets.REFUSED) for pattern, _ in filters]))
         for pattern, qos in granted:
-            if self._over:  # the retained messages of the last one were too many for it
+            if self._closed:  # closed by the retained messages of the previous filter
                 return
-            self._exchange.subscribe(self, pattern, qos)
+            self._broker.subscribe(self, pattern, qos)
 
     def _may_subscribe(self, pattern: str) -> bool:
         assert self.admission is not None  # noqa: S101 (as above)
@@ -293,12 +292,12 @@ class Connection:
         return True
 
     def _reply(self, packet: bytes) -> None:
-        self._link.write(packet)
-        if self._link.unsent > self._limits.unsent_bytes:
-            self.end("it asks and does not read the answers")
+        self._transport.write(packet)
+        if self._transport.unsent > self._limits.unsent_bytes:
+            self.close("the client does not read responses")
 
     def _may_send(self, qos: int) -> bool:
-        return not self._link.congested and (not qos or len(self._inflight) < self._limits.inflight)
+        return not self._transport.congested and (not qos or len(self._inflight) < self._limits.inflight)
 
     def _send(self, topic: str, payload: bytes, *, qos: int, retain: bool) -> None:
         if qos:
@@ -307,12 +306,12 @@ class Connection:
                 if self._packet_id not in self._inflight:
                     break
             self._inflight.add(self._packet_id)
-            self._link.write(packets.publish(topic, payload, packet_id=self._packet_id, retain=retain))
+            self._transport.write(packets.publish(topic, payload, packet_id=self._packet_id, retain=retain))
         else:
-            self._link.write(packets.publish(topic, payload, retain=retain))
+            self._transport.write(packets.publish(topic, payload, retain=retain))
 
-    def _pump(self) -> None:
-        while self._waiting and not self._over and self._may_send(self._waiting[0][2]):
-            topic, payload, qos, retain = self._waiting.popleft()
-            self._waiting_bytes -= len(payload)
+    def _send_queued(self) -> None:
+        while self._queue and not self._closed and self._may_send(self._queue[0][2]):
+            topic, payload, qos, retain = self._queue.popleft()
+            self._queue_bytes -= len(payload)
             self._send(topic, payload, qos=qos, retain=retain)

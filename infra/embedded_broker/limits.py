@@ -1,4 +1,4 @@
-"""Bounds that keep one client from harming the others. Figures are for one machine; a site takes mosquitto."""
+"""Limits per client and in total. The defaults are for one machine."""
 
 from dataclasses import dataclass
 
@@ -7,25 +7,25 @@ from device_agent.protocol import codec
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a client, and all of them together, may take.
+    """Limits of the embedded broker.
 
     Attributes:
-        connections: Open sockets on both listeners; one more is closed at once.
-        connect_timeout_s: Time to send a whole CONNECT [s].
+        connections: Open sockets on both listeners; further ones are closed at once.
+        connect_timeout_s: Time for a complete CONNECT [s].
         connect_bytes: Largest CONNECT: token, user name and will [bytes].
-        payload_bytes: Largest payload [bytes]: what AWS IoT Core takes.
-        retained_bytes: Largest retained payload [bytes]: what Event Grid takes.
+        payload_bytes: Largest payload [bytes], as in AWS IoT Core.
+        retained_bytes: Largest retained payload [bytes], as in Event Grid.
         topic_bytes: Longest topic or filter [bytes].
         filters_per_subscribe: Filters in one SUBSCRIBE.
-        filters_per_client: Filters that one client holds.
-        retained_per_client: Topics that one client keeps retained messages on.
-        retained_total_bytes: All retained payloads together [bytes].
-        inflight: QoS 1 messages sent to a client and not acknowledged by it.
-        waiting: QoS 1 and retained messages that wait for a slow client; one more ends its connection.
-        waiting_bytes: The same in payload [bytes].
-        congested_bytes: Unsent bytes towards a client from which on QoS 0 messages to it are dropped [bytes].
-        unsent_bytes: Unsent bytes that end the connection [bytes]: a client that asks and never reads.
-        token_s: Longest time that a token may still run [s]; revocations are remembered that long.
+        filters_per_client: Filters of one client.
+        retained_per_client: Retained topics of one client.
+        retained_total_bytes: All retained payloads [bytes].
+        inflight: Unacknowledged QoS 1 messages per client.
+        queued: QoS 1 and retained messages queued for a slow client; more close its connection.
+        queued_bytes: The same in payload [bytes].
+        congested_bytes: Unsent data above which QoS 0 messages are dropped [bytes].
+        unsent_bytes: Unsent data above which the connection is closed [bytes].
+        token_s: Maximum remaining lifetime of a token [s]; revocations are stored that long.
     """
 
     connections: int = 1_000
@@ -39,8 +39,8 @@ class Limits:
     retained_per_client: int = 1_000
     retained_total_bytes: int = 256 * 1024 * 1024
     inflight: int = 32
-    waiting: int = 10_000
-    waiting_bytes: int = 32 * 1024 * 1024
+    queued: int = 10_000
+    queued_bytes: int = 32 * 1024 * 1024
     congested_bytes: int = 256 * 1024
     unsent_bytes: int = 4 * 1024 * 1024
     token_s: float = 30 * 86_400.0

@@ -1,7 +1,7 @@
-"""The two ways bytes come: a TCP socket, and a WebSocket. Above them there is no difference.
+"""Transports of the broker: TCP sockets and WebSockets with one interface.
 
-Both set TCP_NODELAY: with Nagle's algorithm a message that follows another waits for the client's delayed
-acknowledgement, 40 ms (facts: latency).
+Both set TCP_NODELAY: with Nagle's algorithm a message waits up to 40 ms for the client's delayed acknowledgement of
+the previous one.
 """
 
 import asyncio
@@ -14,52 +14,52 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 CLOSE_S = 1.0
-"""How long a client may take to read what was written before its connection was closed [s]."""
+"""Time for a client to read pending data before its connection closes [s]."""
 
 
-class Link(Protocol):
-    """The way back to one client."""
+class Transport(Protocol):
+    """Output side of a client connection."""
 
     @property
     def unsent(self) -> int:
-        """Bytes that have not reached the kernel yet."""
+        """Bytes not yet passed to the kernel."""
 
     @property
     def congested(self) -> bool:
-        """Whether more is unsent than a client that keeps up would leave."""
+        """Whether the unsent data exceeds the limit of a client that keeps up."""
 
     def write(self, data: bytes) -> None:
-        """Send; never blocks; nothing happens on a closed link."""
+        """Send data; never blocks; ignored after closing."""
 
     def close(self) -> None:
-        """Close once what was written has been sent, or after ``CLOSE_S``."""
+        """Close after sending pending data, or after ``CLOSE_S``."""
 
     def abort(self) -> None:
-        """Close now."""
+        """Close immediately."""
 
 
 class Receiver(Protocol):
-    """What a link tells the connection on top of it."""
+    """Callbacks of a transport."""
 
     def received(self, data: bytes) -> None:
-        """Bytes have come."""
+        """Data has arrived."""
 
     def drained(self) -> None:
-        """The link is no longer congested."""
+        """The transport is no longer congested."""
 
     def lost(self) -> None:
-        """The link is gone. Called once."""
+        """The transport has closed. Called once."""
 
 
-Connected = Callable[[Link], Receiver]
+Connected = Callable[[Transport], Receiver]
 
 
-def send_at_once(transport: asyncio.BaseTransport) -> None:
-    """Switch off Nagle's algorithm."""
+def disable_nagle(transport: asyncio.BaseTransport) -> None:
+    """Set TCP_NODELAY."""
     transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
-class TcpLink(asyncio.Protocol):
+class TcpTransport(asyncio.Protocol):
     """One accepted TCP socket."""
 
     def __init__(self, connected: Connected, *, congested_bytes: int) -> None:
@@ -70,70 +70,70 @@ class TcpLink(asyncio.Protocol):
         self.congested = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Called by the loop."""
+        """See ``asyncio.Protocol``."""
         self._transport = cast("asyncio.Transport", transport)
-        send_at_once(transport)
+        disable_nagle(transport)
         self._transport.set_write_buffer_limits(high=self._congested_bytes)
         self._receiver = self._connected(self)
 
     def data_received(self, data: bytes) -> None:
-        """Called by the loop."""
+        """See ``asyncio.Protocol``."""
         if self._receiver is not None:
             self._receiver.received(data)
 
     def pause_writing(self) -> None:
-        """Called by the loop."""
+        """See ``asyncio.Protocol``."""
         self.congested = True
 
     def resume_writing(self) -> None:
-        """Called by the loop."""
+        """See ``asyncio.Protocol``."""
         self.congested = False
         if self._receiver is not None:
             self._receiver.drained()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Called by the loop."""
+        """See ``asyncio.Protocol``."""
         del exc
         if self._receiver is not None:
             self._receiver.lost()
 
     @property
     def unsent(self) -> int:
-        """As ``Link`` says."""
+        """See ``Transport``."""
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
     def write(self, data: bytes) -> None:
-        """As ``Link`` says."""
+        """See ``Transport``."""
         if self._transport is not None and not self._transport.is_closing():
             self._transport.write(data)
 
     def close(self) -> None:
-        """As ``Link`` says."""
+        """See ``Transport``."""
         if self._transport is not None:
             self._transport.close()
             asyncio.get_running_loop().call_later(CLOSE_S, self._transport.abort)
 
     def abort(self) -> None:
-        """As ``Link`` says."""
+        """See ``Transport``."""
         if self._transport is not None:
             self._transport.abort()
 
 
-class WebSocketLink:
-    """One accepted WebSocket. Packets that are written while a frame is on its way share the next one."""
+class WebSocketTransport:
+    """One accepted WebSocket. Packets written while a frame is being sent share the next frame."""
 
     def __init__(self, websocket: ServerConnection, connected: Connected, *, congested_bytes: int) -> None:
         self._websocket = websocket
         self._congested_bytes = congested_bytes
-        self._waiting: list[bytes] = []
+        self._pending: list[bytes] = []
         self._unsent = 0
         self._closing = False
         self._wake = asyncio.Event()
-        send_at_once(websocket.transport)
+        disable_nagle(websocket.transport)
         self._receiver = connected(self)
 
     async def serve(self) -> None:
-        """Carry bytes both ways until either side ends it."""
+        """Transfer data in both directions until either side closes."""
         writing = asyncio.create_task(self._write_all())
         try:
             async for message in self._websocket:
@@ -151,29 +151,29 @@ class WebSocketLink:
 
     @property
     def unsent(self) -> int:
-        """As ``Link`` says."""
+        """See ``Transport``."""
         return self._unsent
 
     @property
     def congested(self) -> bool:
-        """As ``Link`` says."""
+        """See ``Transport``."""
         return self._unsent > self._congested_bytes
 
     def write(self, data: bytes) -> None:
-        """As ``Link`` says."""
+        """See ``Transport``."""
         if not self._closing:
-            self._waiting.append(data)
+            self._pending.append(data)
             self._unsent += len(data)
             self._wake.set()
 
     def close(self) -> None:
-        """As ``Link`` says."""
+        """See ``Transport``."""
         self._closing = True
         self._wake.set()
         asyncio.get_running_loop().call_later(CLOSE_S, self._websocket.transport.abort)
 
     def abort(self) -> None:
-        """As ``Link`` says."""
+        """See ``Transport``."""
         self._closing = True
         self._websocket.transport.abort()
 
@@ -182,14 +182,14 @@ class WebSocketLink:
             while True:
                 await self._wake.wait()
                 self._wake.clear()
-                if self._waiting:
-                    data = b"".join(self._waiting)
-                    self._waiting.clear()
+                if self._pending:
+                    data = b"".join(self._pending)
+                    self._pending.clear()
                     await self._websocket.send(data)
                     was_congested = self.congested
                     self._unsent -= len(data)
                     if was_congested and not self.congested:
                         self._receiver.drained()
-                if self._closing and not self._waiting:
+                if self._closing and not self._pending:
                     await self._websocket.close()
                     return

@@ -1,8 +1,7 @@
 """MQTT 3.1.1 packets from and to bytes, without a socket.
 
-A packet is cut out of the stream by its length first and read afterwards, so that a lying length field inside it can
-never reach into the next one. What is not on the path of every message is read and written by amqtt's own codec;
-PUBLISH is done here, because the codec lets text that is not UTF-8 pass and costs as much as all the rest together.
+A packet is cut from the stream by its length before it is parsed, so that an invalid inner length cannot affect the
+next packet. amqtt's codec parses all packets except PUBLISH: for PUBLISH it accepts invalid UTF-8 and is slow.
 """
 
 from collections.abc import Coroutine, Iterator, Mapping
@@ -34,7 +33,7 @@ T = TypeVar("T")
 ACCEPTED, BAD_PROTOCOL, BAD_CLIENT_ID, NOT_AUTHORISED = 0, 1, 2, 5
 """CONNACK return codes."""
 REFUSED = 0x80
-"""SUBACK return code of a filter that was not granted."""
+"""SUBACK return code of a rejected filter."""
 PINGRESP = b"\xd0\x00"
 MAX_QOS = 1
 _QOS_MASK = 0x06
@@ -45,15 +44,15 @@ _EXACT_FLAGS = {SUBSCRIBE: _SUBSCRIBE_FLAGS, UNSUBSCRIBE: _SUBSCRIBE_FLAGS}
 
 
 class MalformedPacket(Exception):  # noqa: N818 (the specification's word)
-    """Bytes that are not the MQTT that this broker speaks; the connection they came on has to end."""
+    """Invalid or unsupported bytes; the connection must be closed."""
 
 
 class UnacceptableProtocol(Exception):  # noqa: N818 (the specification's word)
-    """A CONNECT of another version of MQTT than 3.1.1."""
+    """A CONNECT of an MQTT version other than 3.1.1."""
 
 
 class Frame(NamedTuple):
-    """One whole packet: its type, the flags beside it, and what follows the fixed header."""
+    """One complete packet: type, flags, and the content after the fixed header."""
 
     kind: int
     flags: int
@@ -61,7 +60,7 @@ class Frame(NamedTuple):
 
 
 class Will(NamedTuple):
-    """What a client leaves to be said when it vanishes."""
+    """The message to publish when a client disconnects unexpectedly."""
 
     topic: str
     payload: bytes
@@ -70,7 +69,7 @@ class Will(NamedTuple):
 
 
 class Connect(NamedTuple):
-    """A CONNECT. Empty texts stand for what was not given; ``keep_alive_s`` 0 is none."""
+    """A CONNECT. Missing texts are empty; ``keep_alive_s`` 0 means none."""
 
     client_id: str
     username: str
@@ -90,15 +89,15 @@ class Publish(NamedTuple):
 
 
 class Framer:
-    """Cuts packets out of a stream of bytes. Takes nothing but a CONNECT until ``open_up``."""
+    """Cuts packets from a byte stream. Accepts only CONNECT until ``accept_all``."""
 
     def __init__(self, limits: Limits) -> None:
         self._buffer = bytearray()
         self._limits = limits
         self._longest: Mapping[int, int] = {CONNECT: limits.connect_bytes}
 
-    def open_up(self) -> None:
-        """From now on the packets of an accepted client pass, and no second CONNECT."""
+    def accept_all(self) -> None:
+        """Accept the packets of an admitted client, and no second CONNECT."""
         filters = 2 + self._limits.filters_per_subscribe * (self._limits.topic_bytes + 3)
         self._longest = {
             PUBLISH: self._limits.payload_bytes + self._limits.topic_bytes + 4,
@@ -110,11 +109,10 @@ class Framer:
         }
 
     def feed(self, data: bytes) -> Iterator[Frame]:
-        """Every packet that is now whole.
+        """All packets that are now complete.
 
         Raises:
-            MalformedPacket: A packet out of place, of a type that is not offered, or too long. Raised as soon as its
-                first bytes say so, without waiting for the rest.
+            MalformedPacket: An unexpected, unsupported or too long packet; raised as soon as its first bytes show it.
         """
         self._buffer += data
         while frame := self._next():
@@ -127,9 +125,9 @@ class Framer:
         kind, flags = buffer[0] >> 4, buffer[0] & 0x0F
         longest = self._longest.get(kind)
         if longest is None:
-            raise MalformedPacket(f"a packet of type {kind} has no place here")
+            raise MalformedPacket(f"unexpected packet of type {kind}")
         if kind != PUBLISH and flags != _EXACT_FLAGS.get(kind, 0):
-            raise MalformedPacket(f"flags {flags} on a packet of type {kind}")
+            raise MalformedPacket(f"invalid flags {flags} for packet type {kind}")
         length = shift = 0
         at = 1
         while True:
@@ -142,9 +140,9 @@ class Framer:
                 break
             shift += 7
             if shift > _MAX_LENGTH_SHIFT:
-                raise MalformedPacket("a length of more than four bytes")
+                raise MalformedPacket("length field longer than four bytes")
         if length > longest:
-            raise MalformedPacket(f"a packet of {length} bytes where {longest} is the most")
+            raise MalformedPacket(f"packet of {length} bytes; the maximum is {longest}")
         if len(buffer) - at < length:
             return None
         frame = Frame(kind, flags, bytes(buffer[at : at + length]))
@@ -153,29 +151,29 @@ class Framer:
 
 
 def read_connect(body: bytes) -> Connect:
-    """A CONNECT.
+    """Parse a CONNECT.
 
     Raises:
-        UnacceptableProtocol: MQTT 5, 3.1, or whatever comes next; seen before the rest, which they write differently.
-        MalformedPacket: Not a CONNECT.
+        UnacceptableProtocol: Another MQTT version; detected before the parts that other versions encode differently.
+        MalformedPacket: Not a valid CONNECT.
     """
     reader = BufferReader(body)
-    header = _now(ConnectVariableHeader.from_stream(reader, None))
+    header = _result_of(ConnectVariableHeader.from_stream(reader, None))
     if (header.proto_name, header.proto_level) != ("MQTT", 4):
         if header.proto_name in ("MQTT", "MQIsdp"):
             raise UnacceptableProtocol(f"MQTT level {header.proto_level}")
-        raise MalformedPacket("a CONNECT of another protocol")
+        raise MalformedPacket("CONNECT of another protocol")
     will_flags = header.will_qos or header.will_retain_flag
     if header.reserved_flag or (will_flags and not header.will_flag) or header.will_qos > MAX_QOS:
-        raise MalformedPacket(f"flags {header.flags:#04x} in a CONNECT")
-    payload = _now(ConnectPayload.from_stream(reader, None, header))
+        raise MalformedPacket(f"flags {header.flags:#04x} in CONNECT")
+    payload = _result_of(ConnectPayload.from_stream(reader, None, header))
     missing = (
         (header.will_flag and (payload.will_topic is None or payload.will_message is None))
         or (header.username_flag and payload.username is None)
         or (header.password_flag and payload.password is None)
     )
-    if missing or _now(reader.read(1)):
-        raise MalformedPacket("a CONNECT whose fields do not add up")
+    if missing or _result_of(reader.read(1)):
+        raise MalformedPacket("inconsistent fields in CONNECT")
     will = None
     if header.will_flag:
         will = Will(payload.will_topic, bytes(payload.will_message), header.will_qos, header.will_retain_flag)
@@ -189,10 +187,10 @@ def read_connect(body: bytes) -> Connect:
 
 
 def read_publish(frame: Frame) -> Publish:
-    """A PUBLISH.
+    """Parse a PUBLISH.
 
     Raises:
-        MalformedPacket: Too short, or a topic that is not UTF-8.
+        MalformedPacket: Too short, or the topic is not UTF-8.
     """
     body, flags = frame.body, frame.flags
     qos = (flags & _QOS_MASK) >> 1
@@ -201,27 +199,27 @@ def read_publish(frame: Frame) -> Publish:
     try:
         topic = body[2:start].decode()
     except UnicodeDecodeError as error:
-        raise MalformedPacket("a topic that is not UTF-8") from error
+        raise MalformedPacket("topic is not UTF-8") from error
     if qos:
         packet_id = int.from_bytes(body[start : start + 2])
         start += 2
         if not packet_id:
-            raise MalformedPacket("a PUBLISH without its packet id")
+            raise MalformedPacket("PUBLISH without packet id")
     if start > len(body):
-        raise MalformedPacket("a PUBLISH that ends inside its header")
+        raise MalformedPacket("truncated PUBLISH header")
     return Publish(topic, body[start:], qos, bool(flags & 1), packet_id)
 
 
 def read_subscribe(frame: Frame) -> tuple[int, list[tuple[str, int]]]:
-    """Packet id, and filters with the QoS asked for.
+    """Packet id, and filters with the requested QoS.
 
     Raises:
-        MalformedPacket: None, or not to be read.
+        MalformedPacket: No filters, or invalid.
     """
     packet = _packet(SubscribePacket, frame)
     filters: list[tuple[str, int]] = list(packet.payload.topics)
     if _misread(frame, [text for text, _ in filters], 3) or any(qos > MAX_QOS + 1 for _, qos in filters):
-        raise MalformedPacket("a SUBSCRIBE whose fields do not add up")
+        raise MalformedPacket("inconsistent fields in SUBSCRIBE")
     return packet.variable_header.packet_id, filters
 
 
@@ -229,12 +227,12 @@ def read_unsubscribe(frame: Frame) -> tuple[int, list[str]]:
     """Packet id and filters.
 
     Raises:
-        MalformedPacket: None, or not to be read.
+        MalformedPacket: No filters, or invalid.
     """
     packet = _packet(UnsubscribePacket, frame)
     filters: list[str] = list(packet.payload.topics)
     if _misread(frame, filters, 2):
-        raise MalformedPacket("an UNSUBSCRIBE whose fields do not add up")
+        raise MalformedPacket("inconsistent fields in UNSUBSCRIBE")
     return packet.variable_header.packet_id, filters
 
 
@@ -288,22 +286,22 @@ def publish(topic: str, payload: bytes, *, packet_id: int = 0, retain: bool = Fa
 
 def _packet(kind: Any, frame: Frame) -> Any:
     fixed = MQTTFixedHeader(frame.kind, frame.flags, len(frame.body))
-    return _now(kind.from_stream(BufferReader(frame.body), fixed_header=fixed))
+    return _result_of(kind.from_stream(BufferReader(frame.body), fixed_header=fixed))
 
 
 def _misread(frame: Frame, filters: list[str], overhead: int) -> bool:
-    """Whether the codec has skipped or mended something: a cut-off filter, text that is not UTF-8, no filter at all."""
+    """Whether the codec skipped or repaired something: a truncated filter, invalid UTF-8, no filters."""
     return not filters or 2 + sum(len(text.encode()) + overhead for text in filters) != len(frame.body)
 
 
-def _now(reading: Coroutine[Any, Any, T]) -> T:
-    """The result of one of the codec's coroutines, which has all its bytes and therefore never waits."""
+def _result_of(coroutine: Coroutine[Any, Any, T]) -> T:
+    """The result of a codec coroutine; it has all its data and therefore never waits."""
     try:
-        reading.send(None)
+        coroutine.send(None)
     except StopIteration as end:
         result: T = end.value
         return result
     except (AMQTTError, CodecError, MQTTError, NoDataError, ValueError) as error:
         raise MalformedPacket(str(error) or type(error).__name__) from error
-    reading.close()
-    raise MalformedPacket("a packet that ends inside a field")
+    coroutine.close()
+    raise MalformedPacket("truncated packet")

@@ -1,4 +1,4 @@
-"""Public keys of those who may make tokens, read again when their file changes."""
+"""Public keys of token issuers, reloaded when their file changes."""
 
 import json
 from pathlib import Path
@@ -12,38 +12,38 @@ from device_agent.protocol.security.grants import Grant
 
 
 class KeysError(Exception):
-    """The file of keys cannot be used; the text says what is wrong with it."""
+    """The key file cannot be used; the message gives the reason."""
 
 
 class KeyRing:
-    """Keys by their id, from a JSON object ``{"key id": "base64url"}``."""
+    """Keys by id, from a JSON object ``{"key id": "base64url"}``."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._seen: tuple[int, int, int] | None = None
+        self._version: tuple[int, int, int] | None = None
         self._keys: dict[str, Ed25519PublicKey] = {}
 
     def refresh(self) -> bool:
-        """Read the file when it is not as it was; keeps the keys it had where the new ones cannot be read.
+        """Reload the file if it has changed; keeps the previous keys if the new ones cannot be read.
 
         Returns:
-            Whether there are other keys than before.
+            Whether the keys have changed.
 
         Raises:
-            KeysError: It has changed, and is gone or wrong.
+            KeysError: The changed file is missing or invalid.
         """
         try:
             stat = self._path.stat()
-            stamp = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
-            if stamp == self._seen:
+            version = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+            if version == self._version:
                 return False
             text = self._path.read_text()
         except OSError as error:
-            if self._seen == (0, 0, 0):
+            if self._version == (0, 0, 0):
                 return False
-            self._seen = (0, 0, 0)
+            self._version = (0, 0, 0)
             raise KeysError(f"cannot read the keys in {self._path}: {error.strerror}") from error
-        self._seen = stamp
+        self._version = version
         keys = self._parse(text)
         changed = {name: signing.public_text(key) for name, key in keys.items()} != {
             name: signing.public_text(key) for name, key in self._keys.items()
@@ -55,7 +55,7 @@ class KeyRing:
         """The grant in a token.
 
         Raises:
-            SignatureError: Expired, not a token, or not made by one of the keys.
+            SignatureError: Expired, invalid, or not signed by one of the keys.
         """
         return grants.read(token, self._keys)
 
@@ -66,7 +66,7 @@ class KeyRing:
             raise KeysError(f"{self._path} is not JSON: {error}") from error
         if not isinstance(raw, dict) or not raw:
             raise KeysError(
-                f'{self._path} must be a JSON object {{"key id": "public key in base64url"}} with one or more'
+                f'{self._path} must be a JSON object {{"key id": "public key in base64url"}} with at least one key'
             )
         keys: dict[str, Ed25519PublicKey] = {}
         for name, value in raw.items():

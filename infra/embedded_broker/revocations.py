@@ -1,4 +1,4 @@
-"""What was taken back, remembered over restarts until no token from before can still be running."""
+"""Revoked tokens, stored across restarts until every affected token has expired."""
 
 import contextlib
 import json
@@ -14,15 +14,15 @@ from device_agent.protocol.security.grants import Grant, covering
 from device_agent.protocol.security.revocation import Revoke
 
 _TIDY_AT = 1_000
-"""Revocations from which on those that have run out are looked for."""
+"""Number of revocations at which expired ones are removed."""
 
 
 class RevocationsError(Exception):
-    """The file of revocations cannot be used; the text says what to do."""
+    """The revocation file cannot be used; the message says what to do."""
 
 
 class _Entry(msgspec.Struct, frozen=True):
-    """One line of the file: which field of a grant, its value, and the last moment of issue that it covers."""
+    """One line of the file: a grant field, its value, and the last issue time that it covers."""
 
     field: str
     value: str
@@ -30,14 +30,14 @@ class _Entry(msgspec.Struct, frozen=True):
 
 
 class Revocations:
-    """Refused tokens, by token id, client id or principal.
+    """Revocations by token id, client id or principal.
 
-    The file has one JSON object a line and is appended to; at ``open``, and when there are many, it is written anew
-    without what has run out. A line that a crash has cut short is passed over.
+    The file has one JSON object per line and is appended to. ``open``, and growth, rewrite it without expired entries.
+    A line truncated by a crash is ignored.
     """
 
     def __init__(self, path: Path, *, keep_s: float) -> None:
-        """Remember for ``keep_s`` [s]: the longest that a token may run."""
+        """Keep revocations for ``keep_s`` [s], the maximum lifetime of a token."""
         self._path = path
         self._keep_s = keep_s
         self._before: dict[tuple[str, str], float] = {}
@@ -45,7 +45,7 @@ class Revocations:
         self._tidy_at = _TIDY_AT
 
     def open(self) -> None:
-        """Read the file, tidy it, and keep it open.
+        """Load the file, remove expired entries, and keep it open.
 
         Raises:
             RevocationsError: It cannot be read or written.
@@ -54,41 +54,41 @@ class Revocations:
         try:
             for entry in self._entries():
                 if entry.before_s >= oldest:
-                    self._keep(entry)
-            self._write_anew()
+                    self._store(entry)
+            self._rewrite()
         except OSError as error:
-            raise RevocationsError(f"cannot keep revocations in {self._path}: {error.strerror}") from error
+            raise RevocationsError(f"cannot store revocations in {self._path}: {error.strerror}") from error
 
     def add(self, revoke: Revoke) -> None:
-        """Refuse from now on what ``revoke`` names; on return this survives the end of the process.
+        """Store a revocation; it is durable when the call returns.
 
         Raises:
-            ValueError: Not exactly one of its three was given.
-            OSError: It could not be written. It holds all the same, as long as this process lives.
+            ValueError: Not exactly one of the three fields is set.
+            OSError: It could not be written; it stays in effect until the process ends.
         """
-        named = [(field, getattr(revoke, field)) for field in ("client_id", "principal", "token_id")]
-        given = [(field, value) for field, value in named if value]
+        fields = [(field, getattr(revoke, field)) for field in ("client_id", "principal", "token_id")]
+        given = [(field, value) for field, value in fields if value]
         if len(given) != 1:
-            raise ValueError("a revocation names exactly one of client_id, principal and token_id")
+            raise ValueError("a revocation must name exactly one of client_id, principal and token_id")
         field, value = given[0]
         by_time = field != "token_id" and revoke.before_s is not None
         entry = _Entry(field, value, revoke.before_s if by_time and revoke.before_s is not None else time.time())
-        self._keep(entry)
+        self._store(entry)
         if self._file is not None:
             self._file.write(f"{self._line(entry)}\n")
             self._file.flush()
             os.fsync(self._file.fileno())
         if len(self._before) >= self._tidy_at:
-            self._forget()
+            self._remove_expired()
             self._tidy_at = max(_TIDY_AT, 2 * len(self._before))
-            with contextlib.suppress(OSError):  # the file that there is has all of it, and more
-                self._write_anew()
+            with contextlib.suppress(OSError):  # the existing file is still complete
+                self._rewrite()
 
     def covers(self, grant: Grant, issued_at: float) -> bool:
-        """Whether a grant whose token was made at ``issued_at`` [s since 1970] has been taken back."""
-        named = [("client_id", grant.client_id), *(("principal", name) for name in covering(grant.principal))]
+        """Whether a grant whose token was issued at ``issued_at`` [s since 1970] is revoked."""
+        fields = [("client_id", grant.client_id), *(("principal", name) for name in covering(grant.principal))]
         return ("token_id", grant.token_id) in self._before or any(
-            issued_at <= self._before.get(name, -1.0) for name in named
+            issued_at <= self._before.get(name, -1.0) for name in fields
         )
 
     def close(self) -> None:
@@ -97,26 +97,26 @@ class Revocations:
             self._file.close()
             self._file = None
 
-    def _forget(self) -> None:
-        """Let go of what no running token can be covered by any more."""
+    def _remove_expired(self) -> None:
+        """Remove entries that can no longer cover a valid token."""
         oldest = time.time() - self._keep_s
         self._before = {key: before for key, before in self._before.items() if before >= oldest}
 
-    def _write_anew(self) -> None:
-        """Have a file of what is remembered, and of nothing else, in the place of the one before."""
-        tidy = self._path.with_name(f"{self._path.name}.new")
-        tidy.touch(mode=0o600)
+    def _rewrite(self) -> None:
+        """Replace the file by the current entries."""
+        temporary = self._path.with_name(f"{self._path.name}.new")
+        temporary.touch(mode=0o600)
         with contextlib.ExitStack() as on_error:
-            file = on_error.enter_context(tidy.open("w"))
+            file = on_error.enter_context(temporary.open("w"))
             file.writelines(f"{self._line(_Entry(*key, before))}\n" for key, before in self._before.items())
             file.flush()
             os.fsync(file.fileno())
-            tidy.replace(self._path)
+            temporary.replace(self._path)
             on_error.pop_all()
         self.close()
         self._file = file
 
-    def _keep(self, entry: _Entry) -> None:
+    def _store(self, entry: _Entry) -> None:
         key = (entry.field, entry.value)
         self._before[key] = max(entry.before_s, self._before.get(key, entry.before_s))
 

@@ -1,4 +1,4 @@
-"""Who hears a topic, and what is kept to be said again."""
+"""Subscriptions and retained messages."""
 
 from collections.abc import Hashable, Iterator
 from typing import Generic, NamedTuple, TypeVar
@@ -7,12 +7,12 @@ from device_agent.protocol import topics
 
 C = TypeVar("C", bound=Hashable)
 
-_REMEMBERED_TOPICS = 8_192
-"""Topics whose hearers are remembered; beyond it all are forgotten and looked for again."""
+_CACHED_TOPICS = 8_192
+"""Number of topics with cached subscribers; the cache is cleared beyond it."""
 
 
 def valid_filter(pattern: str, longest: int) -> bool:
-    """Whether a filter's wildcards stand where MQTT allows them, and it is short enough."""
+    """Whether a filter is short enough and its wildcards are at valid positions."""
     if not pattern or len(pattern.encode()) > longest or "\0" in pattern:
         return False
     levels = pattern.split("/")
@@ -22,77 +22,77 @@ def valid_filter(pattern: str, longest: int) -> bool:
 
 
 def valid_topic(topic: str, longest: int) -> bool:
-    """Whether a topic may be published: short enough, no wildcard, not one of the broker's own (``$…``)."""
+    """Whether a topic may be published: short enough, no wildcard, not ``$…``."""
     return bool(topic) and len(topic.encode()) <= longest and topic[0] != "$" and not set(topic) & {"+", "#", "\0"}
 
 
 class Subscriptions(Generic[C]):
-    """Filters and the clients that hold them. A message costs one look-up: hearers are remembered by topic."""
+    """Filters of all clients. Subscribers are cached by topic, so a message costs one look-up."""
 
     def __init__(self) -> None:
         self._exact: dict[str, dict[C, int]] = {}
         self._wild: dict[str, dict[C, int]] = {}
-        self._hearers: dict[str, tuple[tuple[C, int], ...]] = {}
+        self._subscribers: dict[str, tuple[tuple[C, int], ...]] = {}
 
     def add(self, client: C, pattern: str, qos: int) -> None:
-        """Let ``client`` hear ``pattern``; a filter it holds already gets the new QoS."""
+        """Add a filter of a client, or change its QoS."""
         self._table(pattern).setdefault(pattern, {})[client] = qos
-        self._hearers.clear()
+        self._subscribers.clear()
 
     def remove(self, client: C, pattern: str) -> None:
-        """Take one filter back; none held is no error."""
+        """Remove a filter, if present."""
         table = self._table(pattern)
         holders = table.get(pattern, {})
         holders.pop(client, None)
         if not holders:
             table.pop(pattern, None)
-        self._hearers.clear()
+        self._subscribers.clear()
 
-    def hearers(self, topic: str) -> tuple[tuple[C, int], ...]:
-        """Each client that hears ``topic``, once, with the highest QoS of its filters that cover it."""
-        known = self._hearers.get(topic)
-        if known is not None:
-            return known
-        found: dict[C, int] = dict(self._exact.get(topic, {}))
+    def subscribers(self, topic: str) -> tuple[tuple[C, int], ...]:
+        """Each subscriber of ``topic`` once, with the highest QoS of its matching filters."""
+        cached = self._subscribers.get(topic)
+        if cached is not None:
+            return cached
+        matching: dict[C, int] = dict(self._exact.get(topic, {}))
         for pattern, holders in self._wild.items():
             if topics.matches(pattern, topic):
                 for client, qos in holders.items():
-                    found[client] = max(qos, found.get(client, 0))
-        if len(self._hearers) >= _REMEMBERED_TOPICS:
-            self._hearers.clear()
-        result = self._hearers[topic] = tuple(found.items())
+                    matching[client] = max(qos, matching.get(client, 0))
+        if len(self._subscribers) >= _CACHED_TOPICS:
+            self._subscribers.clear()
+        result = self._subscribers[topic] = tuple(matching.items())
         return result
 
     def _table(self, pattern: str) -> dict[str, dict[C, int]]:
         return self._wild if "+" in pattern or "#" in pattern else self._exact
 
 
-class Kept(NamedTuple):
-    """One retained message and the client id that left it."""
+class RetainedMessage(NamedTuple):
+    """One retained message and the client id of its publisher."""
 
     payload: bytes
     qos: int
     owner: str
 
 
-class Retained:
-    """Retained messages, bounded for each client that leaves them and together.
+class RetainedMessages:
+    """Retained messages, limited per publisher and in total.
 
-    In memory only: agents say theirs again on connecting, and after a restart of the broker everybody connects anew.
+    In memory only: after a restart of the broker, agents reconnect and publish their retained messages again.
     """
 
     def __init__(self, *, per_client: int, total_bytes: int) -> None:
         self._per_client = per_client
         self._total_bytes = total_bytes
         self._bytes = 0
-        self._by_topic: dict[str, Kept] = {}
+        self._by_topic: dict[str, RetainedMessage] = {}
         self._counts: dict[str, int] = {}
 
-    def keep(self, topic: str, message: Kept) -> bool:
-        """Keep the newest message of a topic; an empty one clears it.
+    def store(self, topic: str, message: RetainedMessage) -> bool:
+        """Store the newest message of a topic; an empty one deletes it.
 
         Returns:
-            False where a bound is reached, and what was there before stays.
+            False if a limit is reached; the previous message then remains.
         """
         old = self._by_topic.get(topic)
         new_owner = old is None or old.owner != message.owner
@@ -111,16 +111,16 @@ class Retained:
             self._count(message.owner, 1)
         return True
 
-    def matching(self, pattern: str) -> Iterator[tuple[str, Kept]]:
-        """What a new subscription to ``pattern`` has to be told."""
+    def matching(self, pattern: str) -> Iterator[tuple[str, RetainedMessage]]:
+        """RetainedMessages messages for a new subscription."""
         if "+" not in pattern and "#" not in pattern:
-            kept = self._by_topic.get(pattern)
-            if kept is not None:
-                yield pattern, kept
+            message = self._by_topic.get(pattern)
+            if message is not None:
+                yield pattern, message
             return
-        for topic, kept in list(self._by_topic.items()):
+        for topic, message in list(self._by_topic.items()):
             if topics.matches(pattern, topic):
-                yield topic, kept
+                yield topic, message
 
     def _count(self, owner: str, change: int) -> None:
         count = self._counts.get(owner, 0) + change

@@ -1,9 +1,9 @@
 """``python -m infra.home_assistant``: show an account's room devices in Home Assistant.
 
-Prints ``ready`` once both brokers are there. Runs until SIGTERM or SIGINT, and makes lost connections anew.
+Prints ``ready`` once both brokers are connected. Runs until SIGTERM or SIGINT and reconnects automatically.
 
-Its API key stands in ``TELESCOPE_KEY``, the password of Home Assistant's broker in ``HOME_ASSISTANT_PASSWORD``: a list
-of processes shows neither. Exits 4 when the key is refused: it was revoked, or has run out.
+The API key is in ``TELESCOPE_KEY`` and the password of Home Assistant's broker in ``HOME_ASSISTANT_PASSWORD``, so that
+process lists do not show them. Exits with 4 if the key is rejected because it has expired or was revoked.
 """
 
 import argparse
@@ -25,25 +25,25 @@ from infra import programs
 from infra.home_assistant import discovery
 from infra.home_assistant.bridge import Bridge
 
-_WITHIN_S = 15.0
+_TIMEOUT_S = 15.0
 _REFUSED = 4
-_AGAIN_S = 5.0
+_RETRY_S = 5.0
 _RENEW_SHARE = 0.8
-"""Credentials are renewed after this share of their life."""
+"""Credentials are renewed after this share of their lifetime."""
 _log = logging.getLogger("infra.home_assistant")
 
 
 class KeyRefusedError(OSError):
-    """The API key is no good, or no longer."""
+    """The API key is invalid, expired or revoked."""
 
 
 class Telescope:
-    """What an API key may see of the HTTP API.
+    """Client of the HTTP API.
 
     Args:
         server: ``https://host``.
         key: ``ts_…``.
-        ca: The authority (PEM) that alone may speak for the server and its broker; ``None``: those of the machine.
+        ca: CA certificate (PEM) of the server and its broker; ``None`` uses the machine's CAs.
     """
 
     def __init__(self, server: str, key: str, ca: Path | None = None) -> None:
@@ -51,55 +51,57 @@ class Telescope:
         self._base = server.rstrip("/") + "/api/v1"
         self._ca = ca
         self._http = requests.Session()
-        self._http.trust_env = ca is None  # else a variable of the environment would name other authorities
+        self._http.trust_env = ca is None  # otherwise environment variables could replace the CA
         self._http.verify = True if ca is None else str(ca)
         self._http.headers["Authorization"] = f"Bearer {key}"
 
     def watch(self) -> dict[str, Any]:
-        """Credentials to hear all that the account may see.
+        """Broker credentials for everything that the account may view.
 
         Raises:
-            OSError: Not reached, or refused.
+            OSError: The server cannot be reached or rejects the request.
         """
         return self._post("/mqtt/credentials", {"purpose": "view"})
 
-    def tls(self, given: dict[str, Any]) -> ssl.SSLContext | None:
-        """How to connect to the broker that the credentials name.
+    def tls(self, credentials: dict[str, Any]) -> ssl.SSLContext | None:
+        """TLS context for the broker of these credentials.
 
         Raises:
-            OSError: The authority cannot be read.
-            ValueError: The broker does not speak TLS, though the server does.
+            OSError: The CA certificate cannot be read.
+            ValueError: The server uses TLS, but the broker does not.
         """
-        return trust.broker(tls=given["tcp"]["tls"], server=self._server, ca=self._ca, own=None)
+        return trust.broker(tls=credentials["tcp"]["tls"], server=self._server, ca=self._ca, own=None)
 
     def set(self, device: str, control: str, value: float) -> str:
-        """Set a control; why not, or nothing."""
-        order = {"kind": "set_control", "control": control, "value": value}
+        """Set a control; returns an error message, or an empty string."""
+        request = {"kind": "set_control", "control": control, "value": value}
         try:
-            done = self._post(f"/devices/{device}/actions", {"request": order, "wait_ms": 10_000, "wait_for": "done"})
+            result = self._post(
+                f"/devices/{device}/actions", {"request": request, "wait_ms": 10_000, "wait_for": "done"}
+            )
         except (OSError, ValueError) as error:
             return str(error)
-        if done.get("status") == "done":
+        if result.get("status") == "done":
             return ""
-        return str((done.get("reason") or {}).get("message") or done.get("status"))
+        return str((result.get("reason") or {}).get("message") or result.get("status"))
 
     def _post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
-        answer = self._http.post(self._base + path, json=body, timeout=_WITHIN_S)
-        found: dict[str, Any] = answer.json() if answer.content else {}
-        if answer.status_code == requests.codes.unauthorized:
-            raise KeyRefusedError(str(found.get("detail") or answer.reason))
-        if not answer.ok:
-            raise OSError(str(found.get("detail") or answer.reason))
-        return found
+        response = self._http.post(self._base + path, json=body, timeout=_TIMEOUT_S)
+        content: dict[str, Any] = response.json() if response.content else {}
+        if response.status_code == requests.codes.unauthorized:
+            raise KeyRefusedError(str(content.get("detail") or response.reason))
+        if not response.ok:
+            raise OSError(str(content.get("detail") or response.reason))
+        return content
 
 
 def main() -> int:
-    """Run; the exit code."""
+    """Run the bridge; returns the exit code."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     arguments = _arguments()
     key = os.environ.get("TELESCOPE_KEY", "").strip()
     if not key.isascii() or not key:
-        print("home assistant: TELESCOPE_KEY is empty; make a key with `function_app api-key`", file=sys.stderr)
+        print("home assistant: TELESCOPE_KEY is empty; create a key with `function_app api-key`", file=sys.stderr)
         return programs.BAD_INPUT
     try:
         _check(arguments)
@@ -107,104 +109,104 @@ def main() -> int:
         print(f"home assistant: {error}", file=sys.stderr)
         return programs.BAD_INPUT
     telescope = Telescope(arguments.server, key, arguments.ca)
-    ending = threading.Event()
+    stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ending.set())
-    there = mqtt.Client(CallbackAPIVersion.VERSION2, "telescope-bridge")
-    bridge = Bridge(lambda topic, content, retain: there.publish(topic, content, 0, retain), telescope.set)
+        signal.signal(number, lambda *_: stopping.set())
+    home_assistant = mqtt.Client(CallbackAPIVersion.VERSION2, "telescope-bridge")
+    bridge = Bridge(lambda topic, content, retain: home_assistant.publish(topic, content, 0, retain), telescope.set)
     try:
-        _connect_there(there, bridge, arguments)
+        _connect_home_assistant(home_assistant, bridge, arguments)
     except OSError as error:
         print(f"home assistant: its broker {arguments.broker}:{arguments.port}: {error}", file=sys.stderr)
         return programs.CANNOT_START
     try:
-        while not ending.is_set():
+        while not stopping.is_set():
             try:
-                _watch(telescope, bridge, ending)
+                _watch(telescope, bridge, stopping)
             except KeyRefusedError as error:
                 print(f"home assistant: {error}", file=sys.stderr)
                 return _REFUSED
             except (OSError, ValueError) as error:
-                _log.warning("telescope: %s; trying again in %.0f s", error, _AGAIN_S)
-                ending.wait(_AGAIN_S)
+                _log.warning("telescope: %s; reconnecting in %.0f s", error, _RETRY_S)
+                stopping.wait(_RETRY_S)
     finally:
         bridge.close()
-        there.disconnect()
-        there.loop_stop()
+        home_assistant.disconnect()
+        home_assistant.loop_stop()
     return 0
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """See at the start that the authorities can be used.
+    """Check the CA options at start-up.
 
     Raises:
-        OSError: One cannot, or does not fit.
+        OSError: A CA file cannot be used or does not apply.
     """
     if arguments.ca is not None and not arguments.server.startswith("https://"):
-        raise OSError("--ca says who may speak for an https server; this one speaks http, which nobody vouches for")
+        raise OSError("--ca requires an https server")
     for ca in (arguments.ca, arguments.broker_ca):
         if ca is not None:
             try:
                 trust.context(ca)
             except FileNotFoundError as error:
-                raise OSError(f"there is no file {ca}") from error
+                raise OSError(f"{ca} does not exist") from error
 
 
-def _connect_there(there: mqtt.Client, bridge: Bridge, arguments: argparse.Namespace) -> None:
-    """Home Assistant's broker; paho makes the connection anew where it is lost."""
+def _connect_home_assistant(home_assistant: mqtt.Client, bridge: Bridge, arguments: argparse.Namespace) -> None:
+    """Connect to Home Assistant's broker; paho reconnects."""
 
     def connected(client: mqtt.Client, *_: object) -> None:
         client.subscribe([(f"{discovery.ROOT}/+/set/+", 1), (f"{discovery.DISCOVERY}/status", 1)])
-        bridge.again()
+        bridge.announce_all()
 
-    def heard(_client: mqtt.Client, _data: object, message: mqtt.MQTTMessage) -> None:
+    def received(_client: mqtt.Client, _data: object, message: mqtt.MQTTMessage) -> None:
         if message.topic == f"{discovery.DISCOVERY}/status":
-            bridge.again()  # it has just started
+            bridge.announce_all()  # Home Assistant has restarted
         else:
-            bridge.told(message.topic, bytes(message.payload))
+            bridge.on_command(message.topic, bytes(message.payload))
 
-    there.on_connect = connected
-    there.on_message = heard
+    home_assistant.on_connect = connected
+    home_assistant.on_message = received
     if arguments.user:
-        there.username_pw_set(arguments.user, os.environ.get("HOME_ASSISTANT_PASSWORD", ""))
+        home_assistant.username_pw_set(arguments.user, os.environ.get("HOME_ASSISTANT_PASSWORD", ""))
     if arguments.broker_ca is not None:
-        there.tls_set_context(trust.context(arguments.broker_ca))
-    there.connect(arguments.broker, arguments.port)
-    there.loop_start()
+        home_assistant.tls_set_context(trust.context(arguments.broker_ca))
+    home_assistant.connect(arguments.broker, arguments.port)
+    home_assistant.loop_start()
 
 
-def _watch(telescope: Telescope, bridge: Bridge, ending: threading.Event) -> None:
-    """One connection to Telescope's broker, until it is lost, its credentials grow old, or the program ends."""
-    given = telescope.watch()
+def _watch(telescope: Telescope, bridge: Bridge, stopping: threading.Event) -> None:
+    """One connection to Telescope's broker, until it is lost, its credentials expire, or the program stops."""
+    credentials = telescope.watch()
     lost = threading.Event()
-    here = mqtt.Client(CallbackAPIVersion.VERSION2, given["client_id"], reconnect_on_failure=False)
-    here.username_pw_set(given["username"], given["password"])
-    tls = telescope.tls(given)
+    client = mqtt.Client(CallbackAPIVersion.VERSION2, credentials["client_id"], reconnect_on_failure=False)
+    client.username_pw_set(credentials["username"], credentials["password"])
+    tls = telescope.tls(credentials)
     if tls is not None:
-        here.tls_set_context(tls)
+        client.tls_set_context(tls)
 
     def connected(client: mqtt.Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
             lost.set()
             return
-        for topic in given["subscribe"]:
+        for topic in credentials["subscribe"]:
             client.subscribe(topic, 0)
         print("ready", flush=True)
 
-    here.on_connect = connected
-    here.on_disconnect = lambda *_: lost.set()
-    here.on_message = lambda _client, _data, message: bridge.hear(message.topic, bytes(message.payload))
-    here.connect(given["tcp"]["host"], given["tcp"]["port"])
-    here.loop_start()
+    client.on_connect = connected
+    client.on_disconnect = lambda *_: lost.set()
+    client.on_message = lambda _client, _data, message: bridge.on_device_message(message.topic, bytes(message.payload))
+    client.connect(credentials["tcp"]["host"], credentials["tcp"]["port"])
+    client.loop_start()
     try:
         waited_s = 0.0
-        while not (ending.is_set() or lost.is_set()) and waited_s < given["lifetime_s"] * _RENEW_SHARE:
-            ending.wait(0.25)
+        while not (stopping.is_set() or lost.is_set()) and waited_s < credentials["lifetime_s"] * _RENEW_SHARE:
+            stopping.wait(0.25)
             waited_s += 0.25
     finally:
-        here.disconnect()
-        here.loop_stop()
-    if lost.is_set() and not ending.is_set():
+        client.disconnect()
+        client.loop_stop()
+    if lost.is_set() and not stopping.is_set():
         raise OSError("the connection to the broker was lost")
 
 
@@ -212,10 +214,8 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m infra.home_assistant", description="Shows an account's room devices in Home Assistant."
     )
-    parser.add_argument("--server", required=True, help="Telescope, https://host")
-    parser.add_argument(
-        "--ca", type=Path, metavar="FILE", help="the authority (PEM) that alone may speak for an https server"
-    )
+    parser.add_argument("--server", required=True, help="Telescope server, https://host")
+    parser.add_argument("--ca", type=Path, metavar="FILE", help="CA certificate (PEM) of the server and its broker")
     parser.add_argument("--broker", default="127.0.0.1", help="host of Home Assistant's MQTT broker")
     parser.add_argument("--port", type=int, default=1883, help="its port")
     parser.add_argument("--user", default="", help="its user; the password is in HOME_ASSISTANT_PASSWORD")
@@ -223,7 +223,7 @@ def _arguments() -> argparse.Namespace:
         "--broker-ca",
         type=Path,
         metavar="FILE",
-        help="speak TLS to it; the authority (PEM) that speaks for it",
+        help="use TLS with this CA certificate (PEM)",
     )
     return parser.parse_args()
 

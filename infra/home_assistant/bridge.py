@@ -1,4 +1,4 @@
-"""Carries what devices say to Home Assistant's broker, and what is set there back to the devices."""
+"""Forwards device messages to Home Assistant's broker and its commands to the devices."""
 
 import json
 import logging
@@ -11,42 +11,42 @@ from device_agent.protocol.errors import ProtocolError
 from infra.home_assistant import discovery
 from infra.home_assistant.discovery import Announcement
 
-Say = Callable[[str, bytes, bool], object]
+Publish = Callable[[str, bytes, bool], object]
 """Publishes on Home Assistant's broker: topic, content, retained."""
-Order = Callable[[str, str, float], str]
-"""Sets a control: device, control, value. Gives why not, or nothing."""
+SetControl = Callable[[str, str, float], str]
+"""Sets a control: device, control, value. Returns an error message, or an empty string."""
 _log = logging.getLogger(__name__)
 
 
 class Bridge:
-    """Between two brokers. ``hear`` is called by one connection's thread, ``told`` by the other's; neither waits.
+    """Connects two brokers. Each callback runs in its connection's thread and never blocks.
 
     Args:
-        say: Speaks to Home Assistant.
-        order: Asks Telescope; may take as long as the network needs.
+        publish: Publishes to Home Assistant.
+        set_control: Sets a control; may block for the network.
     """
 
-    def __init__(self, say: Say, order: Order) -> None:
-        self._say = say
-        self._order = order
-        self._orders = ThreadPoolExecutor(max_workers=1, thread_name_prefix="orders")
+    def __init__(self, publish: Publish, set_control: SetControl) -> None:
+        self._publish = publish
+        self._set_control = set_control
+        self._requests = ThreadPoolExecutor(max_workers=1, thread_name_prefix="set-control")
         self._known: dict[str, Description] = {}
         self._announced: set[str] = set()
 
     def close(self) -> None:
-        """Let what is under way end."""
-        self._orders.shutdown(wait=True, cancel_futures=True)
+        """Wait for pending requests."""
+        self._requests.shutdown(wait=True, cancel_futures=True)
 
-    def again(self) -> None:
-        """Home Assistant's broker is there anew: announce all, as it is heard."""
+    def announce_all(self) -> None:
+        """Announce all known devices, after Home Assistant or its broker has restarted."""
         self._announced.clear()
-        for device, about in list(self._known.items()):
-            self._announce(discovery.of_device(device, about))
+        for device, description in list(self._known.items()):
+            self._announce(discovery.announce_device(device, description))
 
     # ------------------------------------------------------------ from devices
 
-    def hear(self, topic: str, payload: bytes) -> None:
-        """What a device or agent said; what is none of a room device's is let go."""
+    def on_device_message(self, topic: str, payload: bytes) -> None:
+        """Process a message of a device or agent; ignores messages of other devices."""
         try:
             parsed = topics.parse(topic)
             device = f"{parsed.agent}-{parsed.device}"
@@ -58,50 +58,52 @@ class Bridge:
                 case topics.TELE if device in self._known:
                     self._measured(device, parsed.name, payload)
                 case topics.CAM if device in self._known:
-                    self._say(discovery.topic(device, "cam", parsed.name), camera_frames.decode(payload).jpeg, False)
+                    self._publish(
+                        discovery.topic(device, "cam", parsed.name), camera_frames.decode(payload).jpeg, False
+                    )
         except ProtocolError as error:
             _log.warning("%s: %s", topic, str(error)[:300])
 
-    def _describe(self, device: str, about: Description) -> None:
-        if about.joints or not (about.streams or about.controls or about.cameras):
-            return  # a robot: Home Assistant is no place to move one
-        self._known[device] = about
-        self._announce(discovery.of_device(device, about))
-        self._say(discovery.topic(device, "available"), b"online", True)
+    def _describe(self, device: str, description: Description) -> None:
+        if description.joints or not (description.streams or description.controls or description.cameras):
+            return  # robots are not controlled from Home Assistant
+        self._known[device] = description
+        self._announce(discovery.announce_device(device, description))
+        self._publish(discovery.topic(device, "available"), b"online", True)
 
     def _available(self, agent: str, *, online: bool) -> None:
         for device in self._known:
             if device.startswith(f"{agent}-"):
-                self._say(discovery.topic(device, "available"), b"online" if online else b"offline", True)
+                self._publish(discovery.topic(device, "available"), b"online" if online else b"offline", True)
 
     def _measured(self, device: str, stream: str, payload: bytes) -> None:
         values = codec.decode(payload, Measurements).values
-        self._announce(discovery.of_values(device, self._known[device], stream, values))
-        self._say(discovery.topic(device, "tele", stream), payload, False)
+        self._announce(discovery.announce_values(device, self._known[device], stream, values))
+        self._publish(discovery.topic(device, "tele", stream), payload, False)
 
     def _announce(self, announcements: Iterable[Announcement]) -> None:
-        for each in announcements:
-            if each.topic not in self._announced:
-                self._announced.add(each.topic)
-                self._say(each.topic, json.dumps(each.content, ensure_ascii=False).encode(), True)
+        for announcement in announcements:
+            if announcement.topic not in self._announced:
+                self._announced.add(announcement.topic)
+                self._publish(announcement.topic, json.dumps(announcement.content, ensure_ascii=False).encode(), True)
 
     # ------------------------------------------------------------ from Home Assistant
 
-    def told(self, topic: str, payload: bytes) -> None:
-        """Somebody moved a slider; what the device does not have, or is no number, is let go."""
+    def on_command(self, topic: str, payload: bytes) -> None:
+        """Process a command of Home Assistant; ignores unknown controls and invalid values."""
         match topic.split("/"):
             case [discovery.ROOT, device, "set", name] if device in self._known:
-                control = next((each for each in self._known[device].controls if each.name == name), None)
+                control = next((one for one in self._known[device].controls if one.name == name), None)
                 try:
                     value = float(payload)
                 except ValueError:
                     value = math.nan
                 if control is None or not control.lower <= value <= control.upper:
-                    _log.warning("%s: %r is nothing to set it to", topic, payload[:40])
+                    _log.warning("%s: invalid value %r", topic, payload[:40])
                     return
-                self._orders.submit(self._set, device, name, value)
+                self._requests.submit(self._set, device, name, value)
 
     def _set(self, device: str, control: str, value: float) -> None:
-        why = self._order(device, control, value)
-        if why:
-            _log.warning("%s of %s was not set to %g: %s", control, device, value, why)
+        error = self._set_control(device, control, value)
+        if error:
+            _log.warning("%s of %s was not set to %g: %s", control, device, value, error)

@@ -1,7 +1,7 @@
-"""What Home Assistant is told of a device: one retained configuration for each value, control and camera. Pure.
+"""Home Assistant discovery: one retained configuration for each value, control and camera. Pure functions.
 
-Fields after https://www.home-assistant.io/integrations/mqtt/. Measurements pass as they are, and a ``value_template``
-picks the value out, so a new field needs nothing new here.
+Fields follow https://www.home-assistant.io/integrations/mqtt/. Measurements are forwarded unchanged, and a
+``value_template`` selects the value.
 """
 
 from collections.abc import Iterator, Mapping
@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 from device_agent.protocol import Control, Description
 
 DISCOVERY = "homeassistant"
-"""Where Home Assistant looks, unless it was told otherwise."""
+"""Home Assistant's default discovery prefix."""
 ROOT = "telescope"
 _LEAST_STEP = 0.001
-"""Home Assistant takes no finer one."""
+"""Home Assistant's minimum step."""
 SETTINGS = "settings"
-"""The stream that carries what controls are at."""
+"""Stream with the current values of controls."""
 
 _CLASSES: Mapping[str, tuple[str, str]] = {
     "temperature_c": ("temperature", "°C"),
@@ -24,14 +24,14 @@ _CLASSES: Mapping[str, tuple[str, str]] = {
     "light_lux": ("illuminance", "lx"),
     "sound_db": ("sound_pressure", "dB"),
 }
-"""Quantity → Home Assistant's class and unit."""
+"""Quantity → Home Assistant's device class and unit."""
 _UNITS: Mapping[str, tuple[str, str]] = {
     "_m": ("distance", "m"),
     "_c": ("temperature", "°C"),
     "_v": ("voltage", "V"),
     "_a": ("current", "A"),
 }
-"""How other quantities end → class and unit."""
+"""Suffix of other quantities → device class and unit."""
 _BINARY: Mapping[str, str] = {"present": "motion", "open": "opening"}
 
 
@@ -43,62 +43,62 @@ class Announcement(NamedTuple):
 
 
 _FOR_PROGRAMS = "_bits"
-"""So end names of values that say nothing to people: rows of the room's floor, a place a bit."""
+"""Suffix of values for programs only: bit rows of the occupancy grid."""
 
 
 def topic(device: str, kind: str, name: str = "") -> str:
-    """Where the bridge says what a device says: ``telescope/{device}/{kind}[/{name}]``."""
+    """Topic of the bridge for a device: ``telescope/{device}/{kind}[/{name}]``."""
     return f"{ROOT}/{device}/{kind}" + (f"/{name}" if name else "")
 
 
-def of_values(
-    device: str, about: Description, stream: str, values: Mapping[str, float | bool]
+def announce_values(
+    device: str, description: Description, stream: str, values: Mapping[str, float | bool]
 ) -> Iterator[Announcement]:
-    """What a stream measures, known once it has been measured.
+    """Configurations of a stream's values.
 
     Args:
         device: Its id.
-        about: What it says of itself.
-        stream: The stream's name.
-        values: Of one measurement.
+        description: Its description.
+        stream: Name of the stream.
+        values: One measurement.
     """
-    controls = {control.name for control in about.controls}
+    controls = {control.name for control in description.controls}
     for field, value in values.items():
         if stream == SETTINGS and field in controls:
-            continue  # its number shows it
+            continue  # already a number entity
         quantity, _, part = field.partition(".")
         if quantity.endswith(_FOR_PROGRAMS):
             continue
-        picked = f"value_json['values']['{field}']"
-        content = _common(device, about, f"{stream}-{field}", _spoken(quantity, part)) | {
+        selector = f"value_json['values']['{field}']"
+        content = _common(device, description, f"{stream}-{field}", _readable(quantity, part)) | {
             "state_topic": topic(device, "tele", stream)
         }
         if isinstance(value, bool):
-            content["value_template"] = "{{ 'ON' if " + picked + " else 'OFF' }}"
+            content["value_template"] = "{{ 'ON' if " + selector + " else 'OFF' }}"
             if quantity in _BINARY:
                 content["device_class"] = _BINARY[quantity]
             yield _announce("binary_sensor", device, f"{stream}-{field}", content)
             continue
-        content |= {"value_template": "{{ " + picked + " }}", "state_class": "measurement"}
-        known = _CLASSES.get(quantity) or next((each for end, each in _UNITS.items() if quantity.endswith(end)), None)
-        if known is not None:
-            content["device_class"], content["unit_of_measurement"] = known
+        content |= {"value_template": "{{ " + selector + " }}", "state_class": "measurement"}
+        unit = _CLASSES.get(quantity) or next((each for end, each in _UNITS.items() if quantity.endswith(end)), None)
+        if unit is not None:
+            content["device_class"], content["unit_of_measurement"] = unit
         yield _announce("sensor", device, f"{stream}-{field}", content)
 
 
-def of_device(device: str, about: Description) -> Iterator[Announcement]:
-    """What a device has before it has measured anything: its controls and cameras."""
-    for control in about.controls:
-        yield _announce("number", device, f"set-{control.name}", _number(device, about, control))
-    for camera in about.cameras:
-        content = _common(device, about, f"cam-{camera.name}", camera.name) | {
+def announce_device(device: str, description: Description) -> Iterator[Announcement]:
+    """Configurations of a device's controls and cameras."""
+    for control in description.controls:
+        yield _announce("number", device, f"set-{control.name}", _number(device, description, control))
+    for camera in description.cameras:
+        content = _common(device, description, f"cam-{camera.name}", camera.name) | {
             "topic": topic(device, "cam", camera.name)
         }
         yield _announce("camera", device, f"cam-{camera.name}", content)
 
 
-def _number(device: str, about: Description, control: Control) -> dict[str, Any]:
-    content = _common(device, about, f"set-{control.name}", control.label) | {
+def _number(device: str, description: Description, control: Control) -> dict[str, Any]:
+    content = _common(device, description, f"set-{control.name}", control.label) | {
         "command_topic": topic(device, "set", control.name),
         "min": control.lower,
         "max": control.upper,
@@ -107,27 +107,27 @@ def _number(device: str, about: Description, control: Control) -> dict[str, Any]
     }
     if control.unit:
         content["unit_of_measurement"] = control.unit
-    if any(stream.name == SETTINGS for stream in about.streams):
+    if any(stream.name == SETTINGS for stream in description.streams):
         content["state_topic"] = topic(device, "tele", SETTINGS)
         content["value_template"] = "{{ value_json['values']['" + control.name + "'] }}"
     return content
 
 
-def _common(device: str, about: Description, part: str, name: str) -> dict[str, Any]:
+def _common(device: str, description: Description, part: str, name: str) -> dict[str, Any]:
     return {
         "name": name,
         "unique_id": f"{ROOT}-{device}-{part}",
         "availability_topic": topic(device, "available"),
         "device": {
             "identifiers": [f"{ROOT}-{device}"],
-            "name": about.label,
+            "name": description.label,
             "manufacturer": "Telescope",
-            "model": about.kind,
+            "model": description.kind,
         },
     }
 
 
-def _spoken(quantity: str, part: str) -> str:
+def _readable(quantity: str, part: str) -> str:
     words = quantity.replace("_", " ")
     return f"{words} {part}" if part else words
 

@@ -1,1 +1,1 @@
-"""``make up``: the whole product on one machine, one process each, watched."""
+"""``make up``: the whole product on one machine, one supervised process per program."""

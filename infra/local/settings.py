@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Literal, cast
 
 XMPP_DOMAIN = "telescope.localhost"
-"""Of one machine: no name that anybody could look up."""
+"""Domain of a single machine; not resolvable."""
 ROOMS = Path(__file__).resolve().parents[2] / "robots" / "rooms"
 NO_ROOM = "none"
 _STARTED = "started.json"
-_REMEMBERED = (
+_STORED = (
     "TELESCOPE_PORT",
     "TELESCOPE_BROKER",
     "TELESCOPE_XMPP",
@@ -21,20 +21,19 @@ _REMEMBERED = (
     "TELESCOPE_ROOM",
     "TELESCOPE_PUBLIC_URL",
 )
-"""Settings that somebody else's command at the same folder needs as well. None of them is a secret."""
+"""Settings that other commands for the same folder need, too. None is secret."""
 
 
 class SettingsError(Exception):
-    """A setting is wrong; the text names it and what it may be."""
+    """A setting is invalid; the message names it and its valid values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Where things are. Ports follow ``port``: MQTT is the next one, MQTT over WebSocket the one after, then XMPP.
+    """Folders, ports and options. MQTT uses the port after ``port``, MQTT over WebSocket the next, then XMPP.
 
-    ``tls``: page, API and broker speak TLS alone, by the certificates in ``tls_home``. ``certificates``: the broker
-    wants to see one of each agent, too.
-    ``room``: the simulated room whose robots and devices are started; empty for an arm alone.
+    ``tls``: page, API and broker use TLS only, with the certificates in ``tls_home``. ``certificates``: the broker also
+    requires a client certificate of each agent. ``room``: the simulated room to start; empty for a single arm.
     """
 
     home: Path
@@ -58,7 +57,7 @@ class Settings:
 
     @property
     def xmpp_port(self) -> int:
-        """XMPP, where it is wanted."""
+        """XMPP, if enabled."""
         return self.port + 3
 
     @property
@@ -73,7 +72,7 @@ class Settings:
 
     @property
     def ca(self) -> Path:
-        """The authority that programs on this machine are to trust, where it is a private one."""
+        """The CA certificate that local programs must trust, if it is a private one."""
         return self.tls_home / "ca.crt"
 
     @property
@@ -82,7 +81,7 @@ class Settings:
         return f"http{'s' if self.tls else ''}://{self.host}:{self.port}"
 
     def environment(self) -> dict[str, str]:
-        """What the started programs see."""
+        """Environment of the started programs."""
         return os.environ | {
             "TELESCOPE_HOME": str(self.home),
             "TELESCOPE_HOST": self.host,
@@ -107,35 +106,35 @@ class Settings:
         }
 
 
-def remember(chosen: Settings, environment: Mapping[str, str]) -> None:
-    """Note in the folder how it was started.
+def save_started(settings: Settings, environment: Mapping[str, str]) -> None:
+    """Store the settings of this start in the folder.
 
     Raises:
         OSError: The folder cannot be written.
     """
-    given = {name: environment[name] for name in _REMEMBERED if name in environment}
-    chosen.home.mkdir(parents=True, exist_ok=True, mode=0o700)
-    fresh = chosen.home / f"{_STARTED}.new"
-    fresh.write_text(json.dumps(given, indent=1) + "\n")
-    fresh.replace(chosen.home / _STARTED)
+    values = {name: environment[name] for name in _STORED if name in environment}
+    settings.home.mkdir(parents=True, exist_ok=True, mode=0o700)
+    temporary = settings.home / f"{_STARTED}.new"
+    temporary.write_text(json.dumps(values, indent=1) + "\n")
+    temporary.replace(settings.home / _STARTED)
 
 
-def recall(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment, with how its folder was started last in place of what it does not say.
+def load_started(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment, completed by the settings of the folder's last start.
 
     Raises:
-        SettingsError: What was noted there cannot be read.
+        SettingsError: The stored settings cannot be read.
     """
-    note = _home(environment) / _STARTED
+    path = _home(environment) / _STARTED
     try:
-        noted = json.loads(note.read_text())
+        values = json.loads(path.read_text())
     except FileNotFoundError:
         return dict(environment)
     except (OSError, ValueError) as error:
-        raise SettingsError(f"{note} cannot be read ({error}); delete it, and run `make up` once") from error
-    if not isinstance(noted, dict):
-        raise SettingsError(f"{note} is not what `make up` writes; delete it, and run `make up` once")
-    return {name: str(noted[name]) for name in _REMEMBERED if name in noted} | dict(environment)
+        raise SettingsError(f"cannot read {path} ({error}); delete it and run `make up` once") from error
+    if not isinstance(values, dict):
+        raise SettingsError(f"{path} is invalid; delete it and run `make up` once")
+    return {name: str(values[name]) for name in _STORED if name in values} | dict(environment)
 
 
 def _home(environment: Mapping[str, str]) -> Path:
@@ -143,10 +142,10 @@ def _home(environment: Mapping[str, str]) -> Path:
 
 
 def read(environment: Mapping[str, str]) -> Settings:
-    """The settings in force.
+    """The settings of an environment.
 
     Raises:
-        SettingsError: One is wrong.
+        SettingsError: A setting is invalid.
     """
     port = environment.get("TELESCOPE_PORT", "8080")
     if not port.isdecimal() or not 1 <= int(port) <= 65532:  # noqa: PLR2004 (three more ports follow)
@@ -156,12 +155,12 @@ def read(environment: Mapping[str, str]) -> Settings:
         raise SettingsError(f"TELESCOPE_BROKER is '{broker}'; it must be amqtt or mosquitto")
     xmpp = environment.get("TELESCOPE_XMPP", "0")
     if xmpp not in ("0", "1"):
-        raise SettingsError(f"TELESCOPE_XMPP is '{xmpp}'; it must be 1, for an XMPP server too, or 0")
+        raise SettingsError(f"TELESCOPE_XMPP is '{xmpp}'; it must be 1, to start an XMPP server, or 0")
     tls = environment.get("TELESCOPE_TLS", "0")
     if tls not in ("0", "1"):
-        raise SettingsError(f"TELESCOPE_TLS is '{tls}'; it must be 1, for TLS with the certificates in tls/, or 0")
+        raise SettingsError(f"TELESCOPE_TLS is '{tls}'; it must be 1, to use TLS with the certificates in tls/, or 0")
     if tls == xmpp == "1":
-        raise SettingsError("TELESCOPE_XMPP=1 asks the functions in the clear; on a site with TELESCOPE_TLS=1 use MQTT")
+        raise SettingsError("TELESCOPE_XMPP=1 does not support TLS; with TELESCOPE_TLS=1 use MQTT")
     certificates = environment.get("TELESCOPE_AGENT_CERTIFICATES", "0")
     if certificates not in ("0", "1") or (certificates == "1" and (tls != "1" or broker != "mosquitto")):
         raise SettingsError(
@@ -169,9 +168,9 @@ def read(environment: Mapping[str, str]) -> Settings:
             "TELESCOPE_BROKER=mosquitto"
         )
     room = environment.get("TELESCOPE_ROOM", "lab")
-    known = sorted(path.parent.name for path in ROOMS.glob("*/room.toml"))
-    if room not in (*known, NO_ROOM):
-        raise SettingsError(f"TELESCOPE_ROOM is '{room}'; it must be {', '.join(known)}, or {NO_ROOM} for an arm alone")
+    rooms = sorted(path.parent.name for path in ROOMS.glob("*/room.toml"))
+    if room not in (*rooms, NO_ROOM):
+        raise SettingsError(f"TELESCOPE_ROOM is '{room}'; it must be {', '.join(rooms)}, or {NO_ROOM} for a single arm")
     return Settings(
         home=_home(environment),
         port=int(port),

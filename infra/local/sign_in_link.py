@@ -1,4 +1,4 @@
-"""``make link``: another one-time sign-in link for what ``make up`` has started, as it was started."""
+"""``make link``: print another one-time sign-in link for the product that ``make up`` started."""
 
 import os
 import sys
@@ -9,13 +9,13 @@ from infra.local.settings import SettingsError
 
 
 def main() -> NoReturn:
-    """Become the program that prints the link; exits with one line where it is not known how."""
+    """Replace this process by the program that prints the link; exits with an error if the settings are invalid."""
     try:
-        chosen = settings.read(settings.recall(os.environ))
+        started = settings.read(settings.load_started(os.environ))
     except SettingsError as error:
         sys.exit(f"telescope: {error}")
     command = [sys.executable, "-m", "function_app", "sign-in-link", *sys.argv[1:]]
-    os.execve(sys.executable, command, chosen.environment())  # noqa: S606  # nosec B606 (our own program)
+    os.execve(sys.executable, command, started.environment())  # noqa: S606  # nosec B606 (fixed command)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Child processes: started, watched, restarted, and ended in order."""
+"""Supervised child processes: start, monitor, restart and stop."""
 
 import ctypes
 import signal
@@ -8,24 +8,24 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-_STOP_WITHIN_S = 8.0
-_STEADY_S = 10.0
-_MOST_RESTARTS = 5
+_STOP_TIMEOUT_S = 8.0
+_STABLE_S = 10.0
+_MAX_RESTARTS = 5
 _PR_SET_PDEATHSIG = 1
 
 
 class StartError(Exception):
-    """A program could not be started or kept running; the text is its own last word."""
+    """A program could not be started or kept running; the message is its last output line."""
 
 
-class Child:
+class SupervisedProcess:
     """One program of the product.
 
     Args:
-        name: For people and for the log file's name.
-        arguments: Of the Python interpreter.
-        environment: What it sees.
-        logs: Folder for its log.
+        name: For messages and the log file.
+        arguments: Arguments of the Python interpreter.
+        environment: Its environment.
+        logs: Folder of its log.
     """
 
     def __init__(self, name: str, arguments: Sequence[str], environment: dict[str, str], logs: Path) -> None:
@@ -39,82 +39,82 @@ class Child:
         self._log_start = 0
 
     def start(self) -> None:
-        """Start it; its output goes to its log."""
+        """Start the process; its output goes to its log."""
         with self.log.open("ab") as log:
             self._log_start = log.tell()
-            self._process = subprocess.Popen(  # noqa: S603 (our own programs)
+            self._process = subprocess.Popen(  # noqa: S603 (fixed commands)
                 self._command,
                 env=self._environment,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C reaches us alone, and we end the others in order
-                preexec_fn=_end_with_parent if sys.platform == "linux" else None,  # noqa: PLW1509 (one thread here)
+                start_new_session=True,  # Ctrl-C only reaches this process, which stops the others in order
+                preexec_fn=_stop_with_parent if sys.platform == "linux" else None,  # noqa: PLW1509 (one thread here)
             )
         self._started_s = time.monotonic()
 
-    def await_line(self, beginning: str, within_s: float) -> str:
-        """Wait until its output has a line that starts so.
+    def wait_for_line(self, prefix: str, timeout_s: float) -> str:
+        """Wait for an output line with this prefix.
 
         Returns:
-            That line.
+            The line.
 
         Raises:
-            StartError: It ended, or said nothing of the kind in time.
+            StartError: The process exited, or the line did not appear in time.
         """
-        deadline_s = time.monotonic() + within_s
+        deadline_s = time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
-            ended = self.ended
-            for line in self.said():
-                if line.startswith(beginning):
+            exited = self.exited
+            for line in self.output_lines():
+                if line.startswith(prefix):
                     return line
-            if ended:
-                raise StartError(self.last_word())
+            if exited:
+                raise StartError(self.last_line())
             time.sleep(0.05)
-        raise StartError(f"{self.name} did not start within {within_s:.0f} s; its log: {self.log}")
+        raise StartError(f"{self.name} did not start within {timeout_s:.0f} s; see {self.log}")
 
     @property
-    def ended(self) -> bool:
-        """Whether it has ended."""
+    def exited(self) -> bool:
+        """Whether the process has exited."""
         return self._process is None or self._process.poll() is not None
 
     def restart(self) -> None:
-        """Start it again after it ended by itself.
+        """Restart the process after it exited.
 
         Raises:
-            StartError: It keeps ending.
+            StartError: It exits repeatedly.
         """
-        if time.monotonic() - self._started_s > _STEADY_S:
+        if time.monotonic() - self._started_s > _STABLE_S:
             self._restarts = 0
         self._restarts += 1
-        if self._restarts > _MOST_RESTARTS:
-            raise StartError(f"{self.name} keeps ending: {self.last_word()}")
+        if self._restarts > _MAX_RESTARTS:
+            raise StartError(f"{self.name} exits repeatedly: {self.last_line()}")
         self.start()
 
     def stop(self) -> None:
-        """End it: asked first, made to after some seconds."""
+        """Stop the process: SIGTERM, then SIGKILL after a timeout."""
         if self._process is None:
             return
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
         try:
-            self._process.wait(_STOP_WITHIN_S)
+            self._process.wait(_STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
 
-    def said(self) -> list[str]:
-        """The lines it has printed since it was last started."""
+    def output_lines(self) -> list[str]:
+        """Output lines since the last start."""
         with self.log.open("rb") as log:
             log.seek(self._log_start)
             return log.read().decode(errors="replace").splitlines()
 
-    def last_word(self) -> str:
-        """Its last line, or where to look."""
-        lines = [line for line in self.said() if line.strip()]
-        return lines[-1] if lines else f"{self.name} ended without a word; its log: {self.log}"
+    def last_line(self) -> str:
+        """The last output line, or a reference to the log."""
+        lines = [line for line in self.output_lines() if line.strip()]
+        return lines[-1] if lines else f"{self.name} exited without output; see {self.log}"
 
 
-def _end_with_parent() -> None:
-    """Linux: when whoever started us dies, we are asked to end too."""
+def _stop_with_parent() -> None:
+    """Linux: receive SIGTERM when the parent process exits."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -1,5 +1,5 @@
-"""The site broker: mosquitto with its dynamic security plugin, configured to refuse whatever was not granted.
+"""The site broker: mosquitto with its dynamic security plugin, configured to deny by default.
 
-``python -m infra.mosquitto --home DIR`` writes what it needs into DIR and runs it. Grants reach it through
+``python -m infra.mosquitto --home DIR`` writes its files into DIR and runs it. The functions add grants by
 ``function_app.adapters.local.broker_access.MosquittoBrokerAccess``.
 """

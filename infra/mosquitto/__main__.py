@@ -1,7 +1,7 @@
 """``python -m infra.mosquitto``: run mosquitto until SIGTERM or SIGINT.
 
-Prints ``ready tcp=PORT websocket=PORT`` once both listeners answer. Exits 0 when told to stop; 3 when a port is taken
-or mosquitto is not installed, 2 when the folder cannot be used; 1 when mosquitto ends by itself. Each with one line.
+Prints ``ready tcp=PORT websocket=PORT`` once both listeners accept connections. Exit codes: 0 on a signal; 3 if a port
+is in use or mosquitto is not installed; 2 if the folder cannot be used; 1 if mosquitto exits. Errors print one line.
 """
 
 import argparse
@@ -15,11 +15,11 @@ from infra.mosquitto.configuration import Tls
 
 
 def main() -> int:
-    """Run; the exit code."""
+    """Run mosquitto; returns the exit code."""
     arguments = _arguments()
     home = arguments.home
     try:
-        # On IPv6 mosquitto's listener for WebSocket cannot be kept to one address.
+        # On IPv6 mosquitto's WebSocket listener cannot be bound to one address.
         host = programs.address(arguments.host)
         binary, plugin = configuration.binary(), configuration.plugin()
         tcp_port, websocket_port = programs.free_ports(host, arguments.tcp_port, arguments.websocket_port)
@@ -38,7 +38,7 @@ def main() -> int:
         print(f"broker: {error}; choose another port", file=sys.stderr)
         return programs.CANNOT_START
     except socket.gaierror:
-        print(f"broker: '{arguments.host}' has no IPv4 address, which is what it listens on", file=sys.stderr)
+        print(f"broker: '{arguments.host}' has no IPv4 address, which mosquitto needs", file=sys.stderr)
         return programs.BAD_INPUT
     except OSError as error:
         print(f"broker: cannot use {error.filename or home}: {error.strerror}", file=sys.stderr)
@@ -61,20 +61,20 @@ def _tls(arguments: argparse.Namespace) -> Tls | None:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m infra.mosquitto", description="The site's MQTT broker.")
-    parser.add_argument("--home", type=Path, required=True, help="folder for its files; made when it is not there")
+    parser.add_argument("--home", type=Path, required=True, help="folder for its files; created if missing")
     parser.add_argument("--host", default="127.0.0.1", help="IPv4 address or name to listen on (default: loopback)")
-    parser.add_argument("--tcp-port", type=int, required=True, help="MQTT; 0 takes a free one")
-    parser.add_argument("--websocket-port", type=int, required=True, help="MQTT over WebSocket; 0 takes a free one")
-    parser.add_argument("--certificate", type=Path, help="speak TLS alone, with this certificate and its chain (PEM)")
+    parser.add_argument("--tcp-port", type=int, required=True, help="MQTT; 0 selects a free port")
+    parser.add_argument("--websocket-port", type=int, required=True, help="MQTT over WebSocket; 0 selects a free port")
+    parser.add_argument("--certificate", type=Path, help="use TLS only, with this certificate and its chain (PEM)")
     parser.add_argument("--certificate-key", type=Path, help="its key (PEM)")
-    parser.add_argument("--agents-ca", type=Path, help="over TCP let in only who shows a certificate of it (PEM)")
-    parser.add_argument("--revoked", type=Path, help="which of them count no more (CRL, PEM); read again on change")
-    found = parser.parse_args()
-    if (found.agents_ca and not found.certificate) or (found.revoked and not found.agents_ca):
+    parser.add_argument("--agents-ca", type=Path, help="require client certificates of this CA on TCP (PEM)")
+    parser.add_argument("--revoked", type=Path, help="revoked client certificates (CRL, PEM); reloaded on change")
+    arguments = parser.parse_args()
+    if (arguments.agents_ca and not arguments.certificate) or (arguments.revoked and not arguments.agents_ca):
         parser.error("--agents-ca needs --certificate, --revoked needs --agents-ca")
-    if bool(found.certificate) != bool(found.certificate_key):
-        parser.error("--certificate and --certificate-key belong together")
-    return found
+    if bool(arguments.certificate) != bool(arguments.certificate_key):
+        parser.error("--certificate and --certificate-key must be given together")
+    return arguments
 
 
 if __name__ == "__main__":

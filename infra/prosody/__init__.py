@@ -1,4 +1,4 @@
-"""The site's XMPP server: Prosody, which asks the functions who may log in and lets nobody speak but with the cloud.
+"""The site's XMPP server: Prosody, which authenticates against the functions and only permits traffic with the cloud.
 
-``python -m infra.prosody --home DIR --domain NAME --verify-url URL`` writes what it needs into DIR and runs it.
+``python -m infra.prosody --home DIR --domain NAME --verify-url URL`` writes its files into DIR and runs it.
 """

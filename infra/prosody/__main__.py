@@ -1,7 +1,7 @@
 """``python -m infra.prosody``: run Prosody until SIGTERM or SIGINT.
 
-Prints ``ready xmpp=PORT`` once it answers. Exits 0 when told to stop; 3 when the port is taken or Prosody is not
-installed, 2 when an argument or the folder cannot be used; 1 when Prosody ends by itself. Each with one line.
+Prints ``ready xmpp=PORT`` once it accepts connections. Exit codes: 0 on a signal; 3 if the port is in use or Prosody is
+not installed; 2 if an argument or the folder is invalid; 1 if Prosody exits. Errors print one line.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from infra.prosody import configuration
 
 
 def main() -> int:
-    """Run; the exit code."""
+    """Run Prosody; returns the exit code."""
     arguments = _arguments()
     try:
         host = programs.address(arguments.host)
@@ -30,32 +30,36 @@ def main() -> int:
             key=arguments.key,
         )
     except programs.NotInstalledError as error:
-        return _say(str(error), programs.CANNOT_START)
+        return _fail(str(error), programs.CANNOT_START)
     except programs.PortTakenError as error:
-        return _say(f"{error}; choose another port", programs.CANNOT_START)
+        return _fail(f"{error}; choose another port", programs.CANNOT_START)
     except socket.gaierror:
-        return _say(f"'{arguments.host}' has no IPv4 address, which is what it listens on", programs.BAD_INPUT)
+        return _fail(f"'{arguments.host}' has no IPv4 address, which Prosody needs", programs.BAD_INPUT)
     except configuration.ConfigurationError as error:
-        return _say(str(error), programs.BAD_INPUT)
+        return _fail(str(error), programs.BAD_INPUT)
     except OSError as error:
-        return _say(f"cannot use {error.filename or arguments.home}: {error.strerror}", programs.BAD_INPUT)
+        return _fail(f"cannot use {error.filename or arguments.home}: {error.strerror}", programs.BAD_INPUT)
     command = [binary, "--config", str((arguments.home / configuration.CONFIGURATION_FILE).absolute()), "-F"]
     return programs.supervise("prosody", command, host=host, ports=(port,), ready=f"ready xmpp={port}")
 
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m infra.prosody", description="The site's XMPP server.")
-    parser.add_argument("--home", type=Path, required=True, help="folder for its files; made when it is not there")
-    parser.add_argument("--domain", required=True, help="what stands after the @ of every address, in lower case")
+    parser.add_argument("--home", type=Path, required=True, help="folder for its files; created if missing")
+    parser.add_argument("--domain", required=True, help="domain of all addresses, in lower case")
     parser.add_argument("--verify-url", required=True, help="the functions' …/api/v1/xmpp/verify")
     parser.add_argument("--host", default="127.0.0.1", help="IPv4 address or name to listen on (default: loopback)")
-    parser.add_argument("--port", type=int, default=5222, help="of clients; 0 takes a free one (default: %(default)s)")
-    parser.add_argument("--certificate", type=Path, help="of the domain, with its chain (PEM); needed beyond loopback")
+    parser.add_argument(
+        "--port", type=int, default=5222, help="for clients; 0 selects a free port (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--certificate", type=Path, help="of the domain, with its chain (PEM); required except on loopback"
+    )
     parser.add_argument("--key", type=Path, help="the certificate's private key (PEM)")
     return parser.parse_args()
 
 
-def _say(text: str, code: int) -> int:
+def _fail(text: str, code: int) -> int:
     print(f"broker: {text}", file=sys.stderr)
     return code
 

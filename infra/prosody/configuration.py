@@ -1,4 +1,4 @@
-"""What Prosody reads. Format: https://prosody.im/doc/configure, as of Prosody 0.12."""
+"""Configuration file of Prosody. Format: https://prosody.im/doc/configure, as of Prosody 0.12."""
 
 import ipaddress
 import json
@@ -12,22 +12,22 @@ from infra import programs
 CONFIGURATION_FILE = "prosody.cfg.lua"
 PACKAGE = "prosody"
 MODULES = Path(__file__).resolve().parent
-"""Where our own module is."""
+"""Folder of the project's Prosody module."""
 
 _DOMAIN = re.compile(r"\A(?=.{1,253}\Z)[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*\Z")
 _RATE = "2mb/s"
-"""What one connection may send, the cloud's own excepted: twenty times the telemetry of a robot at 50 Hz."""
+"""Rate limit per connection, except the cloud's: twenty times the telemetry of a robot at 50 Hz."""
 
 
 class ConfigurationError(ValueError):
-    """An argument that would not do, or not be safe; the text says which."""
+    """An invalid or unsafe argument; the message names it."""
 
 
 def binary() -> str:
     """Path of Prosody.
 
     Raises:
-        NotInstalledError: There is none.
+        NotInstalledError: Not installed.
     """
     return programs.find("prosody", package=PACKAGE)
 
@@ -45,14 +45,14 @@ def write(
     """Write the configuration file.
 
     Raises:
-        ConfigurationError: An argument would not do.
+        ConfigurationError: An argument is invalid.
         OSError: ``home`` cannot be written.
     """
     text = configuration(
         home, domain=domain, host=host, port=port, verify_url=verify_url, certificate=certificate, key=key
     )
     home.mkdir(parents=True, exist_ok=True, mode=0o700)
-    (home / "certs").mkdir(exist_ok=True)  # where Prosody looks for more of them, and complains when it cannot
+    (home / "certs").mkdir(exist_ok=True)  # Prosody warns if its certificate folder is missing
     path = home / CONFIGURATION_FILE
     if not path.exists() or path.read_text() != text:
         path.write_text(text)
@@ -71,34 +71,34 @@ def configuration(
     """The text of ``prosody.cfg.lua``.
 
     Args:
-        home: Folder for whatever it writes.
-        domain: The part of every JID after the ``@``.
+        home: Folder for its data.
+        domain: The domain of every JID.
         host: The address to listen on.
-        port: Of clients.
-        verify_url: Where the functions say who may log in.
-        certificate: Of the domain, with its chain; needed wherever others than this machine can connect.
+        port: Port for clients.
+        verify_url: URL by which the functions authenticate clients.
+        certificate: Of the domain, with its chain; required unless ``host`` is a loopback address.
         key: Its private key.
 
     Raises:
-        ConfigurationError: An argument would not do.
+        ConfigurationError: An argument is invalid.
     """
     if not _DOMAIN.match(domain):
-        raise ConfigurationError(f"'{domain[:80]}' is not a domain in lower case")
+        raise ConfigurationError(f"'{domain[:80]}' is not a valid domain in lower case")
     if (certificate is None) != (key is None):
-        raise ConfigurationError("a certificate needs its key, and a key its certificate")
+        raise ConfigurationError("certificate and key must be given together")
     if certificate is None and not ipaddress.ip_address(host).is_loopback:
-        raise ConfigurationError(f"without a certificate it listens on loopback only, not on {host}")
+        raise ConfigurationError(f"without a certificate Prosody must listen on loopback, not on {host}")
     encrypted = certificate is not None
     modules = ["roster", "saslauth", "ping", "disco", "limits", *(["tls"] if encrypted else [])]
     lines = [
-        "-- Written by `python -m infra.prosody` at each start: change it there.",
+        "-- Written by `python -m infra.prosody` at each start; do not edit.",
         f"data_path = {_lua(home.absolute())}",
         f"plugin_paths = {{ {_lua(MODULES)} }}",
         'log = { warn = "*console" }',
-        "-- Nagle's algorithm costs 44 ms for each small message. Of who is silent for so long our module decides.",
+        "-- Nagle's algorithm costs 44 ms for each small message. The module decides about silent clients.",
         f"network_settings = {{ nagle = false, read_timeout = {stanzas.TIMEOUT_S:g} }}",
         f"modules_enabled = {{ {', '.join(_lua(name) for name in modules)} }}",
-        "-- Nothing leaves for other servers, and nothing is kept for somebody who is away: a late order is no order.",
+        "-- No federation and no offline messages: late commands must not be delivered.",
         'modules_disabled = { "s2s", "s2s_auth_certs", "offline" }',
         'storage = "memory"',
         f"interfaces = {{ {_lua(host)} }}",
@@ -121,7 +121,7 @@ def configuration(
 
 
 def _lua(value: object) -> str:
-    """A value as Lua writes it. Lua reads JSON's escapes of quotes, backslashes and line ends."""
+    """A Lua literal. Lua accepts JSON's escapes of quotes, backslashes and line ends."""
     if isinstance(value, bool):
         return "true" if value else "false"
     return json.dumps(str(value), ensure_ascii=False)

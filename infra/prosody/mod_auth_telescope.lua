@@ -1,8 +1,8 @@
--- Who may log in, who knows whom, and who may speak to whom. All of it is what the functions say: Prosody keeps nothing.
+-- Authentication, rosters and message authorization. The functions decide; Prosody stores nothing.
 --
--- A login is a question to the functions (`POST xmpp/verify`). Their answer names the user's contacts; a contact is known
--- on both sides, or on none. An agent and an account speak with the cloud only, never with each other: whatever else a
--- client sends is refused.
+-- For each login the module calls the functions (`POST xmpp/verify`). The response contains the user's contacts; contacts
+-- are always mutual. Agents and accounts may only communicate with the cloud, never with each other; all other stanzas
+-- are rejected.
 
 local async = require "util.async";
 local http = require "net.http";
@@ -18,12 +18,12 @@ local VERIFY_URL = assert(module:get_option_string("telescope_verify_url"), "tel
 
 local host = module.host;
 local sessions = prosody.hosts[host].sessions;
-local contacts = {};  -- user → user → name for people
-local admitted = {};  -- user → what the functions said at the newest login
+local contacts = {};  -- user → contact → display name
+local admitted = {};  -- user → response to the last login
 
-local function ask(user, password)
+local function verify(user, password)
 	local waiting, done = async.waiter();
-	local answer;
+	local response;
 	local request = {
 		method = "POST";
 		headers = { ["Content-Type"] = "application/json" };
@@ -31,136 +31,136 @@ local function ask(user, password)
 	};
 	http.request(VERIFY_URL, request, function (body, code)
 		if code == 200 then
-			answer = json.decode(body);
+			response = json.decode(body);
 		elseif code ~= 401 then
-			module:log("error", "the functions at %s answered a login with %s", VERIFY_URL, tostring(code));
+			module:log("error", "login request to %s failed with status %s", VERIFY_URL, tostring(code));
 		end
 		done();
 	end);
 	waiting();
-	return answer;
+	return response;
 end
 
--- ------------------------------------------------------------ who knows whom
+-- ------------------------------------------------------------ rosters
 
-local function item(name)
+local function roster_item(name)
 	return { subscription = "both", name = name, groups = {}, persist = false };
 end
 
-local function introduce_to(user, contact, name)
+local function add_contact(user, contact, name)
 	contacts[user] = contacts[user] or {};
 	if contacts[user][contact] == name then return; end
 	contacts[user][contact] = name;
 	local roster_cache = prosody.hosts[host].roster_cache;
 	if roster_cache then roster_cache:set(user.."@"..host, nil); end
-	local here = sessions[user];
-	if here and here.roster then
+	local user_sessions = sessions[user];
+	if user_sessions and user_sessions.roster then
 		local jid = contact.."@"..host;
-		here.roster[jid] = item(name);
+		user_sessions.roster[jid] = roster_item(name);
 		roster_push(user, host, jid);
 	end
 end
 
-local function part_from(user, contact)
+local function remove_contact(user, contact)
 	if contacts[user] == nil or contacts[user][contact] == nil then return; end
 	contacts[user][contact] = nil;
 	if next(contacts[user]) == nil then contacts[user] = nil; end
 	local roster_cache = prosody.hosts[host].roster_cache;
 	if roster_cache then roster_cache:set(user.."@"..host, nil); end
-	local here = sessions[user];
-	if here and here.roster then
+	local user_sessions = sessions[user];
+	if user_sessions and user_sessions.roster then
 		local jid = contact.."@"..host;
-		here.roster[jid] = nil;
+		user_sessions.roster[jid] = nil;
 		roster_push(user, host, jid);
 	end
 end
 
 module:hook("roster-load", function (event)
 	for contact, name in pairs(contacts[event.username] or {}) do
-		event.roster[contact.."@"..host] = item(name);
+		event.roster[contact.."@"..host] = roster_item(name);
 	end
 end);
 
-local function end_sessions(user, why)
-	local here = sessions[user];
-	if not here then return; end
+local function end_sessions(user, reason)
+	local user_sessions = sessions[user];
+	if not user_sessions then return; end
 	local open = {};
-	for _, session in pairs(here.sessions) do open[#open + 1] = session; end
+	for _, session in pairs(user_sessions.sessions) do open[#open + 1] = session; end
 	for _, session in ipairs(open) do
-		session:close({ condition = "policy-violation", text = why });
+		session:close({ condition = "policy-violation", text = reason });
 	end
 end
 
 local function forget(user)
 	end_sessions(user, "the cloud ended this session");
-	local known = {};
-	for contact in pairs(contacts[user] or {}) do known[#known + 1] = contact; end
-	for _, contact in ipairs(known) do
-		part_from(user, contact);
-		part_from(contact, user);
+	local former = {};
+	for contact in pairs(contacts[user] or {}) do former[#former + 1] = contact; end
+	for _, contact in ipairs(former) do
+		remove_contact(user, contact);
+		remove_contact(contact, user);
 	end
 	admitted[user] = nil;
 end
 
--- ------------------------------------------------------------ who may log in
+-- ------------------------------------------------------------ authentication
 
-local function test(user, password)
+local function authenticate(user, password)
 	if #password > 4096 then return false; end
-	local answer = ask(user, password);
-	if type(answer) ~= "table" or answer.user ~= user then return false; end
-	admitted[user] = answer;
-	local wanted = {};
-	for _, contact in ipairs(answer.contacts) do
-		wanted[contact.user] = true;
-		introduce_to(user, contact.user, contact.name);
-		introduce_to(contact.user, user, answer.name);
+	local response = verify(user, password);
+	if type(response) ~= "table" or response.user ~= user then return false; end
+	admitted[user] = response;
+	local listed = {};
+	for _, contact in ipairs(response.contacts) do
+		listed[contact.user] = true;
+		add_contact(user, contact.user, contact.name);
+		add_contact(contact.user, user, response.name);
 	end
-	-- Whom the functions do not name any more is forgotten. The cloud knows whoever has come.
-	local gone = {};
+	-- Remove contacts that the functions no longer list. The cloud keeps all users as contacts.
+	local removed = {};
 	for contact in pairs(user ~= CLOUD and contacts[user] or {}) do
-		if not wanted[contact] then gone[#gone + 1] = contact; end
+		if not listed[contact] then removed[#removed + 1] = contact; end
 	end
-	for _, contact in ipairs(gone) do
-		part_from(user, contact);
-		part_from(contact, user);
+	for _, contact in ipairs(removed) do
+		remove_contact(user, contact);
+		remove_contact(contact, user);
 	end
 	return true;
 end
 
 local provider = {};
 
-function provider.test_password(user, password) return test(user, password); end
+function provider.test_password(user, password) return authenticate(user, password); end
 function provider.user_exists(user) return user == CLOUD or contacts[user] ~= nil; end
-function provider.get_password() return nil, "Passwords are not kept."; end
-function provider.set_password() return nil, "Passwords are not kept."; end
-function provider.create_user() return nil, "The functions make accounts."; end
+function provider.get_password() return nil, "Passwords are not stored."; end
+function provider.set_password() return nil, "Passwords are not stored."; end
+function provider.create_user() return nil, "Accounts are created by the functions."; end
 function provider.delete_user() return nil, "The functions delete accounts."; end
 function provider.get_sasl_handler()
 	return new_sasl(host, {
-		plain_test = function (_, user, password) return test(user, password), true; end
+		plain_test = function (_, user, password) return authenticate(user, password), true; end
 	});
 end
 
 module:provides("auth", provider);
 
--- A session lives no longer than its right: whoever stays logs in again. The cloud's own right does not end.
+-- A session ends with its password's lifetime; the client then logs in again. The cloud's session does not expire.
 module:hook("authentication-success", function (event)
 	local session = event.session;
-	local answer = admitted[session.username];
-	session.telescope = answer and answer.kind;
+	local response = admitted[session.username];
+	session.telescope = response and response.kind;
 	if session.telescope == CLOUD then return; end
-	module:add_timer(answer and answer.lifetime_s or 0, function ()
+	module:add_timer(response and response.lifetime_s or 0, function ()
 		if not session.destroyed and session.conn then
 			session:close({ condition = "policy-violation", text = "the password has expired" });
 		end
 	end);
 end);
 
--- ------------------------------------------------------------ who may speak to whom
+-- ------------------------------------------------------------ authorization of stanzas
 
 local RELATIONS = { subscribe = true, subscribed = true, unsubscribe = true, unsubscribed = true };
 
-local function may(session, stanza)
+local function is_allowed(session, stanza)
 	if stanza.name == "presence" and RELATIONS[stanza.attr.type or ""] then return false; end
 	if stanza.name == "iq" and stanza.attr.type == "set" and stanza:get_child("query", "jabber:iq:roster") then
 		return false;
@@ -178,14 +178,14 @@ end
 
 module:hook("pre-stanza", function (event)
 	local session, stanza = event.origin, event.stanza;
-	if session.type ~= "c2s" or may(session, stanza) then return; end
+	if session.type ~= "c2s" or is_allowed(session, stanza) then return; end
 	if stanza.attr.type ~= "error" and (stanza.name == "message" or stanza.attr.type == "get" or stanza.attr.type == "set") then
 		session.send(st.error_reply(stanza, "auth", "forbidden"));
 	end
 	return true;
 end, 1000);
 
--- Only the cloud's messages to the host itself come so far.
+-- Only the cloud may send messages to the host.
 module:hook("message/host", function (event)
 	if event.origin.telescope ~= CLOUD then return; end
 	local order = event.stanza:get_child("forget", NAMESPACE);
@@ -195,10 +195,10 @@ module:hook("message/host", function (event)
 	end
 end, 1000);
 
--- ------------------------------------------------------------ who is still there
+-- ------------------------------------------------------------ timeouts
 
--- Agents and the cloud say something every few seconds: from whom nothing comes is gone, and its contacts are told.
--- An ordinary client need not: it is sent a space, as Prosody does (its own hook, after this one).
+-- Agents and the cloud send data every few seconds; on a timeout the session ends and its contacts are notified.
+-- Other clients may be silent: Prosody's own hook, which runs after this one, sends them a keep-alive.
 module:hook("c2s-read-timeout", function (event)
 	local kind = event.session.telescope;
 	if kind == CLOUD or kind == "agent" then return false; end

@@ -1,1 +1,1 @@
-"""Certificates of a site, by one command: an own authority for its names alone, or certificates from elsewhere."""
+"""Certificates of a site: from its own name-constrained CA, or imported."""

@@ -1,7 +1,6 @@
-"""A second authority, for agents: certificates that mosquitto wants to see before it hears a word.
+"""A CA for agents, whose client certificates mosquitto requires before any MQTT traffic.
 
-Apart from the site's own, so that neither can do the other's work: this one vouches for clients alone, and its key lies
-where the functions sign with it.
+It is separate from the site's server CA: it only signs client certificates, and its key is available to the functions.
 """
 
 import datetime as dt
@@ -19,23 +18,23 @@ from infra.tls.server_ca import TlsError
 
 CA_CERTIFICATE, CA_KEY, REVOKED = "devices-ca.crt", "devices-ca.key", "devices.crl"
 SERVICE_CERTIFICATE, SERVICE_KEY = "service.crt", "service.key"
-"""What the functions themselves show to the broker."""
+"""The functions' own client certificate."""
 
 
-def make(folder: Path, *, now: dt.datetime) -> None:
-    """The authority, an empty list of what is revoked, and the functions' own certificate.
+def create(folder: Path, *, now: dt.datetime) -> None:
+    """Create the CA, an empty revocation list, and the functions' client certificate.
 
     Raises:
-        TlsError: There is one already.
+        TlsError: A CA exists already.
         OSError: The folder cannot be written.
     """
     if (folder / CA_KEY).exists():
-        raise TlsError(f"{folder} has an authority for agents already")
+        raise TlsError(f"{folder} has a CA for agents already")
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"Telescope agents {secrets.token_hex(4)}")])
     end = now + dt.timedelta(days=server_ca.CA_DAYS)
-    own = (
-        _begun(name, name, key, now, end)
+    ca_certificate = (
+        _builder(name, name, key, now, end)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(server_ca.usage(authority=True), critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
@@ -43,22 +42,22 @@ def make(folder: Path, *, now: dt.datetime) -> None:
     )
     service_key = ec.generate_private_key(ec.SECP256R1())
     service = (
-        _begun(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "service")]), name, service_key, now, end)
+        _builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "service")]), name, service_key, now, end)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH]), critical=True)
         .sign(key, hashes.SHA256())
     )
-    none = x509.CertificateRevocationListBuilder().issuer_name(name).last_update(now).next_update(end)
+    revocation_list = x509.CertificateRevocationListBuilder().issuer_name(name).last_update(now).next_update(end)
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     files.write(folder / CA_KEY, server_ca.key_pem(key), mode=0o600)
     files.write(folder / SERVICE_KEY, server_ca.key_pem(service_key), mode=0o600)
     files.write(folder / SERVICE_CERTIFICATE, server_ca.pem(service), mode=0o644)
-    crl = none.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+    crl = revocation_list.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
     files.write(folder / REVOKED, crl, mode=0o644)
-    files.write(folder / CA_CERTIFICATE, server_ca.pem(own), mode=0o644)
+    files.write(folder / CA_CERTIFICATE, server_ca.pem(ca_certificate), mode=0o644)
 
 
-def _begun(
+def _builder(
     subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: dt.datetime, end: dt.datetime
 ) -> x509.CertificateBuilder:
     return (

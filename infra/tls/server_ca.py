@@ -1,7 +1,7 @@
-"""A site's own certificate authority, and the server certificate that browsers, agents and the functions check.
+"""A site's certificate authority and its server certificate.
 
-The authority may speak for the site's own names and addresses and for no others (RFC 5280, name constraints): who
-steals its key can pretend to be this site, not a bank. Keys are on P-256, which every browser and broker takes.
+Name constraints (RFC 5280) limit the CA to the site's own names and addresses, so that a stolen key cannot impersonate
+other sites. Keys use P-256, which all browsers and brokers support.
 """
 
 import datetime as dt
@@ -22,61 +22,61 @@ CA_CERTIFICATE, CA_KEY = "ca.crt", "ca.key"
 CERTIFICATE, KEY = "server.crt", "server.key"
 CA_DAYS = 3650
 SERVER_DAYS = 397
-"""Browsers take no longer-lived ones from public authorities; a renewal is one command."""
+"""Browsers reject longer-lived certificates of public CAs."""
 RENEW_DAYS = 30
-"""So long before its end a certificate is said to end soon."""
+"""A certificate is reported as expiring this long before its end."""
 LOOPBACK_NAMES = ("localhost",)
 LOOPBACK = ("127.0.0.1", "::1")
 _SKEW = dt.timedelta(minutes=5)
-"""Clocks of agents may be behind."""
+"""Tolerance for slow clocks of agents."""
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class TlsError(Exception):
-    """A certificate or key cannot be used; the text says which and what to do."""
+    """A certificate or key cannot be used; the message says which and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Names:
-    """What a site is called: its DNS names and its addresses."""
+    """DNS names and addresses of a site."""
 
     dns: tuple[str, ...]
     addresses: tuple[Address, ...]
 
     @property
     def alternatives(self) -> list[x509.GeneralName]:
-        """As a certificate says them."""
+        """The names as a subjectAltName."""
         return [*(x509.DNSName(name) for name in self.dns), *(x509.IPAddress(each) for each in self.addresses)]
 
 
 def names(dns: tuple[str, ...], addresses: tuple[str, ...]) -> Names:
-    """The site's names, and those of the machine itself.
+    """The names of the site and of the machine itself.
 
     Raises:
-        TlsError: One is no name or address.
+        TlsError: An invalid name or address.
     """
-    found: list[Address] = []
+    result: list[Address] = []
     for text in dict.fromkeys((*LOOPBACK, *addresses)):
         try:
-            found.append(ipaddress.ip_address(text))
+            result.append(ipaddress.ip_address(text))
         except ValueError as error:
-            raise TlsError(f"'{text}' is no address; give a name with --name") from error
+            raise TlsError(f"'{text}' is not an IP address; give a name with --name") from error
     for text in dns:
         labels = text.split(".")
         if not text.isascii() or not all(
             label and len(label) < 64 and label.replace("-", "").isalnum()  # noqa: PLR2004 (RFC 1035)
             for label in labels
         ):
-            raise TlsError(f"'{text}' is no DNS name, such as site.example")
-    return Names(tuple(dict.fromkeys((*LOOPBACK_NAMES, *dns))), tuple(found))
+            raise TlsError(f"'{text}' is not a DNS name such as site.example")
+    return Names(tuple(dict.fromkeys((*LOOPBACK_NAMES, *dns))), tuple(result))
 
 
-def make(folder: Path, site: Names, *, now: dt.datetime) -> None:
-    """An authority and a server certificate in ``folder``.
+def create(folder: Path, site: Names, *, now: dt.datetime) -> None:
+    """Create a CA and a server certificate in ``folder``.
 
     Raises:
-        TlsError: There is an authority already: agents have pinned it.
+        TlsError: A CA exists already: agents have pinned it.
         OSError: The folder cannot be written.
     """
     if (folder / CA_KEY).exists() or (folder / CERTIFICATE).exists():
@@ -106,38 +106,40 @@ def make(folder: Path, site: Names, *, now: dt.datetime) -> None:
 
 
 def renew(folder: Path, *, now: dt.datetime) -> None:
-    """A new server certificate for the same names, from the same authority: nobody has to pin anything anew.
+    """Issue a new server certificate for the same names by the same CA; agents keep their pinned CA.
 
     Raises:
-        TlsError: The authority's key is not here.
+        TlsError: The CA's key is not available.
     """
     try:
         authority = load(folder / CA_CERTIFICATE)
         key = serialization.load_pem_private_key((folder / CA_KEY).read_bytes(), None)
     except (OSError, ValueError, TypeError) as error:
-        raise TlsError(f"the authority in {folder} cannot be used: {error}; only its own certificates renew") from error
+        raise TlsError(
+            f"cannot use the CA in {folder}: {error}; only certificates of this CA can be renewed"
+        ) from error
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise TlsError(f"{folder / CA_KEY} is no key of ours")
-    former = load(folder / CERTIFICATE).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    _issue(folder, authority, key, list(former), now)
+        raise TlsError(f"{folder / CA_KEY} is not a P-256 key")
+    alternatives = load(folder / CERTIFICATE).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    _issue(folder, authority, key, list(alternatives), now)
 
 
-def take(folder: Path, *, certificate: Path, key: Path, ca: Path | None, now: dt.datetime) -> None:
-    """Use certificates from elsewhere: with the whole chain, and the authority's where it is a private one.
+def import_certificate(folder: Path, *, certificate: Path, key: Path, ca: Path | None, now: dt.datetime) -> None:
+    """Install a certificate with its chain, and its CA if that is private.
 
     Raises:
-        TlsError: They do not belong together, or are over.
-        OSError: One cannot be read, or the folder not written.
+        TlsError: Certificate and key do not match, or the certificate has expired.
+        OSError: A file cannot be read, or the folder cannot be written.
     """
-    own = load(certificate)
+    current = load(certificate)
     try:
-        private = serialization.load_pem_private_key(key.read_bytes(), None)
+        private_key = serialization.load_pem_private_key(key.read_bytes(), None)
     except (ValueError, TypeError) as error:
-        raise TlsError(f"{key} cannot be read as a private key without a password: {error}") from error
-    if _public(private.public_key()) != _public(own.public_key()):
+        raise TlsError(f"{key} is not a private key without a password: {error}") from error
+    if _public(private_key.public_key()) != _public(current.public_key()):
         raise TlsError(f"{key} is not the key of {certificate}")
-    if now >= own.not_valid_after_utc:
-        raise TlsError(f"{certificate} ended on {own.not_valid_after_utc:%Y-%m-%d}")
+    if now >= current.not_valid_after_utc:
+        raise TlsError(f"{certificate} expired on {current.not_valid_after_utc:%Y-%m-%d}")
     if ca is not None:
         load(ca)
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -148,22 +150,22 @@ def take(folder: Path, *, certificate: Path, key: Path, ca: Path | None, now: dt
 
 
 def describe(folder: Path, *, now: dt.datetime) -> str:
-    """What the certificate is for and how long, in a line; a warning where it ends soon.
+    """Names and expiry of the certificate in one line, with a warning if it expires soon.
 
     Raises:
         TlsError: It cannot be used.
     """
-    own = load(folder / CERTIFICATE)
+    current = load(folder / CERTIFICATE)
     try:
-        said = own.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        alternatives = current.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound as error:
-        raise TlsError(f"{folder / CERTIFICATE} names no site (no subjectAltName)") from error
-    shown = ", ".join(str(each.value) for each in said)
-    left = own.not_valid_after_utc - now
-    if left <= dt.timedelta():
-        raise TlsError(f"{folder / CERTIFICATE} ended on {own.not_valid_after_utc:%Y-%m-%d}; renew it")
-    soon = "; it ends soon, renew it" if left <= dt.timedelta(days=RENEW_DAYS) else ""
-    return f"for {shown}, until {own.not_valid_after_utc:%Y-%m-%d}{soon}"
+        raise TlsError(f"{folder / CERTIFICATE} has no subjectAltName") from error
+    shown = ", ".join(str(each.value) for each in alternatives)
+    remaining = current.not_valid_after_utc - now
+    if remaining <= dt.timedelta():
+        raise TlsError(f"{folder / CERTIFICATE} expired on {current.not_valid_after_utc:%Y-%m-%d}; renew it")
+    warning = "; it expires soon, renew it" if remaining <= dt.timedelta(days=RENEW_DAYS) else ""
+    return f"for {shown}, until {current.not_valid_after_utc:%Y-%m-%d}{warning}"
 
 
 def load(path: Path) -> x509.Certificate:
@@ -175,25 +177,25 @@ def load(path: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(path.read_bytes())
     except FileNotFoundError as error:
-        raise TlsError(f"{path} is not there; make certificates with `python -m infra.tls --home ...`") from error
+        raise TlsError(f"{path} does not exist; create certificates with `python -m infra.tls --home ...`") from error
     except (OSError, ValueError) as error:
-        raise TlsError(f"{path} cannot be read as a certificate: {error}") from error
+        raise TlsError(f"{path} is not a certificate: {error}") from error
 
 
 def pem(certificate: x509.Certificate) -> bytes:
-    """A certificate as text."""
+    """A certificate in PEM format."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
 def key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    """A private key as text."""
+    """A private key in PEM format."""
     return key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
 
 
 def usage(*, authority: bool) -> x509.KeyUsage:
-    """What a key may be used for."""
+    """Key usage extension."""
     return x509.KeyUsage(
         digital_signature=not authority,
         key_cert_sign=authority,
@@ -241,6 +243,6 @@ def _issue(
 
 
 def _public(key: object) -> bytes:
-    assert hasattr(key, "public_bytes")  # noqa: S101 (every public key has)
-    found: bytes = key.public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
-    return found
+    assert hasattr(key, "public_bytes")  # noqa: S101 (true for every public key)
+    result: bytes = key.public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+    return result

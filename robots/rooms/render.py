@@ -1,8 +1,8 @@
-"""Draw a room as one of its cameras sees it: ``python robots/rooms/render.py lab camera docs/pictures/lab-camera.png``.
+"""Render the view of a room's camera: ``python robots/rooms/render.py lab camera docs/pictures/lab-camera.png``.
 
-With a number behind it, after so many seconds; with ``name=value`` behind that, with that set, as in
-``… lab pan_tilt door.png 6 door=1.2 lamp=0``. Needs a software renderer (Debian: ``libosmesa6``), no display.
-"""  # noqa: INP001 - a script beside the folders it draws, not a package
+Optional arguments: simulated time [s], then settings, as in ``… lab pan_tilt door.png 6 door=1.2 lamp=0``. Requires a
+software renderer (Debian: ``libosmesa6``), but no display.
+"""  # noqa: INP001 - a script, not a package
 
 import argparse
 import sys
@@ -25,11 +25,11 @@ WIDTH, HEIGHT = 480, 360
 
 
 def draw(name: str, camera: str, *, after_s: float, settings: dict[str, float]) -> Any:
-    """The picture, shape (height, width, 3), 8 bits a colour."""
-    world = world_registry.of(ROOMS / name)
+    """The image, shape (height, width, 3), 8 bits per channel."""
+    world = world_registry.get_world(ROOMS / name)
     world.build()
-    for what, value in settings.items():
-        world.set(what, value)
+    for setting, value in settings.items():
+        world.set(setting, value)
     if after_s > 0:
         world.step(round(after_s / TIMESTEP_S))
     data = mujoco.MjData(world.model)
@@ -41,7 +41,7 @@ def draw(name: str, camera: str, *, after_s: float, settings: dict[str, float]) 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description="Draw a room as one of its cameras sees it.")
+    parser = argparse.ArgumentParser(description="Render the view of a room's camera.")
     parser.add_argument("room", choices=sorted(path.parent.name for path in ROOMS.glob("*/room.toml")))
     parser.add_argument("camera")
     parser.add_argument("file", type=Path)
@@ -49,8 +49,8 @@ def main() -> None:
     parser.add_argument("setting", nargs="*", metavar="name=value")
     arguments = parser.parse_args()
     settings = {name: float(value) for name, _, value in (text.partition("=") for text in arguments.setting)}
-    picture = draw(arguments.room, arguments.camera, after_s=arguments.after_s, settings=settings)
-    arguments.file.write_bytes(render.png(picture))
+    image = draw(arguments.room, arguments.camera, after_s=arguments.after_s, settings=settings)
+    arguments.file.write_bytes(render.png(image))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Survey a simulated room as its own sensors see it empty: ``python robots/rooms/survey.py lab``.
+"""Record the background model of a simulated room: ``python robots/rooms/survey.py lab``.
 
-Writes the file that the options of the room's perception name. Take a new one whenever the furniture, a lidar or a
-depth camera has moved. A real room is surveyed by the capture ``survey`` of its perception.
-"""  # noqa: INP001 - a script beside the folders it writes to, not a package
+Writes the file that the options of the room's perception device name. Repeat it after moving furniture, a lidar or a
+depth camera. In a real room, use the capture ``survey`` of the perception device.
+"""  # noqa: INP001 - a script, not a package
 
 import argparse
 import sys
@@ -22,12 +22,12 @@ from device_agent.protocol.manifests import room  # noqa: E402
 from device_agent.simulation import world_registry  # noqa: E402
 
 SETTLE_S = 4.0
-"""Blinds, door and cameras take that long to where they start [s]."""
+"""Time for blinds, door and cameras to reach their start positions [s]."""
 _AWAY_M = -50.0
 
 
-class Nobody:
-    """A process that takes all who are moved by hand out of the room."""
+class EmptyRoom:
+    """A process that moves all mocap bodies out of the room."""
 
     def step(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ARG002 - see ``Process``
         """See ``Process``."""
@@ -35,40 +35,40 @@ class Nobody:
 
 
 def survey(name: str) -> tuple[Path, bytes]:
-    """The file of a room's survey, and what belongs into it."""
+    """Path and content of a room's background model."""
     folder = ROOMS / name
     manifest = room.load(folder)
-    device = next((one for one in manifest.devices if one.driver == "perception"), None)
+    device = next((entry for entry in manifest.devices if entry.driver == "perception"), None)
     if device is None or not device.options.get("survey"):
-        sys.exit(f"room '{name}' has no device with the driver 'perception' whose options name a survey")
+        sys.exit(f"room '{name}' has no device with the driver 'perception' with the option 'survey'")
     options = {**device.options, "survey": "", "mounts": []}
     world = world_registry.make(msgspec.structs.replace(manifest, robots=(), people=()), folder, {})
-    world.add(Nobody())
+    world.add(EmptyRoom())
     neighbours: dict[str, RoomDriver] = {}
     surroundings = Surroundings(neighbours=neighbours, world=world)
-    for one in manifest.devices:
-        if one.name in _eyes(options):
-            neighbours[one.name] = sensors.load(one.driver)(one, folder, surroundings)
-    eye = sensors.load("perception")(
+    for entry in manifest.devices:
+        if entry.name in _sensor_names(options):
+            neighbours[entry.name] = sensors.load(entry.driver)(entry, folder, surroundings)
+    perception = sensors.load("perception")(
         msgspec.structs.replace(device, options={**options, "light": ""}), folder, surroundings
     )
-    for driver in (*neighbours.values(), eye):
+    for driver in (*neighbours.values(), perception):
         driver.connect()
     try:
         time.sleep(SETTLE_S)
-        return folder / str(device.options["survey"]), eye.capture("survey").content
+        return folder / str(device.options["survey"]), perception.capture("survey").content
     finally:
-        for driver in (eye, *neighbours.values()):
+        for driver in (perception, *neighbours.values()):
             driver.close()
 
 
-def _eyes(options: Mapping[str, Any]) -> set[str]:
+def _sensor_names(options: Mapping[str, Any]) -> set[str]:
     return {*options.get("lidars", ()), *options.get("cameras", ())}
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description="Survey a simulated room as its own sensors see it empty.")
+    parser = argparse.ArgumentParser(description="Record the background model of a simulated room.")
     parser.add_argument("room", choices=sorted(path.parent.name for path in ROOMS.glob("*/room.toml")))
     path, content = survey(parser.parse_args().room)
     path.write_bytes(content)

@@ -61,7 +61,7 @@ def raised(page: Page, machine: Machine, device: str) -> None:
     page.get_by_role("link", name="Health", exact=True).click()
     line = page.locator(f"[data-testid=health-row][data-device='{device}']")
     expect(line).to_have_attribute("data-health", "fault", timeout=PATIENCE_MS)
-    expect(line).to_contain_text("does not answer")
+    expect(line).to_contain_text("does not respond")
     assert page.get_by_test_id("health-row").first.get_attribute("data-health") == "fault", "the worst stands first"
     assert_good_page(page, "health")
     go(page, machine, f"#/devices/{device}/health")

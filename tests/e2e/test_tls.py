@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from function_app.ports.broker_access import Credentials
-from infra.local.__main__ import taken as taken_port
+from infra.local.__main__ import port_in_use
 from infra.mosquitto.configuration import binary
 from tests.harness.browser.product import Machine, start_machine
 from tests.harness.network.brokers import Client, wait_until
@@ -29,7 +29,7 @@ def bridge(machine: Machine, home: Path, key: str, *trusting: str) -> Iterator["
     (home / "mosquitto.conf").write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
     command = [sys.executable, "-m", "infra.home_assistant", "--server", machine.url, "--port", str(port), *trusting]
     with subprocess.Popen([binary(), "-c", str(home / "mosquitto.conf")], stderr=subprocess.DEVNULL) as broker:
-        wait_until(lambda: taken_port("127.0.0.1", port), "Home Assistant's broker")
+        wait_until(lambda: port_in_use("127.0.0.1", port), "Home Assistant's broker")
         with subprocess.Popen(
             command,
             cwd=ROOT,

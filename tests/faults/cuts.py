@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import httpx
 
-from infra.local.supervisor import Child
+from infra.local.supervisor import SupervisedProcess
 from tests.faults.judge import MOST_MS, Record, Verdict, judge, share
 from tests.faults.stack import MOVEMENT, PATIENCE_S, Console, Stack, now_ms
 
@@ -306,14 +306,14 @@ class Bench:
         return mends_itself
 
     @property
-    def _children(self) -> dict[str, Child]:
+    def _children(self) -> dict[str, SupervisedProcess]:
         return {"broker": self.stack.broker, "functions": self.stack.functions, "agent": self.stack.agent}
 
-    def _stopped(self, child: Child) -> Mend:
+    def _stopped(self, child: SupervisedProcess) -> Mend:
         self.stack.signal(child, signal.SIGSTOP)
         return lambda: self.stack.signal(child, signal.SIGCONT)
 
-    def _revive(self, child: Child) -> None:
+    def _revive(self, child: SupervisedProcess) -> None:
         self.stack.revive(child)
         self.stack.await_health()
 

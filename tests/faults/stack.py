@@ -20,7 +20,7 @@ from typing import Any
 import httpx
 import msgspec
 
-from infra.local.supervisor import Child
+from infra.local.supervisor import SupervisedProcess
 from tests.faults.console import Seat
 from tests.harness.browser.product import free_ports
 from tests.harness.network.brokers import BrokerKind, wait_until
@@ -114,7 +114,7 @@ class Stack:
         keys = ["--keys", str(self.home / "keys" / "public.json")]
         site = ["--home", str(self.home / "mosquitto")]
         self.broker = self._child("broker", f"infra.{self._kind}", *ports, *(keys if self._kind == "amqtt" else site))
-        self.broker.await_line("ready", PATIENCE_S)
+        self.broker.wait_for_line("ready", PATIENCE_S)
         self.functions = self._child("functions", "function_app", "serve")
         self._child("worker", "function_app", "work")
         self.api = f"http://{HOST}:{self.port}/api/v1"
@@ -140,7 +140,7 @@ class Stack:
         ).split()  # fmt: skip
         self.agent_id = self.post("/agents/claim", code=said[said.index("code") + 1])["agent"]
         self.agent = self._child("agent", self.AGENT, *self.agent_arguments(self.agent_mqtt.port))
-        self.agent.await_line("running", PATIENCE_S)
+        self.agent.wait_for_line("running", PATIENCE_S)
         with contextlib.suppress(PermissionError):  # what moves metal goes before what only talks, where one may say so
             os.setpriority(os.PRIO_PGRP, self.pid(self.agent), _AGENT_NICE)
         wait_until(lambda: all(each["online"] for each in self.devices()), "the arms to be online", PATIENCE_S)
@@ -188,7 +188,7 @@ class Stack:
             )  # fmt: skip
             return Console(int(self._consoles(msgspec.json.encode(seat).decode())), listener, proxy)
 
-    def below(self, child: Child) -> list[int]:
+    def below(self, child: SupervisedProcess) -> list[int]:
         """The process ids of all that a program has started, and what those have."""
         parents = {}
         for folder in Path("/proc").glob("[0-9]*"):
@@ -200,11 +200,11 @@ class Stack:
         return found[1:]
 
     @staticmethod
-    def pid(child: Child) -> int:
+    def pid(child: SupervisedProcess) -> int:
         assert child._process is not None
         return child._process.pid
 
-    def signal(self, child: Child, number: int) -> None:
+    def signal(self, child: SupervisedProcess, number: int) -> None:
         """To a program and all below it: mosquitto runs behind a program of ours."""
         below = self.below(child)
         self._dying = below if number == signal.SIGKILL else []
@@ -212,7 +212,7 @@ class Stack:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, number)
 
-    def revive(self, child: Child) -> None:
+    def revive(self, child: SupervisedProcess) -> None:
         """Start what was killed, once what it ran has let go of its ports."""
         assert child._process is not None
         child._process.wait(PATIENCE_S)
@@ -238,13 +238,13 @@ class Stack:
         assert done.returncode == 0, done.stderr
         return done.stdout.strip()
 
-    def _child(self, name: str, module: str, *arguments: str) -> Child:
-        child = Child(name, ["-m", module, *arguments], dict(self._environment), self._logs)
+    def _child(self, name: str, module: str, *arguments: str) -> SupervisedProcess:
+        child = SupervisedProcess(name, ["-m", module, *arguments], dict(self._environment), self._logs)
         self._closing.callback(self._stop, child)
         child.start()
         return child
 
-    def _stop(self, child: Child) -> None:
+    def _stop(self, child: SupervisedProcess) -> None:
         self.signal(child, signal.SIGCONT)
         child.stop()
 

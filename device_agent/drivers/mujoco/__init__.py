@@ -1,28 +1,28 @@
-"""Robots in a MuJoCo simulation, in real time. Needs no display: nothing here draws."""
+"""Drivers of robots in a real-time MuJoCo simulation; a display is not needed."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
-from device_agent.drivers.mujoco.biped_driver import WalkingDriver
+from device_agent.drivers.mujoco.biped_driver import BipedDriver
 from device_agent.drivers.mujoco.driver import MujocoDriver
 from device_agent.drivers.mujoco.wheeled_driver import WheeledDriver
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation import world_registry
-from device_agent.simulation.mjcf.twin import draw
+from device_agent.simulation.mjcf.twin import build_twin
 from device_agent.simulation.scene_assembly import Placement
 from device_agent.simulation.snapshot import Snapshot
 from device_agent.simulation.world import World
 
 __all__ = [
+    "BipedDriver",
     "MujocoDriver",
     "Placement",
     "Snapshot",
-    "WalkingDriver",
     "WheeledDriver",
     "World",
+    "build_twin",
     "create",
-    "draw",
     "worlds",
 ]
 
@@ -30,13 +30,14 @@ _OPTIONS = ("faults", "room", "scene", "trace")
 
 
 def create(robot_type: RobotType, folder: Path, options: Mapping[str, object], device: str) -> MujocoDriver:
-    """The driver of one robot, alone or in a room: the factory that ``drivers.load("mujoco")`` gives.
+    """The driver of one robot, alone or in a room: the factory of ``drivers.load("mujoco")``.
 
-    Options (text): ``room``, a room's folder, relative to the robot's: the robot is the one of its manifest with the
-    device's name, and all that is in the room shares one world; without it the robot has a world of its own, with
-    ``scene``, an MJCF file instead of the manifest's, relative to the robot's folder; ``trace``, a file to which the
-    world appends the robot's true state at 100 Hz (see ``trace.Trace``); ``faults``, a file with faults to put into the
-    robot, which may come and go while it runs (see ``ailments``).
+    Options (text):
+        room: A room's folder, relative to the robot type's; the robot is the manifest's entry with the device's name.
+            All devices of the room share one world. Without ``room`` the robot has its own world.
+        scene: MJCF file to use instead of the manifest's, relative to the robot type's folder.
+        trace: File for the robot's true state at 100 Hz (see ``trace.Trace``).
+        faults: File of injected faults (see ``fault_injection``); it may appear and disappear at runtime.
 
     Raises:
         DriverError: An option is unknown or not text, or the room cannot be used.
@@ -50,21 +51,21 @@ def create(robot_type: RobotType, folder: Path, options: Mapping[str, object], d
     if "room" not in options:
         scene = folder / str(options.get("scene", robot_type.scene))
         world = World(scene, home=robot_type.home_rad, trace=trace)
-        return _kind(robot_type)(robot_type=robot_type, world=world, device=device, faults=faults)
+        return _driver_class(robot_type)(robot_type=robot_type, world=world, device=device, faults=faults)
     if "scene" in options:
         raise DriverError("driver 'mujoco' takes a room or a scene, not both")
-    world = world_registry.of(folder / str(options["room"]))
+    world = world_registry.get_world(folder / str(options["room"]))
     if trace is not None:
         world.trace(trace, prefix=world_registry.prefix(device))
     prefix = world_registry.prefix(device)
-    return _kind(robot_type)(robot_type=robot_type, world=world, device=device, prefix=prefix, faults=faults)
+    return _driver_class(robot_type)(robot_type=robot_type, world=world, device=device, prefix=prefix, faults=faults)
 
 
-def _kind(robot_type: RobotType) -> type[MujocoDriver]:
-    """What drives robots of this type: by how they get about."""
+def _driver_class(robot_type: RobotType) -> type[MujocoDriver]:
+    """The driver class by locomotion."""
     simulation = robot_type.simulation
     if simulation is not None and simulation.wheels is not None:
         return WheeledDriver
     if simulation is not None and simulation.walk is not None:
-        return WalkingDriver
+        return BipedDriver
     return MujocoDriver

@@ -1,10 +1,9 @@
 """Robots on two legs: an assisted walk.
 
-While it walks, two things are not as on real metal. The legs are the gait's, a script: what the agent commands for them
-waits. And the torso is helped, by a spring that holds it upright and draws it along the course, no harder than the
-manifest says (``[simulation.walk]``); nothing carries its weight but the legs. Standing, sitting and all that the
-agent's own commands do has no help: a robot that loses its balance falls. It then lies, until it is carried back to
-where it began, as a person in a real room would.
+The walk is simplified in two ways. While it lasts, the gait moves the legs and the agent's leg commands wait. A spring
+keeps the torso upright and on course, limited by the manifest (``[simulation.walk]``); the legs carry the weight. At
+all other times there is no support: a robot that loses its balance falls. It lies for a while and is then reset to its
+start, as a person in a real room would do.
 """
 
 import math
@@ -15,7 +14,7 @@ import mujoco
 import numpy as np
 
 from device_agent.drivers.mujoco.driver import MujocoDriver
-from device_agent.drivers.mujoco.gait import Gait, Leg, Legs, Place, Point, legs
+from device_agent.drivers.mujoco.gait import FloorPose, Gait, Leg, Legs, Point, make_legs
 from device_agent.ports.driver import REST, DriverError, Twist
 from device_agent.protocol.manifests.capabilities import Walk
 from device_agent.protocol.manifests.robot_type import Base, RobotType
@@ -26,48 +25,48 @@ ODOMETRY = "odometry"
 
 _STIFFNESS_N_M, _DAMPING_NS_M = 1500.0, 60.0
 _STIFFNESS_NM, _DAMPING_NMS = 80.0, 4.0
-"""Of the spring that helps the torso: firm for five kilograms. What counts is how hard it may pull."""
+"""Parameters of the torso spring, for a robot of 5 kg; the manifest limits its force."""
 _FADE_S = 0.3
-"""Time in which legs and help pass from the agent to the gait."""
+"""Time for the transition of the legs from the agent to the gait."""
 _SILENT_S = 0.3
-"""A robot that nobody has told to walk for so long stops."""
+"""The robot stops when it has received no twist for this time."""
 _STANDING_RAD = 0.15
-"""As near to home all joints of the legs must be commanded for a walk to begin."""
+"""A walk starts only if all leg joints are commanded within this distance from home."""
 _CATCH_UP_RAD_S = 1.0
-"""How fast the legs go to where the agent has commanded them meanwhile, after a walk."""
+"""Speed at which the legs return to the agent's command after a walk."""
 _STILL = 1e-4
-"""A twist of less [m/s, rad/s] is none: nobody makes steps for it."""
-_LIES_S = 10.0
-"""Simulated time that it lies until somebody comes."""
+"""A smaller twist [m/s, rad/s] counts as zero."""
+_RESET_AFTER_S = 10.0
+"""Simulated time until a fallen robot is reset."""
 _UPRIGHT = 0.8
-"""Cosine of the torso's tilt: less is a fall, and nobody walks lying."""
+"""Cosine of the torso's tilt; below it the robot has fallen and cannot walk."""
 
 
-class _Order(NamedTuple):
-    """How to walk, and when that was said, in simulated time [s]."""
+class _WalkCommand(NamedTuple):
+    """The commanded twist and its simulated time [s]."""
 
     twist: Twist
-    said_s: float
+    at_s: float
 
 
-class Walker:
-    """``Process`` that moves one robot's legs while it walks, helps its torso, and carries it back when it has fallen.
+class AssistedWalk:
+    """``Process`` that walks one robot: moves its legs, supports its torso, and resets it after a fall.
 
     Args:
         walk: From the manifest.
         model: ``MjModel``.
         base: The robot's root body, on a free joint.
         soles: Sites of the left and the right sole.
-        servos: Index of each of its actuators → where its joint is in ``qpos``.
-        actuators: Of both legs, the left one's first, shape (12,).
-        measures: Both legs.
-        gait: How it steps.
-        height_m: Of the torso's origin above the soles [m].
+        servos: Index of each actuator → index of its joint in ``qpos``.
+        actuators: Of both legs, left first, shape (12,).
+        legs: Dimensions of both legs.
+        gait: The gait.
+        height_m: Height of the torso's origin above the soles [m].
 
     Attributes:
-        busy: Whether the legs are the gait's.
-        walked: Where the gait believes to have gone since the beginning, by its own steps; slipping is not seen.
-        velocity: How fast it believes to go.
+        busy: Whether the gait moves the legs.
+        walked: Odometry: pose relative to the start by the gait's steps; slip is not included.
+        velocity: Estimated twist.
     """
 
     def __init__(
@@ -79,7 +78,7 @@ class Walker:
         soles: tuple[int, int],
         servos: Mapping[int, int],
         actuators: Ints,
-        measures: Legs,
+        legs: Legs,
         gait: Gait,
         height_m: float,
     ) -> None:
@@ -91,53 +90,53 @@ class Walker:
         self._servos = dict(servos)
         self._fell_s: float | None = None
         self._actuators = actuators
-        self._legs = measures
+        self._legs = legs
         self._gait = gait
         self._height_m = height_m
-        self._order = _Order(REST, -math.inf)
+        self._command = _WalkCommand(REST, -math.inf)
         self._began_s = 0.0
         self._from: Floats = np.zeros(len(actuators))
         self._data: Any = None
         self._last_s = 0.0
-        self._own: tuple[Place, Place] | None = None  # where the course began, in the world and as believed
+        self._start_poses: tuple[FloorPose, FloorPose] | None = None  # start of the walk: true pose and odometry
         self.busy = False
-        self.walked = Place(0.0, 0.0, 0.0)
+        self.walked = FloorPose(0.0, 0.0, 0.0)
         self.velocity = REST
 
-    def tell(self, twist: Twist, now_s: float) -> None:
-        """How to walk from now on [simulated s]."""
-        self._order = _Order(twist, now_s)
+    def set_twist(self, twist: Twist, now_s: float) -> None:
+        """Set the twist at this simulated time [s]."""
+        self._command = _WalkCommand(twist, now_s)
 
     def step(self, model: Any, data: Any, time_s: float) -> None:
-        """One group of steps further."""
+        """Advance by one group of steps."""
         elapsed_s, self._last_s = time_s - self._last_s, time_s
-        if data is not self._data:  # a world that began anew
+        if data is not self._data:  # the world has been reset
             self._data, self.busy, self._gait.walking = data, False, False
             return
-        self._look_after(model, data, time_s)
-        order = self._order
-        twist = order.twist if time_s - order.said_s <= _SILENT_S else REST
+        self._reset_if_fallen(model, data, time_s)
+        command = self._command
+        twist = command.twist if time_s - command.at_s <= _SILENT_S else REST
         if self.busy and (not self._gait.walking or upright(data.xquat[self._base]) < _UPRIGHT):
-            self._end(data)
+            self._stop(data)
         if not self.busy:
             if twist == REST or upright(data.xquat[self._base]) < _UPRIGHT:
                 return
-            self._begin(data, twist, time_s)
+            self._start(data, twist, time_s)
         self.velocity = twist
         self._gait.advance(elapsed_s, twist)
         share = min(1.0, (time_s - self._began_s) / _FADE_S)
         self._move_legs(data, share)
-        self._help(data, share)
-        self._believe()
+        self._support_torso(data, share)
+        self._update_odometry()
 
-    def _look_after(self, model: Any, data: Any, time_s: float) -> None:
-        """Stand it where it began, joints as commanded, when it has lain for a while."""
+    def _reset_if_fallen(self, model: Any, data: Any, time_s: float) -> None:
+        """Reset the robot to its start, with its joints as commanded, when it has lain long enough."""
         if upright(data.xquat[self._base]) >= _UPRIGHT:
             self._fell_s = None
         elif self._fell_s is None:
             self._fell_s = time_s
-        elif time_s - self._fell_s >= _LIES_S:
-            self._fell_s, self.walked = None, Place(0.0, 0.0, 0.0)
+        elif time_s - self._fell_s >= _RESET_AFTER_S:
+            self._fell_s, self.walked = None, FloorPose(0.0, 0.0, 0.0)
             at = self._free_qpos
             data.qpos[at : at + 7] = model.qpos0[at : at + 7]
             data.qvel[self._free : self._free + 6 + len(self._servos)] = 0.0
@@ -148,15 +147,15 @@ class Walker:
             data.qpos[at + 2] += floor_m - float(data.site_xpos[self._soles][:, 2].min())
             mujoco.mj_kinematics(model, data)
 
-    def _begin(self, data: Any, twist: Twist, time_s: float) -> None:
+    def _start(self, data: Any, twist: Twist, time_s: float) -> None:
         x, y = data.xpos[self._base][:2].tolist()
-        course = Place(x, y, heading(data.xquat[self._base]))
-        self._own = course, self.walked
+        course = FloorPose(x, y, heading(data.xquat[self._base]))
+        self._start_poses = course, self.walked
         self._began_s, self._from = time_s, data.ctrl[self._actuators].copy()
-        self._gait.begin(course, twist)
+        self._gait.start(course, twist)
         self.busy = True
 
-    def _end(self, data: Any) -> None:
+    def _stop(self, data: Any) -> None:
         data.xfrc_applied[self._base] = 0.0
         self.busy, self._gait.walking, self.velocity = False, False, REST
 
@@ -165,8 +164,8 @@ class Walker:
         target = np.array(self._legs.positions(soles, self._gait.toes_out_rad))
         data.ctrl[self._actuators] = self._from + (target - self._from) * share
 
-    def _help(self, data: Any, share: float) -> None:
-        """The spring's pull on the torso, up to what it may."""
+    def _support_torso(self, data: Any, share: float) -> None:
+        """Apply the spring's force and torque to the torso, within their limits."""
         place, velocity = self._gait.torso, self._gait.velocity
         x, y, _ = data.xpos[self._base].tolist()
         c, s = math.cos(place.yaw_rad), math.sin(place.yaw_rad)
@@ -182,29 +181,28 @@ class Walker:
         )
         wanted = np.array((math.cos(place.yaw_rad / 2), 0.0, 0.0, math.sin(place.yaw_rad / 2)))
         turn, spin = np.empty(3), np.empty(3)
-        mujoco.mju_subQuat(turn, wanted, data.xquat[self._base])  # in the torso's frame, as its own spin is
+        mujoco.mju_subQuat(turn, wanted, data.xquat[self._base])  # in the torso's frame, like its angular velocity
         torque_here = _STIFFNESS_NM * turn - _DAMPING_NMS * data.qvel[self._free + 3 : self._free + 6]
         mujoco.mju_rotVecQuat(spin, torque_here, data.xquat[self._base])
         spin[2] += _DAMPING_NMS * velocity.turn_rad_s
         pull = data.xfrc_applied[self._base]
-        pull[:3] = share * _at_most(force, self._walk.support_n)
-        pull[3:] = share * _at_most(spin, self._walk.support_nm)
+        pull[:3] = share * _limited(force, self._walk.support_n)
+        pull[3:] = share * _limited(spin, self._walk.support_nm)
 
-    def _believe(self) -> None:
-        if self._own is not None:
-            began, believed = self._own
-            gone = self._gait.course.seen_from(began)
-            there = believed.beside(gone.x_m, gone.y_m)
-            self.walked = Place(there.x_m, there.y_m, math.remainder(believed.yaw_rad + gone.yaw_rad, 2 * math.pi))
+    def _update_odometry(self) -> None:
+        if self._start_poses is not None:
+            start, estimate = self._start_poses
+            moved = self._gait.course.relative_to(start)
+            pose = estimate.shifted(moved.x_m, moved.y_m)
+            self.walked = FloorPose(pose.x_m, pose.y_m, math.remainder(estimate.yaw_rad + moved.yaw_rad, 2 * math.pi))
 
 
-class WalkingDriver(MujocoDriver):
-    """A ``MobileDriver`` for robot types with ``[simulation.walk]``. Its robot walks from home, and nowhere else from.
+class BipedDriver(MujocoDriver):
+    """A ``MobileDriver`` for robot types with ``[simulation.walk]``. The robot walks only from its home posture.
 
-    Who commands the legs is decided here: the agent, except from the first step of a walk to the last. What ``send``
-    then returns for them is what the gait does, so telemetry shows them as limited by the driver. A walk that is told
-    to end stops the torso at once, puts down the foot that is in the air and brings the other one beside it; the legs
-    are then where they were before, and go only slowly to where the agent has commanded them meanwhile.
+    During a walk the gait commands the legs, and ``send`` returns the gait's leg positions, so telemetry shows the leg
+    commands as limited by the driver. At the end of a walk the torso stops at once and the feet come together. The legs
+    then move slowly to the agent's newest command.
     """
 
     def __init__(self, *, robot_type: RobotType, world: World, device: str, prefix: str = "", **more: Any) -> None:
@@ -219,12 +217,12 @@ class WalkingDriver(MujocoDriver):
         )
         self._others = np.array([index for index in range(len(names)) if index not in self._leg_joints], dtype=np.intp)
         self._home = np.array([robot_type.home_rad[name] for name in names])[self._leg_joints]
-        self._walker: Walker | None = None
-        self._start = Place(0.0, 0.0, 0.0)
-        self._legs_at: Floats | None = None  # where the legs were commanded when a walk ended, while they catch up
+        self._walker: AssistedWalk | None = None
+        self._start = FloorPose(0.0, 0.0, 0.0)
+        self._legs_at: Floats | None = None  # leg command while the legs catch up
 
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
-        """As of every driver; while it walks, the legs are not commanded, and read as what the gait does.
+        """As in ``MujocoDriver``; during a walk the returned leg positions are those of the gait.
 
         Raises:
             DriverError: As for ``MujocoDriver.send``.
@@ -239,22 +237,24 @@ class WalkingDriver(MujocoDriver):
             return tuple(applied.tolist())
         if self._legs_at is None:
             return super().send(position_rad)
-        asked = self._checked(position_rad)
-        most = _CATCH_UP_RAD_S * self._type.period_ms / 1000
-        way = asked[self._leg_joints] - self._legs_at
-        self._legs_at = None if np.abs(way).max() <= most else self._legs_at + np.clip(way, -most, most)
+        target = self._checked(position_rad)
+        step_rad = _CATCH_UP_RAD_S * self._type.period_ms / 1000
+        distance = target[self._leg_joints] - self._legs_at
+        self._legs_at = (
+            None if np.abs(distance).max() <= step_rad else self._legs_at + np.clip(distance, -step_rad, step_rad)
+        )
         if self._legs_at is not None:
-            asked[self._leg_joints] = self._legs_at
-        return super().send(asked.tolist())
+            target[self._leg_joints] = self._legs_at
+        return super().send(target.tolist())
 
     def drive(self, twist: Twist) -> Twist:
-        """Walk so for the next period.
+        """Walk with this twist for the next period.
 
         Returns:
-            The twist, inside the base's limits; no motion at all where the robot does not stand as at home.
+            The twist within the base's limits; zero if the robot is not in its home posture.
 
         Raises:
-            DriverError: A number is not finite, not connected, or the simulation has stopped.
+            DriverError: A value is not finite, not connected, or the simulation has stopped.
         """
         snapshot, walker = self._live(), self._walking()
         if not all(map(math.isfinite, twist)):
@@ -266,13 +266,13 @@ class WalkingDriver(MujocoDriver):
             min(max(twist.left_m_s, -sideways), sideways),
             min(max(twist.turn_rad_s, -turning), turning),
         )
-        if max(map(abs, applied)) < _STILL or not (walker.busy or self._stands(snapshot)):
+        if max(map(abs, applied)) < _STILL or not (walker.busy or self._is_in_home_posture(snapshot)):
             applied = REST
-        walker.tell(applied, snapshot.time_s)
+        walker.set_twist(applied, snapshot.time_s)
         return applied
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
-        """``odometry``: where the steps say that it is, from where it was put; and what every simulated robot tells.
+        """``odometry``: the pose by the robot's steps, and the streams of ``MujocoDriver``.
 
         Raises:
             DriverError: Not connected.
@@ -281,7 +281,7 @@ class WalkingDriver(MujocoDriver):
             return super().report(stream)
         self._require()
         walker = self._walking()
-        place = self._start.beside(walker.walked.x_m, walker.walked.y_m)
+        place = self._start.shifted(walker.walked.x_m, walker.walked.y_m)
         return {
             "x_m": round(place.x_m, 4),
             "y_m": round(place.y_m, 4),
@@ -292,22 +292,22 @@ class WalkingDriver(MujocoDriver):
         }
 
     def close(self) -> None:
-        """See ``MujocoDriver``; what still walks stops."""
+        """See ``MujocoDriver``; also stops a walk."""
         if self._walker is not None:
-            self._walker.tell(REST, 0.0)
+            self._walker.set_twist(REST, 0.0)
         super().close()
 
-    def _walking(self) -> Walker:
+    def _walking(self) -> AssistedWalk:
         if self._walker is None:
             raise DriverError(f"'{self._device}' is not connected")
         return self._walker
 
-    def _stands(self, snapshot: Snapshot) -> bool:
+    def _is_in_home_posture(self, snapshot: Snapshot) -> bool:
         commanded = snapshot.ctrl[self._actuators[self._leg_joints]]
         upright_now = upright(snapshot.body_quaternion[self._base]) >= _UPRIGHT
         return upright_now and bool(np.abs(commanded - self._home).max() <= _STANDING_RAD)
 
-    # ------------------------------------------------------------ names and measures
+    # ------------------------------------------------------------ names and dimensions
 
     def _resolve(self, model: Any) -> None:
         super()._resolve(model)
@@ -329,14 +329,14 @@ class WalkingDriver(MujocoDriver):
         data.qpos[self._qpos[self._leg_joints]] = self._home
         mujoco.mj_kinematics(model, data)
         feet = [data.site_xpos[self._site(model, sole)].tolist() for sole in self._walk.soles]
-        self._walker = Walker(
+        self._walker = AssistedWalk(
             self._walk,
             model,
             base=self._base,
             soles=(self._site(model, self._walk.soles[0]), self._site(model, self._walk.soles[1])),
             servos=dict(zip(self._actuators.tolist(), self._qpos.tolist(), strict=True)),
             actuators=self._actuators[self._leg_joints],
-            measures=legs(left, right, (feet[0][0], feet[0][1], feet[0][2])),
+            legs=make_legs(left, right, (feet[0][0], feet[0][1], feet[0][2])),
             gait=Gait(
                 neutral=((feet[0][0], feet[0][1]), (feet[1][0], feet[1][1])),
                 step_s=self._walk.step_s,
@@ -347,7 +347,7 @@ class WalkingDriver(MujocoDriver):
         self._world.add(self._walker)
 
     def _measure(self, model: Any, data: Any, names: Sequence[str], sole: str) -> Leg:
-        """One leg's measures, from the model with all joints at zero."""
+        """Dimensions of one leg, from the model with all joints at 0."""
         kind = mujoco.mjtObj.mjOBJ_JOINT
         joints = [self._find(model, kind, "joint", model.njnt, name) for name in names]
         bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
@@ -366,7 +366,7 @@ class WalkingDriver(MujocoDriver):
 
 
 def heading(quaternion: Floats) -> float:
-    """Where the x axis points, seen from above [rad]."""
+    """Direction of the x axis in the horizontal plane [rad]."""
     w, x, y, z = quaternion.tolist()
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
@@ -377,8 +377,8 @@ def upright(quaternion: Floats) -> float:
     return float(1.0 - 2.0 * (x * x + y * y))
 
 
-def _place(free_joint: Floats) -> Place:
-    return Place(float(free_joint[0]), float(free_joint[1]), heading(free_joint[3:7]))
+def _place(free_joint: Floats) -> FloorPose:
+    return FloorPose(float(free_joint[0]), float(free_joint[1]), heading(free_joint[3:7]))
 
 
 def _point(vector: Floats) -> Point:
@@ -386,6 +386,6 @@ def _point(vector: Floats) -> Point:
     return x, y, z
 
 
-def _at_most(vector: Floats, size: float) -> Floats:
+def _limited(vector: Floats, size: float) -> Floats:
     now = float(np.linalg.norm(vector))
     return vector if now <= size else vector * (size / now)

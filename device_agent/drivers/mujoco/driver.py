@@ -1,4 +1,4 @@
-"""One robot in a ``World``: the ``Driver`` of any robot type whose joints are position servos on hinges or slides."""
+"""Driver of one robot in a ``World``, for joints that are position servos on hinges or slides."""
 
 import logging
 import math
@@ -10,10 +10,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from device_agent.drivers.mujoco.cameras import Eyes
-from device_agent.drivers.mujoco.fault_injection import WELL, FaultInjector, InjectedFaults, MotorFault
-from device_agent.drivers.mujoco.motor_model import HEALTH, Health
-from device_agent.drivers.mujoco.servo_gains import Stiffness
+from device_agent.drivers.mujoco.cameras import RobotCameras
+from device_agent.drivers.mujoco.fault_injection import NO_FAULTS, FaultInjector, InjectedFaults, MotorFault
+from device_agent.drivers.mujoco.motor_model import HEALTH, MotorModel
+from device_agent.drivers.mujoco.servo_gains import ServoGains
 from device_agent.ports import skills
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.ports.sensor import Frame
@@ -27,37 +27,37 @@ from device_agent.simulation.world import STALE_S, World
 
 log = logging.getLogger(__name__)
 
-_LOOKED_S = 0.1
-"""What lies further back than this nobody has seen: a motor may have moved meanwhile."""
+_MAX_GAP_S = 0.1
+"""Longer gaps between observations count as this long: the motor may have moved in between."""
 
-_NOTED_EVERY_S = 0.02
-"""How a robot is changes slowly; a joint is stuck after half a second."""
+_UPDATE_PERIOD_S = 0.02
+"""Period of the motor model. Temperatures change slowly, and a joint counts as stalled after 0.5 s."""
 RAMP_PERIODS = 1.5
-"""Control periods over which a target is approached. Targets arrive up to half a period late on a busy machine; a ramp
-of one and a half then never runs dry between two of them, so the motion has no steps (cost: half a period of delay)."""
+"""Control periods over which a target is approached.
+
+On a busy machine targets arrive up to half a period late. With 1.5 periods a ramp never ends before the next target,
+so the motion is smooth; it adds a delay of half a period."""
 SPEECH_DB = 60.0
-"""Of normal speech a metre away, A-weighted (ISO 9921)."""
+"""Level of normal speech at 1 m, A-weighted (ISO 9921)."""
 _NEAR_M = 0.95
-"""Of a room so much is drawn around a robot that stands still in it: the table under it, the floor under that."""
+"""The twin of a static robot includes static room objects within this distance, for example its table."""
 
 
 class MujocoDriver:
     """Drives one robot of a world, its own or a shared one.
 
-    The robot's base is its model's top-level body; frames and the twin are given in it. The model's joints, actuators
-    and sites carry the manifest's names, after ``prefix`` where the world was put together from several robots.
+    The base is the model's top-level body; frames and the twin are relative to it. The model's joints, actuators and
+    sites have the manifest's names, after ``prefix`` in a world with several robots. It implements
+    ``ReportsStreams`` (stream ``health``) and, if its type has cameras, ``HasCameras``.
 
-    It is ``Reporting`` too: stream ``health``; and ``Filming``, where its type has cameras.
-
-    A motor that does not move though it gives all it can is an error, as it is to a real arm's controller; connecting
-    again forgives it.
+    A joint that stalls at full effort is an error, as for a real arm controller; ``connect`` clears it.
 
     Args:
         robot_type: Its manifest.
-        world: Where it is.
-        device: Its name.
-        prefix: Before its names in the world.
-        faults: A file with faults to put into it, see ``ailments``; it need not be there.
+        world: Its world.
+        device: Id of the device.
+        prefix: Prefix of its names in the world.
+        faults: File of injected faults (see ``fault_injection``); it may be missing.
     """
 
     def __init__(
@@ -75,55 +75,55 @@ class MujocoDriver:
         self._lower: Floats = np.zeros(0)
         self._upper: Floats = np.zeros(0)
         self._frame_bodies: Ints = np.zeros(0, dtype=np.intp)
-        self._frame_sites: tuple[Ints, Ints] = (self._frame_bodies, self._frame_bodies)  # which frames, which sites
-        self._frame_turns: Floats | None = None  # turns each frame by its site's own orientation, if any has one
-        self._turned_as = b""  # the base's orientation when what follows was worked out
+        self._frame_sites: tuple[Ints, Ints] = (self._frame_bodies, self._frame_bodies)  # frame indices, site indices
+        self._frame_turns: Floats | None = None  # site orientations relative to their bodies, if any
+        self._base_orientation_key = b""  # the base orientation that the next two are computed for
         self._base_matrix: Floats = np.eye(3)
         self._from_base: Floats = np.eye(4)
         self._ramp_s = RAMP_PERIODS * robot_type.period_ms / 1000
         battery = None if robot_type.simulation is None else robot_type.simulation.battery
-        self._health = Health(robot_type.joints, battery, seed=device)
-        self._sickbed = FaultInjector(faults, [joint.name for joint in robot_type.joints])
-        self._infliction: MotorFault | None = None
-        self._stiffness: Stiffness | None = None
-        self._seeing = Eyes(robot_type.cameras, world, prefix=prefix)
-        self._noted_s = math.inf
+        self._motors = MotorModel(robot_type.joints, battery, seed=device)
+        self._fault_injector = FaultInjector(faults, [joint.name for joint in robot_type.joints])
+        self._motor_fault: MotorFault | None = None
+        self._stiffness: ServoGains | None = None
+        self._cameras = RobotCameras(robot_type.cameras, world, prefix=prefix)
+        self._updated_s = math.inf
 
     @property
     def simulated(self) -> bool:
-        """Always: no metal moves."""
+        """Always True."""
         return True
 
     @property
     def prompt(self) -> bool:
-        """Always: the physics have a thread of their own."""
+        """Always True: the physics runs in its own thread."""
         return True
 
     def connect(self) -> None:
-        """Build the world, or join it; the robot stands at home, or where it was left.
+        """Open the world; the robot is at home, or where it was last.
 
-        Connecting again after the simulation became unstable begins it anew, with every robot of the world at home.
+        Reconnecting after an instability restarts the world with every robot at home.
 
         Raises:
             DriverError: The model cannot be built, or lacks a joint, actuator or frame of the manifest.
         """
-        self._health.forgive()
+        self._motors.clear()
         if self._connected:
             self._world.recover()
             return
         self._world.open()
         try:
             self._resolve(self._world.model)
-            self._seeing.open(self._world.model)
+            self._cameras.open(self._world.model)
         except DriverError:
             self._world.close()
             raise
         self._connected = True
 
     def twin(self) -> Twin | None:
-        """The drawing: the robot, and what stands still around it; of a room only what is near."""
+        """The robot and the static objects around it; of a room only those nearby."""
         self._require()
-        return twin.draw(
+        return twin.build_twin(
             self._world.model,
             base=self._base,
             device=self._device,
@@ -134,13 +134,13 @@ class MujocoDriver:
     def observe(self) -> Observation:
         """The newest measurement, at most one group of steps old.
 
-        ``effort_nm`` is what the motors give, with the torque that holds the arm against gravity [N m].
+        ``effort_nm`` is the motor torque including gravity compensation [N m].
 
         Raises:
-            DriverError: Not connected, the simulation has stopped, or a joint is stuck; the text says why.
+            DriverError: Not connected, the simulation has stopped, or a joint is stalled; the message gives the reason.
         """
         snapshot = self._live()
-        self._note(snapshot)
+        self._update_motor_model(snapshot)
         return Observation(
             position_rad=tuple(snapshot.qpos[self._qpos].tolist()),
             velocity_rad_s=tuple(snapshot.qvel[self._dof].tolist()),
@@ -149,10 +149,10 @@ class MujocoDriver:
         )
 
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
-        """Command joint positions for the next period; clamps to the actuators' ranges.
+        """Command joint positions for the next period, clamped to the actuators' ranges.
 
         Raises:
-            DriverError: Wrong number of values, one is not finite, not connected, or the simulation has stopped.
+            DriverError: Wrong number of values, a value is not finite, not connected, or the simulation has stopped.
         """
         self._live()
         applied = self._checked(position_rad)
@@ -160,79 +160,77 @@ class MujocoDriver:
         return tuple(applied.tolist())
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
-        """``health``: temperature and load of its joints, and its battery."""
+        """``health``: temperature and load of the joints, and the battery."""
         if stream != HEALTH:
             return {}
-        news = self._sickbed.news()
-        if news is not None:
-            self._suffer(news)
-        return self._health.values()
+        changed = self._fault_injector.poll()
+        if changed is not None:
+            self._inject(changed)
+        return self._motors.values()
 
     def frame(self, camera: str) -> Frame | None:
-        """What one of its cameras sees now."""
-        return self._seeing.frame(camera)
+        """The current image of a camera."""
+        return self._cameras.frame(camera)
 
     performs = (skills.STIFFNESS,)
 
     def perform(self, skill: Skill, stage: Stage) -> None:
-        """Stiffen joints, from the next group of steps on.
+        """Set the stiffness of joints, from the next group of steps on.
 
         Raises:
-            SkillError: Another skill, or not connected.
+            SkillError: Unsupported skill, or not connected.
         """
         del stage
         if not isinstance(skill, SetStiffness) or self._stiffness is None:
-            raise SkillError(f"the simulation of '{self._device}' cannot do this now")
-        self._stiffness.want(skill.value, skill.joints or [joint.name for joint in self._type.joints])
+            raise SkillError(f"the simulation of '{self._device}' does not support this skill or is not connected")
+        self._stiffness.set(skill.value, skill.joints or [joint.name for joint in self._type.joints])
 
     def speaks(self, for_s: float) -> None:
-        """What listens in its room hears it."""
+        """Emit speech sound in the simulated room."""
         if self._connected:
             self._world.sound(self._device, SPEECH_DB, for_s=for_s)
 
     def close(self) -> None:
-        """Leave the world; it stands still when nobody is left in it."""
+        """Leave the world; it stops with its last user."""
         if self._connected:
             self._connected = False
-            self._seeing.close()
+            self._cameras.close()
             self._world.close()
 
-    def _note(self, snapshot: Snapshot) -> None:
-        """What a measurement says about how the robot is.
+    def _update_motor_model(self, snapshot: Snapshot) -> None:
+        """Update the motor model from a measurement.
 
         Raises:
-            DriverError: A joint is stuck.
+            DriverError: A joint is stalled.
         """
-        if 0 <= snapshot.time_s - self._noted_s < _NOTED_EVERY_S:
+        if 0 <= snapshot.time_s - self._updated_s < _UPDATE_PERIOD_S:
             return
         effort, velocity = snapshot.effort[self._dof], snapshot.qvel[self._dof]
-        elapsed_s = min(max(0.0, snapshot.time_s - self._noted_s), _LOOKED_S)
-        self._noted_s = snapshot.time_s
-        self._health.observe(snapshot.time_s, effort, velocity, power_w=self._power_w(snapshot))
+        elapsed_s = min(max(0.0, snapshot.time_s - self._updated_s), _MAX_GAP_S)
+        self._updated_s = snapshot.time_s
+        self._motors.observe(snapshot.time_s, effort, velocity, power_w=self._power_w(snapshot))
         behind = snapshot.ctrl[self._actuators] - snapshot.qpos[self._qpos]
-        stuck = self._health.stuck(elapsed_s, behind, effort, velocity)
-        if stuck:
-            raise DriverError(
-                f"{', '.join(stuck)} does not move though the motor gives all it can; free it, then move it again"
-            )
+        stalled = self._motors.stalled(elapsed_s, behind, effort, velocity)
+        if stalled:
+            raise DriverError(f"{', '.join(stalled)} does not move at full motor effort; free it, then move it again")
 
     def _power_w(self, snapshot: Snapshot) -> float:
-        """What motors take that are no joints."""
+        """Power of motors that are not joints."""
         del snapshot
         return 0.0
 
-    def _suffer(self, ailments: InjectedFaults) -> None:
-        if ailments != WELL:
-            log.warning("%s now suffers from %s", self._device, ailments)
-        self._health.suffer(ailments)
-        if self._infliction is not None:
-            self._infliction.want(ailments)
+    def _inject(self, faults: InjectedFaults) -> None:
+        if faults != NO_FAULTS:
+            log.warning("%s: injected faults are now %s", self._device, faults)
+        self._motors.inject(faults)
+        if self._motor_fault is not None:
+            self._motor_fault.set(faults)
 
     def _checked(self, position_rad: Sequence[float]) -> Floats:
-        """A command inside the actuators' ranges, shape (n,) [rad].
+        """The command within the actuators' ranges, shape (n,) [rad].
 
         Raises:
-            DriverError: Wrong number of values, or one is not finite.
+            DriverError: Wrong number of values, or a value is not finite.
         """
         if len(position_rad) != len(self._actuators):
             raise DriverError(f"{len(position_rad)} positions for {len(self._actuators)} joints")
@@ -256,13 +254,13 @@ class MujocoDriver:
         return snapshot
 
     def _poses(self, snapshot: Snapshot) -> tuple[Pose, ...]:
-        """Frames in the base, all at once: p = Bᵀ (x - b), q = b* ⊗ body ⊗ site."""
+        """Poses of all frames in the base: p = Bᵀ (x - b), q = b* ⊗ body ⊗ site."""
         if not len(self._frame_bodies):
             return ()
         origin, quaternion = snapshot.body_position_m[self._base], snapshot.body_quaternion[self._base]
         now = quaternion.tobytes()
-        if now != self._turned_as:
-            self._turned_as, self._base_matrix, self._from_base = now, *_bases(*quaternion.tolist())
+        if now != self._base_orientation_key:
+            self._base_orientation_key, self._base_matrix, self._from_base = now, *_bases(*quaternion.tolist())
         places = snapshot.body_position_m[self._frame_bodies]
         at_sites, sites = self._frame_sites
         places[at_sites] = snapshot.site_position_m[sites]
@@ -271,7 +269,7 @@ class MujocoDriver:
         if self._frame_turns is not None:
             turns = np.einsum("kij,kj->ki", self._frame_turns, turns)
         pairs = zip((places @ self._base_matrix).tolist(), turns.tolist(), strict=True)
-        # A rotation has two quaternions; give the one with w >= 0.
+        # Of the two quaternions of a rotation return the one with w >= 0.
         return tuple(
             [(x, y, z, w, i, j, k) if w >= 0 else (x, y, z, -w, -i, -j, -k) for (x, y, z), (w, i, j, k) in pairs]
         )
@@ -297,11 +295,11 @@ class MujocoDriver:
         self._upper = np.where(limited, ranges[:, 1], np.inf)
         self._base = int(model.body_rootid[model.jnt_bodyid[joints[0]]]) if joints else 0
         self._resolve_frames(model)
-        if self._infliction is None:
-            self._infliction = MotorFault(model, dict(zip(names, self._actuators.tolist(), strict=True)))
-            self._world.add(self._infliction)
+        if self._motor_fault is None:
+            self._motor_fault = MotorFault(model, dict(zip(names, self._actuators.tolist(), strict=True)))
+            self._world.add(self._motor_fault)
         if self._stiffness is None:
-            self._stiffness = Stiffness(model, dict(zip(names, self._actuators.tolist(), strict=True)))
+            self._stiffness = ServoGains(model, dict(zip(names, self._actuators.tolist(), strict=True)))
             self._world.add(self._stiffness)
 
     def _resolve_frames(self, model: Any) -> None:
@@ -320,16 +318,18 @@ class MujocoDriver:
         turns = np.array([_turned_by(*quaternion) for quaternion in own]).reshape(-1, 4, 4)
         self._frame_turns = None if np.array_equal(turns, np.broadcast_to(np.eye(4), turns.shape)) else turns
 
-    def _find(self, model: Any, kind: Any, word: str, count: int, name: str) -> int:
+    def _find(self, model: Any, kind: Any, label: str, count: int, name: str) -> int:
         index = int(mujoco.mj_name2id(model, kind, self._prefix + name))
         if index < 0:
             known = ", ".join(filter(None, (mujoco.mj_id2name(model, kind, other) for other in range(count))))
-            raise DriverError(f"the model of '{self._type.type}' has no {word} '{self._prefix}{name}'; it has: {known}")
+            raise DriverError(
+                f"the model of '{self._type.type}' has no {label} '{self._prefix}{name}'; it has: {known}"
+            )
         return index
 
 
 def _bases(w: float, x: float, y: float, z: float) -> tuple[Floats, Floats]:
-    """Of a base that is turned so: the matrices of v → v B, which is Bᵀ v, and of q → q b, which is b* ⊗ q."""
+    """For a base orientation b: the matrices of v → v B, which is Bᵀ v, and of q → q b, which is b* ⊗ q."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, np.array([w, x, y, z]))
     return matrix.reshape(3, 3), np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])

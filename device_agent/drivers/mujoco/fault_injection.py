@@ -1,14 +1,14 @@
-"""Faults put into a simulated robot on purpose, for tests and demonstrations: from a file beside the agent.
+"""Faults injected into a simulated robot from a file beside the agent, for tests and demonstrations.
 
-Only who may write on the agent's own machine can make a robot ill: no message, however signed, does. The file need not
-be there; it is read again whenever it has changed.
+Only users of the agent's machine can inject faults; no message can. The file may be missing and is read again when it
+changes.
 
 ```toml
-overheating = { elbow = 2.0 }   # gives off no heat, and warms by so many kelvin a minute besides
-weak = { wrist_1 = 0.3 }        # has this share of its torque left
-stuck = ["shoulder_pan"]        # moves no more
-battery_percent = 25.0          # this is what it has now
-charging = true                 # on its charger, or false: not, however empty
+overheating = { elbow = 2.0 }   # no cooling, and additional warming [K/min]
+weak = { wrist_1 = 0.3 }        # share of the torque that is left
+stuck = ["shoulder_pan"]        # does not move
+battery_percent = 25.0          # charge at this moment
+charging = true                 # on the charger; false: never, even when empty
 ```
 """
 
@@ -24,19 +24,18 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.simulation import fault_file
 
 _CREEP_RAD_S = 1e-4
-"""A stuck joint moves no faster with all the torque of its motor: it stands in something thicker than honey, for dry
-friction gives way in MuJoCo."""
+"""A stuck joint moves at most this fast, by viscous damping; dry friction yields in MuJoCo."""
 
 
 class InjectedFaults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a robot suffers from.
+    """Faults of one robot.
 
     Attributes:
-        overheating: Joint → warming besides that of its work [K/min]; it gives off no heat meanwhile.
+        overheating: Joint → additional warming [K/min]; the joint does not cool.
         weak: Joint → share of its torque that is left, 0…1.
         stuck: Joints that do not move.
-        battery_percent: Charge that the battery is set to, once, when the file is read.
-        charging: Whether it is on its charger; else it goes there when it is empty.
+        battery_percent: Battery charge to set once, when the file is read.
+        charging: Whether the robot is on its charger; by default it charges when the battery is empty.
     """
 
     overheating: dict[str, Annotated[float, Meta(gt=0, le=100)]] = {}
@@ -46,27 +45,27 @@ class InjectedFaults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     charging: bool | None = None
 
 
-WELL = InjectedFaults()
+NO_FAULTS = InjectedFaults()
 
 
 def read(text: str, joints: Sequence[str]) -> InjectedFaults:
-    """Read a file's text.
+    """Parse a fault file.
 
     Raises:
-        ProtocolError: Not TOML, or a field or joint is unknown; the text lists those there are.
+        ProtocolError: Not TOML, or an unknown field or joint; the message lists the valid ones.
     """
-    ailments = fault_file.read(text, InjectedFaults)
-    for name in (*ailments.overheating, *ailments.weak, *ailments.stuck):
+    faults = fault_file.read(text, InjectedFaults)
+    for name in (*faults.overheating, *faults.weak, *faults.stuck):
         if name not in joints:
-            raise ProtocolError(f"no joint '{name}'; there are: {', '.join(joints)}")
-    return ailments
+            raise ProtocolError(f"no joint '{name}'; valid joints: {', '.join(joints)}")
+    return faults
 
 
 class FaultInjector(fault_file.FaultFile[InjectedFaults]):
-    """The file of one robot.
+    """The fault file of one robot.
 
     Args:
-        path: Where it may be; ``None``: nowhere.
+        path: The file; ``None`` disables fault injection.
         joints: Names of the robot's joints.
     """
 
@@ -75,12 +74,12 @@ class FaultInjector(fault_file.FaultFile[InjectedFaults]):
 
 
 class MotorFault:
-    """What ails joints, in the simulation's own terms: a ``Process``, so that nobody writes beside the world's thread.
+    """``Process`` that applies joint faults to the model in the world's thread.
 
-    A joint that is stuck hardly moves for all its motor can do; a weak one has less torque, also to hold itself up.
+    A stuck joint gets a very high damping; a weak one loses torque, also for holding itself.
 
     Args:
-        model: ``MjModel``, with every joint as it was made.
+        model: The unmodified ``MjModel``.
         actuators: Joint → its motor.
     """
 
@@ -89,22 +88,22 @@ class MotorFault:
         self._damping = np.array(model.dof_damping)
         self._force = np.array(model.actuator_forcerange)
         self._torque = np.array(model.jnt_actfrcrange)
-        self._wanted = self._done = WELL
+        self._wanted = self._applied = NO_FAULTS
 
-    def want(self, ailments: InjectedFaults) -> None:
-        """From the next group of steps on it is so. Any thread."""
-        self._wanted = ailments
+    def set(self, faults: InjectedFaults) -> None:
+        """Apply these faults from the next group of steps on. Thread-safe."""
+        self._wanted = faults
 
     def step(self, model: Any, data: Any, time_s: float) -> None:
         """See ``Process``."""
         del data, time_s
         wanted = self._wanted
-        if wanted is self._done:
+        if wanted is self._applied:
             return
         for name, actuator in self._actuators.items():
-            joint, left = model.actuator_trnid[actuator, 0], wanted.weak.get(name, 1.0)
-            dof, most_nm = model.jnt_dofadr[joint], float(np.abs(self._force[actuator]).max())
-            model.dof_damping[dof] = most_nm / _CREEP_RAD_S if name in wanted.stuck else self._damping[dof]
-            model.actuator_forcerange[actuator] = self._force[actuator] * left
-            model.jnt_actfrcrange[joint] = self._torque[joint] * left
-        self._done = wanted
+            joint, share = model.actuator_trnid[actuator, 0], wanted.weak.get(name, 1.0)
+            dof, max_nm = model.jnt_dofadr[joint], float(np.abs(self._force[actuator]).max())
+            model.dof_damping[dof] = max_nm / _CREEP_RAD_S if name in wanted.stuck else self._damping[dof]
+            model.actuator_forcerange[actuator] = self._force[actuator] * share
+            model.jnt_actfrcrange[joint] = self._torque[joint] * share
+        self._applied = wanted

@@ -1,8 +1,8 @@
-"""How a simulated robot feels: temperature and load of its motors, its battery, and faults put into it on purpose.
+"""Simulated motor temperature and load, battery, and their injected faults.
 
-All figures are approximate and of no particular motor; what counts is that they move as real ones do. A motor at its
-largest torque turns, as a direct current motor that is held still does, the power ``max_effort * max_velocity`` into
-heat; less torque heats with its square. The joint warms and cools like one body (first order) in a room of 22 °C.
+All figures are approximate and of no particular motor. A motor at its largest torque dissipates
+``max_effort * max_velocity``, like a stalled DC motor; less torque heats with its square. Each joint is a first-order
+thermal model in a room of 22 °C.
 """
 
 import math
@@ -17,40 +17,40 @@ from device_agent.protocol.manifests.capabilities import Battery
 from device_agent.simulation.snapshot import Floats
 
 HEALTH = "health"
-"""The stream."""
+"""Stream name."""
 
 AMBIENT_C = 22.0
 IDLE_RISE_C = 8.0
-"""How much warmer than the room a joint is that is switched on and rests."""
+"""Temperature rise of a resting joint that is switched on."""
 FULL_RISE_C = 160.0
-"""How much warmer still it would become at its largest torque without end."""
+"""Additional rise at continuous full torque."""
 WARMING_S = 900.0
-"""Time in which it has come 63 % of the way to where its temperature rests."""
+"""Thermal time constant."""
 LOAD_S = 5.0
-"""Time over which the load is taken."""
+"""Averaging time of the load."""
 _STEP_S = 0.2
 _LONGEST_STEP_S = 60.0
 _NOISE_C = 0.1
 
 STALLED_S = 0.5
-"""A motor at its limit that has not moved for so long is stuck;"""
+"""A motor at its limit counts as stalled after this time without motion."""
 _STILL_RAD_S = 0.02
 _AT_LIMIT = 0.97
 _BEHIND_RAD = 0.1
-"""so far from where it should be."""
+"""Smallest position error of a stalled joint."""
 
 PLUGGED_IN_PERCENT = 5.0
-"""At this charge a simulated robot is put on its charger until it is full: it shows the warnings before, and is not
-dead when somebody looks at it a day later."""
+"""At this charge a simulated robot is put on its charger until it is full: low-charge warnings appear, but the robot
+never runs empty."""
 _CHARGING_S = 7200.0
 _INNER_OHM = 0.05
 
 
 class BatteryModel:
-    """Charge and voltage.
+    """Battery charge and voltage.
 
     Args:
-        battery: The robot type's.
+        battery: The robot type's battery.
     """
 
     def __init__(self, battery: Battery) -> None:
@@ -71,11 +71,11 @@ class BatteryModel:
 
     @property
     def charging(self) -> bool:
-        """Whether it is on its charger."""
+        """Whether the robot is on its charger."""
         return self._plugged_in if self.forced is None else self.forced
 
-    def take(self, motors_w: float, duration_s: float) -> None:
-        """Time goes on, with so much power for the motors."""
+    def advance(self, motors_w: float, duration_s: float) -> None:
+        """Advance by ``duration_s`` with this motor power."""
         battery = self._battery
         self._power_w = battery.idle_w + motors_w
         gained_w = battery.capacity_wh * 3600 / _CHARGING_S if self.charging else -self._power_w
@@ -86,7 +86,7 @@ class BatteryModel:
             self._plugged_in = False
 
     def values(self) -> dict[str, float | bool]:
-        """As the stream tells it."""
+        """Values of the stream."""
         battery = self._battery
         open_v = battery.empty_v + (battery.full_v - battery.empty_v) * self.percent / 100.0
         drop_v = 0.0 if self.charging else self._power_w / open_v * _INNER_OHM
@@ -97,97 +97,97 @@ class BatteryModel:
         }
 
 
-class Health:
-    """One robot's. ``observe`` is the control loop's; everything else may be called from another thread.
+class MotorModel:
+    """Motor state of one robot. The control loop calls ``observe``; other threads may call everything else.
 
     Args:
-        joints: The robot type's.
-        battery: Where it has one.
-        seed: Of the sensors' noise: the device's name.
+        joints: The robot type's joints.
+        battery: The robot type's battery, if any.
+        seed: Seed of the sensor noise: the device's name.
     """
 
     def __init__(self, joints: Sequence[Joint], battery: Battery | None, *, seed: str = "") -> None:
         self._names = [joint.name for joint in joints]
-        self._most_nm = np.array([joint.max_effort_nm for joint in joints])
+        self._max_nm = np.array([joint.max_effort_nm for joint in joints])
         self._fastest_rad_s = np.array([joint.max_velocity_rad_s for joint in joints])
         count = len(joints)
         self._temperature_c = np.full(count, AMBIENT_C + IDLE_RISE_C)
         self._load_2 = np.zeros(count)
         self._heat_2 = np.zeros(count)
         self._work_j = 0.0
-        self._open_s = 0.0
+        self._pending_s = 0.0
         self._time_s = math.nan
-        self._ailing = np.zeros(count)
+        self._overheating = np.zeros(count)
         self._still_s = np.zeros(count)
         self._battery = None if battery is None else BatteryModel(battery)
         self._noise = np.random.default_rng(zlib.crc32(seed.encode()))
 
-    def suffer(self, ailments: InjectedFaults) -> None:
-        """Put faults into it; those of before are healed."""
-        self._ailing = np.array([ailments.overheating.get(name, 0.0) / 60 for name in self._names])
+    def inject(self, faults: InjectedFaults) -> None:
+        """Replace the injected faults."""
+        self._overheating = np.array([faults.overheating.get(name, 0.0) / 60 for name in self._names])
         if self._battery is not None:
-            self._battery.forced = ailments.charging
-            if ailments.battery_percent is not None:
-                self._battery.percent = ailments.battery_percent
+            self._battery.forced = faults.charging
+            if faults.battery_percent is not None:
+                self._battery.percent = faults.battery_percent
 
     def observe(self, time_s: float, effort_nm: Floats, velocity_rad_s: Floats, *, power_w: float = 0.0) -> None:
-        """Time has come to ``time_s``, with this effort and motion since last time. Quick.
+        """Advance to ``time_s``. Takes microseconds.
 
         Args:
-            time_s: Simulated [s].
+            time_s: Simulated time [s].
             effort_nm: Torque of the joints' motors, shape (n,).
-            velocity_rad_s: Of the joints, shape (n,).
-            power_w: What other motors take.
+            velocity_rad_s: Joint velocities, shape (n,).
+            power_w: Power of other motors.
         """
         elapsed_s = time_s - self._time_s
         self._time_s = time_s
-        if not 0 < elapsed_s < _LONGEST_STEP_S:  # the first time, or the world stood still meanwhile
+        if not 0 < elapsed_s < _LONGEST_STEP_S:  # first call, or the world was stopped
             return
-        load_2 = (effort_nm / self._most_nm) ** 2
+        load_2 = (effort_nm / self._max_nm) ** 2
         self._load_2 += (load_2 - self._load_2) * min(1.0, elapsed_s / LOAD_S)
         self._heat_2 += load_2 * elapsed_s
         self._work_j += (float(np.abs(effort_nm * velocity_rad_s).sum()) + power_w) * elapsed_s
-        self._open_s += elapsed_s
-        if self._open_s >= _STEP_S:
-            self._warm(self._heat_2 / self._open_s, self._open_s)
-            self._heat_2, self._work_j, self._open_s = np.zeros(len(self._names)), 0.0, 0.0
+        self._pending_s += elapsed_s
+        if self._pending_s >= _STEP_S:
+            self._warm(self._heat_2 / self._pending_s, self._pending_s)
+            self._heat_2, self._work_j, self._pending_s = np.zeros(len(self._names)), 0.0, 0.0
 
-    def stuck(self, elapsed_s: float, behind_rad: Floats, effort_nm: Floats, velocity_rad_s: Floats) -> list[str]:
-        """Names of joints whose motors give all they can and have not moved for half a second, though they should.
+    def stalled(self, elapsed_s: float, behind_rad: Floats, effort_nm: Floats, velocity_rad_s: Floats) -> list[str]:
+        """Names of the joints that have stalled at full torque for 0.5 s.
 
         Args:
-            elapsed_s: Since last time [s].
-            behind_rad: From where they are to where they should be, shape (n,).
-            effort_nm: Torque of their motors, shape (n,).
-            velocity_rad_s: Of the joints, shape (n,).
+            elapsed_s: Time since the last call [s].
+            behind_rad: Position error of each joint, shape (n,).
+            effort_nm: Torque of the joints' motors, shape (n,).
+            velocity_rad_s: Joint velocities, shape (n,).
         """
-        strained = np.abs(effort_nm) >= _AT_LIMIT * self._most_nm
-        if not strained.any():
+        at_limit = np.abs(effort_nm) >= _AT_LIMIT * self._max_nm
+        if not at_limit.any():
             self._still_s[:] = 0.0
             return []
-        stalled = strained & (np.abs(velocity_rad_s) < _STILL_RAD_S) & (np.abs(behind_rad) > _BEHIND_RAD)
+        stalled = at_limit & (np.abs(velocity_rad_s) < _STILL_RAD_S) & (np.abs(behind_rad) > _BEHIND_RAD)
         self._still_s = np.where(stalled, self._still_s + elapsed_s, 0.0)
         return [self._names[index] for index in np.flatnonzero(self._still_s > STALLED_S - 1e-6)]
 
-    def forgive(self) -> None:
-        """Whoever was stuck may try again."""
+    def clear(self) -> None:
+        """Clear stalled joints, so that they may move again."""
         self._still_s = np.zeros(len(self._names))
 
     def values(self) -> Mapping[str, float | bool]:
-        """As the stream ``health`` tells it."""
+        """Values of the stream ``health``."""
         temperature = self._temperature_c + self._noise.normal(0.0, _NOISE_C, len(self._names))
         load = np.sqrt(np.maximum(self._load_2, 0.0))
-        found: dict[str, float | bool] = {}
-        for name, warm, share in zip(self._names, temperature.tolist(), load.tolist(), strict=True):
-            found[f"temperature_c.{name}"] = round(warm, 2)
-            found[f"load.{name}"] = round(share, 3)
-        return found if self._battery is None else found | self._battery.values()
+        values: dict[str, float | bool] = {}
+        for name, celsius, share in zip(self._names, temperature.tolist(), load.tolist(), strict=True):
+            values[f"temperature_c.{name}"] = round(celsius, 2)
+            values[f"load.{name}"] = round(share, 3)
+        return values if self._battery is None else values | self._battery.values()
 
     def _warm(self, load_2: Floats, duration_s: float) -> None:
-        """A joint that overheats gives off no heat any more, and takes up what it was told to."""
+        """Update temperatures; an overheating joint does not cool and warms at the injected rate."""
         heat = (IDLE_RISE_C + FULL_RISE_C * load_2) / WARMING_S
-        cooling = np.where(self._ailing > 0, 0.0, (self._temperature_c - AMBIENT_C) / WARMING_S)
-        self._temperature_c = self._temperature_c + (heat + self._ailing - cooling) * duration_s
+        cooling = np.where(self._overheating > 0, 0.0, (self._temperature_c - AMBIENT_C) / WARMING_S)
+        self._temperature_c = self._temperature_c + (heat + self._overheating - cooling) * duration_s
         if self._battery is not None:
-            lost_w = float((load_2 * self._most_nm * self._fastest_rad_s).sum())
-            self._battery.take(self._work_j / duration_s + lost_w, duration_s)
+            heat_w = float((load_2 * self._max_nm * self._fastest_rad_s).sum())
+            self._battery.advance(self._work_j / duration_s + heat_w, duration_s)

@@ -1,4 +1,4 @@
-"""How firmly the servos of a simulated robot hold: gains between none and all of them."""
+"""Stiffness of simulated servos: scales their gains."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 
 
-class Stiffness:
-    """A ``Process``: nobody writes to the model beside the world's thread.
+class ServoGains:
+    """``Process`` that applies joint stiffness to the model in the world's thread.
 
-    A servo with less stiffness has that share of its gains. What holds a robot against gravity besides belongs to its
-    motors, so it goes as well, for all that a slack joint carries: a limp arm hangs.
+    A servo's gains scale with its stiffness. So does the gravity compensation of its bodies, because the motors provide
+    it: a compliant arm hangs.
 
     Args:
-        model: ``MjModel``, with every servo as it was made.
+        model: The unmodified ``MjModel``.
         actuators: Joint → its servo.
     """
 
@@ -27,17 +27,17 @@ class Stiffness:
             name: _carried(model, int(model.actuator_trnid[servo, 0])) for name, servo in actuators.items()
         }
         self._wanted: dict[str, float] = {}
-        self._done: dict[str, float] = self._wanted
+        self._applied: dict[str, float] = self._wanted
 
-    def want(self, value: float, joints: Sequence[str]) -> None:
-        """From the next group of steps on these joints hold with this share, 0…1. Any thread."""
+    def set(self, value: float, joints: Sequence[str]) -> None:
+        """Set the stiffness of these joints, 0…1, from the next group of steps on. Thread-safe."""
         self._wanted = {**self._wanted, **dict.fromkeys(joints, value)}
 
     def step(self, model: Any, data: Any, time_s: float) -> None:
         """See ``Process``."""
         del data, time_s
         wanted = self._wanted
-        if wanted is self._done:
+        if wanted is self._applied:
             return
         compensation = self._compensation.copy()
         for name, value in wanted.items():
@@ -47,7 +47,7 @@ class Stiffness:
             compensation[bodies] = np.minimum(compensation[bodies], self._compensation[bodies] * value)
         own = sorted({body for bodies in self._carried.values() for body in bodies})
         model.body_gravcomp[own] = compensation[own]
-        self._done = wanted
+        self._applied = wanted
 
 
 def _carried(model: Any, joint: int) -> list[int]:

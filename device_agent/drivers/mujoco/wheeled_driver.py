@@ -1,4 +1,4 @@
-"""Robots on two driven wheels: how a twist turns wheels, and what wheels, sonars and floor sensors notice."""
+"""Robots on two driven wheels: wheel speeds, odometry, sonars and floor sensors."""
 
 import math
 import zlib
@@ -17,31 +17,31 @@ from device_agent.simulation.snapshot import Floats, Ints, Snapshot
 from device_agent.simulation.world import World
 
 ODOMETRY, SONAR = "odometry", "sonar"
-"""The streams that such a robot has besides those of every simulated one."""
+"""Streams in addition to those of ``MujocoDriver``."""
 
 SONAR_MAX_M = 4.0
-"""Farthest that a sonar hears its echo; it reads this where there is none. Approximate, as are the next three."""
+"""Range of a sonar, also its reading without an echo. Approximate, like the next three."""
 SONAR_MIN_M = 0.03
 _BEAM_YAW_RAD = (-0.26, -0.13, 0.0, 0.13, 0.26)
 _BEAM_PITCH_RAD = (0.0, 0.17)
-"""Directions in which a beam is looked along, left and up. A smooth floor sends no echo back, so none looks down."""
+"""Directions of the rays of a beam, left and up. A smooth floor returns no echo, so none points down."""
 _STEP_M = 0.01
 _NOISE_M = 0.004
 FLOOR_MAX_M = 0.3
-"""Farthest that a floor sensor sees: at the edge of a stair it reads this."""
+"""Range of a floor sensor, also its reading at the edge of a stair."""
 _ALL_GROUPS = np.ones(6, dtype=np.uint8)
 _SILENT_S = 0.3
-"""Wheels that nobody has driven for so long stop, as those of real bases do: whoever drove may be gone."""
+"""Wheels stop after this time without a command, as in real bases."""
 
 
 @dataclass(slots=True)
 class Odometry:
-    """Where the wheels say that the robot is. It starts where the robot was put, and drifts as wheels slip.
+    """Pose by wheel rotation. It starts at the robot's true pose and drifts with wheel slip.
 
     Attributes:
-        x_m: Place in the world, or rather in what the robot takes for it [m]; ``y_m``.
+        x_m: Position in the odometry frame [m]; ``y_m``.
         yaw_rad: Heading, counter-clockwise, -pi…pi [rad].
-        forward_m_s: Speed [m/s]; ``turn_rad_s``: of turning [rad/s].
+        forward_m_s: Speed [m/s]; ``turn_rad_s``: turning speed [rad/s].
     """
 
     x_m: float = 0.0
@@ -50,13 +50,13 @@ class Odometry:
     forward_m_s: float = 0.0
     turn_rad_s: float = 0.0
 
-    def roll(self, wheels: Wheels, turned_rad: Floats, velocity_rad_s: Floats) -> None:
-        """Go on by what the wheels have turned since last time.
+    def integrate(self, wheels: Wheels, turned_rad: Floats, velocity_rad_s: Floats) -> None:
+        """Integrate the wheel rotation since the last call.
 
         Args:
-            wheels: Their measures, as the robot believes them.
-            turned_rad: Left, right [rad].
-            velocity_rad_s: Left, right, now [rad/s].
+            wheels: Nominal wheel dimensions.
+            turned_rad: Rotation left, right [rad].
+            velocity_rad_s: Current speed left, right [rad/s].
         """
         left_m, right_m = (turned_rad * wheels.radius_m).tolist()
         along_m, turn_rad = (left_m + right_m) / 2, (right_m - left_m) / wheels.track_m
@@ -69,7 +69,7 @@ class Odometry:
         self.turn_rad_s = (right_m_s - left_m_s) / wheels.track_m
 
     def values(self) -> dict[str, float]:
-        """As a stream tells it."""
+        """Values of the stream."""
         return {
             "x_m": round(self.x_m, 4),
             "y_m": round(self.y_m, 4),
@@ -80,10 +80,9 @@ class Odometry:
 
 
 def wheel_speeds(wheels: Wheels, twist: Twist, *, fastest_rad_s: float) -> tuple[Floats, Twist]:
-    """What the wheels have to turn for a twist, left and right [rad/s], and the twist that comes of it.
+    """Wheel speeds for a twist, left and right [rad/s], and the twist that results.
 
-    Where a wheel cannot turn so fast both are slowed, so that the robot keeps to its curve. Two wheels go nowhere
-    sideways.
+    If a wheel would exceed its limit, both are slowed; the robot stays on its curve. Sideways motion is ignored.
     """
     across_m_s = twist.turn_rad_s * wheels.track_m / 2
     left, right = (twist.forward_m_s - across_m_s) / wheels.radius_m, (twist.forward_m_s + across_m_s) / wheels.radius_m
@@ -91,12 +90,12 @@ def wheel_speeds(wheels: Wheels, twist: Twist, *, fastest_rad_s: float) -> tuple
     return np.array([left, right]) * share, Twist(twist.forward_m_s * share, 0.0, twist.turn_rad_s * share)
 
 
-class Brake:
-    """Stops wheels that nobody drives any more. A ``Process`` of the world.
+class WheelBrake:
+    """``Process`` that stops wheels without commands.
 
     Args:
-        actuators: The wheels'.
-        braking_rad_s2: How hard.
+        actuators: The wheels' actuators.
+        braking_rad_s2: Deceleration.
     """
 
     def __init__(self, actuators: Ints, braking_rad_s2: float) -> None:
@@ -118,27 +117,29 @@ class Brake:
 class WheeledDriver(MujocoDriver):
     """A ``MobileDriver`` for robot types with ``[simulation.wheels]``.
 
-    Its model has a velocity servo for each wheel, and a site ``sonar_<part>`` or ``floor_<part>`` for each such sensor,
-    which looks along the site's x axis.
+    The model has a velocity servo for each wheel, and a site ``sonar_<part>`` or ``floor_<part>`` for each distance
+    sensor, which measures along the site's x axis.
     """
 
     def __init__(self, *, robot_type: RobotType, world: World, device: str, prefix: str = "", **more: Any) -> None:
         super().__init__(robot_type=robot_type, world=world, device=device, prefix=prefix, **more)
         if robot_type.simulation is None or robot_type.simulation.wheels is None:
-            raise DriverError(f"robot type '{robot_type.type}' has no [simulation.wheels]; it cannot be driven so")
+            raise DriverError(
+                f"robot type '{robot_type.type}' has no [simulation.wheels]; it cannot be driven on wheels"
+            )
         if robot_type.base is None:
-            raise DriverError(f"robot type '{robot_type.type}' has no [base]; nobody knows how hard it may brake")
+            raise DriverError(f"robot type '{robot_type.type}' has no [base], which defines its braking deceleration")
         self._wheels = robot_type.simulation.wheels
         self._braking_rad_s2 = robot_type.base.braking_linear_m_s2 / self._wheels.radius_m
-        self._brake: Brake | None = None
+        self._brake: WheelBrake | None = None
         self._wheel_actuators: Ints = np.zeros(2, dtype=np.intp)
         self._wheel_qpos: Ints = np.zeros(2, dtype=np.intp)
         self._wheel_dof: Ints = np.zeros(2, dtype=np.intp)
         self._fastest_rad_s = 0.0
-        self._turned: Floats | None = None
+        self._wheel_rad: Floats | None = None
         self._odometry = Odometry()
-        self._told: Mapping[str, float] = {}
-        self._eyes: Any = None
+        self._odometry_values: Mapping[str, float] = {}
+        self._sensor_data: Any = None
         self._sites: dict[str, tuple[int, bool]] = {}
         self._noise = np.random.default_rng(zlib.crc32(device.encode()))
 
@@ -146,7 +147,7 @@ class WheeledDriver(MujocoDriver):
         """Command the wheels' speeds for the next period.
 
         Raises:
-            DriverError: A number is not finite, not connected, or the simulation has stopped.
+            DriverError: A value is not finite, not connected, or the simulation has stopped.
         """
         snapshot = self._live()
         if not all(map(math.isfinite, twist)):
@@ -158,68 +159,68 @@ class WheeledDriver(MujocoDriver):
         return applied
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
-        """``odometry``, ``sonar`` and what every simulated robot tells.
+        """``odometry``, ``sonar`` and the streams of ``MujocoDriver``.
 
         Raises:
             DriverError: Not connected.
         """
         if stream == ODOMETRY:
             self._require()
-            return self._told
+            return self._odometry_values
         if stream == SONAR:
             self._require()
-            return self._listen()
+            return self._read_distances()
         return super().report(stream)
 
-    def _note(self, snapshot: Snapshot) -> None:
-        super()._note(snapshot)
+    def _update_motor_model(self, snapshot: Snapshot) -> None:
+        super()._update_motor_model(snapshot)
         wheels: Floats = snapshot.qpos[self._wheel_qpos]
-        if self._turned is None:
-            self._put(snapshot)
+        if self._wheel_rad is None:
+            self._reset_odometry(snapshot)
         else:
-            self._odometry.roll(self._wheels, wheels - self._turned, snapshot.qvel[self._wheel_dof])
-        self._turned = wheels
-        self._told = self._odometry.values()
+            self._odometry.integrate(self._wheels, wheels - self._wheel_rad, snapshot.qvel[self._wheel_dof])
+        self._wheel_rad = wheels
+        self._odometry_values = self._odometry.values()
 
     def _power_w(self, snapshot: Snapshot) -> float:
         work = snapshot.effort[self._wheel_dof] * snapshot.qvel[self._wheel_dof]
         return super()._power_w(snapshot) + float(np.abs(work).sum())
 
-    def _put(self, snapshot: Snapshot) -> None:
-        """Whoever put the robot somewhere told it where; from then on it has only its wheels."""
+    def _reset_odometry(self, snapshot: Snapshot) -> None:
+        """Initialise the odometry with the true pose."""
         x, y, _ = snapshot.body_position_m[self._base].tolist()
         w, _, _, k = snapshot.body_quaternion[self._base].tolist()
         self._odometry = Odometry(x, y, math.remainder(2 * math.atan2(k, w), 2 * math.pi))
 
     # ------------------------------------------------------------ sonars and floor sensors
 
-    def _listen(self) -> dict[str, float | bool]:
-        self._world.copy(self._eyes)
-        found: dict[str, float | bool] = {}
+    def _read_distances(self) -> dict[str, float | bool]:
+        self._world.copy(self._sensor_data)
+        values: dict[str, float | bool] = {}
         for part, (site, floor) in self._sites.items():
             if floor:
                 distance_m = self._nearest(site, np.array([[1.0, 0.0, 0.0]]), FLOOR_MAX_M)
-                found[f"distance_m.{part}"] = round(min(distance_m, FLOOR_MAX_M), 3)
+                values[f"distance_m.{part}"] = round(min(distance_m, FLOOR_MAX_M), 3)
             else:
                 distance_m = self._nearest(site, _BEAMS, SONAR_MAX_M) + float(self._noise.normal(0.0, _NOISE_M))
-                heard_m = min(max(distance_m, SONAR_MIN_M), SONAR_MAX_M)
-                found[f"distance_m.{part}"] = round(round(heard_m / _STEP_M) * _STEP_M, 2)
-        return found
+                reading_m = min(max(distance_m, SONAR_MIN_M), SONAR_MAX_M)
+                values[f"distance_m.{part}"] = round(round(reading_m / _STEP_M) * _STEP_M, 2)
+        return values
 
     def _nearest(self, site: int, beams: Floats, farthest_m: float) -> float:
-        """How near the next thing is along the beams, given in the site's frame [m]; far where there is none."""
-        data = self._eyes
-        ways = np.ascontiguousarray(beams @ data.site_xmat[site].reshape(3, 3).T).ravel()
-        things, distances = np.empty(len(beams), dtype=np.int32), np.empty(len(beams))
+        """Smallest distance along beams in the site's frame [m]; ``2 * farthest_m`` without a hit."""
+        data = self._sensor_data
+        directions = np.ascontiguousarray(beams @ data.site_xmat[site].reshape(3, 3).T).ravel()
+        geoms, distances = np.empty(len(beams), dtype=np.int32), np.empty(len(beams))
         mujoco.mj_multiRay(
             self._world.model,
             data,
             data.site_xpos[site],
-            ways,
+            directions,
             _ALL_GROUPS,
             True,
             self._base,
-            things,
+            geoms,
             distances,
             None,
             len(beams),
@@ -232,7 +233,7 @@ class WheeledDriver(MujocoDriver):
 
     def _resolve(self, model: Any) -> None:
         super()._resolve(model)
-        self._odometry, self._turned = Odometry(), None
+        self._odometry, self._wheel_rad = Odometry(), None
         kinds = mujoco.mjtObj
         for index, name in enumerate((self._wheels.left, self._wheels.right)):
             actuator = self._find(model, kinds.mjOBJ_ACTUATOR, "actuator", model.nu, name)
@@ -245,10 +246,10 @@ class WheeledDriver(MujocoDriver):
             self._wheel_qpos[index] = model.jnt_qposadr[joint]
             self._wheel_dof[index] = model.jnt_dofadr[joint]
         if self._brake is None:
-            self._brake = Brake(self._wheel_actuators, self._braking_rad_s2)
+            self._brake = WheelBrake(self._wheel_actuators, self._braking_rad_s2)
             self._world.add(self._brake)
         self._fastest_rad_s = float(model.actuator_ctrlrange[self._wheel_actuators, 1].min())
-        self._eyes = mujoco.MjData(model)
+        self._sensor_data = mujoco.MjData(model)
         self._sites = {}
         for site in range(model.nsite):
             name = model.site(site).name

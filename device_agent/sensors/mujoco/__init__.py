@@ -1,4 +1,4 @@
-"""Room devices in a simulated room: they look at the world that its robots move in, and err as real sensors do."""
+"""Room devices in a simulated room, with realistic sensor errors."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -9,9 +9,9 @@ import msgspec
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.ports.simulation import SimulatedWorld
 from device_agent.protocol.manifests.room import RoomDeviceManifest
-from device_agent.sensors.mujoco.base import Part
+from device_agent.sensors.mujoco.base import SimulatedSensor
 from device_agent.sensors.mujoco.cameras import ColourCamera, DepthCamera
-from device_agent.sensors.mujoco.fault_injection import patient
+from device_agent.sensors.mujoco.fault_injection import with_faults
 from device_agent.sensors.mujoco.lidar import Lidar
 from device_agent.sensors.mujoco.pir import Pir
 from device_agent.sensors.mujoco.scalar_sensors import Contact, Meter
@@ -20,7 +20,7 @@ __all__ = ["FAULTS", "KINDS", "create"]
 
 FAULTS = "faults"
 
-KINDS: Mapping[str, Callable[[RoomDeviceManifest, SimulatedWorld], Part]] = {
+KINDS: Mapping[str, Callable[[RoomDeviceManifest, SimulatedWorld], SimulatedSensor]] = {
     "camera": ColourCamera,
     "depth_camera": DepthCamera,
     "lidar": Lidar,
@@ -31,25 +31,25 @@ KINDS: Mapping[str, Callable[[RoomDeviceManifest, SimulatedWorld], Part]] = {
     "light_meter": partial(Meter, quantity="light_lux"),
     "sound_meter": partial(Meter, quantity="sound_db"),
     "door_contact": Contact,
-    "lamp": Part,
-    "door": Part,
-    "blinds": Part,
-    "thermostat": Part,
+    "lamp": SimulatedSensor,
+    "door": SimulatedSensor,
+    "blinds": SimulatedSensor,
+    "thermostat": SimulatedSensor,
 }
-"""What ``kind`` may be, and what does it."""
+"""``kind`` of the manifest → driver class."""
 
 
 def create(device: RoomDeviceManifest, folder: Path, surroundings: Surroundings) -> RoomDriver:
-    """The driver of one device: the factory that ``sensors.load("mujoco")`` gives.
+    """The driver of one device: the factory of ``sensors.load("mujoco")``.
 
-    Every kind has the option ``faults``: a file, relative to the room's folder, with faults to put into it, which may
-    come and go while it runs (see ``ailments``).
+    Every kind has the option ``faults``: a file of injected faults, relative to the room's folder, which may appear and
+    disappear at runtime (see ``fault_injection``).
 
     Raises:
-        SensorError: An unknown kind or option, or the room is not simulated.
+        SensorError: Unknown kind or option, or the room is not simulated.
     """
     if surroundings.world is None:
-        raise SensorError(f"'{device.name}' is a simulated device, and its room has no model")
+        raise SensorError(f"'{device.name}' is a simulated device, but its room has no model")
     if device.kind not in KINDS:
         raise SensorError(f"driver 'mujoco' has no kind '{device.kind}'; it has: {', '.join(KINDS)}")
     faults = device.options.get(FAULTS)
@@ -59,4 +59,4 @@ def create(device: RoomDeviceManifest, folder: Path, surroundings: Surroundings)
         raise SensorError(f"option '{FAULTS}' of '{device.name}' is {faults!r}; it must be the path of a file")
     options = {name: value for name, value in device.options.items() if name != FAULTS}
     healthy = KINDS[device.kind](msgspec.structs.replace(device, options=options), surroundings.world)
-    return patient(healthy, device, folder / faults)
+    return with_faults(healthy, device, folder / faults)

@@ -1,4 +1,4 @@
-"""What the simulated room devices share: the world they are in, their options, their names in its model."""
+"""Base class of simulated room devices: options, controls, access to the world."""
 
 import threading
 from collections.abc import Mapping
@@ -23,19 +23,18 @@ _KINDS = {
 
 
 SETTINGS = "settings"
-"""The stream of every device with controls: what each of them is at now, which a servo reaches only after a while."""
+"""Stream of every device with controls: their current values, which a servo reaches after a while."""
 
 
-class Part:
-    """One device of a simulated room that measures nothing and sets what its manifest names.
+class SimulatedSensor:
+    """A simulated room device without measurements; sets the controls that its manifest names.
 
-    Options: ``seed`` of its errors; ``actuators``, control → servo or setting of the room where those have another name
-    than the control: ``{ opening = "door" }``. A control runs from its ``lower`` to its ``upper`` as the servo's range
-    does.
+    Options: ``seed`` of its noise; ``actuators``, control → servo or room setting, if the names differ:
+    ``{ opening = "door" }``. The control's range maps linearly to the servo's range.
     """
 
     OPTIONS: Mapping[str, type | tuple[type, ...]] = {}
-    """Its own options besides: name → type."""
+    """Additional options: name → type."""
 
     def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         self._device = device
@@ -53,14 +52,14 @@ class Part:
         self.view = view_of(world)
 
     def option(self, name: str, default: Any) -> Any:
-        """What the manifest says, or else this."""
+        """The option's value, or the default."""
         return self._device.options.get(name, default)
 
     # ------------------------------------------------------------ RoomDriver
 
     @property
     def simulated(self) -> bool:
-        """Always."""
+        """Always True."""
         return True
 
     def connect(self) -> None:
@@ -75,7 +74,7 @@ class Part:
             try:
                 model = self._world.model
                 self._servos = {each.name: self._servo(model, each) for each in self._device.controls}
-                self.begin(model)
+                self.on_connect(model)
             except BaseException:
                 self._world.close()
                 raise
@@ -85,29 +84,29 @@ class Part:
         """See ``RoomDriver``."""
         self.require()
         if stream != SETTINGS or not self._servos:
-            self._lacks("stream", stream, [each.name for each in self._device.streams])
+            self._reject_unknown("stream", stream, [each.name for each in self._device.streams])
         with self.view.look() as (data, _):
             now = {name: float(data.qpos[servo.qpos]) for name, servo in self._servos.items() if servo.qpos is not None}
         settings = self._world.settings
-        told = {}
+        values = {}
         for name, servo in self._servos.items():
             value = now.get(name, settings.get(servo.name))
             if value is not None:
-                told[name] = servo.shown(value)
-        return told
+                values[name] = servo.to_control(value)
+        return values
 
     def capture(self, name: str) -> Capture:
         """See ``RoomDriver``."""
-        self._lacks("capture", name, self._device.captures)
+        self._reject_unknown("capture", name, self._device.captures)
 
     def set(self, control: str, value: float) -> float:
         """See ``RoomDriver``."""
         self.require()
         servo = self._servos.get(control)
         if servo is None:
-            self._lacks("control", control, list(self._servos))
+            self._reject_unknown("control", control, list(self._servos))
         try:
-            return servo.shown(self._world.set(servo.name, servo.asked(value)))
+            return servo.to_control(self._world.set(servo.name, servo.to_servo(value)))
         except DriverError as error:
             raise SensorError(f"'{self._device.name}' could not be set: {error}") from error
 
@@ -130,35 +129,35 @@ class Part:
         with self._life:
             if self._open:
                 self._open = False
-                self.end()
+                self.on_close()
                 self._world.close()
 
-    # ------------------------------------------------------------ for its kinds
+    # ------------------------------------------------------------ for subclasses
 
-    def begin(self, model: Any) -> None:
-        """Find what it needs in the model.
+    def on_connect(self, model: Any) -> None:
+        """Find the sensor's objects in the model.
 
         Raises:
-            SensorError: It is not there; the text names what is.
+            SensorError: An object is missing; the message lists the existing ones.
         """
 
-    def end(self) -> None:
-        """Let go of what ``begin`` took."""
+    def on_close(self) -> None:
+        """Release what ``on_connect`` acquired."""
 
     def require(self) -> None:
-        """It is connected.
+        """Check the connection.
 
         Raises:
-            SensorError: It is not.
+            SensorError: Not connected.
         """
         if not self._open:
             raise SensorError(f"'{self._device.name}' is not connected")
 
     def find(self, model: Any, kind: str, name: str) -> int:
-        """The index of something in the model.
+        """The index of an object in the model.
 
         Raises:
-            SensorError: There is no such thing; the text names those that are.
+            SensorError: It does not exist; the message lists the existing ones.
         """
         code, count = _KINDS[kind]
         index = int(mujoco.mj_name2id(model, code, name))
@@ -171,19 +170,19 @@ class Part:
     def _servo(self, model: Any, control: Control) -> "_Servo":
         name = self._actuators.get(control.name, control.name)
         index = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name))
-        if index < 0:  # a process of the room reads it: lamp, thermostat
+        if index < 0:  # a setting that a process reads: lamp, thermostat
             return _Servo(name, control, (control.lower, control.upper), None)
         lower, upper = model.actuator_ctrlrange[index].tolist()
         return _Servo(name, control, (lower, upper), int(model.jnt_qposadr[model.actuator_trnid[index, 0]]))
 
-    def _lacks(self, what: str, name: str, known: Any) -> NoReturn:
-        there = ", ".join(known) or "none"
-        raise SensorError(f"'{self._device.name}' has no {what} '{name[:80]}'; it has: {there}")
+    def _reject_unknown(self, what: str, name: str, known: Any) -> NoReturn:
+        available = ", ".join(known) or "none"
+        raise SensorError(f"'{self._device.name}' has no {what} '{name[:80]}'; it has: {available}")
 
 
 @dataclass(frozen=True, slots=True)
 class _Servo:
-    """How a control is a servo's range, or a setting of the room. ``qpos``: where its joint is in the state."""
+    """Maps a control to a servo or room setting. ``qpos``: index of the servo's joint position."""
 
     name: str
     control: Control
@@ -194,11 +193,11 @@ class _Servo:
     def _slope(self) -> float:
         return (self.range[1] - self.range[0]) / (self.control.upper - self.control.lower)
 
-    def asked(self, value: float) -> float:
-        """A control's value as the servo's."""
+    def to_servo(self, value: float) -> float:
+        """Servo position for a control value."""
         within = min(max(value, self.control.lower), self.control.upper)
         return self.range[0] + (within - self.control.lower) * self._slope
 
-    def shown(self, position: float) -> float:
-        """A servo's value as the control's."""
+    def to_control(self, position: float) -> float:
+        """Control value for a servo position."""
         return self.control.lower + (position - self.range[0]) / self._slope

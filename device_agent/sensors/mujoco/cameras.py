@@ -12,27 +12,27 @@ from device_agent.ports.sensor import Bytes, Capture, Frame, Image, SensorError
 from device_agent.ports.simulation import SimulatedWorld
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors import png
-from device_agent.sensors.mujoco.base import Part
+from device_agent.sensors.mujoco.base import SimulatedSensor
 from device_agent.sensors.mujoco.noise import generator
-from device_agent.simulation.renderer import Renderer, RenderRequest, studio_of
+from device_agent.simulation.renderer import RenderedImage, Renderer, renderer_of
 
 FRESH_S = 0.1
-"""What ``raw`` gives is no older than this."""
+"""Maximum age of the image that ``raw`` returns."""
 _WIDTH, _HEIGHT = 320, 240
 _QUALITY = 75
 _GRAIN = 1.5
-"""Standard deviation of a colour's value from picture to picture, of 255: a small sensor in a lit room, approximate."""
+"""Standard deviation of colour noise, of 255: a small sensor in a lit room, approximate."""
 _TILES = 64
-"""Grain is made once, by so much larger than the picture in each direction, and shifted at random for each picture."""
+"""Noise is generated once, larger than the image by this in each direction, and shifted randomly per image."""
 _NEAREST_M, _FURTHEST_M = 0.3, 8.0
 _MILLIMETRE = 0.001
 _FAR_MM = 65_535
 
 
-class Camera(Part):
-    """What both kinds share.
+class Camera(SimulatedSensor):
+    """Base class of both cameras.
 
-    Options: ``camera``, its name in the room's model (the device's own name); ``width`` and ``height`` of the picture.
+    Options: ``camera``, its name in the room's model (default: the device's name); ``width`` and ``height`` [px].
     """
 
     OPTIONS: Mapping[str, type | tuple[type, ...]] = {"camera": str, "width": int, "height": int}
@@ -47,24 +47,24 @@ class Camera(Part):
             raise SensorError(
                 f"pictures of '{device.name}' are at most 1920 x 1080, not {self._width} x {self._height}"
             )
-        self._chance = generator(device.name, self.option("seed", 0))
-        self._studio: Renderer | None = None
+        self._random = generator(device.name, self.option("seed", 0))
+        self._renderer: Renderer | None = None
         self._camera = 0
         self._fovy_rad = 0.0
         self._newest: Image | None = None
 
-    def begin(self, model: Any) -> None:
-        """See ``Part``."""
+    def on_connect(self, model: Any) -> None:
+        """See ``SimulatedSensor``."""
         self._camera = self.find(model, "camera", self._name)
         self._fovy_rad = math.radians(float(model.cam_fovy[self._camera]))
-        self._studio = studio_of(self._world)
-        self._studio.open()
+        self._renderer = renderer_of(self._world)
+        self._renderer.open()
 
-    def end(self) -> None:
-        """See ``Part``."""
-        if self._studio is not None:
-            self._studio.close()
-            self._studio = None
+    def on_close(self) -> None:
+        """See ``SimulatedSensor``."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
         self._newest = None
 
     def raw(self) -> Image:
@@ -76,30 +76,30 @@ class Camera(Part):
 
     def _take(self) -> Image:
         self.require()
-        studio = self._studio
-        if studio is None:
+        renderer = self._renderer
+        if renderer is None:
             raise SensorError(f"'{self._device.name}' is not connected")
-        shot = studio.shoot(self._camera, width=self._width, height=self._height, depth=self.DEPTH)
-        self._newest = image = self._image(shot)
+        rendered = renderer.render(self._camera, width=self._width, height=self._height, depth=self.DEPTH)
+        self._newest = image = self._image(rendered)
         return image
 
-    def _image(self, shot: RenderRequest) -> Image:
+    def _image(self, rendered: RenderedImage) -> Image:
         raise NotImplementedError
 
 
 class ColourCamera(Camera):
-    """Pictures at ``cam/{name}``; capture ``image``: a PNG without loss."""
+    """Frames on ``cam/{name}``; capture ``image``: a lossless PNG."""
 
     def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         super().__init__(device, world)
-        grain = self._chance.normal(0.0, _GRAIN, (self._height + _TILES, self._width + _TILES, 3))
+        grain = self._random.normal(0.0, _GRAIN, (self._height + _TILES, self._width + _TILES, 3))
         self._grain = np.rint(grain).astype(np.int16)
 
     def frame(self, camera: str) -> Frame:
         """See ``ports.sensor.Camera``."""
         cameras = [each.name for each in self._device.cameras]
         if camera not in cameras:
-            self._lacks("camera", camera, cameras)
+            self._reject_unknown("camera", camera, cameras)
         image = self._take()
         content = simplejpeg.encode_jpeg(image.rgb, quality=_QUALITY, colorsubsampling="420")
         return Frame(self._width, self._height, content, image.taken_s)
@@ -110,26 +110,26 @@ class ColourCamera(Camera):
             return super().capture(name)
         return Capture("image/png", png.encode(self._take().rgb))
 
-    def _image(self, shot: RenderRequest) -> Image:
-        down, right = self._chance.integers(0, _TILES, 2).tolist()
+    def _image(self, rendered: RenderedImage) -> Image:
+        down, right = self._random.integers(0, _TILES, 2).tolist()
         noise = self._grain[down : down + self._height, right : right + self._width]
-        rgb: Bytes = np.clip(shot.pixels.astype(np.int16) + noise, 0, 255).astype(np.uint8)
+        rgb: Bytes = np.clip(rendered.pixels.astype(np.int16) + noise, 0, 255).astype(np.uint8)
         return Image(
-            taken_s=shot.taken_s,
-            position_m=shot.position_m,
-            rotation=shot.rotation,
+            taken_s=rendered.taken_s,
+            position_m=rendered.position_m,
+            rotation=rendered.rotation,
             fovy_rad=self._fovy_rad,
             rgb=rgb,
         )
 
 
 class DepthCamera(Camera):
-    """Distances for ``raw``; capture ``depth``: a PNG of 16 bits, in millimetres, 0 where nothing is within reach.
+    """Distances for ``raw``; capture ``depth``: a 16-bit PNG in millimetres, 0 without a reading.
 
-    Errs as structured light does: standard deviation 1.2 mm + 1.9 mm/m² (z - 0.4 m)², from Nguyen, Izadi and Lovell,
+    Noise of structured light: standard deviation 1.2 mm + 1.9 mm/m² (z - 0.4 m)², from Nguyen, Izadi and Lovell,
     "Modeling Kinect Sensor Noise for Improved 3D Reconstruction and Tracking", 2012.
 
-    Options besides those of ``Camera``: ``nearest_m``, ``furthest_m``.
+    Additional options: ``nearest_m``, ``furthest_m``.
     """
 
     OPTIONS: Mapping[str, type | tuple[type, ...]] = {
@@ -143,7 +143,7 @@ class DepthCamera(Camera):
         super().__init__(device, world)
         self._nearest_m = float(self.option("nearest_m", _NEAREST_M))
         self._furthest_m = float(self.option("furthest_m", _FURTHEST_M))
-        noise = self._chance.normal(0.0, 1.0, (self._height + _TILES, self._width + _TILES))
+        noise = self._random.normal(0.0, 1.0, (self._height + _TILES, self._width + _TILES))
         self._noise = noise.astype(np.float32)
 
     def capture(self, name: str) -> Capture:
@@ -154,16 +154,16 @@ class DepthCamera(Camera):
         millimetres = np.rint(depth_m / _MILLIMETRE)
         return Capture("image/png", png.encode(np.clip(millimetres, 0, _FAR_MM).astype(np.uint16)))
 
-    def _image(self, shot: RenderRequest) -> Image:
-        down, right = self._chance.integers(0, _TILES, 2).tolist()
+    def _image(self, rendered: RenderedImage) -> Image:
+        down, right = self._random.integers(0, _TILES, 2).tolist()
         noise = self._noise[down : down + self._height, right : right + self._width]
-        true_m = shot.pixels
+        true_m = rendered.pixels
         depth_m = true_m + noise * (np.float32(0.0012) + np.float32(0.0019) * np.square(true_m - np.float32(0.4)))
         depth_m[(true_m < self._nearest_m) | (true_m > self._furthest_m)] = np.inf
         return Image(
-            taken_s=shot.taken_s,
-            position_m=shot.position_m,
-            rotation=shot.rotation,
+            taken_s=rendered.taken_s,
+            position_m=rendered.position_m,
+            rotation=rendered.rotation,
             fovy_rad=self._fovy_rad,
             depth_m=depth_m,
         )

@@ -1,13 +1,12 @@
-"""Faults put into a simulated room device on purpose, for tests and demonstrations: from a file beside the agent.
+"""Faults injected into a simulated room device from a file beside the agent, for tests and demonstrations.
 
-As for robots: only who may write on the agent's own machine can make a device ill, and the file is read again whenever
-it has changed. It need not be there.
+Only users of the agent's machine can inject faults. The file may be missing and is read again when it changes.
 
 ```toml
-unreachable = true            # does not answer at all
-silent = ["motion"]           # these streams and cameras give nothing more
-stuck = ["co2", "colour"]     # these give what they gave last, on and on
-drift = { co2_ppm = 50.0 }    # and this value moves away from the truth, by so much a minute
+unreachable = true            # does not respond
+silent = ["motion"]           # these streams and cameras return nothing
+stuck = ["co2", "colour"]     # these repeat their last value
+drift = { co2_ppm = 50.0 }    # drift of a value per minute
 ```
 """
 
@@ -30,13 +29,13 @@ _log = logging.getLogger(__name__)
 
 
 class InjectedFaults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a room device suffers from.
+    """Faults of one room device.
 
     Attributes:
-        unreachable: It does not answer.
-        silent: Streams and cameras that give nothing.
-        stuck: Streams and cameras that give what they gave last.
-        drift: Value → how much it moves away from the truth [its unit/min], from when the file is read.
+        unreachable: The device does not respond.
+        silent: Streams and cameras that return nothing.
+        stuck: Streams and cameras that repeat their last value.
+        drift: Value → drift [its unit/min], from when the file is read.
     """
 
     unreachable: bool = False
@@ -45,33 +44,33 @@ class InjectedFaults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     drift: dict[str, float] = {}
 
 
-WELL = InjectedFaults()
+NO_FAULTS = InjectedFaults()
 
 
 def read(text: str, sources: Sequence[str]) -> InjectedFaults:
-    """Read a file's text.
+    """Parse a fault file.
 
     Args:
-        text: Of the file.
+        text: Content of the file.
         sources: Names of the device's streams and cameras.
 
     Raises:
-        ProtocolError: Not TOML, or a field, stream or camera is unknown; the text lists those there are.
+        ProtocolError: Not TOML, or an unknown field, stream or camera; the message lists the valid ones.
     """
-    ailments = fault_file.read(text, InjectedFaults)
-    for name in (*ailments.silent, *ailments.stuck):
+    faults = fault_file.read(text, InjectedFaults)
+    for name in (*faults.silent, *faults.stuck):
         if name not in sources:
-            raise ProtocolError(f"no stream or camera '{name}'; there are: {', '.join(sources)}")
-    return ailments
+            raise ProtocolError(f"no stream or camera '{name}'; valid names: {', '.join(sources)}")
+    return faults
 
 
 class FaultySensor:
-    """A room driver with what ails it; without a file it does as it always does.
+    """Wraps a room driver and applies the faults of a file; without the file it is transparent.
 
     Args:
-        driver: Of the device.
+        driver: The device's driver.
         device: Its entry in the room's manifest.
-        path: Where the file may be.
+        path: The fault file; may be missing.
     """
 
     def __init__(self, driver: RoomDriver, device: RoomDeviceManifest, path: Path) -> None:
@@ -79,9 +78,9 @@ class FaultySensor:
         self._name = device.name
         sources = [stream.name for stream in (*device.streams, *device.cameras)]
         self._file = fault_file.FaultFile(path, partial(read, sources=sources))
-        self._ailments, self._since_s = WELL, 0.0
-        self._told: dict[str, Values] = {}
-        self._seen: Scan | Image | None = None
+        self._faults, self._since_s = NO_FAULTS, 0.0
+        self._last_values: dict[str, Values] = {}
+        self._last_raw: Scan | Image | None = None
 
     # ------------------------------------------------------------ RoomDriver
 
@@ -92,45 +91,45 @@ class FaultySensor:
 
     def connect(self) -> None:
         """See ``RoomDriver``."""
-        self.look()
+        self.current_faults()
         self._driver.connect()
 
     def read(self, stream: str) -> Values:
         """See ``RoomDriver``."""
-        ailments = self.look()
-        values = self._driver.read(stream)  # also a silent one says what it has not, and that it is not connected
-        if stream in ailments.silent:
+        faults = self.current_faults()
+        values = self._driver.read(stream)  # also reports errors of a silent device
+        if stream in faults.silent:
             return {}
-        if stream in ailments.stuck:
-            return self._told.setdefault(stream, values)
+        if stream in faults.stuck:
+            return self._last_values.setdefault(stream, values)
         minutes = (time.monotonic() - self._since_s) / _MINUTE_S
-        drifted = {name: values[name] + rate * minutes for name, rate in ailments.drift.items() if name in values}
-        self._told[stream] = values = {**values, **drifted}
+        drifted = {name: values[name] + rate * minutes for name, rate in faults.drift.items() if name in values}
+        self._last_values[stream] = values = {**values, **drifted}
         return values
 
     def capture(self, name: str) -> Capture:
         """See ``RoomDriver``."""
-        self.look()
+        self.current_faults()
         return self._driver.capture(name)
 
     def set(self, control: str, value: float) -> float:
         """See ``RoomDriver``."""
-        self.look()
+        self.current_faults()
         return self._driver.set(control, value)
 
     def raw(self) -> Scan | Image | None:
         """See ``RoomDriver``."""
-        ailments = self.look()
-        if ailments.silent:
-            raise SensorError(f"'{self._name}' gives nothing; see that it has power and is connected")
-        taken = self._driver.raw()
-        if taken is None or not ailments.stuck or self._seen is None:
-            self._seen = taken
-            return taken
-        return replace(self._seen, taken_s=taken.taken_s)
+        faults = self.current_faults()
+        if faults.silent:
+            raise SensorError(f"'{self._name}' returns no data; check its power and connection")
+        current = self._driver.raw()
+        if current is None or not faults.stuck or self._last_raw is None:
+            self._last_raw = current
+            return current
+        return replace(self._last_raw, taken_s=current.taken_s)
 
     def hold(self) -> None:
-        """See ``ports.sensor.Movable``: also what does not answer is told to."""
+        """See ``ports.sensor.Movable``; an unreachable device receives it, too."""
         if isinstance(self._driver, Movable):
             self._driver.hold()
 
@@ -138,42 +137,42 @@ class FaultySensor:
         """See ``RoomDriver``."""
         self._driver.close()
 
-    def look(self) -> InjectedFaults:
-        """What ails it now.
+    def current_faults(self) -> InjectedFaults:
+        """The current faults.
 
         Raises:
-            SensorError: It does not answer.
+            SensorError: The device is unreachable.
         """
-        news = self._file.news()
-        if news is not None:
-            self._ailments, self._since_s = news, time.monotonic()
-            if news != WELL:
-                _log.warning("%s now suffers from %s", self._name, news)
-        if self._ailments.unreachable:
-            raise SensorError(f"'{self._name}' does not answer; see that it has power and is connected")
-        return self._ailments
+        changed = self._file.poll()
+        if changed is not None:
+            self._faults, self._since_s = changed, time.monotonic()
+            if changed != NO_FAULTS:
+                _log.warning("%s: injected faults are now %s", self._name, changed)
+        if self._faults.unreachable:
+            raise SensorError(f"'{self._name}' does not respond; check its power and connection")
+        return self._faults
 
 
-class CameraPatient(FaultySensor):
-    """The same with a camera."""
+class FaultyCamera(FaultySensor):
+    """``FaultySensor`` for a camera."""
 
     def __init__(self, driver: Camera, device: RoomDeviceManifest, path: Path) -> None:
         super().__init__(driver, device, path)
         self._camera = driver
-        self._pictures: dict[str, Frame] = {}
+        self._last_frames: dict[str, Frame] = {}
 
     def frame(self, camera: str) -> Frame | None:
         """See ``ports.sensor.Camera``."""
-        ailments = self.look()
-        taken = self._camera.frame(camera)
-        if taken is None or camera in ailments.silent:
+        faults = self.current_faults()
+        current = self._camera.frame(camera)
+        if current is None or camera in faults.silent:
             return None
-        if camera not in ailments.stuck:
-            self._pictures[camera] = taken
-        # What is stuck does not know it: it says that each of its pictures is new.
-        return replace(self._pictures.setdefault(camera, taken), taken_s=taken.taken_s)
+        if camera not in faults.stuck:
+            self._last_frames[camera] = current
+        # A stuck camera still reports current timestamps.
+        return replace(self._last_frames.setdefault(camera, current), taken_s=current.taken_s)
 
 
-def patient(driver: RoomDriver, device: RoomDeviceManifest, path: Path) -> FaultySensor:
-    """The driver, with what the file may put into it."""
-    return CameraPatient(driver, device, path) if isinstance(driver, Camera) else FaultySensor(driver, device, path)
+def with_faults(driver: RoomDriver, device: RoomDeviceManifest, path: Path) -> FaultySensor:
+    """The driver, wrapped for fault injection."""
+    return FaultyCamera(driver, device, path) if isinstance(driver, Camera) else FaultySensor(driver, device, path)

@@ -1,4 +1,4 @@
-"""A lidar of one plane, as a small spinning one sees a room."""
+"""A single-plane lidar."""
 
 import json
 import math
@@ -12,24 +12,24 @@ from device_agent.ports.clock import wall_ms
 from device_agent.ports.sensor import Capture, Floats, Scan, Values
 from device_agent.ports.simulation import SimulatedWorld
 from device_agent.protocol.manifests.room import RoomDeviceManifest
-from device_agent.sensors.mujoco.base import Part
+from device_agent.sensors.mujoco.base import SimulatedSensor
 from device_agent.sensors.mujoco.noise import generator
 
 STREAM = "range"
 _BEAMS = 360
 _NEAREST_M, _FURTHEST_M = 0.15, 12.0
 _LEAST_M, _SHARE = 0.005, 0.01
-"""Standard deviation: 1 % of the distance, 5 mm at least (SLAMTEC RPLIDAR A1: "below 1 %"; approximate)."""
+"""Standard deviation: 1 % of the distance, at least 5 mm (SLAMTEC RPLIDAR A1: "below 1 %"; approximate)."""
 _SECTORS = 8
 
 
-class Lidar(Part):
-    """Beams in the x-y plane of a site.
+class Lidar(SimulatedSensor):
+    """Beams in the x-y plane of a site; its own body is invisible to it.
 
-    Stream ``range``: the nearest thing in each of eight sectors, ``range_m.0`` from the site's x axis on to the left;
-    a sector in which nothing is met says ``furthest_m``. Capture ``scan``: all beams, JSON. Its own body is not seen.
+    Stream ``range``: the smallest distance in each of eight sectors, ``range_m.0`` to the left of the site's x axis;
+    ``furthest_m`` without a hit. Capture ``scan``: all beams, JSON.
 
-    Options: ``site``, its name in the room's model (the device's own name); ``beams``; ``nearest_m``, ``furthest_m``.
+    Options: ``site``, its name in the model (default: the device's name); ``beams``; ``nearest_m``, ``furthest_m``.
     """
 
     OPTIONS: Mapping[str, type | tuple[type, ...]] = {
@@ -44,18 +44,18 @@ class Lidar(Part):
         self._name: str = self.option("site", device.name)
         self._nearest_m = float(self.option("nearest_m", _NEAREST_M))
         self._furthest_m = float(self.option("furthest_m", _FURTHEST_M))
-        self._chance = generator(device.name, self.option("seed", 0))
+        self._random = generator(device.name, self.option("seed", 0))
         beams = max(_SECTORS, self.option("beams", _BEAMS))
         self._angle_rad: Floats = np.arange(beams) * (2 * math.pi / beams)
         self._beams: Floats = np.stack((np.cos(self._angle_rad), np.sin(self._angle_rad), np.zeros(beams)), axis=1)
         self._site = 0
         self._body = -1
 
-    def begin(self, model: Any) -> None:
-        """See ``Part``."""
+    def on_connect(self, model: Any) -> None:
+        """See ``SimulatedSensor``."""
         self._site = self.find(model, "site", self._name)
         body = int(model.site_bodyid[self._site])
-        # Without a body of its own nothing is left out: the walls belong to the world's body.
+        # A site on the world body excludes nothing: the walls belong to that body.
         self._body = body or -1
 
     def raw(self) -> Scan:
@@ -71,15 +71,15 @@ class Lidar(Part):
                 self._world.model, data, position_m, beams, None, True, self._body, geoms, distance_m, None, count,
                 self._furthest_m,
             )  # fmt: skip
-            noise = self._chance.normal(0.0, 1.0, count)
-        seen = (geoms >= 0) & (distance_m >= self._nearest_m) & (distance_m <= self._furthest_m)
-        told = distance_m + noise * np.maximum(_LEAST_M, _SHARE * distance_m)
+            noise = self._random.normal(0.0, 1.0, count)
+        valid = (geoms >= 0) & (distance_m >= self._nearest_m) & (distance_m <= self._furthest_m)
+        measured_m = distance_m + noise * np.maximum(_LEAST_M, _SHARE * distance_m)
         return Scan(
             taken_s=taken_s,
             position_m=position_m,
             rotation=rotation,
             angle_rad=self._angle_rad.copy(),
-            range_m=np.where(seen, np.maximum(told, self._nearest_m), np.inf),
+            range_m=np.where(valid, np.maximum(measured_m, self._nearest_m), np.inf),
             nearest_m=self._nearest_m,
             furthest_m=self._furthest_m,
         )

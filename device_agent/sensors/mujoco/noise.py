@@ -1,6 +1,6 @@
-"""How real sensors err: a fixed offset, a jitter, a lag, steps. Seeded, so that the same room gives the same errors.
+"""Sensor errors: constant offset, noise, lag and quantisation, seeded for reproducibility.
 
-The figures are typical of the parts that they name, from those parts' data sheets, and approximate.
+The figures are typical of the named parts, from their data sheets, and approximate.
 """
 
 import math
@@ -11,15 +11,15 @@ import numpy as np
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Errors:
-    """Of one kind of sensor, in its own unit.
+class NoiseParameters:
+    """Errors of one kind of sensor, in its own unit.
 
     Attributes:
-        offset: Standard deviation of what this one piece is wrong by for all its life; ``offset_share``: of the value.
-        jitter: Standard deviation from one reading to the next.
-        lag_s: Time in which it follows 63 % of a step [s].
-        step: Smallest difference that it tells.
-        least: The lowest value that it tells.
+        offset: Standard deviation of the constant error of one sensor; ``offset_share``: as a share of the value.
+        jitter: Standard deviation between readings.
+        lag_s: Time constant [s].
+        step: Resolution.
+        least: Smallest reading.
     """
 
     offset: float = 0.0
@@ -30,57 +30,57 @@ class Errors:
     least: float = -math.inf
 
 
-ERRORS = {
+NOISE = {
     # Sensirion SHT31: ±0.2 °C, repeatability 0.04 °C, 8 s with its housing.
-    "temperature_c": Errors(offset=0.1, jitter=0.04, lag_s=8.0, step=0.01),
+    "temperature_c": NoiseParameters(offset=0.1, jitter=0.04, lag_s=8.0, step=0.01),
     # Sensirion SHT31: ±2 %RH, repeatability 0.08 %RH, 8 s.
-    "humidity_percent": Errors(offset=1.0, jitter=0.08, lag_s=8.0, step=0.01, least=0.0),
+    "humidity_percent": NoiseParameters(offset=1.0, jitter=0.08, lag_s=8.0, step=0.01, least=0.0),
     # Sensirion SCD30: ±(30 ppm + 3 %), repeatability 10 ppm, 20 s.
-    "co2_ppm": Errors(offset=15.0, offset_share=0.015, jitter=10.0, lag_s=20.0, step=1.0, least=0.0),
+    "co2_ppm": NoiseParameters(offset=15.0, offset_share=0.015, jitter=10.0, lag_s=20.0, step=1.0, least=0.0),
     # ROHM BH1750: ±20 % from piece to piece, steps of 1 lx, a reading takes 0.12 s.
-    "light_lux": Errors(offset_share=0.1, jitter=0.5, lag_s=0.12, step=1.0, least=0.0),
+    "light_lux": NoiseParameters(offset_share=0.1, jitter=0.5, lag_s=0.12, step=1.0, least=0.0),
     # IEC 61672 class 2: ±1.4 dB at 1 kHz; time weighting F: 0.125 s.
-    "sound_db": Errors(offset=0.7, jitter=0.3, lag_s=0.125, step=0.1, least=0.0),
+    "sound_db": NoiseParameters(offset=0.7, jitter=0.3, lag_s=0.125, step=0.1, least=0.0),
 }
-"""By the quantity that is read."""
+"""Parameters by quantity."""
 
 
 def generator(device: str, seed: int) -> np.random.Generator:
-    """Chance of one device: the same for the same name and seed."""
+    """Random generator of one device; equal for equal name and seed."""
     return np.random.default_rng([zlib.crc32(device.encode()), seed])
 
 
-class Probe:
-    """One piece of a kind of sensor. Not thread-safe.
+class SensorNoise:
+    """Adds errors to the readings of one sensor. Not thread-safe.
 
     Args:
-        errors: Of its kind.
-        chance: Where its own come from.
+        parameters: Parameters of its kind.
+        random: Random generator.
     """
 
-    def __init__(self, errors: Errors, chance: np.random.Generator) -> None:
-        self._errors = errors
-        self._chance = chance
-        self._offset = float(chance.normal(0.0, errors.offset))
-        self._factor = 1.0 + float(chance.normal(0.0, errors.offset_share))
-        self._follows: float | None = None
+    def __init__(self, parameters: NoiseParameters, random: np.random.Generator) -> None:
+        self._parameters = parameters
+        self._random = random
+        self._offset = float(random.normal(0.0, parameters.offset))
+        self._factor = 1.0 + float(random.normal(0.0, parameters.offset_share))
+        self._lagged: float | None = None
         self._at_s = 0.0
 
     def read(self, truth: float, now_s: float) -> float:
-        """What it tells while the truth is this.
+        """The reading for a true value.
 
         Args:
             truth: In the sensor's unit.
-            now_s: A clock that only rises [s].
+            now_s: Monotonic time [s].
         """
-        errors = self._errors
-        if self._follows is None or not errors.lag_s:
-            self._follows = truth
+        parameters = self._parameters
+        if self._lagged is None or not parameters.lag_s:
+            self._lagged = truth
         else:
-            share = 1.0 - math.exp(-max(0.0, now_s - self._at_s) / errors.lag_s)
-            self._follows += (truth - self._follows) * share
+            share = 1.0 - math.exp(-max(0.0, now_s - self._at_s) / parameters.lag_s)
+            self._lagged += (truth - self._lagged) * share
         self._at_s = now_s
-        told = self._follows * self._factor + self._offset + float(self._chance.normal(0.0, errors.jitter))
-        if errors.step:
-            told = round(round(told / errors.step) * errors.step, 6)
-        return max(errors.least, told)
+        reading = self._lagged * self._factor + self._offset + float(self._random.normal(0.0, parameters.jitter))
+        if parameters.step:
+            reading = round(round(reading / parameters.step) * parameters.step, 6)
+        return max(parameters.least, reading)

@@ -1,4 +1,4 @@
-"""A passive infrared detector: it sees something warm that moves across its view, nothing that stands or is cold."""
+"""A passive infrared detector: detects warm bodies that move across its view."""
 
 import math
 from collections.abc import Mapping
@@ -10,27 +10,27 @@ import numpy as np
 from device_agent.ports.sensor import Floats, Values
 from device_agent.ports.simulation import SimulatedWorld
 from device_agent.protocol.manifests.room import RoomDeviceManifest
-from device_agent.sensors.mujoco.base import Part
+from device_agent.sensors.mujoco.base import SimulatedSensor
 
 STREAM = "motion"
 _FURTHEST_M = 7.0
 _CONE_RAD = math.radians(110)
 _HOLD_S = 2.0
 _ACROSS_RAD_S = math.radians(4)
-"""Slower than this across its view, or the same in share of the distance towards it, is not noticed."""
+"""Slower motion across the view, or relative approach, is not detected."""
 _HOUSING_M = 0.1
-"""It does not see itself and what it is fixed to."""
-_LOOKS_S = 0.2
-"""Motion is judged over at least this time."""
+"""Distance at which rays start, outside the detector's own housing."""
+_INTERVAL_S = 0.2
+"""Shortest interval over which motion is measured."""
 
 
-class Pir(Part):
-    """Looks along the x axis of a site. Stream ``motion``: ``present``, for a while after each motion.
+class Pir(SimulatedSensor):
+    """Detects along the x axis of a site. Stream ``motion``: ``present``, held for a time after each motion.
 
-    Typical of small modules (HC-SR501: 7 m, 110°; the hold time is set by a screw), approximate. What is warm is named:
-    people are, furniture and robots hardly are. What stands behind a wall or table is not seen.
+    Typical of small modules (HC-SR501: 7 m, 110°), approximate. Warm bodies are named; by default people are warm,
+    furniture and robots are not. Bodies behind obstacles are not detected.
 
-    Options: ``site``, its name in the room's model (the device's own name); ``warm``, how names of warm bodies begin
+    Options: ``site``, its name in the room's model (default: the device's name); ``warm``, name prefixes of warm bodies
     (``["person"]``); ``furthest_m``, ``cone_rad``, ``hold_s``.
     """
 
@@ -55,8 +55,8 @@ class Pir(Part):
         self._before: dict[int, tuple[float, Floats]] = {}
         self._moved_s = -math.inf
 
-    def begin(self, model: Any) -> None:
-        """See ``Part``."""
+    def on_connect(self, model: Any) -> None:
+        """See ``SimulatedSensor``."""
         self._site = self.find(model, "site", self._name)
         self._own = int(model.site_bodyid[self._site]) or -1
         names = (model.body(index).name for index in range(model.nbody))
@@ -72,31 +72,31 @@ class Pir(Part):
         with self.view.look() as (data, _):
             now_s = float(data.time)
             for body in self._bodies:
-                seen = self._look(data, body)
-                if seen is None:
+                offset = self._visible(data, body)
+                if offset is None:
                     self._before.pop(body, None)
-                elif self._moves(body, seen, now_s):
+                elif self._moves(body, offset, now_s):
                     self._moved_s = now_s
         return {"present": now_s - self._moved_s < self._hold_s}
 
-    def _look(self, data: Any, body: int) -> Floats | None:
-        """Where it sees a body's middle, from itself [m]."""
+    def _visible(self, data: Any, body: int) -> Floats | None:
+        """Vector to a visible body's centre of mass [m]."""
         origin, matrix = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
-        way: Floats = data.xipos[body] - origin
-        distance_m = float(np.linalg.norm(way))
-        if not 0 < distance_m <= self._furthest_m or float(way @ matrix[:, 0]) < self._least_cosine * distance_m:
+        offset: Floats = data.xipos[body] - origin
+        distance_m = float(np.linalg.norm(offset))
+        if not 0 < distance_m <= self._furthest_m or float(offset @ matrix[:, 0]) < self._least_cosine * distance_m:
             return None
-        direction, met = way / distance_m, np.full(1, -1, dtype=np.int32)
+        direction, geom = offset / distance_m, np.full(1, -1, dtype=np.int32)
         start = origin + direction * _HOUSING_M
-        mujoco.mj_ray(self._world.model, data, start, direction, None, True, self._own, met, None)
-        if met[0] >= 0 and int(self._world.model.geom_bodyid[met[0]]) not in self._bodies:
+        mujoco.mj_ray(self._world.model, data, start, direction, None, True, self._own, geom, None)
+        if geom[0] >= 0 and int(self._world.model.geom_bodyid[geom[0]]) not in self._bodies:
             return None
-        return way
+        return offset
 
-    def _moves(self, body: int, way: Floats, now_s: float) -> bool:
-        before_s, before = self._before.setdefault(body, (now_s, way))
+    def _moves(self, body: int, offset: Floats, now_s: float) -> bool:
+        before_s, before = self._before.setdefault(body, (now_s, offset))
         passed_s = now_s - before_s
-        if passed_s < _LOOKS_S:
+        if passed_s < _INTERVAL_S:
             return False
-        self._before[body] = (now_s, way)
-        return float(np.linalg.norm(way - before)) > _ACROSS_RAD_S * passed_s * float(np.linalg.norm(way))
+        self._before[body] = (now_s, offset)
+        return float(np.linalg.norm(offset - before)) > _ACROSS_RAD_S * passed_s * float(np.linalg.norm(offset))

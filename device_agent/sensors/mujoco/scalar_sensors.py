@@ -1,4 +1,4 @@
-"""What measures one thing of the simulated room: its air, its light, its sound, whether its door is shut."""
+"""Sensors of a single quantity of the simulated room, and a door contact."""
 
 import math
 import time
@@ -8,14 +8,14 @@ from typing import Any
 from device_agent.ports.sensor import SensorError, Values
 from device_agent.ports.simulation import SimulatedWorld
 from device_agent.protocol.manifests.room import RoomDeviceManifest
-from device_agent.sensors.mujoco.base import Part
-from device_agent.sensors.mujoco.noise import ERRORS, Probe, generator
+from device_agent.sensors.mujoco.base import SimulatedSensor
+from device_agent.sensors.mujoco.noise import NOISE, SensorNoise, generator
 
 _SHUT_RAD = math.radians(2)
 
 
-class Meter(Part):
-    """Reads one quantity of the room, with the errors of a real part. Any of its streams carries it.
+class Meter(SimulatedSensor):
+    """Reads one quantity of the room, with realistic errors. Each of its streams carries it.
 
     Args:
         device: Its entry in the room's manifest.
@@ -26,24 +26,24 @@ class Meter(Part):
     def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld, quantity: str) -> None:
         super().__init__(device, world)
         self._quantity = quantity
-        self._probe = Probe(ERRORS[quantity], generator(device.name, self.option("seed", 0)))
+        self._noise = SensorNoise(NOISE[quantity], generator(device.name, self.option("seed", 0)))
 
     def read(self, stream: str) -> Values:
         """See ``RoomDriver``."""
         if stream not in {each.name for each in self._device.streams}:
             return super().read(stream)
         self.require()
-        known = self._world.quantities
-        if self._quantity not in known:
-            raise SensorError(f"this room has no {self._quantity}; it has: {', '.join(known) or 'none'}")
-        return {self._quantity: self._probe.read(known[self._quantity], time.monotonic())}
+        quantities = self._world.quantities
+        if self._quantity not in quantities:
+            raise SensorError(f"this room has no {self._quantity}; it has: {', '.join(quantities) or 'none'}")
+        return {self._quantity: self._noise.read(quantities[self._quantity], time.monotonic())}
 
 
-class Contact(Part):
-    """A reed contact at a door or window. Any of its streams carries ``open``.
+class Contact(SimulatedSensor):
+    """A reed contact at a door or window. Each of its streams carries ``open``.
 
-    Options: ``joint``, of the door in the room's model (the device's own name); ``shut_rad``: nearer to 0 than this it
-    is shut.
+    Options: ``joint``, the door's name in the room's model (default: the device's name); ``shut_rad``: a smaller angle
+    counts as shut.
     """
 
     OPTIONS: Mapping[str, type | tuple[type, ...]] = {"joint": str, "shut_rad": (int, float)}
@@ -54,8 +54,8 @@ class Contact(Part):
         self._shut_rad = float(self.option("shut_rad", _SHUT_RAD))
         self._qpos = 0
 
-    def begin(self, model: Any) -> None:
-        """See ``Part``."""
+    def on_connect(self, model: Any) -> None:
+        """See ``SimulatedSensor``."""
         self._qpos = int(model.jnt_qposadr[self.find(model, "joint", self._name)])
 
     def read(self, stream: str) -> Values:

@@ -1,4 +1,4 @@
-"""One copy of the world's state for all sensors that look at positions or cast rays: they are quick and take turns."""
+"""One copy of the world's state, shared by the sensors that read positions or cast rays."""
 
 import contextlib
 import threading
@@ -14,11 +14,11 @@ from device_agent.ports.sensor import SensorError
 from device_agent.ports.simulation import SimulatedWorld
 
 OLDEST_S = 0.02
-"""What is seen is no older than this: a person walks 2 cm in it."""
+"""Maximum age of the copy: a person walks 2 cm in this time."""
 
 
 class View:
-    """The copy. The world it is of must be open while somebody looks."""
+    """The copy. The world must be open during ``look``."""
 
     def __init__(self, world: SimulatedWorld) -> None:
         self._world = world
@@ -28,7 +28,7 @@ class View:
 
     @contextlib.contextmanager
     def look(self) -> Iterator[tuple[Any, float]]:
-        """The state as ``MjData``, and when it was taken [s]. For a moment: others wait.
+        """The state as ``MjData``, and its time [s]. Blocks other sensors.
 
         Raises:
             SensorError: The world has stopped.
@@ -46,12 +46,12 @@ class View:
 
 
 _views: "weakref.WeakKeyDictionary[SimulatedWorld, View]" = weakref.WeakKeyDictionary()
-_making = threading.Lock()
+_views_lock = threading.Lock()
 
 
 def view_of(world: SimulatedWorld) -> View:
-    """The one of this world."""
-    with _making:
+    """The view of this world."""
+    with _views_lock:
         if world not in _views:
             _views[world] = View(weakref.proxy(world))
         return _views[world]

@@ -1,4 +1,4 @@
-"""What a room knows, as a room device: it looks with the agent's other devices, and measures nothing itself."""
+"""The perception sensor: fuses the data of the agent's other room devices."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ __all__ = ["PerceptionDriver", "create"]
 
 
 def create(device: RoomDeviceManifest, folder: Path, surroundings: Surroundings) -> PerceptionDriver:
-    """The driver of one device: the factory that ``sensors.load("perception")`` gives.
+    """The driver of one device: the factory of ``sensors.load("perception")``.
 
     Raises:
         SensorError: An option is unknown or has the wrong type.

@@ -1,4 +1,4 @@
-"""Looks at the room with the agent's lidars and cameras, several times a second, in a thread of its own."""
+"""Room driver that fuses the agent's lidars and cameras in its own thread."""
 
 import logging
 import threading
@@ -12,9 +12,9 @@ import numpy as np
 from msgspec import Struct, field
 
 from device_agent.perception import grid_image
-from device_agent.perception.background_model import BackgroundModel, SurveyError
-from device_agent.perception.grid_rows import rows
-from device_agent.perception.object_classes import Mount, ObjectClass, Place
+from device_agent.perception.background_model import BackgroundModel, BackgroundModelError
+from device_agent.perception.grid_rows import occupancy_rows
+from device_agent.perception.object_classes import Mount, ObjectClass, ObjectPosition
 from device_agent.perception.occupancy_grid import OccupancyGrid
 from device_agent.perception.sensor_fusion import SensorFusion, Zone
 from device_agent.perception.tracker import Box
@@ -31,21 +31,21 @@ STREAMS = (POSITIONS, PRESENCE, LIGHT, OCCUPANCY)
 MAP, SURVEY = "map", "survey"
 CAPTURES = (OCCUPANCY, MAP, SURVEY)
 SURVEY_LOOKS, SURVEY_EVERY_S = 20, 0.5
-"""How long a survey takes: people who walk through it disappear."""
+"""Number of samples of a survey and their interval; people who walk through are filtered out."""
 COLOURS_EVERY_S = 1.0
-"""How often it looks at colours: they tell how bright it is, and no more [s]."""
+"""Interval of colour images, which only provide brightness [s]."""
 OLDEST_S = 30.0
-"""Whom no sensor has seen for that long is not told of any more [s]."""
+"""Objects not detected for this time are not reported [s]."""
 SILENT_S = 3.0
-"""After that long without a look it says that it sees nothing [s]."""
+"""The driver fails when it has had no sensor data for this time [s]."""
 _EDGE_M = 0.2
-"""The grid reaches that far into the walls [m]."""
+"""The grid extends into the walls by this distance [m]."""
 _STOP_TIMEOUT_S = 5.0
 _DIGITS = 3
 
 
-class _Kind(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A ``ObjectClass`` without the place where it begins, which is the robot's in the room's manifest."""
+class _ClassOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An ``ObjectClass`` without the start position, which the room's manifest defines."""
 
     name: str
     lowest_m: float
@@ -55,15 +55,15 @@ class _Kind(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     several: bool = False
 
     def __post_init__(self) -> None:
-        self.begins(None)  # which says what is wrong
+        self.at(None)  # validates the fields
 
-    def begins(self, start_m: tuple[float, float] | None) -> ObjectClass:
-        """It, where it begins."""
+    def at(self, start_m: tuple[float, float] | None) -> ObjectClass:
+        """The object class with a start position."""
         return ObjectClass(**msgspec.structs.asdict(self), start_m=start_m)
 
 
-class _Mount(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A ``Mount`` without the place, which is the robot's in the room's manifest."""
+class _MountOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A ``Mount`` without the position, which the room's manifest defines."""
 
     name: str
     lowest_m: float
@@ -73,26 +73,26 @@ class _Mount(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What the manifest says.
+    """Options of the manifest.
 
     Attributes:
-        lidars: Names of the devices to look with; level ones.
-        cameras: The same of depth and colour cameras.
+        lidars: Names of the (level) lidars to use.
+        cameras: Names of the depth and colour cameras to use.
         light: Name of the room's light meter; empty for none.
-        survey: File of the empty room, in the room's folder. It is read at the start, where it is there.
-        kinds: Who may come into the room.
-        mounts: Which of the room's robots are fixed to something.
-        quiet: Boxes (lowest x, y, highest x, y [m]) in which nobody appears from nothing.
-        look_hz: How often it looks; ``seldom_hz``: the same of single lidars and cameras, where less will do.
-        resolution_m: Side of a cell of the grid [m].
+        survey: File with the background model of the empty room, in the room's folder. It is read at start-up.
+        kinds: Object classes that may enter the room.
+        mounts: The room's robots with a fixed base.
+        quiet: Boxes (lowest x, y, highest x, y [m]) in which no new tracks start.
+        look_hz: Sampling rate of the sensors; ``seldom_hz``: lower rates for single sensors.
+        resolution_m: Cell size of the grid [m].
     """
 
     lidars: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
     light: str = ""
     survey: str = ""
-    kinds: tuple[_Kind, ...] = ()
-    mounts: tuple[_Mount, ...] = ()
+    kinds: tuple[_ClassOptions, ...] = ()
+    mounts: tuple[_MountOptions, ...] = ()
     quiet: tuple[Box, ...] = ()
     look_hz: float = 6.0
     seldom_hz: dict[str, float] = field(default_factory=dict)
@@ -100,25 +100,27 @@ class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if not all(0 < rate_hz <= 50 for rate_hz in (self.look_hz, *self.seldom_hz.values())):  # noqa: PLR2004 - as for streams
-            raise ValueError("look_hz and seldom_hz are above 0, and 50 at most")
-        eyes = (*self.lidars, *self.cameras)
+            raise ValueError("look_hz and seldom_hz must be above 0 and at most 50")
+        sensors = (*self.lidars, *self.cameras)
         for name in self.seldom_hz:
-            if name not in eyes:
-                raise ValueError(
-                    f"seldom_hz names '{name}', with which it does not look; it does with: {', '.join(eyes)}"
-                )
+            if name not in sensors:
+                raise ValueError(f"seldom_hz names '{name}', which is not one of its sensors: {', '.join(sensors)}")
         if not 0.01 <= self.resolution_m <= 1:  # noqa: PLR2004 - cells of a useful size
-            raise ValueError("resolution_m lies between 0.01 and 1")
+            raise ValueError("resolution_m must be between 0.01 and 1")
 
 
 class PerceptionDriver:
-    """A ``RoomDriver`` (see ``ports.sensor``) over the others of its agent.
+    """A ``RoomDriver`` that reads the agent's other room drivers.
 
-    Streams ``positions`` (``x_m.{who}``, ``y_m.{who}``, ``age_s.{who}``, ``speed_m_s.{who}``, and ``yaw_rad.{who}``
-    once it has gone somewhere), ``presence`` (``people``, ``people.{zone}``, ``present.{zone}``), ``light``
-    (``light_lux``, ``brightness.{zone}``), ``occupancy`` (the floor, row by row: see ``perception.rows``); captures
-    ``occupancy`` (a picture), ``map`` (the grid as numbers, JSON), and ``survey``: the room as it is now, for the
-    option of that name. Clear the room before.
+    Streams:
+        positions: ``x_m.{name}``, ``y_m.{name}``, ``age_s.{name}``, ``speed_m_s.{name}``, and ``yaw_rad.{name}``
+            after the first motion.
+        presence: ``people``, ``people.{zone}``, ``present.{zone}``.
+        light: ``light_lux``, ``brightness.{zone}``.
+        occupancy: The floor by rows, see ``perception.grid_rows``.
+
+    Captures: ``occupancy`` (an image), ``map`` (the grid as JSON), and ``survey``: a new file for the option
+    ``survey``. Clear the room before taking it.
     """
 
     def __init__(self, device: RoomDeviceManifest, folder: Path, neighbours: Mapping[str, RoomDriver]) -> None:
@@ -129,66 +131,66 @@ class PerceptionDriver:
             self._options = msgspec.convert(device.options, Options)
         except msgspec.ValidationError as error:
             known = ", ".join(Options.__struct_fields__)
-            raise SensorError(f"options of '{device.name}': {error}; there are: {known}") from error
-        self._sight: SensorFusion | None = None
+            raise SensorError(f"options of '{device.name}': {error}; valid options: {known}") from error
+        self._fusion: SensorFusion | None = None
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._life = threading.Lock()
-        self._looked_s = -np.inf
+        self._sampled_s = -np.inf
         self._next_s: dict[str, float] = {}
-        self._blind: dict[str, str] = {}
+        self._sensor_errors: dict[str, str] = {}
 
     # ------------------------------------------------------------ RoomDriver
 
     @property
     def simulated(self) -> bool:
-        """See ``RoomDriver``: as what it looks with."""
-        return any(self._neighbours[name].simulated for name in self._eyes if name in self._neighbours)
+        """Whether one of the sensors is simulated."""
+        return any(self._neighbours[name].simulated for name in self._sensors if name in self._neighbours)
 
     def connect(self) -> None:
         """See ``RoomDriver``."""
         with self._life:
             if self._thread is not None:
                 return
-            for name in filter(None, (*self._eyes, self._options.light)):
+            for name in filter(None, (*self._sensors, self._options.light)):
                 if name not in self._neighbours:
                     known = ", ".join(sorted(self._neighbours)) or "none"
-                    raise SensorError(f"'{self._device.name}' is to look with '{name}'; this agent's devices: {known}")
-            self._sight = self._sight or self.make()
-            self._looked_s = time.monotonic()
+                    raise SensorError(f"'{self._device.name}' needs device '{name}'; this agent's devices: {known}")
+            self._fusion = self._fusion or self.make()
+            self._sampled_s = time.monotonic()
             self._stopping.clear()
-            self._thread = threading.Thread(target=self._run, args=(self._sight,), name="perception", daemon=True)
+            self._thread = threading.Thread(target=self._run, args=(self._fusion,), name="perception", daemon=True)
             self._thread.start()
 
     def read(self, stream: str) -> Values:
         """See ``RoomDriver``."""
-        sight = self._require()
+        fusion = self._require()
         now_s = time.monotonic()
         if stream == POSITIONS:
-            return _flat(sight.places(now_s))
+            return _flat(fusion.positions(now_s))
         if stream == PRESENCE:
-            return sight.presence(now_s)
+            return fusion.presence(now_s)
         if stream == LIGHT:
-            return {**self._light(), **{name: round(value, _DIGITS) for name, value in sight.brightness().items()}}
+            return {**self._light(), **{name: round(value, _DIGITS) for name, value in fusion.brightness().items()}}
         if stream == OCCUPANCY:
-            return rows(sight.grid)
-        return self._lacks("stream", stream, STREAMS)
+            return occupancy_rows(fusion.grid)
+        return self._reject_unknown("stream", stream, STREAMS)
 
     def capture(self, name: str) -> Capture:
         """See ``RoomDriver``."""
-        sight = self._require()
+        fusion = self._require()
         now_s = time.monotonic()
         if name == OCCUPANCY:
-            return Capture("image/png", png.encode(grid_image.draw(sight.grid, sight.places(now_s))))
+            return Capture("image/png", png.encode(grid_image.draw(fusion.grid, fusion.positions(now_s))))
         if name == MAP:
-            return Capture("application/json", msgspec.json.encode(_map(sight.grid, sight.places(now_s))))
+            return Capture("application/json", msgspec.json.encode(_map(fusion.grid, fusion.positions(now_s))))
         if name == SURVEY:
-            return Capture("application/octet-stream", self._take_survey().content())
-        return self._lacks("capture", name, CAPTURES)
+            return Capture("application/octet-stream", self._take_survey().to_bytes())
+        return self._reject_unknown("capture", name, CAPTURES)
 
     def set(self, control: str, value: float) -> float:  # noqa: ARG002 (it has none)
         """See ``RoomDriver``."""
-        return self._lacks("control", control, ())
+        return self._reject_unknown("control", control, ())
 
     def raw(self) -> Scan | Image | None:
         """See ``RoomDriver``."""
@@ -202,11 +204,11 @@ class PerceptionDriver:
                 self._thread.join(timeout=_STOP_TIMEOUT_S)
                 self._thread = None
 
-    # ------------------------------------------------------------ for who plans ways
+    # ------------------------------------------------------------ for path planning
 
     @property
     def grid(self) -> OccupancyGrid:
-        """Which places are taken. The same one as long as the driver lives.
+        """The occupancy grid; the same object during the driver's lifetime.
 
         Raises:
             SensorError: Not connected yet.
@@ -214,10 +216,10 @@ class PerceptionDriver:
         return self._require().grid
 
     def make(self) -> SensorFusion:
-        """What it will look with, before anything is seen: for its own thread, and for who drives time by hand.
+        """A new ``SensorFusion`` with this driver's configuration.
 
         Raises:
-            SensorError: The room's manifest or survey cannot be used.
+            SensorError: The room's manifest or background model cannot be used.
         """
         try:
             room = rooms.load(self._folder)
@@ -231,7 +233,7 @@ class PerceptionDriver:
                 self._options.resolution_m,
                 plan=(low_x, low_y, high_x, high_y),
             ),
-            survey=self._survey(),
+            background=self._background(),
             kinds=self._kinds(room),
             mounts=self._mounts(room),
             zones=[Zone(zone.name, (*zone.lower_m[:2], *zone.upper_m[:2])) for zone in room.zones],
@@ -239,64 +241,64 @@ class PerceptionDriver:
             inside=(low_x, low_y, high_x, high_y),
         )
 
-    # ------------------------------------------------------------ inside
+    # ------------------------------------------------------------ internal
 
     @property
-    def _eyes(self) -> tuple[str, ...]:
+    def _sensors(self) -> tuple[str, ...]:
         return (*self._options.lidars, *self._options.cameras)
 
     def _require(self) -> SensorFusion:
-        sight = self._sight
-        if sight is None or self._thread is None:
+        fusion = self._fusion
+        if fusion is None or self._thread is None:
             raise SensorError(f"'{self._device.name}' is not connected")
-        if time.monotonic() - self._looked_s > SILENT_S:
-            why = "; ".join(sorted(self._blind.values())) or "its sensors say nothing"
-            raise SensorError(f"'{self._device.name}' sees nothing: {why}")
-        return sight
+        if time.monotonic() - self._sampled_s > SILENT_S:
+            reason = "; ".join(sorted(self._sensor_errors.values())) or "its sensors return no data"
+            raise SensorError(f"'{self._device.name}' has no sensor data: {reason}")
+        return fusion
 
     def _kinds(self, room: Room) -> list[ObjectClass]:
-        """Robots that move begin where the manifest puts them."""
-        found = []
+        """The object classes; robots start where the manifest places them."""
+        result = []
         for kind in self._options.kinds:
             robot = room.robot(kind.name)
-            found.append(kind.begins(None if robot is None else (robot.position_m[0], robot.position_m[1])))
-        return found
+            result.append(kind.at(None if robot is None else (robot.position_m[0], robot.position_m[1])))
+        return result
 
     def _mounts(self, room: Room) -> list[Mount]:
-        found = []
+        result = []
         for mount in self._options.mounts:
             robot = room.robot(mount.name)
             if robot is None:
                 known = ", ".join(one.name for one in room.robots) or "none"
                 raise SensorError(f"mounts of '{self._device.name}': no robot '{mount.name}'; the room has: {known}")
-            found.append(Mount(**msgspec.structs.asdict(mount), near_m=(robot.position_m[0], robot.position_m[1])))
-        return found
+            result.append(Mount(**msgspec.structs.asdict(mount), near_m=(robot.position_m[0], robot.position_m[1])))
+        return result
 
-    def _survey(self) -> BackgroundModel:
+    def _background(self) -> BackgroundModel:
         if not self._options.survey:
             return BackgroundModel()
         path = self._folder / self._options.survey
         try:
-            return BackgroundModel.read(path.read_bytes())
-        except (OSError, SurveyError) as error:
+            return BackgroundModel.from_bytes(path.read_bytes())
+        except (OSError, BackgroundModelError) as error:
             raise SensorError(
-                f"{path}: {error}; clear the room, capture '{SURVEY}' of '{self._device.name}', and put it there"
+                f"{path}: {error}; clear the room, capture '{SURVEY}' of '{self._device.name}', and store it there"
             ) from error
 
     def _take_survey(self) -> BackgroundModel:
-        found = BackgroundModel()
+        result = BackgroundModel()
         for _ in range(SURVEY_LOOKS):
-            for name in self._eyes:
+            for name in self._sensors:
                 raw = self._neighbours[name].raw()
                 if isinstance(raw, Scan) or (isinstance(raw, Image) and raw.depth_m is not None):
-                    found.look(name, raw)
+                    result.add(name, raw)
             if self._stopping.wait(SURVEY_EVERY_S):
                 raise SensorError(f"'{self._device.name}' was closed before the survey was done")
         try:
-            found.settle()
-        except SurveyError as error:
+            result.fit()
+        except BackgroundModelError as error:
             raise SensorError(str(error)) from error
-        return found
+        return result
 
     def _light(self) -> dict[str, float]:
         if not self._options.light:
@@ -304,19 +306,19 @@ class PerceptionDriver:
         read = self._neighbours[self._options.light].read("light")
         return {name: float(value) for name, value in read.items() if name == "light_lux"}
 
-    def _run(self, sight: SensorFusion) -> None:
+    def _run(self, fusion: SensorFusion) -> None:
         period_s = 1.0 / self._options.look_hz
         due_s = time.monotonic()
         while not self._stopping.is_set():
-            for name in self._eyes:
-                self._look(sight, name)
+            for name in self._sensors:
+                self._sample(fusion, name)
             now_s = time.monotonic()
-            sight.settle(now_s)
-            # What was missed is not made up for: the next look sees all there is to see.
+            fusion.advance(now_s)
+            # Skip missed periods: the next sample is complete.
             due_s = max(due_s + period_s, now_s)
             self._stopping.wait(due_s - now_s)
 
-    def _look(self, sight: SensorFusion, name: str) -> None:
+    def _sample(self, fusion: SensorFusion, name: str) -> None:
         now_s = time.monotonic()
         if now_s < self._next_s.get(name, -np.inf):
             return
@@ -325,48 +327,48 @@ class PerceptionDriver:
         try:
             raw = self._neighbours[name].raw()
             if raw is None:
-                raise SensorError(f"'{name}' takes neither scans nor pictures")  # noqa: TRY301 (as when it is silent)
-            sight.see(name, raw)
+                raise SensorError(f"'{name}' provides neither scans nor images")  # noqa: TRY301 (handled like a silent sensor)
+            fusion.update(name, raw)
         except SensorError as error:
-            if name not in self._blind:
+            if name not in self._sensor_errors:
                 log.warning("perception: %s", error)
-            self._blind[name] = str(error)
-        except Exception as error:  # nothing may end this thread: who asks would be told of what is long gone
-            if name not in self._blind:
+            self._sensor_errors[name] = str(error)
+        except Exception as error:  # the thread must survive every error of a sensor
+            if name not in self._sensor_errors:
                 log.exception("perception")
-            self._blind[name] = f"'{name}': {error}"
+            self._sensor_errors[name] = f"'{name}': {error}"
         else:
-            self._blind.pop(name, None)
-            self._looked_s = time.monotonic()
+            self._sensor_errors.pop(name, None)
+            self._sampled_s = time.monotonic()
             if isinstance(raw, Image) and raw.depth_m is None:
-                self._next_s[name] = self._looked_s + COLOURS_EVERY_S
+                self._next_s[name] = self._sampled_s + COLOURS_EVERY_S
 
-    def _lacks(self, what: str, name: str, known: tuple[str, ...]) -> NoReturn:
-        there = ", ".join(known) or "none"
-        raise SensorError(f"'{self._device.name}' has no {what} '{name[:80]}'; it has: {there}")
+    def _reject_unknown(self, what: str, name: str, known: tuple[str, ...]) -> NoReturn:
+        available = ", ".join(known) or "none"
+        raise SensorError(f"'{self._device.name}' has no {what} '{name[:80]}'; it has: {available}")
 
 
-def _flat(places: Mapping[str, Place]) -> dict[str, float]:
-    """Places as measurements carry them."""
-    found = {}
-    for name, place in sorted(places.items()):
-        if place.age_s > OLDEST_S:
+def _flat(positions: Mapping[str, ObjectPosition]) -> dict[str, float]:
+    """Positions as measurements."""
+    result = {}
+    for name, position in sorted(positions.items()):
+        if position.age_s > OLDEST_S:
             continue
-        found[f"x_m.{name}"] = round(place.x_m, _DIGITS)
-        found[f"y_m.{name}"] = round(place.y_m, _DIGITS)
-        found[f"age_s.{name}"] = round(place.age_s, _DIGITS)
-        found[f"speed_m_s.{name}"] = round(place.speed_m_s, _DIGITS)
-        if place.yaw_rad is not None:
-            found[f"yaw_rad.{name}"] = round(place.yaw_rad, _DIGITS)
-    return found
+        result[f"x_m.{name}"] = round(position.x_m, _DIGITS)
+        result[f"y_m.{name}"] = round(position.y_m, _DIGITS)
+        result[f"age_s.{name}"] = round(position.age_s, _DIGITS)
+        result[f"speed_m_s.{name}"] = round(position.speed_m_s, _DIGITS)
+        if position.yaw_rad is not None:
+            result[f"yaw_rad.{name}"] = round(position.yaw_rad, _DIGITS)
+    return result
 
 
-def _map(grid: OccupancyGrid, places: Mapping[str, Place]) -> dict[str, object]:
-    """The grid for programs: rows from the lowest y, each cell in per cent, 50 where nothing is known."""
+def _map(grid: OccupancyGrid, positions: Mapping[str, ObjectPosition]) -> dict[str, object]:
+    """The grid as JSON: rows from the lowest y, occupancy of each cell in per cent, 50 if unknown."""
     return {
         "lower_m": grid.lower_m,
         "resolution_m": grid.resolution_m,
         "shape": grid.shape,
         "taken_percent": np.rint(grid.probability() * 100).astype(int).tolist(),
-        "places": _flat(places),
+        "places": _flat(positions),
     }

@@ -1,1 +1,1 @@
-"""What can be read from a robot's MuJoCo model, for drivers and for geometry alike."""
+"""Information read from MuJoCo models, shared by drivers and geometry."""

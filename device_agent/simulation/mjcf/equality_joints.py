@@ -1,7 +1,7 @@
-"""Joints without a motor of their own that go with others: rods, threads, the second finger of a gripper.
+"""Joints without a motor that follow others: rods, threads, the second finger of a gripper.
 
-In a model they are equality constraints: of two joints, or of one fixed tendon over several. The physics holds them;
-whoever places a robot without stepping it, or draws it, has to work them out.
+A model describes them as equality constraints of two joints or of one fixed tendon. The physics enforces them; code
+that places a robot without stepping must compute them.
 """
 
 from collections.abc import Mapping
@@ -18,12 +18,12 @@ _SCALAR = frozenset({int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT
 
 @dataclass(frozen=True, slots=True)
 class EqualityJoint:
-    """One joint that goes with others: position = ``offset`` + sum of factor times position.
+    """One dependent joint: position = ``offset`` + sum of factor times position.
 
     Attributes:
-        joint: Its index in the model.
-        offset: Where it is when the others are at 0 [rad or m].
-        factors: Index of the other joint → how much it moves per unit of it.
+        joint: Index in the model.
+        offset: Position when the other joints are at 0 [rad or m].
+        factors: Index of the other joint → factor.
     """
 
     joint: int
@@ -32,9 +32,9 @@ class EqualityJoint:
 
 
 class EqualityJoints:
-    """All ties of a model, in an order in which each needs only what was worked out before.
+    """All dependent joints of a model, each after the joints that it depends on.
 
-    Curved ones (a polynomial of higher degree) are taken as their tangent at the model's reference position.
+    Polynomials of higher degree are linearised at the model's reference position.
 
     Args:
         model: ``MjModel``.
@@ -43,30 +43,31 @@ class EqualityJoints:
     def __init__(self, model: Any) -> None:
         self._model = model
         driven = {int(joint) for joint in _driven(model)}
-        found = [tie for index in range(model.neq) if (tie := _tie(model, index, driven)) is not None]
-        self.all = _in_order(found)
+        self.all = _in_order(
+            [joint for index in range(model.neq) if (joint := _equality_joint(model, index, driven)) is not None]
+        )
         count = len(self.all)
-        self._to = np.array([model.jnt_qposadr[tie.joint] for tie in self.all], dtype=np.intp)
+        self._to = np.array([model.jnt_qposadr[dependent.joint] for dependent in self.all], dtype=np.intp)
         self._offset, self._factors = np.zeros(count), np.zeros((count, model.nq))
         row_of: dict[int, int] = {}
-        for row, tie in enumerate(self.all):
-            self._offset[row] = tie.offset
-            for other, factor in tie.factors.items():
+        for row, dependent in enumerate(self.all):
+            self._offset[row] = dependent.offset
+            for other, factor in dependent.factors.items():
                 if other in row_of:
                     self._offset[row] += factor * self._offset[row_of[other]]
                     self._factors[row] += factor * self._factors[row_of[other]]
                 else:
                     self._factors[row, model.jnt_qposadr[other]] += factor
-            row_of[tie.joint] = row
+            row_of[dependent.joint] = row
         self._row_of = row_of
 
-    def settle(self, qpos: Floats) -> None:
-        """Put the tied joints where the others have them, in place."""
+    def apply(self, qpos: Floats) -> None:
+        """Set the dependent joints in place."""
         if self.all:
             qpos[self._to] = self._offset + self._factors @ qpos
 
-    def of(self, joint: int) -> dict[int, float]:
-        """How much a tied joint moves per unit of each that is not tied: joint index → factor; empty for any other."""
+    def factors_of(self, joint: int) -> dict[int, float]:
+        """Independent joint index → factor, for a dependent joint; empty for any other joint."""
         if joint not in self._row_of:
             return {}
         row = self._factors[self._row_of[joint]]
@@ -77,61 +78,62 @@ class EqualityJoints:
         }
 
     def offset(self, joint: int) -> float:
-        """Where a tied joint is when all that it goes with are at 0 [rad or m]; 0 of one that is not tied."""
+        """Position of a dependent joint when all independent ones are at 0 [rad or m]; 0 for others."""
         row = self._row_of.get(joint)
         return 0.0 if row is None else float(self._offset[row])
 
 
 def _driven(model: Any) -> list[int]:
-    """Joints that an actuator moves by itself."""
+    """Joints with their own actuator."""
     joints = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     return [int(joint) for joint in model.actuator_trnid[joints, 0]]
 
 
-def _tie(model: Any, index: int, driven: set[int]) -> EqualityJoint | None:
+def _equality_joint(model: Any, index: int, driven: set[int]) -> EqualityJoint | None:
     if not model.eq_active0[index]:
         return None
     kind, first, second = int(model.eq_type[index]), int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
     constant, slope = (float(value) for value in model.eq_data[index, :2])
     if kind == int(mujoco.mjtEq.mjEQ_JOINT) and second >= 0:
-        if first in driven and second not in driven and slope:  # written the other way round
+        if first in driven and second not in driven and slope:  # written in the opposite direction
             first, second, constant, slope = second, first, -constant / slope, 1 / slope
         reference = model.qpos0[model.jnt_qposadr[[first, second]]]
         return EqualityJoint(first, float(reference[0] + constant - slope * reference[1]), {second: slope})
     if kind == int(mujoco.mjtEq.mjEQ_TENDON) and second < 0:
-        return _of_tendon(model, first, constant, driven)
+        return _from_tendon(model, first, constant, driven)
     return None
 
 
-def _of_tendon(model: Any, tendon: int, constant: float, driven: set[int]) -> EqualityJoint | None:
-    """Of a fixed tendon that keeps its length, with one joint in it that has no motor."""
+def _from_tendon(model: Any, tendon: int, constant: float, driven: set[int]) -> EqualityJoint | None:
+    """From a fixed tendon of constant length with exactly one joint without a motor."""
     start = model.tendon_adr[tendon]
     wraps = range(start, start + model.tendon_num[tendon])
     if any(int(model.wrap_type[wrap]) != int(mujoco.mjtWrap.mjWRAP_JOINT) for wrap in wraps):
         return None
     parts = {int(model.wrap_objid[wrap]): float(model.wrap_prm[wrap]) for wrap in wraps}
-    loose = [joint for joint in parts if joint not in driven]
-    if len(loose) != 1 or not parts[loose[0]]:
+    passive = [joint for joint in parts if joint not in driven]
+    if len(passive) != 1 or not parts[passive[0]]:
         return None
-    own = parts.pop(loose[0])
-    at = {joint: float(model.qpos0[model.jnt_qposadr[joint]]) for joint in (*parts, loose[0])}
-    pulled = sum(part * at[joint] for joint, part in parts.items())
+    own = parts.pop(passive[0])
+    at = {joint: float(model.qpos0[model.jnt_qposadr[joint]]) for joint in (*parts, passive[0])}
+    weighted = sum(part * at[joint] for joint, part in parts.items())
     return EqualityJoint(
-        loose[0], at[loose[0]] + (constant + pulled) / own, {joint: -part / own for joint, part in parts.items()}
+        passive[0], at[passive[0]] + (constant + weighted) / own, {joint: -part / own for joint, part in parts.items()}
     )
 
 
-def _in_order(found: list[EqualityJoint]) -> tuple[EqualityJoint, ...]:
-    """Each after those that it needs; one that would need itself is left out."""
-    tied = {tie.joint for tie in found}
-    done: list[EqualityJoint] = []
+def _in_order(joints: list[EqualityJoint]) -> tuple[EqualityJoint, ...]:
+    """Each joint after those that it depends on; circular dependencies are dropped."""
+    dependents = {dependent.joint for dependent in joints}
+    ordered: list[EqualityJoint] = []
     while True:
-        known = {tie.joint for tie in done}
-        free = [
-            tie
-            for tie in found
-            if tie.joint not in known and all(other in known or other not in tied for other in tie.factors)
+        known = {dependent.joint for dependent in ordered}
+        ready = [
+            dependent
+            for dependent in joints
+            if dependent.joint not in known
+            and all(other in known or other not in dependents for other in dependent.factors)
         ]
-        if not free:
-            return tuple(done)
-        done.append(free[0])
+        if not ready:
+            return tuple(ordered)
+        ordered.append(ready[0])

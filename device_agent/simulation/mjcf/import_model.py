@@ -1,7 +1,6 @@
-"""Makes a robot type folder from somebody else's MuJoCo model, for example one of MuJoCo Menagerie.
+"""Creates a robot type folder from a MuJoCo model, for example one of MuJoCo Menagerie.
 
-What the model says is taken; what it does not say is guessed on the safe side, and the manifest says so beside
-each guess.
+Missing figures are replaced by conservative guesses, which the manifest marks.
 """
 
 import math
@@ -30,13 +29,13 @@ _FRAMES = 8
 _POSITION_KEY = "home"
 
 
-class AdoptError(Exception):
-    """The model cannot be made a robot type. Its text says why, and what to do."""
+class ImportModelError(Exception):
+    """The model cannot become a robot type. The message says why and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Servo:
-    """A joint and its motor. A ``guess`` names the fields that the model does not tell."""
+    """A joint and its motor. ``guessed`` names the fields that the model does not define."""
 
     name: str
     slides: bool
@@ -46,26 +45,26 @@ class _Servo:
     guessed: frozenset[str]
 
 
-def adopt(source: Path, name: str, into: Path, *, without: Sequence[str] = ()) -> Path:
-    """Write ``into/name``: manifest, model, scene, a movement, README.
+def import_model(source: Path, name: str, into: Path, *, without: Sequence[str] = ()) -> Path:
+    """Create ``into/name``: manifest, model, scene, a movement, README.
 
     Args:
-        source: MJCF file of the robot, alone or in a scene; only the robot is taken.
+        source: MJCF file of the robot, alone or in a scene; only the robot is imported.
         name: Id of the new type.
-        into: The folder of robot types.
+        into: Folder of robot types.
         without: Actuators to leave out.
 
     Returns:
         The new folder.
 
     Raises:
-        AdoptError: There is such a folder, the model cannot be read, or is no robot of position servos.
+        ImportModelError: The folder exists, the model cannot be read, or an actuator is not a position servo.
     """
     if not is_id(name):
-        raise AdoptError(f"'{name}' is no name for a robot type: letters, digits, _ and -, 1 to 64 of them")
+        raise ImportModelError(f"'{name}' is not a valid robot type: use 1 to 64 letters, digits, _ and -")
     folder = into / name
     if folder.exists():
-        raise AdoptError(f"{folder} is there already; choose another name, or delete it")
+        raise ImportModelError(f"{folder} exists already; choose another name, or delete it")
     spec = _read(source)
     home = _home(spec, _compile(spec, source))
     _leave_out(spec, without)
@@ -73,23 +72,23 @@ def adopt(source: Path, name: str, into: Path, *, without: Sequence[str] = ()) -
     _check_servos(model)
     _keep_robot_only(spec, model.body(_root(model)).name)
     _name_actuators(spec, model)
-    alone = _compile(spec, source)
-    servos = [_servo(alone, actuator) for actuator in range(alone.nu)]
+    robot_model = _compile(spec, source)
+    servos = [_servo(robot_model, actuator) for actuator in range(robot_model.nu)]
     for actuator, servo in zip(spec.actuators, servos, strict=True):
         actuator.forcelimited, actuator.forcerange = True, (-servo.effort, servo.effort)
         actuator.ctrllimited, actuator.ctrlrange = True, (servo.lower, servo.upper)
     for joint in spec.joints:
-        found = next((servo for servo in servos if servo.name == joint.name), None)
-        if found is not None and "range" in found.guessed:
-            joint.limited, joint.range = True, (found.lower, found.upper)
+        match = next((servo for servo in servos if servo.name == joint.name), None)
+        if match is not None and "range" in match.guessed:
+            joint.limited, joint.range = True, (match.lower, match.upper)
     home = {servo.name: min(max(home.get(servo.name, 0.0), servo.lower), servo.upper) for servo in servos}
     folder.mkdir(parents=True)
     try:
         _write_model(spec, source, folder)
-        _write_texts(folder, source, alone, servos, home)
-    except (OSError, ValueError, AdoptError) as error:
+        _write_texts(folder, source, robot_model, servos, home)
+    except (OSError, ValueError, ImportModelError) as error:
         shutil.rmtree(folder)
-        raise AdoptError(str(error)) from error
+        raise ImportModelError(str(error)) from error
     return folder
 
 
@@ -100,73 +99,73 @@ def _read(source: Path) -> Any:
     try:
         return mujoco.MjSpec.from_file(str(source))
     except (ValueError, OSError, mujoco.FatalError) as error:
-        raise AdoptError(f"{source}: MuJoCo cannot read this model: {error}") from error
+        raise ImportModelError(f"{source}: MuJoCo cannot read this model: {error}") from error
 
 
 def _compile(spec: Any, source: Path) -> Any:
     try:
         return spec.compile()
     except (ValueError, OSError, mujoco.FatalError) as error:
-        raise AdoptError(f"{source}: MuJoCo cannot build this model: {error}") from error
+        raise ImportModelError(f"{source}: MuJoCo cannot build this model: {error}") from error
 
 
 def _leave_out(spec: Any, without: Sequence[str]) -> None:
     known = {actuator.name: actuator for actuator in spec.actuators}
     for name in without:
         if name not in known:
-            raise AdoptError(f"no actuator '{name}' to leave out; there are: {', '.join(known)}")
+            raise ImportModelError(f"no actuator '{name}' to leave out; available: {', '.join(known)}")
         spec.delete(known[name])
 
 
 def _check_servos(model: Any) -> None:
-    """All actuators are position servos of one joint each."""
+    """Check that every actuator is a position servo of one joint."""
     if not model.nu:
-        raise AdoptError("the model has no actuators: nothing could move it")
-    wrong = {
-        model.actuator(index).name or f"actuator {index}": why
+        raise ImportModelError("the model has no actuators")
+    invalid = {
+        model.actuator(index).name or f"actuator {index}": reason
         for index in range(model.nu)
-        if (why := _wrong(model, index))
+        if (reason := _unsupported(model, index))
     }
-    if wrong:
-        told = "; ".join(f"{name} {why}" for name, why in wrong.items())
-        leave = " ".join(f"--without {name}" for name in wrong)
-        raise AdoptError(
-            f"only position servos of joints can be driven: {told}. Change the model, or leave out: {leave}"
+    if invalid:
+        details = "; ".join(f"{name} {reason}" for name, reason in invalid.items())
+        options = " ".join(f"--without {name}" for name in invalid)
+        raise ImportModelError(
+            f"only position servos of joints are supported: {details}. Change the model, or use {options}"
         )
     joints = model.actuator_trnid[:, 0].tolist()
     if len(set(joints)) != len(joints):
-        raise AdoptError("two actuators move the same joint; leave one of each pair out with --without")
+        raise ImportModelError("two actuators move the same joint; leave one out with --without")
     if any(not model.joint(joint).name for joint in joints):
-        raise AdoptError("a joint with an actuator has no name; name it in the model")
+        raise ImportModelError("a joint with an actuator has no name; name it in the model")
 
 
-def _wrong(model: Any, index: int) -> str:
+def _unsupported(model: Any, index: int) -> str:
     if model.actuator_trntype[index] != int(mujoco.mjtTrn.mjTRN_JOINT):
-        return "moves no joint by itself"
+        return "does not act on a joint"
     if model.jnt_type[model.actuator_trnid[index, 0]] not in (
         int(mujoco.mjtJoint.mjJNT_HINGE),
         int(mujoco.mjtJoint.mjJNT_SLIDE),
     ):
-        return "moves a joint that is neither a hinge nor a slide"
+        return "acts on a joint that is neither a hinge nor a slide"
     if model.actuator_gear[index, 0] != 1:
         return f"has a gear of {model.actuator_gear[index, 0]:g}"
     gain = model.actuator_gainprm[index, 0]
     affine = model.actuator_biastype[index] == int(mujoco.mjtBias.mjBIAS_AFFINE)
     servo = affine and gain > 0 and model.actuator_biasprm[index, 1] == -gain and not model.actuator_dyntype[index]
-    return "" if servo else "is no position servo"
+    return "" if servo else "is not a position servo"
 
 
 def _root(model: Any) -> int:
-    """The one top-level body that all driven joints hang on."""
+    """The top-level body of all driven joints."""
     roots = {int(model.body_rootid[model.jnt_bodyid[joint]]) for joint in model.actuator_trnid[:, 0]}
     if len(roots) != 1:
         names = ", ".join(sorted(model.body(root).name for root in roots))
-        raise AdoptError(f"the motors belong to several robots ({names}); make a file of each")
+        raise ImportModelError(f"the motors belong to several robots ({names}); use one file per robot")
     return roots.pop()
 
 
 def _keep_robot_only(spec: Any, root: str) -> None:
-    """Take away what stands around the robot, and what names it."""
+    """Remove the scene around the robot."""
     world = spec.worldbody
     for thing in [*world.geoms, *world.lights, *world.cameras, *world.sites]:
         spec.delete(thing)
@@ -184,18 +183,18 @@ def _below(body: Any) -> Iterator[Any]:
 
 
 def _home(spec: Any, model: Any) -> dict[str, float]:
-    """Where its joints are in the keyframe ``home``, or in the first; else where the model has them."""
-    found = model.qpos0
+    """Joint positions of the keyframe ``home``, or the first one; else the model's reference."""
+    match = model.qpos0
     if model.nkey:
         names = [model.key(index).name for index in range(model.nkey)]
-        found = model.key_qpos[names.index(_POSITION_KEY) if _POSITION_KEY in names else 0]
-    for key in list(spec.keys):  # they list joints that may be gone
+        match = model.key_qpos[names.index(_POSITION_KEY) if _POSITION_KEY in names else 0]
+    for key in list(spec.keys):  # they reference removed joints
         spec.delete(key)
-    return {model.joint(joint).name: float(found[model.jnt_qposadr[joint]]) for joint in range(model.njnt)}
+    return {model.joint(joint).name: float(match[model.jnt_qposadr[joint]]) for joint in range(model.njnt)}
 
 
 def _name_actuators(spec: Any, model: Any) -> None:
-    """An actuator is called as its joint: so the driver finds both."""
+    """Name each actuator like its joint, as the driver expects."""
     names = [model.joint(joint).name for joint in model.actuator_trnid[:, 0]]
     for index, actuator in enumerate(spec.actuators):
         actuator.name = f"adopted {index}"
@@ -212,13 +211,13 @@ def _servo(model: Any, actuator: int) -> _Servo:
     else:
         guessed.add("range")
     if model.actuator_ctrllimited[actuator]:
-        least, most = model.actuator_ctrlrange[actuator].tolist()
-        lower, upper = max(lower, least), min(upper, most)
-    # A written model has six digits: rounded inwards, the manifest's range lies within it.
+        least, largest = model.actuator_ctrlrange[actuator].tolist()
+        lower, upper = max(lower, least), min(upper, largest)
+    # The written model has six digits; round inwards so that the manifest's range is within it.
     lower, upper = math.ceil(lower * _DIGITS) / _DIGITS, math.floor(upper * _DIGITS) / _DIGITS
     if lower >= upper:
         name = model.joint(joint).name
-        raise AdoptError(f"joint '{name}' and its actuator have no position in common; correct their ranges")
+        raise ImportModelError(f"joint '{name}' and its actuator have disjoint ranges; correct them")
     efforts = [
         float(np.abs(ranges).min())
         for limited, ranges in (
@@ -229,17 +228,17 @@ def _servo(model: Any, actuator: int) -> _Servo:
     ]
     if not efforts:
         guessed.add("effort")
-        efforts = [max(_LEAST_EFFORT, 2 * _holding(model, joint))]
+        efforts = [max(_LEAST_EFFORT, 2 * _gravity_load(model, joint))]
     slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
     return _Servo(
         model.joint(joint).name, slides, float(lower), float(upper), round(min(efforts), 3), frozenset(guessed)
     )
 
 
-def _holding(model: Any, joint: int) -> float:
-    """The most that a joint needs against gravity, in random positions [N m or N]."""
+def _gravity_load(model: Any, joint: int) -> float:
+    """Largest gravity load of a joint in random positions [N m or N]."""
     data, random = mujoco.MjData(model), np.random.default_rng(0)
-    ties, most = EqualityJoints(model), 0.0
+    equality_joints, largest = EqualityJoints(model), 0.0
     dof = int(model.jnt_dofadr[joint])
     scalar = model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)
     addresses = model.jnt_qposadr[scalar]
@@ -247,17 +246,17 @@ def _holding(model: Any, joint: int) -> float:
     ranges = np.where(limited, model.jnt_range[scalar], (-_RANGE_RAD, _RANGE_RAD))
     for _ in range(_SAMPLES):
         data.qpos[addresses] = random.uniform(ranges[:, 0], ranges[:, 1])
-        ties.settle(data.qpos)
+        equality_joints.apply(data.qpos)
         mujoco.mj_forward(model, data)
-        most = max(most, abs(float(data.qfrc_bias[dof] - data.qfrc_gravcomp[dof])))
-    return most
+        largest = max(largest, abs(float(data.qfrc_bias[dof] - data.qfrc_gravcomp[dof])))
+    return largest
 
 
 # ------------------------------------------------------------ what is written
 
 
 def _write_model(spec: Any, source: Path, folder: Path) -> None:
-    """The model with the files that it needs beside it."""
+    """Write the model with the assets that it references."""
     spec.modelname = folder.name
     places = {"meshdir": spec.meshdir, "texturedir": spec.texturedir}
     needed = [(places["meshdir"], mesh) for mesh in spec.meshes] + [
@@ -265,13 +264,13 @@ def _write_model(spec: Any, source: Path, folder: Path) -> None:
     ]
     for where, asset in needed:
         if asset.file:
-            found = source.parent / where / asset.file
-            if not found.is_file():
-                raise AdoptError(f"{found} is missing, which the model asks for")
-            kept = folder / "assets" / Path(asset.file).name
-            kept.parent.mkdir(exist_ok=True)
-            shutil.copyfile(found, kept)
-            asset.file = kept.name
+            match = source.parent / where / asset.file
+            if not match.is_file():
+                raise ImportModelError(f"{match} is missing; the model references it")
+            target = folder / "assets" / Path(asset.file).name
+            target.parent.mkdir(exist_ok=True)
+            shutil.copyfile(match, target)
+            asset.file = target.name
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(folder)
     (folder / f"{folder.name}.xml").write_text(spec.to_xml(), encoding="utf-8")
@@ -282,23 +281,25 @@ def _write_texts(folder: Path, source: Path, model: Any, servos: Sequence[_Servo
     data = mujoco.MjData(model)
     for joint, position in home.items():
         data.joint(joint).qpos[0] = position
-    EqualityJoints(model).settle(data.qpos)
+    EqualityJoints(model).apply(data.qpos)
     mujoco.mj_forward(model, data)
     (folder / "scene.xml").write_text(_scene(name, model, data), encoding="utf-8")
     (folder / "robot.toml").write_text(_manifest(name, model, servos, home), encoding="utf-8")
     (folder / "movements").mkdir()
-    (folder / "movements" / "home.py").write_text('"""Go home, slowly."""\n\nrobot.home(speed=0.3)\n', encoding="utf-8")
+    (folder / "movements" / "home.py").write_text(
+        '"""Move slowly to the home position."""\n\nrobot.home(speed=0.3)\n', encoding="utf-8"
+    )
     (folder / "README.md").write_text(_readme(name, source, servos), encoding="utf-8")
 
 
 def _scene(name: str, model: Any, data: Any) -> str:
-    """A floor, and a camera that sees all of it.
+    """A floor, and a camera that shows the whole robot.
 
-    The floor is where the robot stands on it at home; below what moves, where that would be too near.
+    The floor is under the robot's base at home; it is lower if it would be too close to moving parts.
     """
     reach = float(model.stat.extent)
     fixed = model.body_weldid[model.geom_bodyid] == 0
-    stands = not fixed.any()  # on feet or wheels
+    stands = not fixed.any()  # mobile robot
     low = [_bottom(model, data, geom) - (0.0 if fixed[geom] or stands else _ROOM_M) for geom in range(model.ngeom)]
     lowest = min(low, default=0.0)
     x, y, z = (float(value) for value in model.stat.center)
@@ -328,7 +329,7 @@ def _manifest(name: str, model: Any, servos: Sequence[_Servo], home: dict[str, f
         "version = 1",
         f'label = "{name}"',
         'kind = "robot"',
-        'description = "Taken over from a MuJoCo model. Look at every guessed figure before you trust it."',
+        'description = "Imported from a MuJoCo model. Check every guessed figure before use."',
         f'model = "{name}.xml"',
         'scene = "scene.xml"',
         'driver = "mujoco"',
@@ -366,12 +367,12 @@ def _readme(name: str, source: Path, servos: Sequence[_Servo]) -> str:
     ranges = ", ".join(servo.name for servo in servos if "range" in servo.guessed) or "none"
     return f"""# {name}
 
-Taken over from `{source.name}` by `python -m device_agent import-model`. **Source** of shapes, masses, ranges and
-servos: that model; its licence holds for this folder as well.
+Imported from `{source.name}` by `python -m device_agent import-model`. **Source** of shapes, masses, ranges and
+servos: that model; its licence applies to this folder, too.
 
 ## What is approximate
 
-- Speeds, accelerations, jerk and braking: guessed, slow.
-- Ranges that were guessed (±180°): {ranges}. Efforts that were guessed (twice what gravity asks for): {efforts}.
+- Speeds, accelerations, jerk and braking: guessed, conservative.
+- Guessed ranges (±180°): {ranges}. Guessed efforts (twice the gravity load): {efforts}.
 - The scene is a floor and a camera.
 """

@@ -1,12 +1,12 @@
-"""One set of options for all parts of a model."""
+"""Makes the options of model parts equal."""
 
 from typing import Any
 
 import numpy as np
 
 
-def agree(child: Any, parent: Any) -> None:
-    """Give one part of a model the options of another: MuJoCo warns, aloud, of each that differs."""
+def copy_options(child: Any, parent: Any) -> None:
+    """Copy options from one model part to another; MuJoCo warns of each difference."""
     for name in dir(parent):
         value = getattr(parent, name)
         if name.startswith("_") or callable(value):
@@ -16,4 +16,4 @@ def agree(child: Any, parent: Any) -> None:
         elif isinstance(value, int | float):
             setattr(child, name, value)
         else:
-            agree(getattr(child, name), value)
+            copy_options(getattr(child, name), value)

@@ -1,6 +1,6 @@
-"""A compiled model as the protocol's ``Twin``: a tree of primitive shapes that a page can move by itself.
+"""A compiled model as the protocol's ``Twin``: a tree of primitive shapes that a page can animate.
 
-Shown are the geoms of groups 0 to 2, as in MuJoCo's own viewer; collision geoms belong in group 3.
+It contains the geoms of groups 0 to 2, as in MuJoCo's viewer; collision geoms belong in group 3.
 """
 
 from typing import Any, Literal, cast
@@ -14,7 +14,7 @@ from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 _LAST_VISIBLE_GROUP = 2
 _DIGITS = 12
-"""Decimals written. A chain of ten such bodies stays within 1e-10 m of MuJoCo's own poses."""
+"""Decimals written. A chain of ten bodies stays within 1e-10 m of MuJoCo's own poses."""
 _IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
 _ORIGIN: Vector3 = (0.0, 0.0, 0.0)
 
@@ -29,27 +29,26 @@ _SHAPES: dict[int, Shape] = {
 }
 
 
-def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery_m: float = 0.0) -> Twin:
-    """The drawing of one robot, in the frame of its base.
+def build_twin(model: Any, *, base: int, device: str, prefix: str = "", scenery_m: float = 0.0) -> Twin:
+    """The twin of one robot, in the frame of its base.
 
-    A pose follows from it thus: start at the parent's; move by ``position_m`` and ``quaternion``; where there is a
-    joint, turn about its axis through its anchor (or slide along it) by position minus ``reference_rad``. A joint
-    that ``follows`` others stands at the sum of factor times position of those.
+    To compute a pose: start at the parent's; move by ``position_m`` and ``quaternion``; at a joint, turn about its axis
+    through its anchor (or slide along it) by position minus ``reference_rad``. A joint that ``follows`` others has the
+    sum of factor times position of those.
 
     Args:
         model: The compiled ``MjModel``.
         base: Index of the robot's top-level body.
         device: Id of the device.
-        prefix: Taken off the names.
-        scenery_m: How near something must be to the base that is fixed to the world, as the base then must be too, to
-            be drawn with it, as a body ``scene`` of its own [m]; 0 for none of it.
+        prefix: Removed from the names.
+        scenery_m: Include static geoms within this distance of a static base, as a body ``scene`` [m]; 0 includes none.
 
     Raises:
-        DriverError: A body turns about a ball joint, or floats free below the base.
+        DriverError: A body below the base has a ball or free joint.
     """
     bodies: list[Body] = []
     index_of: dict[int, int] = {}
-    ties = EqualityJoints(model)
+    equality_joints = EqualityJoints(model)
     if scenery_m > 0 and model.body_weldid[base] == 0:
         bodies.append(_scene(model, base, scenery_m))
     for body in range(base, model.nbody):
@@ -57,15 +56,26 @@ def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery_m: flo
             bodies.append(Body(name=_name(model, body, prefix), parent=-1, position_m=_ORIGIN, quaternion=_IDENTITY,
                                geometries=_shapes(model, body)))  # fmt: skip
         elif model.body_parentid[body] in index_of:
-            bodies.extend(_moving(model, body, index_of[model.body_parentid[body]], len(bodies), prefix, ties=ties))
+            bodies.extend(
+                _moving(
+                    model,
+                    body,
+                    index_of[model.body_parentid[body]],
+                    len(bodies),
+                    prefix,
+                    equality_joints=equality_joints,
+                )
+            )
         else:
             continue
         index_of[body] = len(bodies) - 1
     return Twin(device=device, bodies=tuple(bodies))
 
 
-def _moving(model: Any, body: int, parent: int, first: int, prefix: str, *, ties: EqualityJoints) -> list[Body]:
-    """One body of the model: one in the drawing, or a chain of them where it has several joints."""
+def _moving(
+    model: Any, body: int, parent: int, first: int, prefix: str, *, equality_joints: EqualityJoints
+) -> list[Body]:
+    """The twin bodies of one model body: a chain if it has several joints."""
     joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
     name = _name(model, body, prefix)
     position, quaternion = _vector(model.body_pos[body]), _quaternion(model.body_quat[body])
@@ -79,14 +89,14 @@ def _moving(model: Any, body: int, parent: int, first: int, prefix: str, *, ties
             parent=parent if step == 0 else first + step - 1,
             position_m=position if step == 0 else _ORIGIN,
             quaternion=quaternion if step == 0 else _IDENTITY,
-            joint=_joint(model, joint, prefix, ties),
+            joint=_joint(model, joint, prefix, equality_joints),
             geometries=geometries if step == last else (),
         )
         for step, joint in enumerate(joints)
     ]
 
 
-def _joint(model: Any, joint: int, prefix: str, ties: EqualityJoints) -> TwinJoint:
+def _joint(model: Any, joint: int, prefix: str, equality_joints: EqualityJoints) -> TwinJoint:
     kinds: dict[int, Literal["hinge", "slide"]] = {
         int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
         int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
@@ -94,21 +104,22 @@ def _joint(model: Any, joint: int, prefix: str, ties: EqualityJoints) -> TwinJoi
     name = model.joint(joint).name.removeprefix(prefix)
     kind = kinds.get(int(model.jnt_type[joint]))
     if kind is None:
-        raise DriverError(f"joint '{name}' is neither a hinge nor a slide; a twin has no other below its base")
+        raise DriverError(f"joint '{name}' is neither a hinge nor a slide; a twin supports no other joints")
     return TwinJoint(
         name=name,
         kind=kind,
         axis=_vector(model.jnt_axis[joint]),
         anchor_m=_vector(model.jnt_pos[joint]),
-        reference_rad=_round(model.qpos0[model.jnt_qposadr[joint]] - ties.offset(joint)),
+        reference_rad=_round(model.qpos0[model.jnt_qposadr[joint]] - equality_joints.offset(joint)),
         follows={
-            model.joint(other).name.removeprefix(prefix): _round(factor) for other, factor in ties.of(joint).items()
+            model.joint(other).name.removeprefix(prefix): _round(factor)
+            for other, factor in equality_joints.factors_of(joint).items()
         },
     )
 
 
 def _scene(model: Any, base: int, within_m: float) -> Body:
-    """The world body's geoms and those of bodies fixed to it, as far as they are near, seen from the base."""
+    """Geoms of static bodies near the base, in the base frame."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     inverse_position, inverse_quaternion = np.empty(3), np.empty(4)
@@ -129,9 +140,9 @@ def _scene(model: Any, base: int, within_m: float) -> Body:
     return Body(name="scene", parent=-1, position_m=_ORIGIN, quaternion=_IDENTITY, geometries=tuple(geometries))
 
 
-def _away_m(model: Any, data: Any, geom: int, place: Any) -> float:
-    """How far the box around a geom is from a place; of a plane the plane itself [m]."""
-    offset = data.geom_xmat[geom].reshape(3, 3).T @ (place - data.geom_xpos[geom])
+def _away_m(model: Any, data: Any, geom: int, point: Any) -> float:
+    """Distance from a point to a geom's bounding box or to a plane [m]."""
+    offset = data.geom_xmat[geom].reshape(3, 3).T @ (point - data.geom_xpos[geom])
     if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_PLANE):
         return abs(float(offset[2]))
     box = model.geom_aabb[geom]

@@ -1,1 +1,1 @@
-"""Room."""
+"""Models of people, climate, light and sound in a simulated room."""

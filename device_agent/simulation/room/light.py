@@ -1,8 +1,8 @@
-"""Light of a simulated room: what comes through the window and from the lamps, as a number and for the cameras.
+"""Light model of a simulated room: illuminance, and light intensities for the cameras.
 
-Illuminance adds up: E = E_day (b + (1 - b) opening of the blinds) + E_lamp level, in the middle of the room at table
-height; b is what closed blinds let through. E_day and E_lamp are the room's own figures. EN 12464-1 asks for 500 lx in
-a laboratory, which the usual one has with both. For cameras the model's ``window`` and ``lamp…`` lights are dimmed too.
+Illuminance in the middle of the room at table height is E = E_day (b + (1 - b) blind opening) + E_lamp level, where b
+is the share that closed blinds let through. E_day and E_lamp are room parameters. EN 12464-1 requires 500 lx in a
+laboratory. The model's ``window`` and ``lamp…`` lights are dimmed accordingly.
 """
 
 from typing import Any
@@ -16,22 +16,22 @@ from device_agent.simulation.world import World
 
 PERIOD_S = 0.1
 _THROUGH_BLINDS = 0.08
-"""Share of daylight that light fabric lets through; approximate."""
+"""Share of daylight that passes light fabric; approximate."""
 _LAMP, _BLINDS, _WINDOW = "lamp", "blinds", "window"
 _UNLIT = 0.45
-"""Colour of a lamp's panel when it is off, as a share of when it is on."""
+"""Colour of a lamp panel that is off, relative to one that is on."""
 
 
 class Light:
-    """A ``Process`` of a ``World``; tells ``light_lux``, and dims the model's lights and lamp panels.
+    """``Process`` that computes ``light_lux`` and dims the model's lights and lamp panels.
 
     Args:
-        room: Its figures.
-        world: Whose quantities it tells.
+        room: Its light parameters.
+        world: Receives the quantity.
     """
 
     def __init__(self, room: Room, world: World) -> None:
-        self._of = room.climate
+        self._parameters = room.climate
         self._world = world
         self._model: Any = None
         self._next_s = 0.0
@@ -43,7 +43,7 @@ class Light:
         self._dimmed = (-1.0, -1.0)
 
     def step(self, model: Any, data: Any, time_s: float) -> None:
-        """Look at lamp and blinds."""
+        """Update the light from lamp and blinds."""
         if model is not self._model:
             self._resolve(model)
         if time_s < self._next_s:
@@ -51,7 +51,9 @@ class Light:
         self._next_s = time_s + PERIOD_S
         level = min(1.0, max(0.0, self._world.settings.get(_LAMP, 0.0)))
         day = _THROUGH_BLINDS + (1 - _THROUGH_BLINDS) * opening(model, data, _BLINDS, missing=1.0)
-        self._world.tell({"light_lux": self._of.daylight_lux * day + self._of.lamp_lux * level})
+        self._world.set_quantities(
+            {"light_lux": self._parameters.daylight_lux * day + self._parameters.lamp_lux * level}
+        )
         if self._dimmed != (level, day):
             self._dim(model, level, day)
 

@@ -1,4 +1,4 @@
-"""How far the doors and blinds of a simulated room are open."""
+"""Opening of the doors and blinds of a simulated room."""
 
 from typing import Any
 
@@ -6,13 +6,13 @@ import mujoco
 
 
 def opening(model: Any, data: Any, joint: str, *, missing: float = 0.0) -> float:
-    """How far something is open, as a share of its joint's range.
+    """Position of a joint as a share of its range, 0…1.
 
     Args:
         model: ``MjModel``.
         data: ``MjData``.
-        joint: Its name in the room.
-        missing: What counts where the room has no such joint.
+        joint: Joint name.
+        missing: Result if the room has no such joint.
     """
     index = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint))
     if index < 0:

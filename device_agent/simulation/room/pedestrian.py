@@ -1,7 +1,7 @@
-"""Somebody who walks about in a simulated room, limb by limb, and gives way to robots.
+"""A person who walks in a simulated room and stops for robots.
 
-Moved by hand (mocap), not by physics: it is seen by cameras, lidars and motion sensors, and pushes nothing. The model
-has a mocap body with the person's name, its frame between the hips with x ahead, and eight more, as
+Positioned kinematically (mocap): visible to cameras, lidars and motion sensors, but exerts no forces. The model has a
+mocap body with the person's name, its frame between the hips with x forward, and eight more, as
 ``{name}_thigh_left``, each hanging from its upper joint along -z.
 """
 
@@ -16,7 +16,7 @@ from device_agent.ports.driver import DriverError
 from device_agent.protocol.manifests import room
 
 PERIOD_S = 0.02
-"""A walker moves on so often: 2 cm at a usual pace."""
+"""Update period of a pedestrian: 2 cm at usual speed."""
 
 # Lengths of an adult of 1.75 m, by the shares of body height in Winter, "Biomechanics and Motor Control of Human
 # Movement" (thigh 0.245, shank 0.246 with the foot's height 0.039, upper arm 0.186); rounded to the model's shapes.
@@ -24,7 +24,7 @@ _THIGH_M, _SHANK_M = 0.43, 0.477
 _ARM_M = 0.30
 _HIP_M, _SHOULDER_M, _SHOULDER_UP_M = 0.09, 0.215, 0.47
 
-# A gait that looks like one; approximate.
+# Gait parameters; approximate.
 _STRIDE_M = 1.3
 _SWING_RAD, _KNEE_RAD, _KNEE_REST_RAD = 0.42, 0.85, 0.06
 _ARM_SWING_RAD, _ELBOW_RAD = 0.38, 0.32
@@ -32,20 +32,20 @@ _FULL_GAIT_M_S = 0.6
 _ACCELERATION_M_S2 = 1.2
 _TURN_RAD_S = 2.5
 _AHEAD_RAD = 0.35
-"""Who looks further away from where it wants to go turns on the spot."""
-_THERE_M = 0.04
+"""Above this heading error the pedestrian turns on the spot."""
+_ARRIVED_M = 0.04
 _ROOM_M = 0.65
-"""Nearer to a robot that is ahead nobody walks."""
+"""Minimum distance to a robot ahead."""
 _PATIENCE_S = 3.0
-"""Whoever is kept waiting for longer turns round."""
+"""A pedestrian blocked for longer turns around."""
 _ROBOT = "/"
-"""Stands in the names of robots' bodies, and of nothing else in a room."""
+"""Occurs only in body names of robots."""
 _SIDES = (("left", 1.0, 0.0), ("right", -1.0, math.pi))
 
 
 @dataclass(slots=True)
 class _Gait:
-    """Where somebody is on the floor, and in the step. ``phase_rad`` is the left leg's."""
+    """Pose on the floor and phase of the step. ``phase_rad`` is the left leg's."""
 
     x_m: float
     y_m: float
@@ -54,11 +54,11 @@ class _Gait:
     phase_rad: float = 0.0
 
 
-class Walker:
-    """Walks round and round: a ``Process`` of a ``World``.
+class Pedestrian:
+    """``Process`` of a person who walks along a closed path.
 
     Args:
-        person: Its way, speed and pauses.
+        person: Path, speed and pauses.
     """
 
     def __init__(self, person: room.Person) -> None:
@@ -76,16 +76,16 @@ class Walker:
 
     @property
     def position_m(self) -> tuple[float, float]:
-        """Where it is on the floor [m]."""
+        """x, y on the floor [m]."""
         return self._gait.x_m, self._gait.y_m
 
     @property
     def speed_m_s(self) -> float:
-        """How fast it walks [m/s]."""
+        """Walking speed [m/s]."""
         return self._gait.speed_m_s
 
     def step(self, model: Any, data: Any, time_s: float) -> None:
-        """Walk on.
+        """Advance the walk.
 
         Raises:
             DriverError: The model lacks a body of the person.
@@ -95,42 +95,42 @@ class Walker:
         if time_s < self._next_s:
             return
         self._next_s = max(self._next_s + PERIOD_S, time_s)
-        self._walk(data.xpos[self._robots])
+        self._advance(data.xpos[self._robots])
         position, quaternion = _posture(self._gait)
         data.mocap_pos[self._mocap] = position
         data.mocap_quat[self._mocap] = quaternion
 
-    # ------------------------------------------------------------ where to
+    # ------------------------------------------------------------ path
 
-    def _walk(self, robots_m: Any) -> None:
+    def _advance(self, robots_m: Any) -> None:
         gait = self._gait
         if self._resting_s > 0:
             self._resting_s -= PERIOD_S
         x, y = self._person.path_m[self._towards]
         left_m = math.hypot(x - gait.x_m, y - gait.y_m)
-        if left_m < _THERE_M:
+        if left_m < _ARRIVED_M:
             self._towards = (self._towards + self._direction) % len(self._person.path_m)
             self._resting_s = self._person.pause_s
             gait.speed_m_s = 0.0
             return
         off_rad = _wrapped(math.atan2(y - gait.y_m, x - gait.x_m) - gait.yaw_rad)
         gait.yaw_rad = _wrapped(gait.yaw_rad + min(max(off_rad, -_TURN_RAD_S * PERIOD_S), _TURN_RAD_S * PERIOD_S))
-        wanted_m_s = min(self._person.speed_m_s, math.sqrt(2 * _ACCELERATION_M_S2 * left_m))
-        if self._in_the_way(robots_m):
-            wanted_m_s = 0.0
+        target_m_s = min(self._person.speed_m_s, math.sqrt(2 * _ACCELERATION_M_S2 * left_m))
+        if self._is_blocked(robots_m):
+            target_m_s = 0.0
             self._wait()
         elif self._resting_s > 0 or abs(off_rad) > _AHEAD_RAD:
-            wanted_m_s = 0.0
+            target_m_s = 0.0
         else:
             self._blocked_s = 0.0
         change = _ACCELERATION_M_S2 * PERIOD_S
-        gait.speed_m_s = max(min(wanted_m_s, gait.speed_m_s + change), gait.speed_m_s - 2 * change)
-        gone_m = gait.speed_m_s * PERIOD_S
-        gait.x_m += gone_m * math.cos(gait.yaw_rad)
-        gait.y_m += gone_m * math.sin(gait.yaw_rad)
-        gait.phase_rad = (gait.phase_rad + 2 * math.pi * gone_m / _STRIDE_M) % (2 * math.pi)
+        gait.speed_m_s = max(min(target_m_s, gait.speed_m_s + change), gait.speed_m_s - 2 * change)
+        step_m = gait.speed_m_s * PERIOD_S
+        gait.x_m += step_m * math.cos(gait.yaw_rad)
+        gait.y_m += step_m * math.sin(gait.yaw_rad)
+        gait.phase_rad = (gait.phase_rad + 2 * math.pi * step_m / _STRIDE_M) % (2 * math.pi)
 
-    def _in_the_way(self, robots_m: Any) -> bool:
+    def _is_blocked(self, robots_m: Any) -> bool:
         if not len(robots_m):
             return False
         gait = self._gait
@@ -164,7 +164,7 @@ def _posture(gait: _Gait) -> tuple[Any, Any]:
     """Positions, shape (9, 3) [m], and quaternions, shape (9, 4), of the bodies, in the order of ``_resolve``."""
     share = min(1.0, gait.speed_m_s / _FULL_GAIT_M_S)
     legs = [_leg(gait.phase_rad + shift, share) for _, _, shift in _SIDES]
-    # The foot that reaches lowest stands on the floor.
+    # The lower foot stands on the floor.
     hip_m = max(_THIGH_M * math.cos(thigh) + _SHANK_M * math.cos(shin) for thigh, shin in legs)
     shoulder_m = hip_m + _SHOULDER_UP_M
     thighs, shins, arms, forearms = [], [], [], []
@@ -181,14 +181,14 @@ def _posture(gait: _Gait) -> tuple[Any, Any]:
     positions, quaternions = [], []
     for x, y, z, swing in ((0.0, 0.0, hip_m, 0.0), *thighs, *shins, *arms, *forearms):
         positions.append((gait.x_m + cosine * x - sine * y, gait.y_m + sine * x + cosine * y, z))
-        # Turned about the vertical, then about its own y axis: forward is negative there.
+        # Rotate about the vertical, then about the local y axis, where forward is negative.
         c, s = math.cos(swing / 2), -math.sin(swing / 2)
         quaternions.append((half_cosine * c, -half_sine * s, half_cosine * s, half_sine * c))
     return np.array(positions), np.array(quaternions)
 
 
 def _leg(phase_rad: float, share: float) -> tuple[float, float]:
-    """How far thigh and shin are swung ahead [rad]: the knee bends while the leg goes forward."""
+    """Swing of thigh and shin [rad]: the knee bends while the leg moves forward."""
     thigh = _SWING_RAD * share * math.sin(phase_rad) + _KNEE_REST_RAD / 2
     knee = _KNEE_REST_RAD + _KNEE_RAD * share * max(0.0, math.cos(phase_rad))
     return thigh, thigh - knee

@@ -272,7 +272,7 @@ def main() -> int:
         import msgspec  # noqa: PLC0415
         import mujoco  # noqa: PLC0415 (within the limits)
 
-        from device_agent.simulation.mjcf.twin import draw  # noqa: PLC0415 (needs MuJoCo)
+        from device_agent.simulation.mjcf.twin import build_twin  # noqa: PLC0415 (needs MuJoCo)
     except ImportError:
         return NO_MUJOCO
     warned: list[str] = []
@@ -283,7 +283,7 @@ def main() -> int:
 
     mujoco.set_mju_user_warning(warn)
     confine(".")
-    check = Check(mujoco, draw, task)
+    check = Check(mujoco, build_twin, task)
     try:
         errors = check.errors()
     except MemoryError:

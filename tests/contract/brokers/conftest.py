@@ -26,7 +26,7 @@ def broker(running: RunningBroker) -> Iterator[RunningBroker]:
     """One broker for all tests, which keep apart by their spaces. Whatever a test does, it must live and stay calm."""
     yield running
     assert running.process.poll() is None, running.stderr()
-    for word in ("Traceback", "fault in the broker"):
+    for word in ("Traceback", "internal error"):
         assert word not in running.stderr()
 
 

@@ -32,26 +32,26 @@ def another_instance(broker: RunningBroker) -> BrokerAccess:
 
 
 @pytest.mark.parametrize("client_id", ["", "with space", "a/b", "a+", "x" * 65, "ü"])
-def test_a_client_id_outside_the_contract_is_refused(broker: RunningBroker, client_id: str) -> None:
+def test_an_invalid_client_id_is_rejected(broker: RunningBroker, client_id: str) -> None:
     with pytest.raises(ProtocolError, match="client id"):
         broker.issue(broker.grant(client_id))
 
 
 @pytest.mark.parametrize("pattern", ["a/#/b", "a#"])
-def test_a_filter_that_is_none_is_refused(broker: RunningBroker, space: str, pattern: str) -> None:
+def test_an_invalid_filter_is_rejected(broker: RunningBroker, space: str, pattern: str) -> None:
     for grant in (broker.grant(space, publish=(pattern,)), broker.grant(space, subscribe=(pattern,))):
         with pytest.raises(ProtocolError, match="filter"):
             broker.issue(grant)
 
 
-def test_revoke_wants_exactly_one_name(broker: RunningBroker) -> None:
+def test_revoke_requires_exactly_one_name(broker: RunningBroker) -> None:
     with pytest.raises(ValueError, match="exactly one"):
         broker.revoke()
     with pytest.raises(ValueError, match="exactly one"):
         broker.revoke(client_id="a", principal="b")
 
 
-def test_revoking_what_does_not_exist_is_no_error(broker: RunningBroker, space: str) -> None:
+def test_revoking_an_unknown_name_succeeds(broker: RunningBroker, space: str) -> None:
     for _ in range(2):
         broker.revoke(client_id=space)
         broker.revoke(principal=f"account:{space}")
@@ -77,7 +77,7 @@ def test_any_instance_revokes_what_another_has_issued(broker: RunningBroker, spa
     broker.run(other.close())
 
 
-def test_every_service_connection_has_a_client_id_of_its_own(broker: RunningBroker) -> None:
+def test_service_connections_have_distinct_client_ids(broker: RunningBroker) -> None:
     first, second = broker.access.service_credentials(), broker.access.service_credentials()
     assert first.client_id != second.client_id
     assert first.expires_at > time.time() + 3_600
@@ -88,7 +88,7 @@ def test_every_service_connection_has_a_client_id_of_its_own(broker: RunningBrok
         assert not one.disconnected.is_set()
 
 
-def test_a_broker_that_is_away_is_one_clear_error_and_works_again_afterwards(kind: BrokerKind, tmp_path: Path) -> None:
+def test_an_unavailable_broker_is_an_error_until_it_returns(kind: BrokerKind, tmp_path: Path) -> None:
     with start_broker(kind, tmp_path) as broker:
         access = another_instance(broker)
         broker.run(access.revoke(client_id="nobody"))
@@ -112,13 +112,13 @@ def test_a_revocation_outlives_a_crash_of_the_broker(kind: BrokerKind, tmp_path:
             assert client.connected.is_set()
 
 
-def test_mosquitto_without_its_password_file_is_one_clear_error(tmp_path: Path) -> None:
+def test_a_missing_password_file_is_an_error(tmp_path: Path) -> None:
     access = MosquittoBrokerAccess(host=HOST, port=1, username="service", password_file=tmp_path / "none")
     with pytest.raises(BrokerAccessError, match="start the broker"):
         access.service_credentials()
 
 
-def test_a_token_made_with_another_key_is_refused(tmp_path: Path) -> None:
+def test_a_token_of_another_key_is_rejected(tmp_path: Path) -> None:
     with start_broker("amqtt", tmp_path) as broker:
         grant = broker.grant("thief", publish=("#",))
         forged = TokenBrokerAccess(signer=signing.generate, publish=_nowhere)

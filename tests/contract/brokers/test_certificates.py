@@ -26,8 +26,8 @@ from tests.harness.network.brokers import HOST, Client, RunningBroker, start_bro
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, now = tmp_path_factory.mktemp("site") / "tls", dt.datetime.now(dt.UTC)
-    server_ca.make(folder, server_ca.names((), ()), now=now)
-    agent_ca.make(folder, now=now)
+    server_ca.create(folder, server_ca.names((), ()), now=now)
+    agent_ca.create(folder, now=now)
     return folder
 
 
@@ -73,22 +73,22 @@ def agent(site: Path, broker: RunningBroker, tmp_path: Path) -> Agent:
     return Agent("agentaaaaa", site, broker, tmp_path / "agent")
 
 
-def test_with_its_certificate_an_agent_is_let_in(agent: Agent) -> None:
+def test_an_agent_with_its_certificate_connects(agent: Agent) -> None:
     assert agent.connect().connected.is_set()
 
 
-def test_without_one_the_right_credentials_are_not_heard(agent: Agent) -> None:
+def test_credentials_without_certificate_are_rejected(agent: Agent) -> None:
     assert not agent.connect(shown=False).connected.is_set()
 
 
-def test_one_of_another_authority_is_none(agent: Agent, tmp_path: Path) -> None:
+def test_a_certificate_of_another_ca_is_rejected(agent: Agent, tmp_path: Path) -> None:
     other = tmp_path / "other"
-    agent_ca.make(other, now=dt.datetime.now(dt.UTC))
+    agent_ca.create(other, now=dt.datetime.now(dt.UTC))
     agent.authority = FileCertificates(other)
     assert not agent.connect().connected.is_set()
 
 
-def test_the_sites_own_server_certificate_is_none(agent: Agent) -> None:
+def test_the_server_certificate_is_no_client_certificate(agent: Agent) -> None:
     context = client_context(agent.site / "ca.crt")
     context.load_cert_chain(agent.site / "server.crt", agent.site / "server.key")
     client = Client(agent.name, Credentials(*agent.credentials), port=agent.broker.tcp_port, tls=context)
@@ -96,7 +96,7 @@ def test_the_sites_own_server_certificate_is_none(agent: Agent) -> None:
     assert not client.open().connected.is_set()
 
 
-def test_a_certificate_alone_opens_nothing(agent: Agent) -> None:
+def test_a_certificate_without_credentials_is_rejected(agent: Agent) -> None:
     context = client_context(agent.site / "ca.crt")
     context.load_cert_chain(*agent.certificate())
     client = Client(agent.name, None, port=agent.broker.tcp_port, tls=context)
@@ -104,9 +104,7 @@ def test_a_certificate_alone_opens_nothing(agent: Agent) -> None:
     assert not client.open().connected.is_set()
 
 
-def test_a_revoked_one_is_cut_and_not_let_in_again_and_others_stay(
-    site: Path, broker: RunningBroker, tmp_path: Path
-) -> None:
+def test_a_revoked_certificate_is_disconnected_and_rejected(site: Path, broker: RunningBroker, tmp_path: Path) -> None:
     leaving, staying = (Agent(name, site, broker, tmp_path / name) for name in ("agentbbbbb", "agentccccc"))
     gone, there = leaving.connect(), staying.connect()
     assert gone.connected.is_set()
@@ -128,7 +126,7 @@ def test_a_revoked_one_is_cut_and_not_let_in_again_and_others_stay(
     assert leaving.connect().connected.is_set()
 
 
-def test_old_tls_is_no_way_around(broker: RunningBroker, site: Path) -> None:
+def test_old_tls_versions_do_not_bypass_certificates(broker: RunningBroker, site: Path) -> None:
     context = client_context(site / "ca.crt")
     context.maximum_version = ssl.TLSVersion.TLSv1_2
     with socket.create_connection((HOST, broker.tcp_port)) as plain, pytest.raises(OSError, match=r"SSL|EOF|reset"):
@@ -141,7 +139,7 @@ class TestRequests:
             asyncio.run(FileCertificates(site).issue("agentddddd", request))
         return str(refused.value)
 
-    def test_whatever_a_request_says_its_certificate_is_the_agents(self, site: Path) -> None:
+    def test_certificates_only_contain_the_agents_identity(self, site: Path) -> None:
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "service")])
         request = (
@@ -156,7 +154,7 @@ class TestRequests:
         assert made.subject.rfc4514_string() == "CN=agentddddd"
         assert made.extensions.get_extension_for_class(x509.BasicConstraints).value.ca is False
 
-    def test_one_that_somebody_else_signed_is_refused(self, site: Path) -> None:
+    def test_a_request_signed_by_another_key_is_rejected(self, site: Path) -> None:
         key = ec.generate_private_key(ec.SECP256R1())
         request = x509.CertificateSigningRequestBuilder().subject_name(x509.Name([])).sign(key, hashes.SHA256())
         raw = bytearray(request.public_bytes(serialization.Encoding.DER))
@@ -165,10 +163,10 @@ class TestRequests:
         assert "not signed by the key" in self.refused(site, forged)
 
     @pytest.mark.parametrize("text", ["", "no request", "-----BEGIN CERTIFICATE REQUEST-----\nAAAA\n", "x" * 5000])
-    def test_what_is_no_request_is_refused(self, site: Path, text: str) -> None:
+    def test_an_invalid_request_is_rejected(self, site: Path, text: str) -> None:
         self.refused(site, text)
 
-    def test_other_kinds_of_keys_are_refused(self, site: Path) -> None:
+    def test_other_key_types_are_rejected(self, site: Path) -> None:
         builder = x509.CertificateSigningRequestBuilder().subject_name(x509.Name([]))
         weak = builder.sign(ec.generate_private_key(ec.SECP384R1()), hashes.SHA256())
         edwards = builder.sign(ed25519.Ed25519PrivateKey.generate(), None)
@@ -176,6 +174,6 @@ class TestRequests:
             text = request.public_bytes(serialization.Encoding.PEM).decode()
             assert "P-256" in self.refused(site, text)
 
-    def test_without_an_authority_it_says_what_to_do(self, tmp_path: Path) -> None:
+    def test_a_missing_ca_is_reported(self, tmp_path: Path) -> None:
         with pytest.raises(BrokerAccessError, match=r"infra\.tls --devices"):
             asyncio.run(FileCertificates(tmp_path).revoke("agentddddd"))

@@ -61,7 +61,7 @@ def test_eight_filters_fit_into_one_subscribe(broker: RunningBroker, space: str)
         assert [client.receive().topic for _ in topics] == topics
 
 
-def test_after_an_unsubscribe_nothing_comes(broker: RunningBroker, space: str) -> None:
+def test_unsubscribe_stops_delivery(broker: RunningBroker, space: str) -> None:
     topic, other = f"ts/v1/{space}/arm/conn", f"ts/v1/{space}/other/conn"
     with broker.client(space, publish=(topic, other), subscribe=(topic, other)) as client:
         client.subscribe(topic, other)
@@ -71,7 +71,7 @@ def test_after_an_unsubscribe_nothing_comes(broker: RunningBroker, space: str) -
         assert [m.topic for m in (client.receive(), *client.heard())] == [other]
 
 
-def test_a_new_subscriber_gets_what_is_retained_and_a_present_one_what_is_live(
+def test_new_subscribers_get_retained_and_existing_ones_live_messages(
     broker: RunningBroker, space: str, transport: Transport
 ) -> None:
     topic = f"ts/v1/{space}/arm/ur5/state"
@@ -92,7 +92,7 @@ def test_a_new_subscriber_gets_what_is_retained_and_a_present_one_what_is_live(
         assert late.heard() == []
 
 
-def test_an_empty_message_clears_what_is_retained(broker: RunningBroker, space: str) -> None:
+def test_an_empty_message_deletes_the_retained_one(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/ur5/state"
     with (
         broker.client(f"{space}-arm", publish=(topic,)) as arm,
@@ -105,9 +105,7 @@ def test_an_empty_message_clears_what_is_retained(broker: RunningBroker, space: 
             late.receive(SILENCE_S)
 
 
-def test_retained_messages_come_only_for_the_new_filter_and_only_to_who_subscribed(
-    broker: RunningBroker, space: str
-) -> None:
+def test_retained_messages_go_to_the_new_subscription_only(broker: RunningBroker, space: str) -> None:
     """The leak: a new client got what is retained for every filter that anybody held."""
     mine, others = f"ts/v1/{space}/mine/conn", f"ts/v1/{space}/others/conn"
     with (
@@ -126,7 +124,7 @@ def test_retained_messages_come_only_for_the_new_filter_and_only_to_who_subscrib
             assert [m.payload for m in (everything.receive(), *everything.heard())] == [b"end"]
 
 
-def test_a_denied_publish_is_not_told_to_have_succeeded(broker: RunningBroker, space: str) -> None:
+def test_a_denied_publish_is_not_acknowledged(broker: RunningBroker, space: str) -> None:
     """In the newest protocol that the broker speaks; mosquitto acknowledges whatever 3.1.1 publishes."""
     protocol = paho.MQTTv311 if broker.kind == "amqtt" else paho.MQTTv5
     allowed = f"ts/v1/{space}/arm/conn"
@@ -152,7 +150,7 @@ def test_the_largest_message_of_the_contract_passes(broker: RunningBroker, space
 
 
 @pytest.mark.parametrize("qos", [0, 1])
-def test_a_message_over_the_limit_is_refused_and_harms_nobody(
+def test_an_oversized_message_is_rejected_without_side_effects(
     broker: RunningBroker, space: str, transport: Transport, qos: int
 ) -> None:
     topic = f"ts/v1/{space}/arm/ur5/cam/wrist"
@@ -174,7 +172,7 @@ def test_a_message_over_the_limit_is_refused_and_harms_nobody(
         assert set(heard) <= {b"after", b"small"}
 
 
-def test_small_messages_are_sent_at_once(broker: RunningBroker, space: str, transport: Transport) -> None:
+def test_small_messages_are_sent_without_delay(broker: RunningBroker, space: str, transport: Transport) -> None:
     """TCP_NODELAY on the broker's side: with Nagle's algorithm the second of two messages waits 40 ms.
 
     The listener has just been in conversation, as a client that acknowledges messages is: its kernel then delays its

@@ -21,7 +21,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningBroker]
         yield broker
 
 
-def test_a_revoked_agent_is_seen_to_be_offline(broker: RunningBroker, space: str) -> None:
+def test_a_revoked_agent_appears_offline(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     with (
         broker.client(f"{space}-page", subscribe=(topic,)) as page,
@@ -32,7 +32,7 @@ def test_a_revoked_agent_is_seen_to_be_offline(broker: RunningBroker, space: str
         assert page.receive().payload == b"offline"
 
 
-def test_an_agent_whose_token_runs_out_is_seen_to_be_offline(broker: RunningBroker, space: str) -> None:
+def test_an_agent_with_an_expired_token_appears_offline(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     with broker.client(f"{space}-page", subscribe=(topic,)) as page:
         _, agent = broker.short_lived(space, publish=(topic,), will=Message(topic, b"offline", 1, retain=True))
@@ -64,14 +64,14 @@ def test_one_token_can_be_revoked_alone(broker: RunningBroker, space: str) -> No
         b'{"revoke":{"all":true}}',
     ],
 )
-def test_an_instruction_that_cannot_be_followed_is_not_acknowledged(broker: RunningBroker, order: bytes) -> None:
+def test_an_invalid_control_message_is_not_acknowledged(broker: RunningBroker, order: bytes) -> None:
     with broker.service() as functions:
         sent = functions.publish(revocation.TOPIC, order)
         wait_until(functions.disconnected.is_set, "the end of the connection")
         assert not functions.acknowledged(sent)
 
 
-def test_instructions_reach_no_subscriber_and_are_not_kept(broker: RunningBroker, space: str) -> None:
+def test_control_messages_are_neither_delivered_nor_retained(broker: RunningBroker, space: str) -> None:
     own = f"ts/v1/{space}/nosy/conn"
     with (
         broker.client(f"{space}-nosy", publish=(own,), subscribe=(own, revocation.TOPIC, "$CONTROL/#")) as nosy,
@@ -84,14 +84,14 @@ def test_instructions_reach_no_subscriber_and_are_not_kept(broker: RunningBroker
         assert [m.topic for m in (nosy.receive(), *nosy.heard())] == [own]
 
 
-def test_a_will_cannot_instruct_the_broker(broker: RunningBroker) -> None:
+def test_a_will_cannot_use_the_control_topic(broker: RunningBroker) -> None:
     service = broker.access.service_credentials()
     will = Message(revocation.TOPIC, b'{"revoke":{"client_id":"x"}}', 1, retain=False)
     with broker.connect(service.client_id, Credentials(service.username, service.password), will=will) as functions:
         assert not functions.connected.is_set()
 
 
-def test_mqtt_5_gets_the_old_refusal_at_once_also_with_credentials(broker: RunningBroker, space: str) -> None:
+def test_mqtt_5_is_rejected_immediately_in_the_old_format(broker: RunningBroker, space: str) -> None:
     for credentials in (None, broker.issue(broker.grant(space))):
         with Wire(broker.tcp_port) as raw:
             raw.send(raw_mqtt.connect_packet(space, credentials, level=5))
@@ -100,14 +100,14 @@ def test_mqtt_5_gets_the_old_refusal_at_once_also_with_credentials(broker: Runni
 
 
 @pytest.mark.parametrize("retain", [False, True])
-def test_a_denied_publish_ends_the_connection(broker: RunningBroker, space: str, *, retain: bool) -> None:
+def test_a_denied_publish_closes_the_connection(broker: RunningBroker, space: str, *, retain: bool) -> None:
     for qos in (0, 1):
         with broker.client(space) as client:
             client.publish(f"ts/v1/{space}/arm/conn", b"x", qos=qos, retain=retain)
             wait_until(client.disconnected.is_set, "the end of the connection")
 
 
-def test_qos_2_is_not_offered(broker: RunningBroker, space: str) -> None:
+def test_qos_2_is_rejected(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     with broker.client(space, publish=(topic,), subscribe=(topic,)) as client:
         assert client.subscribe(topic, qos=2) == [1]
@@ -115,7 +115,7 @@ def test_qos_2_is_not_offered(broker: RunningBroker, space: str) -> None:
         wait_until(client.disconnected.is_set, "the end of the connection")
 
 
-def test_a_denied_filter_is_refused_and_its_neighbours_are_not(broker: RunningBroker, space: str) -> None:
+def test_a_denied_filter_does_not_affect_others(broker: RunningBroker, space: str) -> None:
     mine = f"ts/v1/{space}/arm/+"
     refused = ("#", "ts/v1/+/arm/conn", f"{mine}/#", "$SYS/#", "", "ts/v1/#/conn", f"ts/v1/{space}/arm/a+", "x" * 600)
     with Wire(broker.tcp_port) as raw:
@@ -125,7 +125,7 @@ def test_a_denied_filter_is_refused_and_its_neighbours_are_not(broker: RunningBr
         assert raw.read() == (raw_mqtt.SUBACK, 0, b"\0\1" + b"\x80" * 4 + b"\0" + b"\x80" * 4)
 
 
-def test_a_session_is_never_kept(broker: RunningBroker, space: str) -> None:
+def test_sessions_are_always_clean(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     credentials = broker.issue(broker.grant(space, publish=(topic,), subscribe=(topic,)))
     for _ in range(2):
@@ -138,28 +138,26 @@ def test_a_session_is_never_kept(broker: RunningBroker, space: str) -> None:
             assert raw.read() == (raw_mqtt.SUBACK, 0, b"\0\1\1")
 
 
-def test_one_byte_over_the_limit_is_too_much(broker: RunningBroker, space: str) -> None:
+def test_one_byte_above_the_limit_is_rejected(broker: RunningBroker, space: str) -> None:
     with broker.client(space, publish=("t",)) as client:
         client.publish_acknowledged("t", bytes(codec.MAX_BYTES))
         client.publish("t", bytes(codec.MAX_BYTES + 1))
         wait_until(client.disconnected.is_set, "the end of the connection")
 
 
-def test_a_retained_message_over_its_limit_is_refused(broker: RunningBroker, space: str) -> None:
+def test_an_oversized_retained_message_is_rejected(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/ur5/desc/twin"
     with broker.client(space, publish=(topic,)) as client:
         client.publish(topic, bytes(codec.MAX_RETAINED_BYTES + 1), retain=True)
         wait_until(client.disconnected.is_set, "the end of the connection")
 
 
-def test_a_token_that_runs_for_longer_than_revocations_are_remembered_is_refused(
-    broker: RunningBroker, space: str
-) -> None:
+def test_a_token_with_a_too_long_lifetime_is_rejected(broker: RunningBroker, space: str) -> None:
     with broker.connect(space, broker.issue(broker.grant(space, lifetime_s=31 * 86_400))) as client:
         assert not client.connected.is_set()
 
 
-def test_the_log_names_who_was_refused_and_no_secret(broker: RunningBroker, space: str) -> None:
+def test_the_log_names_rejected_clients_but_no_secrets(broker: RunningBroker, space: str) -> None:
     credentials = broker.issue(broker.grant(space))
     with broker.connect(f"{space}-thief", credentials):
         pass
@@ -168,7 +166,7 @@ def test_the_log_names_who_was_refused_and_no_secret(broker: RunningBroker, spac
     assert credentials.password not in broker.stderr()
 
 
-def test_keys_are_read_again_when_their_file_changes(tmp_path: Path) -> None:
+def test_changed_keys_are_reloaded(tmp_path: Path) -> None:
     def write(*keys: object) -> None:
         text = json.dumps({signing.key_id(k.public_key()): signing.public_text(k.public_key()) for k in keys})  # type: ignore[attr-defined]
         new = path.with_suffix(".new")

@@ -49,7 +49,7 @@ NOT_MQTT = {
 
 
 @pytest.mark.parametrize("garbage", GARBAGE.values(), ids=GARBAGE.keys())
-def test_garbage_before_a_connect_harms_nobody(
+def test_garbage_before_connect_does_not_affect_others(
     broker: RunningBroker, space: str, transport: Transport, garbage: bytes
 ) -> None:
     """Raw, on both listeners: the one for WebSocket gets what is not even HTTP."""
@@ -64,7 +64,7 @@ def test_garbage_before_a_connect_harms_nobody(
 
 
 @pytest.mark.parametrize("garbage", GARBAGE.values(), ids=GARBAGE.keys())
-def test_garbage_in_websocket_frames_harms_nobody(broker: RunningBroker, space: str, garbage: bytes) -> None:
+def test_garbage_in_websocket_frames_does_not_affect_others(broker: RunningBroker, space: str, garbage: bytes) -> None:
     with broker.client(space) as client:
         with Wire(broker.websocket_port, "websockets") as raw:
             raw.send(garbage)
@@ -74,7 +74,7 @@ def test_garbage_in_websocket_frames_harms_nobody(broker: RunningBroker, space: 
 
 
 @pytest.mark.parametrize("sent", NOT_MQTT.values(), ids=NOT_MQTT.keys())
-def test_what_is_not_mqtt_ends_the_connection_that_sent_it(
+def test_invalid_packets_close_their_connection_only(
     broker: RunningBroker, space: str, transport: Transport, sent: bytes
 ) -> None:
     credentials = broker.issue(broker.grant(space, publish=("ts/v1/#",), subscribe=("ts/v1/#",)))
@@ -88,14 +88,14 @@ def test_what_is_not_mqtt_ends_the_connection_that_sent_it(
         assert other.subscribe("x") != []
 
 
-def test_a_connect_in_single_bytes_is_understood(broker: RunningBroker, space: str, transport: Transport) -> None:
+def test_a_connect_in_single_bytes_is_accepted(broker: RunningBroker, space: str, transport: Transport) -> None:
     with Wire(broker.port(transport), transport) as raw:
         for byte in raw_mqtt.connect_packet(space, broker.issue(broker.grant(space))):
             raw.send(bytes([byte]))
         assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
 
 
-def test_packets_that_come_together_are_all_answered(broker: RunningBroker, space: str, transport: Transport) -> None:
+def test_packets_in_one_segment_are_all_answered(broker: RunningBroker, space: str, transport: Transport) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     credentials = broker.issue(broker.grant(space, publish=(topic,), subscribe=(topic,)))
     with Wire(broker.port(transport), transport) as raw:
@@ -113,7 +113,7 @@ def test_packets_that_come_together_are_all_answered(broker: RunningBroker, spac
         assert answers[-1] == (raw_mqtt.PINGRESP, 0, b"")
 
 
-def test_a_subscriber_that_never_reads_holds_nobody_up(broker: RunningBroker, space: str, transport: Transport) -> None:
+def test_a_blocked_subscriber_does_not_delay_others(broker: RunningBroker, space: str, transport: Transport) -> None:
     topic = f"ts/v1/{space}/arm/ur5/cam/wrist"
     credentials = broker.issue(broker.grant(f"{space}-stuck", subscribe=(topic,)))
     with (

@@ -66,7 +66,7 @@ def test_each_belongs_to_its_agents_thing_and_ends_with_the_pairing(endpoint: st
     asyncio.run(live())
 
 
-def test_without_the_policy_it_says_so(endpoint: str) -> None:
+def test_a_missing_policy_is_reported(endpoint: str) -> None:
     async def live() -> None:
         authority = IotCertificates(region=REGION, policy="missing", endpoint=endpoint)
         await authority.place("agentccccc", "space")

@@ -34,7 +34,7 @@ def arguments_for(kind: BrokerKind, home: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_it_ends_cleanly_when_told_to(kind: BrokerKind, tmp_path: Path, number: signal.Signals) -> None:
+def test_signals_stop_it_cleanly(kind: BrokerKind, tmp_path: Path, number: signal.Signals) -> None:
     with start_broker(kind, tmp_path) as broker:
         with broker.client("tcp") as tcp, broker.client("websocket", transport="websockets") as websocket:
             broker.process.send_signal(number)
@@ -47,7 +47,7 @@ def test_it_ends_cleanly_when_told_to(kind: BrokerKind, tmp_path: Path, number: 
 
 
 @pytest.mark.parametrize("taken", ["tcp", "websocket"])
-def test_a_taken_port_is_one_clear_line(kind: BrokerKind, tmp_path: Path, taken: str) -> None:
+def test_a_port_in_use_is_reported_in_one_line(kind: BrokerKind, tmp_path: Path, taken: str) -> None:
     with socket.create_server((HOST, 0)) as other:
         port = str(other.getsockname()[1])
         ports = {"tcp": "0", "websocket": "0", taken: port}
@@ -76,7 +76,7 @@ def test_it_listens_on_loopback_only_by_default(kind: BrokerKind, tmp_path: Path
         assert f":{port:04X} 0000" not in everywhere
 
 
-def test_a_second_start_finds_what_the_first_has_left(kind: BrokerKind, tmp_path: Path) -> None:
+def test_credentials_survive_a_restart(kind: BrokerKind, tmp_path: Path) -> None:
     with start_broker(kind, tmp_path) as broker:
         credentials = broker.issue(broker.grant("agent"))
         assert broker.stop() == 0
@@ -84,7 +84,7 @@ def test_a_second_start_finds_what_the_first_has_left(kind: BrokerKind, tmp_path
         assert agent.connected.is_set()
 
 
-def test_after_a_crash_it_starts_again_on_the_same_ports(kind: BrokerKind, tmp_path: Path) -> None:
+def test_it_restarts_on_the_same_ports_after_a_crash(kind: BrokerKind, tmp_path: Path) -> None:
     with start_broker(kind, tmp_path) as broker, broker.client("agent"):
         ports = (broker.tcp_port, broker.websocket_port)
         broker.kill()
@@ -103,7 +103,7 @@ def test_after_a_crash_it_starts_again_on_the_same_ports(kind: BrokerKind, tmp_p
         ('{"a": "11qYAYKxCrfVS_7TyWQHOg7hcvPapiMlrwIaaPcHURo"}', "the id of key 'a' is"),
     ],
 )
-def test_keys_that_cannot_be_used_are_one_clear_line(tmp_path: Path, text: str | None, said: str) -> None:
+def test_invalid_keys_are_reported_in_one_line(tmp_path: Path, text: str | None, said: str) -> None:
     keys = tmp_path / "keys.json"
     if text is not None:
         keys.write_text(text)
@@ -114,7 +114,7 @@ def test_keys_that_cannot_be_used_are_one_clear_line(tmp_path: Path, text: str |
     assert str(keys) in ended.stderr
 
 
-def test_a_folder_that_cannot_be_used_is_one_clear_line(tmp_path: Path) -> None:
+def test_an_unusable_folder_is_reported_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     ended = run("infra.mosquitto", "--home", str(tmp_path / "file"), "--tcp-port", "0", "--websocket-port", "0")
     assert (ended.returncode, ended.stdout) == (2, "")
@@ -123,14 +123,14 @@ def test_a_folder_that_cannot_be_used_is_one_clear_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("host", ["::1", "no.such.host.invalid"])
-def test_mosquitto_on_anything_but_ipv4_is_one_clear_line(tmp_path: Path, host: str) -> None:
+def test_mosquitto_requires_an_ipv4_address(tmp_path: Path, host: str) -> None:
     ports = ("--tcp-port", "0", "--websocket-port", "0")
     ended = run("infra.mosquitto", "--home", str(tmp_path), "--host", host, *ports)
     assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
     assert host in ended.stderr
 
 
-def test_mosquittos_secrets_are_for_its_user_alone(tmp_path: Path) -> None:
+def test_mosquittos_secrets_are_readable_by_its_owner_only(tmp_path: Path) -> None:
     with start_broker("mosquitto", tmp_path) as broker:
         password = (tmp_path / "service.password").read_text().strip()
         assert stat.S_IMODE((tmp_path / "service.password").stat().st_mode) == 0o600
@@ -142,7 +142,7 @@ def test_mosquittos_secrets_are_for_its_user_alone(tmp_path: Path) -> None:
             assert password not in (tmp_path / name).read_text()
 
 
-def test_a_security_file_without_its_password_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_missing_password_file_is_reported_in_one_line(tmp_path: Path) -> None:
     with start_broker("mosquitto", tmp_path):
         pass
     (tmp_path / "service.password").unlink()
@@ -161,12 +161,12 @@ def test_killing_the_program_leaves_no_mosquitto_behind(tmp_path: Path) -> None:
         wait_until(lambda: not _runs(children[0]), "the end of mosquitto")
 
 
-def test_mosquitto_that_ends_by_itself_is_told(tmp_path: Path) -> None:
+def test_an_exit_of_mosquitto_is_reported(tmp_path: Path) -> None:
     with start_broker("mosquitto", tmp_path) as broker:
         child = Path(f"/proc/{broker.process.pid}/task/{broker.process.pid}/children").read_text().split()[0]
         os.kill(int(child), signal.SIGKILL)
         assert broker.process.wait(PATIENCE_S) == 1
-        assert "ended by itself" in broker.stderr()
+        assert "exited with code" in broker.stderr()
 
 
 def _runs(pid: str) -> bool:

@@ -25,20 +25,20 @@ def heard_before_mark(ear: Client, marker: Client, space: str) -> list[Message]:
     return found
 
 
-def test_nobody_enters_without_credentials(broker: RunningBroker, space: str, transport: Transport) -> None:
+def test_connecting_without_credentials_fails(broker: RunningBroker, space: str, transport: Transport) -> None:
     with broker.connect(space, None, transport=transport) as stranger:
         assert stranger.answer_code not in (None, 0)
         assert not stranger.connected.is_set()
 
 
-def test_nobody_enters_with_a_wrong_password(broker: RunningBroker, space: str) -> None:
+def test_connecting_with_a_wrong_password_fails(broker: RunningBroker, space: str) -> None:
     right = broker.issue(broker.grant(space))
     for password in ("", "wrong", right.password[:-4], right.password[1:]):
         with broker.connect(space, Credentials(right.username, password)) as stranger:
             assert not stranger.connected.is_set()
 
 
-def test_nobody_enters_under_another_user_name(broker: RunningBroker, space: str) -> None:
+def test_connecting_with_another_user_name_fails(broker: RunningBroker, space: str) -> None:
     right = broker.issue(broker.grant(space))
     with broker.connect(space, Credentials(f"{right.username}x", right.password)) as stranger:
         assert not stranger.connected.is_set()
@@ -50,7 +50,7 @@ def test_credentials_are_bound_to_their_client_id(broker: RunningBroker, space: 
         assert not thief.connected.is_set()
 
 
-def test_a_client_without_rights_hears_nothing(broker: RunningBroker, space: str) -> None:
+def test_a_client_without_rights_receives_nothing(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     with broker.client(f"{space}-arm", publish=(topic,)) as arm, broker.client(f"{space}-deaf") as deaf:
         arm.publish_acknowledged(topic, b"retained", retain=True)
@@ -62,7 +62,7 @@ def test_a_client_without_rights_hears_nothing(broker: RunningBroker, space: str
             assert deaf.heard() == []
 
 
-def test_a_client_without_rights_says_nothing(broker: RunningBroker, space: str) -> None:
+def test_a_client_without_rights_cannot_publish(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     ear, marker = echo(broker, space, topic)
     with ear, marker:
@@ -80,7 +80,7 @@ def test_a_client_without_rights_says_nothing(broker: RunningBroker, space: str)
 @pytest.mark.parametrize(
     "wider", ["#", "ts/#", "ts/v1/#", "ts/v1/{space}/#", "ts/v1/{space}/+/arm/state", "+/+/+/+/+/+"]
 )
-def test_a_wildcard_wider_than_the_grant_hears_nothing_of_others(broker: RunningBroker, space: str, wider: str) -> None:
+def test_a_wildcard_beyond_the_grant_receives_nothing_else(broker: RunningBroker, space: str, wider: str) -> None:
     mine, other = f"ts/v1/{space}/mine/arm/state", f"ts/v1/{space}/other/arm/state"
     with (
         broker.client(f"{space}-agents", publish=(mine, other)) as agents,
@@ -126,7 +126,7 @@ def test_an_agent_cannot_publish_for_another(broker: RunningBroker, space: str) 
         assert heard_before_mark(ear, marker, space) == []
 
 
-def test_an_agent_cannot_hear_what_is_said_to_another(broker: RunningBroker, space: str) -> None:
+def test_an_agent_cannot_receive_commands_of_another(broker: RunningBroker, space: str) -> None:
     order = f"ts/v1/{space}/victim/arm/cmd"
     ear, marker = echo(broker, space, order)
     with ear, marker, broker.connect("evil", agent_of(broker, space, "evil")) as evil, broker.service() as functions:
@@ -137,7 +137,7 @@ def test_an_agent_cannot_hear_what_is_said_to_another(broker: RunningBroker, spa
         assert evil.heard() == []
 
 
-def test_an_agent_cannot_hear_what_another_has_retained(broker: RunningBroker, space: str) -> None:
+def test_an_agent_cannot_receive_retained_messages_of_another(broker: RunningBroker, space: str) -> None:
     state = f"ts/v1/{space}/victim/arm/state"
     own = f"ts/v1/{space}/evil/arm/cmd"
     with (
@@ -151,7 +151,7 @@ def test_an_agent_cannot_hear_what_another_has_retained(broker: RunningBroker, s
         assert [m.topic for m in (evil.receive(), *evil.heard())] == [own]
 
 
-def test_an_agent_hears_what_its_own_space_measures_and_nothing_else_of_it(broker: RunningBroker, space: str) -> None:
+def test_an_agent_only_receives_telemetry_of_its_space(broker: RunningBroker, space: str) -> None:
     measured = f"ts/v1/{space}/sensors/pir/tele/presence"
     kinds = ("late/presence", "cam/room", "event", "ack", "cmd", "ctl/1", "stop", "desc", "state")
     others = [f"ts/v1/{space}/sensors/pir/{kind}" for kind in kinds]
@@ -167,7 +167,7 @@ def test_an_agent_hears_what_its_own_space_measures_and_nothing_else_of_it(broke
         assert [m.topic for m in (robot.receive(), *robot.heard())] == [measured]
 
 
-def test_a_will_on_a_topic_outside_the_grant_is_never_said(broker: RunningBroker, space: str) -> None:
+def test_a_will_outside_the_grant_is_not_published(broker: RunningBroker, space: str) -> None:
     conn = f"ts/v1/{space}/victim/conn"
     ear, marker = echo(broker, space, conn)
     with ear, marker:
@@ -183,7 +183,7 @@ def test_a_will_on_a_topic_outside_the_grant_is_never_said(broker: RunningBroker
             late.receive(SILENCE_S)
 
 
-def test_a_former_holder_of_the_lease_is_fenced_by_the_epoch_in_the_topic(broker: RunningBroker, space: str) -> None:
+def test_the_epoch_in_the_topic_fences_a_former_holder(broker: RunningBroker, space: str) -> None:
     device = f"ts/v1/{space}/arm/ur5"
     ear, marker = echo(broker, space, f"{device}/ctl/+")
     with ear, marker:
@@ -199,7 +199,7 @@ def test_a_former_holder_of_the_lease_is_fenced_by_the_epoch_in_the_topic(broker
 @pytest.mark.parametrize(
     "pattern", ["$SYS/#", "$CONTROL/#", "$share/group/ts/v1/#", "$share/group/ts/v1/{space}/arm/conn"]
 )
-def test_what_starts_with_a_dollar_is_invisible(broker: RunningBroker, space: str, pattern: str) -> None:
+def test_dollar_topics_are_invisible(broker: RunningBroker, space: str, pattern: str) -> None:
     topic, own = f"ts/v1/{space}/arm/conn", f"ts/v1/{space}/nosy/conn"
     with (
         broker.client(f"{space}-arm", publish=(topic, own)) as arm,
@@ -214,7 +214,7 @@ def test_what_starts_with_a_dollar_is_invisible(broker: RunningBroker, space: st
 
 
 @pytest.mark.parametrize("topic", ["$CONTROL/telescope/v1", "$CONTROL/dynamic-security/v1", "$SYS/broker/uptime"])
-def test_nobody_but_the_functions_instructs_the_broker(broker: RunningBroker, space: str, topic: str) -> None:
+def test_only_the_functions_may_use_the_control_topic(broker: RunningBroker, space: str, topic: str) -> None:
     with broker.client(f"{space}-victim") as victim, broker.client(f"{space}-evil", publish=("#", "+/+/+")) as evil:
         for order in (
             b'{"revoke":{"client_id":"%s-victim"}}' % space.encode(),
@@ -239,7 +239,7 @@ def test_a_topic_with_wildcards_cannot_be_published(broker: RunningBroker, space
         assert heard_before_mark(ear, marker, space) == []
 
 
-def test_the_functions_hear_every_agent_and_command_every_device(broker: RunningBroker, space: str) -> None:
+def test_the_functions_receive_from_agents_and_command_devices(broker: RunningBroker, space: str) -> None:
     own = f"ts/v1/{space}/arm"
     said = [
         f"{own}/conn",
@@ -263,7 +263,7 @@ def test_the_functions_hear_every_agent_and_command_every_device(broker: Running
         assert [arm.receive().payload, arm.receive().payload] == [b"move", b"stop"]
 
 
-def test_the_functions_pass_on_what_an_agent_told_them_over_http(broker: RunningBroker, space: str) -> None:
+def test_the_functions_may_forward_messages_of_http_agents(broker: RunningBroker, space: str) -> None:
     own = f"ts/v1/{space}/arm"
     kept = [f"{own}/conn", *(f"{own}/ur5/{kind}" for kind in ("desc", "desc/twin", "state"))]
     passed = [f"{own}/ur5/{kind}" for kind in ("event", "ack", "tele/joints")]
@@ -283,7 +283,7 @@ def test_the_functions_pass_on_what_an_agent_told_them_over_http(broker: Running
         assert found == dict.fromkeys(kept, True)
 
 
-def test_the_functions_cannot_steer_or_show_pictures(broker: RunningBroker, space: str) -> None:
+def test_the_functions_cannot_publish_setpoints_or_frames(broker: RunningBroker, space: str) -> None:
     own = f"ts/v1/{space}/arm"
     ear, marker = echo(broker, space, f"{own}/ur5/ctl/+", f"{own}/ur5/cam/+")
     with ear, marker:

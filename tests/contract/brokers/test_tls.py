@@ -20,7 +20,7 @@ from tests.harness.network.brokers import HOST, BrokerKind, Client, RunningBroke
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "tls"
-    server_ca.make(folder, server_ca.names((), ()), now=dt.datetime.now(dt.UTC))
+    server_ca.create(folder, server_ca.names((), ()), now=dt.datetime.now(dt.UTC))
     return folder
 
 
@@ -50,7 +50,7 @@ def connect(broker: RunningBroker, transport: Transport, tls: ssl.SSLContext | N
     return client.open()
 
 
-def test_who_trusts_the_authority_connects(
+def test_a_client_that_trusts_the_ca_connects(
     broker: RunningBroker, transport: Transport, trusting: ssl.SSLContext
 ) -> None:
     assert connect(broker, transport, trusting).connected.is_set()
@@ -60,8 +60,10 @@ def port_of(broker: RunningBroker, transport: Transport) -> int:
     return broker.tcp_port if transport == "tcp" else broker.websocket_port
 
 
-def test_who_trusts_another_does_not_connect(broker: RunningBroker, transport: Transport, tmp_path: Path) -> None:
-    server_ca.make(tmp_path, server_ca.names((), ()), now=dt.datetime.now(dt.UTC))
+def test_a_client_that_trusts_another_ca_does_not_connect(
+    broker: RunningBroker, transport: Transport, tmp_path: Path
+) -> None:
+    server_ca.create(tmp_path, server_ca.names((), ()), now=dt.datetime.now(dt.UTC))
     for context in (client_context(tmp_path / "ca.crt"), client_context(None)):
         with (
             socket.create_connection((HOST, port_of(broker, transport))) as plain,
@@ -70,9 +72,7 @@ def test_who_trusts_another_does_not_connect(broker: RunningBroker, transport: T
             context.wrap_socket(plain, server_hostname=HOST)
 
 
-def test_a_name_that_is_not_the_sites_is_refused(
-    broker: RunningBroker, transport: Transport, trusting: ssl.SSLContext
-) -> None:
+def test_another_host_name_is_rejected(broker: RunningBroker, transport: Transport, trusting: ssl.SSLContext) -> None:
     with (
         socket.create_connection((HOST, port_of(broker, transport))) as plain,
         pytest.raises(ssl.SSLCertVerificationError, match=r"other\.example"),
@@ -80,7 +80,7 @@ def test_a_name_that_is_not_the_sites_is_refused(
         trusting.wrap_socket(plain, server_hostname="other.example")
 
 
-def test_nobody_is_answered_in_the_clear(broker: RunningBroker, transport: Transport) -> None:
+def test_plaintext_connections_get_no_response(broker: RunningBroker, transport: Transport) -> None:
     mqtt = b"\x10\x0d\x00\x04MQTT\x04\x02\x00\x3c\x00\x01a"
     upgrade = b"GET /mqtt HTTP/1.1\r\nHost: a\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\r\n"
     with socket.create_connection((HOST, port_of(broker, transport)), timeout=10) as plain:
@@ -92,7 +92,7 @@ def test_nobody_is_answered_in_the_clear(broker: RunningBroker, transport: Trans
     assert answer[:1] in {b"", b"\x15"}, "nothing, or an alert of TLS"
 
 
-def test_old_tls_is_not_spoken(broker: RunningBroker, site: Path) -> None:
+def test_old_tls_versions_are_rejected(broker: RunningBroker, site: Path) -> None:
     old = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     old.load_verify_locations(site / "ca.crt")
     with warnings.catch_warnings():
@@ -103,9 +103,7 @@ def test_old_tls_is_not_spoken(broker: RunningBroker, site: Path) -> None:
         old.wrap_socket(plain, server_hostname=HOST)
 
 
-def test_nothing_is_left_lying_in_what_was_decrypted(
-    broker: RunningBroker, trusting: ssl.SSLContext, space: str
-) -> None:
+def test_decrypted_data_is_processed_completely(broker: RunningBroker, trusting: ssl.SSLContext, space: str) -> None:
     """Several messages come in one record of TLS: the socket tells of the first alone."""
     heard: list[object] = []
     link = MqttConnection(

@@ -48,7 +48,7 @@ class DriverContract:
             for value, joint in zip(position, limits, strict=True)
         )
 
-    def test_it_says_before_connect_whether_metal_moves(self, driver: Driver) -> None:
+    def test_simulated_is_known_before_connect(self, driver: Driver) -> None:
         assert isinstance(driver.simulated, bool)
 
     def test_nothing_works_before_connect(self, driver: Driver, robot_type: RobotType) -> None:
@@ -81,12 +81,12 @@ class DriverContract:
         # What stands on wheels or feet comes down on them by a millimetre, and its head nods by as little.
         assert connected.observe().position_rad == pytest.approx(before, abs=5e-3)
 
-    def test_it_goes_where_it_is_sent(self, connected: Driver, robot_type: RobotType) -> None:
+    def test_send_moves_the_joints(self, connected: Driver, robot_type: RobotType) -> None:
         target = self.nudged(robot_type, connected.observe().position_rad)
         assert connected.send(target) == pytest.approx(target)
         until(lambda: self.near(connected.observe(), target))
 
-    def test_send_clamps_to_the_range_and_says_so(self, connected: Driver, robot_type: RobotType) -> None:
+    def test_send_clamps_and_returns_the_applied_values(self, connected: Driver, robot_type: RobotType) -> None:
         now = list(connected.observe().position_rad)
         now[0] = robot_type.joints[0].upper_rad + 100
         applied = connected.send(now)
@@ -95,20 +95,18 @@ class DriverContract:
         connected.send(connected.observe().position_rad)
 
     @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-    def test_a_number_that_is_not_finite_is_refused(self, connected: Driver, bad: float) -> None:
+    def test_values_that_are_not_finite_are_rejected(self, connected: Driver, bad: float) -> None:
         before = connected.observe().position_rad
         with pytest.raises(DriverError, match="finite"):
             connected.send([bad, *before[1:]])
         time.sleep(0.05)
         assert connected.observe().position_rad == pytest.approx(before, abs=1e-2)
 
-    def test_a_wrong_number_of_positions_is_refused(self, connected: Driver) -> None:
+    def test_a_wrong_number_of_positions_is_rejected(self, connected: Driver) -> None:
         with pytest.raises(DriverError, match="positions"):
             connected.send([*connected.observe().position_rad, 0.0])
 
-    def test_it_may_be_connected_again_and_stands_where_it_was_left(
-        self, connected: Driver, robot_type: RobotType
-    ) -> None:
+    def test_reconnecting_keeps_the_position(self, connected: Driver, robot_type: RobotType) -> None:
         target = self.nudged(robot_type, connected.observe().position_rad)
         connected.send(target)
         until(lambda: self.near(connected.observe(), target))

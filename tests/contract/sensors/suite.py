@@ -34,7 +34,7 @@ class RoomDriverContract:
         driver.connect()
         return driver
 
-    def test_it_is_a_room_driver_and_says_before_connect_whether_it_is_simulated(self, driver: RoomDriver) -> None:
+    def test_simulated_is_known_before_connect(self, driver: RoomDriver) -> None:
         assert isinstance(driver, RoomDriver)
         assert isinstance(driver.simulated, bool)
 
@@ -43,7 +43,7 @@ class RoomDriverContract:
             with pytest.raises(SensorError):
                 call()
 
-    def test_each_stream_gives_finite_values_with_names_that_may_travel(
+    def test_streams_return_finite_values_with_valid_names(
         self, connected: RoomDriver, entry: RoomDeviceManifest
     ) -> None:
         for stream in entry.streams:
@@ -54,9 +54,7 @@ class RoomDriverContract:
             if values:
                 codec.encode(Measurements(tick_ms=1, at_ms=1, sequence=1, values=dict(values)))
 
-    def test_each_capture_is_a_file_of_the_type_that_it_says(
-        self, connected: RoomDriver, entry: RoomDeviceManifest
-    ) -> None:
+    def test_captures_have_their_media_type(self, connected: RoomDriver, entry: RoomDeviceManifest) -> None:
         for name in entry.captures:
             taken = connected.capture(name)
             assert taken.content
@@ -66,7 +64,7 @@ class RoomDriverContract:
                 case "application/json":
                     json.loads(taken.content)
 
-    def test_each_camera_gives_a_jpeg_of_the_size_that_it_says_and_small_enough_to_travel(
+    def test_cameras_return_small_jpegs_of_the_stated_size(
         self, connected: RoomDriver, entry: RoomDeviceManifest
     ) -> None:
         if entry.cameras:
@@ -77,9 +75,7 @@ class RoomDriverContract:
                 assert simplejpeg.decode_jpeg(frame.content).shape == (frame.height, frame.width, 3)
                 camera_frames.encode(CameraFrame(1, 1, frame.width, frame.height, frame.content))
 
-    def test_each_control_applies_what_it_says_within_its_limits(
-        self, connected: RoomDriver, entry: RoomDeviceManifest
-    ) -> None:
+    def test_controls_apply_the_returned_value(self, connected: RoomDriver, entry: RoomDeviceManifest) -> None:
         for control in entry.controls:
             middle = (control.lower + control.upper) / 2
             for value in (control.lower, control.upper, middle):
@@ -87,7 +83,7 @@ class RoomDriverContract:
         if isinstance(connected, Movable):
             connected.hold()
 
-    def test_raw_gives_arrays_that_fit_each_other(self, connected: RoomDriver) -> None:
+    def test_raw_arrays_are_consistent(self, connected: RoomDriver) -> None:
         raw = connected.raw()
         if raw is None:
             return
@@ -107,7 +103,7 @@ class RoomDriverContract:
             if raw.depth_m is not None:
                 assert (raw.depth_m > 0).all()
 
-    def test_what_it_has_not_is_refused_by_name_with_a_list_of_what_there_is(
+    def test_unknown_names_are_rejected_with_the_valid_ones(
         self, connected: RoomDriver, entry: RoomDeviceManifest
     ) -> None:
         asked: list[tuple[Callable[[], object], list[str]]] = [
@@ -120,7 +116,7 @@ class RoomDriverContract:
                 call()
             assert all(name in str(refused.value) for name in there)
 
-    def test_it_may_be_connected_and_closed_twice(self, connected: RoomDriver, entry: RoomDeviceManifest) -> None:
+    def test_connect_and_close_are_idempotent(self, connected: RoomDriver, entry: RoomDeviceManifest) -> None:
         connected.connect()
         connected.close()
         connected.close()

@@ -334,7 +334,7 @@ class TestCertificates:
     def test_an_agent_that_is_claimed_gets_one_and_loses_it_with_its_pairing(
         self, alone: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        devices.make(tmp_path / "tls", now=dt.datetime.now(dt.UTC))
+        devices.create(tmp_path / "tls", now=dt.datetime.now(dt.UTC))
         authority = FileCertificates(tmp_path / "tls")
         monkeypatch.setattr(alone.functions.agent_certificates, "_certificates", authority)
         anna, robot = alone.sign_in("anna"), alone.robot()

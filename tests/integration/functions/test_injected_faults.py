@@ -9,7 +9,7 @@ import pytest
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import MujocoDriver
 from device_agent.drivers.mujoco.fault_injection import FaultInjector
-from device_agent.drivers.mujoco.motor_model import Health
+from device_agent.drivers.mujoco.motor_model import MotorModel
 from device_agent.protocol import AckStatus, Measurements, Mode, MoveJoints, State, codec, topics
 from device_agent.protocol.manifests import robot_type
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
@@ -30,7 +30,7 @@ class Ageing:
 
     def __init__(self, cloud: Cloud, robot: Robot, faults: Path) -> None:
         self.cloud = cloud
-        self.health = Health(UR5.joints, None, seed="arm")
+        self.health = MotorModel(UR5.joints, None, seed="arm")
         self.bed = FaultInjector(faults, NAMES)
         self.topic = topics.device(robot.space, robot.id, robot.names[0], topics.TELE, "health")
         self.now_ms = cloud.clock.now_ms()
@@ -38,9 +38,9 @@ class Ageing:
 
     def messages(self, windows: int) -> Iterable[tuple[str, bytes]]:
         for _ in range(windows):
-            news = self.bed.news()
+            news = self.bed.poll()
             if news is not None:
-                self.health.suffer(news)
+                self.health.inject(news)
             for second in range(10):
                 self.health.observe(self.windows * 10.0 + second, WORK, np.zeros(6))
             self.cloud.clock.advance(10)
@@ -95,12 +95,12 @@ def test_a_joint_that_is_stuck_raises_a_fault_in_the_state_and_in_the_cloud(
     anna, robot = pair
     eventually(lambda: arm.heard(topics.TELE, Measurements, "health"))
     (tmp_path / "arm.toml").write_text('stuck = ["elbow"]')
-    eventually(lambda: arm.driver._sickbed.seen != (0, 0))  # type: ignore[attr-defined]
+    eventually(lambda: arm.driver._fault_injector.seen != (0, 0))  # type: ignore[attr-defined]
     elbow_rad = UR5.home_rad["elbow"]
     ack = arm.end(arm.command(MoveJoints(position_rad={"elbow": elbow_rad - 0.5}, speed=0.05), epoch=1))
     assert ack.status is AckStatus.FAILED
     assert ack.reason is not None
-    assert ack.reason.message.startswith("elbow does not move though the motor gives all it can")
+    assert ack.reason.message.startswith("elbow does not move at full motor effort")
     state: State = eventually(lambda: [state for state in arm.heard(topics.STATE, State) if state.faults])[0]
     assert state.mode is Mode.FAULT
     cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), codec.encode(state)))
@@ -109,6 +109,6 @@ def test_a_joint_that_is_stuck_raises_a_fault_in_the_state_and_in_the_cloud(
     # It holds where it is, and may be moved again: the fault is not for ever.
     eventually(lambda: arm.heard(topics.STATE, State)[-1].mode is not Mode.FAULT)
     (tmp_path / "arm.toml").unlink()
-    eventually(lambda: arm.driver._sickbed.seen == (0, 0))  # type: ignore[attr-defined]
+    eventually(lambda: arm.driver._fault_injector.seen == (0, 0))  # type: ignore[attr-defined]
     ack = arm.end(arm.command(MoveJoints(position_rad={"elbow": elbow_rad - 0.2}, speed=0.5), epoch=2))
     assert ack.status is AckStatus.DONE

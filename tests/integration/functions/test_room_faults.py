@@ -12,7 +12,7 @@ from device_agent.protocol.manifests.room import RoomDeviceManifest, Watch
 from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.sensors.mujoco import scalar_sensors
 from device_agent.simulation.room.climate import Climate
-from device_agent.simulation.room.pedestrian import Walker
+from device_agent.simulation.room.pedestrian import Pedestrian
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from tests.fakes.agent import Robot
 from tests.harness.agent.device_harness import DeviceHarness, eventually
@@ -32,8 +32,8 @@ class Air:
         self.cloud, self.now_s = cloud, 0.0
         manifest = msgspec.structs.replace(room.load(LAB), robots=())
         self.world = StillWorld(manifest=manifest)
-        self.people: list[Walker] = []
-        self.world.add(Climate(manifest, self.world.world, self.people, hurry=HURRY))
+        self.people: list[Pedestrian] = []
+        self.world.add(Climate(manifest, self.world.world, self.people, speedup=HURRY))
         monkeypatch.setattr(scalar_sensors, "time", self)
         self.meter = self.world.driver("co2")
         self.meter.connect()
@@ -82,7 +82,7 @@ def test_people_behind_a_closed_door_raise_a_fault_of_the_air_and_the_open_door_
         air = Air(cloud, anna, robot, monkeypatch)
         air.live(30)
         assert open_faults(anna, robot) == [], "nobody is there"
-        air.people += [Walker(air.world.manifest.people[0]) for _ in range(12)]
+        air.people += [Pedestrian(air.world.manifest.people[0]) for _ in range(12)]
         air.live(16)
         (warned,) = open_faults(anna, robot)
         assert (warned["code"], warned["severity"]) == ("co2.co2_ppm", "warning")

@@ -250,7 +250,7 @@ def _packet(data: bytes) -> None:
     """What a broker hears: first of all, and from somebody whom it has accepted."""
     limits = Limits()
     accepted = Framer(limits)
-    accepted.open_up()
+    accepted.accept_all()
     for framer in (Framer(limits), accepted):
         try:
             frames = list(framer.feed(data))

@@ -1,4 +1,4 @@
-"""The bounds of one client, with a link that records instead of a socket; tests/contract/brokers has real ones."""
+"""Limits of one client, with a recording transport; tests/contract/brokers uses real sockets."""
 
 import asyncio
 import json
@@ -15,37 +15,33 @@ from function_app.ports.broker_access import Credentials
 from infra.embedded_broker.broker import TCP, WEBSOCKET, TelescopeBroker
 from infra.embedded_broker.connection import Connection
 from infra.embedded_broker.limits import Limits
-from infra.embedded_broker.listeners import TcpLink, WebSocketLink
+from infra.embedded_broker.listeners import TcpTransport, WebSocketTransport
 from infra.embedded_broker.public_keys import KeyRing
 from infra.embedded_broker.revocations import Revocations
 from tests.harness.network import raw_mqtt
 from tests.harness.network.raw_mqtt import Wire
 
 TOPIC = "ts/v1/s/a/conn"
-Attached = tuple["Link", Connection]
 
 
-class Link:
-    """Where the broker writes to."""
-
+class RecordingTransport:
     def __init__(self) -> None:
         self.written: list[bytes] = []
         self.congested = False
         self.unsent = 0
-        self.gone = False
+        self.closed = False
 
     def write(self, data: bytes) -> None:
         self.written.append(data)
 
     def close(self) -> None:
-        self.gone = True
+        self.closed = True
 
-    def abort(self) -> None:
-        self.gone = True
+    abort = close
 
 
-class Bench:
-    """A broker that does not listen, and clients of it."""
+class Harness:
+    """A broker without listeners, and its clients."""
 
     def __init__(self, folder: Path, limits: Limits) -> None:
         self._key = signing.generate()
@@ -57,7 +53,7 @@ class Bench:
             sockets={}, keys=keys, revocations=Revocations(folder / "revoked", keep_s=1), limits=limits
         )
 
-    def credentials(self, client_id: str) -> Credentials:
+    def client(self, client_id: str, *subscriptions: str, qos: int = 1) -> tuple[RecordingTransport, Connection]:
         grant = Grant(
             principal="p",
             client_id=client_id,
@@ -66,194 +62,185 @@ class Bench:
             token_id=client_id,
             expires_at=int(time.time()) + 60,
         )
-        return Credentials("p", grants.issue(grant, self._key))
-
-    def client(self, client_id: str, *subscriptions: str, qos: int = 1) -> Attached:
-        link = Link()
-        connection = self.broker._connected(link)
-        connection.received(raw_mqtt.connect_packet(client_id, self.credentials(client_id)))
+        transport = RecordingTransport()
+        connection = self.broker._connected(transport)
+        credentials = Credentials("p", grants.issue(grant, self._key))
+        connection.received(raw_mqtt.connect_packet(client_id, credentials))
         if subscriptions:
             connection.received(raw_mqtt.subscribe_packet(*subscriptions, qos=qos))
-        link.written.clear()
-        return link, connection
+        transport.written.clear()
+        return transport, connection
+
+    def publish(self, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
+        self.broker.publish(TOPIC, payload, qos=qos, retain=retain, owner="x")
 
 
-def with_bench(folder: Path, use: Callable[[Bench], None], **limits: int) -> None:
-    async def run() -> None:
-        use(Bench(folder, Limits(**limits)))
+@pytest.fixture
+def with_harness(tmp_path: Path) -> Callable[..., None]:
+    def run(use: Callable[[Harness], None], **limits: int) -> None:
+        async def in_loop() -> None:
+            use(Harness(tmp_path, Limits(**limits)))
 
-    asyncio.run(run())
+        asyncio.run(in_loop())
 
-
-def test_more_connections_than_there_may_be_are_closed_and_the_others_live(tmp_path: Path) -> None:
-    def use(bench: Bench) -> None:
-        first, _ = bench.client("first")
-        second, _ = bench.client("second")
-        third, _ = bench.client("third")
-        assert (first.gone, second.gone, third.gone) == (False, False, True)
-        second_again, _ = bench.client("second")
-        assert second_again.gone
-
-    with_bench(tmp_path, use, connections=2)
+    return run
 
 
-def test_qos_1_waits_for_a_client_that_acknowledges_late_and_keeps_its_order(tmp_path: Path) -> None:
-    def use(bench: Bench) -> None:
-        link, slow = bench.client("slow", TOPIC)
+def test_connections_above_the_limit_are_closed(with_harness: Callable[..., None]) -> None:
+    def use(harness: Harness) -> None:
+        transports = [harness.client(name)[0] for name in ("first", "second", "third", "second")]
+        assert [transport.closed for transport in transports] == [False, False, True, True]
+
+    with_harness(use, connections=2)
+
+
+def test_qos_1_messages_are_queued_in_order_until_acknowledged(with_harness: Callable[..., None]) -> None:
+    def use(harness: Harness) -> None:
+        transport, slow = harness.client("slow", TOPIC)
         for number in range(5):
-            bench.broker.publish(TOPIC, b"%d" % number, qos=1, retain=False, owner="x")
-        assert len(link.written) == 2
+            harness.publish(b"%d" % number)
+        assert len(transport.written) == 2
         for packet_id in range(1, 4):
             slow.received(raw_mqtt.packet(4, packet_id.to_bytes(2)))
-        assert [packet[-1:] for packet in link.written] == [b"0", b"1", b"2", b"3", b"4"]
+        assert [packet[-1:] for packet in transport.written] == [b"0", b"1", b"2", b"3", b"4"]
 
-    with_bench(tmp_path, use, inflight=2)
+    with_harness(use, inflight=2)
 
 
-@pytest.mark.parametrize("limits", [{"waiting": 3}, {"waiting_bytes": 3}])
-def test_a_client_that_falls_too_far_behind_is_cut_off_rather_than_lied_to(
-    tmp_path: Path, limits: dict[str, int]
-) -> None:
-    def use(bench: Bench) -> None:
-        link, _ = bench.client("slow", TOPIC)
+@pytest.mark.parametrize("limits", [{"queued": 3}, {"queued_bytes": 3}])
+def test_a_full_queue_closes_the_connection(with_harness: Callable[..., None], limits: dict[str, int]) -> None:
+    def use(harness: Harness) -> None:
+        transport, _ = harness.client("slow", TOPIC)
         for _ in range(1 + 3):
-            bench.broker.publish(TOPIC, b"x", qos=1, retain=False, owner="x")
-        assert not link.gone
-        bench.broker.publish(TOPIC, b"x", qos=1, retain=False, owner="x")
-        assert link.gone
+            harness.publish(b"x")
+        assert not transport.closed
+        harness.publish(b"x")
+        assert transport.closed
 
-    with_bench(tmp_path, use, inflight=1, **limits)
+    with_harness(use, inflight=1, **limits)
 
 
-def test_qos_0_is_dropped_for_a_congested_client_and_comes_again_afterwards(tmp_path: Path) -> None:
-    def use(bench: Bench) -> None:
-        link, slow = bench.client("slow", TOPIC, qos=0)
-        link.congested = True
-        bench.broker.publish(TOPIC, b"lost", qos=0, retain=False, owner="x")
-        link.congested = False
+def test_a_congested_client_loses_qos_0_but_not_retained_messages(with_harness: Callable[..., None]) -> None:
+    def use(harness: Harness) -> None:
+        transport, slow = harness.client("slow", TOPIC, qos=0)
+        transport.congested = True
+        harness.publish(b"lost", qos=0)
+        transport.congested = False
         slow.drained()
-        bench.broker.publish(TOPIC, b"here", qos=0, retain=False, owner="x")
-        assert [packet[-4:] for packet in link.written] == [b"here"]
-
-    with_bench(tmp_path, use)
-
-
-def test_retained_messages_wait_for_a_congested_client(tmp_path: Path) -> None:
-    def use(bench: Bench) -> None:
-        bench.broker.publish(TOPIC, b"state", qos=1, retain=True, owner="x")
-        link, slow = bench.client("slow")
-        link.congested = True
+        harness.publish(b"sent", qos=0)
+        assert [packet[-4:] for packet in transport.written] == [b"sent"]
+        harness.publish(b"state", retain=True)
+        transport, slow = harness.client("other")
+        transport.congested = True
         slow.received(raw_mqtt.subscribe_packet(TOPIC))
-        assert len(link.written) == 1, "the SUBACK only"
-        link.congested = False
+        assert len(transport.written) == 1, "the SUBACK only"
+        transport.congested = False
         slow.drained()
-        assert link.written[1].endswith(b"state")
+        assert transport.written[1].endswith(b"state")
 
-    with_bench(tmp_path, use)
-
-
-def test_a_client_that_asks_and_never_reads_is_cut_off(tmp_path: Path) -> None:
-    def use(bench: Bench) -> None:
-        link, rude = bench.client("rude")
-        link.unsent = 101
-        rude.received(raw_mqtt.PINGREQ)
-        assert link.gone
-
-    with_bench(tmp_path, use, unsent_bytes=100)
+    with_harness(use)
 
 
-def test_filters_are_bounded_in_one_subscribe_and_for_one_client(tmp_path: Path) -> None:
-    def use(bench: Bench) -> None:
-        link, greedy = bench.client("greedy")
-        greedy.received(raw_mqtt.subscribe_packet(*(f"ts/{number}" for number in range(8))))
-        greedy.received(raw_mqtt.subscribe_packet(*(f"ts/{number}" for number in range(6, 12))))
-        assert link.written == [
+def test_a_client_that_never_reads_is_closed(with_harness: Callable[..., None]) -> None:
+    def use(harness: Harness) -> None:
+        transport, client = harness.client("client")
+        transport.unsent = 101
+        client.received(raw_mqtt.PINGREQ)
+        assert transport.closed
+
+    with_harness(use, unsent_bytes=100)
+
+
+def test_filters_are_limited_per_subscribe_and_per_client(with_harness: Callable[..., None]) -> None:
+    def use(harness: Harness) -> None:
+        transport, client = harness.client("client")
+        client.received(raw_mqtt.subscribe_packet(*(f"ts/{number}" for number in range(8))))
+        client.received(raw_mqtt.subscribe_packet(*(f"ts/{number}" for number in range(6, 12))))
+        assert transport.written == [
             raw_mqtt.packet(raw_mqtt.SUBACK, b"\0\1" + bytes(8)),
             raw_mqtt.packet(raw_mqtt.SUBACK, b"\0\1" + bytes(4) + b"\x80\x80"),
         ]
-        greedy.received(raw_mqtt.subscribe_packet(*(f"ts/{number}" for number in range(9))))
-        assert link.gone
+        client.received(raw_mqtt.subscribe_packet(*(f"ts/{number}" for number in range(9))))
+        assert transport.closed
 
-    with_bench(tmp_path, use, filters_per_subscribe=8, filters_per_client=10)
+    with_harness(use, filters_per_subscribe=8, filters_per_client=10)
 
 
-def test_more_retained_topics_than_a_clients_share_end_its_connection(tmp_path: Path) -> None:
-    def use(bench: Bench) -> None:
-        link, greedy = bench.client("greedy")
+def test_too_many_retained_topics_close_the_connection(with_harness: Callable[..., None]) -> None:
+    def use(harness: Harness) -> None:
+        transport, client = harness.client("client")
         for number in range(3):
-            assert not link.gone
-            greedy.received(raw_mqtt.publish_packet(f"ts/{number}", b"x", retain=True))
-        assert link.gone
+            assert not transport.closed
+            client.received(raw_mqtt.publish_packet(f"ts/{number}", b"x", retain=True))
+        assert transport.closed
 
-    with_bench(tmp_path, use, retained_per_client=2)
+    with_harness(use, retained_per_client=2)
 
 
-def test_a_client_that_sends_no_connect_is_cut_off_in_the_end(tmp_path: Path) -> None:
-    def use(bench: Bench) -> None:
-        link = Link()
-        idle = bench.broker._connected(link)
+def test_a_client_without_connect_times_out(with_harness: Callable[..., None]) -> None:
+    def use(harness: Harness) -> None:
+        transport = RecordingTransport()
+        idle = harness.broker._connected(transport)
         now_s = asyncio.get_running_loop().time()
         idle.received(b"\x10")
         idle.tick(now_s + 9, time.time())
-        assert not link.gone
+        assert not transport.closed
         idle.tick(now_s + 11, time.time())
-        assert link.gone
+        assert transport.closed
 
-    with_bench(tmp_path, use)
+    with_harness(use)
 
 
-def test_a_client_may_be_silent_for_one_and_a_half_times_its_keep_alive(tmp_path: Path) -> None:
-    def use(bench: Bench) -> None:
-        link, client = bench.client("client")
+def test_the_keep_alive_timeout_is_one_and_a_half_intervals(with_harness: Callable[..., None]) -> None:
+    def use(harness: Harness) -> None:
+        transport, client = harness.client("client")
         client.tick(1_000.0, time.time())
         client.tick(1_089.0, time.time())
-        assert not link.gone
+        assert not transport.closed
         client.received(raw_mqtt.PINGREQ)
         client.tick(1_091.0, time.time())
-        assert not link.gone
+        assert not transport.closed
         client.tick(1_182.0, time.time())
-        assert link.gone
+        assert transport.closed
 
-    with_bench(tmp_path, use)
+    with_harness(use)
 
 
-def test_nothing_of_a_client_is_left_when_it_is_gone(tmp_path: Path) -> None:
-    def use(bench: Bench) -> None:
-        _, client = bench.client("client", TOPIC, "ts/#")
+def test_a_lost_connection_leaves_no_state(with_harness: Callable[..., None]) -> None:
+    def use(harness: Harness) -> None:
+        _, client = harness.client("client", TOPIC, "ts/#")
         client.lost()
         client.lost()
-        assert not bench.broker._connections
-        assert not bench.broker._clients
-        assert bench.broker._subscriptions_table.hearers(TOPIC) == ()
+        assert not harness.broker._connections
+        assert not harness.broker._clients
+        assert harness.broker._subscriptions_table.subscribers(TOPIC) == ()
 
-    with_bench(tmp_path, use)
+    with_harness(use)
 
 
-@pytest.mark.parametrize("transport", ["tcp", "websockets"])
-def test_every_accepted_socket_has_nagles_algorithm_switched_off(tmp_path: Path, transport: str) -> None:
-    """The option itself; that it is felt is measured against both brokers in tests/contract/brokers."""
-    seen: list[int] = []
+@pytest.mark.parametrize("kind", ["tcp", "websockets"])
+def test_accepted_sockets_have_tcp_nodelay(tmp_path: Path, kind: str) -> None:
+    options: list[int] = []
     accepted = asyncio.Event()
 
-    class Watched(TelescopeBroker):
-        def _connected(self, link: TcpLink | WebSocketLink) -> Connection:  # type: ignore[override]
-            carrier = link._transport if isinstance(link, TcpLink) else link._websocket.transport
-            assert carrier is not None
-            opened = carrier.get_extra_info("socket")
-            seen.append(opened.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+    class ObservedBroker(TelescopeBroker):
+        def _connected(self, transport: TcpTransport | WebSocketTransport) -> Connection:  # type: ignore[override]
+            inner = transport._transport if isinstance(transport, TcpTransport) else transport._websocket.transport
+            assert inner is not None
+            options.append(inner.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
             accepted.set()
-            return super()._connected(link)
+            return super()._connected(transport)
 
     async def run() -> None:
-        bench = Bench(tmp_path, Limits())
+        harness = Harness(tmp_path, Limits())
         sockets = {name: socket.create_server(("127.0.0.1", 0)) for name in (TCP, WEBSOCKET)}
-        port = sockets[TCP if transport == "tcp" else WEBSOCKET].getsockname()[1]
-        broker = Watched(sockets=sockets, keys=bench.broker._keys, revocations=bench.broker._revocations)
+        port = sockets[TCP if kind == "tcp" else WEBSOCKET].getsockname()[1]
+        broker = ObservedBroker(sockets=sockets, keys=harness.broker._keys, revocations=harness.broker._revocations)
         await broker.start()
-        connected = await asyncio.to_thread(Wire, port, transport)  # type: ignore[arg-type]
+        client = await asyncio.to_thread(Wire, port, kind)  # type: ignore[arg-type]
         await accepted.wait()
         await broker.shutdown()
-        await asyncio.to_thread(connected.close)
+        await asyncio.to_thread(client.close)
 
     asyncio.run(run())
-    assert seen == [1]
+    assert options == [1]

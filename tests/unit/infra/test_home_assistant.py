@@ -1,4 +1,4 @@
-"""What Home Assistant is told, held to what its own package takes; and what is carried in both directions."""
+"""Home Assistant announcements match its own schema; messages are forwarded in bridge directions."""
 
 import json
 import threading
@@ -15,7 +15,7 @@ from infra.home_assistant import discovery
 from infra.home_assistant.bridge import Bridge
 from tests.harness.paths import ROOT
 
-OWN: dict[str, Any] = json.loads((Path(__file__).parent / "home_assistant.json").read_text())
+SCHEMA: dict[str, Any] = json.loads((Path(__file__).parent / "home_assistant.json").read_text())
 LAB = room.load(Path(ROOT) / "robots" / "rooms" / "lab")
 VALUES: dict[str, float | bool] = {
     "temperature_c": 20.5,
@@ -45,57 +45,57 @@ def described(device: room.RoomDeviceManifest) -> Description:
     )
 
 
-class Both:
-    """A bridge between two lists."""
+class RecordingBridge:
+    """A bridge that records its messages and requests."""
 
     def __init__(self) -> None:
-        self.said: list[tuple[str, bytes, bool]] = []
-        self.orders: list[tuple[str, str, float]] = []
-        self.ordered = threading.Event()
-        self.bridge = Bridge(lambda *said: self.said.append(said), self.order)
+        self.published: list[tuple[str, bytes, bool]] = []
+        self.requests: list[tuple[str, str, float]] = []
+        self.requested = threading.Event()
+        self.target = Bridge(lambda *message: self.published.append(message), self.set_control)
 
-    def order(self, device: str, control: str, value: float) -> str:
-        self.orders.append((device, control, value))
-        self.ordered.set()
+    def set_control(self, device: str, control: str, value: float) -> str:
+        self.requests.append((device, control, value))
+        self.requested.set()
         return ""
 
-    def hear(self, name: str, kind: str, message: Any, stream: str = "") -> None:
+    def receive(self, name: str, kind: str, message: Any, stream: str = "") -> None:
         payload = message if isinstance(message, bytes) else codec.encode(message)
-        self.bridge.hear(topics.device("s", "a", name, kind, stream), payload)
+        self.target.on_device_message(topics.device("s", "a", name, kind, stream), payload)
 
     def announced(self) -> list[tuple[str, dict[str, Any]]]:
-        return [(topic, json.loads(content)) for topic, content, _ in self.said if topic.endswith("/config")]
+        return [(topic, json.loads(content)) for topic, content, _ in self.published if topic.endswith("/config")]
 
 
 @pytest.fixture
-def both() -> Iterator[Both]:
-    both = Both()
+def bridge() -> Iterator[RecordingBridge]:
+    bridge = RecordingBridge()
     for device in LAB.devices:
-        both.hear(device.name, topics.DESC, described(device))
-    yield both
-    both.bridge.close()
+        bridge.receive(device.name, topics.DESC, described(device))
+    yield bridge
+    bridge.target.close()
 
 
-def test_every_announcement_is_one_that_home_assistant_takes(both: Both) -> None:
+def test_announcements_match_home_assistants_schema(bridge: RecordingBridge) -> None:
     for device in LAB.devices:
         for stream in device.streams:
             values = VALUES | {control.name: 0.5 for control in device.controls}
-            both.hear(
+            bridge.receive(
                 device.name, topics.TELE, Measurements(tick_ms=1, at_ms=1, sequence=1, values=values), stream.name
             )
-    announced = both.announced()
+    announced = bridge.announced()
     components = [topic.split("/")[1] for topic, _ in announced]
-    assert not any("_bits" in topic for topic, _ in announced), "that is for programs"
+    assert not any("_bits" in topic for topic, _ in announced)
     assert set(components) == {"sensor", "binary_sensor", "number", "camera"}
     for component, (_, content) in zip(components, announced, strict=True):
-        allowed = OWN["keys"][component]
+        allowed = SCHEMA["keys"][component]
         assert set(content) <= set(allowed)
         assert {key for key, required in allowed.items() if required} <= set(content)
         kind = content.get("device_class")
         if component == "sensor" and kind is not None:
-            assert content["unit_of_measurement"] in OWN["sensor_units"][kind]
+            assert content["unit_of_measurement"] in SCHEMA["sensor_units"][kind]
         if component == "binary_sensor" and kind is not None:
-            assert kind in OWN["binary_sensor_classes"]
+            assert kind in SCHEMA["binary_sensor_classes"]
         if component == "number":
             assert content["min"] < content["max"]
             assert content["step"] >= 0.001
@@ -103,46 +103,48 @@ def test_every_announcement_is_one_that_home_assistant_takes(both: Both) -> None
     assert len({topic for topic, _ in announced}) == len(announced)
 
 
-def test_it_is_announced_once_retained_and_again_when_home_assistant_starts(both: Both) -> None:
-    before = len(both.announced())
+def test_announcements_are_retained_and_repeated_when_home_assistant_restarts(bridge: RecordingBridge) -> None:
+    count = len(bridge.announced())
     for device in LAB.devices:
-        both.hear(device.name, topics.DESC, described(device))
-    assert len(both.announced()) == before
-    both.bridge.again()
-    assert len(both.announced()) == 2 * before
-    assert all(retained for topic, _, retained in both.said if topic.endswith(("/config", "/available")))
+        bridge.receive(device.name, topics.DESC, described(device))
+    assert len(bridge.announced()) == count
+    bridge.target.announce_all()
+    assert len(bridge.announced()) == 2 * count
+    assert all(retained for topic, _, retained in bridge.published if topic.endswith(("/config", "/available")))
 
 
-def test_a_control_is_a_slider_and_its_value_no_second_sensor(both: Both) -> None:
-    both.hear("door", topics.TELE, Measurements(tick_ms=1, at_ms=1, sequence=1, values={"opening": 0.5}), "settings")
-    own = [topic for topic, _ in both.announced() if "/a-door/" in topic]
-    assert own == ["homeassistant/number/a-door/set-opening/config"]
+def test_a_control_is_announced_as_number_only(bridge: RecordingBridge) -> None:
+    bridge.receive(
+        "door", topics.TELE, Measurements(tick_ms=1, at_ms=1, sequence=1, values={"opening": 0.5}), "settings"
+    )
+    door_topics = [topic for topic, _ in bridge.announced() if "/a-door/" in topic]
+    assert door_topics == ["homeassistant/number/a-door/set-opening/config"]
 
 
-def test_measurements_and_pictures_are_carried_as_they_are(both: Both) -> None:
+def test_measurements_and_frames_are_forwarded_unchanged(bridge: RecordingBridge) -> None:
     measured = Measurements(tick_ms=1, at_ms=1, sequence=1, values={"temperature_c": 20.5})
-    both.hear("thermometer", topics.TELE, measured, "temperature")
-    assert both.said[-1] == ("telescope/a-thermometer/tele/temperature", codec.encode(measured), False)
-    both.hear("camera", topics.CAM, camera_frames.encode(CameraFrame(1, 1, 4, 3, b"JPEG")), "colour")
-    assert both.said[-1] == ("telescope/a-camera/cam/colour", b"JPEG", False)
+    bridge.receive("thermometer", topics.TELE, measured, "temperature")
+    assert bridge.published[-1] == ("telescope/a-thermometer/tele/temperature", codec.encode(measured), False)
+    bridge.receive("camera", topics.CAM, camera_frames.encode(CameraFrame(1, 1, 4, 3, b"JPEG")), "colour")
+    assert bridge.published[-1] == ("telescope/a-camera/cam/colour", b"JPEG", False)
 
 
-def test_robots_and_strangers_are_left_out(both: Both) -> None:
-    before = len(both.said)
-    both.hear("thing", topics.TELE, Measurements(tick_ms=1, at_ms=1, sequence=1, values={"x": 1.0}), "joints")
-    both.hear("thing", topics.DESC, Description(device="thing", kind="arm", robot_type="ur5", label="Arm"))
-    both.hear("camera", topics.CAM, b"no picture", "colour")
-    both.bridge.hear("nonsense", b"")
-    assert len(both.said) == before
+def test_robots_and_unknown_devices_are_ignored(bridge: RecordingBridge) -> None:
+    count = len(bridge.published)
+    bridge.receive("thing", topics.TELE, Measurements(tick_ms=1, at_ms=1, sequence=1, values={"x": 1.0}), "joints")
+    bridge.receive("thing", topics.DESC, Description(device="thing", kind="arm", robot_type="ur5", label="Arm"))
+    bridge.receive("camera", topics.CAM, b"no picture", "colour")
+    bridge.target.on_device_message("nonsense", b"")
+    assert len(bridge.published) == count
 
 
-def test_who_is_gone_is_shown_as_gone(both: Both) -> None:
-    both.bridge.hear(topics.conn("s", "a"), codec.encode(Presence(online=False, session=1, at_ms=1)))
-    gone = {topic for topic, content, _ in both.said if content == b"offline"}
-    shown = [device for device in LAB.devices if device.streams or device.controls or device.cameras]
-    assert gone == {f"telescope/a-{device.name}/available" for device in shown}
-    both.bridge.hear(topics.conn("s", "other"), codec.encode(Presence(online=False, session=1, at_ms=1)))
-    assert len([1 for _, content, _ in both.said if content == b"offline"]) == len(gone)
+def test_an_offline_agent_makes_its_devices_unavailable(bridge: RecordingBridge) -> None:
+    bridge.target.on_device_message(topics.conn("s", "a"), codec.encode(Presence(online=False, session=1, at_ms=1)))
+    offline = {topic for topic, content, _ in bridge.published if content == b"offline"}
+    expected = [device for device in LAB.devices if device.streams or device.controls or device.cameras]
+    assert offline == {f"telescope/a-{device.name}/available" for device in expected}
+    bridge.target.on_device_message(topics.conn("s", "other"), codec.encode(Presence(online=False, session=1, at_ms=1)))
+    assert len([1 for _, content, _ in bridge.published if content == b"offline"]) == len(offline)
 
 
 @pytest.mark.parametrize(
@@ -152,21 +154,21 @@ def test_who_is_gone_is_shown_as_gone(both: Both) -> None:
         ("telescope/a-door/set/opening", b"1.5"),
         ("telescope/a-door/set/opening", b"open"),
         ("telescope/a-door/set/colour", b"0.5"),
-        ("telescope/a-nobody/set/opening", b"0.5"),
+        ("telescope/a-unknown/set/opening", b"0.5"),
         ("telescope/a-door/available", b"0.5"),
     ],
 )
-def test_a_slider_sets_its_control_and_nothing_else_does(both: Both, topic: str, content: bytes) -> None:
-    both.bridge.told(topic, content)
-    both.bridge.told("telescope/a-door/set/opening", b"0.5")
-    assert both.ordered.wait(10)
-    assert both.orders == [("a-door", "opening", 0.5)]
+def test_only_valid_commands_set_a_control(bridge: RecordingBridge, topic: str, content: bytes) -> None:
+    bridge.target.on_command(topic, content)
+    bridge.target.on_command("telescope/a-door/set/opening", b"0.5")
+    assert bridge.requested.wait(10)
+    assert bridge.requests == [("a-door", "opening", 0.5)]
 
 
-def test_a_control_without_a_stream_that_shows_it_has_no_state() -> None:
-    about = Description(
+def test_a_control_without_settings_stream_has_no_state() -> None:
+    description = Description(
         device="x", kind="x", robot_type="x", label="X", controls=(Control(name="a", label="A", lower=0.0, upper=0.01),)
     )
-    (number,) = discovery.of_device("a-x", about)
+    (number,) = discovery.announce_device("a-x", description)
     assert "state_topic" not in number.content
     assert number.content["step"] == 0.001

@@ -11,36 +11,26 @@ def write(home: Path, tcp_port: int = 1) -> None:
     configuration.write(home, host="127.0.0.1", tcp_port=tcp_port, websocket_port=2, plugin_path="/x.so")
 
 
-def test_whatever_was_not_granted_is_denied() -> None:
-    """Each of these alone would keep a message from a stranger: all are off, so that one mistake is not enough.
-
-    Who leaves what they heard takes nothing from anybody.
-    """
-    assert set(configuration.first_security("x")["defaultACLAccess"].items()) == {
-        ("publishClientSend", False),
-        ("publishClientReceive", False),
-        ("subscribe", False),
-        ("unsubscribe", True),
-    }
-
-
-def test_nobody_is_let_in_without_credentials_and_nothing_listens_without_an_address(tmp_path: Path) -> None:
+def test_everything_is_denied_by_default(tmp_path: Path) -> None:
+    defaults = configuration.initial_security("x")["defaultACLAccess"]
+    denied = {"publishClientSend": False, "publishClientReceive": False, "subscribe": False}
+    assert defaults == {**denied, "unsubscribe": True}
     write(tmp_path)
     lines = (tmp_path / configuration.CONFIGURATION_FILE).read_text().splitlines()
     assert "allow_anonymous false" in lines
     assert [line for line in lines if line.startswith("listener")] == ["listener 1 127.0.0.1", "listener 2 127.0.0.1"]
 
 
-def test_a_second_start_keeps_rights_and_password_and_takes_the_new_ports(tmp_path: Path) -> None:
+def test_a_second_start_keeps_rights_and_password_but_updates_ports(tmp_path: Path) -> None:
     write(tmp_path)
-    kept = (configuration.SECURITY_FILE, configuration.PASSWORD_FILE)
-    before = [(tmp_path / name).read_text() for name in kept]
+    names = (configuration.SECURITY_FILE, configuration.PASSWORD_FILE)
+    before = [(tmp_path / name).read_text() for name in names]
     write(tmp_path, tcp_port=3)
-    assert [(tmp_path / name).read_text() for name in kept] == before
+    assert [(tmp_path / name).read_text() for name in names] == before
     assert "listener 3 127.0.0.1" in (tmp_path / configuration.CONFIGURATION_FILE).read_text()
 
 
-def test_a_newer_version_gives_the_functions_their_rights_and_leaves_what_was_granted(tmp_path: Path) -> None:
+def test_an_update_restores_the_functions_rights_and_keeps_grants(tmp_path: Path) -> None:
     write(tmp_path)
     path = tmp_path / configuration.SECURITY_FILE
     new = json.loads(path.read_text())
@@ -59,7 +49,7 @@ def test_a_newer_version_gives_the_functions_their_rights_and_leaves_what_was_gr
     assert renewed["defaultACLAccess"] == new["defaultACLAccess"]
 
 
-def test_the_password_is_in_its_own_file_only(tmp_path: Path) -> None:
+def test_the_password_is_only_in_its_own_file(tmp_path: Path) -> None:
     write(tmp_path)
     password = (tmp_path / configuration.PASSWORD_FILE).read_text().strip()
     assert len(password) >= 40
@@ -68,16 +58,10 @@ def test_the_password_is_in_its_own_file_only(tmp_path: Path) -> None:
     assert json.loads((tmp_path / configuration.SECURITY_FILE).read_text())["clients"][0]["username"] == "service"
 
 
-def test_a_machine_without_mosquitto_is_told_which_package_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_installation_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(programs, "_PATH_BESIDE", str(tmp_path))
-    with pytest.raises(programs.NotInstalledError, match="apt-get install mosquitto"):
-        configuration.binary()
-
-
-def test_a_machine_without_the_plugin_is_told_which_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(configuration, "_PLUGIN_FOLDERS", ("no/such/folder",))
-    with pytest.raises(programs.NotInstalledError, match="apt-get install mosquitto"):
-        configuration.plugin()
+    for find in (configuration.binary, configuration.plugin):
+        with pytest.raises(programs.NotInstalledError, match="apt-get install mosquitto"):
+            find()

@@ -1,4 +1,5 @@
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -10,97 +11,87 @@ from infra.embedded_broker import revocations as module
 from infra.embedded_broker.revocations import Revocations, RevocationsError
 
 GRANT = Grant(principal="p", client_id="c", publish=(), subscribe=(), token_id="t", expires_at=0)
+Opener = Callable[..., Revocations]
 
 
-def opened(path: Path, keep_s: float = 1_000) -> Revocations:
-    revocations = Revocations(path, keep_s=keep_s)
-    revocations.open()
-    return revocations
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "r"
+
+
+@pytest.fixture
+def open_file(path: Path) -> Iterator[Opener]:
+    opened: list[Revocations] = []
+
+    def open_again(keep_s: float = 1_000) -> Revocations:
+        opened.append(Revocations(path, keep_s=keep_s))
+        opened[-1].open()
+        return opened[-1]
+
+    yield open_again
+    for revocations in opened:
+        revocations.close()
 
 
 @pytest.mark.parametrize("revoke", [Revoke(client_id="c"), Revoke(principal="p")])
-def test_tokens_made_before_are_covered_and_later_ones_are_not(tmp_path: Path, revoke: Revoke) -> None:
-    revocations = opened(tmp_path / "r")
-    now = time.time()
+def test_only_earlier_tokens_are_revoked(open_file: Opener, revoke: Revoke) -> None:
+    revocations, now = open_file(), time.time()
     revocations.add(msgspec.structs.replace(revoke, before_s=now))
+    revocations.add(msgspec.structs.replace(revoke, before_s=now - 100))
     assert revocations.covers(GRANT, now)
     assert revocations.covers(GRANT, 0.0)
     assert not revocations.covers(GRANT, now + 0.001)
-    revocations.close()
 
 
-def test_a_later_revocation_wins_over_an_earlier_one_whatever_their_order(tmp_path: Path) -> None:
-    revocations = opened(tmp_path / "r")
-    now = time.time()
-    revocations.add(Revoke(client_id="c", before_s=now))
-    revocations.add(Revoke(client_id="c", before_s=now - 100))
-    assert revocations.covers(GRANT, now)
-    revocations.close()
-
-
-def test_a_token_id_is_covered_whenever_it_was_made(tmp_path: Path) -> None:
-    revocations = opened(tmp_path / "r")
+def test_a_token_id_is_revoked_at_any_time(open_file: Opener) -> None:
+    revocations = open_file()
     revocations.add(Revoke(token_id="t", before_s=1.0))
     assert revocations.covers(GRANT, time.time() + 10)
     assert not revocations.covers(msgspec.structs.replace(GRANT, token_id="other"), 0.0)
-    revocations.close()
 
 
-def test_they_survive_the_end_of_the_process_and_a_line_cut_short(tmp_path: Path) -> None:
-    path = tmp_path / "r"
-    first = opened(path)
-    first.add(Revoke(client_id="c"))
-    with path.open("a") as file:  # never closed in order: a crash
+def test_revocations_survive_a_crash_and_a_truncated_line(open_file: Opener, path: Path) -> None:
+    open_file().add(Revoke(client_id="c"))
+    with path.open("a") as file:
         file.write('{"field": "principal", "val')
-    second = opened(path)
-    assert second.covers(GRANT, time.time() - 1)
-    second.close()
-    first.close()
+    assert open_file().covers(GRANT, time.time() - 1)
     assert len(path.read_text().splitlines()) == 1
 
 
-def test_what_has_run_out_is_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_expired_revocations_are_removed(open_file: Opener, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_TIDY_AT", 3)
-    path = tmp_path / "r"
-    revocations = opened(path, keep_s=50)
+    revocations = open_file(keep_s=50)
     revocations.add(Revoke(client_id="c", before_s=time.time() - 100))
     for name in ("x", "y"):
         revocations.add(Revoke(client_id=name))
     assert not revocations.covers(GRANT, 0.0)
-    assert len(path.read_text().splitlines()) == 2, "neither is the file to grow for ever"
+    assert len(path.read_text().splitlines()) == 2
     revocations.add(Revoke(client_id="z"))
     revocations.close()
-    again = opened(path, keep_s=50)
+    again = open_file(keep_s=50)
     assert all(again.covers(msgspec.structs.replace(GRANT, client_id=name), 0.0) for name in ("x", "y", "z"))
-    again.close()
     assert len(path.read_text().splitlines()) == 3
 
 
-def test_where_the_file_cannot_be_written_anew_the_one_before_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_rewrite_keeps_the_file(open_file: Opener, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_TIDY_AT", 3)
-    path = tmp_path / "r"
-    revocations = opened(path)
-    (tmp_path / "r.new").mkdir()
+    revocations = open_file()
+    blocker = path.with_name("r.new")
+    blocker.mkdir()
     for name in ("x", "y", "z", "c"):
         revocations.add(Revoke(client_id=name))
     revocations.close()
     assert len(path.read_text().splitlines()) == 4
-    (tmp_path / "r.new").rmdir()
-    again = opened(path)
-    assert again.covers(GRANT, 0.0)
-    again.close()
+    blocker.rmdir()
+    assert open_file().covers(GRANT, 0.0)
 
 
 @pytest.mark.parametrize("revoke", [Revoke(), Revoke(client_id=""), Revoke(client_id="a", token_id="b")])
-def test_exactly_one_thing_is_named(tmp_path: Path, revoke: Revoke) -> None:
-    revocations = opened(tmp_path / "r")
+def test_a_revocation_names_exactly_one_field(open_file: Opener, revoke: Revoke) -> None:
     with pytest.raises(ValueError, match="exactly one"):
-        revocations.add(revoke)
-    revocations.close()
+        open_file().add(revoke)
 
 
-def test_a_file_that_cannot_be_kept_is_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(RevocationsError, match="cannot keep revocations"):
+def test_an_unusable_file_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(RevocationsError, match="cannot store revocations"):
         Revocations(tmp_path / "none" / "r", keep_s=1).open()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from device_agent.drivers.mujoco import WalkingDriver, World
+from device_agent.drivers.mujoco import BipedDriver, World
 from device_agent.drivers.mujoco.biped_driver import heading, upright
 from device_agent.ports.driver import REST, Twist
 from device_agent.protocol.manifests import robot_type
@@ -78,7 +78,7 @@ class Walking:
     def __init__(self, folder: Path, *, seed: int | None = None, scene: Path | None = None) -> None:
         self.type = robot_type.load(folder)
         self.world = HandDriven(scene or folder / self.type.scene, home=self.type.home_rad)
-        self.driver = WalkingDriver(robot_type=self.type, world=self.world, device="walker")
+        self.driver = BipedDriver(robot_type=self.type, world=self.world, device="walker")
         self.driver.connect()
         self.model = self.world.model
         self.names = [joint.name for joint in self.type.joints]

@@ -120,7 +120,7 @@ def test_names_that_robots_of_one_world_share_begin_with_the_type(folder: Path):
 
 
 @folders
-def test_what_it_can_show_keeps_off_itself_and_what_stands_around(folder: Path):
+def test_named_poses_are_collision_free(folder: Path):
     manifest = robot_type.load(folder)
     shape = geometry.load(manifest, folder)
     if shape is None:
@@ -150,6 +150,6 @@ def test_movement_is_a_script_with_a_description(path: Path):
 
 
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
-def test_the_drawing_of_a_shipped_type_is_that_of_its_model(folder: Path):
+def test_drawings_are_up_to_date(folder: Path):
     draw = runpy.run_path(str(ROBOTS / "draw.py"))
     assert (folder / "drawing.json").read_bytes() == draw["drawing"](folder), "run python robots/draw.py"

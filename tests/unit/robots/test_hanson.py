@@ -25,19 +25,19 @@ def bench() -> Bench:
     return Bench(FOLDER)
 
 
-def test_rods_and_threads_pull_the_skin_where_the_ties_say(bench: Bench):
-    ties = EqualityJoints(bench.model)
-    assert len(ties.all) == 21
+def test_dependent_joints_follow_the_equality_constraints(bench: Bench):
+    equality_joints = EqualityJoints(bench.model)
+    assert len(equality_joints.all) == 21
     random = np.random.default_rng(2)
     bench.data.ctrl[bench.ctrl] = random.uniform(bench.lower, bench.upper)
     mujoco.mj_step(bench.model, bench.data, nstep=1500)
     assert bench.data.qpos[bench.qpos] == pytest.approx(bench.data.ctrl[bench.ctrl], abs=1e-3)
     settled = bench.data.qpos.copy()
-    ties.settle(settled)
+    equality_joints.apply(settled)
     assert settled == pytest.approx(bench.data.qpos, abs=1e-3)
 
 
-def test_the_agents_limits_know_where_the_rods_carry_the_head(bench: Bench):
+def test_limits_include_dependent_joints(bench: Bench):
     shape = geometry.load(bench.type, FOLDER)
     assert shape is not None
     random = np.random.default_rng(5)
@@ -61,7 +61,7 @@ def test_it_moves_its_head_less_than_its_motors(bench: Bench):
 
 
 @pytest.mark.parametrize("point_m", [(1.0, 0.0, 0.4), (0.45, 0.1, 0.3), (0.3, -0.25, 0.5), (1.0, 1.0, 0.3)])
-def test_both_eyes_look_at_a_point_and_the_neck_helps(bench: Bench, point_m: tuple[float, float, float]):
+def test_eyes_and_neck_look_at_a_point(bench: Bench, point_m: tuple[float, float, float]):
     shape = geometry.load(bench.type, FOLDER)
     assert shape is not None
     position = dict(zip(bench.names, bench.home.tolist(), strict=True))
@@ -76,7 +76,7 @@ def test_both_eyes_look_at_a_point_and_the_neck_helps(bench: Bench, point_m: tup
     assert abs(position["EyeTurn-L"]) < 0.5, "the neck takes its share"
 
 
-def test_it_can_show_the_basic_emotions_and_no_two_expressions_are_alike(bench: Bench):
+def test_expressions_are_distinct(bench: Bench):
     shown = bench.type.expressions
     assert set(shown) >= SIX | {"neutral", "thinking", "sleepy"}
     faces = {
@@ -93,7 +93,7 @@ def test_its_mouth_has_a_dozen_shapes(bench: Bench):
     assert all(joint.startswith(mouth) for pose in bench.type.visemes.values() for joint in pose)
 
 
-def test_it_opens_its_mouth_for_a_vowel_as_wide_as_its_shape_says_at_a_calm_pace(bench: Bench):
+def test_visemes_reach_their_mouth_shapes(bench: Bench):
     text = "Hello, I am a robot, and I am glad to see all of you at the table today."
     score = BehaviourTrajectory(bench.type, bench.home.tolist())
     score.add_speech(SpokenLine(0.0, text, mouth.estimate_duration_s(text)))

@@ -141,11 +141,11 @@ def test_no_shipped_movement_is_limited(path: Path) -> None:
         ("wave", {"times": 1, "speed": 1.0}),
     ],
 )
-def test_nor_with_extreme_parameters(name: str, parameters: dict[str, Any]) -> None:
+def test_no_movement_is_limited_with_extreme_parameters(name: str, parameters: dict[str, Any]) -> None:
     assert play(ROBOTS / "ur5" / "movements" / f"{name}.py", parameters).limited == set()
 
 
-def test_what_the_arm_would_touch_is_refused_or_held_before() -> None:
+def test_collisions_are_prevented() -> None:
     robot = LimitedRobot(ROBOTS / "ur5")
     with pytest.raises(Refused, match="no room there: workspace: wrist_3 \u2013 lower z, 281 mm too near"):
         robot.move_joints({"shoulder_lift": -0.2, "elbow": 1.2}, speed=1.0)

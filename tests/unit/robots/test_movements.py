@@ -190,7 +190,7 @@ def test_ur5_movement_stays_free_with_extreme_parameters(name: str, parameters: 
     check(play(ROBOTS / "ur5" / "movements" / f"{name}.py", parameters))
 
 
-def test_a_movement_into_the_table_is_noticed(tmp_path: Path):
+def test_a_movement_into_the_table_is_detected(tmp_path: Path):
     (tmp_path / "movements").mkdir()
     for source in (ROBOTS / "ur5").glob("*.*"):
         (tmp_path / source.name).write_bytes(source.read_bytes())

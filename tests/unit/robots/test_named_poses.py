@@ -51,7 +51,7 @@ class Shower:
 
 
 @pytest.mark.parametrize("folder", kinds("postures", "expressions"), ids=lambda folder: folder.name)
-def test_every_posture_and_expression_is_taken_from_every_one_before(folder: Path) -> None:
+def test_every_transition_between_named_poses_succeeds(folder: Path) -> None:
     shower = Shower(folder)
     for name in shower.kind.postures:
         shower.move(named_poses.posture(shower.kind, name), name)
@@ -71,7 +71,7 @@ def test_every_behaviour_is_played_from_home(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("folder", kinds("visemes"), ids=lambda folder: folder.name)
-def test_a_mouth_forms_every_sound(folder: Path) -> None:
+def test_every_viseme_is_reached(folder: Path) -> None:
     shower = Shower(folder)
     score = BehaviourTrajectory(shower.kind, shower.controller.commanded_rad)
     score.add_speech(SpokenLine(0.0, TEXT, estimate_duration_s(TEXT)))

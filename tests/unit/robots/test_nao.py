@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from device_agent import geometry
-from device_agent.drivers.mujoco import MujocoDriver, WalkingDriver, World, create
+from device_agent.drivers.mujoco import BipedDriver, MujocoDriver, World, create
 from device_agent.ports.driver import REST, DriverError, Twist
 from device_agent.protocol import StopLatch
 from device_agent.protocol.manifests import robot_type
@@ -69,7 +69,7 @@ def test_one_motor_turns_both_hips() -> None:
     assert turned["RHipYawPitch"] == pytest.approx(turned["LHipYawPitch"], abs=0.01)
 
 
-def test_the_head_has_less_room_the_further_it_is_turned() -> None:
+def test_the_pitch_range_of_the_head_depends_on_its_yaw() -> None:
     (narrowing,) = TYPE.position_dependent_limits
     assert (narrowing.joint, narrowing.depends_on) == ("HeadPitch", "HeadYaw")
     ahead, aside = narrowing.at(0.0), narrowing.at(1.5)
@@ -80,7 +80,7 @@ def test_the_head_has_less_room_the_further_it_is_turned() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(TYPE.postures))
-def test_postures_have_room_and_keep_the_centre_of_mass_over_the_feet(name: str) -> None:
+def test_postures_are_clear_and_balanced(name: str) -> None:
     shape = geometry.load(TYPE, FOLDER)
     assert shape is not None
     position_rad = TYPE.home_rad | TYPE.postures[name]
@@ -92,7 +92,7 @@ def test_postures_have_room_and_keep_the_centre_of_mass_over_the_feet(name: str)
 
 
 @pytest.mark.parametrize("name", sorted(TYPE.behaviours))
-def test_behaviours_are_played_standing(name: str) -> None:
+def test_behaviours_keep_the_robot_standing(name: str) -> None:
     walking = Walking(FOLDER, seed=3)
     for keyframe in TYPE.behaviours[name]:
         if keyframe.position_rad:
@@ -128,7 +128,7 @@ def test_it_sits_stands_and_walks_without_falling(seed: int) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(2, 20))
-def test_it_does_not_fall_in_twenty_such_days(seed: int) -> None:
+def test_it_does_not_fall_with_twenty_seeds(seed: int) -> None:
     a_day(seed)
 
 
@@ -151,7 +151,7 @@ def test_feet_leave_the_ground_in_turn() -> None:
 
 
 @pytest.mark.parametrize("twist", [Twist(-0.1, 0.0, 0.0), Twist(0.0, -0.1, 0.0), Twist(0.05, 0.05, 0.4)])
-def test_it_goes_where_it_is_told(twist: Twist) -> None:
+def test_it_walks_along_the_commanded_twist(twist: Twist) -> None:
     walking = Walking(FOLDER)
     walking.drive(FORWARD, duration_s=4.0)  # away from its stool
     walking.wait(1.0)
@@ -197,7 +197,7 @@ def test_a_stop_ends_a_walk_on_both_feet_within_the_brakes() -> None:
     assert walking.applied == pytest.approx(walking.home, abs=1e-6), "the legs are the agent's again"
 
 
-def test_legs_are_the_gaits_while_it_walks_and_what_is_sent_back_says_so() -> None:
+def test_send_returns_the_gaits_leg_positions_during_a_walk() -> None:
     walking = Walking(FOLDER)
     walking.controller.start_drive(walking.tenure, FORWARD, duration_s=3.0)
     walking.wait(1.5)
@@ -210,7 +210,7 @@ def test_legs_are_the_gaits_while_it_walks_and_what_is_sent_back_says_so() -> No
     assert walking.driver.send(asked)[0] == asked[0], "the head is the agent's"
 
 
-def test_what_was_commanded_meanwhile_is_gone_to_slowly_after_the_walk() -> None:
+def test_legs_return_slowly_to_the_command_after_a_walk() -> None:
     walking = Walking(FOLDER)
     driver, posture = walking.driver, TYPE.home_rad | TYPE.postures["Crouch"]
     asked = [posture[name] for name in walking.names]
@@ -227,7 +227,7 @@ def test_what_was_commanded_meanwhile_is_gone_to_slowly_after_the_walk() -> None
     assert max(abs(after - before) for before, after in pairwise(sent[walked:])) <= 0.02 + 1e-9
 
 
-def test_it_does_not_walk_where_it_sits() -> None:
+def test_it_does_not_walk_while_sitting() -> None:
     walking = Walking(FOLDER)
     walking.move(TYPE.postures["Sit"])
     there = walking.torso_m.copy()
@@ -236,7 +236,7 @@ def test_it_does_not_walk_where_it_sits() -> None:
     assert np.linalg.norm(walking.torso_m - there) < 0.01
 
 
-def test_who_is_told_nothing_any_more_stops() -> None:
+def test_it_stops_without_new_twists() -> None:
     walking = Walking(FOLDER)
     walking.driver.drive(FORWARD)
     walking.world.step(1500)
@@ -246,7 +246,7 @@ def test_who_is_told_nothing_any_more_stops() -> None:
     assert walking.driver.report("odometry")["forward_m_s"] == 0.0
 
 
-def test_it_is_helped_only_while_it_walks_and_no_more_than_the_manifest_says() -> None:
+def test_the_torso_support_is_limited_and_only_active_during_a_walk() -> None:
     walking = Walking(FOLDER, seed=5)
     assert TYPE.simulation is not None
     walk = TYPE.simulation.walk
@@ -266,7 +266,7 @@ def test_it_is_helped_only_while_it_walks_and_no_more_than_the_manifest_says() -
     assert not help_now.any()
 
 
-def test_it_falls_when_it_is_pushed_hard_and_then_lies() -> None:
+def test_a_hard_push_makes_it_fall() -> None:
     walking = Walking(FOLDER)
     walking.controller.start_drive(walking.tenure, FORWARD, duration_s=10.0)
     walking.wait(1.0)
@@ -277,7 +277,7 @@ def test_it_falls_when_it_is_pushed_hard_and_then_lies() -> None:
     assert not walking.world._data.xfrc_applied[walking.body].any()
 
 
-def test_who_has_fallen_is_carried_back_to_where_it_began_and_can_walk_again() -> None:
+def test_a_fallen_robot_is_reset_and_can_walk_again() -> None:
     walking = Walking(FOLDER)
     walking.world._data.qvel[:2] = (0.0, 3.0)  # a kick
     walking.world.step(1000)
@@ -295,20 +295,20 @@ def test_who_has_fallen_is_carried_back_to_where_it_began_and_can_walk_again() -
     ("change", "says"),
     [({"base": None}, r"has no \[base\]"), ({"simulation": None}, r"no \[simulation.walk\]")],
 )
-def test_what_cannot_walk_is_refused(change: dict[str, Any], says: str) -> None:
+def test_a_type_without_walk_is_rejected(change: dict[str, Any], says: str) -> None:
     kind = msgspec.structs.replace(TYPE, **change)
     with pytest.raises(DriverError, match=says):
-        WalkingDriver(robot_type=kind, world=World(FOLDER / TYPE.scene), device="walker")
+        BipedDriver(robot_type=kind, world=World(FOLDER / TYPE.scene), device="walker")
 
 
-def test_a_twist_that_is_no_number_is_refused_and_one_too_fast_is_slowed() -> None:
+def test_invalid_twists_are_rejected_and_fast_ones_limited() -> None:
     walking = Walking(FOLDER)
     with pytest.raises(DriverError, match="not finite"):
         walking.driver.drive(Twist(math.nan, 0.0, 0.0))
     assert walking.driver.drive(Twist(5.0, -5.0, 9.0)) == Twist(0.1, -0.1, 0.5)
 
 
-def test_the_manifest_says_which_driver_it_gets() -> None:
-    assert isinstance(create(TYPE, FOLDER, {}, "nao"), WalkingDriver)
+def test_the_manifest_selects_the_driver() -> None:
+    assert isinstance(create(TYPE, FOLDER, {}, "nao"), BipedDriver)
     still = msgspec.structs.replace(TYPE, simulation=None)
     assert type(create(still, FOLDER, {}, "nao")) is MujocoDriver

@@ -147,7 +147,7 @@ class Laboratory:
     def look(self) -> None:
         now_s = self.looked_s = self.now_s
         self.watched.see()
-        told = _flat(self.watched.sight.places(now_s))
+        told = _flat(self.watched.sight.positions(now_s))
         tick_ms = round(now_s * 1000)
         self.room.record(
             "perception", "positions", Measurements(tick_ms=tick_ms, at_ms=0, sequence=tick_ms, values=told)
@@ -202,7 +202,7 @@ def check(lab: Laboratory, x_m: float, y_m: float, yaw_rad: float) -> None:
     assert not lab.touched
 
 
-def test_qbo_goes_around_another_robot_to_where_it_is_sent(lab: Laboratory) -> None:
+def test_qbo_drives_around_another_robot(lab: Laboratory) -> None:
     with pytest.raises(Refused, match="nearest place to go to is x_m") as refused:
         lab.robot.execute(GoTo(x_m=1.5, y_m=2.0))  # the arm's table stands there
     assert refused.value.code == "taken"
@@ -211,7 +211,7 @@ def test_qbo_goes_around_another_robot_to_where_it_is_sent(lab: Laboratory) -> N
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_qbo_goes_to_one_place_after_the_other_while_a_person_walks_about(lab: Laboratory) -> None:
+def test_qbo_visits_several_places_while_a_person_walks(lab: Laboratory) -> None:
     chance = random.Random(5)  # noqa: S311
     gone = 0
     while gone < 12:
@@ -230,7 +230,7 @@ def test_qbo_goes_to_one_place_after_the_other_while_a_person_walks_about(lab: L
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("settle_s", [3.0, 9.0, 15.0, 21.0, 27.0])
-def test_qbo_visits_the_person_who_walks_about(settle_s: float) -> None:
+def test_qbo_visits_a_walking_person(settle_s: float) -> None:
     lab = Laboratory(settle_s=settle_s)
     heard = play(lab, "visit", {})
     lab.close()

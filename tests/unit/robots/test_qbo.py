@@ -114,7 +114,7 @@ def test_odometry_follows_a_long_way_and_drifts_a_little(track: Track) -> None:
     assert abs(math.remainder(told["yaw_rad"] - yaw, 2 * math.pi)) < 0.08
 
 
-def test_wheels_that_slip_are_believed(track: Track) -> None:
+def test_odometry_includes_wheel_slip(track: Track) -> None:
     """Odometry is what wheels say: held in the air it goes on."""
     track.world._data.qpos[2] = 0.5
     track.world.model.opt.gravity[2] = 0.0
@@ -144,7 +144,7 @@ def test_it_stops_within_its_braking_limits(track: Track, twist: Twist) -> None:
     assert math.dist(place[:2], track.truth[:2]) < 0.04
 
 
-def test_it_never_tips_over_whatever_is_asked_of_it(track: Track) -> None:
+def test_it_never_tips_over(track: Track) -> None:
     chance = np.random.default_rng(4)
     upright = 1.0
     for _ in range(40):
@@ -158,7 +158,7 @@ def test_it_never_tips_over_whatever_is_asked_of_it(track: Track) -> None:
     assert not track.world._data.warning.number.any()
 
 
-def test_sideways_it_does_not_go_and_too_fast_keeps_its_curve(track: Track) -> None:
+def test_sideways_motion_is_ignored_and_fast_curves_keep_their_radius(track: Track) -> None:
     assert track.driver.drive(Twist(0.1, 0.2, 0.0)) == Twist(0.1, 0.0, 0.0)
     fast = track.driver.drive(Twist(2.0, 0.0, 4.0))
     assert fast.turn_rad_s / fast.forward_m_s == pytest.approx(2.0)
@@ -168,7 +168,7 @@ def test_sideways_it_does_not_go_and_too_fast_keeps_its_curve(track: Track) -> N
     track.driver.drive(REST)
 
 
-def test_wheels_that_nobody_drives_any_more_stop_by_themselves(track: Track) -> None:
+def test_wheels_stop_without_commands(track: Track) -> None:
     """As when the control loop has found a fault and waits: nothing is commanded any more, and it was going."""
     track.go(Twist(0.3), 2.0)
     place = track.truth
@@ -183,7 +183,7 @@ def test_wheels_that_nobody_drives_any_more_stop_by_themselves(track: Track) -> 
     assert track.speed[0] > 0.25, "who drives again is obeyed"
 
 
-def test_its_sonars_hear_the_wall_it_comes_to(track: Track) -> None:
+def test_sonars_measure_an_approaching_wall(track: Track) -> None:
     """The wall's face is at x = 2.0 m; the sonars sit 0.156 m before the axle."""
     heard = [track.driver.report("sonar")]
     while track.truth[0] < 1.0:
@@ -200,7 +200,7 @@ def test_its_sonars_hear_the_wall_it_comes_to(track: Track) -> None:
         assert (told[-1] * 100) == pytest.approx(round(told[-1] * 100), abs=1e-6), "steps of 10 mm"
 
 
-def test_an_empty_hall_is_silent_and_a_floor_is_a_floor(track: Track) -> None:
+def test_distance_sensors_report_their_range_without_an_echo(track: Track) -> None:
     model, data = track.world.model, track.world._data
     data.qpos[:2] = (0.0, 0.0)
     data.qpos[3:7] = (math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4))  # to the left: no wall
@@ -214,7 +214,7 @@ def test_an_empty_hall_is_silent_and_a_floor_is_a_floor(track: Track) -> None:
     assert model.nq == len(data.qpos)
 
 
-def test_odometry_begins_where_the_robot_was_put() -> None:
+def test_odometry_starts_at_the_true_pose() -> None:
     track = Track()
     track.world._data.qpos[:7] = (0.7, -0.4, 0.0, math.cos(0.5), 0.0, 0.0, math.sin(0.5))
     track.world.step(2)
@@ -234,7 +234,7 @@ def connected(tmp_path: Path) -> Iterator[WheeledDriver]:
     driver.close()
 
 
-def test_before_connect_nothing_is_told_but_how_it_is(connected: WheeledDriver) -> None:
+def test_only_health_is_reported_before_connect(connected: WheeledDriver) -> None:
     with pytest.raises(DriverError, match="not connected"):
         connected.report("odometry")
     with pytest.raises(DriverError, match="not connected"):
@@ -245,7 +245,7 @@ def test_before_connect_nothing_is_told_but_how_it_is(connected: WheeledDriver) 
     assert connected.report("health")["battery_percent"] == 100.0
 
 
-def test_every_stream_of_its_manifest_is_told(connected: WheeledDriver) -> None:
+def test_every_stream_of_the_manifest_is_reported(connected: WheeledDriver) -> None:
     connected.connect()
     connected.observe()
     streams = [stream.name for stream in robot_type.load(FOLDER).streams]
@@ -254,8 +254,8 @@ def test_every_stream_of_its_manifest_is_told(connected: WheeledDriver) -> None:
         assert connected.report(stream)
 
 
-def test_in_the_laboratory_its_sonars_hear_a_person_who_steps_before_it() -> None:
-    world = world_registry.of(ROBOTS / "rooms" / "lab")
+def test_sonars_measure_a_person_in_the_laboratory() -> None:
+    world = world_registry.get_world(ROBOTS / "rooms" / "lab")
     world.build()
     world._processes = ()  # nobody walks by himself
     driver = WheeledDriver(

@@ -65,7 +65,7 @@ def test_wrist_3_frame_and_flange_are_one(bench: Bench):
     assert bench.data.site("wrist_3").xpos == pytest.approx(bench.data.site("flange").xpos, abs=1e-12)
 
 
-def test_links_lie_beside_one_another_as_on_the_real_arm(bench: Bench):
+def test_link_offsets_match_the_real_arm(bench: Bench):
     model = bench.model
 
     def lateral(body: str) -> set[float]:

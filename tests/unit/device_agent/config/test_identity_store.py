@@ -70,7 +70,7 @@ def test_unwritable_files_are_named(tmp_path: Path) -> None:
 
 
 def test_certificate_authority_is_pinned(store: IdentityStore, tmp_path: Path) -> None:
-    server_ca.make(tmp_path / "tls", server_ca.names(("site.example",), ()), now=dt.datetime.now(dt.UTC))
+    server_ca.create(tmp_path / "tls", server_ca.names(("site.example",), ()), now=dt.datetime.now(dt.UTC))
     source = tmp_path / "tls" / server_ca.CA_CERTIFICATE
     assert store.certificate_authority("") is None
     name = store.pin_certificate_authority(source)

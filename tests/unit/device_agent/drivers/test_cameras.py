@@ -17,8 +17,8 @@ QBO = ROOT / "robots" / "qbo"
 TYPE = robot_type.load(QBO)
 
 
-def test_the_eyes_see_the_world_that_the_robot_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(renderer, "WITHIN_S", PATIENCE_S)
+def test_a_robot_camera_shows_its_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(renderer, "TIMEOUT_S", PATIENCE_S)
     driver = simulation.create(TYPE, QBO, {}, "qbo")
     assert isinstance(driver, HasCameras)
     assert driver.frame("eyes") is None
@@ -29,7 +29,7 @@ def test_the_eyes_see_the_world_that_the_robot_stands_in(monkeypatch: pytest.Mon
         pixels = simplejpeg.decode_jpeg(taken.content)
         assert pixels.shape == (taken.height, taken.width, 3)
         assert float(np.std(pixels)) > 5, "it sees nothing but one colour"
-        with pytest.raises(DriverError, match="no camera 'ears'; there are: eyes"):
+        with pytest.raises(DriverError, match="no camera 'ears'; available cameras: eyes"):
             driver.frame("ears")
     finally:
         driver.close()
@@ -37,7 +37,7 @@ def test_the_eyes_see_the_world_that_the_robot_stands_in(monkeypatch: pytest.Mon
     assert driver.frame("eyes") is None
 
 
-def test_a_camera_that_the_model_lacks_is_named() -> None:
+def test_a_missing_camera_is_an_error() -> None:
     kind = msgspec.structs.replace(TYPE, cameras=(Stream(name="third", rate_hz=1.0),))
     with pytest.raises(DriverError, match="no camera 'third'"):
         simulation.create(kind, QBO, {}, "qbo").connect()

@@ -44,7 +44,7 @@ def test_built_in_driver_cannot_be_replaced_by_an_entry_point(monkeypatch: pytes
 
 
 @pytest.mark.parametrize("target", ["acme_is_not_installed:create", "pathlib:create"])
-def test_third_party_driver_that_cannot_be_imported_is_one_clear_error(monkeypatch: pytest.MonkeyPatch, target: str):
+def test_a_third_party_driver_that_cannot_be_imported_is_an_error(monkeypatch: pytest.MonkeyPatch, target: str):
     third_party(monkeypatch, acme=target)
     with pytest.raises(DriverError, match="driver 'acme' cannot be loaded"):
         drivers.load("acme")
@@ -57,7 +57,7 @@ def test_unknown_option_error_lists_the_valid_ones():
 
 
 @pytest.mark.parametrize("value", [7, "", None, ["a"]])
-def test_option_of_the_wrong_type_is_refused(value: object):
+def test_an_option_of_the_wrong_type_is_rejected(value: object):
     folder = ROBOTS / "ur5"
     with pytest.raises(DriverError, match="must be the path of a file"):
         drivers.load("mujoco")(robot_type.load(folder), folder, {"trace": value}, "arm")
@@ -75,7 +75,7 @@ def test_scene_can_be_chosen():
         driver.close()
 
 
-def test_missing_scene_is_one_clear_error_at_connect(tmp_path: Path):
+def test_a_missing_scene_is_an_error_at_connect(tmp_path: Path):
     driver = drivers.load("mujoco")(robot_type.load(ROBOTS / "ur5"), tmp_path, {}, "arm")
     with pytest.raises(DriverError, match=r"scene\.xml"):
         driver.connect()

@@ -10,14 +10,14 @@ import pytest
 
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import MujocoDriver
-from device_agent.drivers.mujoco.fault_injection import WELL, FaultInjector, InjectedFaults, read
+from device_agent.drivers.mujoco.fault_injection import NO_FAULTS, FaultInjector, InjectedFaults, read
 from device_agent.drivers.mujoco.motor_model import (
     AMBIENT_C,
     FULL_RISE_C,
     IDLE_RISE_C,
     PLUGGED_IN_PERCENT,
     WARMING_S,
-    Health,
+    MotorModel,
 )
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.errors import ProtocolError
@@ -37,7 +37,7 @@ class Life:
     """A robot's days, in steps of a tenth of a second that are not waited for."""
 
     def __init__(self, battery: Battery | None = None, *, share: float = 0.0) -> None:
-        self.health = Health(UR5.joints, battery, seed="arm")
+        self.health = MotorModel(UR5.joints, battery, seed="arm")
         self.share = share
         self.time_s = 0.0
         self.health.observe(0.0, MOST * share, STILL)
@@ -49,7 +49,7 @@ class Life:
         return dict(self.health.values())
 
 
-def test_a_joint_at_rest_keeps_its_temperature() -> None:
+def test_a_resting_joint_keeps_its_temperature() -> None:
     values = Life().live(3600)
     assert set(values) == {f"{what}.{name}" for what in ("temperature_c", "load") for name in NAMES}
     for name in NAMES:
@@ -57,7 +57,7 @@ def test_a_joint_at_rest_keeps_its_temperature() -> None:
         assert values[f"load.{name}"] == 0.0
 
 
-def test_a_loaded_joint_warms_with_the_square_of_its_torque_and_comes_to_rest() -> None:
+def test_a_loaded_joint_warms_with_the_square_of_its_torque() -> None:
     life = Life(share=0.5)
     first = life.live(WARMING_S)["temperature_c.elbow"]
     last = life.live(10 * WARMING_S)["temperature_c.elbow"]
@@ -67,32 +67,32 @@ def test_a_loaded_joint_warms_with_the_square_of_its_torque_and_comes_to_rest() 
     assert life.live(1)["load.elbow"] == pytest.approx(0.5, abs=0.01)
 
 
-def test_how_often_it_is_looked_at_does_not_matter() -> None:
+def test_the_thermal_model_is_independent_of_the_step() -> None:
     coarse, fine = Life(share=0.4), Life(share=0.4)
     assert coarse.live(600)["temperature_c.elbow"] == pytest.approx(
         fine.live(600, step_s=0.05)["temperature_c.elbow"], abs=0.5
     )
 
 
-def test_a_world_that_stood_still_has_aged_nothing() -> None:
+def test_a_stopped_world_does_not_heat_motors() -> None:
     life = Life(share=1.0)
     life.time_s += 86_400
     assert life.live(1)["temperature_c.elbow"] < AMBIENT_C + IDLE_RISE_C + 1
 
 
-def test_a_joint_that_overheats_warms_without_end_and_cools_when_it_is_well() -> None:
+def test_an_overheating_joint_cools_after_the_fault() -> None:
     life = Life()
-    life.health.suffer(InjectedFaults(overheating={"elbow": 2.0}))
+    life.health.inject(InjectedFaults(overheating={"elbow": 2.0}))
     values = life.live(1200)
     assert values["temperature_c.elbow"] == pytest.approx(
         AMBIENT_C + IDLE_RISE_C + 40 + IDLE_RISE_C * 1200 / WARMING_S, abs=1
     )
     assert values["temperature_c.wrist_1"] == pytest.approx(AMBIENT_C + IDLE_RISE_C, abs=0.5)
-    life.health.suffer(WELL)
+    life.health.inject(NO_FAULTS)
     assert life.live(10 * WARMING_S)["temperature_c.elbow"] == pytest.approx(AMBIENT_C + IDLE_RISE_C, abs=0.5)
 
 
-def test_a_battery_empties_by_what_is_taken_and_goes_to_its_charger_before_it_is_flat() -> None:
+def test_a_battery_discharges_and_recharges() -> None:
     life = Life(BATTERY)
     half = life.live(3600)
     assert half["battery_percent"] == pytest.approx(50.0, abs=0.5)
@@ -108,81 +108,81 @@ def test_a_battery_empties_by_what_is_taken_and_goes_to_its_charger_before_it_is
     assert life.live(7200 - 7000)["battery_percent"] > emptiest
 
 
-def test_a_battery_empties_sooner_under_load() -> None:
+def test_load_discharges_the_battery_faster() -> None:
     idle, busy = Life(BATTERY), Life(BATTERY, share=0.1)
     assert busy.live(60)["battery_percent"] < idle.live(60)["battery_percent"] - 0.2
 
 
-def test_a_battery_can_be_set_and_kept_from_its_charger() -> None:
+def test_battery_charge_and_charger_can_be_injected() -> None:
     life = Life(BATTERY)
-    life.health.suffer(InjectedFaults(battery_percent=4.0, charging=False))
+    life.health.inject(InjectedFaults(battery_percent=4.0, charging=False))
     assert life.live(10)["battery_percent"] < 4.0
     assert life.live(7200)["battery_percent"] == 0.0
-    life.health.suffer(InjectedFaults(charging=True))
+    life.health.inject(InjectedFaults(charging=True))
     assert life.live(720)["battery_percent"] == pytest.approx(10.0, abs=0.5)
 
 
-def test_a_motor_that_strains_and_does_not_move_is_stuck_after_half_a_second() -> None:
+def test_a_motor_at_its_limit_without_motion_has_stalled() -> None:
     health = Life().health
     behind = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
     effort = np.where(behind > 0, MOST, 0.0)
-    assert [name for _ in range(4) for name in health.stuck(0.1, behind, effort, STILL)] == []
-    assert health.stuck(0.1, behind, effort, STILL) == ["elbow"]
-    health.forgive()
-    assert health.stuck(0.1, behind, effort, STILL) == []
+    assert [name for _ in range(4) for name in health.stalled(0.1, behind, effort, STILL)] == []
+    assert health.stalled(0.1, behind, effort, STILL) == ["elbow"]
+    health.clear()
+    assert health.stalled(0.1, behind, effort, STILL) == []
     for innocent in (
         (np.zeros(6), effort, STILL),  # where it should be: it carries
         (behind, effort * 0.5, STILL),  # it could give more
         (behind, effort, np.full(6, 0.1)),  # it moves
     ):
-        health.forgive()
-        assert [name for _ in range(30) for name in health.stuck(0.1, *innocent)] == []
+        health.clear()
+        assert [name for _ in range(30) for name in health.stalled(0.1, *innocent)] == []
 
 
 # ------------------------------------------------------------ the file
 
 
-def test_a_file_says_what_ails_a_robot() -> None:
+def test_a_fault_file_is_parsed() -> None:
     text = 'overheating = { elbow = 2.0 }\nweak = { wrist_1 = 0.3 }\nstuck = ["shoulder_pan"]\nbattery_percent = 25.0\n'
     assert read(text, NAMES) == InjectedFaults(
         overheating={"elbow": 2.0}, weak={"wrist_1": 0.3}, stuck=("shoulder_pan",), battery_percent=25.0
     )
-    assert read("", NAMES) == WELL
+    assert read("", NAMES) == NO_FAULTS
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('stuck = ["nose"]', "no joint 'nose'; there are: shoulder_pan, shoulder_lift"),
-        ("broken = true", "unknown field `broken`; there are: overheating, weak, stuck"),
-        ("stuck = [", "there are: overheating"),
+        ('stuck = ["nose"]', "no joint 'nose'; valid joints: shoulder_pan, shoulder_lift"),
+        ("broken = true", "unknown field `broken`; valid fields: overheating, weak, stuck"),
+        ("stuck = [", "valid fields: overheating"),
         ("weak = { elbow = 2.0 }", "<= 1"),
         ("overheating = { elbow = nan }", "> 0"),
     ],
 )
-def test_a_wrong_file_says_what_there_is(text: str, says: str) -> None:
-    with pytest.raises(ProtocolError, match="there are") as refused:
+def test_an_invalid_fault_file_is_rejected_with_valid_names(text: str, says: str) -> None:
+    with pytest.raises(ProtocolError, match="valid") as refused:
         read(text, NAMES)
     assert says in str(refused.value)
 
 
-def test_the_file_may_come_change_and_go(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_fault_file_may_appear_change_and_disappear(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "arm.toml"
     bed = FaultInjector(path, NAMES)
-    assert bed.news() is None
+    assert bed.poll() is None
     path.write_text('stuck = ["elbow"]')
-    assert bed.news() == InjectedFaults(stuck=("elbow",))
-    assert bed.news() is None
+    assert bed.poll() == InjectedFaults(stuck=("elbow",))
+    assert bed.poll() is None
     with caplog.at_level(logging.WARNING):
         path.write_text('stuck = ["nose"]  # no such joint')
-        assert bed.news() is None
-        assert bed.news() is None
+        assert bed.poll() is None
+        assert bed.poll() is None
     assert caplog.text.count("no joint 'nose'") == 1
     path.unlink()
-    assert bed.news() == WELL
+    assert bed.poll() == NO_FAULTS
     path.mkdir()
-    assert bed.news() is None
-    assert FaultInjector(None, NAMES).news() is None
+    assert bed.poll() is None
+    assert FaultInjector(None, NAMES).poll() is None
 
 
 # ------------------------------------------------------------ in the simulation
@@ -210,7 +210,7 @@ def hold(arm: MujocoDriver, target: list[float], until: Any) -> None:
         time.sleep(0.01)
 
 
-def test_a_joint_that_is_stuck_is_an_error_that_names_it_and_it_may_try_again(arm: MujocoDriver, faults: Path) -> None:
+def test_a_stuck_joint_is_an_error_until_reconnect(arm: MujocoDriver, faults: Path) -> None:
     home = list(arm.observe().position_rad)
     target = [home[0], home[1], home[2] - 0.4, *home[3:]]
     faults.write_text('stuck = ["elbow"]')
@@ -225,7 +225,7 @@ def test_a_joint_that_is_stuck_is_an_error_that_names_it_and_it_may_try_again(ar
         return bool(said)
 
     hold(arm, target, failed)
-    assert said[0].startswith("elbow does not move though the motor gives all it can")
+    assert said[0].startswith("elbow does not move at full motor effort")
     arm.connect()  # as the control loop does, a second later
     seen = arm.observe()
     assert seen.position_rad[2] == pytest.approx(home[2], abs=0.05)
@@ -234,7 +234,7 @@ def test_a_joint_that_is_stuck_is_an_error_that_names_it_and_it_may_try_again(ar
     hold(arm, target, lambda: abs(arm.observe().position_rad[2] - target[2]) < 0.01)
 
 
-def test_a_weak_joint_gives_in(arm: MujocoDriver, faults: Path) -> None:
+def test_a_weak_joint_yields(arm: MujocoDriver, faults: Path) -> None:
     stretched = [0.0, 0.0, 0.0, -1.57, -1.57, 0.0]
     arm.observe()
     faults.write_text("weak = { shoulder_lift = 0.05 }")
@@ -242,8 +242,8 @@ def test_a_weak_joint_gives_in(arm: MujocoDriver, faults: Path) -> None:
     hold(arm, stretched, lambda: arm.observe().position_rad[1] > 0.05)
 
 
-def test_without_an_option_nothing_can_be_put_into_a_robot(tmp_path: Path) -> None:
+def test_without_the_option_no_faults_can_be_injected(tmp_path: Path) -> None:
     driver = load("mujoco")(UR5, ROBOTS / "ur5", {}, "arm")
     assert isinstance(driver, MujocoDriver)
-    assert driver._sickbed.news() is None
+    assert driver._fault_injector.poll() is None
     assert not list(tmp_path.iterdir())

@@ -31,7 +31,7 @@ def arm() -> Iterator[MujocoDriver]:
     driver.close()
 
 
-def test_frames_are_in_the_base_wherever_the_robot_stands(arm: MujocoDriver, tmp_path: Path):
+def test_frames_are_relative_to_the_base(arm: MujocoDriver, tmp_path: Path):
     room = tmp_path / "room.xml"
     room.write_text("<mujoco/>")
     turned = Placement(
@@ -47,7 +47,7 @@ def test_frames_are_in_the_base_wherever_the_robot_stands(arm: MujocoDriver, tmp
         away.close()
 
 
-def test_flange_pose_is_the_simulations(arm: MujocoDriver):
+def test_the_flange_pose_matches_the_simulation(arm: MujocoDriver):
     observation = arm.observe()
     model = mujoco.MjModel.from_xml_path(str(UR5 / "scene.xml"))
     data = mujoco.MjData(model)
@@ -80,7 +80,7 @@ def test_a_frame_may_be_a_body():
         ),
     ],
 )
-def test_a_name_that_the_model_lacks_is_reported_with_the_valid_ones(change: dict[str, object], says: str):
+def test_missing_names_are_reported_with_the_valid_ones(change: dict[str, object], says: str):
     driver = alone(msgspec.structs.replace(TYPE, **change))
     with pytest.raises(DriverError, match=says):
         driver.connect()
@@ -88,7 +88,7 @@ def test_a_name_that_the_model_lacks_is_reported_with_the_valid_ones(change: dic
         driver.observe()
 
 
-def test_an_actuator_that_is_no_position_servo_is_refused(tmp_path: Path):
+def test_other_actuators_than_position_servos_are_rejected(tmp_path: Path):
     scene = tmp_path / "motor.xml"
     scene.write_text(
         (UR5 / "ur5.xml")
@@ -124,7 +124,7 @@ def test_a_fault_of_the_world_reaches_observe_and_send(arm: MujocoDriver):
         arm.send([0.0] * 6)
 
 
-def test_connecting_after_a_fault_begins_anew_at_home(arm: MujocoDriver):
+def test_reconnecting_after_a_fault_restarts_at_home(arm: MujocoDriver):
     home = arm.observe().position_rad
     arm.send([0.3, *home[1:]])
     time.sleep(0.05)
@@ -143,13 +143,13 @@ def test_connecting_after_a_fault_begins_anew_at_home(arm: MujocoDriver):
     assert arm.observe().position_rad == pytest.approx(home, abs=1e-3)
 
 
-def test_a_simulation_that_hangs_is_noticed(arm: MujocoDriver, monkeypatch: pytest.MonkeyPatch):
+def test_a_hanging_simulation_is_detected(arm: MujocoDriver, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(driver_module, "STALE_S", -1.0)
     with pytest.raises(DriverError, match="has not moved for"):
         arm.observe()
 
 
-def test_targets_every_period_give_an_even_motion():
+def test_periodic_targets_give_smooth_motion():
     """Driven by hand at a steady rate: velocity stays within 1 % once the servo follows."""
     world = World(UR5 / "scene.xml", home=TYPE.home_rad)
     world.build()

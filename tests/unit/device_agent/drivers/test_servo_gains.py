@@ -33,7 +33,7 @@ class Arm:
         return dict(zip(self.names, snapshot.qpos[self.driver._qpos].tolist(), strict=True))
 
 
-def test_a_limp_joint_falls_and_the_others_hold() -> None:
+def test_a_compliant_joint_falls_and_the_others_hold() -> None:
     arm = Arm()
     before = arm.run(0.2)
     arm.stiffen(0.0, "wrist_1")
@@ -43,7 +43,7 @@ def test_a_limp_joint_falls_and_the_others_hold() -> None:
     assert abs(after["elbow"] - before["elbow"]) < 0.1
 
 
-def test_with_all_of_its_stiffness_back_it_is_as_it_was_made() -> None:
+def test_full_stiffness_restores_the_model() -> None:
     arm = Arm()
     model = arm.world.model
     made = [model.actuator_gainprm.copy(), model.actuator_biasprm.copy(), model.body_gravcomp.copy()]
@@ -58,6 +58,6 @@ def test_with_all_of_its_stiffness_back_it_is_as_it_was_made() -> None:
     assert all(np.array_equal(one, other) for one, other in zip(made, now, strict=True))
 
 
-def test_other_skills_are_not_the_simulations() -> None:
-    with pytest.raises(SkillError, match="cannot do this"):
+def test_other_skills_are_rejected() -> None:
+    with pytest.raises(SkillError, match="does not support this skill"):
         Arm().driver.perform(Say(text="hello"), STAGE)

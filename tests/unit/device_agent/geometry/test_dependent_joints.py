@@ -34,7 +34,7 @@ def walker() -> tuple[RobotType, MujocoGeometry, np.ndarray]:
     return loaded("nao")
 
 
-def test_a_pose_of_what_hangs_on_rods_is_found_for_its_motors(
+def test_ik_solves_for_dependent_joints(
     head: tuple[RobotType, MujocoGeometry, np.ndarray],
 ) -> None:
     kind, shape, home = head
@@ -49,16 +49,16 @@ def test_a_pose_of_what_hangs_on_rods_is_found_for_its_motors(
         assert abs(np.dot(found[3:], wanted[3:])) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_pose_that_only_rods_without_their_motors_could_reach_is_refused(
+def test_ik_rejects_poses_that_motors_cannot_reach(
     head: tuple[RobotType, MujocoGeometry, np.ndarray],
 ) -> None:
     _, shape, home = head
     x, y, z, *turn = shape.poses(home.tolist())["head"]
-    with pytest.raises(GeometryError, match="found no way to bring head there: the nearest it comes is"):
+    with pytest.raises(GeometryError, match="found no joint position for head: the closest one is"):
         shape.solve("head", (x, y, z + 0.05, *turn), home.tolist())  # type: ignore[arg-type]
 
 
-def test_a_pose_of_a_leg_is_found_with_both_joints_of_the_one_motor(
+def test_ik_moves_mirrored_joints_together(
     walker: tuple[RobotType, MujocoGeometry, np.ndarray],
 ) -> None:
     kind, shape, home = walker
@@ -79,14 +79,14 @@ def test_a_pose_of_a_leg_is_found_with_both_joints_of_the_one_motor(
         ("nao", "RLeg", (0.02, 0.0, 0.0, 0.0, 0.0, 0.0)),
     ],
 )
-def test_a_jog_moves_the_frame_as_it_is_asked_by_what_motors_can_do(
+def test_jogs_use_motor_joints_only(
     robot: str, frame: str, twist: tuple[float, ...], request: pytest.FixtureRequest
 ) -> None:
     kind, shape, home = request.getfixturevalue({"hanson": "head", "nao": "walker"}[robot])
     rates = np.array(shape.rates(frame, twist, home.tolist(), tool=False))
     names = [joint.name for joint in kind.joints]
     for mirror in kind.mimic_joints:
-        assert rates[names.index(mirror.joint)] == mirror.factor * rates[names.index(mirror.of)]
+        assert rates[names.index(mirror.joint)] == mirror.multiplier * rates[names.index(mirror.mimics)]
     before, after = (np.array(shape.poses((home + rates * at).tolist())[frame]) for at in (0.0, STEP_S))
     linear = (after[:3] - before[:3]) / STEP_S
     turned = 2 * math.acos(min(1.0, abs(float(before[3:] @ after[3:])))) / STEP_S

@@ -41,11 +41,11 @@ def free(shape: MujocoGeometry, count: int, seed: int) -> list[Any]:
     return found[:count]
 
 
-def test_the_home_position_has_room(shape: MujocoGeometry) -> None:
+def test_the_home_position_is_clear(shape: MujocoGeometry) -> None:
     assert shape.clearance(HOME).room_m > 0.02
 
 
-def test_wherever_mujoco_finds_a_contact_there_is_no_room(shape: MujocoGeometry) -> None:
+def test_contacts_have_no_clearance(shape: MujocoGeometry) -> None:
     model = mujoco.MjModel.from_xml_path(str(UR5 / KIND.scene))
     data = mujoco.MjData(model)
     touching = 0
@@ -59,7 +59,7 @@ def test_wherever_mujoco_finds_a_contact_there_is_no_room(shape: MujocoGeometry)
     assert touching > 50
 
 
-def test_a_clear_way_is_clear_everywhere_and_a_blocked_one_is_not(shape: MujocoGeometry) -> None:
+def test_sweeps_agree_with_sampling(shape: MujocoGeometry) -> None:
     random = np.random.default_rng(3)
     blocked = 0
     for start in free(shape, 120, 2):
@@ -78,12 +78,10 @@ def test_a_clear_way_is_clear_everywhere_and_a_blocked_one_is_not(shape: MujocoG
     assert 20 < blocked < 100
 
 
-def test_what_was_measured_before_lets_no_step_pass_that_measuring_would_stop(
-    shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cached_bounds_agree_with_measurements(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(8)
     measuring = MujocoGeometry(KIND, UR5 / KIND.scene)
-    monkeypatch.setattr(measuring._probe, "_surely_clear", lambda _: False)
+    monkeypatch.setattr(measuring._checker, "_surely_clear", lambda _: False)
     counts = {True: 0, False: 0}
     for start in free(shape, 25, 4):
         heading = random.uniform(-0.06, 0.06, len(start))
@@ -96,7 +94,7 @@ def test_what_was_measured_before_lets_no_step_pass_that_measuring_would_stop(
     assert min(counts.values()) > 50
 
 
-def test_who_is_too_near_may_leave_but_not_go_on(shape: MujocoGeometry) -> None:
+def test_a_violated_margin_may_only_grow(shape: MujocoGeometry) -> None:
     low = [0.0, -0.86, *HOME[2:]]
     assert shape.clearance(low).room_m < 0
     away, on = ([0.0, lift, *HOME[2:]] for lift in (-1.0, -0.80))
@@ -107,7 +105,7 @@ def test_who_is_too_near_may_leave_but_not_go_on(shape: MujocoGeometry) -> None:
     assert stopped.clearance.text == "clearance: table_top \u2013 wrist_3_link"
 
 
-def test_a_glance_sees_how_far_a_way_is_clear(shape: MujocoGeometry) -> None:
+def test_glance_estimates_the_clear_share(shape: MujocoGeometry) -> None:
     assert shape.glance(HOME, [1.0, *HOME[1:]]) == 1.0
     for lift in (-0.8, -0.5, 0.3):
         down = [0.0, lift, *HOME[2:]]
@@ -182,7 +180,7 @@ def test_poses_are_those_of_the_model(shape: MujocoGeometry) -> None:
             assert pose[3] >= 0
 
 
-def test_inverse_kinematics_reaches_what_can_be_reached(shape: MujocoGeometry) -> None:
+def test_inverse_kinematics_finds_reachable_poses(shape: MujocoGeometry) -> None:
     for place in free(shape, 12, 7):
         wanted = shape.poses(place.tolist())["flange"]
         found = shape.solve("flange", wanted, HOME)
@@ -192,17 +190,17 @@ def test_inverse_kinematics_reaches_what_can_be_reached(shape: MujocoGeometry) -
         assert shape.clearance(found).room_m >= 0
 
 
-def test_a_step_that_cannot_be_solved_ends_the_try(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unsolvable_step_ends_the_attempt(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
     def unsolved(*_: Any, **__: Any) -> Any:
         raise mink.NoSolutionFound("daqp")
 
     monkeypatch.setattr(mink, "solve_ik", unsolved)
     x, y, z, *turn = shape.poses(HOME)["flange"]
-    with pytest.raises(GeometryError, match="found no way"):
+    with pytest.raises(GeometryError, match="found no joint position"):
         shape.solve("flange", (x, y + 0.05, z, *turn), HOME)  # type: ignore[arg-type]
 
 
-def test_near_the_start_it_stays_near_the_start(shape: MujocoGeometry) -> None:
+def test_solutions_are_near_the_start(shape: MujocoGeometry) -> None:
     x, y, z, *turn = shape.poses(HOME)["flange"]
     found = shape.solve("flange", (x, y + 0.05, z - 0.05, *turn), HOME)  # type: ignore[arg-type]
     assert np.abs(np.subtract(found, HOME)).max() < 0.3
@@ -211,26 +209,24 @@ def test_near_the_start_it_stays_near_the_start(shape: MujocoGeometry) -> None:
 @pytest.mark.parametrize(
     ("frame", "pose", "says"),
     [
-        ("hand", (0.3, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0), "there are: shoulder_pan"),
-        ("flange", (2.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0), "found no way to bring flange there: the nearest it comes is"),
-        ("flange", (-0.5, -0.1, 0.005, 0.0, 0.7071068, 0.7071068, 0.0), "flange cannot go there: "),
+        ("hand", (0.3, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0), "available frames: shoulder_pan"),
+        ("flange", (2.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0), "found no joint position for flange: the closest one is"),
+        ("flange", (-0.5, -0.1, 0.005, 0.0, 0.7071068, 0.7071068, 0.0), "flange cannot reach this pose: "),
         ("flange", (0.3, math.nan, 0.3, 1.0, 0.0, 0.0, 0.0), "finite"),
         ("flange", (0.3, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0), "quaternion"),
     ],
 )
-def test_what_cannot_be_reached_is_said_with_what_to_do(
-    shape: MujocoGeometry, frame: str, pose: Any, says: str
-) -> None:
+def test_unreachable_poses_are_rejected(shape: MujocoGeometry, frame: str, pose: Any, says: str) -> None:
     with pytest.raises(GeometryError, match=says):
         shape.solve(frame, pose, HOME)
 
 
-def test_a_type_without_a_model_has_no_shape() -> None:
+def test_a_type_without_model_has_no_geometry() -> None:
     assert geometry.load(msgspec.structs.replace(KIND, model="", workspace=None), UR5) is None
     assert geometry.load(KIND, UR5) is not None
 
 
-def test_without_mujoco_the_agent_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_mujoco_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
 
     def without(name: str, *arguments: Any, **options: Any) -> Any:
@@ -260,13 +256,13 @@ def broken() -> dict[str, tuple[RobotType, str, str]]:
         "home below the table": (
             msgspec.structs.replace(KIND, home_rad={**KIND.home_rad, "shoulder_lift": 0.0}),
             KIND.scene,
-            "the home position has no room",
+            "the home position is too close",
         ),
     }
 
 
 @pytest.mark.parametrize("case", broken())
-def test_a_model_that_does_not_fit_is_refused(case: str) -> None:
+def test_a_mismatched_model_is_rejected(case: str) -> None:
     kind, scene, says = broken()[case]
     if case == "no joint":
         kind = msgspec.structs.replace(kind, home_rad={"knee": 0.0})
@@ -292,7 +288,7 @@ CART = """
 """
 
 
-def test_a_robot_that_drives_is_held_against_itself_and_not_against_a_place_it_has_left(tmp_path: Path) -> None:
+def test_a_mobile_robot_is_only_checked_against_itself(tmp_path: Path) -> None:
     (tmp_path / "cart.xml").write_text(CART)
     joint = KIND.joints[0]
     kind = msgspec.structs.replace(
@@ -322,7 +318,7 @@ def test_a_robot_that_drives_is_held_against_itself_and_not_against_a_place_it_h
         MujocoGeometry(msgspec.structs.replace(kind, base=None), tmp_path / "cart.xml")
 
 
-def test_another_scene_can_be_named(tmp_path: Path) -> None:
+def test_another_scene_can_be_selected(tmp_path: Path) -> None:
     shutil.copytree(UR5, tmp_path / "ur5")
     scene = (tmp_path / "ur5" / "scene.xml").read_text()
     post = '<geom name="post" type="cylinder" size="0.05 0.5" pos="-0.48 0.25 0.5"/>'
@@ -344,13 +340,13 @@ def room_with(tmp_path: Path, *things: str) -> Path:
     return room
 
 
-def standing(room: Path, yaw_rad: float = 0.7) -> MujocoGeometry:
+def base_pose(room: Path, yaw_rad: float = 0.7) -> MujocoGeometry:
     there = geometry.BasePose(room=room, position_m=(2.0, -1.0, 0.75), yaw_rad=yaw_rad)
-    return MujocoGeometry(KIND, UR5 / KIND.model, standing=there)
+    return MujocoGeometry(KIND, UR5 / KIND.model, base_pose=there)
 
 
-def test_in_a_room_poses_stay_in_the_robots_base(shape: MujocoGeometry, tmp_path: Path):
-    there = standing(room_with(tmp_path))
+def test_poses_in_a_room_are_relative_to_the_base(shape: MujocoGeometry, tmp_path: Path):
+    there = base_pose(room_with(tmp_path))
     for name, pose in shape.poses(HOME).items():
         assert there.poses(HOME)[name] == pytest.approx(pose, abs=1e-9)
     target = shape.poses(HOME)["flange"]
@@ -358,12 +354,12 @@ def test_in_a_room_poses_stay_in_the_robots_base(shape: MujocoGeometry, tmp_path
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.7, -2.2])
-def test_in_a_room_a_thing_is_where_the_robots_place_and_turn_have_it(tmp_path: Path, yaw_rad: float):
+def test_room_objects_are_transformed_by_the_base_pose(tmp_path: Path, yaw_rad: float):
     # As far from the base as the flange; the arm turns there about its base.
     x, y = -0.36, -0.36
     place = (2.0 + x * math.cos(yaw_rad) - y * math.sin(yaw_rad), -1.0 + x * math.sin(yaw_rad) + y * math.cos(yaw_rad))
     post = f'<geom name="post" type="cylinder" size="0.05 0.6" pos="{place[0]} {place[1]} 1.3"/>'
-    there = standing(room_with(tmp_path, post), yaw_rad=yaw_rad)
+    there = base_pose(room_with(tmp_path, post), yaw_rad=yaw_rad)
     towards = [HOME[0] + 1.0, *HOME[1:]]
     swept = there.sweep([HOME, towards])
     assert swept.clearance is not None
@@ -376,7 +372,7 @@ def test_what_moves_in_a_room_or_is_out_of_reach_is_left_out(tmp_path: Path):
     gate = '<geom name="gate" type="box" size="0.05 0.4 0.4"/>'
     swinging = f'<body pos="1.5 -1 1"><joint name="swing" type="hinge"/>{gate}</body>'
     far = '<geom name="far" type="box" size="0.1 0.1 0.1" pos="-3 3 1"/>'
-    with_both = standing(room_with(tmp_path, swinging, far))
+    with_both = base_pose(room_with(tmp_path, swinging, far))
     names = {name for pair in with_both._pairs._names for name in pair}
     assert "gate" not in names
     assert "far" not in names

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from device_agent import geometry
-from device_agent.geometry.joint_bounds import Bounds
+from device_agent.geometry.joint_bounds import JointBounds
 from device_agent.geometry.mujoco_geometry import MujocoGeometry
 from device_agent.ports.geometry import GeometryError, PlannerLostError
 from device_agent.protocol import MoveJoints, StopLatch
@@ -62,7 +62,7 @@ def divided(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shape(divided: Path) -> Iterator[MujocoGeometry]:
     shape = MujocoGeometry(KIND, divided)
     yield shape
-    shape._planning._process.end()
+    shape._planner_process._process.stop()
 
 
 def until(happened: Callable[[], bool]) -> None:
@@ -73,7 +73,7 @@ def until(happened: Callable[[], bool]) -> None:
 
 
 def pid_of(shape: MujocoGeometry) -> int:
-    running = shape._planning._process.running
+    running = shape._planner_process._process.running
     return 0 if running is None else running.pid
 
 
@@ -84,7 +84,7 @@ def alive(pid: int) -> bool:
         return False
 
 
-def test_the_process_finds_what_would_be_found_here() -> None:
+def test_the_process_plans_the_same_path() -> None:
     shape = MujocoGeometry(KIND, UR5 / KIND.scene)
     low = shape.solve("flange", (*shape.poses(HOME)["flange"][:2], 0.1, *shape.poses(HOME)["flange"][3:]), HOME)
     goal = [low[0] + 2.5, *low[1:]]
@@ -97,16 +97,16 @@ def test_the_process_finds_what_would_be_found_here() -> None:
     until(lambda: not alive(first))
 
 
-def test_what_is_no_way_says_so_from_there_too(shape: MujocoGeometry) -> None:
-    with pytest.raises(GeometryError, match="found no way there in 0 s"):
+def test_a_planning_failure_is_reported(shape: MujocoGeometry) -> None:
+    with pytest.raises(GeometryError, match="found no path in 0 s"):
         shape.plan(HOME, BEYOND, within_s=0.2)
 
 
-def test_who_no_longer_wants_a_way_has_it_killed_at_once(shape: MujocoGeometry) -> None:
+def test_cancelling_kills_the_process(shape: MujocoGeometry) -> None:
     shape.plan(HOME, HOME)
     pid, enough = pid_of(shape), threading.Event()
     threading.Timer(0.3, enough.set).start()
-    with pytest.raises(GeometryError, match="nobody waits"):
+    with pytest.raises(GeometryError, match="cancelled"):
         shape.plan(HOME, BEYOND, within_s=PATIENCE_S, ended=enough.is_set)
     assert not alive(pid)
 
@@ -135,7 +135,7 @@ class Arm:
         return refused.value
 
 
-def test_an_action_whose_planner_is_killed_fails_with_a_reason_and_the_arm_holds(shape: MujocoGeometry) -> None:
+def test_a_killed_planner_fails_the_action(shape: MujocoGeometry) -> None:
     arm = Arm(shape)
 
     def kill() -> None:
@@ -153,17 +153,17 @@ def test_an_action_whose_planner_is_killed_fails_with_a_reason_and_the_arm_holds
     assert shape.plan(HOME, HOME), "asked again, another one does it"
 
 
-def test_a_planner_that_hangs_is_given_up(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hanging_planner_times_out(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
     shape.plan(HOME, HOME)
     pid = pid_of(shape)
     os.kill(pid, signal.SIGSTOP)
-    monkeypatch.setattr("device_agent.geometry.planner_process._SLOW_S", 0.2)
-    with pytest.raises(PlannerLostError, match="does not answer"):
+    monkeypatch.setattr("device_agent.geometry.planner_process._STARTUP_S", 0.2)
+    with pytest.raises(PlannerLostError, match="does not respond"):
         shape.plan(HOME, BEYOND, within_s=0.1)
     assert not alive(pid)
 
 
-def test_a_stop_ends_the_search(shape: MujocoGeometry) -> None:
+def test_stop_cancels_planning(shape: MujocoGeometry) -> None:
     arm = Arm(shape)
 
     def stop() -> None:
@@ -172,19 +172,19 @@ def test_a_stop_ends_the_search(shape: MujocoGeometry) -> None:
 
     stopper = threading.Thread(target=stop)
     stopper.start()
-    assert "nobody waits" in arm.cross().message
+    assert "cancelled" in arm.cross().message
     stopper.join()
     assert pid_of(shape) == 0
 
 
-def test_a_model_that_cannot_be_used_there_says_so(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
-    site = shape._planning._site
-    monkeypatch.setattr(shape._planning, "_site", type(site)(robot_type=KIND, scene="/nowhere/scene.xml"))
+def test_an_invalid_scene_is_reported(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+    site = shape._planner_process._scene
+    monkeypatch.setattr(shape._planner_process, "_scene", type(site)(robot_type=KIND, scene="/nowhere/scene.xml"))
     with pytest.raises(GeometryError, match=r"/nowhere/scene\.xml"):
         shape.plan(HOME, HOME)
 
 
-def test_a_python_that_is_gone_is_told(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_start_is_reported(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(PlannerLostError, match="does not start"):
         shape.plan(HOME, HOME)
@@ -204,7 +204,7 @@ shape.plan(t.HOME, t.BEYOND, within_s=600.0)
 """
 
 
-def test_it_ends_with_an_agent_that_is_killed_in_the_middle_of_a_search(divided: Path) -> None:
+def test_the_process_exits_when_the_agent_is_killed(divided: Path) -> None:
     root = ROOT
     with subprocess.Popen(
         [sys.executable, "-c", AGENT, str(divided)],
@@ -224,7 +224,7 @@ def test_it_ends_with_an_agent_that_is_killed_in_the_middle_of_a_search(divided:
 # ------------------------------------------------------------ joints that hang together
 
 
-def test_a_planned_way_keeps_to_what_a_yaw_leaves_the_head_and_moves_both_hips_as_one() -> None:
+def test_planned_paths_respect_joint_couplings() -> None:
     kind = robot_type.load(NAO)
     shape = geometry.load(kind, NAO)
     assert shape is not None
@@ -249,9 +249,9 @@ def test_a_planned_way_keeps_to_what_a_yaw_leaves_the_head_and_moves_both_hips_a
     assert goal[names.index("RHipYawPitch")] == pytest.approx(-0.1)
 
 
-def test_between_rows_of_its_table_a_straight_way_is_looked_at_where_it_is_narrowest() -> None:
+def test_position_dependent_limits_are_checked_between_table_rows() -> None:
     kind = robot_type.load(NAO)
-    bounds, couplings = Bounds(kind), Couplings(kind)
+    bounds, couplings = JointBounds(kind), Couplings(kind)
     home = np.array([kind.home_rad[joint.name] for joint in kind.joints])
     names = [joint.name for joint in kind.joints]
     yaw, pitch = names.index("HeadYaw"), names.index("HeadPitch")
@@ -261,8 +261,8 @@ def test_between_rows_of_its_table_a_straight_way_is_looked_at_where_it_is_narro
         start, end = home.copy(), home.copy()
         start[[yaw, pitch]] = chance.uniform((-2, -0.5), (2, 0.4))
         end[[yaw, pitch]] = chance.uniform((-2, -0.5), (2, 0.4))
-        keeps = bounds.keeps(start, end, np.zeros(1))
+        keeps = bounds.admits(start, end, np.zeros(1))
         assert keeps == (couplings.describe_violation(np.linspace(start, end, 2000)) == "")
         kept += keeps
     assert 50 < kept < 350
-    assert bounds.spare(home, home)[0] == pytest.approx(0.03)
+    assert bounds.clearance(home, home)[0] == pytest.approx(0.03)

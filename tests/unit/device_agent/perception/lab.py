@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from device_agent.drivers.mujoco import WalkingDriver, driver
+from device_agent.drivers.mujoco import BipedDriver, driver
 from device_agent.ports.driver import Twist
 from device_agent.ports.sensor import Image, RoomDriver, Scan
 from device_agent.protocol.manifests import robot_type
@@ -37,7 +37,7 @@ def by_hand() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shared_view, "OLDEST_S", -1.0)
         patch.setattr(cameras, "FRESH_S", -1.0)
-        patch.setattr(renderer, "WITHIN_S", 60.0)
+        patch.setattr(renderer, "TIMEOUT_S", 60.0)
         patch.setattr(driver, "STALE_S", math.inf)
         yield
 
@@ -94,7 +94,7 @@ class Watched:
                 self.nao.go_on(PERIOD_S)
                 self.walked_m += math.dist(before, self.truth()["nao"])
             self.see()
-            places = self.sight.places(self.now_s)
+            places = self.sight.positions(self.now_s)
             for name, at in self.truth().items():
                 off = math.dist(at, (places[name].x_m, places[name].y_m)) if name in places else math.inf
                 found[name].append(off)
@@ -104,9 +104,9 @@ class Watched:
         """One look."""
         for name in EYES:
             if self._looks % EVERY.get(name, 1) == 0:
-                self.sight.see(name, self.raw(name))
+                self.sight.update(name, self.raw(name))
         self._looks += 1
-        self.sight.settle(self.now_s)
+        self.sight.advance(self.now_s)
 
     def truth(self) -> dict[str, tuple[float, float]]:
         """Where everybody is."""
@@ -146,7 +146,7 @@ class Nao:
     def __init__(self, world: StillWorld, name: str = "nao") -> None:
         self._world = world
         self.type = robot_type.load(ROBOTS / "nao")
-        self._driver = WalkingDriver(robot_type=self.type, world=_Held(world), device=name, prefix=f"{name}/")  # type: ignore[arg-type]
+        self._driver = BipedDriver(robot_type=self.type, world=_Held(world), device=name, prefix=f"{name}/")  # type: ignore[arg-type]
         self._driver.connect()
         self._controller = Controller(self.type, LeaseGate())
         self._controller.start_at([self.type.home_rad[joint.name] for joint in self.type.joints])

@@ -197,16 +197,16 @@ def survey(seed: int = 7) -> BackgroundModel:
     empty, found = Playground(seed), BackgroundModel()
     empty.clear()
     for _ in range(10):
-        found.look("lidar", empty.scan())
-        found.look("depth", empty.depth())
-    found.settle()
+        found.add("lidar", empty.scan())
+        found.add("depth", empty.depth())
+    found.fit()
     return found
 
 
 def sight(found: BackgroundModel) -> SensorFusion:
     return SensorFusion(
         grid=OccupancyGrid((-3.2, -2.7), (3.2, 2.7)),
-        survey=found,
+        background=found,
         kinds=KINDS,
         mounts=MOUNTS,
         inside=(*LOWER_M, *UPPER_M),
@@ -218,9 +218,9 @@ def watch(ground: Playground, eyes: SensorFusion, seconds: float, *, period_s: f
     """Let it go on, and look at it every ``period_s``; ``each(ground, eyes)`` is asked half a period later."""
     for _ in range(round(seconds / period_s)):
         ground.step(period_s / 2)
-        eyes.see("lidar", ground.scan())
-        eyes.see("depth", ground.depth())
-        eyes.settle(ground.time_s)
+        eyes.update("lidar", ground.scan())
+        eyes.update("depth", ground.depth())
+        eyes.advance(ground.time_s)
         ground.step(period_s / 2)
         if each is not None:
             each(ground, eyes)

@@ -79,7 +79,7 @@ def folder(tmp_path):
     found = tmp_path / "toy"
     found.mkdir()
     (found / "room.toml").write_text(ROOM)
-    (found / "survey.npz").write_bytes(survey().content())
+    (found / "survey.npz").write_bytes(survey().to_bytes())
     return found
 
 
@@ -105,7 +105,7 @@ def until(driver, stream, holds, patience_s=60):
     return found
 
 
-def test_it_tells_where_who_is(driver, eyes):
+def test_streams_report_positions(driver, eyes):
     ground = eyes["lidar"].ground
     found = until(driver, "positions", lambda found: {"x_m.person", "x_m.nao", "x_m.qbo"} <= set(found))
     for name, one in ground.walkers.items():
@@ -125,7 +125,7 @@ def test_it_is_a_room_driver_found_by_name(driver):
     assert driver.raw() is None
 
 
-def test_it_gives_the_grid_as_picture_and_as_numbers(driver):
+def test_captures_return_the_grid(driver):
     until(driver, "positions", lambda found: "x_m.qbo" in found)
     picture = driver.capture("occupancy")
     assert (picture.media_type, picture.content[:8]) == ("image/png", b"\x89PNG\r\n\x1a\n")
@@ -135,7 +135,7 @@ def test_it_gives_the_grid_as_picture_and_as_numbers(driver):
     assert driver.grid.blocked(0.2).at(0.9, -2.2)
 
 
-def test_what_it_has_not_is_refused_with_what_there_is(driver):
+def test_unknown_names_are_rejected_with_the_valid_ones(driver):
     with pytest.raises(SensorError, match="positions, presence, light"):
         driver.read("smell")
     with pytest.raises(SensorError, match="occupancy, map, survey"):
@@ -144,7 +144,7 @@ def test_what_it_has_not_is_refused_with_what_there_is(driver):
         driver.set("smell", 1.0)
 
 
-def test_it_goes_on_while_one_of_its_eyes_is_blind_and_says_so_when_all_are(driver, eyes, monkeypatch):
+def test_it_fails_only_if_all_sensors_fail(driver, eyes, monkeypatch):
     until(driver, "positions", lambda found: "x_m.qbo" in found)
     eyes["depth"].broken = True
     driver.read("positions")
@@ -170,7 +170,7 @@ def told(driver, *, blind, patience_s=60):
         time.sleep(0.02)
 
 
-def test_closed_it_says_that_it_is_not_connected_and_can_be_opened_again(driver):
+def test_it_can_be_reopened(driver):
     driver.close()
     driver.close()
     with pytest.raises(SensorError, match="not connected"):
@@ -193,7 +193,7 @@ def test_a_survey_can_be_captured(driver, monkeypatch):
         ({"kinds": [{"name": "x", "lowest_m": 2, "highest_m": 1, "radius_m": 0}]}, "heights rise"),
     ],
 )
-def test_wrong_options_are_refused(folder, eyes, more, says):
+def test_invalid_options_are_rejected(folder, eyes, more, says):
     with pytest.raises(SensorError, match=says):
         PerceptionDriver(device(**more), folder, eyes)
 
@@ -206,6 +206,6 @@ def test_wrong_options_are_refused(folder, eyes, more, says):
         ({"mounts": [{"name": "x", "lowest_m": 0, "highest_m": 1, "radius_m": 0, "reach_m": 1}]}, "the room has: arm"),
     ],
 )
-def test_what_does_not_fit_the_room_is_told_on_connecting(folder, eyes, more, says):
+def test_connect_reports_mismatches_with_the_room(folder, eyes, more, says):
     with pytest.raises(SensorError, match=says):
         PerceptionDriver(device(**more), folder, eyes).connect()

@@ -36,7 +36,7 @@ def show(found: dict[str, list[float]]) -> None:
               f"most {max(known):.3f} m, unknown {len(off) - len(known)} of {len(off)}")  # fmt: skip
 
 
-def test_the_survey_is_of_this_room() -> None:
+def test_the_shipped_background_matches_the_room() -> None:
     """When this fails the furniture has moved: `python robots/rooms/survey.py lab`."""
     manifest = StillWorld().manifest
     watched = Watched(msgspec.structs.replace(manifest, robots=(), people=()))
@@ -44,7 +44,7 @@ def test_the_survey_is_of_this_room() -> None:
     watched.world.go_on(4.0)
     try:
         for name in EYES:
-            assert watched.sight.survey.differs(name, watched.raw(name)) < SAME, name
+            assert watched.sight.background.change_share(name, watched.raw(name)) < SAME, name
     finally:
         watched.close()
 
@@ -79,7 +79,7 @@ def seen() -> tuple[Watched, dict[str, list[float]]]:
         watched.close()
 
 
-def test_the_person_and_all_four_robots_are_found_within_the_promise_as_they_move(
+def test_moving_person_and_robots_are_located_accurately(
     seen: tuple[Watched, dict[str, list[float]]],
 ) -> None:
     watched, found = seen
@@ -102,7 +102,7 @@ def test_walls_and_tables_of_the_laboratory_are_blocked_and_its_floor_is_free(
 
 
 @pytest.mark.parametrize("posture", ["Sit", pytest.param("Crouch", marks=pytest.mark.long)])
-def test_nao_that_is_as_low_as_qbo_is_not_mistaken_for_it(posture: str) -> None:
+def test_a_sitting_nao_is_not_classified_as_qbo(posture: str) -> None:
     """Whether it was watched as it sat down, or sat there when the room began to look."""
     watched = Watched(walks=True)
     assert watched.nao is not None
@@ -122,7 +122,7 @@ def test_nao_that_is_as_low_as_qbo_is_not_mistaken_for_it(posture: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_the_person_and_all_four_robots_are_found_for_minutes_while_all_move() -> None:
+def test_person_and_robots_are_located_for_minutes() -> None:
     watched = Watched(walks=True)
     try:
         watched.look(KNOWN_S)

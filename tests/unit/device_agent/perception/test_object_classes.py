@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from device_agent.perception.fixed_robots import FixedRobots
+from device_agent.perception.fixed_robots import FixedRobot
 from device_agent.perception.object_classes import Mount, ObjectClass
-from device_agent.perception.tracker import Tracks
+from device_agent.perception.tracker import Tracker
 
 NAO = ObjectClass(name="nao", lowest_m=0.42, highest_m=0.68, radius_m=0.07, fastest_m_s=0.3, start_m=(0.0, 0.0))
 QBO = ObjectClass(name="qbo", lowest_m=0.3, highest_m=0.56, radius_m=0.12, fastest_m_s=0.6, start_m=(-0.9, 0.4))
@@ -28,30 +28,30 @@ class Floor:
     """Those on the floor, watched."""
 
     def __init__(self, *kinds: ObjectClass) -> None:
-        self.tracks = Tracks(kinds or (NAO, QBO))
+        self.tracks = Tracker(kinds or (NAO, QBO))
         self.now_s = 0.0
 
     def watch(self, *seen: tuple[float, float], for_s: float = 2.0, height_m: float = LOW_M) -> None:
         points = np.concatenate([np.zeros((0, 3)), *(somebody(x, y, height_m) for x, y in seen)])
         for _ in range(round(for_s / PERIOD_S)):
             self.now_s += PERIOD_S
-            self.tracks.see("depth", points, CAMERA_M, self.now_s)
+            self.tracks.update("depth", points, CAMERA_M, self.now_s)
 
     def holds(self, **expected: tuple[float, float]) -> bool:
         """Whether those are known, nobody else, and each about there."""
-        places = self.tracks.places(self.now_s)
+        places = self.tracks.positions(self.now_s)
         off = {name: math.dist(at, (places[name].x_m, places[name].y_m)) for name, at in expected.items()}
         return set(places) == set(expected) and max(off.values()) < NEAR_M
 
 
 @pytest.mark.parametrize("kinds", [(NAO, QBO), (QBO, NAO)])
-def test_two_of_one_height_are_told_apart_by_where_they_began(kinds: tuple[ObjectClass, ObjectClass]) -> None:
+def test_start_positions_distinguish_equal_heights(kinds: tuple[ObjectClass, ObjectClass]) -> None:
     floor = Floor(*kinds)
     floor.watch((0.2, 0.1), (-0.8, 0.2))
     assert floor.holds(nao=(0.2, 0.1), qbo=(-0.8, 0.2))
 
 
-def test_who_sits_where_nao_began_is_nao_while_qbo_is_hidden() -> None:
+def test_the_start_position_decides_while_the_other_robot_is_hidden() -> None:
     floor = Floor()
     floor.watch((0.1, 0.0), for_s=20.0)
     assert floor.holds(nao=(0.1, 0.0))
@@ -59,7 +59,7 @@ def test_who_sits_where_nao_began_is_nao_while_qbo_is_hidden() -> None:
     assert floor.holds(nao=(0.1, 0.0), qbo=(-1.2, 1.0))
 
 
-def test_both_are_found_again_where_they_were_last_and_not_where_they_began() -> None:
+def test_the_last_position_takes_precedence_over_the_start() -> None:
     floor = Floor()
     floor.watch((0.0, 0.0), (-0.9, 0.4))
     for share in np.linspace(0, 1, 30):  # round each other, and each to where the other began
@@ -75,7 +75,7 @@ def test_both_are_found_again_where_they_were_last_and_not_where_they_began() ->
     assert floor.holds(nao=(-0.9, 0.5), qbo=(0.1, 0.1))
 
 
-def test_who_stands_as_high_as_only_nao_does_is_nao_wherever_it_was_carried() -> None:
+def test_a_unique_height_decides_at_any_position() -> None:
     floor = Floor()
     floor.watch((-0.9, 0.4), for_s=2.0, height_m=0.58)
     assert floor.holds(nao=(-0.9, 0.4))
@@ -92,47 +92,47 @@ def on_table(x_m: float, y_m: float, low_m: float = 0.8) -> np.ndarray:
     return np.column_stack((x_m + across.ravel(), y_m + up.ravel(), np.full(across.size, low_m)))
 
 
-def look(robot: FixedRobots, points_m: np.ndarray, *, from_s: float, for_s: float = 4.0, camera: str = "one") -> float:
+def look(robot: FixedRobot, points_m: np.ndarray, *, from_s: float, for_s: float = 4.0, camera: str = "one") -> float:
     now_s = from_s
     for _ in range(round(for_s / PERIOD_S)):
         now_s += PERIOD_S
-        mine = points_m[robot.own(points_m)]
-        robot.see(camera, mine, CAMERA_M, now_s)
+        mine = points_m[robot.mask(points_m)]
+        robot.update(camera, mine, CAMERA_M, now_s)
     return now_s
 
 
-def test_a_robot_on_a_table_is_told_of_only_when_something_stands_where_it_belongs() -> None:
-    robot = FixedRobots(ARM)
+def test_a_fixed_robot_is_reported_only_if_visible() -> None:
+    robot = FixedRobot(ARM)
     now_s = look(robot, on_table(3.0, -1.0), from_s=0.0)
     now_s = look(robot, on_table(1.7, 1.0), from_s=now_s)  # within reach of its arm, but no place for its base
-    assert robot.place(now_s) is None
+    assert robot.position(now_s) is None
     now_s = look(robot, on_table(1.05, 0.95), from_s=now_s)
-    place = robot.place(now_s)
+    place = robot.position(now_s)
     assert place is not None
     assert math.dist((place.x_m, place.y_m), (1.05, 0.95)) < 0.1
     assert place.age_s == pytest.approx(0.0)
 
 
-def test_one_that_is_hidden_or_gone_is_told_with_when_it_was_seen_last() -> None:
-    robot = FixedRobots(ARM)
+def test_a_hidden_fixed_robot_is_reported_with_its_age() -> None:
+    robot = FixedRobot(ARM)
     now_s = look(robot, on_table(1.0, 1.0), from_s=0.0)
-    before = robot.place(now_s)
+    before = robot.position(now_s)
     # Somebody's hand within its reach is not its base.
     now_s = look(robot, on_table(1.3, 1.0), from_s=now_s, for_s=6.0)
-    place = robot.place(now_s)
+    place = robot.position(now_s)
     assert before is not None
     assert place is not None
     assert place.age_s == pytest.approx(6.0, abs=0.01)
     assert (place.x_m, place.y_m) == pytest.approx((before.x_m, before.y_m), abs=0.01)
 
 
-def test_one_of_two_cameras_is_enough_to_see_it() -> None:
-    robot = FixedRobots(ARM)
+def test_one_camera_suffices_for_a_fixed_robot() -> None:
+    robot = FixedRobot(ARM)
     now_s = 0.0
     for _ in range(4):
         look(robot, on_table(1.0, 1.0), from_s=now_s, for_s=1.0)
         now_s = look(robot, np.zeros((0, 3)), from_s=now_s, for_s=1.0, camera="two")
-    place = robot.place(now_s)
+    place = robot.position(now_s)
     assert place is not None
     assert place.age_s == pytest.approx(0.0, abs=0.01)
     assert math.dist((place.x_m, place.y_m), (1.0, 1.0)) < 0.1

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from device_agent.perception.grid_rows import rows
+from device_agent.perception.grid_rows import occupancy_rows
 from device_agent.perception.occupancy_grid import OccupancyGrid
 from device_agent.protocol import MAX_VALUES, Measurements, codec
 from device_agent.sandbox import api
@@ -28,8 +28,8 @@ def room(*boxes):
 
 def look(grid, ends, times=1, elapsed_s=0.1):
     for _ in range(times):
-        grid.see_rays("lidar", (2.0, 1.5), ends, np.ones(len(ends), dtype=bool))
-        grid.settle(elapsed_s)
+        grid.add_rays("lidar", (2.0, 1.5), ends, np.ones(len(ends), dtype=bool))
+        grid.advance(elapsed_s)
 
 
 def cell(grid, x, y):
@@ -47,7 +47,7 @@ def test_walls_are_found_within_a_cell():
     assert off.max() <= 0.05
 
 
-def test_who_has_left_disappears_and_is_never_furniture():
+def test_a_person_who_leaves_disappears():
     grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
     look(grid, room(), times=100)
     person = (3.0, 1.3, 3.3, 1.6)
@@ -59,40 +59,40 @@ def test_who_has_left_disappears_and_is_never_furniture():
     assert not grid.taken()[at]
 
 
-def test_what_stays_becomes_furniture():
+def test_objects_that_stay_become_static():
     grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
     look(grid, room(), times=100)
     look(grid, room((3.0, 1.3, 3.3, 1.6)), times=90, elapsed_s=1.0)
     assert grid.static()[cell(grid, 3.02, 1.45)]
 
 
-def test_a_wall_behind_somebody_stays():
+def test_a_wall_behind_a_person_stays():
     grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
     look(grid, room(), times=100)
     look(grid, room((3.0, 1.0, 3.3, 2.0)), times=40, elapsed_s=0.5)
     assert grid.static()[cell(grid, 4.02, 1.5)]
 
 
-def test_somebody_who_went_where_nobody_looks_is_forgotten():
+def test_unseen_cells_are_forgotten():
     grid = OccupancyGrid((0, 0), (4, 3))
-    grid.see_places("depth", taken_m=EMPTY, clear_m=np.array([[1.0, 1.0]]))
+    grid.add_cells("depth", taken_m=EMPTY, clear_m=np.array([[1.0, 1.0]]))
     for _ in range(50):
-        grid.settle(0.1)
+        grid.advance(0.1)
     for _ in range(5):
-        grid.see_places("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
-        grid.settle(0.1)
+        grid.add_cells("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
+        grid.advance(0.1)
     assert grid.taken()[cell(grid, 1.0, 1.0)]
     for _ in range(300):
-        grid.settle(0.1)
+        grid.advance(0.1)
     assert not grid.taken()[cell(grid, 1.0, 1.0)]
 
 
-def test_a_table_that_the_lidar_looks_through_is_taken():
+def test_a_table_above_the_lidar_plane_is_occupied():
     grid = OccupancyGrid((0, 0), (4, 3))
     table = np.array([[3.0, 1.5]])
     for _ in range(10):
         look(grid, room(), times=1)
-        grid.see_places("depth", taken_m=table, clear_m=EMPTY)
+        grid.add_cells("depth", taken_m=table, clear_m=EMPTY)
     assert grid.taken()[cell(grid, 3.0, 1.5)]
 
 
@@ -115,33 +115,33 @@ def test_a_robot_does_not_block_itself():
     assert not grid.blocked(0.2, apart=[(2.9, 1.5, 0.3)]).at(2.7, 1.5)
 
 
-def test_what_is_no_number_is_let_go():
+def test_points_that_are_not_finite_are_ignored():
     grid = OccupancyGrid((0, 0), (4, 3))
-    grid.see_places("depth", taken_m=np.array([[math.nan, 1.0], [math.inf, 1.0], [1.0, 1.0]]), clear_m=EMPTY)
+    grid.add_cells("depth", taken_m=np.array([[math.nan, 1.0], [math.inf, 1.0], [1.0, 1.0]]), clear_m=EMPTY)
     assert grid.taken().sum() == 1
 
 
-def test_a_grid_without_size_is_refused():
+def test_a_grid_without_size_is_rejected():
     with pytest.raises(ValueError, match="upper corner"):
         OccupancyGrid((0, 0), (0, 3))
 
 
-def test_somebody_seen_again_and_again_where_the_floor_is_hidden_is_no_furniture():
+def test_people_in_front_of_hidden_floor_do_not_become_static():
     grid = OccupancyGrid((0, 0), (4, 3))
     for _ in range(10):
         for _ in range(10):  # two seconds there, eighteen not
-            grid.see_places("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
-            grid.settle(0.2)
+            grid.add_cells("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
+            grid.advance(0.2)
         for _ in range(90):
-            grid.settle(0.2)
+            grid.advance(0.2)
         assert not grid.taken()[cell(grid, 1.0, 1.0)]
         assert not grid.static()[cell(grid, 1.0, 1.0)]
 
 
-def test_nobody_plans_a_way_through_the_walls_of_the_plan():
+def test_cells_outside_the_plan_are_blocked():
     grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5), plan=(0.0, 0.0, 4.0, 3.0))
     for unknown in (True, False):
-        grid.see_places("depth", taken_m=EMPTY, clear_m=np.array([[0.3, 1.0], [0.15, 1.0], [-0.2, 1.0]]))
+        grid.add_cells("depth", taken_m=EMPTY, clear_m=np.array([[0.3, 1.0], [0.15, 1.0], [-0.2, 1.0]]))
         floor = grid.blocked(0.2, unknown=unknown)
         assert not floor.at(0.3, 1.0)
         assert floor.at(0.15, 1.0)
@@ -153,13 +153,13 @@ def floor_of(values: dict[str, float]) -> api.Room:
     return api.Room(lambda kind, device, stream: {"values": values, "age_s": 0.5})  # noqa: ARG005
 
 
-def test_a_script_reads_the_grid_from_its_rows():
+def test_scripts_can_decode_the_rows():
     grid = OccupancyGrid((-3.2, -2.7), (3.2, 2.7), plan=(-3.0, -2.5, 3.0, 2.5))
     across, up = np.meshgrid(np.arange(-2.9, 2.9, 0.05), np.arange(-2.4, 1.0, 0.05))
     clear = np.column_stack((across.ravel(), up.ravel()))
     for _ in range(5):
-        grid.see_places("depth", taken_m=np.array([[1.01, -1.0], [-2.5, 0.6]]), clear_m=clear)
-    found = rows(grid)
+        grid.add_cells("depth", taken_m=np.array([[1.01, -1.0], [-2.5, 0.6]]), clear_m=clear)
+    found = occupancy_rows(grid)
     assert (found["columns"], found["rows"], found["side_m"]) == (32.0, 27.0, 0.2)
     assert len(found) <= MAX_VALUES
     room = floor_of(found)
@@ -180,10 +180,10 @@ def test_a_script_reads_the_grid_from_its_rows():
 
 
 @pytest.mark.parametrize("size_m", [6.0, 40.0, 80.0])
-def test_a_floor_fits_into_a_message_however_large_it_is(size_m):
+def test_rows_of_any_floor_fit_into_a_message(size_m):
     grid = OccupancyGrid((0.0, 0.0), (size_m, size_m * 0.9))
     last = np.array([[size_m - 0.03, size_m * 0.9 - 0.03]])
-    grid.see_places("depth", taken_m=last, clear_m=np.zeros((0, 2)))
-    found = rows(grid)
+    grid.add_cells("depth", taken_m=last, clear_m=np.zeros((0, 2)))
+    found = occupancy_rows(grid)
     codec.encode(Measurements(tick_ms=1, at_ms=1, sequence=1, values=found))
     assert floor_of(found).taken(*last[0]) is True

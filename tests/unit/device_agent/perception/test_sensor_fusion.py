@@ -6,7 +6,7 @@ import statistics
 import numpy as np
 import pytest
 
-from device_agent.perception.background_model import BackgroundModel, SurveyError
+from device_agent.perception.background_model import BackgroundModel, BackgroundModelError
 from tests.unit.device_agent.perception.playground import (
     ARM_M,
     FURNITURE,
@@ -24,7 +24,7 @@ MEDIAN_M = 0.15
 
 @pytest.fixture(scope="module")
 def empty():
-    return BackgroundModel.read(survey().content())
+    return BackgroundModel.from_bytes(survey().to_bytes())
 
 
 def errors(empty, seed, seconds):
@@ -35,7 +35,7 @@ def errors(empty, seed, seconds):
     strange: list[str] = []
 
     def compare(ground, eyes):
-        places = eyes.places(ground.time_s)
+        places = eyes.positions(ground.time_s)
         truth = {name: (one.x_m, one.y_m) for name, one in ground.walkers.items() if ground.in_view(name)}
         truth["arm"] = ARM_M
         for name, at in truth.items():
@@ -71,14 +71,14 @@ def test_positions_are_within_the_promise_for_minutes(empty, seed):
     check(*errors(empty, seed=seed, seconds=240))
 
 
-def test_nobody_is_seen_in_an_empty_room(empty):
+def test_an_empty_room_has_no_people(empty):
     ground, eyes = Playground(3), sight(empty)
     ground.clear()
     for look in range(50):
-        eyes.see("lidar", ground.scan())
-        eyes.see("depth", ground.depth())
+        eyes.update("lidar", ground.scan())
+        eyes.update("depth", ground.depth())
         ground.time_s = look * 0.2
-        assert not eyes.places(ground.time_s)
+        assert not eyes.positions(ground.time_s)
     assert eyes.presence(ground.time_s) == {
         "people": 0.0,
         "people.west": 0.0,
@@ -103,10 +103,10 @@ def test_presence_follows_a_person_from_zone_to_zone_and_out(empty):
     person.x_m = 50.0
     watch(ground, eyes, 6)
     assert eyes.presence(ground.time_s)["people"] == 0.0
-    assert "person" not in eyes.places(ground.time_s)
+    assert "person" not in eyes.positions(ground.time_s)
 
 
-def test_a_robot_that_nobody_sees_any_more_stays_where_it_was_and_ages(empty):
+def test_an_occluded_robot_keeps_its_position_and_ages(empty):
     ground, eyes = Playground(5), sight(empty)
     robot = ground.walkers["qbo"]
     robot._rest_s = math.inf
@@ -114,45 +114,45 @@ def test_a_robot_that_nobody_sees_any_more_stays_where_it_was_and_ages(empty):
     at = robot.x_m, robot.y_m
     robot.x_m = 50.0
     watch(ground, eyes, 5)
-    place = eyes.places(ground.time_s)["qbo"]
+    place = eyes.positions(ground.time_s)["qbo"]
     assert math.dist((place.x_m, place.y_m), at) < 0.3
     assert place.age_s > 4
 
 
-def test_a_robot_that_is_carried_is_found_again(empty):
+def test_a_carried_robot_is_located_again(empty):
     ground, eyes = Playground(6), sight(empty)
     robot = ground.walkers["qbo"]
     robot._rest_s = math.inf
     watch(ground, eyes, 6)
     robot.x_m, robot.y_m = 0.6, 0.9
     watch(ground, eyes, 4)
-    place = eyes.places(ground.time_s)["qbo"]
+    place = eyes.positions(ground.time_s)["qbo"]
     assert math.dist((place.x_m, place.y_m), (0.6, 0.9)) < MEDIAN_M
 
 
-def test_yaw_is_known_once_it_went_somewhere(empty):
+def test_yaw_is_known_after_the_first_motion(empty):
     ground, eyes = Playground(7), sight(empty)
     robot = ground.walkers["qbo"]
     robot._rest_s = math.inf
     watch(ground, eyes, 4)
-    assert eyes.places(ground.time_s)["qbo"].yaw_rad is None
+    assert eyes.positions(ground.time_s)["qbo"].yaw_rad is None
     robot._rest_s, robot.x_m, robot.y_m, robot._goal = 0.0, 1.4, -0.9, (1.4, 0.9)
     watch(ground, eyes, 4)
-    yaw_rad = eyes.places(ground.time_s)["qbo"].yaw_rad
+    yaw_rad = eyes.positions(ground.time_s)["qbo"].yaw_rad
     assert yaw_rad is not None
     assert abs(yaw_rad - math.pi / 2) < 0.3
 
 
-def test_what_no_number_tells_is_let_go(empty):
+def test_readings_that_are_not_finite_are_ignored(empty):
     ground, eyes = Playground(8), sight(empty)
     scan, image = ground.scan(), ground.depth()
     scan.range_m[::3] = math.nan
     assert image.depth_m is not None
     image.depth_m[::3] = math.nan
-    eyes.see("lidar", scan)
-    eyes.see("depth", image)
-    eyes.settle(1.0)
-    assert all(place.finite for place in eyes.places(1.0).values())
+    eyes.update("lidar", scan)
+    eyes.update("depth", image)
+    eyes.advance(1.0)
+    assert all(place.finite for place in eyes.positions(1.0).values())
     assert np.isfinite(eyes.grid.probability()).all()
 
 
@@ -166,7 +166,7 @@ def outside_of(x, y):
     return np.maximum(off, 0)
 
 
-def test_the_grid_shows_walls_and_furniture_and_not_who_walks(empty):
+def test_the_static_grid_has_furniture_but_no_people(empty):
     ground, eyes = Playground(9), sight(empty)
     robots = {name: ground.walkers[name] for name in ("nao", "qbo")}
     for robot in robots.values():
@@ -185,29 +185,29 @@ def test_the_grid_shows_walls_and_furniture_and_not_who_walks(empty):
         assert floor.at(x, y)
 
 
-def test_a_survey_that_is_none_is_refused():
-    with pytest.raises(SurveyError, match="take a new one"):
-        BackgroundModel.read(b"PK nonsense")
+def test_an_invalid_background_file_is_rejected():
+    with pytest.raises(BackgroundModelError, match="take a new one"):
+        BackgroundModel.from_bytes(b"PK nonsense")
 
 
-def test_a_sensor_that_was_moved_has_no_survey(empty):
+def test_a_moved_sensor_has_no_background(empty):
     ground = Playground(1)
     scan = ground.scan()
-    assert empty.nearer("lidar", scan) is not None
+    assert empty.foreground("lidar", scan) is not None
     scan.position_m[0] += 0.1
-    assert empty.nearer("lidar", scan) is None
+    assert empty.foreground("lidar", scan) is None
     found = BackgroundModel()
-    found.look("lidar", ground.scan())
-    found.look("lidar", scan)
-    with pytest.raises(SurveyError, match="moved"):
-        found.settle()
+    found.add("lidar", ground.scan())
+    found.add("lidar", scan)
+    with pytest.raises(BackgroundModelError, match="moved"):
+        found.fit()
 
 
-def test_who_passes_while_the_room_is_surveyed_is_no_furniture():
+def test_people_are_filtered_out_of_the_background():
     ground, found = Playground(2), BackgroundModel()
     for _ in range(60):
         ground.step(1.0)
-        found.look("depth", ground.depth())
-    found.settle()
+        found.add("depth", ground.depth())
+    found.fit()
     ground.clear()
-    assert found.differs("depth", ground.depth()) < 0.02
+    assert found.change_share("depth", ground.depth()) < 0.02

@@ -31,17 +31,17 @@ def run(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
     )
 
 
-def test_the_page_has_a_driver_where_to_find_it_a_room_and_a_test() -> None:
+def test_the_guide_has_four_files() -> None:
     assert len(FILES) == 4
 
 
-def test_the_driver_of_the_page_passes_the_suite(folder: Path) -> None:
+def test_the_guides_driver_passes_the_contract(folder: Path) -> None:
     done = run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_weather_station.py")
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"\b9 passed", done.stdout), done.stdout
 
 
-def test_the_agent_knows_the_room_and_the_driver(folder: Path) -> None:
+def test_the_agent_lists_room_and_driver(folder: Path) -> None:
     done = run(folder, "-m", "device_agent", "devices", "--home", str(folder / "nobody"))
     assert "room    roof: Roof" in done.stdout, done.stdout + done.stderr
     assert "sensor  weather_station" in done.stdout

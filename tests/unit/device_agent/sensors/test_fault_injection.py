@@ -11,7 +11,7 @@ from device_agent.ports.sensor import Camera, Image, Movable, RoomDriver, Sensor
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import room
 from device_agent.sensors.mujoco import fault_injection, scalar_sensors
-from device_agent.sensors.mujoco.fault_injection import WELL, InjectedFaults, read
+from device_agent.sensors.mujoco.fault_injection import NO_FAULTS, InjectedFaults, read
 from tests.harness.agent.rooms import LAB, StillWorld
 
 
@@ -52,7 +52,7 @@ def ward(world: StillWorld, file: Path) -> Iterator[Ward]:
     ward.close()
 
 
-def test_without_the_file_a_device_is_as_it_always_is(ward: Ward) -> None:
+def test_a_device_without_fault_file_is_unchanged(ward: Ward) -> None:
     co2, camera, door = ward("co2"), ward("camera"), ward("door")
     assert 500 < co2.read("co2")["co2_ppm"] < 800
     assert not isinstance(co2, Camera)
@@ -63,7 +63,7 @@ def test_without_the_file_a_device_is_as_it_always_is(ward: Ward) -> None:
     door.hold()
 
 
-def test_a_stuck_meter_tells_its_last_value_and_is_free_again_without_the_file(ward: Ward, file: Path) -> None:
+def test_a_stuck_meter_repeats_its_value_until_the_file_is_removed(ward: Ward, file: Path) -> None:
     co2 = ward("co2")
     last = co2.read("co2")
     file.write_text('stuck = ["co2"]')
@@ -72,7 +72,7 @@ def test_a_stuck_meter_tells_its_last_value_and_is_free_again_without_the_file(w
     assert len({co2.read("co2")["co2_ppm"] for _ in range(20)}) > 3
 
 
-def test_a_silent_stream_gives_nothing_and_still_says_what_there_is(ward: Ward, file: Path) -> None:
+def test_a_silent_stream_returns_nothing_but_rejects_unknown_names(ward: Ward, file: Path) -> None:
     pir = ward("pir")
     file.write_text('silent = ["motion"]')
     assert pir.read("motion") == {}
@@ -80,7 +80,7 @@ def test_a_silent_stream_gives_nothing_and_still_says_what_there_is(ward: Ward, 
         pir.read("nonsense")
 
 
-def test_a_value_drifts_by_so_much_a_minute(ward: Ward, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_value_drifts_per_minute(ward: Ward, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [1000.0]
     clock = type("Clock", (), {"monotonic": staticmethod(lambda: now_s[0])})
     monkeypatch.setattr(fault_injection, "time", clock)
@@ -94,17 +94,17 @@ def test_a_value_drifts_by_so_much_a_minute(ward: Ward, file: Path, monkeypatch:
     assert after - before == pytest.approx(500.0, abs=15.0)
 
 
-def test_what_is_unreachable_answers_nothing_and_is_still_told_to_hold(ward: Ward, file: Path) -> None:
+def test_an_unreachable_device_fails_but_receives_hold(ward: Ward, file: Path) -> None:
     door = ward("door")
     file.write_text("unreachable = true")
     for call in (lambda: door.read("settings"), lambda: door.set("opening", 0.5), door.connect, door.raw):
-        with pytest.raises(SensorError, match="'door' does not answer; see that it has power"):
+        with pytest.raises(SensorError, match="'door' does not respond; check its power"):
             call()
     assert isinstance(door, Movable)
     door.hold()
 
 
-def test_a_stuck_camera_shows_one_picture_for_ever_and_a_silent_one_none(ward: Ward, file: Path) -> None:
+def test_a_stuck_camera_repeats_its_frame_and_a_silent_one_has_none(ward: Ward, file: Path) -> None:
     camera = ward("camera")
     assert isinstance(camera, Camera)
     moving = {frame.content for frame in (camera.frame("colour") for _ in range(3)) if frame is not None}
@@ -120,26 +120,26 @@ def test_a_stuck_camera_shows_one_picture_for_ever_and_a_silent_one_none(ward: W
     assert again.rgb is seen.rgb
     file.write_text('silent = ["colour"]  # now')
     assert camera.frame("colour") is None
-    with pytest.raises(SensorError, match="gives nothing"):
+    with pytest.raises(SensorError, match="returns no data"):
         camera.raw()
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('stuck = ["nose"]', "no stream or camera 'nose'; there are: co2, image"),
-        ("broken = true", "unknown field `broken`; there are: unreachable, silent, stuck, drift"),
-        ("silent = [", "there are: unreachable"),
+        ('stuck = ["nose"]', "no stream or camera 'nose'; valid names: co2, image"),
+        ("broken = true", "unknown field `broken`; valid fields: unreachable, silent, stuck, drift"),
+        ("silent = [", "valid fields: unreachable"),
     ],
 )
-def test_a_wrong_file_says_what_there_is(text: str, says: str) -> None:
+def test_an_invalid_fault_file_is_rejected_with_valid_names(text: str, says: str) -> None:
     with pytest.raises(ProtocolError) as refused:
         read(text, ["co2", "image"])
     assert says in str(refused.value)
-    assert read("", []) == WELL == InjectedFaults()
+    assert read("", []) == NO_FAULTS == InjectedFaults()
 
 
-def test_a_path_of_faults_that_is_none_is_refused(world: StillWorld) -> None:
+def test_an_invalid_fault_path_is_rejected(world: StillWorld) -> None:
     entry = msgspec.structs.replace(world.entry("pir"), options={"faults": 3})
     with pytest.raises(SensorError, match="path of a file"):
         world.driver(entry)

@@ -15,7 +15,7 @@ from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors import load, names
 from device_agent.sensors import mujoco as simulated
 from device_agent.sensors.mujoco import cameras, shared_view
-from device_agent.sensors.mujoco.noise import ERRORS, Errors, Probe, generator
+from device_agent.sensors.mujoco.noise import NOISE, NoiseParameters, SensorNoise, generator
 from tests.harness.agent.rooms import LAB, StillWorld
 
 ROUND_S = 45.0
@@ -83,7 +83,7 @@ def met_by(scan: Scan) -> np.ndarray:
 # ---------------------------------------------------------------- somebody moves
 
 
-def test_the_motion_detector_tells_that_somebody_walks_and_forgets_who_stands(world: StillWorld) -> None:
+def test_the_motion_detector_only_detects_motion(world: StillWorld) -> None:
     pir = connected(world, "pir")
     told: list[tuple[bool, float]] = []
     for _ in range(round(ROUND_S / 0.25)):
@@ -96,7 +96,7 @@ def test_the_motion_detector_tells_that_somebody_walks_and_forgets_who_stands(wo
     assert min(rose) > 0.1, "it woke while nobody walked"
 
 
-def test_the_motion_detector_does_not_see_furniture_that_moves_nor_through_a_wall(world: StillWorld) -> None:
+def test_the_motion_detector_ignores_cold_and_hidden_bodies(world: StillWorld) -> None:
     entry = world.entry("pir")
     still = connected(world, changed(entry, options={"warm": ["chair"]}))
     door = connected(world, changed(entry, options={"warm": ["nobody"]}))
@@ -107,7 +107,7 @@ def test_the_motion_detector_does_not_see_furniture_that_moves_nor_through_a_wal
         assert not door.read("motion")["present"], "the door is not warm"
 
 
-def test_the_lidar_meets_the_legs_of_whoever_walks_where_they_are(world: StillWorld) -> None:
+def test_the_lidar_measures_the_persons_legs(world: StillWorld) -> None:
     lidar = connected(world, "lidar")
     empty = scan(lidar).range_m
     seen = 0
@@ -122,7 +122,7 @@ def test_the_lidar_meets_the_legs_of_whoever_walks_where_they_are(world: StillWo
     assert seen > 25, f"the person was met in {seen} of 40 scans"
 
 
-def test_a_scan_has_the_errors_of_its_kind_and_leaves_the_lidar_itself_out(world: StillWorld) -> None:
+def test_a_scan_has_noise_and_excludes_the_lidar(world: StillWorld) -> None:
     lidar = connected(world, "lidar")
     scans = np.array([scan(lidar).range_m for _ in range(60)])
     known = np.isfinite(scans).all(axis=0)
@@ -132,7 +132,7 @@ def test_a_scan_has_the_errors_of_its_kind_and_leaves_the_lidar_itself_out(world
     assert scans.min() >= 0.15
 
 
-def test_the_cameras_see_a_robot_that_moves(lab: StillWorld) -> None:
+def test_cameras_show_a_moving_robot(lab: StillWorld) -> None:
     corner, turning = connected(lab, "camera"), connected(lab, "pan_tilt")
     model = lab.model
     arm = [index for index in range(model.nu) if model.actuator(index).name.startswith("ur5/")]
@@ -154,7 +154,7 @@ def difference(one: Image, other: Image) -> int:
     return int((np.abs(one.rgb.astype(int) - other.rgb.astype(int)).max(axis=2) > 25).sum())
 
 
-def test_the_depth_camera_measures_how_far_the_person_is(world: StillWorld) -> None:
+def test_the_depth_camera_measures_the_person(world: StillWorld) -> None:
     depth = connected(world, "depth")
 
     def seen() -> bool:
@@ -182,7 +182,7 @@ def onto(image: Image, point: np.ndarray) -> tuple[tuple[int, int], float]:
     return (round(height / 2 - focal * y / -z), round(width / 2 + focal * x / -z)), -z
 
 
-def test_depth_agrees_with_a_ray_and_is_without_end_beyond_reach(world: StillWorld) -> None:
+def test_depth_equals_a_ray_and_is_infinite_out_of_range(world: StillWorld) -> None:
     entry = world.entry("depth")
     near = connected(world, changed(entry, options={"furthest_m": 2.0}))
     depth_m = image(near).depth_m
@@ -206,7 +206,7 @@ def test_the_door_contact_follows_the_door_and_the_door_its_control(world: Still
     assert contact.read("contact") == {"open": False}
 
 
-def test_a_door_that_is_held_stays_where_it_is(world: StillWorld) -> None:
+def test_hold_stops_the_door(world: StillWorld) -> None:
     door = connected(world, "door")
     door.set("opening", 1.0)
     world.go_on(1.0)
@@ -216,7 +216,7 @@ def test_a_door_that_is_held_stays_where_it_is(world: StillWorld) -> None:
     assert door.read("settings")["opening"] == pytest.approx(held, abs=0.08)
 
 
-def test_a_camera_that_turns_sees_something_else_and_says_where_it_looks(world: StillWorld) -> None:
+def test_a_pan_tilt_camera_reports_its_pose(world: StillWorld) -> None:
     camera = connected(world, "pan_tilt")
     before = image(camera)
     camera.set("pan", 1.0)
@@ -229,7 +229,7 @@ def test_a_camera_that_turns_sees_something_else_and_says_where_it_looks(world: 
     camera.close()
 
 
-def test_the_lamp_changes_what_the_light_meter_tells(world: StillWorld) -> None:
+def test_the_lamp_changes_the_light_meter(world: StillWorld) -> None:
     lamp, meter = connected(world, "lamp"), connected(world, changed(world.entry("light"), options={"seed": 3}))
     lamp.set("level", 0.0)
     world.go_on(0.02)
@@ -242,28 +242,28 @@ def test_the_lamp_changes_what_the_light_meter_tells(world: StillWorld) -> None:
 # ---------------------------------------------------------------- errors of sensors
 
 
-def test_a_probe_is_wrong_by_its_offset_and_jitter_and_the_same_again_with_the_same_seed() -> None:
-    errors = Errors(offset=2.0, jitter=0.5)
-    told = [[Probe(errors, generator("one", seed)).read(20.0, 0.0) for _ in range(3)] for seed in (1, 1, 2)]
+def test_noise_is_reproducible_by_seed() -> None:
+    errors = NoiseParameters(offset=2.0, jitter=0.5)
+    told = [[SensorNoise(errors, generator("one", seed)).read(20.0, 0.0) for _ in range(3)] for seed in (1, 1, 2)]
     assert told[0] == told[1] != told[2]
     offsets = [np.mean([probe.read(0.0, each) for each in range(200)]) for probe in probes(errors, 300)]
     assert np.std(offsets) == pytest.approx(2.0, rel=0.15)
 
 
-def probes(errors: Errors, count: int) -> list[Probe]:
-    return [Probe(errors, generator("many", seed)) for seed in range(count)]
+def probes(errors: NoiseParameters, count: int) -> list[SensorNoise]:
+    return [SensorNoise(errors, generator("many", seed)) for seed in range(count)]
 
 
-def test_a_probe_follows_a_step_in_its_time() -> None:
-    probe = Probe(Errors(lag_s=10.0), generator("slow", 0))
+def test_readings_lag_behind_a_step() -> None:
+    probe = SensorNoise(NoiseParameters(lag_s=10.0), generator("slow", 0))
     assert probe.read(0.0, 0.0) == 0
     assert probe.read(1.0, 10.0) == pytest.approx(1 - math.exp(-1))
     assert probe.read(1.0, 100.0) == pytest.approx(1, abs=1e-3)
 
 
-@pytest.mark.parametrize("quantity", ERRORS)
-def test_no_probe_tells_less_than_there_can_be_or_finer_than_it_can(quantity: str) -> None:
-    errors = ERRORS[quantity]
+@pytest.mark.parametrize("quantity", NOISE)
+def test_readings_respect_minimum_and_resolution(quantity: str) -> None:
+    errors = NOISE[quantity]
     for probe in probes(errors, 20):
         told = probe.read(0.3, 0.0)
         assert told >= errors.least
@@ -273,7 +273,7 @@ def test_no_probe_tells_less_than_there_can_be_or_finer_than_it_can(quantity: st
 # ---------------------------------------------------------------- what cannot be made
 
 
-def test_a_name_that_is_none_is_refused_with_those_there_are() -> None:
+def test_an_unknown_driver_is_rejected() -> None:
     with pytest.raises(SensorError, match=r"no sensor driver 'crystal_ball'; there are: .*mujoco"):
         load("crystal_ball")
     assert {"mujoco", "perception"} <= set(names())
@@ -288,18 +288,18 @@ def test_a_name_that_is_none_is_refused_with_those_there_are() -> None:
         ({"options": {"seed": True}}, "option 'seed' .* is True, of the wrong type"),
     ],
 )
-def test_an_entry_that_cannot_be_is_refused(world: StillWorld, changes: dict[str, object], said: str) -> None:
+def test_an_invalid_entry_is_rejected(world: StillWorld, changes: dict[str, object], said: str) -> None:
     with pytest.raises(SensorError, match=said):
         world.driver(changed(world.entry("door_contact"), **changes))
 
 
-def test_a_name_that_the_model_lacks_is_refused_with_those_it_has(world: StillWorld) -> None:
+def test_a_name_missing_in_the_model_is_rejected(world: StillWorld) -> None:
     driver = world.driver(changed(world.entry("door_contact"), options={"joint": "gate"}))
     with pytest.raises(SensorError, match=r"no joint 'gate'; it has: .*door"):
         driver.connect()
 
 
-def test_a_picture_that_nobody_could_draw_is_refused(world: StillWorld) -> None:
+def test_an_oversized_image_is_rejected(world: StillWorld) -> None:
     with pytest.raises(SensorError, match="at most 1920 x 1080"):
         world.driver(changed(world.entry("camera"), options={"width": 100_000}))
 
@@ -309,7 +309,7 @@ def test_a_real_room_has_no_simulated_devices(world: StillWorld) -> None:
         simulated.create(world.entry("pir"), LAB, Surroundings(neighbours={}))
 
 
-def test_a_quantity_that_the_room_lacks_is_told(world: StillWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_quantity_is_reported(world: StillWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(StillWorld, "quantities", {"temperature_c": 20.0})
     meter = connected(world, changed(world.entry("co2"), streams=(Stream(name="co2", rate_hz=1.0),)))
     with pytest.raises(SensorError, match="this room has no co2_ppm; it has: temperature_c"):

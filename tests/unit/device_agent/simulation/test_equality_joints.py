@@ -34,7 +34,7 @@ def model_of(text: str = HAND):
     return mujoco.MjModel.from_xml_string(text)
 
 
-def test_tied_joints_are_settled_where_the_physics_takes_them():
+def test_dependent_joints_match_the_physics():
     model = model_of()
     model.opt.gravity[:] = 0
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -45,21 +45,23 @@ def test_tied_joints_are_settled_where_the_physics_takes_them():
         mujoco.mj_step(model, data, nstep=4000)
         settled = data.qpos.copy()
         settled[[2, 3, 4]] = 9.0
-        EqualityJoints(model).settle(settled)
+        EqualityJoints(model).apply(settled)
         assert settled == pytest.approx(data.qpos, abs=2e-3)
 
 
-def test_each_is_told_by_what_is_not_tied_itself():
+def test_factors_refer_to_independent_joints():
     model = model_of()
-    ties = EqualityJoints(model)
-    assert [model.joint(tie.joint).name for tie in ties.all] == ["twice_a", "chained", "mixed"]
-    assert ties.of(model.joint("chained").id) == pytest.approx({model.joint("a").id: 0.1})
-    assert ties.of(model.joint("mixed").id) == pytest.approx({model.joint("a").id: 0.5, model.joint("b").id: -0.25})
-    assert ties.of(model.joint("free_one").id) == {}
-    assert ties.offset(model.joint("free_one").id) == 0.0
+    equality_joints = EqualityJoints(model)
+    assert [model.joint(tie.joint).name for tie in equality_joints.all] == ["twice_a", "chained", "mixed"]
+    assert equality_joints.factors_of(model.joint("chained").id) == pytest.approx({model.joint("a").id: 0.1})
+    assert equality_joints.factors_of(model.joint("mixed").id) == pytest.approx(
+        {model.joint("a").id: 0.5, model.joint("b").id: -0.25}
+    )
+    assert equality_joints.factors_of(model.joint("free_one").id) == {}
+    assert equality_joints.offset(model.joint("free_one").id) == 0.0
 
 
-def test_a_ring_of_ties_and_one_that_is_switched_off_are_left_alone():
+def test_circular_and_inactive_constraints_are_ignored():
     ring = HAND.replace(
         "</equality>",
         '<joint joint1="free_one" joint2="mixed"/><joint joint1="mixed" joint2="free_one"/></equality>',
@@ -68,8 +70,8 @@ def test_a_ring_of_ties_and_one_that_is_switched_off_are_left_alone():
     assert [model.joint(tie.joint).name for tie in EqualityJoints(model).all] == ["twice_a", "chained"]
 
 
-def test_a_model_without_ties_is_left_as_it_is():
+def test_a_model_without_constraints_is_unchanged():
     model = model_of("<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>")
     qpos = np.array([0.7])
-    EqualityJoints(model).settle(qpos)
+    EqualityJoints(model).apply(qpos)
     assert qpos.tolist() == [0.7]

@@ -9,7 +9,7 @@ from device_agent import geometry
 from device_agent.__main__ import main
 from device_agent.drivers import load as load_driver
 from device_agent.protocol.manifests import robot_type
-from device_agent.simulation.mjcf.import_model import AdoptError, adopt
+from device_agent.simulation.mjcf.import_model import ImportModelError, import_model
 
 ARM = """
 <mujoco model="arm"><compiler angle="radian" autolimits="true"/>
@@ -59,8 +59,8 @@ def scene(tmp_path: Path) -> Path:
     return tmp_path / "scene.xml"
 
 
-def test_what_the_model_says_is_taken_and_what_it_does_not_say_is_guessed_and_told(scene: Path, tmp_path: Path) -> None:
-    folder = adopt(scene, "arm", tmp_path / "types")
+def test_missing_figures_are_guessed_and_marked(scene: Path, tmp_path: Path) -> None:
+    folder = import_model(scene, "arm", tmp_path / "types")
     kind = robot_type.load(folder)
     turn, bend, finger = kind.joints
     assert [joint.name for joint in kind.joints] == ["turn", "bend", "finger"]
@@ -75,8 +75,8 @@ def test_what_the_model_says_is_taken_and_what_it_does_not_say_is_guessed_and_to
     assert "bend" in (folder / "README.md").read_text()
 
 
-def test_the_robot_alone_is_in_the_model_and_it_moves(scene: Path, tmp_path: Path) -> None:
-    folder = adopt(scene, "arm", tmp_path / "types")
+def test_only_the_robot_is_imported(scene: Path, tmp_path: Path) -> None:
+    folder = import_model(scene, "arm", tmp_path / "types")
     alone = mujoco.MjModel.from_xml_path(str(folder / "arm.xml"))
     assert [alone.body(index).name for index in range(1, alone.nbody)] == ["link0", "link1", "link2", "finger", "thumb"]
     assert alone.nlight == 0
@@ -90,7 +90,7 @@ def test_the_robot_alone_is_in_the_model_and_it_moves(scene: Path, tmp_path: Pat
     driver.close()
 
 
-def test_meshes_come_along(tmp_path: Path) -> None:
+def test_meshes_are_copied(tmp_path: Path) -> None:
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "hand.obj").write_text(corners)
@@ -98,7 +98,7 @@ def test_meshes_come_along(tmp_path: Path) -> None:
         "<worldbody>", '<asset><mesh name="hand" file="hand.obj" scale=".1 .1 .1"/></asset><worldbody>', 1
     )
     (tmp_path / "arm.xml").write_text(text.replace('<geom size=".01"/>', '<geom type="mesh" mesh="hand"/>', 1))
-    folder = adopt(tmp_path / "arm.xml", "arm", tmp_path / "types")
+    folder = import_model(tmp_path / "arm.xml", "arm", tmp_path / "types")
     assert (folder / "assets" / "hand.obj").read_text() == corners
     assert mujoco.MjModel.from_xml_path(str(folder / "scene.xml")).nmesh == 1
 
@@ -106,7 +106,7 @@ def test_meshes_come_along(tmp_path: Path) -> None:
 THREAD = '<tendon><fixed name="t"><joint joint="turn" coef="1"/></fixed></tendon>'
 MOTOR = '<motor name="act_turn" joint="turn"/>'
 WRONG = {
-    "motor": (f"<actuator>{MOTOR}</actuator>", "act_turn is no position servo.*--without act_turn"),
+    "motor": (f"<actuator>{MOTOR}</actuator>", "act_turn is not a position servo.*--without act_turn"),
     "gear": ('<actuator><position name="a" joint="turn" gear="2"/></actuator>', "a has a gear of 2"),
     "nothing": ("<actuator/>", "no actuators"),
     "twice": (
@@ -115,52 +115,52 @@ WRONG = {
     ),
     "apart": (
         '<actuator><position name="a" joint="turn" ctrlrange="3 4"/></actuator>',
-        "'turn' and its actuator have no position in common",
+        "'turn' and its actuator have disjoint ranges",
     ),
     "tendon": (
         f'{THREAD}<actuator><position name="a" tendon="t"/></actuator>',
-        "a moves no joint by itself",
+        "a does not act on a joint",
     ),
 }
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_is_no_robot_of_position_servos_is_refused(case: str, tmp_path: Path) -> None:
+def test_unsupported_actuators_are_rejected(case: str, tmp_path: Path) -> None:
     actuators, why = WRONG[case]
     head, _, tail = ARM.partition("<actuator>")
     (tmp_path / "arm.xml").write_text(head + actuators + tail.partition("</actuator>")[2])
-    with pytest.raises(AdoptError, match=why):
-        adopt(tmp_path / "arm.xml", "arm", tmp_path / "types")
+    with pytest.raises(ImportModelError, match=why):
+        import_model(tmp_path / "arm.xml", "arm", tmp_path / "types")
     assert not (tmp_path / "types" / "arm").exists()
 
 
 def test_an_actuator_can_be_left_out(scene: Path, tmp_path: Path) -> None:
-    folder = adopt(scene, "arm", tmp_path / "types", without=["act_bend"])
+    folder = import_model(scene, "arm", tmp_path / "types", without=["act_bend"])
     assert [joint.name for joint in robot_type.load(folder).joints] == ["turn", "finger"]
-    with pytest.raises(AdoptError, match="no actuator 'x' to leave out; there are: act_turn, act_bend, act_finger"):
-        adopt(scene, "other", tmp_path / "types", without=["x"])
+    with pytest.raises(
+        ImportModelError, match="no actuator 'x' to leave out; available: act_turn, act_bend, act_finger"
+    ):
+        import_model(scene, "other", tmp_path / "types", without=["x"])
 
 
 @pytest.mark.parametrize(
     ("source", "name", "why"),
     [
         ("nowhere.xml", "arm", "MuJoCo cannot read this model"),
-        ("scene.xml", "no good", "no name for a robot type"),
-        ("scene.xml", "types", "is there already"),
+        ("scene.xml", "no good", "not a valid robot type"),
+        ("scene.xml", "types", "exists already"),
     ],
 )
-def test_what_cannot_be_read_or_written_is_told(scene: Path, source: str, name: str, why: str) -> None:
+def test_unusable_files_are_reported(scene: Path, source: str, name: str, why: str) -> None:
     (scene.parent / "types").mkdir()
-    with pytest.raises(AdoptError, match=why):
-        adopt(scene.parent / source, name, scene.parent)
+    with pytest.raises(ImportModelError, match=why):
+        import_model(scene.parent / source, name, scene.parent)
 
 
-def test_the_command_makes_a_folder_and_tries_it(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_creates_a_type(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["import-model", str(scene), "--name", "arm", "--into", str(tmp_path / "types")]) == 0
     said = capsys.readouterr().out
     assert str(tmp_path / "types" / "arm") in said
     assert "TELESCOPE_ROBOTS_PATH" in said
     assert main(["import-model", str(scene), "--name", "arm", "--into", str(tmp_path / "types")]) == 1
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err

@@ -18,30 +18,28 @@ def lab() -> StillWorld:
 
 def drawn(
     lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch, *, depth: bool
-) -> tuple[renderer.RenderRequest, ...]:
+) -> tuple[renderer.RenderedImage, ...]:
     """A picture as it is, and one with everything in it, by the same lamps."""
     wish = (mujoco.mj_name2id(lab.model, mujoco.mjtObj.mjOBJ_CAMERA, camera), SIZE[0], SIZE[1])
     seen = renderer.Renderer(lab)
     seen.open()
     try:
-        quick = seen.shoot(wish[0], width=wish[1], height=wish[2], depth=depth)
+        quick = seen.render(wish[0], width=wish[1], height=wish[2], depth=depth)
         monkeypatch.setattr(renderer, "_in_view", lambda model, *_: np.ones(model.ngeom, dtype=np.bool_))
-        return quick, seen.shoot(wish[0], width=wish[1], height=wish[2], depth=depth)
+        return quick, seen.render(wish[0], width=wish[1], height=wish[2], depth=depth)
     finally:
         seen.close()
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_what_a_camera_cannot_see_is_left_out_and_nothing_else(
-    lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_culling_does_not_change_depth_images(lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch) -> None:
     quick, whole = drawn(lab, camera, monkeypatch, depth=True)
     # Specks below a pixel may be missing: of 19,200 pixels not one in a hundred.
     assert np.mean(np.abs(quick.pixels - whole.pixels) > 0.01) < 0.01
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_less_than_all_is_drawn(lab: StillWorld, camera: str) -> None:
+def test_culling_hides_geoms(lab: StillWorld, camera: str) -> None:
     data = mujoco.MjData(lab.model)
     lab.copy(data)
     index = mujoco.mj_name2id(lab.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
@@ -50,6 +48,6 @@ def test_less_than_all_is_drawn(lab: StillWorld, camera: str) -> None:
     assert seen[lab.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE].all()
 
 
-def test_colours_are_those_of_the_whole_room(lab: StillWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_culling_does_not_change_colour_images(lab: StillWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     quick, whole = drawn(lab, "camera", monkeypatch, depth=False)
     assert np.mean(np.abs(quick.pixels.astype(int) - whole.pixels) > 2) < 0.01

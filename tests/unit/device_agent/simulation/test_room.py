@@ -16,8 +16,8 @@ from device_agent.protocol.manifests import robot_type, room
 from device_agent.protocol.manifests.room import Room
 from device_agent.simulation import world_registry
 from device_agent.simulation.room.climate import Climate, water_g_m3
-from device_agent.simulation.room.pedestrian import Walker
-from device_agent.simulation.room.sound import heard_db
+from device_agent.simulation.room.pedestrian import Pedestrian
+from device_agent.simulation.room.sound import received_db
 from tests.harness.paths import ROBOTS
 
 LAB = ROBOTS / "rooms" / "lab"
@@ -47,7 +47,7 @@ def warnings(world: World) -> list[str]:
     ]
 
 
-def test_two_thousand_steps_under_chance_are_finite_and_the_same_again():
+def test_random_commands_are_finite_and_reproducible():
     def play() -> list[np.ndarray]:
         world, random, seen = lab(), np.random.default_rng(5), []
         lower, upper = world.model.actuator_ctrlrange.T
@@ -65,7 +65,7 @@ def test_two_thousand_steps_under_chance_are_finite_and_the_same_again():
         assert np.array_equal(first, second)
 
 
-def test_every_robot_stands_where_the_manifest_puts_it():
+def test_robots_start_at_their_manifest_poses():
     world = lab()
     for robot in MANIFEST.robots:
         kind = robot_type.load(ROBOTS / robot.type)
@@ -81,12 +81,12 @@ def test_every_robot_stands_where_the_manifest_puts_it():
 
 
 @pytest.mark.parametrize("name", ["nao", "qbo"])
-def test_a_robot_that_drives_gets_somewhere_in_the_room(name: str):
+def test_mobile_robots_move_in_the_room(name: str):
     robot = MANIFEST.robot(name)
     assert robot is not None
     kind = robot_type.load(ROBOTS / robot.type)
     world = lab()
-    mobile = driver._kind(kind)(robot_type=kind, world=world, device=name, prefix=world_registry.prefix(name))
+    mobile = driver._driver_class(kind)(robot_type=kind, world=world, device=name, prefix=world_registry.prefix(name))
     assert isinstance(mobile, MobileDriver)
     mobile._resolve(world.model)
     mobile._connected = True
@@ -105,16 +105,16 @@ def test_a_robot_that_drives_gets_somewhere_in_the_room(name: str):
     assert warnings(world) == []
 
 
-def test_devices_of_one_room_share_its_world_and_it_ends_with_them():
-    first, second = world_registry.of(LAB), world_registry.of(LAB)
+def test_devices_of_a_room_share_a_world():
+    first, second = world_registry.get_world(LAB), world_registry.get_world(LAB)
     assert first is second
-    first.tell({"mark": 1.0})
+    first.set_quantities({"mark": 1.0})
     del first, second
     gc.collect()
-    assert "mark" not in world_registry.of(LAB).quantities
+    assert "mark" not in world_registry.get_world(LAB).quantities
 
 
-def test_a_driver_in_a_room_is_the_robot_of_its_name():
+def test_a_driver_uses_the_robot_of_its_name():
     kind = robot_type.load(ROBOTS / "ur5")
     arm = driver.create(kind, ROBOTS / "ur5", {"room": str(LAB)}, "ur5")
     arm.connect()
@@ -129,7 +129,7 @@ def test_a_driver_in_a_room_is_the_robot_of_its_name():
         stranger.connect()
 
 
-def test_the_drawing_of_an_arm_in_a_room_has_its_table_and_not_the_whole_room():
+def test_the_twin_of_an_arm_includes_nearby_scenery_only():
     world = lab()
     kind = robot_type.load(ROBOTS / "ur5")
     arm = driver.MujocoDriver(robot_type=kind, world=world, device="ur5", prefix="ur5/")
@@ -145,7 +145,7 @@ def test_the_drawing_of_an_arm_in_a_room_has_its_table_and_not_the_whole_room():
     ]
 
 
-def test_a_copy_is_of_one_moment_and_shows_poses():
+def test_a_copy_is_consistent():
     world = lab()
     snapshot = world.step(500)
     data = mujoco.MjData(world.model)
@@ -168,7 +168,7 @@ def shapes_of_the_person(world: World) -> list[int]:
     return [geom for geom in range(model.ngeom) if model.body(model.geom_bodyid[geom]).name.startswith("person")]
 
 
-def test_the_person_walks_its_way_and_keeps_its_feet_on_the_floor():
+def test_the_person_walks_along_its_path_on_the_floor():
     world = lab(EMPTY)
     way = walked(world, 45)
     for corner in MANIFEST.people[0].path_m:
@@ -188,7 +188,7 @@ def test_the_person_walks_its_way_and_keeps_its_feet_on_the_floor():
     assert np.abs(lowest).max() < 0.03
 
 
-def test_the_persons_way_is_free_of_furniture_and_of_where_robots_begin():
+def test_the_persons_path_is_free_of_obstacles():
     world = lab()
     data = mujoco.MjData(world.model)
     world.copy(data)
@@ -203,7 +203,7 @@ def test_the_persons_way_is_free_of_furniture_and_of_where_robots_begin():
             assert away_m < 0 or away_m > np.linalg.norm(there - here) or hit[0] in people, (here, there, int(hit[0]))
 
 
-def test_the_person_pushes_nothing():
+def test_the_person_has_no_contacts():
     world = lab()
     person = [
         g for g in range(world.model.ngeom) if world.model.body(world.model.geom_bodyid[g]).name.startswith("person")
@@ -212,19 +212,19 @@ def test_the_person_pushes_nothing():
     assert not world.model.geom_conaffinity[person].any()
 
 
-def test_the_person_waits_for_a_robot_and_turns_round():
+def test_the_person_stops_for_a_robot_and_turns_around():
     way = room.Person(name="person", path_m=((0.0, 0.0), (4.0, 0.0)), pause_s=0.0)
-    walker = Walker(way)
+    walker = Pedestrian(way)
     robots = np.array([[2.0, 0.0, 0.0]])
     xs = []
     for _ in range(600):
-        walker._walk(robots)
+        walker._advance(robots)
         xs.append(walker.position_m[0])
     assert 1.2 < max(xs) < 1.5
     assert min(xs[200:]) < 0.1
 
 
-def test_a_room_without_the_persons_body_says_what_is_missing():
+def test_a_missing_body_of_the_person_is_an_error():
     manifest = msgspec.structs.replace(MANIFEST, people=(room.Person(name="nobody", path_m=((0.0, 0.0), (1.0, 0.0))),))
     world = lab(manifest)
     with pytest.raises(DriverError, match="no mocap body 'nobody'"):
@@ -234,7 +234,7 @@ def test_a_room_without_the_persons_body_says_what_is_missing():
 # ------------------------------------------------------------ door, blinds, light
 
 
-def test_the_door_opens_at_its_own_pace_when_it_is_set():
+def test_the_door_opens_at_limited_speed():
     world = lab(EMPTY)
     assert world.snapshot().position_rad["door"] == pytest.approx(0.0, abs=1e-3)
     assert world.set("door", 9.0) == 1.5
@@ -243,18 +243,18 @@ def test_the_door_opens_at_its_own_pace_when_it_is_set():
     assert world.settings["door"] == 1.5
 
 
-def test_a_number_that_is_none_sets_nothing():
+def test_a_setting_that_is_not_finite_is_rejected():
     world = lab(EMPTY)
     with pytest.raises(DriverError, match="not finite"):
         world.set("door", math.nan)
 
 
-def test_the_blinds_start_where_the_manifest_says_on_both_sides():
+def test_the_blinds_start_at_their_manifest_position():
     position = lab(EMPTY).snapshot().position_rad
     assert position["blinds"] == position["blinds_east"] == MANIFEST.start["blinds"]
 
 
-def test_light_comes_from_window_and_lamp_and_cameras_see_it():
+def test_light_depends_on_window_and_lamp():
     world = lab(EMPTY)
     world.step(2)
     bright, lights = world.quantities["light_lux"], world.model.light_diffuse.copy()
@@ -278,16 +278,16 @@ class Air:
 
     def __init__(self, manifest: Room = MANIFEST, *, people: int = 0) -> None:
         self.world = World(Path("nothing"), settings={"thermostat": -50.0})
-        self.climate = Climate(manifest, self.world, [Walker(MANIFEST.people[0]) for _ in range(people)])
+        self.climate = Climate(manifest, self.world, [Pedestrian(MANIFEST.people[0]) for _ in range(people)])
 
     def after(self, hours: float, *, door: float = 0.0, blinds: float = 0.0) -> dict[str, float]:
         for _ in range(60):
             self.climate._advance(hours * 60, door=door, blinds=blinds)
-        self.climate._tell()
+        self.climate._publish()
         return dict(self.world.quantities)
 
 
-def test_co2_settles_where_the_balance_of_a_mixed_room_has_it():
+def test_co2_converges_to_the_steady_state():
     climate = MANIFEST.climate
     fresh_m3_h = climate.ventilation_per_h * 6 * 5 * 2.7
     settled = climate.outside_co2_ppm + 2 * 0.018 / fresh_m3_h * 1e6
@@ -295,7 +295,7 @@ def test_co2_settles_where_the_balance_of_a_mixed_room_has_it():
     assert Air().after(12)["co2_ppm"] == pytest.approx(climate.outside_co2_ppm, abs=1)
 
 
-def test_co2_and_heat_go_out_through_the_open_door():
+def test_an_open_door_exchanges_air():
     shut, wide = Air(people=4).after(2), Air(people=4).after(2, door=1.0)
     assert wide["co2_ppm"] < shut["co2_ppm"] - 400
     assert abs(wide["temperature_c"] - MANIFEST.climate.corridor_c) < abs(
@@ -303,13 +303,13 @@ def test_co2_and_heat_go_out_through_the_open_door():
     )
 
 
-def test_people_warm_and_moisten_the_air():
+def test_people_add_heat_and_water():
     empty, full = Air().after(1), Air(people=5).after(1)
     assert full["temperature_c"] > empty["temperature_c"] + 0.5
     assert full["humidity_percent"] > empty["humidity_percent"]
 
 
-def test_the_thermostat_is_kept():
+def test_the_thermostat_controls_the_temperature():
     air = Air()
     air.world.settings["thermostat"] = 23.0  # type: ignore[index]
     assert air.after(6)["temperature_c"] == pytest.approx(22.6, abs=0.45)
@@ -317,20 +317,20 @@ def test_the_thermostat_is_kept():
     assert air.after(12)["temperature_c"] < 15
 
 
-def test_a_long_step_of_the_air_is_as_good_as_many_short_ones():
+def test_the_air_model_is_independent_of_the_step():
     many, one = Air(people=1), Air(people=1)
     many.after(1)
     one.climate._advance(3600, door=0.0, blinds=0.0)
-    one.climate._tell()
+    one.climate._publish()
     for name, value in many.world.quantities.items():
         assert one.world.quantities[name] == pytest.approx(value, rel=1e-3)
 
 
-def test_water_in_the_air_is_as_the_tables_have_it():
+def test_saturated_water_content_matches_tables():
     assert water_g_m3(20.0, 100.0) == pytest.approx(17.3, abs=0.1)
 
 
-def test_the_air_of_the_running_lab_follows_its_door():
+def test_the_laboratory_air_depends_on_its_door():
     world = lab(EMPTY)
     world.set("door", 1.5)
     world.step(10_000)
@@ -341,12 +341,12 @@ def test_the_air_of_the_running_lab_follows_its_door():
 # ------------------------------------------------------------ sound
 
 
-def test_a_sound_is_louder_near_by_and_never_vanishes_in_a_room():
-    assert heard_db(60.0, 1.0) == pytest.approx(66.6, abs=0.2)  # the diffuse field adds to the direct one
-    assert heard_db(60.0, 0.5) > heard_db(60.0, 1.0) > heard_db(60.0, 3.0) > 60.0
+def test_sound_decreases_with_distance_to_the_diffuse_level():
+    assert received_db(60.0, 1.0) == pytest.approx(66.6, abs=0.2)  # the diffuse field adds to the direct one
+    assert received_db(60.0, 0.5) > received_db(60.0, 1.0) > received_db(60.0, 3.0) > 60.0
 
 
-def test_footsteps_speech_and_motors_are_heard():
+def test_footsteps_and_speech_raise_the_sound_level():
     world = lab(changed(quiet_db=20.0))
     world.step(300)
     before = world.quantities["sound_db"]

@@ -9,7 +9,7 @@ from device_agent.simulation.stepper import Stepper
 from tests.harness.agent.rooms import StillWorld
 
 
-def test_steps_in_one_call_equal_steps_one_by_one() -> None:
+def test_batched_steps_equal_single_steps() -> None:
     lab = StillWorld()
     lab.go_on(0.5)
     model = lab.model
@@ -26,7 +26,7 @@ def test_steps_in_one_call_equal_steps_one_by_one() -> None:
         for row in rows:
             one.ctrl[:] = row
             mujoco.mj_step(model, one)
-        stepper.go(many, rows)
+        stepper.step(many, rows)
         for what in ("time", "qpos", "qvel", "act", "ctrl", "qacc_warmstart", "xfrc_applied", "mocap_pos", "eq_active"):
             assert np.array_equal(getattr(one, what), getattr(many, what)), what
     assert not np.array_equal(one.qpos, model.qpos0)

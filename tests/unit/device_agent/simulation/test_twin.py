@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from device_agent.drivers.mujoco import draw
+from device_agent.drivers.mujoco import build_twin
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import Twin, codec
 from device_agent.protocol.manifests import robot_type
@@ -76,7 +76,7 @@ def drawn_geoms(model: Any, base: int, *, scenery: bool) -> list[int]:
 
 def assert_same_poses(model: Any, twin: Twin, base: int, *, scenery: bool) -> None:
     data = mujoco.MjData(model)
-    random, ties = np.random.default_rng(11), EqualityJoints(model)
+    random, equality_joints = np.random.default_rng(11), EqualityJoints(model)
     for _ in range(100):
         position = {}
         for joint in range(model.njnt):
@@ -84,7 +84,7 @@ def assert_same_poses(model: Any, twin: Twin, base: int, *, scenery: bool) -> No
                 value = random.uniform(-2, 2)
                 data.qpos[model.jnt_qposadr[joint]] = value
                 position[model.joint(joint).name] = value
-        ties.settle(data.qpos)
+        equality_joints.apply(data.qpos)
         mujoco.mj_kinematics(model, data)
         want = simulated_poses(data, base, drawn_geoms(model, base, scenery=scenery))
         got = geometry_poses(twin, position)
@@ -97,7 +97,7 @@ def test_forward_kinematics_of_the_twin_equals_the_simulation(folder: Path):
     manifest = robot_type.load(folder)
     model = mujoco.MjModel.from_xml_path(str(folder / manifest.scene))
     base = int(model.body_rootid[model.jnt_bodyid[model.joint(manifest.joints[0].name).id]])
-    twin = draw(model, base=base, device="arm", scenery_m=math.inf)
+    twin = build_twin(model, base=base, device="arm", scenery_m=math.inf)
     read_back = codec.decode(codec.encode(twin, limit=codec.MAX_RETAINED_BYTES), Twin)
     # What stands around a robot that goes away from it is not drawn in its own frame.
     assert_same_poses(model, read_back, base, scenery=bool(model.body_weldid[base] == 0))
@@ -125,20 +125,20 @@ MANY = """
 
 
 @pytest.mark.parametrize("scenery", [True, False])
-def test_several_joints_on_a_body_slides_anchors_and_references(scenery: bool):
+def test_bodies_with_several_joints(scenery: bool):
     model = mujoco.MjModel.from_xml_string(MANY)
     base = model.body("base").id
-    twin = draw(model, base=base, device="x", scenery_m=math.inf if scenery else 0.0)
+    twin = build_twin(model, base=base, device="x", scenery_m=math.inf if scenery else 0.0)
     assert_same_poses(model, twin, base, scenery=scenery)
     names = [body.name for body in twin.bodies]
     assert names == ["scene"] * scenery + ["base", "gimbal#0", "gimbal#1", "gimbal", "plate", "tip"]
 
 
-def test_base_that_moves_is_still_the_origin():
+def test_a_moving_base_is_the_origin():
     floating = MANY.replace('<body name="base" pos="1 2 3" euler="20 30 40">', '<body name="base"><freejoint/>')
     model = mujoco.MjModel.from_xml_string(floating)
     base = model.body("base").id
-    twin = draw(model, base=base, device="x", scenery_m=math.inf)
+    twin = build_twin(model, base=base, device="x", scenery_m=math.inf)
     assert "scene" not in [body.name for body in twin.bodies], "what stands still would move with the robot"
     assert_same_poses(model, twin, base, scenery=False)
 
@@ -148,16 +148,16 @@ def test_names_lose_their_prefix():
     spec = mujoco.MjSpec()
     spec.attach(child, prefix="left/", frame=spec.worldbody.add_frame(pos=[1, 0, 0]))
     model = spec.compile()
-    twin = draw(model, base=model.body("left/base").id, device="x", prefix="left/")
+    twin = build_twin(model, base=model.body("left/base").id, device="x", prefix="left/")
     assert "tip" in [body.name for body in twin.bodies]
     assert {body.joint.name for body in twin.bodies if body.joint} == {"yaw", "pitch", "lift", "roll"}
 
 
-def test_mesh_is_drawn_as_its_bounding_box():
+def test_a_mesh_becomes_its_bounding_box():
     model = mujoco.MjModel.from_xml_string("""
       <mujoco><asset><mesh name="m" vertex="1 0 0  3 0 0  1 4 0  1 0 6"/></asset>
       <worldbody><body name="base"><geom type="mesh" mesh="m"/></body></worldbody></mujoco>""")
-    (body,) = draw(model, base=1, device="x").bodies
+    (body,) = build_twin(model, base=1, device="x").bodies
     (shape,) = body.geometries
     assert shape.shape == "box"
     corners = np.array([[1, 0, 0], [3, 0, 0], [1, 4, 0], [1, 0, 6]], dtype=float)
@@ -165,24 +165,24 @@ def test_mesh_is_drawn_as_its_bounding_box():
     assert np.all(np.abs(local) <= np.array(shape.size_m) + 1e-6)
 
 
-def test_ball_joint_is_one_clear_error():
+def test_a_ball_joint_is_an_error():
     model = mujoco.MjModel.from_xml_string("""
       <mujoco><worldbody><body name="base"><geom size="1"/>
       <body><joint name="hip" type="ball"/><geom size="1"/></body></body></worldbody></mujoco>""")
     with pytest.raises(DriverError, match="joint 'hip' is neither a hinge nor a slide"):
-        draw(model, base=1, device="x")
+        build_twin(model, base=1, device="x")
 
 
-def test_colour_is_the_materials_or_the_geoms():
+def test_colours_come_from_material_or_geom():
     model = mujoco.MjModel.from_xml_string("""
       <mujoco><asset><material name="m" rgba="0.1 0.2 0.3 1"/></asset><worldbody><body name="base">
       <geom size="1" material="m"/><geom size="1" rgba="0.5 0.5 0.5 1"/><geom size="1" rgba="1 1 1 0"/>
       </body></worldbody></mujoco>""")
-    (body,) = draw(model, base=1, device="x").bodies
+    (body,) = build_twin(model, base=1, device="x").bodies
     assert [shape.rgba for shape in body.geometries] == [(0.1, 0.2, 0.3, 1.0), (0.5, 0.5, 0.5, 1.0)]
 
 
-def test_the_arm_of_the_consoles_own_tests_is_todays() -> None:
+def test_the_web_fixture_is_up_to_date() -> None:
     """Else run ``.venv/bin/python web/tests/fixtures/make.py``."""
     fixtures = ROBOTS.parent / "web" / "tests" / "fixtures"
     made = runpy.run_path(str(fixtures / "make.py"))["content"]()

@@ -47,7 +47,7 @@ def played() -> list[Snapshot]:
     return snapshots
 
 
-def test_same_commands_by_hand_give_the_same_numbers():
+def test_manual_stepping_is_deterministic():
     for first, second in zip(played(), played(), strict=True):
         assert first.time_s == second.time_s
         assert np.array_equal(first.qpos, second.qpos)
@@ -56,14 +56,14 @@ def test_same_commands_by_hand_give_the_same_numbers():
         assert np.array_equal(first.site_position_m, second.site_position_m)
 
 
-def test_it_starts_at_home_and_stays():
+def test_it_stays_at_home():
     world = ur5_world()
     world.build()
     assert world.snapshot().position_rad == pytest.approx(HOME)
     assert world.step(500).position_rad == pytest.approx(HOME, abs=1e-4)
 
 
-def test_poses_belong_to_the_positions_beside_them():
+def test_poses_match_the_joint_positions():
     world = ur5_world()
     world.build()
     world.command("arm", ALL, [0.5, -1.2, 1.2, -1.0, -1.0, 0.5])
@@ -75,7 +75,7 @@ def test_poses_belong_to_the_positions_beside_them():
     assert np.abs(data.xpos - snapshot.body_position_m).max() < 1e-12
 
 
-def test_snapshot_is_a_copy_that_nobody_can_change():
+def test_a_snapshot_is_immutable():
     world = ur5_world()
     world.build()
     snapshot = world.snapshot()
@@ -87,7 +87,7 @@ def test_snapshot_is_a_copy_that_nobody_can_change():
         snapshot.qpos[0] = 1.0
 
 
-def test_command_is_followed_in_a_straight_line():
+def test_a_command_is_followed_linearly():
     world = ur5_world()
     world.build()
     start = world.snapshot().ctrl
@@ -117,7 +117,7 @@ def test_a_command_is_copied():
 
 
 @pytest.mark.parametrize("counted_by_the_model", [True, False])
-def test_effort_counts_what_holds_the_arm_against_gravity(tmp_path: Path, counted_by_the_model: bool):
+def test_effort_includes_gravity_compensation(tmp_path: Path, counted_by_the_model: bool):
     model = (UR5 / "ur5.xml").read_text()
     if not counted_by_the_model:
         model = model.replace('actuatorgravcomp="true"', "")
@@ -128,7 +128,7 @@ def test_effort_counts_what_holds_the_arm_against_gravity(tmp_path: Path, counte
     assert abs(world.step(10).effort[0]) < 0.1  # the base turns about the vertical
 
 
-def test_real_time_runs_while_somebody_takes_part():
+def test_real_time_runs_while_there_are_users():
     world = ur5_world()
     world.open()
     world.open()
@@ -147,7 +147,7 @@ def test_real_time_runs_while_somebody_takes_part():
     assert "mujoco-world" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_it_goes_on_where_it_stopped():
+def test_it_resumes_where_it_stopped():
     world = ur5_world()
     world.open()
     until(lambda: world.snapshot().time_s > 0.02)
@@ -171,7 +171,7 @@ def test_simulated_time_never_runs_ahead_of_the_clock():
         world.close()
 
 
-def test_a_slow_machine_loses_time_and_says_so(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
+def test_lost_time_is_reported(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
     world = ur5_world()
     groups = 0
     advance = world._advance
@@ -199,7 +199,7 @@ def test_a_slow_machine_loses_time_and_says_so(monkeypatch: pytest.MonkeyPatch, 
     assert snapshot.time_s + lost_s <= snapshot.taken_s - before + 0.005
 
 
-def test_a_diverged_world_stops_and_says_so():
+def test_a_diverged_world_stops_with_a_fault():
     world = ur5_world()
     world.build()
     world._data.qvel[0] = np.nan
@@ -208,7 +208,7 @@ def test_a_diverged_world_stops_and_says_so():
     assert "unstable" in world.snapshot().fault
 
 
-def test_a_diverged_world_does_not_jump_back_to_the_start():
+def test_a_diverged_world_is_not_reset():
     world = ur5_world()
     world.build()
     world.step(100)
@@ -232,7 +232,7 @@ def test_an_error_while_stepping_becomes_a_fault(monkeypatch: pytest.MonkeyPatch
         world.close()
 
 
-def test_trace_tells_the_truth_at_100_hz(tmp_path: Path):
+def test_the_trace_has_the_state_at_100_hz(tmp_path: Path):
     path = tmp_path / "trace.ndjson"
     world = ur5_world(path)
     world.open()
@@ -258,13 +258,13 @@ def test_trace_tells_the_truth_at_100_hz(tmp_path: Path):
     assert 0 < rows[-1]["qpos"][0] < 0.2
 
 
-def test_a_full_disk_at_the_start_is_one_clear_error():
+def test_a_full_disk_is_reported_at_start():
     world = ur5_world(Path("/dev/full"))
     with pytest.raises(DriverError, match="cannot write the trace"):
         world.open()
 
 
-def test_a_trace_that_fails_later_ends_and_the_simulation_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_a_failing_trace_does_not_stop_the_simulation(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
@@ -273,7 +273,7 @@ def test_a_trace_that_fails_later_ends_and_the_simulation_goes_on(tmp_path: Path
         world.open()
         try:
             os.close(reader)
-            until(lambda: "the trace ends here" in caplog.text)
+            until(lambda: "tracing stopped" in caplog.text)
             then = world.snapshot().time_s
             until(lambda: world.snapshot().time_s > then)
             assert world.snapshot().fault == ""
@@ -290,26 +290,26 @@ def test_trace_is_appended_to(tmp_path: Path):
     assert path.read_text().startswith("earlier\n{")
 
 
-def test_trace_that_cannot_be_written_is_one_clear_error(tmp_path: Path):
+def test_an_unwritable_trace_is_an_error(tmp_path: Path):
     world = ur5_world(tmp_path / "no" / "trace.ndjson")
     with pytest.raises(DriverError, match="cannot write the trace"):
         world.open()
 
 
 @pytest.mark.parametrize("text", ["<mujoco><worldbody><geom/></worldbody></mujoco>", "not xml", ""])
-def test_a_model_that_mujoco_refuses_is_one_clear_error(tmp_path: Path, text: str):
+def test_an_invalid_model_is_an_error(tmp_path: Path, text: str):
     scene = tmp_path / "bad.xml"
     scene.write_text(text)
     with pytest.raises(DriverError, match="MuJoCo cannot build this world"):
         World(scene).build()
 
 
-def test_unknown_joint_in_home_is_named_with_the_valid_ones():
+def test_an_unknown_home_joint_is_an_error():
     with pytest.raises(DriverError, match=r"no joint 'ellbow'; the model has: shoulder_pan, "):
         World(UR5 / "scene.xml", home={"ellbow": 1.0}).build()
 
 
-def test_nothing_is_there_before_it_is_built():
+def test_using_an_unbuilt_world_is_an_error():
     world = ur5_world()
     for use in (world.snapshot, lambda: world.model, lambda: world.step(1)):
         with pytest.raises(DriverError, match="not built"):

@@ -10,7 +10,7 @@ from device_agent.ports.speech import SpeechError
 from device_agent.speech import Espeak
 
 
-def test_a_text_becomes_a_whole_file_of_its_length() -> None:
+def test_a_text_becomes_a_wav_file() -> None:
     short, long = (Espeak().speak(text, "en") for text in ("Hello.", "Hello, I am a robot, and I can speak for long."))
     assert short is not None
     assert long is not None
@@ -19,26 +19,26 @@ def test_a_text_becomes_a_whole_file_of_its_length() -> None:
     assert 0.2 < short.duration_s < long.duration_s < 10
 
 
-def test_languages_are_spoken_and_an_unknown_one_in_its_own() -> None:
+def test_an_unknown_language_falls_back() -> None:
     slovak, unknown = Espeak().speak("Dobrý deň", "sk"), Espeak().speak("Hello", "xx-YY")
     assert slovak is not None
     assert unknown is not None
 
 
 @pytest.mark.parametrize("text", ["--help", "-f /etc/passwd", "a\x00b", "<speak>", "\U0001f916", "\ud83e"])
-def test_no_text_is_taken_for_anything_but_words(text: str) -> None:
+def test_texts_are_not_parsed_as_options(text: str) -> None:
     spoken = Espeak().speak(f"{text} and so on", "")
     assert spoken is not None
     assert spoken.wav.startswith(b"RIFF")
 
 
-def test_a_machine_without_the_program_has_no_voice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_espeak_nothing_is_synthesized(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     assert Espeak().speak("hello", "") is None
 
 
 @pytest.mark.parametrize("does", ["exit 1", "exec sleep 60"])
-def test_a_program_that_fails_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, does: str) -> None:
+def test_a_failing_synthesizer_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, does: str) -> None:
     program = tmp_path / "espeak-ng"
     program.write_text(f"#!/bin/sh\n{does}\n")
     program.chmod(0o755)

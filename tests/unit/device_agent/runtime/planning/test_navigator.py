@@ -7,7 +7,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from device_agent.perception.occupancy_grid import Floor, OccupancyGrid
+from device_agent.perception.occupancy_grid import GridFloorMap, OccupancyGrid
 from device_agent.ports.driver import REST, Twist
 from device_agent.protocol import GoTo, StopLatch
 from device_agent.runtime.actions.device_context import DeviceContext
@@ -32,7 +32,7 @@ def room(*walls: tuple[float, float, float, float]) -> OccupancyGrid:
     for x0, y0, x1, y1 in walls:
         taken |= (places[:, 0] >= x0) & (places[:, 0] <= x1) & (places[:, 1] >= y0) & (places[:, 1] <= y1)
     for _ in range(5):
-        grid.see_points("lidar", places, taken)
+        grid.add_points("lidar", places, taken)
     return grid
 
 
@@ -80,7 +80,7 @@ def test_where_no_way_leads_is_refused() -> None:
 
 
 def test_somebody_who_stands_in_the_way_is_gone_around_or_waited_for() -> None:
-    floor = Floor(np.zeros((5, 5), dtype=bool), (0.0, 0.0), 1.0)
+    floor = GridFloorMap(np.zeros((5, 5), dtype=bool), (0.0, 0.0), 1.0)
     assert find_path(floor, (0.5, 0.5), (4.5, 0.5))[-1] == (4.5, 0.5)
     floor.blocked[:, 2] = True
     with pytest.raises(Refused, match="no free path"):
@@ -94,13 +94,13 @@ def test_a_refusal_names_the_nearest_place_that_has_a_way() -> None:
                 Pose2D(-1.0, 0.0, 0.0), room((-0.1, -2.0, 0.1, 2.0))
             )
         assert refused.value.code == code
-    full = Floor(np.ones((5, 5), dtype=bool), (0.0, 0.0), 1.0)
+    full = GridFloorMap(np.ones((5, 5), dtype=bool), (0.0, 0.0), 1.0)
     with pytest.raises(Refused, match=r"or it is unseen$"):
         find_path(full, (0.5, 0.5), (4.5, 0.5))
 
 
 def test_who_stands_too_near_to_something_leaves_it_for_the_nearest_free_place() -> None:
-    floor = Floor(np.zeros((40, 40), dtype=bool), (0.0, 0.0), 0.05)
+    floor = GridFloorMap(np.zeros((40, 40), dtype=bool), (0.0, 0.0), 0.05)
     floor.blocked[:, :6] = True
     places = find_path(floor, (0.08, 1.0), (1.5, 1.0))
     assert places[0] == pytest.approx((0.325, 1.025))
@@ -110,7 +110,7 @@ def test_who_stands_too_near_to_something_leaves_it_for_the_nearest_free_place()
 
 
 def test_a_way_leads_between_things_corner_by_corner() -> None:
-    floor = Floor(np.eye(6, dtype=bool)[::-1].copy(), (0.0, 0.0), 1.0)
+    floor = GridFloorMap(np.eye(6, dtype=bool)[::-1].copy(), (0.0, 0.0), 1.0)
     floor.blocked[0, 5] = False
     assert find_path(floor, (0.5, 0.5), (5.5, 5.5))[-1] == (5.5, 5.5)
 
