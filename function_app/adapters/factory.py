@@ -13,7 +13,7 @@ from function_app.adapters.local.broker_access import MosquittoBrokerAccess, Tok
 from function_app.adapters.local.certificates import FileCertificates, NoCertificates
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
-from function_app.adapters.local.device_feed import MqttFeed, MqttLate, MqttTelemetry
+from function_app.adapters.local.device_feed import MqttDeviceFeed, MqttTelemetryFeed
 from function_app.adapters.local.password_hasher import Argon2Hashes
 from function_app.adapters.local.robot_catalogue import FolderCatalogue
 from function_app.adapters.local.signing_keys import FileKeys
@@ -213,7 +213,7 @@ def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
 def feeds(settings: Settings, granted: BrokerAccess) -> tuple[DeviceFeed, TelemetryFeed, TelemetryFeed]:
     """What brings what devices say, what they measure, and what they measured while their link was down."""
     broker = _broker(settings, granted)
-    return MqttFeed(broker), MqttTelemetry(broker), MqttLate(broker)
+    return MqttDeviceFeed(broker), MqttTelemetryFeed(broker), MqttTelemetryFeed(broker, late=True)
 
 
 def certificates(settings: Settings) -> Certificates:

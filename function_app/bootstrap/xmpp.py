@@ -1,7 +1,7 @@
 """Connections of the XMPP gateway."""
 
 from function_app.adapters import factory
-from function_app.adapters.local.command_feed import MqttOrders
+from function_app.adapters.local.command_feed import MqttCommandFeed
 from function_app.bootstrap import Functions
 from function_app.ports.command_feed import CommandFeed
 from function_app.ports.xmpp_connection import XmppConnection
@@ -14,7 +14,7 @@ def xmpp_connection(functions: Functions) -> XmppConnection:
     Raises:
         SettingsError: The settings name no XMPP server.
     """
-    from function_app.adapters.xmpp.connection import SlixmppLine  # noqa: PLC0415 (loads slixmpp only for the gateway)
+    from function_app.adapters.xmpp.connection import SlixmppConnection  # noqa: PLC0415 (loads slixmpp only for the gateway)
 
     settings = functions.settings
     if not settings.xmpp.domain:
@@ -23,12 +23,14 @@ def xmpp_connection(functions: Functions) -> XmppConnection:
     async def password() -> str:
         return (await functions.xmpp_credentials.cloud()).password
 
-    return SlixmppLine(host=settings.xmpp.host, port=settings.xmpp.port, domain=settings.xmpp.domain, password=password)
+    return SlixmppConnection(
+        host=settings.xmpp.host, port=settings.xmpp.port, domain=settings.xmpp.domain, password=password
+    )
 
 
 def command_feed(functions: Functions) -> CommandFeed:
     """The broker's commands for agents that connect through the gateway, not yet subscribed."""
     settings = functions.settings
-    return MqttOrders(
+    return MqttCommandFeed(
         host=settings.mqtt_host, port=settings.mqtt_port, access=functions.access, tls=factory.broker_tls(settings)
     )

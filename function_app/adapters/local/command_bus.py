@@ -17,7 +17,7 @@ class MqttCommandBus:
     """``CommandBus`` over MQTT. Every instance hears all acks and hands on those that somebody here waits for."""
 
     def __init__(self, broker: Broker) -> None:
-        self._link = MqttConnection(
+        self._connection = MqttConnection(
             broker,
             subscriptions=(topics.device(topics.ANY, topics.ANY, topics.ANY, topics.ACK),),
             receive=self._dispatch,
@@ -26,16 +26,16 @@ class MqttCommandBus:
 
     async def start(self) -> None:
         """See ``CommandBus``."""
-        await self._link.ready(_READY_S)
+        await self._connection.ready(_READY_S)
 
     async def publish(self, topic: str, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
         """See ``CommandBus``."""
-        await self._link.publish(topic, payload, qos, retain=retain)
+        await self._connection.publish(topic, payload, qos, retain=retain)
 
     @contextlib.asynccontextmanager
     async def acks(self, device_topic: str, command: str) -> AsyncGenerator[AsyncIterator[Ack] | None]:
         """See ``CommandBus``."""
-        if not await self._link.ready(_READY_S):
+        if not await self._connection.ready(_READY_S):
             yield None
             return
         topic = f"{device_topic}/{topics.ACK}"
@@ -54,12 +54,12 @@ class MqttCommandBus:
 
     async def status(self) -> str:
         """See ``CommandBus``."""
-        await self._link.tried(_READY_S)
-        return self._link.trouble or "ok"
+        await self._connection.attempted(_READY_S)
+        return self._connection.trouble or "ok"
 
     async def close(self) -> None:
         """See ``CommandBus``."""
-        await self._link.close()
+        await self._connection.close()
 
     def _dispatch(self, message: MQTTMessage) -> None:
         # By topic and id: an agent can only answer for its own devices, whatever id it writes into its ack.

@@ -17,29 +17,29 @@ from function_app.ports.command_feed import OnMessage
 LIFETIME_S = 24 * 3600.0
 
 
-class MqttOrders:
+class MqttCommandFeed:
     """``Orders`` over MQTT, by a connection with rights of its own."""
 
     def __init__(self, *, host: str, port: int, access: BrokerAccess, tls: ssl.SSLContext | None = None) -> None:
         self._hear: OnMessage | None = None
         self._wanted: dict[tuple[str, str], tuple[str, ...]] = {}
-        self._link = MqttConnection(
+        self._connection = MqttConnection(
             Broker(host=host, port=port, credentials=_credentials(access), tls=tls), receive=self._arrived
         )
 
     @property
     def up(self) -> bool:
         """See ``Orders``."""
-        return not self._link.trouble
+        return not self._connection.trouble
 
     async def run(self, hear: OnMessage) -> None:
         """See ``Orders``."""
         self._hear = hear
-        self._link.start()
+        self._connection.start()
         try:
             await asyncio.Event().wait()
         finally:
-            await self._link.close()
+            await self._connection.close()
 
     async def add(self, space: str, agent: str, listen: Sequence[str] = ()) -> None:
         """See ``Orders``."""
@@ -47,12 +47,12 @@ class MqttOrders:
         wanted = (*_patterns(space, agent), *listen)
         fresh = [pattern for pattern in dict.fromkeys(wanted) if not self._heard(pattern)]
         self._wanted[space, agent] = wanted
-        await self._link.hear(fresh)
+        await self._connection.subscribe(fresh)
 
     def drop(self, space: str, agent: str) -> None:
         """See ``Orders``."""
         gone = self._wanted.pop((space, agent), ())
-        self._link.unhear([pattern for pattern in gone if not self._heard(pattern)])
+        self._connection.unsubscribe([pattern for pattern in gone if not self._heard(pattern)])
 
     def _heard(self, pattern: str) -> bool:
         return any(pattern in wanted for wanted in self._wanted.values())

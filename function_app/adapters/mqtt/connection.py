@@ -80,7 +80,7 @@ class MqttConnection:
         self._client: mqtt.Client | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._ready = asyncio.Event()
-        self._tried = asyncio.Event()
+        self._attempted = asyncio.Event()
         self._lost = asyncio.Event()
         self._waiting: dict[int, asyncio.Future[None]] = {}
         self._subscribed: dict[int, asyncio.Future[None]] = {}
@@ -103,7 +103,7 @@ class MqttConnection:
     async def ready(self, timeout_s: float) -> bool:
         """Wait until connected and subscribed."""
         self.start()
-        self._notice_frost()
+        self._detect_freeze()
         if self._ready.is_set():
             return True
         try:
@@ -113,13 +113,13 @@ class MqttConnection:
             return False
         return True
 
-    async def tried(self, timeout_s: float) -> None:
+    async def attempted(self, timeout_s: float) -> None:
         """Wait until it is known whether the broker can be reached, but no longer than the first try takes."""
         self.start()
-        self._notice_frost()
+        self._detect_freeze()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
-                await self._tried.wait()
+                await self._attempted.wait()
 
     async def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool = False) -> None:
         """Send, and for QoS 1 wait for the broker's word. After a frost it may be sent twice.
@@ -127,7 +127,7 @@ class MqttConnection:
         Raises:
             BusUnavailable: Not connected, or not confirmed in time.
         """
-        self._notice_frost()
+        self._detect_freeze()
         generation = self.generation
         if self._unproven:
             if qos == 0:  # which nobody confirms
@@ -171,7 +171,7 @@ class MqttConnection:
             self._client.ack(message.mid, message.qos)
             event_loop.flush(self._client)
 
-    async def hear(self, patterns: Sequence[str]) -> None:
+    async def subscribe(self, patterns: Sequence[str]) -> None:
         """Subscribe to these too, on this connection and on those that follow."""
         self._subscriptions = tuple(dict.fromkeys((*self._subscriptions, *patterns)))
         client, generation = self._client, self.generation
@@ -182,7 +182,7 @@ class MqttConnection:
         except (BusUnavailable, TimeoutError) as error:
             self._abandon(generation, str(error) or "a subscription was not confirmed")
 
-    def unhear(self, patterns: Iterable[str]) -> None:
+    def unsubscribe(self, patterns: Iterable[str]) -> None:
         """Subscribe to these no longer."""
         gone = set(patterns)
         self._subscriptions = tuple(pattern for pattern in self._subscriptions if pattern not in gone)
@@ -214,9 +214,9 @@ class MqttConnection:
                 if str(error) != self._trouble:
                     _log.warning("broker: %s", error)
                 self._trouble = str(error)
-                self._tried.set()
+                self._attempted.set()
             finally:
-                self._let_go(client)
+                self._disconnect(client)
             await asyncio.sleep(pause_s * random.uniform(0.5, 1.0))  # noqa: S311 (spreads reconnects, hides nothing)
             pause_s = min(2 * pause_s, LAST_RETRY_S)
 
@@ -240,7 +240,7 @@ class MqttConnection:
             raise
         self._turn_at, self._unproven = self._clocks(), False
         self._ready.set()
-        self._tried.set()
+        self._attempted.set()
         return client
 
     def _make(  # noqa: C901 (one short callback after another)
@@ -316,7 +316,7 @@ class MqttConnection:
     async def _stay(self, client: mqtt.Client, expires_at: float) -> None:
         """Keep the connection alive until it breaks or its credentials are about to end."""
         while not self._lost.is_set():
-            self._notice_frost()
+            self._detect_freeze()
             client.loop_misc()
             event_loop.flush(client)
             if time.time() > expires_at - RENEW_BEFORE_S:
@@ -326,7 +326,7 @@ class MqttConnection:
                     await self._lost.wait()
         raise BusUnavailable(self._trouble)
 
-    def _notice_frost(self) -> None:
+    def _detect_freeze(self) -> None:
         """Called whenever the loop turns. Both clocks, since some hosts stop the monotonic one too."""
         now = self._clocks()
         still_s = max(new - old for new, old in zip(now, self._turn_at, strict=True))
@@ -347,7 +347,7 @@ class MqttConnection:
     def _clocks() -> tuple[float, float]:
         return time.monotonic(), time.time()
 
-    def _let_go(self, client: mqtt.Client | None) -> None:
+    def _disconnect(self, client: mqtt.Client | None) -> None:
         self._ready.clear()
         self._lost.clear()
         self._client = None

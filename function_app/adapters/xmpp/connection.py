@@ -19,7 +19,7 @@ MOST_UNSENT_BYTES = 1024 * 1024
 _log = logging.getLogger(__name__)
 
 
-class SlixmppLine:
+class SlixmppConnection:
     """``XmppLine`` to one server, each connection with a new password and a place (resource) of its own."""
 
     def __init__(self, *, host: str, port: int, domain: str, password: Callable[[], Awaitable[str]]) -> None:

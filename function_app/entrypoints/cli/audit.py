@@ -1,26 +1,26 @@
-"""``python -m function_app audit verify|head``: whether the chains of who did what are whole, and where they end."""
+"""Verifies the audit log's hash chains and prints their heads."""
 
 import argparse
 from typing import Any
 
 from function_app.bootstrap import Functions
 from function_app.domain.audit.hash_chain import CLOUD, Head, parse_head
+from function_app.entrypoints.cli import with_functions
 from function_app.ports.tables import StoreError
 
 _EXIT_BROKEN = 1
-_EXIT_WRONG = 2
+_EXIT_USAGE = 2
 
 
-def add_command(commands: Any) -> None:
-    """Add ``audit`` to the commands."""
-    audit: argparse.ArgumentParser = commands.add_parser("audit", help="check the chains of who did what")
-    verbs = audit.add_subparsers(required=True, metavar="VERB", dest="verb")
-    about = {
-        "verify": "see whether every record is as it was written; the first that is not is named",
-        "head": "print where chains end, to be kept elsewhere and given to verify as --expect",
-    }
-    for verb, text in about.items():
-        parser = verbs.add_parser(verb, help=text)
+def add_commands(commands: Any) -> None:
+    """Add ``audit verify`` and ``audit head``."""
+    text = "verify the audit log"
+    verbs = commands.add_parser("audit", help=text, description=text).add_subparsers(required=True, metavar="VERB")
+    for verb, run, description in (
+        ("verify", _verify, "verify every record; prints the first invalid record of each chain"),
+        ("head", _head, "print the head of each chain, to be stored elsewhere and passed to verify with --expect"),
+    ):
+        parser = verbs.add_parser(verb, help=description, description=description)
         parser.add_argument("--account", help=f"name or id of one account, or '{CLOUD}' (default: all)")
         if verb == "verify":
             parser.add_argument(
@@ -28,45 +28,39 @@ def add_command(commands: Any) -> None:
                 action="append",
                 default=[],
                 metavar="SEQ:HASH",
-                help="a head that was noted elsewhere, of --account; may be given again",
+                help="a head of --account that was stored elsewhere; repeatable",
             )
+        parser.set_defaults(run=with_functions(run))
 
 
-async def run(functions: Functions, options: argparse.Namespace) -> int:
-    """Do it; returns the exit code: 0 whole, 1 broken, 2 the command is wrong."""
-    try:
-        return await _run(functions, options)
-    finally:
-        await functions.close()
+async def _head(functions: Functions, options: argparse.Namespace) -> None:
+    for chain in await _chains(functions, options.account):
+        print(f"{chain} {await functions.audit_reader.head(chain) or 'has no records'}")
 
 
-async def _run(functions: Functions, options: argparse.Namespace) -> int:
-    trail = functions.audit_reader
-    expected = [parse_head(text) for text in getattr(options, "expect", [])]
+async def _verify(functions: Functions, options: argparse.Namespace) -> int:
+    expected = [parse_head(text) for text in options.expect]
     if None in expected:
-        print("--expect is a number, a colon and 64 hexadecimal digits, as `audit head` prints it")  # noqa: T201
-        return _EXIT_WRONG
+        print("--expect must be a number, a colon and 64 hexadecimal digits, as `audit head` prints it")
+        return _EXIT_USAGE
     if expected and options.account is None:
-        print("--expect needs --account: say whose chain it is of")  # noqa: T201
-        return _EXIT_WRONG
-    chains = await trail.chains() if options.account is None else [await _chain(functions, options.account)]
-    if options.verb == "head":
-        for chain in chains:
-            print(f"{chain} {await trail.head(chain) or 'has no records'}")  # noqa: T201
-        return 0
+        print("--expect needs --account: name the account whose head it is")
+        return _EXIT_USAGE
     broken = False
     heads = tuple(head for head in expected if isinstance(head, Head))
-    for chain in chains:
-        verdict = await trail.verify(chain, expected=heads)
-        said = f"BROKEN {chain} {verdict.broken}" if verdict.broken else f"OK {chain} {verdict.head}"
-        print(f"{said} ({verdict.anchors} heads noted in the blob store)")  # noqa: T201
+    for chain in await _chains(functions, options.account):
+        verdict = await functions.audit_reader.verify(chain, expected=heads)
+        result = f"BROKEN {chain} {verdict.broken}" if verdict.broken else f"OK {chain} {verdict.head}"
+        print(f"{result} ({verdict.anchors} heads in the blob store)")
         broken = broken or bool(verdict.broken)
     return _EXIT_BROKEN if broken else 0
 
 
-async def _chain(functions: Functions, account: str) -> str:
-    """The chain of an account that is named by its name or its id."""
+async def _chains(functions: Functions, account: str | None) -> list[str]:
+    """The chain of one account, by its name or id, or all chains."""
+    if account is None:
+        return await functions.audit_reader.chains()
     if not account:
-        raise StoreError("--account is empty; give an account's name or id")
+        raise StoreError("--account is empty; pass an account's name or id")
     known = await functions.sign_in.known(account)
-    return account if known is None else known.id
+    return [account if known is None else known.id]

@@ -46,7 +46,6 @@ async def work(functions: Functions) -> None:
     for task in (*tasks, waiting):
         task.cancel()
     await asyncio.gather(*tasks, waiting, return_exceptions=True)
-    await functions.close()
     for task in done - {waiting}:
         task.result()
 

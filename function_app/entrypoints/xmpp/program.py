@@ -27,6 +27,5 @@ async def speak(functions: Functions) -> None:
     for task in (speaking, waiting):
         task.cancel()
     await asyncio.gather(speaking, waiting, return_exceptions=True)
-    await functions.close()
     if speaking in done:
         speaking.result()

@@ -119,7 +119,7 @@ class Cloud:
     def _listen(self, feed: Any, handle: Callable[..., Coroutine[Any, Any, None]]) -> None:
         async def start() -> None:
             self._feeds.append(asyncio.ensure_future(feed.run(handle)))
-            assert await feed._link.ready(PATIENCE_S), feed._link.trouble
+            assert await feed._connection.ready(PATIENCE_S), feed._connection.trouble
 
         self.run(start())
 

@@ -1,13 +1,15 @@
 """What was measured while a link was down reaches the series by its own time, never a live view."""
 
 import asyncio
+import math
 from typing import Any
 
 import pytest
 
 from device_agent.protocol import Measurements, codec, topics
 from function_app.adapters.local import device_feed
-from function_app.ports.broker_access import Credentials
+from function_app.adapters.mqtt.connection import Broker
+from function_app.ports.broker_access import Credentials, ServiceCredentials
 from function_app.ports.tables import StoreError
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person
@@ -15,6 +17,7 @@ from tests.harness.cloud.polling import PollingRobot
 from tests.harness.network.brokers import Client, RunningBroker, wait_until
 
 HOUR_MS = 3_600_000
+NO_CREDENTIALS = ServiceCredentials("", "", "", math.inf)
 
 
 def late(robot: Robot | PollingRobot) -> str:
@@ -68,5 +71,8 @@ def test_it_is_tried_until_the_store_takes_it(monkeypatch: pytest.MonkeyPatch) -
         if len(tries) < 20:
             raise StoreError("the store is away")
 
-    asyncio.run(device_feed.MqttLate._store([("t", b"")], away))
+    feed = device_feed.MqttTelemetryFeed(
+        Broker(host="127.0.0.1", port=1, credentials=lambda: NO_CREDENTIALS), late=True
+    )
+    asyncio.run(feed.store([("t", b"")], away))
     assert tries == [1] * 20

@@ -139,7 +139,7 @@ def test_a_taken_port_is_one_line_and_exit_code_3(tmp_path: Path, server: int) -
     code, out, err = run(tmp_path, server, "serve")
     assert (code, out) == (3, "")
     assert err == (
-        f"telescope functions: 127.0.0.1:{server} cannot be used (Address already in use); "
+        f"telescope-server: 127.0.0.1:{server} cannot be used (Address already in use); "
         "set TELESCOPE_PORT to a free port\n"
     )
 
@@ -150,7 +150,7 @@ def test_a_damaged_file_of_tables_is_one_line_and_left_as_it_is(tmp_path: Path, 
     damaged.write_bytes(b"no database " * 1000)
     code, out, err = run(tmp_path, free_port(), command)
     assert (code, out, err.count("\n")) == (1, "", 1)
-    assert err.startswith(f"telescope functions: the tables in {damaged} are damaged")
+    assert err.startswith(f"telescope-server: the tables in {damaged} are damaged")
     assert damaged.read_bytes() == b"no database " * 1000
 
 
@@ -160,7 +160,7 @@ def test_damaged_keys_are_one_line_and_left_as_they_are(tmp_path: Path) -> None:
     damaged.write_text("no key")
     code, out, err = run(tmp_path, free_port(), "serve")
     assert (code, out, err.count("\n")) == (1, "", 1)
-    assert err.startswith(f"telescope functions: the signing keys in {damaged.parent} cannot be used")
+    assert err.startswith(f"telescope-server: the signing keys in {damaged.parent} cannot be used")
     assert damaged.read_text() == "no key"
 
 

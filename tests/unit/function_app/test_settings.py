@@ -111,7 +111,7 @@ def test_a_terminal_gets_that_line_and_no_traceback(tmp_path: Path, command: str
         check=False,
     )
     assert done.returncode == 1
-    assert done.stderr == "telescope functions: TELESCOPE_PORT is 'http'; it must be a number from 1 to 65535\n"
+    assert done.stderr == "telescope-server: TELESCOPE_PORT is 'http'; it must be a number from 1 to 65535\n"
     assert done.stdout == ""
 
 
@@ -152,7 +152,7 @@ def test_speaking_xmpp_without_a_server_is_one_line(tmp_path: Path) -> None:
         check=False,
     )
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.splitlines()[-1].startswith("telescope functions: TELESCOPE_XMPP_DOMAIN is empty. Set it to")
+    assert done.stderr.splitlines()[-1].startswith("telescope-server: TELESCOPE_XMPP_DOMAIN is empty. Set it to")
     assert "Traceback" not in done.stderr
 
 

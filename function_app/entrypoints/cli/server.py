@@ -1,0 +1,69 @@
+"""Commands that run the server's processes, and that prepare cloud resources."""
+
+import argparse
+import asyncio
+import os
+from typing import Any
+
+from function_app import bootstrap, settings
+from function_app.adapters import factory
+from function_app.bootstrap import Functions
+from function_app.entrypoints.cli import with_functions
+from function_app.entrypoints.hosts import uvicorn, worker
+from function_app.settings import SettingsError
+
+_WORKER_NICE = 5
+"""Storage may wait; HTTP responses, and an agent on the same machine, may not."""
+
+
+def add_commands(commands: Any) -> None:
+    """Add ``serve``, ``work``, ``xmpp``, ``prepare`` and ``check-models``."""
+    for name, run, text in (
+        ("serve", _serve, "serve the API and the console with uvicorn"),
+        ("work", with_functions(_work), "store messages from the broker and run timers"),
+        ("xmpp", with_functions(_xmpp), "connect agents that use XMPP"),
+        ("prepare", _prepare, "create the vault secret, DynamoDB table and S3 bucket that do not exist yet"),
+    ):
+        commands.add_parser(name, help=text, description=text).set_defaults(run=run)
+    text = "compile uploaded robot types with MuJoCo; `work` does this too"
+    checks = commands.add_parser("check-models", help=text, description=text)
+    checks.add_argument("--drain", action="store_true", help="exit when no upload is left")
+    checks.set_defaults(run=with_functions(_check_models))
+
+
+def _serve(_: argparse.Namespace) -> int:
+    functions = bootstrap.build(settings.read())
+    asyncio.run(_check(functions))
+    uvicorn.serve(functions)
+    return 0
+
+
+async def _check(functions: Functions) -> None:
+    """Report unusable tables or keys at the start instead of at the first request."""
+    await functions.health.require_tables()
+    await functions.keys.current()
+    await functions.tables.close()
+
+
+def _prepare(_: argparse.Namespace) -> int:
+    asyncio.run(factory.prepare(settings.read()))
+    return 0
+
+
+async def _work(functions: Functions, _: argparse.Namespace) -> None:
+    if hasattr(os, "nice"):
+        os.nice(_WORKER_NICE)
+    await worker.work(functions)
+
+
+async def _xmpp(functions: Functions, _: argparse.Namespace) -> None:
+    try:
+        from function_app.entrypoints.xmpp import speak  # noqa: PLC0415 (slixmpp is optional)
+
+        await speak(functions)
+    except ModuleNotFoundError as error:
+        raise SettingsError(f"the XMPP gateway needs the Python package {error.name}; run `make env`") from error
+
+
+async def _check_models(functions: Functions, options: argparse.Namespace) -> None:
+    await worker.check_models(functions, drain=options.drain)
