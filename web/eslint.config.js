@@ -1,5 +1,6 @@
 import js from "@eslint/js";
 import tseslint from "typescript-eslint";
+import importRules from "./scripts/import-rules.mjs";
 
 const pageNames = ["document", "window", "navigator", "location", "history", "localStorage", "sessionStorage"];
 
@@ -13,14 +14,19 @@ export default tseslint.config(
     rules: {
       "@typescript-eslint/restrict-template-expressions": ["error", { allowNumber: true }],
       "@typescript-eslint/switch-exhaustiveness-check": "error",
-      // `onClick={() => signal.value = x}` reads well and returns nothing anyone looks at.
+      // `onClick={() => signal.value = x}` returns a value that nothing reads.
       "@typescript-eslint/no-confusing-void-expression": ["error", { ignoreArrowShorthand: true }],
       eqeqeq: "error",
       "no-console": "error",
     },
   },
   {
-    // The core is told of the page by its callers, so that it runs and is tested without one.
+    files: ["src/**"],
+    plugins: { imports: importRules },
+    rules: { "imports/layers": "error" },
+  },
+  {
+    // Models and the shared client do not use the DOM, so that they run and are tested without a page.
     files: ["src/features/*/model/**", "src/shared/{api,lib,mqtt}/**"],
     rules: {
       "no-restricted-globals": ["error", ...pageNames],

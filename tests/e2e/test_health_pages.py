@@ -119,7 +119,7 @@ def test_times_are_measured_drawn_beside_the_papers_and_saved(browser: Browser, 
     with laboratory.api() as api:
         device = api.device("light")["id"]
         with pages(browser, laboratory) as (ann,):
-            go(ann, laboratory, f"#/devices/{device}/times")
+            go(ann, laboratory, f"#/devices/{device}/latency")
             ann.get_by_test_id("measure").click()
             measured = ann.get_by_test_id("measured")
             chart = ann.get_by_test_id("times-samples")
@@ -151,7 +151,7 @@ def test_times_are_measured_drawn_beside_the_papers_and_saved(browser: Browser, 
             assert rows[0] == "device,label,transport,path,at,ms"
             assert len(rows) - 1 == drawn >= 3 * MEASURED
             assert_good_page(ann, "times-device")
-            go(ann, laboratory, "#/times")
+            go(ann, laboratory, "#/latency")
             expect(ann.get_by_test_id("times-line").first).to_be_visible(timeout=PATIENCE_MS)
             assert_good_page(ann, "times")
 

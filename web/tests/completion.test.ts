@@ -3,7 +3,7 @@ import { CompletionContext } from "@codemirror/autocomplete";
 import { python } from "@codemirror/lang-python";
 import { EditorState } from "@codemirror/state";
 import { describe, expect, test } from "vitest";
-import type { Scripting } from "../src/features/movements/model/movement-library";
+import type { Scripting } from "../src/shared/api/movement-library";
 import { complete } from "../src/features/movements/completion";
 
 const api = JSON.parse(

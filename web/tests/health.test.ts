@@ -1,6 +1,7 @@
 /** What the health page says where the device and the cloud do not agree, and what is measured of what. */
+import type { Fault, Watched } from "../src/shared/api/health";
 import { describe, expect, it } from "vitest";
-import { intervalAround, healthNow, openCount, standings, watchedQuantity, worstFirst, type Fault, type Watched } from "../src/features/health/model/health";
+import { intervalAround, healthNow, openCount, standings, watchedQuantity, worstFirst } from "../src/features/health/model/health";
 
 const fault = (code: string, more: Partial<Fault> = {}): Fault => ({
   id: code,

@@ -1,9 +1,9 @@
 import { beforeEach, describe, expect, test } from "vitest";
 import { ApiError, type Http } from "../src/shared/api/http";
 import { StoredValue, storedDraft, type Draft } from "../src/shared/lib/local-storage";
-import { Library, type MovementSource } from "../src/features/movements/model/movement-library";
+import { Library, type MovementSource } from "../src/shared/api/movement-library";
 import { ScriptDraft } from "../src/features/movements/model/script-draft";
-import { failureMark, placed } from "../src/shared/lib/text-offsets";
+import { failureMark, placed } from "../src/features/movements/model/text-offsets";
 
 /** The movements of one account, as the back end keeps them. */
 class Shelf {

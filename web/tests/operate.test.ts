@@ -201,6 +201,7 @@ describe("who has control", () => {
 
 describe("what is retained", () => {
   it("is read anew only when it has changed, so that nothing drawn from it is built again", async () => {
+    await until(() => device.twin.value !== null, "the model");
     const { description, twin } = { description: device.description.value, twin: device.twin.value };
     cloud.cutAll();
     await until(() => !fleet.link.up.value, "the loss");

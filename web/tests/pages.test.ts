@@ -1,18 +1,19 @@
 import { describe, expect, it, vi } from "vitest";
+import type { PageName } from "../src/shared/routing/routes";
 
 vi.stubGlobal("location", { hash: "" });
 vi.stubGlobal("addEventListener", () => undefined);
-const { PAGES, ROWS } = await import("../src/app/page-registry");
-const route = await import("../src/app/routes");
+const { ROWS } = await import("../src/app/page-registry");
+const route = await import("../src/shared/routing/routes");
 
 describe("the table of pages", () => {
   it("reads each address as the page that it was written for", () => {
     const written = {
-      fleet: route.deviceListAddress,
+      devices: route.deviceListAddress,
       device: route.deviceAddress("a-b"),
       keyframes: route.keyframesAddress("a-b", "wave"),
       typeKeyframes: route.typeKeyframesAddress("ur5"),
-      together: route.multiRobotAddress(["a-b", "c_d"]),
+      multiRobot: route.multiRobotAddress(["a-b", "c_d"]),
       space: route.spaceAddress("lab"),
       pair: route.pairAddress,
       movements: route.movementsAddress,
@@ -23,12 +24,12 @@ describe("the table of pages", () => {
       health: route.healthAddress,
       deviceHealth: route.healthAddressOf("device", "a-b"),
       spaceHealth: route.healthAddressOf("space", "lab"),
-      times: PAGES.times.pattern,
-      deviceTimes: route.latencyAddressOf("a-b"),
+      latency: route.pageAddress("latency"),
+      deviceLatency: route.latencyAddressOf("a-b"),
       account: route.accountAddress,
-      activity: route.auditLogAddress,
+      auditLog: route.auditLogAddress,
       invitation: route.invitationAddress,
-    } satisfies Record<keyof typeof PAGES, string>;
+    } satisfies Record<PageName, string>;
     for (const [page, address] of Object.entries(written)) expect(route.read(address).page, address).toBe(page);
   });
 
@@ -40,7 +41,7 @@ describe("the table of pages", () => {
 
   it("shows the first page where an address is none", () => {
     for (const hash of ["", "#", "#/nowhere", "#/devices/", "#/devices/a/b/c", "#/devices/<b>"]) {
-      expect(route.read(hash).page, hash).toBe("fleet");
+      expect(route.read(hash).page, hash).toBe("devices");
     }
   });
 

@@ -1,6 +1,6 @@
 import { describe, expect, test } from "vitest";
 import { storedDraft, storedParameters } from "../src/shared/lib/local-storage";
-import type { ObjectSchema } from "../src/features/movements/model/movement-library";
+import type { ObjectSchema } from "../src/shared/api/movement-library";
 import { fieldsOf, fill, read } from "../src/features/movements/model/parameter-form";
 
 const SCHEMA: ObjectSchema = {

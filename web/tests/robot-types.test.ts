@@ -1,7 +1,7 @@
 import { describe, expect, it } from "vitest";
 import { readFinding, readFindings } from "../src/features/robot-types/model/parse-findings";
 import { ApiError } from "../src/shared/api/http";
-import type { Look, RobotType, RobotTypes, TypeFolder, TypeModel } from "../src/features/robot-types/model/robot-types";
+import type { Look, RobotType, RobotTypes, TypeFolder, TypeModel } from "../src/shared/api/robot-types";
 import { UploadDraft } from "../src/features/robot-types/model/upload-draft";
 import { selectFiles, packFiles } from "../src/features/robot-types/model/upload-files";
 

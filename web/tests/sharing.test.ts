@@ -4,7 +4,7 @@ import { Api } from "../src/shared/api/client";
 import { subjectOf, accountIdsOf, AuditReader, ALL_ENTRIES } from "../src/features/account/model/audit-log";
 import { Fleet } from "../src/features/devices/model/device-list";
 import { FollowedInvitation, invitationSecret } from "../src/features/sharing/model/invitation-link";
-import type { AuditRecord, Share } from "../src/features/sharing/model/wire-types";
+import type { AuditRecord, Share } from "../src/shared/api/sharing";
 import { Session } from "../src/features/account/model/session";
 import { secondsLeft, ShareList } from "../src/features/sharing/model/shares";
 import { entryText, type Names } from "../src/features/account/audit-entry-text";

@@ -1,4 +1,5 @@
 /** Times: what is drawn, what it comes to, what is saved; and the papers' figures. */
+import { LatencyApi, type Sample, type StoredLatency } from "../src/shared/api/latency";
 import { signal } from "@preact/signals-core";
 import { describe, expect, it } from "vitest";
 import { Api, type Action, type LatencyBatch } from "../src/shared/api/client";
@@ -7,7 +8,7 @@ import { ApiError, Http } from "../src/shared/api/http";
 import type { Link } from "../src/shared/mqtt/mqtt-link";
 import { LatencyProbe, TIMES, probeKindsOf } from "../src/features/latency/model/probe";
 import { PUBLISHED, publishedFor, UR5_TABLE_2 } from "../src/features/latency/model/published-figures";
-import { csv, figuresOf, linesOf, distribution, LatencyApi, type Line, type Sample, type StoredLatency } from "../src/features/latency/model/latency-stats";
+import { csv, figuresOf, linesOf, distribution, type Line } from "../src/features/latency/model/latency-stats";
 
 const stored = (more: Partial<StoredLatency> = {}): StoredLatency => ({
   transport: "mqtt",

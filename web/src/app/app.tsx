@@ -10,8 +10,8 @@ import { common } from "../shared/i18n/common";
 import { texts } from "./texts";
 import { lazyPage } from "./lazy-page";
 import { Navigation } from "./navigation-bar";
-import { type At, type PageProps, ROWS } from "./page-registry";
-import { route } from "./routes";
+import { type PageProps, ROWS } from "./page-registry";
+import { type At, route } from "../shared/routing/routes";
 import { SignInPage } from "../features/account/sign-in-page";
 
 const LATER = new Map([...ROWS].map(([name, { load }]) => [name, lazyPage(load)]));

@@ -12,9 +12,10 @@ import "../shared/ui/styles/layout.css";
 import "../shared/ui/styles/sliders.css";
 import "../shared/ui/styles/charts.css";
 import "../shared/ui/styles/lists.css";
+import "../shared/ui/styles/forms.css";
 import { texts } from "./texts";
 import { App, fetchEarly } from "./app";
-import { invitationAddress, pairAddress, replaceWith } from "./routes";
+import { invitationAddress, pairAddress, replaceWith } from "../shared/routing/routes";
 
 const api = new Api();
 const session = new Session(api);

@@ -3,9 +3,9 @@ import type { Account } from "../shared/api/client";
 import type { Session } from "../features/account/model/session";
 import { texts } from "./texts";
 import { PAGES, ROWS } from "./page-registry";
-import { accountAddress, deviceListAddress, route } from "./routes";
+import { accountAddress, deviceListAddress, pageAddress, route } from "../shared/routing/routes";
 
-const LINKS = [...ROWS.values()].flatMap(({ link, pattern, part }) => (link === undefined ? [] : [{ link, pattern, part }]));
+const LINKS = [...ROWS].flatMap(([page, { link, part }]) => (link === undefined ? [] : [{ link, address: pageAddress(page), part }]));
 
 export function Navigation({ account, session }: { account: Account; session: Session }) {
   const { part: here } = PAGES[route.value.page];
@@ -15,8 +15,8 @@ export function Navigation({ account, session }: { account: Account; session: Se
         {texts.product}
       </a>
       <nav aria-label={texts.sections.title}>
-        {LINKS.map(({ link, pattern, part }) => (
-          <a key={part} href={pattern} aria-current={part === here ? "page" : undefined}>
+        {LINKS.map(({ link, address, part }) => (
+          <a key={part} href={address} aria-current={part === here ? "page" : undefined}>
             {link}
           </a>
         ))}

@@ -1,17 +1,18 @@
+import type { Fleet } from "../devices/model";
+import { MAY } from "../sharing";
+import { Card } from "../../shared/ui/card";
+import { Choice } from "../../shared/ui/choice";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api, Space } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
-import type { Fleet } from "../devices/model/device-list";
-import type { ApiKey, ApiKeyMade, SharedRole } from "../sharing/model/wire-types";
+import type { ApiKey, ApiKeyMade, SharedRole } from "../../shared/api/sharing";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { InlineForm } from "../../shared/ui/inline-form";
 import { ConfirmButton } from "../../shared/ui/confirm-button";
 import { useReturnFocus } from "../../shared/hooks/use-return-focus";
-import { MAY } from "../sharing/invite-form";
-import { Card, Choice } from "../../shared/ui/parts";
 import { CopyOnce } from "../../shared/ui/copy-once";
-import "../sharing/sharing.css";
+import "./account.css";
 
 /** What a key may be kept to, by the name it has in `only`. */
 type Names = ReadonlyMap<string, string>;

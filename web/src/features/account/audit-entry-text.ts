@@ -1,6 +1,6 @@
 /** One record of the audit list in plain English. */
 import { subjectOf } from "./model/audit-log";
-import type { AuditRecord, Role } from "../sharing/model/wire-types";
+import type { AuditRecord, Role } from "../../shared/api/sharing";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";

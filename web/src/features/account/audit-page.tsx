@@ -1,14 +1,14 @@
+import type { Fleet } from "../devices/model";
 import { useEffect, useMemo, useState } from "preact/hooks";
 import type { Api, Space } from "../../shared/api/client";
 import { accountIdsOf, AuditReader, ALL_ENTRIES } from "./model/audit-log";
-import type { Fleet } from "../devices/model/device-list";
-import type { ApiKey, AuditQuery, AuditRecord } from "../sharing/model/wire-types";
+import type { ApiKey, AuditQuery, AuditRecord } from "../../shared/api/sharing";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { entryText, type Names } from "./audit-entry-text";
-import { accountAddress } from "../../app/routes";
-import "../sharing/sharing.css";
+import { accountAddress } from "../../shared/routing/routes";
+import "./account.css";
 
 const DAY_MS = 86_400_000;
 

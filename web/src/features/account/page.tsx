@@ -1,12 +1,12 @@
+import type { Fleet } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useEffect, useState } from "preact/hooks";
 import type { Api, SignInSession } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
-import type { Fleet } from "../devices/model/device-list";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { ApiKeys } from "./api-keys";
-import { Card } from "../../shared/ui/parts";
-import { auditLogAddress, deviceListAddress } from "../../app/routes";
+import { auditLogAddress, deviceListAddress } from "../../shared/routing/routes";
 
 /** One's own account: its password, where else one is signed in, its API keys, and what was done in it. */
 export function AccountPage({ api, fleet }: { api: Api; fleet: Fleet }) {

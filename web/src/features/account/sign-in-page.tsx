@@ -1,10 +1,10 @@
+import { JoinForm } from "../sharing";
+import type { FollowedInvitation } from "../sharing/model";
 import { useEffect, useState } from "preact/hooks";
 import type { Api, SignInMethods } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
-import type { FollowedInvitation } from "../sharing/model/invitation-link";
 import { signInToken, type Session } from "./model/session";
 import { texts } from "./texts";
-import { JoinForm } from "../sharing/join-form";
 
 interface SignInProps {
   api: Api;

@@ -1,4 +1,4 @@
-import type { Outcome } from "../sharing/model/wire-types";
+import type { Outcome } from "../../shared/api/sharing";
 import { format } from "../../shared/i18n/format";
 
 export const texts = {

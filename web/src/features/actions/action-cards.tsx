@@ -1,13 +1,12 @@
 /** What a robot can be asked to do besides being steered: a card for each ability that its description names. */
+import { actionUnavailableReason } from "../devices";
+import type { DeviceSession, Fleet } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import type { ComponentChildren } from "preact";
-import type { Fleet } from "../devices/model/device-list";
 import type { KnownDescription } from "../../shared/mqtt/parse-messages";
 import type { AnyRequest } from "../../shared/api/action-requests";
-import type { DeviceSession } from "../devices/model/device-session";
 import { texts } from "./texts";
 import { CollapsibleCard } from "../../shared/ui/collapsible-card";
-import { Card } from "../../shared/ui/parts";
-import { actionUnavailableReason } from "../devices/availability";
 import "./actions.css";
 import { LookAtCard } from "./look-at-card";
 import { GoToPlaceCard } from "./go-to-place-card";

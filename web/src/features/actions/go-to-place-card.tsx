@@ -1,10 +1,10 @@
 /** Go to a place in the room: pointed at on its plan, or typed. */
+import type { Fleet } from "../devices/model";
+import { Drawing, useFloorPlan } from "../spaces";
 import { useEffect, useMemo, useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
-import type { Fleet } from "../devices/model/device-list";
 import type { GoTo } from "../../shared/mqtt/protocol.generated";
 import { texts } from "./texts";
-import { Drawing, useFloorPlan } from "../spaces/floor-plan";
 import { startAction, type ActionCardProps } from "./action-cards";
 import { NumberField, numberOf } from "./action-form-fields";
 

@@ -1,10 +1,10 @@
+import type { DeviceStore } from "../devices/model";
+import { rollPitchYaw, unit } from "../twin/model";
+import { Choice } from "../../shared/ui/choice";
 import { useEffect, useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
-import type { DeviceStore } from "../devices/model/device-store";
-import { rollPitchYaw, unit } from "../twin/model/forward-kinematics";
 import type { Vector3 } from "../../shared/lib/vectors";
 import { texts } from "./texts";
-import { Choice } from "../../shared/ui/parts";
 import { startAction, type ActionCardProps } from "./action-cards";
 import { NumberField, numbersOf, ShareField } from "./action-form-fields";
 

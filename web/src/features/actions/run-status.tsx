@@ -1,11 +1,11 @@
 /** What the device does now at somebody's request: how far it is, its end, the way back. Always in sight. */
+import type { Control } from "../control/model";
+import { actionUnavailableReason } from "../devices";
+import type { DeviceStore } from "../devices/model";
 import { useState } from "preact/hooks";
 import { ended, type ActionRunner, type Run } from "./model/action-runner";
-import type { Control } from "../control/model/lease";
-import type { DeviceStore } from "../devices/model/device-store";
 import { format } from "../../shared/i18n/format";
 import { describeRequest, texts } from "./texts";
-import { actionUnavailableReason } from "../devices/availability";
 import "./run-status.css";
 
 interface RunStatusProps {

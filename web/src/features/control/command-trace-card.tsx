@@ -1,14 +1,14 @@
 /** How long things take, and what became of the last commands: nothing here is guessed. */
-import type { DeviceSession } from "../devices/model/device-session";
-import type { Step } from "../actions/model/action-runner";
+import { actionTexts, describeRequest } from "../actions";
+import type { Step } from "../actions/model";
+import type { DeviceSession } from "../devices/model";
+import { LiveLatency } from "../latency";
+import { steeringTexts } from "../steering";
+import { Card } from "../../shared/ui/card";
 import { clock } from "../../shared/lib/clock";
 import type { TraceLine, TraceStatus } from "./model/command-trace";
 import { format } from "../../shared/i18n/format";
-import { describeRequest, texts as actionTexts } from "../actions/texts";
-import { texts as steeringTexts } from "../steering/texts";
 import { texts } from "./texts";
-import { LiveLatency } from "../latency/live-latency-card";
-import { Card } from "../../shared/ui/parts";
 
 const COLUMNS = ["accepted", "started", "observed"] as const;
 const FIRST: ReadonlySet<TraceStatus> = new Set(["sent", ...COLUMNS]);

@@ -1,6 +1,6 @@
+import type { DeviceStore } from "../devices/model";
 import { useId, useState } from "preact/hooks";
 import type { Control } from "./model/lease";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { StopSwitch } from "./model/stop";
 import type { Watchers } from "./model/watchers";
 import { texts } from "./texts";

@@ -1,10 +1,10 @@
 /** Asking for control, answering who asks, taking over: rows of the control bar, which they make higher and never cover. */
+import type { DeviceStore } from "../devices/model";
 import { useComputed } from "@preact/signals";
 import { useEffect, useId, useRef, useState } from "preact/hooks";
 import type { ControlRequestState } from "./model/control-request";
 import { clock } from "../../shared/lib/clock";
 import type { Control } from "./model/lease";
-import type { DeviceStore } from "../devices/model/device-store";
 import { texts } from "./texts";
 
 /** Seconds that are left, for eyes: read out each second it would drown everything else. */

@@ -1,5 +1,5 @@
+import type { DeviceStore } from "../devices/model";
 import { useState } from "preact/hooks";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { StopSwitch } from "./model/stop";
 import { texts } from "./texts";
 

@@ -1,4 +1,4 @@
-import type { Channel } from "../actions/model/action-runner";
+import type { Channel } from "../actions/model";
 import type { SeenBy } from "./model/command-trace";
 import type { Ended } from "./model/control-request";
 

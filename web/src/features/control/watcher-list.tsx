@@ -1,9 +1,9 @@
 /** How many others look at a device, and who they are: as the server tells, for as long as it is heard. */
+import { Age } from "../../shared/ui/age";
 import { onThisClock } from "../../shared/lib/clock";
 import type { Watchers } from "./model/watchers";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { Age } from "../../shared/ui/parts";
 
 interface WatchersButtonProps {
   watching: Watchers;

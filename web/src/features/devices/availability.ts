@@ -1,5 +1,5 @@
 /** Whether something may be asked of a device now, and if not, why. */
-import type { Control } from "../control/model/lease";
+import type { Control } from "../control/model";
 import type { DeviceStore } from "./model/device-store";
 import { texts } from "./texts";
 

@@ -1,14 +1,14 @@
 /** Devices of one space: robots first, with all that is known of them, then what hangs in the room. */
+import { MultiRobotCheckbox } from "../steering";
+import { LastSeenAge, ReachChip } from "./reach-chip";
+import type { HealthLine } from "../../shared/api/health";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
-import type { HealthLine } from "../health/model/health";
 import { isRoomDevice } from "./model/filter";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { LastSeenAge, ReachChip } from "../../shared/ui/parts";
-import { deviceAddress } from "../../app/routes";
-import { MultiRobotCheckbox } from "../steering/multi-select";
+import { deviceAddress } from "../../shared/routing/routes";
 
 interface DeviceListsProps {
   devices: readonly DeviceStore[];

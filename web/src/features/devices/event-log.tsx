@@ -1,8 +1,8 @@
+import { Card } from "../../shared/ui/card";
 import { clock, onThisClock } from "../../shared/lib/clock";
 import type { DeviceStore } from "./model/device-store";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
 
 /** What lasts (faults) and what happened (events), newest first. */
 export function EventLog({ device }: { device: DeviceStore }) {

@@ -1,3 +1,7 @@
+import { FirstSteps } from "../help";
+import { SpaceList } from "../spaces";
+import { OperateSelected } from "../steering";
+import { Choice } from "../../shared/ui/choice";
 import { useMemo, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
@@ -7,12 +11,8 @@ import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { DeviceLists, faultsOf } from "./device-list";
 import "./list.css";
-import { Choice } from "../../shared/ui/parts";
 import { usePolling } from "../../shared/hooks/use-polling";
-import { pairAddress, spaceAddress } from "../../app/routes";
-import { SpaceList } from "../spaces/space-list";
-import { FirstSteps } from "../help/first-steps";
-import { OperateSelected } from "../steering/multi-select";
+import { pairAddress, spaceAddress } from "../../shared/routing/routes";
 
 const EVERYTHING: DeviceFilter = { search: "", kinds: "all", whose: "all", onlyTrouble: false };
 /** Fewer devices than this are seen at a glance. */

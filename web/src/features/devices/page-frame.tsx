@@ -1,4 +1,6 @@
 /** The frame of a page about one device beside its own: who it is, its control, its Stop, and its other pages. */
+import { ControlBar, StopBanner } from "../control";
+import { LastSeenAge, ReachChip } from "./reach-chip";
 import type { ComponentChildren } from "preact";
 import type { Account, Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
@@ -6,11 +8,9 @@ import type { Fleet } from "./model/device-list";
 import type { DeviceSession } from "./model/device-session";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { ControlBar } from "../control/control-bar";
-import { LastSeenAge, ReachChip } from "../../shared/ui/parts";
-import { deviceAddress, deviceListAddress, healthAddressOf, latencyAddressOf } from "../../app/routes";
+import { deviceAddress, deviceListAddress, healthAddressOf, latencyAddressOf } from "../../shared/routing/routes";
 import { useDeviceSessions } from "./device-sessions";
-import { StopBanner } from "../control/stop-button";
+import "./page-frame.css";
 
 interface DeviceFrameProps {
   api: Api;
@@ -49,7 +49,7 @@ function Framed({ api, fleet, account, device, page, children }: FramedProps) {
   return (
     <>
       <ControlBar device={device} control={session.control} stop={session.stop} />
-      <main class="page operate care" id="content">
+      <main class="page operate monitoring" id="content">
         <div class="heading">
           <a href={deviceListAddress}>← {common.allDevices}</a>
           <h1>{texts.pages.title[page](label)}</h1>
@@ -59,7 +59,7 @@ function Framed({ api, fleet, account, device, page, children }: FramedProps) {
               {texts.list.heard}: <LastSeenAge device={device} />
             </span>
           </p>
-          <nav class="care-pages" aria-label={texts.pages.of(label)}>
+          <nav class="page-tabs" aria-label={texts.pages.of(label)}>
             {pages.map(([name, address, here]) => (
               <a key={address} href={address} aria-current={here ? "page" : undefined}>
                 {name}

@@ -1,4 +1,14 @@
+import type { Reach } from "./model/device-store";
+
 export const texts = {
+  reach: { online: "Online", stale: "Stale", offline: "Offline", unknown: "Unknown" } satisfies Record<Reach, string>,
+  reachExplained: {
+    online: "The device is connected and its data is current.",
+    stale: "The device is connected, but its data is overdue.",
+    offline: "The device's agent is not connected.",
+    unknown: "This page has no connection to the broker, so the status is unknown.",
+  } satisfies Record<Reach, string>,
+
   list: {
     title: "Devices",
     none: "No devices. Pair one with the code that its agent shows.",

@@ -1,31 +1,20 @@
 /** How one device is: what is watched of it with its trend, and its faults from the first report to the end. */
+import type { DeviceStore } from "../devices/model";
+import { shown } from "../sensors";
+import { type Quantity, quantityOf } from "../sensors/model";
+import { Card } from "../../shared/ui/card";
+import { Choice } from "../../shared/ui/choice";
+import type { DeviceHealth, Fault, StoredStream, Watched } from "../../shared/api/health";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import {
-  healthNow,
-  isLate,
-  newestOf,
-  openCount,
-  standings,
-  reportedFaults,
-  watchedQuantity,
-  worstFirst,
-  type DeviceHealth,
-  type Fault,
-  type StoredStream,
-  type Watched,
-} from "./model/health";
-import type { DeviceStore } from "../devices/model/device-store";
+import { healthNow, isLate, newestOf, openCount, standings, reportedFaults, watchedQuantity, worstFirst } from "./model/health";
 import { sentence } from "../../shared/api/http";
-import { quantityOf, type Quantity } from "../sensors/model/quantities";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { FaultItem } from "./fault-item";
 import { codes, HealthLabel, useReportedFaults } from "./health-chip";
-import { Card, Choice } from "../../shared/ui/parts";
 import { usePolling } from "../../shared/hooks/use-polling";
-import { shown } from "../sensors/readings-card";
 import { Trend } from "./trend-chart";
 
 const EVERY_MS = 5_000;
@@ -52,7 +41,7 @@ export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStor
     trend.current?.focus();
   };
   return (
-    <div class="desk care-desk">
+    <div class="desk health-columns">
       <div class="column">
         <Now device={device} value={value} trouble={trouble} />
         <Faults api={api} device={device} open={value?.faults ?? null} past={past} again={again} show={show} />
@@ -78,7 +67,7 @@ function Now({ device, value, trouble }: { device: DeviceStore; value: DeviceHea
   const told = reportedFaults(device);
   const count = openCount(value?.faults ?? null, told);
   return (
-    <div class="row care-sum">
+    <div class="row health-summary">
       {value !== null && <HealthLabel health={healthNow(value.health, told, device.reach.value)} />}
       <p role="status" data-testid="open-faults" data-count={count}>
         {value === null && trouble === "" ? common.loading : texts.health.open(count)}

@@ -1,14 +1,15 @@
 /** One fault, from its first report to its end, and what happened around it. */
+import type { DeviceStore } from "../devices/model";
+import { Age } from "../../shared/ui/age";
+import type { Fault, StoredEvent } from "../../shared/api/health";
 import { useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import { intervalAround, type Fault, type Standing, type StoredEvent } from "./model/health";
+import { intervalAround, type Standing } from "./model/health";
 import { onThisClock } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
 import { sentence } from "../../shared/api/http";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Age } from "../../shared/ui/parts";
 
 interface FaultItemProps {
   api: Api;

@@ -1,11 +1,12 @@
 /** How a device is, in a word. */
+import type { DeviceStore } from "../devices/model";
+import type { HealthState } from "../../shared/api/health";
 import { useEffect } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import type { DeviceStore } from "../devices/model/device-store";
-import { openCount, reportedFaults, type HealthState } from "./model/health";
+import { openCount, reportedFaults } from "./model/health";
 import { texts } from "./texts";
 import { usePolling, type Polled } from "../../shared/hooks/use-polling";
-import { healthAddressOf } from "../../app/routes";
+import { healthAddressOf } from "../../shared/routing/routes";
 
 const EVERY_MS = 15_000;
 /** What a device says reaches the cloud's tables a moment later. */

@@ -1,20 +1,21 @@
 /** How devices are: all of them, those of a space, or one. */
+import { DevicePageFrame, LastSeenAge, ReachChip } from "../devices";
+import type { DeviceStore, Fleet } from "../devices/model";
+import { Age } from "../../shared/ui/age";
+import { Choice } from "../../shared/ui/choice";
+import { RANK, type HealthLine, type HealthState } from "../../shared/api/health";
 import { useComputed } from "@preact/signals";
 import { useState } from "preact/hooks";
 import type { Account, Api } from "../../shared/api/client";
-import { healthNow, RANK, reportedFaults, type HealthLine, type HealthState } from "./model/health";
+import { healthNow, reportedFaults } from "./model/health";
 import { onThisClock } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
-import type { Fleet } from "../devices/model/device-list";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { DevicePageFrame } from "../devices/page-frame";
 import { DeviceHealthView } from "./device-page";
 import { codes, HealthLabel, useReportedFaults } from "./health-chip";
-import { Age, Choice, LastSeenAge, ReachChip } from "../../shared/ui/parts";
 import { usePolling } from "../../shared/hooks/use-polling";
-import { healthAddress, healthAddressOf, spaceAddress } from "../../app/routes";
+import { healthAddress, healthAddressOf, spaceAddress } from "../../shared/routing/routes";
 import "./health.css";
 
 const EVERY_MS = 10_000;
@@ -67,10 +68,10 @@ function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: stri
   const shown = which === "all" ? lines : lines.filter(({ health }) => health !== "ok");
   const spaces = [...new Set([...(devices?.values() ?? [])].map(({ info }) => info.value.space))];
   return (
-    <main class="page fleet care" id="content">
+    <main class="page fleet monitoring" id="content">
       <h1>{space === "" ? texts.health.title : texts.health.titleOf(fleet.spaceName(space))}</h1>
       <p class="quiet">{texts.health.explained}</p>
-      <nav class="care-pages" aria-label={texts.health.spaces}>
+      <nav class="page-tabs" aria-label={texts.health.spaces}>
         <a href={healthAddress} aria-current={space === "" ? "page" : undefined}>
           {texts.health.everywhere}
         </a>
@@ -83,7 +84,7 @@ function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: stri
       {trouble !== "" && <p class="notice bad">{texts.health.failed(trouble)}</p>}
       {value === null && trouble === "" && <p class="quiet">{common.loading}</p>}
       {value !== null && (
-        <div class="row care-sum">
+        <div class="row health-summary">
           <p role="status" data-testid="health-counts">
             {texts.health.counts(counted.filter(([, count]) => count > 0).map(([health, count]) => `${count} ${texts.health.state[health].toLowerCase()}`))}
           </p>

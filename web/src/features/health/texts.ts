@@ -1,4 +1,4 @@
-import type { Fault, HealthState, Severity } from "./model/health";
+import type { Fault, HealthState, Severity } from "../../shared/api/health";
 import { format } from "../../shared/i18n/format";
 
 export const texts = {

@@ -1,17 +1,17 @@
 /** One measured field over hours, days, weeks: the stored series with its least and greatest, continued live. */
+import type { DeviceStore } from "../devices/model";
+import { Figure, HistoryCard, Limits, shown, useRecording } from "../sensors";
+import type { Quantity, Recording } from "../sensors/model";
+import { Card } from "../../shared/ui/card";
+import { Choice } from "../../shared/ui/choice";
+import type { Fault, Watched } from "../../shared/api/health";
 import { useMemo, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { serverNow } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
-import { isLate, newestOf, type Fault, type Watched } from "./model/health";
-import type { Quantity } from "../sensors/model/quantities";
-import type { Recording } from "../sensors/model/stored-series";
+import { isLate, newestOf } from "./model/health";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { HistoryCard, useRecording } from "../sensors/history-card";
-import { Card, Choice } from "../../shared/ui/parts";
-import { Figure, Limits, shown } from "../sensors/readings-card";
 
 type Span = keyof typeof texts.trend.spans;
 const HOUR_MS = 3_600_000;

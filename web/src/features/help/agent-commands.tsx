@@ -1,7 +1,6 @@
 /** The commands that make an agent and run it, to be copied: items of a list of steps. */
 import { texts } from "./texts";
 import { CopyOnce } from "../../shared/ui/copy-once";
-import "../sharing/sharing.css";
 import "./help.css";
 
 interface AgentCommandsProps {

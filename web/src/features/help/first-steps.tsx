@@ -1,7 +1,7 @@
 /** What who has no device yet can do: make an agent, run it, pair it; with a simulated robot where there is no other. */
+import { Card } from "../../shared/ui/card";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
-import { robotTypesAddress } from "../../app/routes";
+import { robotTypesAddress } from "../../shared/routing/routes";
 import { AgentCommands } from "./agent-commands";
 import { PageExplainer } from "./page-explainer";
 

@@ -1,14 +1,11 @@
 /** The keyframe editor of one device: the same for an arm, a humanoid, a base and a head. */
+import { ControlBar, StopBanner } from "../control";
+import { ReachChip, useDeviceSessions } from "../devices";
+import type { DeviceStore, Fleet } from "../devices/model";
 import type { Account, Api } from "../../shared/api/client";
-import type { DeviceStore } from "../devices/model/device-store";
-import type { Fleet } from "../devices/model/device-list";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { ControlBar } from "../control/control-bar";
-import { ReachChip } from "../../shared/ui/parts";
-import { deviceAddress, deviceListAddress, keyframesAddress } from "../../app/routes";
-import { useDeviceSessions } from "../devices/device-sessions";
-import { StopBanner } from "../control/stop-button";
+import { deviceAddress, deviceListAddress, keyframesAddress } from "../../shared/routing/routes";
 import { KeyframeEditor } from "./editor";
 import { LoadMovement, useMovementSource } from "./load-movement";
 import { measuredPose } from "./preview-twin";

@@ -1,10 +1,10 @@
 /** What keyframes are edited with, with a robot or without. */
+import type { DeviceSession } from "../devices/model";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { begun, Drafts, Editor } from "./model/editor";
 import type { Positions, Robot } from "./model/keyframes";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
-import type { DeviceSession } from "../devices/model/device-session";
 import { texts } from "./texts";
 import { KeyframeInspector } from "./keyframe-inspector";
 import "./keyframes.css";

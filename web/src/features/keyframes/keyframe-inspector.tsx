@@ -1,4 +1,6 @@
 /** The keyframe that is chosen: its time, where its joints are, and what is done there. */
+import { JointSlider } from "../steering";
+import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
 import type { Editor } from "./model/editor";
@@ -15,8 +17,6 @@ import {
 } from "./model/keyframes";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
-import { JointSlider } from "../steering/joint-slider";
 
 interface KeyframeCardProps {
   editor: Editor;

@@ -7,7 +7,7 @@ import { readScript } from "./model/script-codec";
 import type { Movement } from "./model/keyframes";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { movementAddress } from "../../app/routes";
+import { movementAddress } from "../../shared/routing/routes";
 
 /** `saved` `null`: it is yet to be made. */
 export interface MovementReference {

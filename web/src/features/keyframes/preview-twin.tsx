@@ -1,14 +1,13 @@
 /** The movement on the robot's twin, and the robot itself as a shadow of it. */
+import type { DeviceStore } from "../devices/model";
+import { type LiveScene, useScene } from "../twin";
+import { Card } from "../../shared/ui/card";
 import { useSignalEffect } from "@preact/signals";
 import { useEffect } from "preact/hooks";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { Editor } from "./model/editor";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import type { Positions } from "./model/keyframes";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
-import type { LiveScene } from "../twin/scene";
-import { useScene } from "../twin/use-scene";
 
 /** Where the robot is measured to be, while that is what it is [rad]. */
 export function measuredPose(device: DeviceStore): Positions | null {

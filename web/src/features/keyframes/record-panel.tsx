@@ -1,14 +1,14 @@
 /** Recording what the robot does, whoever moves it; its ends are trimmed, and it becomes keyframes. */
+import type { DeviceStore } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { effect } from "@preact/signals";
 import { useEffect, useMemo, useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { Editor } from "./model/editor";
 import type { Keyframe } from "./model/keyframes";
 import { keyframesOf, Recorder, trim, type Recording } from "./model/recording";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
 
 interface RecordProps {
   device: DeviceStore;

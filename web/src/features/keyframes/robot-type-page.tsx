@@ -1,11 +1,11 @@
 /** The keyframe editor of a robot type, for who has no robot at hand: nothing moves but the drawing. */
+import { robotOf } from "./model/robot-of-type";
 import { useCallback, useMemo } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import { robotOf } from "../robot-types/model/robot-types";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { useResource } from "../../shared/hooks/use-resource";
-import { movementAddress, movementsAddress, typeKeyframesAddress } from "../../app/routes";
+import { movementAddress, movementsAddress, typeKeyframesAddress } from "../../shared/routing/routes";
 import { KeyframeEditor } from "./editor";
 import { LoadMovement, useMovementSource } from "./load-movement";
 

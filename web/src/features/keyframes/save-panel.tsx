@@ -1,16 +1,16 @@
 /** The movement's name; saving it as a script, and running that on the robot. */
+import { RunStatusPanel } from "../actions";
+import { actionUnavailableReason } from "../devices";
+import type { DeviceSession } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { Editor } from "./model/editor";
 import { LONGEST_SCRIPT, writeScript } from "./model/script-codec";
-import { MovementChanged } from "../movements/model/movement-library";
-import type { DeviceSession } from "../devices/model/device-session";
+import { MovementChanged } from "../../shared/api/movement-library";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { RunStatusPanel } from "../actions/run-status";
-import { Card } from "../../shared/ui/parts";
-import { actionUnavailableReason } from "../devices/availability";
 
 interface SaveProps {
   api: Api;

@@ -1,5 +1,5 @@
-import type { Control } from "../control/model/lease";
-import type { DeviceStore } from "../devices/model/device-store";
+import type { Control } from "../control/model";
+import type { DeviceStore } from "../devices/model";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 

@@ -1,22 +1,22 @@
 /** How long things take: of all devices, or of one, where it can be measured here and now. */
+import { DevicePageFrame } from "../devices";
+import type { DeviceSession, DeviceStore, Fleet } from "../devices/model";
+import { Card } from "../../shared/ui/card";
+import { Choice } from "../../shared/ui/choice";
+import { PATHS, type Path, type StoredLatency, TRANSPORTS, type Transport } from "../../shared/api/latency";
 import { useMemo, useState } from "preact/hooks";
 import type { Account, Api } from "../../shared/api/client";
 import { serverNow } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
-import type { Fleet } from "../devices/model/device-list";
 import { LatencyProbe } from "./model/probe";
 import { publishedFor, SOURCES, type Published } from "./model/published-figures";
-import type { DeviceSession } from "../devices/model/device-session";
-import { csv, figuresOf, lineKey, linesOf, PATHS, TRANSPORTS, type Line, type Path, type StoredLatency, type Transport } from "./model/latency-stats";
+import { csv, figuresOf, lineKey, linesOf, type Line } from "./model/latency-stats";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { DevicePageFrame } from "../devices/page-frame";
 import { ProbePanel } from "./probe-panel";
-import { Card, Choice } from "../../shared/ui/parts";
 import { usePolling } from "../../shared/hooks/use-polling";
 import { LatencyPlots, type Axis, type Scale } from "./plots";
-import "../health/health.css";
+import "./latency.css";
 
 const EVERY_MS = 10_000;
 const AT_ONCE = 4;
@@ -43,7 +43,7 @@ export function LatencyPage({ device, ...rest }: TimesPageProps) {
     );
   }
   return (
-    <main class="page care care-times" id="content">
+    <main class="page monitoring latency-page" id="content">
       <h1>{texts.title}</h1>
       <p class="quiet">{texts.explained}</p>
       {devices === null ? <p class="quiet">{common.loading}</p> : <Times api={rest.api} devices={[...devices.values()]} fresh={NONE} />}
@@ -57,7 +57,7 @@ function OfDevice({ api, fleet, session }: { api: Api; fleet: Fleet; session: De
   const { device, control } = session;
   const measure = useMemo(() => new LatencyProbe(api, fleet.link, device, () => control.epoch), [api, fleet, device, control]);
   return (
-    <div class="care-times">
+    <div class="latency-page">
       <p class="quiet">{texts.explained}</p>
       <ProbePanel device={device} measure={measure} />
       <Times api={api} devices={[device]} fresh={measure.lines} />
@@ -94,7 +94,7 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
   const count = lines.reduce((sum, { samples }) => sum + samples.length, 0);
   return (
     <>
-      <fieldset class="card times-tools">
+      <fieldset class="card latency-filters">
         <legend class="visually-hidden">{texts.filters}</legend>
         {devices.length > 1 && (
           <Pick

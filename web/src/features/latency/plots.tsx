@@ -1,10 +1,10 @@
 /** The papers' plots: response times over samples, and beside them the share that was no slower. */
+import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Published } from "./model/published-figures";
 import { distribution, type Line } from "./model/latency-stats";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
 import { onColourChange, seriesColour } from "../../shared/ui/canvas-theme";
 import type { Along, PlotSeries, Reference, LatencyChart } from "./plot-canvas";
 
@@ -30,7 +30,7 @@ export function LatencyPlots({ lines, name, published, axis, scale }: TimesPlots
     return { label: name(line), colour: seriesColour(index), x, y: y.map((one) => one * 100) };
   });
   return (
-    <div class="times-charts">
+    <div class="latency-charts">
       <TimesCard title={texts.overTime} along={axis} scale={scale} lines={over} references={references} />
       <TimesCard title={texts.shares} along="ms" scale={scale} lines={share} references={references} />
     </div>
@@ -78,7 +78,7 @@ function TimesCard({ title, along, scale, lines, references }: TimesCardProps) {
       {failed && <p class="notice">{common.chartFailed}</p>}
       <div
         ref={box}
-        class="times-chart"
+        class="latency-chart"
         data-testid={`times-${along === "ms" ? "shares" : "samples"}`}
         data-samples={samples}
         data-references={references.length}

@@ -1,8 +1,8 @@
 /** Measuring here and now, by what moves nothing. */
+import type { DeviceStore } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { TIMES, probeKindsOf, type LatencyProbe } from "./model/probe";
-import type { DeviceStore } from "../devices/model/device-store";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
 
 export function ProbePanel({ device, measure }: { device: DeviceStore; measure: LatencyProbe }) {
   const progress = measure.progress.value;

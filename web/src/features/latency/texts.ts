@@ -1,4 +1,4 @@
-import type { Path, Transport } from "./model/latency-stats";
+import type { Path, Transport } from "../../shared/api/latency";
 import type { ProbeKind } from "./model/probe";
 
 export const texts = {

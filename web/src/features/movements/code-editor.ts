@@ -26,8 +26,8 @@ import {
   tooltips,
 } from "@codemirror/view";
 import { tags } from "@lezer/highlight";
-import type { Scripting } from "./model/movement-library";
-import type { Place } from "../../shared/lib/text-offsets";
+import type { Scripting } from "../../shared/api/movement-library";
+import type { Place } from "./model/text-offsets";
 import { complete } from "./completion";
 
 const CHECK_AFTER_MS = 500;

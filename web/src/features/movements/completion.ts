@@ -3,7 +3,7 @@ import type { Completion, CompletionContext, CompletionResult } from "@codemirro
 import { syntaxTree } from "@codemirror/language";
 import type { EditorState } from "@codemirror/state";
 import type { SyntaxNode } from "@lezer/common";
-import type { ScriptCall, ScriptParameter, Scripting } from "./model/movement-library";
+import type { ScriptCall, ScriptParameter, Scripting } from "../../shared/api/movement-library";
 
 const WORD = /[\w]*$/;
 const NAME = /^[^'"\n]*$/;

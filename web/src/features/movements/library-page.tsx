@@ -1,14 +1,14 @@
 /** All movements, robot type by robot type: find one, open it, begin a new one, delete one's own. */
+import type { Fleet } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useEffect, useId, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import type { Fleet } from "../devices/model/device-list";
 import { sentence } from "../../shared/api/http";
-import type { Movement, RobotTypeEntry } from "./model/movement-library";
+import type { Movement, RobotTypeEntry } from "../../shared/api/movement-library";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { ConfirmButton } from "../../shared/ui/confirm-button";
-import { Card } from "../../shared/ui/parts";
-import { movementAddress, typeKeyframesAddress } from "../../app/routes";
+import { movementAddress, typeKeyframesAddress } from "../../shared/routing/routes";
 import "./movements.css";
 
 interface Shelf {

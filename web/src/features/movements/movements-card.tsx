@@ -1,15 +1,15 @@
 /** The movements that one robot can run, each with its parameters, on the robot's own page. */
+import { type ActionRunner, ended } from "../actions/model";
+import type { Control } from "../control/model";
+import type { DeviceStore } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useEffect, useState } from "preact/hooks";
-import { ended, type ActionRunner } from "../actions/model/action-runner";
 import type { Api, Movement } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
-import type { Control } from "../control/model/lease";
-import type { DeviceStore } from "../devices/model/device-store";
-import type { Parameters } from "./model/movement-library";
+import type { Parameters } from "../../shared/api/movement-library";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
-import { movementAddress } from "../../app/routes";
+import { movementAddress } from "../../shared/routing/routes";
 import { ParameterFields, useParameters } from "./parameter-form";
 import "./parameter-form.css";
 

@@ -1,7 +1,7 @@
 /** What an operator may set for a movement, as fields; what is wrong stands beside each. */
 import { useId, useMemo, useState } from "preact/hooks";
 import { storedParameters } from "../../shared/lib/local-storage";
-import type { ObjectSchema, Parameters } from "./model/movement-library";
+import type { ObjectSchema, Parameters } from "../../shared/api/movement-library";
 import { fieldsOf, fill, read, type Field, type Filled, type Wrong } from "./model/parameter-form";
 import { texts } from "./texts";
 import { storage } from "../../shared/hooks/browser-storage";

@@ -1,19 +1,17 @@
 /** One movement on many robots at once: who takes part, and what becomes of each. */
+import { RunSteps } from "../actions";
+import { ended } from "../actions/model";
+import { StopBanner } from "../control";
+import { actionUnavailableReason, ReachChip } from "../devices";
+import type { DeviceSession, DeviceStore, Fleet } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useEffect, useState } from "preact/hooks";
-import { ended } from "../actions/model/action-runner";
 import type { Account, Api } from "../../shared/api/client";
-import type { DeviceStore } from "../devices/model/device-store";
-import type { Fleet } from "../devices/model/device-list";
 import { ApiError } from "../../shared/api/http";
 import { newId } from "../../shared/lib/ids";
-import type { ObjectSchema, Parameters } from "./model/movement-library";
-import type { DeviceSession } from "../devices/model/device-session";
+import type { ObjectSchema, Parameters } from "../../shared/api/movement-library";
 import { texts } from "./texts";
-import { RunSteps } from "../actions/run-status";
-import { Card, ReachChip } from "../../shared/ui/parts";
-import { deviceAddress } from "../../app/routes";
-import { StopBanner } from "../control/stop-button";
-import { actionUnavailableReason } from "../devices/availability";
+import { deviceAddress } from "../../shared/routing/routes";
 import { ParameterFields, useParameters } from "./parameter-form";
 
 /** The account's robots of a type: what its library has runs on them. On others' robots their owners' movements run. */

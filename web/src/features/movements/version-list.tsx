@@ -1,11 +1,11 @@
 /** All versions of a movement: look at one, beside what is in the editor, and bring it back. */
+import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
-import type { Movement } from "./model/movement-library";
+import type { Movement } from "../../shared/api/movement-library";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
 import { Comparison } from "./code-editor";
 
 /** Two texts, the newer with what has changed in it. */

@@ -1,15 +1,15 @@
 /** Pairing an agent: by the code it shows or the link it prints, into a space; and then naming what has come. */
+import { LastSeenAge, ReachChip, RenameDevice } from "../devices";
+import type { Fleet } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api, Device, Space } from "../../shared/api/client";
-import type { Fleet } from "../devices/model/device-list";
 import { ApiError, sentence } from "../../shared/api/http";
 import { readCode, type FollowedCode } from "./model/claim-code";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { RenameDevice } from "../devices/rename";
 import "./pairing.css";
-import { Card, LastSeenAge, ReachChip } from "../../shared/ui/parts";
-import { deviceAddress, deviceListAddress } from "../../app/routes";
+import { deviceAddress, deviceListAddress } from "../../shared/routing/routes";
 
 interface PairingPageProps {
   api: Api;

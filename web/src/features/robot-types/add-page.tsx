@@ -1,4 +1,5 @@
 /** Adding a robot type: choose its files, look at what they are, save. */
+import { Card } from "../../shared/ui/card";
 import { useEffect, useMemo } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { clock } from "../../shared/lib/clock";
@@ -7,8 +8,7 @@ import { MANIFEST } from "./model/upload-files";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
-import { robotTypeAddress, robotTypesAddress } from "../../app/routes";
+import { robotTypeAddress, robotTypesAddress } from "../../shared/routing/routes";
 import { FilePicker, SelectedFiles } from "./file-picker";
 import { FindingsList } from "./findings-list";
 import { UploadSummary } from "./upload-findings";

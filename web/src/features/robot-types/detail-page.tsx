@@ -1,17 +1,17 @@
 /** One robot type: what every robot of it has in common. */
+import type { Fleet } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useCallback } from "preact/hooks";
 import type { Api, Device } from "../../shared/api/client";
 import { degrees } from "../../shared/lib/angles";
 import { readFindings } from "./model/parse-findings";
-import type { Fleet } from "../devices/model/device-list";
 import { ApiError } from "../../shared/api/http";
-import type { RobotType, TypeModel } from "./model/robot-types";
+import type { RobotType, TypeModel } from "../../shared/api/robot-types";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { ConfirmButton } from "../../shared/ui/confirm-button";
-import { Card } from "../../shared/ui/parts";
-import { addRobotTypeAddress, deviceAddress, replaceWith, robotTypesAddress } from "../../app/routes";
+import { addRobotTypeAddress, deviceAddress, replaceWith, robotTypesAddress } from "../../shared/routing/routes";
 import { FindingsList } from "./findings-list";
 import { ModelViewer } from "./model-viewer";
 import { StartAgent } from "./start-agent";

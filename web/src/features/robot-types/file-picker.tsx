@@ -1,9 +1,9 @@
 /** Files of a robot type: dropped, or chosen as a folder, an archive or one by one. They stay until it is saved. */
+import { Card } from "../../shared/ui/card";
 import { useRef, useState } from "preact/hooks";
 import type { UploadDraft } from "./model/upload-draft";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
 import { ArchiveError, filesFromDrop, filesFromPicker, readFiles } from "./read-archive";
 
 const WANTED = ".zip,.toml,.xml,.stl,.obj,.png,.py";

@@ -1,12 +1,12 @@
 /** All robot types that one may see. */
+import type { Fleet } from "../devices/model";
+import { PageExplainer } from "../help";
 import { useCallback } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import type { Fleet } from "../devices/model/device-list";
-import type { RobotType } from "./model/robot-types";
+import type { RobotType } from "../../shared/api/robot-types";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { PageExplainer } from "../help/page-explainer";
-import { addRobotTypeAddress, robotTypeAddress } from "../../app/routes";
+import { addRobotTypeAddress, robotTypeAddress } from "../../shared/routing/routes";
 import { LoadError } from "../../shared/ui/load-error";
 import { StatusChip } from "./status-chip";
 import { useResource } from "../../shared/hooks/use-resource";

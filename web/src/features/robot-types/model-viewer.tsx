@@ -1,12 +1,12 @@
 /** A robot type's model, moved by sliders: what it looks like, and how far each joint goes. */
+import { useScene } from "../twin";
+import { Card } from "../../shared/ui/card";
 import { useEffect, useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
-import { useScene } from "../twin/use-scene";
 
 interface ModelViewProps {
   twin: KnownTwin;

@@ -1,7 +1,7 @@
 /** What comes after a type: an agent with a robot of it. */
+import { AgentCommands } from "../help";
+import { Card } from "../../shared/ui/card";
 import { texts } from "./texts";
-import { AgentCommands } from "../help/agent-commands";
-import { Card } from "../../shared/ui/parts";
 
 /** `builtIn`: the agent has the type already. */
 export function StartAgent({ type, builtIn }: { type: string; builtIn: boolean }) {

@@ -1,4 +1,4 @@
-import type { RobotType } from "./model/robot-types";
+import type { RobotType } from "../../shared/api/robot-types";
 import { texts } from "./texts";
 
 /** Whether a type can be used, and how its newest upload fares. */

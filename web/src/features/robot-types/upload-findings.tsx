@@ -1,10 +1,10 @@
 /** What the checkers have found in an upload. */
+import { Card } from "../../shared/ui/card";
 import { degrees } from "../../shared/lib/angles";
-import type { RobotType, TypeModel } from "./model/robot-types";
+import type { RobotType, TypeModel } from "../../shared/api/robot-types";
 import { packFiles, type Files } from "./model/upload-files";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
 
 interface FoundProps {
   type: RobotType;

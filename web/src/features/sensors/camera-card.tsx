@@ -1,15 +1,16 @@
+import { unavailableReason } from "../devices";
+import type { DeviceStore } from "../devices/model";
+import { Age } from "../../shared/ui/age";
+import { Card } from "../../shared/ui/card";
 import type { ComponentChildren } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
 import { clock, now } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { CameraFrame } from "../../shared/mqtt/camera-frame";
 import type { RoomDeviceAction } from "./model/room-device-action";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
-import { Age, Card } from "../../shared/ui/parts";
-import { unavailableReason } from "../devices/availability";
 import "./sensors.css";
 
 /** Without a picture for this long, what is shown is not live [ms]; a slow camera has three of its periods. */

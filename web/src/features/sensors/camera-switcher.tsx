@@ -1,7 +1,6 @@
 /** What there is to be seen of a robot: through its own cameras, or from the room that it stands in. */
+import type { DeviceStore, Fleet } from "../devices/model";
 import { useEffect, useState } from "preact/hooks";
-import type { DeviceStore } from "../devices/model/device-store";
-import type { Fleet } from "../devices/model/device-list";
 import { texts } from "./texts";
 import { CameraCard } from "./camera-card";
 

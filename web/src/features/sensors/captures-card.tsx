@@ -1,13 +1,14 @@
+import { unavailableReason } from "../devices";
+import type { DeviceStore } from "../devices/model";
+import { Age } from "../../shared/ui/age";
+import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
 import type { Upload } from "../../shared/api/client";
 import { onThisClock } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { RoomDeviceAction } from "./model/room-device-action";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Age, Card } from "../../shared/ui/parts";
-import { unavailableReason } from "../devices/availability";
 
 /** Captures that are taken and shown by a card of their own. */
 const SHOWN_ELSEWHERE = ["image", "depth", "scan"];

@@ -1,15 +1,16 @@
+import { unavailableReason } from "../devices";
+import type { DeviceStore } from "../devices/model";
+import { Age } from "../../shared/ui/age";
+import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
 import { now } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { RoomDeviceAction } from "./model/room-device-action";
 import { readDepth, type DepthPicture } from "../../shared/lib/png";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
 import { falseColour, NOTHING } from "../../shared/ui/colour-map";
-import { Age, Card } from "../../shared/ui/parts";
-import { unavailableReason } from "../devices/availability";
 
 interface Drawn extends DepthPicture {
   nearM: number;

@@ -1,17 +1,17 @@
 /** What one field has measured over time: from the cloud's store, continued with what this page hears. */
+import type { DeviceStore } from "../devices/model";
+import { newestOf } from "../health/model";
 import { effect } from "@preact/signals";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { serverNow } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
-import { newestOf } from "../health/model/health";
 import { ApiError, sentence } from "../../shared/api/http";
 import { digits, type Quantity } from "./model/quantities";
 import { Recording } from "./model/stored-series";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import type { Marks, SeriesChart } from "../../shared/charts/series-chart";
+import type { Marks, SeriesChart } from "./series-chart";
 import { colour, onColourChange } from "../../shared/ui/canvas-theme";
 
 const DRAW_EVERY_MS = 500;
@@ -106,7 +106,7 @@ export function HistoryCard({ recording, quantity, spanMs, binary, old, marks }:
       if (given !== undefined) tellPlace(element, columns, cursor.current, quantity);
     };
     drawn.current.draw = draw;
-    import("../../shared/charts/series-chart").then(
+    import("./series-chart").then(
       ({ createSeriesChart }) => {
         if (!alive) return;
         drawn.current.chart = createSeriesChart(element, { quantity, binary, colour: colour("--series-1") });

@@ -1,16 +1,17 @@
+import { unavailableReason } from "../devices";
+import type { DeviceStore } from "../devices/model";
+import type { Values } from "../spaces/model";
+import { Age } from "../../shared/ui/age";
+import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
 import { now } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { RoomDeviceAction } from "./model/room-device-action";
 import { readScan, type LidarScan } from "../../shared/mqtt/parse-messages";
-import type { Values } from "../spaces/model/room-perception";
 import { texts } from "./texts";
 import { canvasBox } from "../../shared/ui/hidpi-canvas";
 import { contentOf } from "./use-capture-content";
-import { Age, Card } from "../../shared/ui/parts";
 import { colour, onColourChange } from "../../shared/ui/canvas-theme";
-import { unavailableReason } from "../devices/availability";
 
 const RANGE = "range";
 const LABEL_PX = 12;

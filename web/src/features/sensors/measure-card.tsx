@@ -1,13 +1,15 @@
+import { unavailableReason } from "../devices";
+import type { DeviceStore } from "../devices/model";
+import { Age } from "../../shared/ui/age";
+import { Card } from "../../shared/ui/card";
+import { Choice } from "../../shared/ui/choice";
 import { useState } from "preact/hooks";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { RoomDeviceAction } from "./model/room-device-action";
 import { quantityOf } from "./model/quantities";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Age, Card, Choice } from "../../shared/ui/parts";
 import { shown } from "./readings-card";
-import { unavailableReason } from "../devices/availability";
 
 const LEAST_HZ = 0.001;
 const MOST_HZ = 50;

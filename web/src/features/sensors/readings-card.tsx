@@ -1,15 +1,17 @@
 /** What one stream measures: a number with its history, a state with since when, or, of many values, a table. */
+import type { DeviceStore } from "../devices/model";
+import { Age } from "../../shared/ui/age";
+import { Card } from "../../shared/ui/card";
+import { Choice } from "../../shared/ui/choice";
 import { useMemo, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { onThisClock } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
 import { digits, judge, quantityOf, type Quantity } from "./model/quantities";
 import type { Recording } from "./model/stored-series";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { HistoryCard, useRecording } from "./history-card";
-import { Age, Card, Choice } from "../../shared/ui/parts";
 import "./sensors.css";
 
 /** More values than this are a table. */

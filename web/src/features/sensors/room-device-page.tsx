@@ -1,18 +1,17 @@
 /** The page of a room device: a card for each thing that it has, whatever kind of device it is. */
+import { EventLog } from "../devices";
+import type { DeviceSession, Fleet } from "../devices/model";
+import { FloorPlan } from "../spaces";
 import { useComputed, useSignalEffect } from "@preact/signals";
 import type { ComponentChildren } from "preact";
 import { useEffect, useMemo } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import type { Fleet } from "../devices/model/device-list";
 import { RoomDeviceAction } from "./model/room-device-action";
 import type { KnownDescription } from "../../shared/mqtt/parse-messages";
-import type { DeviceSession } from "../devices/model/device-session";
 import { CameraCard } from "./camera-card";
 import { DepthCard } from "./depth-card";
-import { EventLog } from "../devices/event-log";
 import { CapturesCard } from "./captures-card";
 import { CollectDataCard } from "./measure-card";
-import { FloorPlan } from "../spaces/floor-plan";
 import { ReadingsCard } from "./readings-card";
 import { LidarCard } from "./lidar-card";
 import { SettingsCard } from "./settings-card";

@@ -1,13 +1,13 @@
+import { unavailableReason } from "../devices";
+import type { DeviceStore } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
 import { clamp } from "../../shared/lib/angles";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { RoomDeviceAction } from "./model/room-device-action";
 import { quantityOf, type Quantity } from "./model/quantities";
 import type { Control } from "../../shared/mqtt/protocol.generated";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
-import { unavailableReason } from "../devices/availability";
 
 const STREAM = "settings";
 const STEPS = 100;

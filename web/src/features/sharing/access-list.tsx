@@ -1,9 +1,11 @@
+import { Card } from "../../shared/ui/card";
+import { Choice } from "../../shared/ui/choice";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Account, Api } from "../../shared/api/client";
 import { ApiError, sentence } from "../../shared/api/http";
-import type { Invitation, Person, Role, Share, SharedRole, Target } from "./model/wire-types";
+import type { Invitation, Person, Role, Share, SharedRole, Target } from "../../shared/api/sharing";
 import { secondsLeft, ShareList } from "./model/shares";
-import type { Whole } from "./model/transfers";
+import type { Whole } from "../../shared/api/transfers";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
@@ -12,8 +14,7 @@ import { ConfirmButton } from "../../shared/ui/confirm-button";
 import { useReturnFocus } from "../../shared/hooks/use-return-focus";
 import { InviteForm, MAY } from "./invite-form";
 import { AS_IT_IS, DurationPicker, seconds } from "../../shared/ui/duration-picker";
-import { Card, Choice } from "../../shared/ui/parts";
-import { spaceAddress } from "../../app/routes";
+import { spaceAddress } from "../../shared/routing/routes";
 import { TransferPanel } from "./transfer-panel";
 import "./sharing.css";
 

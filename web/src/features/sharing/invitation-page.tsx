@@ -1,14 +1,14 @@
+import type { Fleet } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Account, Api, Space } from "../../shared/api/client";
 import { ApiError, sentence } from "../../shared/api/http";
-import type { Fleet } from "../devices/model/device-list";
 import type { FollowedInvitation } from "./model/invitation-link";
-import type { Invitation } from "./model/wire-types";
+import type { Invitation } from "../../shared/api/sharing";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { ConfirmButton } from "../../shared/ui/confirm-button";
-import { Card } from "../../shared/ui/parts";
-import { deviceAddress, deviceListAddress, replaceWith, spaceAddress } from "../../app/routes";
+import { deviceAddress, deviceListAddress, replaceWith, spaceAddress } from "../../shared/routing/routes";
 
 interface InvitationPageProps {
   api: Api;

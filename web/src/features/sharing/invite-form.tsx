@@ -1,6 +1,7 @@
+import { Choice } from "../../shared/ui/choice";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
-import type { InvitationMade, SharedRole } from "./model/wire-types";
+import type { InvitationMade, SharedRole } from "../../shared/api/sharing";
 import type { ShareList } from "./model/shares";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
@@ -8,7 +9,6 @@ import { texts } from "./texts";
 import { AccountNameField, InlineForm } from "../../shared/ui/inline-form";
 import { FOR_GOOD, DurationPicker, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
 import { LinkOnce } from "../../shared/ui/link-once";
-import { Choice } from "../../shared/ui/parts";
 
 const HOW = [
   ["link", texts.invite.byLink],

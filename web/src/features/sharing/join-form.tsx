@@ -1,10 +1,10 @@
+import type { Session } from "../account/model";
+import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
 import type { FollowedInvitation } from "./model/invitation-link";
-import type { Session } from "../account/model/session";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
-import { invitationAddress, replaceWith } from "../../app/routes";
+import { invitationAddress, replaceWith } from "../../shared/routing/routes";
 
 interface JoinFormProps {
   session: Session;

@@ -1,4 +1,4 @@
-import type { Role, SharedRole } from "./model/wire-types";
+import type { Role, SharedRole } from "../../shared/api/sharing";
 import { format } from "../../shared/i18n/format";
 
 export const texts = {

@@ -1,9 +1,11 @@
 /** Handing something over for good: the offer, those that are out, and taking them back. For its owner. */
+import { Card } from "../../shared/ui/card";
+import { Choice } from "../../shared/ui/choice";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
-import type { Invitation, InvitationMade } from "./model/wire-types";
-import type { Whole } from "./model/transfers";
+import type { Invitation, InvitationMade } from "../../shared/api/sharing";
+import type { Whole } from "../../shared/api/transfers";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { AccountNameField, InlineForm } from "../../shared/ui/inline-form";
@@ -11,7 +13,6 @@ import { ConfirmButton } from "../../shared/ui/confirm-button";
 import { useReturnFocus } from "../../shared/hooks/use-return-focus";
 import { DurationPicker, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
 import { LinkOnce } from "../../shared/ui/link-once";
-import { Card, Choice } from "../../shared/ui/parts";
 import { usePolling } from "../../shared/hooks/use-polling";
 import "./sharing.css";
 

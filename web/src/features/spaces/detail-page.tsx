@@ -1,13 +1,13 @@
+import type { Fleet } from "../devices/model";
+import { PageExplainer } from "../help";
+import { AccessList } from "../sharing";
 import { useEffect, useState } from "preact/hooks";
 import type { Account, Api, Space } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
-import type { Fleet } from "../devices/model/device-list";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { AccessList } from "../sharing/access-list";
-import { PageExplainer } from "../help/page-explainer";
 import { RoomView } from "./room-view";
-import { deviceListAddress, healthAddressOf, replaceWith } from "../../app/routes";
+import { deviceListAddress, healthAddressOf, replaceWith } from "../../shared/routing/routes";
 
 interface SpacePageProps {
   api: Api;

@@ -1,20 +1,20 @@
 /** The floor of a room as its perception knows it: what is taken, who is where, and what hangs where. */
+import type { DeviceStore, Fleet } from "../devices/model";
+import { shown } from "../sensors";
+import { quantityOf } from "../sensors/model";
+import { Age } from "../../shared/ui/age";
+import { Card } from "../../shared/ui/card";
 import { effect } from "@preact/signals";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { degrees } from "../../shared/lib/angles";
 import { clock, now } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
-import type { Fleet } from "../devices/model/device-list";
-import { quantityOf } from "../sensors/model/quantities";
 import { apart, extent, readFloor, readPlaces, type Extent, type Floor, type Place } from "./model/room-perception";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { canvasBox } from "../../shared/ui/hidpi-canvas";
-import { Age, Card } from "../../shared/ui/parts";
 import { useFloorPlanLabels } from "./floor-plan-labels";
-import { shown } from "../sensors/readings-card";
-import { deviceAddress } from "../../app/routes";
+import { deviceAddress } from "../../shared/routing/routes";
 import { colour, onColourChange } from "../../shared/ui/canvas-theme";
 import "./floor-plan.css";
 

@@ -1,7 +1,7 @@
+import { DeviceLists } from "../devices";
+import type { Fleet } from "../devices/model";
 import { useEffect } from "preact/hooks";
-import type { Fleet } from "../devices/model/device-list";
 import { texts } from "./texts";
-import { DeviceLists } from "../devices/device-list";
 import { FloorPlan } from "./floor-plan";
 
 /** A room: its plan, and its devices. */

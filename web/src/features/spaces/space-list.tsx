@@ -1,12 +1,11 @@
+import type { Fleet } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useEffect, useState } from "preact/hooks";
 import type { Api, Space } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
-import type { Fleet } from "../devices/model/device-list";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
-import { spaceAddress } from "../../app/routes";
-import "../sharing/sharing.css";
+import { spaceAddress } from "../../shared/routing/routes";
 
 /** The spaces that one may see, and making one. */
 export function SpaceList({ api, fleet }: { api: Api; fleet: Fleet }) {

@@ -1,6 +1,6 @@
 /** Whether a page may move a robot now, and what has become of what it streams. */
-import type { Control } from "../control/model/lease";
-import type { DeviceStore } from "../devices/model/device-store";
+import type { Control } from "../control/model";
+import type { DeviceStore } from "../devices/model";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
 import { texts } from "./texts";
 

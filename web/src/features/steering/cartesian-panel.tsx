@@ -1,12 +1,12 @@
+import type { DeviceStore } from "../devices/model";
+import { rollPitchYaw, unit } from "../twin/model";
+import { Choice } from "../../shared/ui/choice";
 import { useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
-import type { DeviceStore } from "../devices/model/device-store";
 import { JOG_KEYS } from "./model/keymap";
-import { rollPitchYaw, unit } from "../twin/model/forward-kinematics";
 import { direction, jogOf, sumOf, type Direction } from "./model/steerable-parts";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Choice } from "../../shared/ui/parts";
 import { useGamepadInputs } from "./use-gamepad";
 import { useHeldInputs } from "./use-held-inputs";
 import { HoldButton } from "./hold-button";

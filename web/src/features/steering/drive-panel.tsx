@@ -1,6 +1,6 @@
+import type { DeviceStore } from "../devices/model";
 import { useState } from "preact/hooks";
 import { degrees } from "../../shared/lib/angles";
-import type { DeviceStore } from "../devices/model/device-store";
 import { DRIVE_KEYS } from "./model/keymap";
 import type { BaseLimits } from "../../shared/mqtt/protocol.generated";
 import { AT_REST, driveOf, pushed, type Push } from "./model/steerable-parts";

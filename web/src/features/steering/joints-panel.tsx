@@ -1,7 +1,7 @@
+import type { DeviceStore } from "../devices/model";
 import { effect, type ReadonlySignal, useComputed, useSignalEffect } from "@preact/signals";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { clamp, radians } from "../../shared/lib/angles";
-import type { DeviceStore } from "../devices/model/device-store";
 import { HeldInputs } from "./model/held-inputs";
 import { JOINT_KEYS, jointOfKey } from "./model/keymap";
 import type { KnownTelemetry } from "../../shared/mqtt/parse-messages";

@@ -1,18 +1,14 @@
 /** Several robots on one page, each with its own control; one key and one button stop them all. */
+import { ControlBar, StopBanner } from "../control";
+import { LastSeenAge, ReachChip, useDeviceSessions } from "../devices";
+import type { DeviceSession, DeviceStore, Fleet } from "../devices/model";
+import { TwinView } from "../twin";
 import { useMemo, useState } from "preact/hooks";
 import type { Account, Api } from "../../shared/api/client";
-import type { DeviceStore } from "../devices/model/device-store";
-import type { Fleet } from "../devices/model/device-list";
-import type { DeviceSession } from "../devices/model/device-session";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { ControlBar } from "../control/control-bar";
-import { LastSeenAge, ReachChip } from "../../shared/ui/parts";
-import { deviceAddress, deviceListAddress } from "../../app/routes";
-import { useDeviceSessions } from "../devices/device-sessions";
-import { StopBanner } from "../control/stop-button";
-import { TwinView } from "../twin/twin-view";
+import { deviceAddress, deviceListAddress } from "../../shared/routing/routes";
 import { SteeringCard } from "./steering-card";
 import "./multi-robot.css";
 

@@ -1,4 +1,4 @@
-import type { DeviceStore } from "../devices/model/device-store";
+import type { DeviceStore } from "../devices/model";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
 import type { PadWatch } from "./use-gamepad";
 

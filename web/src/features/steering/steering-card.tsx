@@ -1,10 +1,10 @@
 /** What moves a robot by hand, in the ways that its description names: joints, a frame, the base. */
+import type { DeviceSession } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useId, useRef, useState } from "preact/hooks";
 import type { ComponentType } from "preact";
-import type { DeviceSession } from "../devices/model/device-session";
 import { steeringModesOf, type SteeringMode } from "./model/steerable-parts";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
 import { BlockedNotice, blockedReason } from "./blocked-notice";
 import { DrivePanel } from "./drive-panel";
 import { useGamepad, type PadNews } from "./use-gamepad";

@@ -1,11 +1,12 @@
+import type { DeviceStore } from "../devices/model";
+import { Card } from "../../shared/ui/card";
+import { Choice } from "../../shared/ui/choice";
 import { useState } from "preact/hooks";
 import { degrees } from "../../shared/lib/angles";
-import type { DeviceStore } from "../devices/model/device-store";
 import { jointFrames, rollPitchYaw, unit } from "./model/forward-kinematics";
 import type { Pose } from "../../shared/lib/vectors";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { Card, Choice } from "../../shared/ui/parts";
 
 type Form = "degrees" | "quaternion";
 type Which = "told" | "joints";

@@ -1,4 +1,5 @@
 /** The robot in three dimensions. Loaded only where one is looked at; draws only when something has changed. */
+import type { Targets } from "../steering/model";
 import {
   BoxGeometry,
   type BufferGeometry,
@@ -28,7 +29,6 @@ import { isVisibleChange } from "./model/visible-change";
 import { add, forward, placed, rotate, standing } from "./model/forward-kinematics";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import type { Geometry } from "../../shared/mqtt/protocol.generated";
-import type { Targets } from "../steering/model/setpoint-streamer";
 import type { Vector3 as Vector } from "../../shared/lib/vectors";
 import { DrawSlot } from "../../shared/hooks/draw-scheduler";
 

@@ -1,13 +1,14 @@
+import type { DeviceStore } from "../devices/model";
+import { Card } from "../../shared/ui/card";
+import { Choice } from "../../shared/ui/choice";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { degrees } from "../../shared/lib/angles";
 import { now } from "../../shared/lib/clock";
-import type { DeviceStore } from "../devices/model/device-store";
 import type { Quantity } from "./model/recent-telemetry";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
-import type { Chart } from "../../shared/charts/live-chart";
-import { Card, Choice } from "../../shared/ui/parts";
+import type { Chart } from "./live-chart";
 import { onColourChange, seriesColour } from "../../shared/ui/canvas-theme";
 
 const QUANTITIES: readonly Quantity[] = ["position_rad", "velocity_rad_s", "effort_nm"];
@@ -43,7 +44,7 @@ export function TelemetryPlot({ device }: { device: DeviceStore }) {
       const inUnit = quantity === "effort_nm" ? values : values.map((column) => column.map(toDegrees));
       chart?.draw([times, ...inUnit]);
     };
-    import("../../shared/charts/live-chart").then(
+    import("./live-chart").then(
       ({ createChart }) => {
         if (!alive) return;
         const lines = shown.map(({ joint, index }) => ({

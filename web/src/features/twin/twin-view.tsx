@@ -1,8 +1,8 @@
+import type { Control } from "../control/model";
+import type { DeviceStore } from "../devices/model";
+import { Card } from "../../shared/ui/card";
 import { useSignalEffect } from "@preact/signals";
-import type { Control } from "../control/model/lease";
-import type { DeviceStore } from "../devices/model/device-store";
 import { texts } from "./texts";
-import { Card } from "../../shared/ui/parts";
 import type { LiveScene } from "./scene";
 import { useScene } from "./use-scene";
 

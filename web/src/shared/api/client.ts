@@ -1,8 +1,8 @@
 /** The HTTP API, as far as the console uses it. The session travels in a cookie that no script can read. */
-import { HealthApi } from "../../features/health/model/health";
+import { HealthApi } from "./health";
+import { LatencyApi } from "./latency";
 import { Http, type Page } from "./http";
-import { Library, type Movement } from "../../features/movements/model/movement-library";
-import type { ActionOptions } from "../../features/actions/model/action-runner";
+import { Library, type Movement } from "./movement-library";
 import type { AckStatus, Reason } from "../mqtt/protocol.generated";
 import type { AnyRequest } from "./action-requests";
 import type {
@@ -19,10 +19,9 @@ import type {
   Share,
   SharedRole,
   Target,
-} from "../../features/sharing/model/wire-types";
-import { RobotTypes } from "../../features/robot-types/model/robot-types";
-import { Transfers } from "../../features/sharing/model/transfers";
-import { LatencyApi } from "../../features/latency/model/latency-stats";
+} from "./sharing";
+import { RobotTypes } from "./robot-types";
+import { Transfers } from "./transfers";
 
 export interface Account {
   id: string;
@@ -165,6 +164,14 @@ interface SignedIn {
   account: { id: string; name: string };
   session: string;
   csrf_token: string;
+}
+
+export interface ActionCallOptions {
+  /** Epoch of the lease held here; `null`: the cloud takes a lease for the duration of the action. */
+  epoch: number | null;
+  waitFor?: "started" | "done";
+  /** The device ends the action after this time [ms]. */
+  timeoutMs?: number;
 }
 
 /** One method for each call. All of them throw `ApiError`, and nothing else. */
@@ -377,7 +384,7 @@ export class Api {
   }
 
   /** Ask something of a device; the answer comes when it has got as far as wanted, or after some seconds. */
-  startAction(device: string, request: AnyRequest, { epoch, waitFor, timeoutMs }: ActionOptions, key: string): Promise<Action> {
+  startAction(device: string, request: AnyRequest, { epoch, waitFor, timeoutMs }: ActionCallOptions, key: string): Promise<Action> {
     const waitMs = waitFor === "done" ? 10_000 : 3_000;
     const body = {
       request,

@@ -1,6 +1,5 @@
 /** Texts that more than one feature shows. */
-import type { Role } from "../../features/sharing/model/wire-types";
-import type { Reach } from "../../features/devices/model/device-store";
+import type { Role } from "../api/sharing";
 import type { Mode } from "../mqtt/protocol.generated";
 
 export const common = {
@@ -20,13 +19,6 @@ export const common = {
     present: ["Motion detected", "No motion"],
   } as Readonly<Record<string, readonly [string, string]>>,
   role: { owner: "Owner", operator: "Operator", viewer: "Viewer" } satisfies Record<Role, string>,
-  reach: { online: "Online", stale: "Stale", offline: "Offline", unknown: "Unknown" } satisfies Record<Reach, string>,
-  reachExplained: {
-    online: "The device is connected and its data is current.",
-    stale: "The device is connected, but its data is overdue.",
-    offline: "The device's agent is not connected.",
-    unknown: "This page has no connection to the broker, so the status is unknown.",
-  } satisfies Record<Reach, string>,
   mode: {
     idle: "idle",
     streaming: "following an operator",

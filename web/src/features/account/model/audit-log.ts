@@ -2,7 +2,7 @@
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
 import { sentence } from "../../../shared/api/http";
-import type { AuditQuery, AuditRecord } from "../../sharing/model/wire-types";
+import type { AuditQuery, AuditRecord } from "../../../shared/api/sharing";
 
 const PAGE = 50;
 /** Where a filter lets little through, pages come empty: so many are asked for before the reader is asked. */

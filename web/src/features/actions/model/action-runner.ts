@@ -2,10 +2,10 @@
  * What a device is asked to do, each request followed from the click to its end: by the acks of the device, and by
  * asking the cloud. Robots and room devices alike.
  */
+import type { DeviceStore } from "../../devices/model";
 import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Action, ActionStatus, Api } from "../../../shared/api/client";
+import type { Action, ActionCallOptions, ActionStatus, Api } from "../../../shared/api/client";
 import { now } from "../../../shared/lib/clock";
-import type { DeviceStore } from "../../devices/model/device-store";
 import { ApiError, sentence } from "../../../shared/api/http";
 import { newId } from "../../../shared/lib/ids";
 import type { KnownAck } from "../../../shared/mqtt/parse-messages";
@@ -55,13 +55,8 @@ export interface Run {
   back: AnyRequest | null;
 }
 
-export interface ActionOptions {
-  /** Of the lease held here; `null`: the cloud takes one for the time of the action. */
-  epoch: number | null;
-  waitFor?: "started" | "done";
-  /** After this time the device ends it [ms]. */
-  timeoutMs?: number;
-  /** What undoes it; without one, what `wayBack` finds. */
+export interface ActionOptions extends ActionCallOptions {
+  /** What undoes it; otherwise the result of `undoRequestOf`. */
   back?: AnyRequest;
   /** What the cloud answers, where it was asked by another call: of many devices at once. */
   asked?: Promise<Action>;

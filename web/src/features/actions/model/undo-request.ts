@@ -1,6 +1,6 @@
 /** What undoes a request: from where the device is, as it says itself, at the moment of the click. */
+import type { DeviceStore } from "../../devices/model";
 import { clamp } from "../../../shared/lib/angles";
-import type { DeviceStore } from "../../devices/model/device-store";
 import type { AnyRequest } from "../../../shared/api/action-requests";
 
 /** These leave the joints elsewhere than they were. */

@@ -2,14 +2,14 @@
  * What became of the last commands of this page: sent, accepted, started, observed, ended, each by what this page heard
  * itself and on its own clock. A stream of setpoints is one line, as an action is.
  */
+import { type ActionRunner, ended, type Run, type RunStatus, type Step } from "../../actions/model";
+import type { DeviceStore } from "../../devices/model";
+import type { SetpointStreamer } from "../../steering/model";
 import { computed, effect, signal, untracked, type ReadonlySignal } from "@preact/signals-core";
-import { ended, type ActionRunner, type Run, type RunStatus, type Step } from "../../actions/model/action-runner";
 import { now } from "../../../shared/lib/clock";
 import type { Control } from "./lease";
-import type { DeviceStore } from "../../devices/model/device-store";
 import { newId } from "../../../shared/lib/ids";
 import { moves, type AnyRequest } from "../../../shared/api/action-requests";
-import type { SetpointStreamer } from "../../steering/model/setpoint-streamer";
 
 export type TraceStatus = RunStatus | "observed";
 

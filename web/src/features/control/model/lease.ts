@@ -1,13 +1,13 @@
 /** Control of one device from this page: the lease, its renewal, its loss, and the stream of setpoints it allows. */
+import type { DeviceStore, OpenRequestHere } from "../../devices/model";
+import { RoundTrip } from "../../latency/model";
+import { SetpointStreamer } from "../../steering/model";
 import { batch, computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api, GrantedLease } from "../../../shared/api/client";
 import { ControlRequest } from "./control-request";
 import { ApiError, sentence } from "../../../shared/api/http";
 import { now } from "../../../shared/lib/clock";
-import type { DeviceStore, OpenRequestHere } from "../../devices/model/device-store";
 import { MqttLink, type Link, type LinkStatus } from "../../../shared/mqtt/mqtt-link";
-import { RoundTrip } from "../../latency/model/round-trip";
-import { SetpointStreamer } from "../../steering/model/setpoint-streamer";
 
 export const LEASE_MS = 30_000;
 const RETRY_MS = 1_000;

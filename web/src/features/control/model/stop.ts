@@ -1,9 +1,9 @@
 /** Stop: told to the robot by every way there is, again and again, until the robot itself says that it has stopped. */
+import type { DeviceStore } from "../../devices/model";
 import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
 import { sentence } from "../../../shared/api/http";
 import { now } from "../../../shared/lib/clock";
-import type { DeviceStore } from "../../devices/model/device-store";
 import { newId } from "../../../shared/lib/ids";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
 import type { KnownState } from "../../../shared/mqtt/parse-messages";

@@ -1,13 +1,10 @@
 /** All with which one device is operated from this page: control of it, its stop, what it is asked to do. */
+import { ActionRunner } from "../../actions/model";
+import { CommandTrace, Control, StopSwitch, Watchers } from "../../control/model";
+import { LatencySamples } from "../../latency/model";
 import type { Api } from "../../../shared/api/client";
-import { ActionRunner } from "../../actions/model/action-runner";
-import { Control } from "../../control/model/lease";
 import type { DeviceStore } from "./device-store";
-import { CommandTrace } from "../../control/model/command-trace";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
-import { LatencySamples } from "../../latency/model/sample-upload";
-import { StopSwitch } from "../../control/model/stop";
-import { Watchers } from "../../control/model/watchers";
 
 export class DeviceSession {
   readonly device: DeviceStore;

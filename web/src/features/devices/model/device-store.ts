@@ -1,9 +1,9 @@
 /** One device as the page knows it: only what it or the cloud has said, with the time at which it was heard. */
+import { RecentTelemetry } from "../../twin/model";
 import { computed, signal, type ReadonlySignal, type Signal } from "@preact/signals-core";
 import type { Api, Device, Lease } from "../../../shared/api/client";
 import { ApiError } from "../../../shared/api/http";
 import { clock, now, onThisClock } from "../../../shared/lib/clock";
-import { RecentTelemetry } from "../../twin/model/recent-telemetry";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
 import {
   MessageError,

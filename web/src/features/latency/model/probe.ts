@@ -1,12 +1,13 @@
 /** Measuring here and now, by requests that move nothing: one after the other, each on this page's clock alone. */
+import type { DeviceStore } from "../../devices/model";
+import type { Sample } from "../../../shared/api/latency";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api, LatencyBatch } from "../../../shared/api/client";
 import { now, serverNow } from "../../../shared/lib/clock";
-import type { DeviceStore } from "../../devices/model/device-store";
 import { sentence } from "../../../shared/api/http";
 import { newId } from "../../../shared/lib/ids";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
-import type { Line, Sample } from "./latency-stats";
+import type { Line } from "./latency-stats";
 
 /** As many as in the papers. */
 export const TIMES = 20;

@@ -1,5 +1,5 @@
 /** What the papers that this system follows have printed of their own response times, to hold one's own beside. */
-import type { Path } from "./latency-stats";
+import type { Path } from "../../../shared/api/latency";
 
 /** One published figure. Nothing here was measured by this page. */
 export interface Published {

@@ -1,6 +1,6 @@
 /** A movement's parameters as fields of a form: text in, values out, and what is wrong with each. */
 import { degrees, radians } from "../../../shared/lib/angles";
-import type { ObjectSchema, Parameters, Schema } from "./movement-library";
+import type { ObjectSchema, Parameters, Schema } from "../../../shared/api/movement-library";
 
 /** `list`: numbers, one after the other. `json`: whatever has no field of its own kind. */
 export type FieldKind = "number" | "integer" | "text" | "choice" | "yes-no" | "list" | "json";

@@ -2,7 +2,7 @@
 import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import { ApiError, sentence } from "../../../shared/api/http";
 import type { Draft, StoredValue } from "../../../shared/lib/local-storage";
-import { MovementChanged, type Library, type Movement, type MovementSource } from "./movement-library";
+import { MovementChanged, type Library, type Movement, type MovementSource } from "../../../shared/api/movement-library";
 
 export type Loading = { kind: "loading" } | { kind: "there" } | { kind: "failed"; why: string };
 

@@ -1,6 +1,6 @@
 /** A claim code: how it is written, and one whose link was followed. It stays in this tab until it is used or dropped. */
+import type { Shelf } from "../../sharing/model";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Shelf } from "../../sharing/model/invitation-link";
 
 const KEY = "telescope.pair";
 /** The agent's alphabet has no vowels and nothing that looks like a digit. */

@@ -3,7 +3,7 @@ import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-co
 import { now } from "../../../shared/lib/clock";
 import { readFindings, type Finding } from "./parse-findings";
 import { ApiError, sentence } from "../../../shared/api/http";
-import type { Look, RobotType, RobotTypes, TypeModel } from "./robot-types";
+import type { Look, RobotType, RobotTypes, TypeModel } from "../../../shared/api/robot-types";
 import { selectFiles, MANIFEST, MAX_BYTES, packFiles, size, type Files } from "./upload-files";
 
 export type DraftStep = "empty" | "sending" | "checking" | "good" | "wrong" | "unsent" | "saving" | "saved";

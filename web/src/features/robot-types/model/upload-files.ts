@@ -1,5 +1,5 @@
 /** The files of a robot type as somebody chose them: what belongs to it, and how it is sent. */
-import type { TypeFolder } from "./robot-types";
+import type { TypeFolder } from "../../../shared/api/robot-types";
 
 export const MANIFEST = "robot.toml";
 const SCRIPT = /^movements\/([^/]+)\.py$/;

@@ -1,13 +1,13 @@
 /** What this page asks of one room device: one thing at a time, and what became of it. */
+import type { ActionOptions, ActionRunner, Run } from "../../actions/model";
+import type { DeviceStore } from "../../devices/model";
+import type { Values } from "../../spaces/model";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
-import { type ActionRunner, type ActionOptions, type Run } from "../../actions/model/action-runner";
 import type { Api, Upload } from "../../../shared/api/client";
 import { sentence } from "../../../shared/api/http";
 import { now } from "../../../shared/lib/clock";
-import type { DeviceStore } from "../../devices/model/device-store";
 import { readApplied, readShot } from "../../../shared/mqtt/parse-messages";
 import type { RoomRequest } from "../../../shared/api/action-requests";
-import type { Values } from "../../spaces/model/room-perception";
 
 /** A short question is answered, or has failed, within this time [ms]. */
 const TIMEOUT_MS = 30_000;

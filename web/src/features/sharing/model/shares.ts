@@ -3,7 +3,7 @@ import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
 import { sentence } from "../../../shared/api/http";
 import { now, onThisClock } from "../../../shared/lib/clock";
-import type { Invitation, InvitationMade, InvitationWanted, Share, SharedRole, Target } from "./wire-types";
+import type { Invitation, InvitationMade, InvitationWanted, Share, SharedRole, Target } from "../../../shared/api/sharing";
 
 /** The shortest that the server takes [s]. */
 const SHORTEST_S = 10;

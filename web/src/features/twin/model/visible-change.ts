@@ -1,5 +1,5 @@
 /** Whether a change of pose can be seen. */
-import type { Targets } from "../../steering/model/setpoint-streamer";
+import type { Targets } from "../../steering/model";
 
 /** Less than this of a pixel is not seen. */
 const SEEN_PX = 0.5;

@@ -1,8 +1,7 @@
 /** Robot types over the HTTP API: those that one may see, and one that is looked at before it is saved. */
-import type { Http } from "../../../shared/api/http";
-import { readTwin, type KnownTwin } from "../../../shared/mqtt/parse-messages";
-import type { Robot } from "../../keyframes/model/keyframes";
-import type { Joint, MimicJoint, PositionDependentLimit } from "../../../shared/mqtt/protocol.generated";
+import type { Http } from "./http";
+import { readTwin, type KnownTwin } from "../mqtt/parse-messages";
+import type { Joint, MimicJoint, PositionDependentLimit } from "../mqtt/protocol.generated";
 
 export type TypeState = "checking" | "ready" | "rejected";
 
@@ -73,12 +72,6 @@ interface TwinAnswer {
   bodies: unknown;
   actuators: string[];
   cameras: string[];
-}
-
-/** What the keyframe editor needs to know of any robot of a type. */
-export function robotOf({ joints, mimic_joints, position_dependent_limits, postures, expressions, behaviours, capabilities, actions }: RobotType): Robot {
-  const complete = mimic_joints.map(({ joint, mimics, multiplier = 1 }) => ({ joint, mimics, multiplier }));
-  return { joints, mimic_joints: complete, position_dependent_limits, postures, expressions, behaviours, capabilities, actions };
 }
 
 /** How long a large upload may take on a slow line [ms]. */

@@ -1,9 +1,9 @@
 /** A line chart of the last seconds. Loaded only where one is looked at. */
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
-import { SPAN_MS } from "../../features/twin/model/recent-telemetry";
-import { common } from "../i18n/common";
-import { colour } from "../ui/canvas-theme";
+import { SPAN_MS } from "./model/recent-telemetry";
+import { common } from "../../shared/i18n/common";
+import { colour } from "../../shared/ui/canvas-theme";
 
 export interface Line {
   label: string;

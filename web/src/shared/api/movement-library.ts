@@ -1,6 +1,6 @@
 /** Movements of the robot types: what is in the library, saving, checking, and running one on many robots. */
-import type { Action } from "../../../shared/api/client";
-import { ApiError, type Http } from "../../../shared/api/http";
+import type { Action } from "./client";
+import { ApiError, type Http } from "./http";
 
 /** What an operator may set: a small part of JSON Schema, with units. */
 export type Schema = {

@@ -1,6 +1,6 @@
 /** Handing an agent with its devices, or a space with all that is in it, over to another account that accepts it. */
-import type { Http } from "../../../shared/api/http";
-import type { Invitation, InvitationMade } from "./wire-types";
+import type { Http } from "./http";
+import type { Invitation, InvitationMade } from "./sharing";
 
 /** What can change hands. */
 export interface Whole {

@@ -1,5 +1,5 @@
 /** Places in a script: the server counts characters, an editor the units of UTF-16. */
-import type { Mark } from "../../features/movements/model/movement-library";
+import type { Mark } from "../../../shared/api/movement-library";
 
 export interface Place {
   from: number;

@@ -1,10 +1,10 @@
 /** A line over time with the limits that its room gives. Loaded only where one is looked at. */
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
-import { digits, type Quantity } from "../../features/sensors/model/quantities";
-import { common } from "../i18n/common";
-import { format } from "../i18n/format";
-import { colour } from "../ui/canvas-theme";
+import { digits, type Quantity } from "./model/quantities";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { colour } from "../../shared/ui/canvas-theme";
 
 /** What is drawn beside the line itself. */
 export interface Marks {

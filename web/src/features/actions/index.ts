@@ -1,0 +1,3 @@
+export { ActionCards } from "./action-cards";
+export { RunStatusPanel, RunSteps } from "./run-status";
+export { describeRequest, texts as actionTexts } from "./texts";

@@ -1,0 +1,3 @@
+export { CommandTraceCard } from "./command-trace-card";
+export { ControlBar } from "./control-bar";
+export { StopBanner } from "./stop-button";

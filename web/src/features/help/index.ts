@@ -1,0 +1,3 @@
+export { AgentCommands } from "./agent-commands";
+export { FirstSteps } from "./first-steps";
+export { PageExplainer } from "./page-explainer";

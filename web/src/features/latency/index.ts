@@ -1,0 +1,1 @@
+export { LiveLatency } from "./live-latency-card";

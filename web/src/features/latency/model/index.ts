@@ -1,0 +1,2 @@
+export { RoundTrip } from "./round-trip";
+export { LatencySamples } from "./sample-upload";

@@ -1,0 +1,2 @@
+export { type Quantity, quantityOf } from "./quantities";
+export { Recording } from "./stored-series";

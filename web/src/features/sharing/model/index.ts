@@ -1,0 +1,1 @@
+export { FollowedInvitation, type Shelf } from "./invitation-link";

@@ -1,0 +1,2 @@
+export { Drawing, FloorPlan, useFloorPlan } from "./floor-plan";
+export { SpaceList } from "./space-list";

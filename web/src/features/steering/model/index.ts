@@ -1,0 +1,1 @@
+export { SetpointStreamer, type Targets } from "./setpoint-streamer";

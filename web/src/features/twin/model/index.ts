@@ -1,0 +1,2 @@
+export { rollPitchYaw, unit } from "./forward-kinematics";
+export { RecentTelemetry } from "./recent-telemetry";

@@ -1,0 +1,137 @@
+/** Health of devices over the HTTP API. */
+import type { Http, Page } from "./http";
+import type { Event } from "../mqtt/protocol.generated";
+
+export type Severity = Event["severity"];
+/** `unknown`: nothing is heard of it. */
+export type HealthState = "ok" | "unknown" | "warning" | "fault";
+
+export interface Fault {
+  /** Counts down with time: of all faults the newest sorts first. */
+  id: string;
+  code: string;
+  state: "raised" | "acknowledged" | "cleared";
+  /** Who noticed: the device itself, the detectors, or the cloud, which no longer hears of it. */
+  source: "device" | "detector" | "cloud";
+  kind: string;
+  severity: Severity;
+  message: string;
+  stream: string;
+  field: string;
+  value: number | null;
+  baseline: number | null;
+  limit: number | null;
+  raised_at: string;
+  acknowledged_at: string | null;
+  acknowledged_by: string;
+  cleared_at: string | null;
+  /** The first, second … of its code. */
+  count: number;
+  worsened: number;
+}
+
+/** One watched field, by means over ten seconds. */
+export interface Watched {
+  stream: string;
+  field: string;
+  label: string;
+  unit: string;
+  advice: string;
+  value: number;
+  baseline: number;
+  usual_low: number | null;
+  usual_high: number | null;
+  warning_low: number | null;
+  warning_high: number | null;
+  low: number | null;
+  high: number | null;
+  slope_per_s: number | null;
+  limit_in_s: number | null;
+  findings: string[];
+  updated_at: string;
+}
+
+interface Counts {
+  error: number;
+  warning: number;
+  info: number;
+}
+
+export interface DeviceHealth {
+  device: string;
+  health: HealthState;
+  online: boolean;
+  last_seen_at: string | null;
+  counts: Counts;
+  faults: Fault[];
+  fields: Watched[];
+}
+
+/** One device in the list of all. */
+export interface HealthLine {
+  device: string;
+  label: string;
+  space: string;
+  health: HealthState;
+  online: boolean;
+  last_seen_at: string | null;
+  counts: Counts;
+  worst: Fault | null;
+}
+
+export interface StoredEvent {
+  id: string;
+  kind: string;
+  severity: Severity;
+  message: string;
+  data: Record<string, unknown>;
+  at: string;
+}
+
+export interface StoredStream {
+  name: string;
+  fields: string[];
+}
+
+/** One method for each call. All of them throw `ApiError`, and nothing else. */
+export const RANK: Readonly<Record<HealthState, number>> = { ok: 0, unknown: 1, warning: 2, fault: 3 };
+
+export class HealthApi {
+  readonly #http: Http;
+
+  constructor(http: Http) {
+    this.#http = http;
+  }
+
+  /** Every device's health, worst first; of one space, or of all. */
+  async all(space: string | null): Promise<HealthLine[]> {
+    const lines = await this.#http.all<HealthLine>(space === null ? "/diagnostics" : `/spaces/${space}/diagnostics`);
+    return lines.sort((one, other) => RANK[other.health] - RANK[one.health] || one.label.localeCompare(other.label));
+  }
+
+  of(device: string): Promise<DeviceHealth> {
+    return this.#http.call("GET", `/devices/${device}/diagnostics`);
+  }
+
+  /** Faults that are over, the newest first. */
+  past(device: string, cursor: string | null, limit: number): Promise<Page<Fault>> {
+    return this.#http.call("GET", `/devices/${device}/faults?open=false&${paging(cursor, limit)}`);
+  }
+
+  acknowledge(device: string, fault: string): Promise<Fault> {
+    return this.#http.call("POST", `/devices/${device}/faults/${fault}/acknowledge`);
+  }
+
+  /** What happened, the newest first. */
+  events(device: string, cursor: string | null, limit: number): Promise<Page<StoredEvent>> {
+    return this.#http.call("GET", `/devices/${device}/events?${paging(cursor, limit)}`);
+  }
+
+  streams(device: string): Promise<StoredStream[]> {
+    return this.#http.all(`/devices/${device}/data`);
+  }
+}
+
+function paging(cursor: string | null, limit: number): string {
+  return new URLSearchParams({ limit: String(limit), ...(cursor === null ? {} : { cursor }) }).toString();
+}

@@ -1,0 +1,122 @@
+/** Where the page is, in the address's fragment, which the server never sees; and the addresses of all pages. */
+import { signal, type ReadonlySignal } from "@preact/signals";
+
+/** Parameters of addresses; empty if the page's address has no such parameter. */
+export type At = Readonly<Record<"device" | "id" | "ids" | "name" | "robotType" | "space", string>>;
+
+/** The address of each page: `:name` is a parameter, `:name?` an optional one. */
+const PATTERNS = {
+  devices: "#/",
+  device: "#/devices/:id",
+  keyframes: "#/devices/:id/keyframes/:name?",
+  multiRobot: "#/operate/:ids",
+  space: "#/spaces/:id",
+  pair: "#/pair",
+  movements: "#/movements",
+  movement: "#/movements/:robotType/:name",
+  typeKeyframes: "#/robot-types/:robotType/keyframes/:name?",
+  robotTypes: "#/robot-types",
+  robotType: "#/robot-types/:id",
+  addRobotType: "#/add-robot-type",
+  health: "#/health",
+  deviceHealth: "#/devices/:device/health",
+  spaceHealth: "#/spaces/:space/health",
+  latency: "#/latency",
+  deviceLatency: "#/devices/:device/latency",
+  account: "#/account",
+  auditLog: "#/account/audit-log",
+  invitation: "#/invitation",
+} as const;
+
+export type PageName = keyof typeof PATTERNS;
+
+export interface Route {
+  page: PageName;
+  at: At;
+}
+
+const NOTHING: At = { device: "", id: "", ids: "", name: "", robotType: "", space: "" };
+
+const EXPRESSIONS: readonly (readonly [PageName, RegExp])[] = (Object.entries(PATTERNS) as [PageName, string][]).map(([name, pattern]) => [
+  name,
+  new RegExp(
+    `^${pattern
+      .replaceAll(/\/:(\w+)\?/g, "(?:/(?<$1>[A-Za-z0-9_,-]+))?")
+      .replaceAll(/\/:(\w+)/g, "/(?<$1>[A-Za-z0-9_,-]+)")}$`,
+  ),
+]);
+
+/** The page of an address; the first one's where there is no such page. */
+export function read(hash: string): Route {
+  for (const [page, expression] of EXPRESSIONS) {
+    const found = expression.exec(hash);
+    if (found === null) continue;
+    const named = Object.entries(found.groups ?? {}).filter(([, value]) => (value as string | undefined) !== undefined);
+    return { page, at: { ...NOTHING, ...Object.fromEntries(named) } };
+  }
+  return { page: "devices", at: NOTHING };
+}
+
+/** The address of a page, with what its pattern names. */
+export function pageAddress(page: PageName, at: Partial<At> = {}): string {
+  return PATTERNS[page].replaceAll(/\/:(\w+)\??/g, (_, name: keyof At) => (at[name] ? `/${at[name]}` : ""));
+}
+
+const current = signal(read(location.hash));
+export const route: ReadonlySignal<Route> = current;
+
+export const accountAddress = pageAddress("account");
+export const auditLogAddress = pageAddress("auditLog");
+export const addRobotTypeAddress = pageAddress("addRobotType");
+export const deviceListAddress = pageAddress("devices");
+export const healthAddress = pageAddress("health");
+export const invitationAddress = pageAddress("invitation");
+export const movementsAddress = pageAddress("movements");
+export const pairAddress = pageAddress("pair");
+export const robotTypesAddress = pageAddress("robotTypes");
+
+export function deviceAddress(id: string): string {
+  return pageAddress("device", { id });
+}
+
+/** The keyframe editor on a device; without a name a new movement. */
+export function keyframesAddress(device: string, name = ""): string {
+  return pageAddress("keyframes", { id: device, name });
+}
+
+/** The same for all robots of a type, without a device. */
+export function typeKeyframesAddress(robotType: string, name = ""): string {
+  return pageAddress("typeKeyframes", { robotType, name });
+}
+
+export function spaceAddress(id: string): string {
+  return pageAddress("space", { id });
+}
+
+/** Several devices on one page. */
+export function multiRobotAddress(ids: readonly string[]): string {
+  return pageAddress("multiRobot", { ids: ids.join(",") });
+}
+
+export function robotTypeAddress(id: string): string {
+  return pageAddress("robotType", { id });
+}
+
+export function healthAddressOf(kind: "device" | "space", id: string): string {
+  return kind === "device" ? pageAddress("deviceHealth", { device: id }) : pageAddress("spaceHealth", { space: id });
+}
+
+export function latencyAddressOf(device: string): string {
+  return pageAddress("deviceLatency", { device });
+}
+
+export function movementAddress(robotType: string, name: string): string {
+  return pageAddress("movement", { robotType, name });
+}
+
+/** Go to a page in the place of this one: the way back does not lead here again. */
+export function replaceWith(to: string): void {
+  location.replace(to);
+}
+
+addEventListener("hashchange", () => (current.value = read(location.hash)));
