@@ -240,7 +240,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
         factory.make(wiring), upload=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms())
     )
     outbox = _outbox(store, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
-    sandbox = SandboxHost(trusted=configuration.allow_unconfined_scripts)
+    sandbox = SandboxHost(allow_unconfined=configuration.allow_unconfined_scripts)
     uploads = HttpUploads(pairing.agent, lambda: cloud_client(store, configuration, clock))
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}

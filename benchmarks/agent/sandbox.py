@@ -25,9 +25,9 @@ SCRIPTS = {
 }
 
 
-def first_line(inmate: SandboxProcess, source: str) -> None:
+def first_line(process: SandboxProcess, source: str) -> None:
     """Sends the script and waits for its first message."""
-    with inmate.link.makefile("rwb") as lines:
+    with process.link.makefile("rwb") as lines:
         lines.readline()
         task = {"source": source, "name": "x", "parameters": {}, "joints": [], "frames": [], "can": []}
         lines.write(json.dumps(task).encode() + b"\n")
@@ -37,19 +37,19 @@ def first_line(inmate: SandboxProcess, source: str) -> None:
 
 
 def measure(
-    jail: SandboxHost, source: str, runs: int, *, stranger: bool, pause_s: float = 0.0
+    sandbox: SandboxHost, source: str, runs: int, *, untrusted: bool, pause_s: float = 0.0
 ) -> tuple[list[float], list[float]]:
     """Returns the start and stop time of each run [ms]."""
     starts, stops = [], []
     for _ in range(runs):
         time.sleep(pause_s)
         begun_s = time.perf_counter()
-        with contextlib.closing(jail.open(Limits(), stranger=stranger)) as inmate:
-            first_line(inmate, source)
+        with contextlib.closing(sandbox.open(Limits(), untrusted=untrusted)) as process:
+            first_line(process, source)
             starts.append((time.perf_counter() - begun_s) * 1000)
             stopped_s = time.perf_counter()
-            inmate.kill()
-            if not inmate.wait(10):
+            process.kill()
+            if not process.wait(10):
                 raise RuntimeError("it does not die")
             stops.append((time.perf_counter() - stopped_s) * 1000)
     return starts, stops
@@ -64,22 +64,22 @@ def percentiles(values: list[float]) -> str:
 
 def main(runs: int = 300) -> None:
     """Runs all measurements."""
-    jail = SandboxHost()
+    sandbox = SandboxHost()
     begun_s = time.perf_counter()
-    jail.start()
+    sandbox.start()
     print(f"warm parent ready after {(time.perf_counter() - begun_s) * 1000:.0f} ms; {runs} runs each [ms]")
-    for stranger in (False, True):
-        with contextlib.closing(jail.open(Limits(), stranger=stranger)):
+    for untrusted in (False, True):
+        with contextlib.closing(sandbox.open(Limits(), untrusted=untrusted)):
             pass  # the first run starts the zygote
-        where = "bubblewrap: " if stranger else ""
+        where = "bubblewrap: " if untrusted else ""
         for name, source in SCRIPTS.items():
-            starts, stops = measure(jail, source, runs, stranger=stranger)
+            starts, stops = measure(sandbox, source, runs, untrusted=untrusted)
             print(f"{where + name:50} start {percentiles(starts)}")
             print(f"{'':50} stop  {percentiles(stops)}")
         waits = SCRIPTS["a script that waits"]
-        starts, _ = measure(jail, waits, max(1, runs // 6), stranger=stranger, pause_s=_UNTIL_READY_S)
+        starts, _ = measure(sandbox, waits, max(1, runs // 6), untrusted=untrusted, pause_s=_UNTIL_READY_S)
         print(f"{where + 'a script that waits, where one is ready':50} start {percentiles(starts)}")
-    jail.close()
+    sandbox.close()
 
 
 if __name__ == "__main__":

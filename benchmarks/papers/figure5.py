@@ -250,7 +250,7 @@ def show(report: Report, found: Found) -> None:
 
 
 _NOTE: Final = f"""Printed: averages of the three robots were between these two. A *stored movement* is a script that is
-signed, pinned and run in its jail: the paper's click on a movement. An *action* moves one joint; Qbo's drives. A
+signed, pinned and run in its sandbox: the paper's click on a movement. An *action* moves one joint; Qbo's drives. A
 *streamed setpoint* goes through the broker alone. First motion: the first state of the simulation in which the joint is
 faster than 0.003° a second, which none is at rest; motion begins with limited jerk, and the last column is when the
 joint is faster than 0.1° a second. The paper's times end where the program on the robot began to act. Where a round

@@ -1,22 +1,22 @@
-"""Where movement scripts run: in processes that can do nothing but speak to the agent. The implementer's manual."""
+"""Port: runs movement scripts in confined processes that can only communicate with the agent."""
 
 import socket
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
 
-class JailError(Exception):
-    """A script cannot be run safely, or at all. Its text says what to do."""
+class SandboxError(Exception):
+    """A script cannot be run safely, or at all. The message names the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What one script may use.
+    """Resources of one script.
 
     Attributes:
         cpu_s: Processor time [s].
-        memory_bytes: Address space, of which Python and NumPy take about 110 MB. The kernel needs the time of a Stop to
-            take it back: a process that has filled 256 MB is dead 12 to 30 ms after its kill, one of 512 MB 30 to 75.
+        memory_bytes: Address space [bytes]; Python and NumPy need about 110 MB. The kernel needs time to reclaim memory
+            after a Stop: 12 to 30 ms for a process of 256 MB, 30 to 75 ms for one of 512 MB (measured).
     """
 
     cpu_s: int = 120
@@ -28,58 +28,67 @@ class SandboxStatus:
     """How scripts run on this machine.
 
     Attributes:
-        how: In the jail with all its layers; with fewer, since the owner trusts them; or not at all.
-        why: What is missing, and what to do about it; empty where they are ``sandboxed``.
+        mode: ``sandboxed``: with all layers. ``unconfined``: with fewer layers, as the owner allows. ``unavailable``:
+            not at all.
+        reason: What is missing, and the remedy; empty for ``sandboxed``.
     """
 
-    how: Literal["sandboxed", "unconfined", "unavailable"]
-    why: str = ""
+    mode: Literal["sandboxed", "unconfined", "unavailable"]
+    reason: str = ""
 
 
 class SandboxProcess(Protocol):
-    """The locked process of one script.
+    """The confined process of one script.
 
     Attributes:
-        link: The agent's end of its only socket (a stream). Its first line says whether the jail holds.
+        link: The agent's end of the process's only socket (a stream). Its first line reports whether the process is
+            confined.
     """
 
     link: socket.socket
 
     def kill(self) -> None:
-        """End it at once, whatever it does about signals. From any thread, never blocks, may be called twice."""
+        """Kill the process at once. Callable from any thread and repeatedly; never blocks."""
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether it is dead within that time [s]."""
+        """Wait until the process is dead.
+
+        Args:
+            timeout_s: Maximum time [s].
+
+        Returns:
+            Whether the process is dead.
+        """
 
     def ending(self) -> str:
-        """Once it is dead: why, if that was not of its own will or by ``kill``; else empty."""
+        """Why a dead process ended; empty if it exited by itself or was killed by ``kill``."""
 
     def close(self) -> None:
-        """Kill it, see it dead, and let go of it. May be called twice."""
+        """Kill the process, wait for its end and release its resources. Callable repeatedly."""
 
 
 class Sandbox(Protocol):
-    """Makes inmates. Thread-safe; the constructor starts nothing."""
+    """Creates sandbox processes. Thread-safe; the constructor starts no process."""
 
     def start(self) -> None:
-        """Look what this machine has, and be ready. May be called twice. Never raises: ``refusal`` tells."""
+        """Detect the features of this machine and prepare a process. Never raises; see ``refusal``."""
 
-    def standing(self) -> SandboxStatus:
-        """How scripts of the robot's own people run here."""
+    def status(self) -> SandboxStatus:
+        """How scripts of the agent's owner run here."""
 
-    def refusal(self, *, stranger: bool) -> str | None:
-        """Why scripts are refused here, and what to do about it; ``None`` where they run.
+    def refusal(self, *, untrusted: bool) -> str | None:
+        """Why scripts cannot run here, with the remedy, or ``None`` if they can.
 
         Args:
-            stranger: Whether it is a script of an unknown owner, which needs one wall more.
+            untrusted: Whether the script's author is not the agent's owner; such scripts need an additional layer.
         """
 
-    def open(self, limits: Limits, *, stranger: bool) -> SandboxProcess:
-        """A new locked process, which waits for its script.
+    def open(self, limits: Limits, *, untrusted: bool) -> SandboxProcess:
+        """Start a confined process that waits for its script.
 
         Raises:
-            JailError: There is a ``refusal``, or the process could not be made.
+            SandboxError: There is a ``refusal``, or the process cannot be started.
         """
 
     def close(self) -> None:
-        """End all inmates. May be called twice."""
+        """Kill all processes. Callable repeatedly."""

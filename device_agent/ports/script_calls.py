@@ -22,11 +22,11 @@ class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, ta
 
 
 class Ready(_Message, frozen=True, kw_only=True, tag="ready"):
-    """The jail holds; the script may be sent."""
+    """The sandbox holds; the script may be sent."""
 
 
 class Unfit(_Message, frozen=True, kw_only=True, tag="unfit"):
-    """The jail does not hold; the process has ended."""
+    """the sandbox could not be set up; the process has ended."""
 
     reason: _Text
 

@@ -214,9 +214,10 @@ class Device:
         data = {"epoch": epoch, "stopped": self._controller.latch is not None}
         message = "the agent started; all previous leases have ended"
         self._events.record(EventRecord(EventKind.AGENT_STARTED, message, data=data))
-        self.publisher.scripts = scripts = self._sandbox.standing()
-        if scripts.how in _SCRIPTS:
-            self._events.record(EventRecord(_SCRIPTS[scripts.how], scripts.why, "warning", {"reason": scripts.why}))
+        self.publisher.scripts = scripts = self._sandbox.status()
+        if scripts.mode in _SCRIPTS:
+            data = {"reason": scripts.reason}
+            self._events.record(EventRecord(_SCRIPTS[scripts.mode], scripts.reason, "warning", data))
         self._commands.start(None if isinstance(self._driver, RoomDevice) else self._driver.twin())
 
     def stop(self) -> None:

@@ -1,10 +1,10 @@
-"""The jail of movement scripts: a warm parent from which every script is forked into a locked process of its own.
+"""Sandbox of movement scripts: a zygote forks one confined process per script.
 
 ```
-agent ── warm ──(requests)── parent ──fork── confine, script, api
-  └─────── the script's only socket: a line of JSON a message ──────┘
+agent ── host ──(requests)── zygote ──fork── confinement, script_process, api
+  └────────── the script's only socket: one line of JSON per message ────────┘
 ```
 
-``warm`` runs inside the agent and implements ``ports.jail``. All other files run in processes that hold nothing of the
-agent's: they import the standard library, NumPy and ``pyseccomp``, nothing else of Telescope.
+``host`` runs inside the agent and implements ``ports.sandbox``. All other modules run in processes without any
+resource of the agent. They import the standard library, NumPy and ``pyseccomp``, and no other part of Telescope.
 """

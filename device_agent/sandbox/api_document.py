@@ -1,6 +1,6 @@
-"""What a script finds, as a document, made from the very objects that it is given.
+"""Generates the script API document from the objects that scripts use.
 
-``python -m device_agent.sandbox.api_document`` prints it; ``make contract`` keeps ``protocol/script_api.json`` equal to it.
+``python -m device_agent.sandbox.api_document`` prints it; ``make contract`` updates ``script_api.json``.
 """
 
 import inspect
@@ -14,7 +14,7 @@ import msgspec
 
 from device_agent.protocol.documents.script_api import Call, Names, Parameter, ScriptApi, Value
 from device_agent.sandbox import api
-from device_agent.sandbox.importable_modules import SHOWN
+from device_agent.sandbox.importable_modules import LISTED
 
 _TASK: Final[dict[str, Any]] = {"joints": (), "frames": (), "can": (), "parameters": {}}
 _STRINGS: Final[dict[tuple[str, str], Names]] = {
@@ -27,12 +27,12 @@ _STRINGS: Final[dict[tuple[str, str], Names]] = {
     ("latest", "device"): "devices",
     ("taken", "device"): "devices",
 }
-"""Call and parameter → what its strings are names of."""
-_PARAMETERS: Final = "What the operator set, by name: see `PARAMETERS` of this script."
+"""Call and parameter → kind of names that its strings are."""
+_PARAMETERS: Final = "Parameters that the operator set, by name; declared in `PARAMETERS`."
 _PRINT: Final = Call(
     name="print",
     signature="print(*values)",
-    doc="Write to the operator's page.",
+    doc="Print to the operator's console.",
     parameters=(
         Parameter(name="values", kind="rest"),
         *(Parameter(name=name, kind="keyword", default="None") for name in ("sep", "end", "file", "flush")),
@@ -45,14 +45,14 @@ _KINDS: Final[dict[Any, str]] = {
 
 
 def document() -> ScriptApi:
-    """The document.
+    """The script API.
 
     Raises:
-        LookupError: ``_STRINGS`` names a parameter that there is not.
+        LookupError: ``_STRINGS`` names an unknown parameter.
     """
-    found = api.names(_nothing, _nothing, _nothing, _TASK)
+    objects = api.names(_nothing, _nothing, _nothing, _TASK)
     values, functions = [], [_PRINT]
-    for name, given in found.items():
+    for name, given in objects.items():
         if inspect.isfunction(given):
             functions.append(_call(name, given))
         elif inspect.isclass(given):
@@ -63,12 +63,12 @@ def document() -> ScriptApi:
             values.append(_object(name, given))
     known = {(each.name, one.name) for value in values for each in value.methods for one in each.parameters}
     if _STRINGS.keys() - known:
-        raise LookupError(f"there is no {_STRINGS.keys() - known}")
-    return ScriptApi(values=tuple(values), functions=tuple(functions), modules=tuple(SHOWN))
+        raise LookupError(f"unknown parameters: {_STRINGS.keys() - known}")
+    return ScriptApi(values=tuple(values), functions=tuple(functions), modules=tuple(LISTED))
 
 
 def _nothing(*_: Any, **__: Any) -> None:
-    """Stands where a script would speak to its agent."""
+    """Placeholder for communication with the agent."""
 
 
 def _object(name: str, given: object) -> Value:
@@ -103,16 +103,16 @@ def _call(name: str, function: Callable[..., Any]) -> Call:
 
 def _parameter(call: str, given: inspect.Parameter) -> Parameter:
     kind = inspect.formatannotation(given.annotation)
-    found = {
+    fields = {
         "name": given.name,
         "kind": _KINDS[given.kind],
         "type": re.sub(r"\b(?:typing|collections\.abc)\.", "", kind),
     }
     if given.default is not inspect.Parameter.empty:
-        found["default"] = repr(given.default)
+        fields["default"] = repr(given.default)
     if names := _STRINGS.get((call, given.name)):
-        found["names"] = names
-    return msgspec.convert(found, Parameter)
+        fields["names"] = names
+    return msgspec.convert(fields, Parameter)
 
 
 def _first(given: object) -> str:

@@ -1,7 +1,7 @@
-"""What both sides of the jail must agree on. Nothing in here needs Linux."""
+"""Constants that the host and the sandbox processes share. They work on every operating system."""
 
 LIMITS, USER, LANDLOCK, SECCOMP = "limits", "user", "landlock", "seccomp"
 LAYERS = (LIMITS, USER, LANDLOCK, SECCOMP)
-"""In the order in which a script's process puts them on."""
-LONGEST_MESSAGE = 4096
-"""Bytes of a message between the agent and the warm parent."""
+"""Layers in the order in which a script process applies them."""
+MAX_MESSAGE = 4096
+"""Maximum size of a message between the host and the zygote [bytes]."""

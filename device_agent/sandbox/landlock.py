@@ -1,7 +1,7 @@
-"""Landlock: from here on this process opens no file, no TCP port, and reaches no process outside.
+"""Landlock: denies this process all files, TCP ports and signals to other processes.
 
-A ruleset without a single rule: whatever the kernel's version knows to forbid is forbidden. Numbers are those of
-``linux/landlock.h``; its three system calls have the same number on every architecture.
+The ruleset has no rules, so everything that the kernel's Landlock version can restrict is denied. Numbers are those of
+``linux/landlock.h``; the three system calls have the same number on all architectures.
 """
 
 import ctypes
@@ -10,25 +10,25 @@ import os
 _CREATE_RULESET, _RESTRICT_SELF = 444, 446
 _ASK_VERSION = 1
 _FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}
-"""ABI version → how many rights over files it knows; each is a bit, without gaps."""
+"""ABI version → number of file rights; each is one bit, without gaps."""
 _TCP_RIGHTS, _TCP_SINCE = 0b11, 4
 _SCOPES, _SCOPES_SINCE = 0b11, 6
-"""Abstract sockets and signals: none to a process outside."""
+"""Scopes: no abstract sockets of, and no signals to, processes outside."""
 
 _kernel = ctypes.CDLL(None, use_errno=True)
 _kernel.syscall.restype = ctypes.c_long
 
 
 def abi() -> int:
-    """The kernel's Landlock version; 0 where it has none."""
+    """The kernel's Landlock version; 0 for none."""
     return max(0, int(_kernel.syscall(_CREATE_RULESET, None, 0, _ASK_VERSION)))
 
 
 def restrict() -> None:
-    """Forbid all. Needs ``no_new_privs``.
+    """Apply the restrictions. Requires ``no_new_privs``.
 
     Raises:
-        OSError: The kernel cannot.
+        OSError: The kernel cannot apply them.
     """
     version = abi()
     rights = [0, 0, 0]
@@ -38,7 +38,7 @@ def restrict() -> None:
         rights[1] = _TCP_RIGHTS
     if version >= _SCOPES_SINCE:
         rights[2] = _SCOPES
-    # An older kernel refuses a longer structure than its own unless the rest is zero, which it is.
+    # Older kernels accept a longer structure if the additional fields are zero.
     attribute = (ctypes.c_uint64 * len(rights))(*rights)
     ruleset = _kernel.syscall(_CREATE_RULESET, ctypes.byref(attribute), ctypes.sizeof(attribute), 0)
     if ruleset < 0:

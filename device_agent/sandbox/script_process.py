@@ -1,8 +1,8 @@
-"""The process of one script, from the fork to its end: speaks to the agent, compiles and runs the script.
+"""The process of one script, from fork to exit: communicates with the agent, compiles and runs the script.
 
-A JSON object per line each way. To the agent: ``ready`` once the jail holds, calls, ``output``, ``progress``, at last
-``ended``; from it: the script, then one answer to each call. Nothing in here is a boundary: a script may change every
-word of it. What holds is around the process, and what the agent believes of the lines that come out.
+Each message is one line of JSON. It sends ``ready`` once confined, then calls, ``output``, ``progress`` and finally
+``ended``; it receives the script, then one response per call. This module is not a security boundary: a script can
+change all of it. The boundaries are the confinement, and the agent's strict parsing of the lines.
 """
 
 import io
@@ -16,10 +16,10 @@ from typing import Any
 
 from device_agent.sandbox import api, confinement
 
-_PIECE = 65_536
-_OUTPUT_KEPT = 8_000
-"""Characters of output that wait to be sent; of more the newest, since the agent keeps fewer."""
-_OUTPUT_EVERY_S = 0.02
+_CHUNK_BYTES = 65_536
+_MAX_OUTPUT = 8_000
+"""Buffered characters of output; the oldest are dropped, since the agent stores fewer."""
+_OUTPUT_INTERVAL_S = 0.02
 
 
 class Link:
@@ -29,88 +29,88 @@ class Link:
         self._rest = b""
 
     def read(self) -> dict[str, Any]:
-        """The next message; the process ends when the agent has gone."""
-        pieces = [self._rest]
-        while b"\n" not in pieces[-1]:
-            piece = os.read(confinement.LINK, _PIECE)
-            if not piece:
+        """The next message. Exits if the agent has ended."""
+        chunks = [self._rest]
+        while b"\n" not in chunks[-1]:
+            chunk = os.read(confinement.LINK, _CHUNK_BYTES)
+            if not chunk:
                 os._exit(1)
-            pieces.append(piece)
-        line, _, self._rest = b"".join(pieces).partition(b"\n")
+            chunks.append(chunk)
+        line, _, self._rest = b"".join(chunks).partition(b"\n")
         message: dict[str, Any] = json.loads(line)
         return message
 
-    def tell(self, kind: str, **arguments: Any) -> None:
-        """One message; a number that is not finite is an error here, in the script's own line."""
+    def send(self, kind: str, **arguments: Any) -> None:
+        """Send one message. A number that is not finite raises here, at the script's own line."""
         line = json.dumps({"kind": kind, **arguments}, allow_nan=False).encode() + b"\n"
         while line:
             line = line[os.write(confinement.LINK, line) :]
 
 
 class Output(io.TextIOBase):
-    """Where a script prints to: the operator's page."""
+    """Standard output of the script, shown in the operator's console."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._waiting = ""
+        self._buffer = ""
         self._sent_s = float("-inf")
 
     def write(self, text: str) -> int:
-        """Send what was printed, whole lines, and not every one by itself."""
-        self._waiting = (self._waiting + text)[-_OUTPUT_KEPT:]
-        if "\n" in text and time.monotonic() - self._sent_s >= _OUTPUT_EVERY_S:
+        """Buffer text; sends complete lines at a limited rate."""
+        self._buffer = (self._buffer + text)[-_MAX_OUTPUT:]
+        if "\n" in text and time.monotonic() - self._sent_s >= _OUTPUT_INTERVAL_S:
             self.flush()
         return len(text)
 
     def flush(self) -> None:
-        """Send what waits."""
-        if self._waiting:
-            text, self._waiting = self._waiting, ""
-            self._link.tell("output", text=text)
+        """Send the buffered text."""
+        if self._buffer:
+            text, self._buffer = self._buffer, ""
+            self._link.send("output", text=text)
             self._sent_s = time.monotonic()
 
     def writable(self) -> bool:
-        """Yes."""
+        """Always true."""
         return True
 
 
 def prepare() -> None:
-    """What a forked process must not share with its brothers: random numbers (``random`` sees to its own)."""
+    """Reseed NumPy's random numbers, which forked processes would share; ``random`` reseeds itself."""
     if (numpy := sys.modules.get("numpy")) is not None:
         numpy.random.seed()
 
 
-def give_up(reason: str) -> None:
-    """Tell the agent that the jail does not hold; the script is then never sent."""
+def report_unfit(reason: str) -> None:
+    """Report that the process could not be confined; the agent then sends no script."""
     with suppress(OSError):
-        Link().tell("unfit", reason=reason[:1000])
+        Link().send("unfit", reason=reason[:1000])
 
 
 def main() -> None:
-    """Run the script that the agent sends, and end this process."""
+    """Run the script that the agent sends, and exit."""
     link = Link()
-    link.tell("ready")
+    link.send("ready")
     task = link.read()
     filename = f"{task['name']}.py"
     output = Output(link)
     sys.stdout = sys.stderr = output
 
-    def ask(kind: str, **arguments: Any) -> Any:
+    def call(kind: str, **arguments: Any) -> Any:
         output.flush()
-        link.tell(kind, **arguments)
-        answer = link.read()
-        if "error" in answer:
-            raise api.RobotError(answer["error"])
-        return answer.get("value")
+        link.send(kind, **arguments)
+        response = link.read()
+        if "error" in response:
+            raise api.RobotError(response["error"])
+        return response.get("value")
 
-    given = {"__name__": "__movement__", **api.names(link.tell, ask, output.flush, task)}
+    namespace = {"__name__": "__movement__", **api.names(link.send, call, output.flush, task)}
     error = ""
     try:
-        exec(compile(task["source"], filename, "exec"), given)  # noqa: S102 (the purpose of this process)  # nosec B102
-    except BaseException as raised:  # noqa: BLE001 (whatever a script raises is an answer, not a crash)
+        exec(compile(task["source"], filename, "exec"), namespace)  # noqa: S102 (the purpose of this process)  # nosec B102
+    except BaseException as raised:  # noqa: BLE001 (an exception of the script is a result, not a crash)
         error = _explain(raised, filename)
     output.flush()
-    link.tell("ended", error=error[:2000])
+    link.send("ended", error=error[:2000])
     os._exit(0)
 
 

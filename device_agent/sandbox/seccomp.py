@@ -1,7 +1,7 @@
-"""seccomp: the few system calls that a script's process has left.
+"""seccomp: the few system calls that a script process may use.
 
-An allow-list without a single call that takes a path, makes a descriptor or a process, or reaches another process.
-``libseccomp`` writes the filter for the machine's own architecture; calls of any other (32-bit, x32) kill.
+The allow-list has no call that takes a path, creates a descriptor or a process, or reaches another process.
+``libseccomp`` generates the filter for the machine's architecture; calls of other architectures (32-bit, x32) kill.
 """
 
 import errno
@@ -10,10 +10,10 @@ from typing import Any, Protocol
 
 
 class Filter(Protocol):
-    """A filter that is built; ``load`` puts it in force for ever."""
+    """A built filter; ``load`` applies it permanently."""
 
     def load(self) -> None:
-        """Lock this process."""
+        """Apply the filter to this process."""
 
 
 _ALLOWED = (
@@ -23,7 +23,7 @@ _ALLOWED = (
     ("brk", "munmap", "mremap", "madvise"),
     # Time and waiting.
     ("clock_gettime", "clock_getres", "gettimeofday", "time", "nanosleep", "clock_nanosleep", "restart_syscall"),
-    # Python's own locks and signal handling. A handler is no way out: what ends a script is SIGKILL.
+    # Python's locks and signal handling. Handlers are harmless: scripts are ended by SIGKILL.
     ("futex", "rt_sigaction", "rt_sigprocmask", "rt_sigreturn", "sigaltstack", "sched_yield"),
     ("getrandom", "getpid", "gettid", "getuid", "geteuid", "getgid", "getegid", "getrusage", "times"),
     ("sched_getaffinity",),
@@ -37,19 +37,19 @@ _DEADLY = (
     ("init_module", "finit_module", "delete_module", "kexec_load", "reboot", "swapon", "iopl", "ioperm"),
     ("modify_ldt", "name_to_handle_at", "open_by_handle_at", "fanotify_init", "quotactl", "acct", "settimeofday"),
 )
-"""No slip of a script's author ends here: whoever tries is killed. All the rest is refused as "not permitted"."""
+"""Calls that no script makes by mistake: they kill the process. All other calls fail with EPERM."""
 _WRITABLE, _EXECUTABLE = 2, 4
 
 
 def build() -> Filter:
-    """The filter for this machine; building takes some milliseconds, so once for all scripts.
+    """Build the filter for this machine. It takes some milliseconds, so it is built once for all scripts.
 
     Raises:
         ImportError: ``pyseccomp`` is not installed.
-        RuntimeError: libseccomp is not.
-        OSError: The filter cannot be made here.
+        RuntimeError: libseccomp is not installed.
+        OSError: The filter cannot be built.
     """
-    import pyseccomp as library  # noqa: PLC0415 (only Linux has it, and not every Linux)
+    import pyseccomp as library  # noqa: PLC0415 (not available on all systems)
 
     filter_ = library.SyscallFilter(defaction=library.ERRNO(errno.EPERM))
     filter_.set_attr(library.Attr.ACT_BADARCH, library.KILL_PROCESS)
@@ -57,7 +57,7 @@ def build() -> Filter:
         for name in (name for group in names for name in group):
             _add(library, filter_, action, name)
     _allow_memory(library, filter_)
-    # Asking for a limit, of this process alone; never setting one.
+    # Reading a limit of this process; never setting one.
     _add(
         library,
         filter_,
@@ -70,21 +70,21 @@ def build() -> Filter:
 
 
 def _allow_memory(library: Any, filter_: Any) -> None:
-    """Memory that can be written can never be run: no code of a script's own making."""
+    """Allow memory that is writable or executable, never both: scripts cannot run machine code of their own."""
     for name in ("mmap", "mmap2"):
-        for lacks in (_WRITABLE, _EXECUTABLE):
-            _add(library, filter_, library.ALLOW, name, library.Arg(2, library.MASKED_EQ, lacks, 0))
+        for forbidden in (_WRITABLE, _EXECUTABLE):
+            _add(library, filter_, library.ALLOW, name, library.Arg(2, library.MASKED_EQ, forbidden, 0))
     _add(library, filter_, library.ALLOW, "mprotect", library.Arg(2, library.MASKED_EQ, _EXECUTABLE, 0))
 
 
 def _add(library: Any, filter_: Any, action: int, name: str, *arguments: Any) -> None:
-    """One rule; a call that this architecture or this libseccomp does not know needs none."""
+    """Add a rule, unless this architecture or libseccomp does not know the call."""
     if library.resolve_syscall(library.system_arch(), name) >= 0:
         filter_.add_rule(action, name, *arguments)
 
 
 def in_force() -> bool:
-    """Whether this process is locked: it tries what no script may."""
+    """Whether the filter is active, tested with a denied call."""
     try:
         os.getpgid(0)
     except PermissionError:

@@ -1,9 +1,8 @@
-"""The warm parent: a clean process that has imported what scripts need, and forks one process for each script.
+"""The zygote: a clean process with the modules of scripts, which forks one process per script.
 
-It is started once, afresh, without environment, descriptors or memory of the agent's, and has one thread. Asked over
-one socket (a JSON object and the script's socket in each message) it answers with the child's process id and a
-descriptor of the process, by which the agent kills it whatever becomes of the number. When the agent goes, the socket
-ends, and with it this process and its children.
+It starts without environment, descriptors or memory of the agent, and has one thread. Requests arrive over one socket
+(a JSON object and the script's socket). The response contains the child's process id and a pidfd, by which the agent
+can kill it without a race. When the agent ends, the socket closes, and the zygote ends with all its children.
 """
 
 import contextlib
@@ -20,30 +19,30 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 from device_agent.sandbox import confinement, importable_modules, landlock, script_process, seccomp
-from device_agent.sandbox.constants import LANDLOCK, LONGEST_MESSAGE, SECCOMP
+from device_agent.sandbox.constants import LANDLOCK, MAX_MESSAGE, SECCOMP
 
-_MOST_ENDINGS = 1000
+_MAX_EXIT_CODES = 1000
 
 
 def main(control: int) -> NoReturn:
-    """Serve until the agent goes."""
+    """Serve requests until the agent ends."""
     os.dup2(control, confinement.LINK)
     os.closerange(confinement.LINK + 1, control + 1)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (confinement.MOST_DESCRIPTORS, confinement.MOST_DESCRIPTORS))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (confinement.MAX_DESCRIPTORS, confinement.MAX_DESCRIPTORS))
     importable_modules.load()
-    time.localtime()  # reads the time zone's file now
-    parent = _Parent(socket.socket(fileno=confinement.LINK))
+    time.localtime()  # loads the time zone file
+    zygote = _Zygote(socket.socket(fileno=confinement.LINK))
     gc.collect()
-    gc.freeze()  # the children share these pages as long as nobody writes to them
-    parent.serve()
+    gc.freeze()  # children share these pages until they are written
+    zygote.serve()
     os._exit(0)
 
 
-class _Parent:
+class _Zygote:
     def __init__(self, control: socket.socket) -> None:
         self._control = control
         self._children: dict[int, int] = {}  # descriptor of the process → process id
-        self._endings: dict[int, int] = {}
+        self._exit_codes: dict[int, int] = {}
         self._waiting = select.poll()
         self._missing: dict[str, str] = {}
         self._filter: seccomp.Filter | None = None
@@ -56,7 +55,7 @@ class _Parent:
             self._probe(SECCOMP, self._filter.load)
 
     def _probe(self, layer: str, apply: Callable[[], None]) -> None:
-        """Put a layer on a process that is for nothing else: what works once will for scripts."""
+        """Apply a layer in a test process. If that succeeds, it succeeds for scripts."""
         pid = os.fork()
         if pid == 0:
             try:
@@ -69,42 +68,42 @@ class _Parent:
             self._missing[layer] = f"the kernel does not have it; Landlock ABI {landlock.abi()}"
 
     def serve(self) -> None:
-        """Introduce, then answer one request after another."""
-        self._introduce()
+        """Report the available layers, then serve requests."""
+        self._report_layers()
         self._waiting.register(self._control, select.POLLIN)
         while True:
             for descriptor, _ in self._waiting.poll():
                 if descriptor == self._control.fileno():
-                    self._answer()
+                    self._serve_request()
                 else:
-                    self._bury(descriptor)
+                    self._reap(descriptor)
 
-    def _introduce(self) -> None:
+    def _report_layers(self) -> None:
         own = os.pidfd_open(os.getpid())
-        hello = {"missing": self._missing, "landlock": landlock.abi(), "python": sys.version.split()[0]}
-        self._reply(hello, own)
+        report = {"missing": self._missing, "landlock": landlock.abi(), "python": sys.version.split()[0]}
+        self._reply(report, own)
         os.close(own)
 
-    def _answer(self) -> None:
-        """Do what one message asks."""
+    def _serve_request(self) -> None:
+        """Serve one request."""
         try:
-            message, descriptors, _, _ = socket.recv_fds(self._control, LONGEST_MESSAGE, 1)
+            message, descriptors, _, _ = socket.recv_fds(self._control, MAX_MESSAGE, 1)
         except OSError:
             message, descriptors = b"", []
         if not message:
             self._end()
         task: dict[str, Any] = json.loads(message)
         if "ended" in task:
-            self._tell_ending(task["ended"])
+            self._reply_exit_code(task["ended"])
             return
         (link,) = descriptors
         self._fork(link, task)
         os.close(link)
 
-    def _tell_ending(self, pid: int) -> None:
-        for child in [child for child, known in self._children.items() if known == pid]:
-            self._bury(child)  # the agent knows it dead; this process had not looked yet
-        self._reply({"status": self._endings.pop(pid, None)})
+    def _reply_exit_code(self, pid: int) -> None:
+        for child in [child for child, child_pid in self._children.items() if child_pid == pid]:
+            self._reap(child)  # the agent has seen its end before this process
+        self._reply({"status": self._exit_codes.pop(pid, None)})
 
     def _fork(self, link: int, task: dict[str, Any]) -> None:
         parent = os.getpid()
@@ -114,19 +113,19 @@ class _Parent:
             self._reply({"error": f"no process can be started for the script ({error.strerror})"})
             return
         if pid == 0:
-            self._become_script(link, parent, task)
+            self._run_script(link, parent, task)
         child = os.pidfd_open(pid)
         self._children[child] = pid
         self._waiting.register(child, select.POLLIN)
         self._reply({"pid": pid}, child)
 
-    def _become_script(self, link: int, parent: int, task: dict[str, Any]) -> NoReturn:
+    def _run_script(self, link: int, parent: int, task: dict[str, Any]) -> NoReturn:
         try:
             script_process.prepare()
             try:
                 confinement.enter(link, parent, task, self._filter)
             except confinement.Unconfined as error:
-                script_process.give_up(str(error))
+                script_process.report_unfit(str(error))
             else:
                 script_process.main()
         except BaseException:  # noqa: BLE001, S110 (a forked child must never return into the parent's loop)
@@ -134,16 +133,16 @@ class _Parent:
         finally:
             os._exit(1)
 
-    def _bury(self, child: int) -> None:
+    def _reap(self, child: int) -> None:
         pid = self._children.pop(child, 0)
         if not pid:
             return
         self._waiting.unregister(child)
         os.close(child)
         _, status = os.waitpid(pid, 0)
-        self._endings[pid] = os.waitstatus_to_exitcode(status)
-        while len(self._endings) > _MOST_ENDINGS:
-            del self._endings[next(iter(self._endings))]
+        self._exit_codes[pid] = os.waitstatus_to_exitcode(status)
+        while len(self._exit_codes) > _MAX_EXIT_CODES:
+            del self._exit_codes[next(iter(self._exit_codes))]
 
     def _reply(self, message: dict[str, Any], *descriptors: int) -> None:
         try:
@@ -152,7 +151,7 @@ class _Parent:
             self._end()
 
     def _end(self) -> NoReturn:
-        """The agent has gone: nothing of it stays."""
+        """Kill all children and exit, because the agent has ended."""
         for child in self._children:
             with contextlib.suppress(OSError):
                 signal.pidfd_send_signal(child, signal.SIGKILL)

@@ -132,7 +132,7 @@ def test_a_movement_is_written_mended_and_saved(browser: Browser, machine: Machi
         assert written(page) == BROKEN
         assert_good_page(page, "movement-wrong")
 
-        # What the jail gives is offered, and the names of this robot type.
+        # What the sandbox gives is offered, and the names of this robot type.
         write(page, "robot.mo")
         offered = page.get_by_test_id("code").locator(".cm-completionLabel")
         page.keyboard.press("Control+Space")

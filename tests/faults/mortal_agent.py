@@ -35,7 +35,7 @@ from device_agent.runtime.storage.outbox_store import OutboxStore
 from device_agent.runtime.telemetry.outbox import Outbox
 from tests.fakes.drivers import FakeDriver, robot_type
 from tests.harness.agent.pinned_keys import pinned_keys_of
-from tests.harness.agent.sandbox import LateJail
+from tests.harness.agent.sandbox import LateSandbox
 
 TARGET_RAD = 1e-4
 """The elbow's target [rad] times this is the number of the command that moved it: so each move says whose it is."""
@@ -129,7 +129,7 @@ class Body:
             journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
             device = Device(
                 name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=FakeDriver(),
-                journal=journal, cloud_clock=self.clock, publish=self._publish, sandbox=LateJail(),
+                journal=journal, cloud_clock=self.clock, publish=self._publish, sandbox=LateSandbox(),
                 keys=pinned_keys_of(key),
                 readings=ReadingCache(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
             )  # fmt: skip

@@ -119,8 +119,8 @@ def scripts(*, allow_unconfined: bool) -> Iterator[Finding]:
     sandbox = SandboxHost()
     try:
         sandbox.start()
-        refusal = sandbox.refusal(stranger=False)
-        untrusted_refusal = sandbox.refusal(stranger=True) if refusal is None else None
+        refusal = sandbox.refusal(untrusted=False)
+        untrusted_refusal = sandbox.refusal(untrusted=True) if refusal is None else None
         missing = sandbox.missing
     finally:
         sandbox.close()

@@ -103,7 +103,7 @@ class ActionExecutor:
         """Check a script, and select the sandbox for it."""
         self._policy.verify(request)
         untrusted = self._policy.is_untrusted(request)
-        refusal = self._sandbox.refusal(stranger=untrusted)
+        refusal = self._sandbox.refusal(untrusted=untrusted)
         if refusal is not None:
             raise Refused("no_sandbox", refusal)
         return ScriptSandbox(self._sandbox, untrusted)

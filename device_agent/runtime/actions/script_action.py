@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import msgspec
 
 from device_agent.ports import script_calls
-from device_agent.ports.sandbox import JailError, Limits, Sandbox, SandboxProcess
+from device_agent.ports.sandbox import Limits, Sandbox, SandboxError, SandboxProcess
 from device_agent.protocol import RunMovement
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.errors import Refused
@@ -102,8 +102,8 @@ class ScriptAction:
             ScriptFailed: The script raised, or its process died.
         """
         try:
-            process = self._sandbox.sandbox.open(self._sandbox.limits, stranger=self._sandbox.untrusted)
-        except JailError as error:
+            process = self._sandbox.sandbox.open(self._sandbox.limits, untrusted=self._sandbox.untrusted)
+        except SandboxError as error:
             raise ScriptFailed(str(error)) from error
         self._process = process
         watcher = threading.Thread(target=self._watch, args=(process,), name="script-watch", daemon=True)

@@ -270,8 +270,8 @@ class DevicePublisher:
             # A manifest without a position leaves the origin.
             position_m=room.position_m if room is not None and any(room.position_m) else None,
             base=None if robot_type.base is None else BaseLimits(**limits_of(robot_type.base)._asdict()),
-            scripts=self.scripts.how,
-            scripts_note=self.scripts.why[:2000],
+            scripts=self.scripts.mode,
+            scripts_note=self.scripts.reason[:2000],
         )
 
     def _topic(self, kind: str, name: str = "") -> str:

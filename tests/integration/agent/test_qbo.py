@@ -1,4 +1,4 @@
-"""A whole device: Qbo's driver in real time, its scripts in the jail, its sonars' readings on the way to both."""
+"""A whole device: Qbo's driver in real time, its scripts in the sandbox, its sonars' readings on the way to both."""
 
 import math
 from collections.abc import Iterator

@@ -1,6 +1,6 @@
-"""What a hostile script tries, each by itself. ``breach(…)`` is called where it worked; the captor looks outside too.
+"""Hostile scripts. Each reports a success with ``breach(…)``; the attack host also checks from outside.
 
-``call(name, …)`` is a system call by its number, past Python and libc; ``worked(result)`` says whether it went well.
+``call(name, …)`` makes a system call by number, past Python and libc; ``worked(result)`` tells whether it succeeded.
 """
 
 from textwrap import dedent
@@ -367,7 +367,7 @@ EXHAUSTION = {
 
 LIES = {
     "moves_without_the_api": """
-        for speed in ('1e9', 'NaN', '1e999', '-1'):
+        for speed in ('0.5', '1e9', 'NaN', '1e999', '-1'):
             os.write(3, b'{"kind": "move_joints", "position_rad": {"elbow": 1}, "speed": %s}\\n' % speed.encode())
         for value in ('NaN', 'Infinity', '1e999', 'null', '"1"', 'true'):
             os.write(3, b'{"kind": "move_joints", "position_rad": {"elbow": %s}, "speed": 0.5}\\n' % value.encode())""",
@@ -386,7 +386,7 @@ LIES = {
     "sends_names_of_other_kinds": """
         for kind in ('ready', 'unfit', '__class__', 'stop', 'reset_stop', 'grant_lease'):
             os.write(3, b'{"kind": "%s"}\\n' % kind.encode())""",
-    "claims_that_the_jail_is_broken": 'os.write(3, b\'{"kind": "unfit", "reason": "x"}\\n\')',
+    "claims_that_the_sandbox_is_broken": 'os.write(3, b\'{"kind": "unfit", "reason": "x"}\\n\')',
     "ends_without_a_word": "os._exit(0)",
     "closes_its_socket": """
         os.close(3)

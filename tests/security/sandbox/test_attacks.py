@@ -1,4 +1,4 @@
-"""Hostile scripts against the real jail, with the agent as an ordinary user and as root: none gets anywhere."""
+"""Hostile scripts against the real sandbox, with the agent as an ordinary user and as root: none gets anywhere."""
 
 import math
 import os
@@ -8,17 +8,17 @@ from typing import Any
 import pytest
 
 from device_agent.sandbox.constants import LANDLOCK, LIMITS, SECCOMP, USER
+from tests.security.sandbox.attack_host import Result
+from tests.security.sandbox.attack_runner import AttackRunner, inside
 from tests.security.sandbox.attacks import ATTACKS
-from tests.security.sandbox.captor import Result
-from tests.security.sandbox.halves import Half, inside
 
-HALVES = ["user", "root"] if os.geteuid() == 0 else ["user"]
+USERS = ["user", "root"] if os.geteuid() == 0 else ["user"]
 ENDLESS = [
     "computes_for_ever", "sleeps_for_ever", "ignores_every_signal", "prints_for_ever", "asks_for_ever",
     "never_reads_its_answers", "says_progress_for_ever", "closes_its_socket",
 ]  # fmt: skip
 FLOODS = ["prints_for_ever", "asks_for_ever", "never_reads_its_answers", "says_progress_for_ever"]
-BY_STRANGERS = [
+BY_UNTRUSTED = [
     "reads_the_agents_key", "reads_the_agents_memory", "asks_whether_a_file_is_there", "writes_to_the_temporary_folder",
     "fills_the_disk", "connects_by_tcp", "connects_to_an_abstract_socket", "makes_a_socket_pair", "forks",
     "starts_a_thread", "becomes_a_shell", "kills_the_agent", "kills_the_warm_parent", "traces_a_process",
@@ -44,31 +44,31 @@ WITHOUT = {
 """The layers that are left, and attacks that then succeed where the agent is an ordinary user: what each is for."""
 
 
-@pytest.fixture(scope="module", params=HALVES)
-def half(request: pytest.FixtureRequest) -> Iterator[Half]:
-    started = Half(root=request.param == "root")
+@pytest.fixture(scope="module", params=USERS)
+def runner(request: pytest.FixtureRequest) -> Iterator[AttackRunner]:
+    started = AttackRunner(root=request.param == "root")
     yield started
     started.close()
 
 
 def require_harmless(result: Result) -> None:
     assert result.breaches == []
-    assert result.tried, result.said
+    assert result.tried, result.message
 
 
 @pytest.mark.parametrize("name", ATTACKS)
-def test_attack(half: Half, name: str) -> None:
-    require_harmless(half.attack(name))
+def test_attack(runner: AttackRunner, name: str) -> None:
+    require_harmless(runner.attack(name))
 
 
-@pytest.mark.parametrize("name", BY_STRANGERS)
-def test_attack_of_an_unknown_owner(half: Half, name: str) -> None:
-    require_harmless(half.attack(name, stranger=True))
+@pytest.mark.parametrize("name", BY_UNTRUSTED)
+def test_attack_of_an_unknown_owner(runner: AttackRunner, name: str) -> None:
+    require_harmless(runner.attack(name, untrusted=True))
 
 
 @pytest.mark.parametrize(("layers", "names"), WITHOUT.values(), ids=list(WITHOUT))
 def test_with_less_than_all_layers_attacks_succeed(layers: tuple[str, ...], names: list[str]) -> None:
-    weak = Half(root=False, layers=layers)
+    weak = AttackRunner(root=False, layers=layers)
     try:
         assert [name for name in names if not weak.attack(name).breaches] == []
     finally:
@@ -76,32 +76,32 @@ def test_with_less_than_all_layers_attacks_succeed(layers: tuple[str, ...], name
 
 
 @pytest.mark.parametrize("name", ENDLESS)
-def test_what_does_not_end_is_ended(half: Half, name: str) -> None:
-    result = half.attacked(name)
+def test_what_does_not_end_is_ended(runner: AttackRunner, name: str) -> None:
+    result = runner.attacked(name)
     assert result.killed_ms > 0
-    assert "ended before the script did" in result.said
+    assert "ended before the script did" in result.message
 
 
 @pytest.mark.parametrize("name", FLOODS)
-def test_a_flood_costs_the_agent_little(half: Half, name: str) -> None:
-    result = half.attacked(name)
+def test_a_flood_costs_the_agent_little(runner: AttackRunner, name: str) -> None:
+    result = runner.attacked(name)
     assert result.cpu_s < 0.7 * result.wall_s
     assert result.messages <= 600 + 600 * result.wall_s
 
 
-def test_what_a_lying_process_says_of_numbers_never_reaches_the_robot_unless_finite(half: Half) -> None:
-    moves = half.attacked("moves_without_the_api").moves
+def test_what_a_lying_process_says_of_numbers_never_reaches_the_robot_unless_finite(runner: AttackRunner) -> None:
+    moves = runner.attacked("moves_without_the_api").moves
     assert moves
     assert all(math.isfinite(number) for move in moves for number in numbers(move))
 
 
-def test_nothing_moves_after_the_end(half: Half) -> None:
-    assert half.attacked("moves_after_it_has_ended").moves == []
+def test_nothing_moves_after_the_end(runner: AttackRunner) -> None:
+    assert runner.attacked("moves_after_it_has_ended").moves == []
 
 
-def test_a_script_finds_nothing_of_the_one_before(half: Half) -> None:
-    half.attack("leaves_a_surprise_for_the_next_script")
-    result = half.run(
+def test_a_script_finds_nothing_of_the_one_before(runner: AttackRunner) -> None:
+    runner.attack("leaves_a_surprise_for_the_next_script")
+    result = runner.run(
         "next",
         inside(
             "import builtins, json, math, os\n"
@@ -110,7 +110,7 @@ def test_a_script_finds_nothing_of_the_one_before(half: Half) -> None:
         ),
     )
     require_harmless(result)
-    assert result.said == ""
+    assert result.message == ""
 
 
 def numbers(value: Any) -> Iterator[float]:

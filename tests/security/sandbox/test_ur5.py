@@ -1,4 +1,4 @@
-"""A script in the jail moves the simulated UR5: by joints, to poses, and not where it may not go."""
+"""A script in the sandbox moves the simulated UR5: by joints, to poses, and not where it may not go."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Every call of a script's API, from the script in its jail to a toy robot that can do all of it."""
+"""Every call of a script's API, from the script in its sandbox to a toy robot that can do all of it."""
 
 import math
 import threading
@@ -361,7 +361,7 @@ def test_where_scripts_cannot_be_locked_in_it_is_said_at_once(
     harness.stop()
 
 
-def test_where_the_jail_holds_desc_says_so(harness: DeviceHarness) -> None:
+def test_desc_reports_the_sandbox(harness: DeviceHarness) -> None:
     described: Description = eventually(lambda: harness.heard(topics.DESC, Description))[0]
     assert (described.scripts, described.scripts_note) == ("sandboxed", "")
 

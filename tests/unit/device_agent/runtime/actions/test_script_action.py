@@ -1,4 +1,4 @@
-"""Movement scripts in the real jail, with a robot that only takes notes."""
+"""Movement scripts in the real sandbox, with a robot that only takes notes."""
 
 import contextlib
 import hashlib
@@ -13,7 +13,7 @@ import pytest
 
 from device_agent import protocol
 from device_agent.ports import script_calls
-from device_agent.ports.sandbox import JailError, Limits, SandboxStatus
+from device_agent.ports.sandbox import Limits, SandboxError, SandboxStatus
 from device_agent.protocol import RunMovement
 from device_agent.runtime.actions import script_action
 from device_agent.runtime.actions.script_action import ScriptAction, ScriptFailed, ScriptSandbox
@@ -57,7 +57,7 @@ class Told:
             self.progress.append(share)
 
 
-class FakeInmate:
+class FakeProcess:
     """A process that says what it is told to."""
 
     def __init__(self, *, dies: bool = True) -> None:
@@ -83,25 +83,25 @@ class FakeInmate:
         self.theirs.close()
 
 
-class FakeJail:
-    def __init__(self, inmate: FakeInmate | None) -> None:
-        self.inmate = inmate
+class FakeSandbox:
+    def __init__(self, process: FakeProcess | None) -> None:
+        self.process = process
 
     def start(self) -> None:
         pass
 
-    def standing(self) -> SandboxStatus:
+    def status(self) -> SandboxStatus:
         return SandboxStatus("sandboxed")
 
-    def refusal(self, *, stranger: bool) -> str | None:
-        del stranger
+    def refusal(self, *, untrusted: bool) -> str | None:
+        del untrusted
         return None
 
-    def open(self, limits: Limits, *, stranger: bool) -> FakeInmate:
-        del limits, stranger
-        if self.inmate is None:
-            raise JailError("no process can be started for the script")
-        return self.inmate
+    def open(self, limits: Limits, *, untrusted: bool) -> FakeProcess:
+        del limits, untrusted
+        if self.process is None:
+            raise SandboxError("no process can be started for the script")
+        return self.process
 
     def close(self) -> None:
         pass
@@ -122,10 +122,10 @@ def run(source: str, parameters: dict[str, Any] | None = None) -> tuple[Notes, T
     return notes, told
 
 
-def run_fake(inmate: FakeInmate) -> Told:
+def run_fake(process: FakeProcess) -> Told:
     told = Told()
     ScriptAction(
-        order(""), Notes(), told, sandbox=ScriptSandbox(FakeJail(inmate), untrusted=False), on_exit=nothing
+        order(""), Notes(), told, sandbox=ScriptSandbox(FakeSandbox(process), untrusted=False), on_exit=nothing
     ).run()
     return told
 
@@ -227,7 +227,7 @@ def test_keyframes_are_played_up_to_each_at_which_something_is_done() -> None:
         ("import os\nos._exit(1)", "ended before the script did"),
         ("import os\nos._exit(7)", "ended before the script did: it ended with 7"),
         ("import ctypes\nctypes.string_at(0)", "ended before the script did: it crashed"),
-        ("import ctypes\nctypes.CDLL(None).ptrace(0, 0, 0, 0)", "did: it tried something that no script may"),
+        ("import ctypes\nctypes.CDLL(None).ptrace(0, 0, 0, 0)", "did: it made a forbidden system call"),
     ],
 )
 def test_a_script_that_fails_says_where(source: str, says: str) -> None:
@@ -299,9 +299,9 @@ def test_a_script_that_dies_in_the_middle_of_a_call_lets_go_of_the_robot_at_once
     class Busy(Notes):
         def execute(self, call: script_calls.Call) -> Any:
             del call
-            inmate = script._process
-            assert inmate is not None
-            inmate.kill()
+            process = script._process
+            assert process is not None
+            process.kill()
             assert let_go.wait(10), "the call went on for as long as it liked"
             raise Refused("ended", "the action ended")
 
@@ -317,11 +317,11 @@ def test_a_script_that_dies_in_the_middle_of_a_call_lets_go_of_the_robot_at_once
 
 
 def test_a_process_that_cannot_be_killed_does_not_hold_up_the_action() -> None:
-    inmate = FakeInmate(dies=False)
-    inmate.say(b'{"kind":"ready"}', b'{"kind":"ended"}')
+    process = FakeProcess(dies=False)
+    process.say(b'{"kind":"ready"}', b'{"kind":"ended"}')
     died = threading.Event()
     ScriptAction(
-        order(""), Notes(), Told(), sandbox=ScriptSandbox(FakeJail(inmate), untrusted=False), on_exit=died.set
+        order(""), Notes(), Told(), sandbox=ScriptSandbox(FakeSandbox(process), untrusted=False), on_exit=died.set
     ).run()
     assert not died.is_set()
 
@@ -339,40 +339,40 @@ def test_a_script_killed_before_it_began_does_not_run() -> None:
 
 def test_without_a_process_it_says_why() -> None:
     script = ScriptAction(
-        order(""), Notes(), Told(), sandbox=ScriptSandbox(FakeJail(None), untrusted=False), on_exit=nothing
+        order(""), Notes(), Told(), sandbox=ScriptSandbox(FakeSandbox(None), untrusted=False), on_exit=nothing
     )
     with pytest.raises(ScriptFailed, match="no process can be started"):
         script.run()
 
 
-def test_a_jail_that_does_not_hold_gets_no_script() -> None:
-    inmate = FakeInmate()
-    inmate.say(b'{"kind": "unfit", "reason": "landlock: no"}')
+def test_a_broken_sandbox_receives_no_script() -> None:
+    process = FakeProcess()
+    process.say(b'{"kind": "unfit", "reason": "landlock: no"}')
     with pytest.raises(ScriptFailed, match="the sandbox is incomplete: landlock: no"):
-        run_fake(inmate)
+        run_fake(process)
 
 
 @pytest.mark.parametrize("first", [b'{"kind": "nonsense"}', b"", b"\xff\xfe"])
 def test_a_process_that_does_not_begin_as_it_should_gets_no_script(first: bytes) -> None:
-    inmate = FakeInmate()
-    inmate.say(first)
+    process = FakeProcess()
+    process.say(first)
     with pytest.raises(ScriptFailed, match="ended before the script did: it crashed"):
-        run_fake(inmate)
+        run_fake(process)
 
 
 def test_a_process_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(script_action, "_READY_TIMEOUT_S", 0.05)
     with pytest.raises(ScriptFailed, match="it stopped following the protocol"):
-        run_fake(FakeInmate(dies=False))
+        run_fake(FakeProcess(dies=False))
 
 
 def test_a_line_without_end_is_the_end() -> None:
-    inmate = FakeInmate()
-    inmate.say(b'{"kind": "ready"}')
-    flood = threading.Thread(target=_flood, args=(inmate.theirs,))
+    process = FakeProcess()
+    process.say(b'{"kind": "ready"}')
+    flood = threading.Thread(target=_flood, args=(process.theirs,))
     flood.start()
     with pytest.raises(ScriptFailed, match="ended before"):
-        run_fake(inmate)
+        run_fake(process)
     flood.join(10)
 
 
@@ -390,16 +390,16 @@ def test_a_line_that_is_too_long_is_the_end() -> None:
 
 
 def test_what_is_said_twice_or_is_no_message_is_answered_with_an_error() -> None:
-    inmate = FakeInmate()
-    inmate.say(
+    process = FakeProcess()
+    process.say(
         b'{"kind": "ready"}',
         b'{"kind": "ready"}',
         b'{"kind": "progress", "share": 7}',
         b'{"kind": "output", "text": "x"}',
         b'{"kind": "ended", "error": ""}',
     )
-    answers = inmate.theirs.dup()
-    told = run_fake(inmate)
+    answers = process.theirs.dup()
+    told = run_fake(process)
     assert (told.printed, told.progress) == ("x", [])
     got = [json.loads(line) for line in answers.makefile("rb").read().splitlines()]
     assert got[0]["name"] == "wave"

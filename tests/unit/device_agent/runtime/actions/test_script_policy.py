@@ -108,7 +108,7 @@ def test_each_device_and_author_counts_by_itself(journal: Journal, device: str, 
 
 
 @pytest.mark.parametrize(
-    ("author", "owner", "stranger"),
+    ("author", "owner", "untrusted"),
     [
         (SHIPPED, OWNER, False),
         (OWNER, OWNER, False),
@@ -119,5 +119,5 @@ def test_each_device_and_author_counts_by_itself(journal: Journal, device: str, 
         (SHIPPED, "", False),
     ],
 )
-def test_who_is_a_stranger(journal: Journal, author: str, owner: str, stranger: bool) -> None:
-    assert trust_of(journal, owner=owner).is_untrusted(movement(author=author)) is stranger
+def test_which_authors_are_untrusted(journal: Journal, author: str, owner: str, untrusted: bool) -> None:
+    assert trust_of(journal, owner=owner).is_untrusted(movement(author=author)) is untrusted

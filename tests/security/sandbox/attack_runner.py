@@ -1,4 +1,4 @@
-"""Starts a captor as root, or as a user that may do nothing."""
+"""Starts an attack host as root, or as a user that may do nothing."""
 
 import json
 import os
@@ -11,31 +11,31 @@ import msgspec
 
 from device_agent.sandbox.constants import LAYERS
 from tests.harness.paths import ROOT
+from tests.security.sandbox.attack_host import Result
 from tests.security.sandbox.attacks import ATTACKS, PRELUDE
-from tests.security.sandbox.captor import Result
 
 REPOSITORY = ROOT
 NOBODY = 65534
 
 
-class Half:
-    """A captor and the pipe to it."""
+class AttackRunner:
+    """an attack host and the pipe to it."""
 
     def __init__(self, *, root: bool, layers: Sequence[str] = LAYERS) -> None:
         self._results: dict[str, Result] = {}
         command = [] if root == (os.geteuid() == 0) else as_nobody()
         self._process = subprocess.Popen(
-            [*command, sys.executable, "-m", "tests.security.sandbox.captor", ",".join(layers)],
+            [*command, sys.executable, "-m", "tests.security.sandbox.attack_host", ",".join(layers)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             cwd=REPOSITORY,
             env={"PATH": os.environ["PATH"], "OPENBLAS_NUM_THREADS": "1"},
         )
 
-    def attack(self, name: str, *, stranger: bool = False) -> Result:
+    def attack(self, name: str, *, untrusted: bool = False) -> Result:
         """One of the attacks."""
-        result = self.run(name, ATTACKS[name], stranger=stranger)
-        if not stranger:
+        result = self.run(name, ATTACKS[name], untrusted=untrusted)
+        if not untrusted:
             self._results[name] = result
         return result
 
@@ -45,11 +45,11 @@ class Half:
             self._results[name] = self.attack(name)
         return self._results[name]
 
-    def run(self, name: str, source: str, *, stranger: bool = False) -> Result:
+    def run(self, name: str, source: str, *, untrusted: bool = False) -> Result:
         """Any script."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps([name, source, stranger]).encode() + b"\n")
+        self._process.stdin.write(json.dumps([name, source, untrusted]).encode() + b"\n")
         self._process.stdin.flush()
         line = self._process.stdout.readline()
         assert line, "the agent's side has ended: the attack reached it"

@@ -1,7 +1,8 @@
-"""The agent's side of an attack: a process with secrets, victims and open doors, which runs hostile scripts.
+"""Agent side of an attack: a process with secrets, victims and open ports, which runs hostile scripts.
 
-``python -m tests.security.sandbox.captor LAYERS``: each line that it reads is a JSON ``[name, source, stranger]``, each
-line that it writes what came of it (``Result``). LAYERS are the jail's, comma-separated; none: no jail at all.
+``python -m tests.security.sandbox.attack_host LAYERS``: each line that it reads is a JSON ``[name, source,
+untrusted]``, each line that it writes what came of it (``Result``). LAYERS are the sandbox's, comma-separated; none:
+no sandbox at all.
 """
 
 import contextlib
@@ -32,29 +33,29 @@ from device_agent.sandbox.host import SandboxHost
 from tests.security.sandbox.attacks import ATTACKS
 
 SECRET = "the-agents-secret-7e1e5c09e"
-PATIENCE_S = 0.2
-"""What has not ended by itself after this time is killed, as Stop does."""
+TIME_LIMIT_S = 0.2
+"""Scripts are killed after this time [s], as by Stop."""
 LIMITS = Limits(cpu_s=2)
 _NAMES = {word.split("'")[1] for source in ATTACKS.values() for word in source.split("call(")[1:] if word[0] == "'"}
 
 
 class Result(msgspec.Struct):
-    """What came of one attack.
+    """Result of one attack.
 
     Attributes:
-        tried: Whether it got as far as trying.
-        breaches: What succeeded, inside as the attack says and outside as it was seen.
-        said: The script's end, as the operator would read it.
-        moves: What reached the robot.
-        killed_ms: From the kill to the dead process [ms]; 0 where it ended by itself.
-        messages: How many of its messages were answered.
-        cpu_s: Processor time of this process meanwhile [s].
-        wall_s: Time meanwhile [s].
+        tried: Whether the attack was executed.
+        breaches: What succeeded, as reported by the attack and as observed from outside.
+        message: The error of the script, as the operator reads it.
+        moves: Calls that reached the robot.
+        killed_ms: Time from the kill to the end of the process [ms]; 0 if it ended by itself.
+        messages: Number of processed messages.
+        cpu_s: Processor time of the host during the attack [s].
+        wall_s: Duration [s].
     """
 
     tried: bool
     breaches: list[str]
-    said: str
+    message: str
     moves: list[Any]
     killed_ms: float
     messages: int
@@ -62,8 +63,8 @@ class Result(msgspec.Struct):
     wall_s: float
 
 
-class Puppet:
-    """A robot that takes notes."""
+class RecordingRobot:
+    """A robot that records its calls."""
 
     joints = ("shoulder", "elbow")
     frames = ("tool",)
@@ -82,10 +83,10 @@ class Puppet:
 
 
 class Surroundings:
-    """What an attack may reach for, and what can be seen of it afterwards."""
+    """Targets of attacks, and observation of their effects."""
 
     def __init__(self) -> None:
-        self.home = Path(tempfile.mkdtemp(prefix="telescope-captor-"))
+        self.home = Path(tempfile.mkdtemp(prefix="telescope-attack-host-"))
         self.outside = Path(tempfile.gettempdir()) / f"telescope-attack-{os.getpid()}"
         self.key = self.home / "identity.pem"
         self.key.write_text(f"PRIVATE KEY {SECRET}", encoding="ascii")
@@ -94,13 +95,13 @@ class Surroundings:
         self.victim = subprocess.Popen(["sleep", "1000"], stdin=subprocess.DEVNULL)
         self.contacts: list[str] = []
         self.port = self._listen(socket.AF_INET, ("127.0.0.1", 0)).getsockname()[1]
-        self.abstract = f"telescope-captor-{os.getpid()}"
+        self.abstract = f"telescope-attack-host-{os.getpid()}"
         self._listen(socket.AF_UNIX, b"\0" + self.abstract.encode())
         self._listen(socket.AF_UNIX, str(self.home / "socket"))
         self._udp = socket.socket(type=socket.SOCK_DGRAM)
         self._udp.bind(("127.0.0.1", self.port))
         self._udp.setblocking(False)
-        self._before = self._look()
+        self._before = self._observe()
 
     def _listen(self, family: int, address: Any) -> socket.socket:
         listener = socket.socket(family)
@@ -136,14 +137,14 @@ class Surroundings:
         }
 
     def breaches(self) -> Iterator[str]:
-        """What was done outside, since this was asked last; mended as far as that goes."""
-        now = self._look()
+        """Effects outside the sandbox since the last call; repairs them."""
+        now = self._observe()
         for name, before in self._before.items():
             if now[name] != before:
                 yield f"{name}: {before} became {now[name]}"
-        self._mend()
+        self._repair()
 
-    def _look(self) -> dict[str, Any]:
+    def _observe(self) -> dict[str, Any]:
         with contextlib.suppress(BlockingIOError):
             self._udp.recv(10)
             self.contacts.append("udp")
@@ -161,7 +162,7 @@ class Surroundings:
             "the machine's name": platform.node(),
         }
 
-    def _mend(self) -> None:
+    def _repair(self) -> None:
         for path in (self.outside, Path("/dev/shm/telescope-attack"), self.home / "new"):
             if path.is_dir() and not path.is_symlink():
                 path.rmdir()
@@ -174,7 +175,7 @@ class Surroundings:
         if self.victim.poll() is not None:
             self.victim = subprocess.Popen(["sleep", "1000"], stdin=subprocess.DEVNULL)
         self.memory.value = SECRET.encode()
-        self._before = self._look()
+        self._before = self._observe()
 
     def clear(self) -> None:
         self.victim.kill()
@@ -182,12 +183,12 @@ class Surroundings:
         shutil.rmtree(self.home, ignore_errors=True)
 
 
-def strays(jail: SandboxHost, session: int) -> int:
-    """What is alive of a script: of its session, or a child of a warm parent of this process but for the ready ones."""
+def strays(sandbox: SandboxHost, session: int) -> int:
+    """What is alive of a script: of its session, or a child of a zygote of this process but for the ready ones."""
     count = 0
-    with jail._lock:  # so that meanwhile none is made ready
-        parents = warm_parents()
-        waiting = {process_of(parent.ready[1]) for parent in (jail._own, jail._walled) if parent.ready}
+    with sandbox._lock:  # so that meanwhile none is made ready
+        parents = zygotes()
+        waiting = {process_of(parent.ready[1]) for parent in (sandbox._own, sandbox._wrapped) if parent.ready}
         for stat in Path("/proc").glob("[0-9]*/stat"):
             with contextlib.suppress(OSError):
                 state, parent, _, its_session, *_ = stat.read_text(encoding="utf-8").rsplit(")", 1)[1].split()
@@ -196,14 +197,14 @@ def strays(jail: SandboxHost, session: int) -> int:
     return count
 
 
-def process_of(inmate: SandboxProcess) -> int:
-    """Its process id in this world; behind bubblewrap it has another."""
-    known = Path(f"/proc/self/fdinfo/{inmate._descriptor}").read_text(encoding="ascii")  # type: ignore[attr-defined]
+def process_of(process: SandboxProcess) -> int:
+    """Process id outside of bubblewrap."""
+    known = Path(f"/proc/self/fdinfo/{process._descriptor}").read_text(encoding="ascii")  # type: ignore[attr-defined]
     return next(int(line.split()[1]) for line in known.splitlines() if line.startswith("Pid:"))
 
 
-def warm_parents() -> list[int]:
-    """Process ids of this process's children that are warm parents, and of theirs behind bubblewrap."""
+def zygotes() -> list[int]:
+    """Process ids of this process's children that are zygotes, and of theirs behind bubblewrap."""
     found: list[int] = []
     seen = [os.getpid()]
     while seen:
@@ -219,11 +220,11 @@ def warm_parents() -> list[int]:
     return found
 
 
-def attack(jail: SandboxHost, around: Surroundings, name: str, source: str, *, stranger: bool) -> Result:
-    """Run one script, kill it in time, and see what it has done."""
-    puppet, printed = Puppet(), [""]
+def attack(sandbox: SandboxHost, around: Surroundings, name: str, source: str, *, untrusted: bool) -> Result:
+    """Run one script, kill it after a time limit, and collect its effects."""
+    robot, printed = RecordingRobot(), [""]
 
-    def told(text: str, share: float | None) -> None:
+    def report(text: str, share: float | None) -> None:
         del share
         if not printed[0]:
             alarm.start()
@@ -231,9 +232,9 @@ def attack(jail: SandboxHost, around: Surroundings, name: str, source: str, *, s
 
     order = RunMovement(
         robot_type="toy", name=name, version=1, sha256="0" * 64, source=source,
-        parameters=around.parameters(warm_parents()),
+        parameters=around.parameters(zygotes()),
     )  # fmt: skip
-    script = ScriptAction(order, puppet, told, sandbox=ScriptSandbox(jail, stranger, LIMITS), on_exit=lambda: None)
+    script = ScriptAction(order, robot, report, sandbox=ScriptSandbox(sandbox, untrusted, LIMITS), on_exit=lambda: None)
     killed_at_s = 0.0
 
     def stop() -> None:
@@ -241,27 +242,27 @@ def attack(jail: SandboxHost, around: Surroundings, name: str, source: str, *, s
         killed_at_s = time.perf_counter()
         script.kill()
 
-    alarm = threading.Timer(PATIENCE_S, stop)  # from its first word on
-    said = ""
+    alarm = threading.Timer(TIME_LIMIT_S, stop)  # starts with its first output
+    message = ""
     cpu_s, wall_s = time.process_time(), time.perf_counter()
     try:
         script.run()
     except ScriptFailed as failed:
-        said = str(failed)
+        message = str(failed)
     ended_s = time.perf_counter()
     alarm.cancel()
     breaches = [line for line in printed[0].splitlines() if line.startswith("BREACH")]
     breaches += around.breaches()
-    inmate = script._process
-    if inmate is not None and strays(jail, inmate.pid):  # type: ignore[attr-defined]
-        breaches.append("something of it is still alive")
+    process = script._process
+    if process is not None and strays(sandbox, process.pid):  # type: ignore[attr-defined]
+        breaches.append("a process of the script is still alive")
     return Result(
         tried=printed[0].startswith("TRIED\n"),
         breaches=breaches,
-        said=said,
-        moves=puppet.moves,
+        message=message,
+        moves=robot.moves,
         killed_ms=(ended_s - killed_at_s) * 1000 if killed_at_s else 0.0,
-        messages=puppet.messages,
+        messages=robot.messages,
         cpu_s=time.process_time() - cpu_s,
         wall_s=ended_s - wall_s,
     )
@@ -269,17 +270,17 @@ def attack(jail: SandboxHost, around: Surroundings, name: str, source: str, *, s
 
 def main(layers: str) -> None:
     os.environ["TELESCOPE_SECRET"] = SECRET
-    jail = SandboxHost(layers=[layer for layer in layers.split(",") if layer])
-    jail.start()
+    sandbox = SandboxHost(layers=[layer for layer in layers.split(",") if layer])
+    sandbox.start()
     around = Surroundings()
     try:
         for line in sys.stdin:
-            name, source, stranger = json.loads(line)
-            result = attack(jail, around, name, source, stranger=stranger)
+            name, source, untrusted = json.loads(line)
+            result = attack(sandbox, around, name, source, untrusted=untrusted)
             sys.stdout.buffer.write(msgspec.json.encode(result) + b"\n")
             sys.stdout.buffer.flush()
     finally:
-        jail.close()
+        sandbox.close()
         around.clear()
 
 
