@@ -1,1 +1,1 @@
-"""Accounts."""
+"""API keys, passwords, OpenID Connect sign-in and sign-out."""

@@ -1,4 +1,4 @@
-"""API keys of an account: made, listed, revoked, and recognised."""
+"""Creates, lists, revokes and authenticates API keys of an account."""
 
 import contextlib
 import logging
@@ -25,21 +25,21 @@ from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import DAY_MS, Retention
 
 MOST: Final = 50
-"""Of one account, more or less: two that are made at once may both be the last."""
+"""Approximate maximum per account: concurrent requests may exceed it by one."""
 SHOWN_MS: Final = 30 * DAY_MS
-"""A key that has run out stays on the list so long: somebody will ask why their program stopped."""
+"""Time that an expired key remains in the list, so that users see why a program stopped."""
 USED_EVERY_MS: Final = 3_600_000
 _KNOWN: Final = 4096
 _INDEX: Final = "api-key:"
 _EXPIRES: Final = "key-expires:"
-_REFUSED: Final = "This API key is unknown, revoked or expired. Make a new one."
+_REFUSED: Final = "This API key is unknown, revoked or expired. Create a new one."
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class ApiKeyRequest:
-    """A key to be made: as ``ApiKey``."""
+    """A request to create a key; fields as in ``ApiKey``."""
 
     label: str
     most: Role
@@ -54,7 +54,7 @@ class _Checked:
 
 
 class ApiKeys:
-    """The keys. A key that this process has seen is looked up again after a few seconds, as sessions are."""
+    """Manages API keys. A process caches a key for a few seconds, as it does for sessions."""
 
     def __init__(
         self,
@@ -79,17 +79,17 @@ class ApiKeys:
         self._known: OrderedDict[str, _Checked] = OrderedDict()
 
     async def make(self, caller: Identity, wanted: ApiKeyRequest) -> tuple[ApiKey, str]:
-        """A new key, and the token that is shown this once.
+        """Create a key; also return its token, which is shown only once.
 
         Raises:
-            Problem: ``too-many-keys``; ``device-unknown``, ``space-unknown``: it would be kept to what there is not.
+            Problem: ``too-many-keys``; ``device-unknown``, ``space-unknown``: a target of ``only`` does not exist.
         """
         if wanted.most is Role.OWNER:
-            raise invalid("A key is operator or viewer: owning is for people, who sign in.")
+            raise invalid("An API key has the role operator or viewer. Only a signed-in person can be owner.")
         if not 1 <= wanted.days <= rules.MOST_DAYS:
-            raise invalid(f"A key is good for 1 to {rules.MOST_DAYS} days; make another one then.")
+            raise invalid(f"An API key is valid for 1 to {rules.MOST_DAYS} days. Create another one after that.")
         if len(await self._ids(caller.account)) >= MOST:
-            detail = f"An account has at most {MOST} API keys. Revoke one that is not used."
+            detail = f"An account has at most {MOST} API keys. Revoke an unused one."
             raise Problem("too-many-keys", 409, "Too many API keys", detail)
         only = tuple(dict.fromkeys(wanted.only))
         await self._require_there(caller, only)
@@ -105,7 +105,7 @@ class ApiKeys:
             created_ms=now_ms,
             expires_ms=now_ms + wanted.days * DAY_MS,
         )
-        # Forgotten on time whatever becomes of this, and on the list before it is any use.
+        # Deletion is scheduled first, and the key is listed before it is valid.
         due_ms = key.expires_ms + SHOWN_MS
         await self._retention.delete_row_at(records.API_KEYS, key.id, API_KEY, due_ms=due_ms)
         await self._retention.delete_row_at(records.MEMBERS, caller.account, _INDEX + key.id, due_ms=due_ms)
@@ -120,13 +120,13 @@ class ApiKeys:
         return key, rules.token(key.id, secret)
 
     async def of(self, account: str) -> tuple[ApiKey, ...]:
-        """Those of an account, the newest first."""
+        """The keys of an account, newest first."""
         rows = [await self._tables.get(records.API_KEYS, key, API_KEY) for key in await self._ids(account)]
         result = [records.read(row, ApiKey) for row in rows if row is not None]
         return tuple(sorted((key for key in result if key.account == account), key=lambda key: -key.created_ms))
 
     async def revoke(self, caller: Identity, key_id: str) -> None:
-        """Refuse a key from now on, here at once and elsewhere within seconds, and end what is done with it.
+        """Revoke a key: immediately in this process, within seconds in others. Ends its sessions and actions.
 
         Raises:
             Problem: ``api-key-unknown``.
@@ -142,7 +142,7 @@ class ApiKeys:
             try:
                 await self._tables.delete(records.API_KEYS, row)
             except Conflict:
-                change.came_to_nothing = True  # it was used just now, or somebody else revokes it too
+                change.came_to_nothing = True  # used or revoked concurrently
         if await self._tables.get(records.API_KEYS, key_id, API_KEY) is not None:
             await self.revoke(caller, key_id)
             return
@@ -154,7 +154,7 @@ class ApiKeys:
                 await self._tables.delete(records.MEMBERS, index)
 
     async def look(self, what: str, note: Row) -> None:
-        """The timer's look at a key whose time may be over: what is done with it ends, as when it is revoked."""
+        """Called by the timer: end the sessions and actions of an expired key."""
         row = await self._tables.get(records.API_KEYS, what.removeprefix(_EXPIRES), API_KEY)
         key = records.read(row, ApiKey) if row else None
         if key is not None and self._clock.now_ms() >= key.expires_ms:
@@ -162,10 +162,10 @@ class ApiKeys:
         await self._reminders.cancel(note)
 
     async def identify(self, token: str) -> Identity:
-        """Who asks by this token.
+        """The identity behind a token.
 
         Raises:
-            Problem: ``unauthorized``: unknown, revoked or expired; the answer is the same.
+            Problem: ``unauthorized``: unknown, revoked or expired; the response is the same.
         """
         parts = rules.split(token)
         if parts is None:
@@ -192,7 +192,7 @@ class ApiKeys:
         return checked
 
     async def _used(self, key: ApiKey, now_ms: int) -> ApiKey:
-        """The key, once it is noted that it was used; at most once an hour, and without insisting."""
+        """The key, after its use was recorded; at most once an hour, best effort."""
         used = replace(key, used_ms=now_ms)
         try:
             row = await self._tables.get(records.API_KEYS, key.id, API_KEY)
@@ -224,5 +224,5 @@ class ApiKeys:
 
 
 def about_key(note: str) -> bool:
-    """Whether a note of the timer is about an API key."""
+    """Whether a reminder is about an API key."""
     return note.startswith(_EXPIRES)

@@ -1,7 +1,7 @@
-"""Signing in elsewhere: a browser is sent to an OpenID Connect provider and comes back with its word on who this is.
+"""Sign-in with OpenID Connect: redirects a browser to the provider and handles the callback.
 
-What has to be remembered in between is one row, found by the hash of ``state`` and deleted by whoever brings it first.
-It belongs to one browser, by a secret in a cookie: whoever is sent here with somebody else's ``code`` is not signed in.
+The state between the two is one row, found by the hash of ``state`` and deleted by the first callback. It is bound to
+one browser by a secret in a cookie, so a callback with the ``code`` of another person does not sign in.
 """
 
 import base64
@@ -25,14 +25,14 @@ from function_app.services.sharing.invitations import Invitations, Known
 from function_app.services.storage import records
 
 BEGUN_S: Final = 10 * 60
-"""So long somebody may take to sign in there."""
+"""Time limit for signing in at the provider [s]."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class OidcRedirect:
-    """Where to send the browser, and what it is to keep until it comes back."""
+    """The URL for the browser, and the secret that it stores until the callback."""
 
     address: str
     secret: str
@@ -40,12 +40,12 @@ class OidcRedirect:
 
 @dataclass(frozen=True, slots=True)
 class OidcCallback:
-    """What a browser comes back with; empty where it brought nothing.
+    """Parameters of the callback; empty if missing.
 
     Attributes:
-        secret: That it was to keep.
-        issuer: Who sent it back; ``None`` where that is not said.
-        error: Why the provider signs nobody in.
+        secret: Secret from the cookie.
+        issuer: ``iss`` parameter; ``None`` if missing.
+        error: Error code of the provider.
     """
 
     state: str = ""
@@ -56,9 +56,9 @@ class OidcCallback:
 
 
 class OidcSignIn:
-    """Signing in at one provider, where there is one.
+    """Signs in through the configured provider.
 
-    An account is made for who brings an invitation; for ``anyone`` else only where that is wanted.
+    Creates an account for a person with an invitation; for others only if ``anyone`` is set.
     """
 
     def __init__(
@@ -85,13 +85,13 @@ class OidcSignIn:
         self._clock = clock
 
     async def begin(self, invitation: str = "") -> OidcRedirect:
-        """Begin in one browser.
+        """Start a sign-in in one browser.
 
         Args:
-            invitation: The secret of one that whoever signs in brings along.
+            invitation: Secret of an invitation, for new accounts.
 
         Raises:
-            Problem: ``oidc-unknown``: there is no provider; ``oidc-unavailable``; ``invitation-unknown``.
+            Problem: ``oidc-unknown``: no provider is configured; ``oidc-unavailable``; ``invitation-unknown``.
         """
         provider = self._known()
         brought = (await self._invitations.look(invitation)).id if invitation else ""
@@ -101,8 +101,10 @@ class OidcSignIn:
             address = await provider.address(state=state, nonce=nonce, challenge=challenge, redirect=self._redirect)
         except OidcError as error:
             _log.error("sign-in elsewhere: %s", error)
-            detail = "The sign-in provider cannot be used now; the log of this server says why."
-            raise Problem("oidc-unavailable", 503, "No sign-in elsewhere now", detail, retry_after_s=30) from error
+            detail = "The sign-in provider is not available. See the server's log."
+            raise Problem(
+                "oidc-unavailable", 503, "The sign-in provider is not available", detail, retry_after_s=30
+            ) from error
         hashed = _hash(state)
         data = {
             "nonce": nonce,
@@ -115,17 +117,17 @@ class OidcSignIn:
         return OidcRedirect(address, secret)
 
     async def finish(self, returned: OidcCallback, whence: SignInOrigin) -> SignedIn:
-        """Sign in whoever comes back. What was begun is used up by it, whatever becomes of it.
+        """Complete a sign-in. The stored state is consumed in any case.
 
         Raises:
-            Problem: ``oidc-unknown``: there is no provider; ``oidc-expired``: this was not begun here, in this
-                browser, just now; ``oidc-rejected``: the provider, or what came from it, does not sign them in;
-                ``oidc-uninvited``: they have no account here, and none is made for them.
+            Problem: ``oidc-unknown``: no provider is configured; ``oidc-expired``: not started in this browser, or too
+                long ago; ``oidc-rejected``: the provider rejected the sign-in, or its response is not valid;
+                ``oidc-uninvited``: there is no account, and none is created.
         """
         provider = self._known()
         begun = await self._begun(returned)
         if returned.error or not returned.code:
-            _log.warning("sign-in elsewhere: the provider says %r", returned.error[:200])
+            _log.warning("OIDC sign-in: the provider reports %r", returned.error[:200])
             raise _refused()
         try:
             subject = await provider.redeem(
@@ -149,7 +151,7 @@ class OidcSignIn:
         return done
 
     async def _invited(self, invitation: str) -> Known | None:
-        """What a newcomer brings along, if it is still good and for nobody else."""
+        """The invitation of a new person, if it is valid and not reserved for another account."""
         if not invitation:
             return None
         try:
@@ -162,21 +164,26 @@ class OidcSignIn:
         try:
             await self._invitations.redeem(caller, existing)
         except Problem as problem:
-            # Somebody else was first with its last use. The account is there all the same, and empty.
-            _log.warning("sign-in elsewhere: the invitation of a new account came to nothing: %s", problem.detail)
+            # Another account took its last use. The account exists but is empty.
+            _log.warning("OIDC sign-in: the invitation of a new account failed: %s", problem.detail)
 
     async def _refuse_stranger(self, subject: Subject, whence: SignInOrigin) -> NoReturn:
         code = "oidc-uninvited"
-        _log.warning("sign-in elsewhere: %r (%r) has no account here and was not invited", subject.name, subject.id)
+        _log.warning("OIDC sign-in: %r (%r) has no account and no invitation", subject.name, subject.id)
         await self._audit_log.record_rejection(
             CLOUD, AccountEvent.SIGN_IN_REFUSED, None, code=code, address=whence.address
         )
-        detail = "Nobody has invited you here. Ask somebody for an invitation, or whoever runs this server."
+        detail = "You have no account here. Ask an owner for an invitation, or contact the operator of this server."
         raise Problem(code, 403, "Not invited", detail)
 
     async def _begun(self, returned: OidcCallback) -> dict[str, str]:
         hashed = _hash(returned.state)
-        expired = Problem("oidc-expired", 403, "Begin again", "This sign-in was not begun here just now. Begin again.")
+        expired = Problem(
+            "oidc-expired",
+            403,
+            "Begin again",
+            "This sign-in was not started in this browser, or has expired. Start again.",
+        )
         row = await self._tables.get(records.SIGN_INS, hashed[0], hashed)
         if row is None or not hmac.compare_digest(str(row.data["secret"]), _hash(returned.secret)):
             raise expired
@@ -190,16 +197,16 @@ class OidcSignIn:
 
     def _known(self) -> OidcProvider:
         if self._provider is None:
-            detail = "Nobody signs in elsewhere at this server. Use a password or a one-time link."
+            detail = "No sign-in provider is configured. Use a password or a one-time link."
             raise Problem("oidc-unknown", 404, "No sign-in elsewhere", detail)
         return self._provider
 
 
 def _refused() -> Problem:
-    detail = "The sign-in provider did not sign you in. Try again, or ask whoever runs this server: its log says why."
+    detail = "The sign-in provider rejected the sign-in. Try again, or contact the operator of this server."
     return Problem("oidc-rejected", 403, "Not signed in", detail)
 
 
 def _hash(text: str) -> str:
-    """Of another kind than a one-time link's: neither is ever taken for the other."""
+    """Domain-separated from one-time links, so that the tokens are not interchangeable."""
     return hashlib.sha256(f"open-id:{text}".encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Local accounts' passwords: signing in by one, setting and changing it, an account made with one."""
+"""Passwords of local accounts: sign-in, change, and registration."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -20,14 +20,14 @@ from function_app.services.storage import records
 
 GUESS: Final = Guess("password", 300_000, "Too many wrong passwords.")
 WRONG_TRIES: Final = 10
-"""By one account in five minutes: in a year a million, of more than 10²⁰ that twelve characters can be. NIST SP 800-63B
-allows a hundred in a row."""
+"""Per account in five minutes: a million per year, of more than 10²⁰ possible passwords of twelve characters. NIST
+SP 800-63B allows 100 consecutive attempts."""
 WRONG_TRIES_FROM: Final = 30
-"""From one address: behind one may be a whole school."""
+"""Per address; an address may serve many people."""
 WRONG: Final = "wrong-password"
 _PASSWORD: Final = "password"  # noqa: S105 (the key of a row)
 _NOBODY: Final = "name:"
-"""A partition of no account: a name that nobody has costs the same reads."""
+"""Partition without an account, so that an unknown name costs the same reads."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class _Stored:
 
 
 class Passwords:
-    """Passwords, of which only hashes are stored."""
+    """Manages passwords, of which only hashes are stored."""
 
     def __init__(
         self,
@@ -61,12 +61,12 @@ class Passwords:
         self._clock = clock
 
     async def sign_in(self, name: str, password: str, whence: SignInOrigin) -> SignedIn:
-        """Sign in by name and password. An unknown name takes as long as a wrong password, and is answered the same.
+        """Sign in with name and password. Unknown names take the same time and give the same response.
 
         Raises:
-            Problem: ``unauthorized``; ``too-many-tries`` for this name, or from this address.
+            Problem: ``unauthorized``; ``too-many-tries`` for this name or address.
         """
-        # The address first: once it has had its tries, names that it makes up leave no rows.
+        # Count by address first: after its limit, invented names create no rows.
         counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(name): WRONG_TRIES}
         try:
             await self._guess_limiter.add_failure(GUESS, counters)
@@ -80,30 +80,30 @@ class Passwords:
         right = await self._hasher.check(stored.hash if stored else None, normalize(password))
         if named is None or row is None or stored is None or not right:
             await self._refused(account, whence, WRONG)
-            raise unauthorized("This name and password do not belong together.")
+            raise unauthorized("Name or password is wrong.")
         await self._guess_limiter.remove_failure(GUESS, counters)
         done = await self._sessions.begin(named, "password", whence)
         again = await self._tables.get(records.ACCOUNTS, account, _PASSWORD)
         if again is None or records.read(again, _Stored) != stored:
-            # It was changed while this was looked at: that ended the sessions that it saw, not this one.
+            # A concurrent change ended the sessions that it found, but not this one.
             await self._sign_out.end(Identity(account, named.name, done.session))
-            raise unauthorized("The password was changed just now. Sign in with the new one.")
+            raise unauthorized("The password was changed. Sign in with the new one.")
         if self._hasher.outdated(stored.hash):
             await self._renew(again, password)
         return done
 
     async def put(self, caller: Identity, password: str, *, old: str | None, whence: SignInOrigin) -> None:
-        """Set or change the password of one's own account; every other session of it ends.
+        """Set or change the caller's password; all other sessions of the account end.
 
-        The old one has to be given, except in the first minutes after a one-time link was redeemed: whoever finds a
-        page that is signed in does not keep the account.
+        Requires the old password, except in the first minutes after a sign-in by one-time link. An open page alone is
+        not sufficient to take over the account.
 
         Raises:
             Problem: ``password-not-managed-here``, ``forbidden``, ``password-weak``, ``too-many-tries``.
         """
         named = await self._sign_in.known(caller.name)
         if named is None or named.id != caller.account:
-            detail = "This account signs in elsewhere and has no password here. Change it there."
+            detail = "This account signs in with a provider and has no password here. Change it at the provider."
             raise Problem("password-not-managed-here", 409, "No password here", detail)
         row = await self._tables.get(records.ACCOUNTS, caller.account, _PASSWORD)
         await self._require_right(caller, row, old, whence)
@@ -118,17 +118,17 @@ class Passwords:
                 else:
                     await self._tables.replace(records.ACCOUNTS, Row(caller.account, _PASSWORD, data, row.etag))
             except Conflict as conflict:
-                detail = "The password was changed in the meantime. Give the new one as the old one."
+                detail = "The password was changed concurrently. Use the new one as the old password."
                 raise forbidden(detail) from conflict
         await self._sign_out.others(caller)
 
     async def register(self, name: str, password: str) -> Account:
-        """A new local account. Its password is there before its name: a name without one would be nobody's.
+        """Create a local account. The password is written before the name, so that no name exists without a password.
 
         Raises:
             Problem: ``name-taken``, ``password-weak``.
         """
-        taken = Problem("name-taken", 409, "The name is taken", "Somebody has this name. Choose another.")
+        taken = Problem("name-taken", 409, "The name is taken", "Another account has this name. Choose another name.")
         if await self._sign_in.known(name) is not None:
             raise taken
         stored = await self._store(password, name)
@@ -148,9 +148,9 @@ class Passwords:
         return await self._sign_in.account(name)
 
     async def _refused(self, account: str, whence: SignInOrigin, code: str) -> None:
-        """Record it with the account that was meant, or, where there is none of that name, with the cloud's own.
+        """Record the failure in the account's audit log, or in the cloud's log for an unknown name.
 
-        Each wrong password, for there are few, so that a name that nobody has takes as long as one that is known.
+        Every failure is recorded, so that unknown and known names take the same time.
         """
         wrong = code == WRONG
         data = {"code": code, "address": whence.address}
@@ -161,14 +161,14 @@ class Passwords:
             session = await self._sessions.get(caller)
             if session is None or not session.fresh_by_link(self._clock.now_ms()):
                 raise forbidden(
-                    "Give the old password, or sign in by a new one-time link and set it within 10 minutes."
+                    "Enter the old password, or use a new one-time link and set the password within 10 minutes."
                 )
             return
         counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(caller.name): WRONG_TRIES}
         await self._guess_limiter.add_failure(GUESS, counters)
         if not await self._hasher.check(records.read(row, _Stored).hash if row else None, normalize(old)):
             await self._refused(caller.account, whence, WRONG)
-            raise forbidden("The old password is not right.")
+            raise forbidden("The old password is wrong.")
         await self._guess_limiter.remove_failure(GUESS, counters)
 
     async def _store(self, password: str, name: str) -> _Stored:
@@ -179,11 +179,11 @@ class Passwords:
         return _Stored(await self._hasher.make(password), self._clock.now_ms())
 
     async def _renew(self, row: Row, password: str) -> None:
-        """The same password under today's parameters."""
+        """Store the password with current parameters."""
         created = _Stored(await self._hasher.make(normalize(password)), self._clock.now_ms())
         try:
             await self._tables.replace(
                 records.ACCOUNTS, Row(row.partition, row.key, records.to_data(created), row.etag)
             )
         except Conflict:
-            return  # it was changed just now
+            return  # changed concurrently

@@ -1,4 +1,4 @@
-"""Signing out: tokens, broker connections and control end, at once and for good."""
+"""Ends sign-in sessions with their tokens, broker connections and leases."""
 
 import asyncio
 import logging
@@ -18,13 +18,13 @@ from function_app.services.identity.authenticator import Authenticator, principa
 from function_app.services.identity.sessions import Sessions
 
 AT_ONCE = 16
-"""DeviceAccess that are looked at in the same moment."""
+"""Devices that are processed concurrently."""
 
 _log = logging.getLogger(__name__)
 
 
 class SignOut:
-    """Ends sign-in sessions, and whatever else acts for an account by a principal of its own."""
+    """Ends sign-in sessions, and API keys, which have a session of their own."""
 
     def __init__(
         self,
@@ -48,10 +48,10 @@ class SignOut:
         self._clock = clock
 
     async def end(self, caller: Identity) -> None:
-        """End the session of ``caller``: its tokens first, then its connections to the broker, then its leases.
+        """End the session of ``caller``: first its tokens, then its broker connections, then its leases.
 
-        Whoever is not reached changes nothing: what the broker was told ends by itself within a quarter of an hour, a
-        lease when it runs out, and until then nobody can renew either.
+        If broker or device are not reachable, credentials expire within 15 minutes and leases at their expiry time.
+        Neither can be renewed.
         """
         async with self._audit_log.change(caller.account, AccountEvent.SIGNED_OUT, caller) as change:
             await change.noted()
@@ -74,7 +74,7 @@ class SignOut:
         await self.end(Identity(caller.account, caller.name, session))
 
     async def others(self, caller: Identity) -> int:
-        """End every session of the account but the one that asks; how many there were."""
+        """End all other sessions of the account; return their number."""
         others = [
             existing.id for existing in await self._sessions.list(caller.account) if existing.id != caller.session
         ]

@@ -1,1 +1,1 @@
-"""Actions."""
+"""Starts, queues, follows, cancels and stops actions."""

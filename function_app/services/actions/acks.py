@@ -1,4 +1,4 @@
-"""What devices report about actions, written down by whoever hears it first: the waiting call or the ingest."""
+"""Applies acks to actions, from the waiting request or from the ingest, whichever receives them first."""
 
 import asyncio
 from collections.abc import AsyncIterator, Iterable
@@ -26,7 +26,7 @@ _SLOWEST_READ_S = 0.5
 
 
 class ActionAcks:
-    """Applies acks to actions, and waits for them."""
+    """Applies acks and waits for them."""
 
     def __init__(
         self,
@@ -44,16 +44,16 @@ class ActionAcks:
         self._clock = clock
 
     async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
-        """Apply one ack that came by ``topic``. Doubled and late ones change nothing.
+        """Apply an ack received on ``topic``. Duplicate and late acks have no effect.
 
         Raises:
-            ProtocolError: Not an ack, or to a command of another device.
-            Problem: ``busy``: not stored, to be delivered again.
+            ProtocolError: Not an ack, or for a command of another device.
+            Problem: ``busy``: not stored; deliver it again.
         """
         ack = codec.decode(payload, Ack)
         parts = split_command(ack.id)
         if parts is None or parts[0] != device_id(topic.agent, topic.device):
-            raise ProtocolError(f"'{ack.id}' is no command to {topic.agent}/{topic.device}")
+            raise ProtocolError(f"'{ack.id}' is not a command of {topic.agent}/{topic.device}")
         heard = report(ack, self._clock.now_ms())
         stored = await self._queues.change(ack.id, lambda action: apply_report(action, heard))
         if stored is None:
@@ -61,11 +61,11 @@ class ActionAcks:
         elif ack.status.terminal:
             await self._latencies.measured(stored.action, by)
         if by != "mqtt":
-            # Last: until then the agent is given the command again, and answers again.
+            # Last, so that after a failure the agent gets the command again and repeats the ack.
             await self._mailbox.withdraw(topic.agent, ack.id)
 
     async def _answer(self, agent: str, ack: Ack) -> None:
-        """To a command that is no action: somebody may wait for it."""
+        """Store the ack of a command that is not an action: its sender may wait for it."""
         if ack.status.terminal or ack.status in CONFIRMING:
             await self._mailbox.store_answer(agent, ack)
 
@@ -78,16 +78,16 @@ class ActionAcks:
         wait_ms: int,
         published: bool = False,
     ) -> Action:
-        """Wait until the action has reached ``wanted``, has ended, or ``wait_ms`` are over.
+        """Wait until the action reaches ``wanted`` or ends, at most ``wait_ms``.
 
-        Acks are collected and written once, before this returns: who asks next reads what this answered.
+        Acks are collected and written once before this returns, so later requests read at least this state.
 
         Args:
-            stored: The action as it was read or written last.
-            acks: Its acks from before it was published, or ``None``: then the row is read again and again.
-            wanted: The status to wait for.
-            wait_ms: At most this long.
-            published: Whether to note that the command was published.
+            stored: The action as last read or written.
+            acks: Its acks since before it was published; ``None``: poll the row.
+            wanted: Status to wait for.
+            wait_ms: Time limit.
+            published: Whether to record that the command was published.
         """
         end = asyncio.get_running_loop().time() + wait_ms / 1000
         published_ms = self._clock.now_ms() if published else None
@@ -102,7 +102,7 @@ class ActionAcks:
     async def _receive(
         self, stored: StoredAction, acks: AsyncIterator[Ack], wanted: Status, end: float, reports: list[AckReport]
     ) -> tuple[StoredAction, Action]:
-        """Collect acks, and read the row now and then: the ingest may have stored acks from before this call."""
+        """Collect acks, and read the row at intervals: the ingest may have stored earlier acks."""
         loop = asyncio.get_running_loop()
         action = stored.action
         pause_s = _FIRST_READ_S
@@ -147,7 +147,7 @@ def _applied(action: Action, reports: Iterable[AckReport]) -> Action:
 
 
 def report(ack: Ack, heard_ms: int) -> AckReport:
-    """An ack as the domain reads it. A result that could not be read again is left out; the end still counts."""
+    """The ack as a domain report. A result that is nested too deeply is dropped."""
     return AckReport(
         status=Status(ack.status.value),
         sequence=ack.sequence,

@@ -1,4 +1,4 @@
-"""Actions in their rows: the one place that changes them, so that slot, lease and place in the queue end with them."""
+"""Stores actions. Ending an action also frees its slot, lease and place in the queue."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ _END = "action;"
 
 @dataclass(frozen=True, slots=True)
 class StoredAction:
-    """An action and the row it was read from; ``waited_for``: its end, just now, was what others wait for."""
+    """An action and its row; ``waited_for``: the change ended it and other actions are queued."""
 
     action: Action
     row: Row
@@ -29,7 +29,7 @@ class StoredAction:
 
 
 def row_location(action: str) -> tuple[str, str] | None:
-    """Partition and key of an action, or ``None`` for what is no action's id."""
+    """Partition and key of an action, or ``None`` for an invalid id."""
     parts = split_command(action)
     return None if parts is None else (parts[0], f"{_PREFIX}{parts[1]}")
 
@@ -55,7 +55,7 @@ class ActionStore:
         return None if row is None else StoredAction(records.read(row, Action), row)
 
     async def list(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Action], str | None]:
-        """Actions of a device since it was paired, newest first.
+        """Actions of a device since its pairing, newest first.
 
         Raises:
             Problem: ``cursor-invalid``.
@@ -65,25 +65,27 @@ class ActionStore:
                 records.CONTROL, device.id, first=_PREFIX, last=_END, limit=limit, cursor=cursor
             )
         except ValueError as error:
-            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+            raise invalid(
+                "The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid"
+            ) from error
         actions = [action for row in page.rows if (action := records.read(row, Action)).pairing == device.pairing]
-        # Older than the pairing is all that follows a stranger's action: the list ends there.
+        # All further rows are older than the pairing, so the list ends here.
         return actions, page.cursor if len(actions) == len(page.rows) else None
 
     async def change(
         self, action: str, change: Callable[[Action], Action], *, existing: StoredAction | None = None
     ) -> StoredAction | None:
-        """Change an action by ETag; when that ends it, free its slot, lease and place in the queue in the same batch.
+        """Change an action by ETag. If it ends, its slot, lease and place in the queue are freed in the same batch.
 
-        Who ends one that others wait for must see to the queue then: ``Queues.change`` does both.
+        If the result is ``waited_for``, the caller must advance the queue; ``ActionQueues.change`` does both.
 
         Args:
-            action: Its id.
-            change: Gives the same object when there is nothing to change; may be called several times.
-            existing: What the caller read or wrote last: saves a read, and costs one more when it is stale.
+            action: Action id.
+            change: Returns the same object for no change; may be called several times.
+            existing: The action as last read; saves one read, and costs one if outdated.
 
         Returns:
-            The action as it is now, or ``None`` when there is none.
+            The action after the change, or ``None`` if it does not exist.
 
         Raises:
             Problem: ``busy``.
@@ -112,7 +114,7 @@ class ActionStore:
 
 
 def _freed(action: Action, control: ControlRows) -> list[Write]:
-    """Give back what the action held: the slot, its place in the queue, and the lease that was given for it alone."""
+    """The writes that free slot, queue place and own lease of an action."""
     writes = []
     queue = control.queue.without(action.id)
     if control.action == action.id:

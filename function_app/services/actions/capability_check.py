@@ -1,4 +1,4 @@
-"""What a device says that it can do, asked before an action takes its slot."""
+"""Checks a task against the device's description before the action occupies the slot."""
 
 from collections.abc import Iterable, Sequence
 
@@ -22,13 +22,13 @@ from function_app.services.storage import records
 
 
 async def check(tables: Tables, device: Device, asked: Task) -> None:
-    """Refuse what the device's own description lacks. Who has not described itself, or not its actions, decides itself.
+    """Reject a task that the description excludes. Without a description the device decides.
 
     Raises:
-        Problem: ``unable``; the text lists what there is.
+        Problem: ``unable``; the text lists the available names.
     """
     if isinstance(asked, MoveJoints):
-        return  # asked of nearly every device, many times: it costs no reading of the description
+        return  # frequent and supported by nearly every device: skip reading the description
     row = await tables.get(records.DESCRIPTIONS, device.agent, device.name)
     if row is None:
         return
@@ -42,7 +42,7 @@ async def check(tables: Tables, device: Device, asked: Task) -> None:
 
 
 def _named(asked: Task, described: Description) -> Iterable[tuple[str, str, Sequence[str]]]:
-    """What is asked for by name: the word for it, the name, and the names there are."""
+    """The names in a task: their kind, the name, and the available names."""
     match asked:
         case Express(name=name):
             yield "expression", name, described.expressions

@@ -1,4 +1,4 @@
-"""From an action's row to its device: the same row always makes the same command, so the device drops doubles."""
+"""Publishes the command of a stored action. Equal rows give equal commands, so the device drops duplicates."""
 
 import msgspec
 
@@ -19,11 +19,11 @@ from function_app.services.storage import records
 
 
 class MovementUnavailable(Exception):  # noqa: N818 (an outcome that callers expect)
-    """The script that the action pinned is gone."""
+    """The pinned script does not exist any more."""
 
 
 class PermissionEnded(Exception):  # noqa: N818 (an outcome that callers expect)
-    """Who started the action may not have it carried out any more; ``why`` is one of ``DROPPED``."""
+    """The account may no longer run the action; ``why`` is a key of ``DROPPED``."""
 
     def __init__(self, why: str) -> None:
         super().__init__(DROPPED[why][1])
@@ -31,7 +31,7 @@ class PermissionEnded(Exception):  # noqa: N818 (an outcome that callers expect)
 
 
 class ActionDispatcher:
-    """Publishes written actions: those whose turn has come, and those that nobody has answered."""
+    """Publishes stored actions: those that leave the queue, and unanswered ones."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class ActionDispatcher:
         self._clock = clock
 
     async def device(self, action: Action) -> Device | None:
-        """The action's device, as long as its agent is still of the pairing that the action belongs to."""
+        """The action's device, if the agent still has the same pairing."""
         parts = split_device((split_command(action.id) or ("", ""))[0])
         row = await self._tables.get(records.AGENTS, parts[0], "agent") if parts else None
         if row is None:
@@ -62,11 +62,11 @@ class ActionDispatcher:
         return next((device for device in devices_of(agent) if device.id == action.device), None)
 
     async def current_permissions(self, action: Action) -> tuple[Identity, Device]:
-        """For whom the action would begin now, and on what. It is looked up anew: it may have waited for long.
+        """The current identity and device of an action, read again because it may have been queued for long.
 
         Raises:
-            NoLonger: The device is another's or gone, the share has ended or is a viewer's, its key has ended or
-                may do less, or whoever started it has signed out.
+            PermissionEnded: The device has another owner or is gone, share or key have ended or changed, or the account
+                has signed out.
         """
         caller = await self._devices.current_identity(Identity(action.account, action.who, action.session))
         device, _ = (None, None) if caller is None else await self._devices.find_with_link(caller, action.device)
@@ -79,12 +79,12 @@ class ActionDispatcher:
         raise PermissionEnded(SIGNED_OUT if caller is None else UNSHARED)
 
     async def send(self, stored: StoredAction, device: Device) -> None:
-        """Publish it and write that down.
+        """Publish the command and record it.
 
         Raises:
-            MovementChanged: There is nothing to send.
-            NoLonger: Who started it may not have it carried out any more.
-            BusUnavailable: The broker did not confirm it.
+            MovementUnavailable: The script is not available.
+            PermissionEnded: The account may no longer run the action.
+            BusUnavailable: The broker did not confirm the command.
         """
         action = stored.action
         await self.current_permissions(action)
@@ -96,7 +96,7 @@ class ActionDispatcher:
         if action.request["kind"] != "run_movement":
             task: Task = msgspec.convert(action.request, Task)
             return task
-        # On a shared device its owner's movements run: whoever wrote it is whose store it is in.
+        # A shared device runs its owner's movements, so the author's store contains the script.
         owner = Identity(action.pinned["author"] or action.account, action.who, "")
         source = await self._movements.pinned_source(owner, action.request["name"], action.pinned)
         if source is None:

@@ -1,4 +1,4 @@
-"""Looking at actions, waiting for them, cancelling them."""
+"""Reads, awaits and cancels actions."""
 
 from dataclasses import replace
 from typing import Literal
@@ -21,7 +21,7 @@ from function_app.services.messaging.delivery import Delivery
 
 
 class Actions:
-    """Actions that exist."""
+    """Existing actions."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class Actions:
         return await self._action_store.list(await self._devices.get(caller, device), cursor=cursor, limit=limit)
 
     async def get(self, caller: Identity, action: str, *, wait_ms: int, wait_for: Literal["started", "done"]) -> Action:
-        """One action, as soon as it has come as far as ``wait_for``, or as it is after ``wait_ms``.
+        """One action, after it reached ``wait_for`` or after ``wait_ms``.
 
         Raises:
             Problem: ``action-unknown``.
@@ -66,7 +66,7 @@ class Actions:
             return await self._acks.follow(stored, acks, wanted=Status(wait_for), wait_ms=wait_ms)
 
     async def cancel(self, caller: Identity, action: str) -> Action:
-        """Ask the device to end an action; one that waits for its turn ends at once. It has ended when it says so.
+        """Request the device to cancel an action. A queued action ends at once; others end when the device reports it.
 
         Raises:
             Problem: ``action-unknown``, ``forbidden``, ``broker-unavailable``, ``busy``.
@@ -109,7 +109,7 @@ class Actions:
 
 def _cancelling(action: Action, cancel_id: str, now_ms: int) -> Action:
     if action.status is Status.QUEUED:
-        return end(action, Status.CANCELLED, "cancelled", "Cancelled before its turn came.", now_ms)
+        return end(action, Status.CANCELLED, "cancelled", "Cancelled while it was queued.", now_ms)
     if action.status.terminal or action.cancel_id:
         return action
     return replace(action, cancel_id=cancel_id)

@@ -1,8 +1,8 @@
-"""The queue of each device: whoever sees the slot free gives the next action its turn.
+"""Advances the queue of each device when its slot is free.
 
-At its turn an action starts or ends; it never waits for a lease. One that was started with an epoch needs that lease
-still to be held; one that was started without gets a lease for its own time, and fails when somebody holds another one:
-to begin in the very moment in which that person lets go would surprise whoever stands there.
+The next action starts or ends; it does not wait for a lease. An action with an epoch requires that its lease is still
+held. An action without an epoch gets its own lease, and fails if another session holds one: motion must not start at
+the moment a person releases control.
 """
 
 import logging
@@ -29,15 +29,15 @@ from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 
 LOOK_MS: Final = 2_000
-"""A queue is looked at so often, for the case that whoever freed the slot was killed before it saw to the queue."""
+"""Interval of queue checks, in case a process was killed after it freed the slot."""
 _NOTE: Final = "queue:"
-TIMEOUT: Final = "Its turn did not come in the time it was given. Start it again, with a larger queue_ms if need be."
+TIMEOUT: Final = "It was queued longer than queue_ms. Start it again, with a larger queue_ms if needed."
 
 _log = logging.getLogger(__name__)
 
 
 class ActionQueues:
-    """Sees to the queues of devices."""
+    """Processes the queues of devices."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class ActionQueues:
     async def change(
         self, action: str, change: Callable[[Action], Action], *, existing: StoredAction | None = None
     ) -> StoredAction | None:
-        """As ``ActionStore.change``; then, where others waited for its end, see to them.
+        """Change an action as ``ActionStore.change`` does, then advance the queue if other actions waited for it.
 
         Raises:
             Problem: ``busy``.
@@ -72,18 +72,18 @@ class ActionQueues:
         return stored
 
     async def schedule_check(self, device: str) -> None:
-        """Have the timer look at a device's queue; to be noted before something is put into it."""
+        """Schedule a check of a device's queue; call it before the queue is written."""
         await self._reminders.schedule(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
 
     async def check(self, device: str) -> bool:
-        """See to a device's queue; whether there is one."""
+        """Advance a device's queue; return whether it is not empty."""
         await self.advance(device)
         return not (await read_control_rows(self._tables, device)).queue.empty
 
     async def advance(self, device: str) -> None:
-        """End those that lost their place, and give the next one its turn if the slot is free.
+        """End dropped actions, and start the next one if the slot is free.
 
-        What fails is logged: the timer looks again.
+        Errors are logged; the timer retries.
         """
         try:
             while await records.retry(lambda: self._step(device)):
@@ -92,7 +92,7 @@ class ActionQueues:
             _log.warning("queue of %s: %s", device, error)
 
     async def cancel_all(self, device: str, why: str) -> None:
-        """Drop all that wait, and end them.
+        """Cancel all queued actions.
 
         Raises:
             Problem: ``busy``.
@@ -100,7 +100,7 @@ class ActionQueues:
         await self._lose(device, lambda queue: queue.with_all_cancelled(why))
 
     async def cancel(self, device: str, actions: Collection[str], why: str) -> None:
-        """Drop some of those that wait, and end them.
+        """Cancel some of the queued actions.
 
         Raises:
             Problem: ``busy``.
@@ -118,7 +118,7 @@ class ActionQueues:
         await self.advance(device)
 
     async def positions(self, actions: list[Action]) -> dict[str, int]:
-        """The places of those that wait: 1 is the next. All of one device."""
+        """Queue positions of the queued actions of one device; 1 is next."""
         waiting = [action for action in actions if action.status is Status.QUEUED]
         if not waiting:
             return {}
@@ -126,7 +126,7 @@ class ActionQueues:
         return {action.id: place for action in waiting if (place := queue.position(action.id)) is not None}
 
     async def _step(self, device: str) -> bool:
-        """One change of the queue; whether there may be another."""
+        """Apply one change to the queue; return whether to continue."""
         control = await read_control_rows(self._tables, device)
         queue = control.queue
         if queue.dropped:
@@ -143,7 +143,7 @@ class ActionQueues:
         return await self._turn(stored)
 
     async def _drop(self, device: str, action: str, status: Status, code: str, message: str) -> None:
-        """End one that lost its place. That takes it out of the queue; what has no row or an end already goes so."""
+        """End a dropped action, which also removes it from the queue."""
         now_ms = self._clock.now_ms()
         await self._action_store.change(action, lambda existing: _if_queued(existing, status, code, message, now_ms))
         control = await read_control_rows(self._tables, device)
@@ -151,7 +151,7 @@ class ActionQueues:
             await self._tables.batch(records.CONTROL, [control.write_queue(device, control.queue.without(action))])
 
     async def _turn(self, stored: StoredAction) -> bool:
-        """Give the first one its turn, or its end where it cannot start."""
+        """Start the first action, or end it if it cannot start."""
         action = stored.action
         now_ms = self._clock.now_ms()
         if now_ms >= action.queued_until_ms:
@@ -169,9 +169,7 @@ class ActionQueues:
             if problem.code not in {"lease-held", "lease-lost"}:
                 raise
             await self._refuse(stored, Status.FAILED, problem.code, problem.detail)
-            await self._control_events.record_rejection(
-                device, caller, "start an action that waited for its turn", problem
-            )
+            await self._control_events.record_rejection(device, caller, "start a queued action", problem)
             return True
         if started is None:
             return False
@@ -184,9 +182,9 @@ class ActionQueues:
         return False
 
     async def _start(self, stored: StoredAction, device: Device, caller: Identity) -> StoredAction | None:
-        """Slot, lease, place in the queue and the action itself in one batch; ``None``: somebody was faster.
+        """Write slot, lease, queue and action in one batch; ``None``: another process was first.
 
-        The note is written before, as for every action that the timer has to see to.
+        The reminder is written before, as for every action.
         """
         await self._reminders.schedule(stored.action.id, self._clock.now_ms() + RETRY_MS)
         control = await read_control(self._tables, device)
@@ -223,7 +221,7 @@ class ActionQueues:
 
 
 def device_of_reminder(note: str) -> str | None:
-    """The device whose queue a note of the timer is about; ``None`` where it is about something else."""
+    """The device of a queue reminder; ``None`` for other reminders."""
     return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None
 
 
@@ -237,7 +235,7 @@ def action_lease(
     now_ms: int,
     pairing: str,
 ) -> Lease:
-    """The lease that an action runs under: the caller's own, or one for the time of this action.
+    """The lease of an action: the caller's own, or one for the duration of the action.
 
     Raises:
         Problem: ``lease-lost``, ``lease-held``.
@@ -250,5 +248,5 @@ def action_lease(
 
 
 def _if_queued(action: Action, status: Status, code: str, message: str, now_ms: int) -> Action:
-    """Its end, unless it got its turn meanwhile."""
+    """The ended action, unless it has left the queue."""
     return end(action, status, code, message, now_ms) if action.status is Status.QUEUED else action

@@ -1,6 +1,6 @@
-"""Stop, and its reset. Needs no lease: whoever may operate may stop, one device or all of them at once.
+"""Stop and its reset, for one device or many. Stop requires the role operator but no lease.
 
-It is called Stop, not emergency stop: that is a function of the machine itself, hard-wired. See the architecture page.
+It is not an emergency stop, which is a hard-wired function of the machine.
 """
 
 import asyncio
@@ -31,14 +31,14 @@ from function_app.services.messaging.delivery import Delivery
 REPEAT_S: Final = 0.2
 CONFIRM_MS: Final = 1_000
 AT_ONCE: Final = 16
-"""DeviceAccess whose tables are written at the same moment when many are stopped. The Stop itself waits for nothing."""
+"""Devices whose tables are written concurrently. The Stop itself is not limited."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class StopResult:
-    """What became of Stop on one device: whether it has confirmed, or why it could not be told."""
+    """The result of Stop on one device: confirmed by the device, or the error."""
 
     device: str
     confirmed: bool
@@ -68,13 +68,12 @@ class StopDevices:
         self._control_events = control_events
 
     async def stop(self, caller: Identity, device_id: str, reason: str) -> bool:
-        """Latch Stop; whether the device has confirmed it within a second.
+        """Latch Stop; return whether the device confirmed it within one second.
 
-        Goes out twice: as the plain ``stop`` message, repeated until confirmed, and as a signed command. Actions that
-        wait for their turn end: nothing may start by itself after the reset.
+        Publishes the plain ``stop`` message until confirmed, and a signed command. Cancels all queued actions.
 
         Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: neither way was open.
+            Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: both ways failed.
         """
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "stop"):
@@ -82,12 +81,12 @@ class StopDevices:
         return await self._stop(caller, device, reason, nullcontext())
 
     async def stop_many(self, caller: Identity, reason: str, *, space: str | None = None) -> list[StopResult]:
-        """Stop every device that ``caller`` may operate, of one space or of all; each has its own answer.
+        """Stop all devices that ``caller`` may operate, in one space or in all, each with its own result.
 
-        All are told at the same time, and each for itself is waited for: one that is dead costs the others nothing.
+        All devices are stopped concurrently, so an unreachable device does not delay the others.
 
         Raises:
-            Problem: ``space-unknown``; ``forbidden``: there is nothing in this space that they may stop.
+            Problem: ``space-unknown``; ``forbidden``: the caller may not stop any device in this space.
         """
         view = None if space is None else await self._spaces.get(caller, space)
         gate = asyncio.Semaphore(AT_ONCE)
@@ -97,15 +96,15 @@ class StopDevices:
             if device.role.may_operate and space in {None, device.space}
         ]
         if view is not None and not devices and not view.role.may_operate:
-            # "All have confirmed" would be true, and read as if something had stopped.
-            raise forbidden("You may watch this space, not stop it. Ask its owner, or whoever stands there.")
+            # An empty result would read as if all devices had been stopped.
+            raise forbidden("You may watch this space, but not stop it. Ask its owner or a person on site.")
         return await asyncio.gather(*(self._one(caller, device, reason, gate) for device in devices))
 
     async def reset(self, caller: Identity, device_id: str) -> bool:
-        """Release the latch; whether the device has confirmed it within a second. Nothing resumes.
+        """Reset the latch; return whether the device confirmed it within one second. No motion resumes.
 
-        The reset takes the next epoch for itself: whatever was ordered before it, and is still on its way, is from an
-        older lease then, and a reset that arrives late or twice is older than the latch that it finds.
+        The reset takes the next epoch. Commands from before the reset are fenced by their older epoch, and a late or
+        repeated reset is older than a newer latch.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``busy``, ``broker-unavailable``.
@@ -130,11 +129,11 @@ class StopDevices:
     async def _stop(
         self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
     ) -> bool:
-        """Tell it in both ways; the tables are written beside that, not before."""
+        """Send Stop in both ways; write the tables concurrently, not before."""
         plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), caller=caller.name, reason=reason)))
         writing: asyncio.Task[None] | None = None
         try:
-            await asyncio.sleep(0)  # it goes before anything is signed or written
+            await asyncio.sleep(0)  # publish first, before signing and writing
             writing = asyncio.create_task(self._write(caller, device, reason, gate))
             order = StopDevice(reason=reason)
             return await self._command_sender.send_confirmed(
@@ -160,7 +159,7 @@ class StopDevices:
     async def _write(
         self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
     ) -> None:
-        """Empty the queue, and tell of it. The device is stopped without either: what waits fails at its turn."""
+        """Cancel the queue and record the event. The device stops without either, and queued actions would fail."""
         message = f"{caller.name} stopped it: {reason}" if reason else f"{caller.name} stopped it."
         try:
             async with gate:

@@ -1,1 +1,1 @@
-"""Audit."""
+"""Writes, reads and verifies the audit log."""

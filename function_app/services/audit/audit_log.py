@@ -1,13 +1,12 @@
-"""What was done in an account, in a chain that shows when anything of it was changed or taken away.
+"""The audit log: a tamper-evident chain of records for each account.
 
-One chain for each account that owns something, in a partition of ``Audit``. A record and the new head are one batch by
-the head's ETag: writers in any number of processes take turns and never fork it. What one process has to write at the
-same time goes into one batch.
+A record and the new head are one batch with the head's ETag, so concurrent writers never fork the chain. Writes of one
+process at the same time share a batch.
 
-Nothing that was acknowledged is missing. A change of the account is noted (``wait:<id>``) before the write that decides
-it, and its record takes the note away in its own batch; what a killed process leaves, the timer records as ``unknown``.
-What ``services/audit.py`` tells comes at least once, from rows written in the batch of the change, and is recorded once
-by its id (``once:<day>:<id>``). Heads are noted elsewhere, against a chain that is cut off: see the architecture page.
+No acknowledged change is missing. A pending change is stored (``wait:<id>``) before its deciding write, and its record
+deletes this row in the same batch. The timer records changes of killed processes as ``unknown``. Events of
+``ControlEvents`` arrive at least once and are recorded once by id (``once:<day>:<id>``). Heads are also stored in the
+blob store, to detect truncation.
 """
 
 import asyncio
@@ -37,14 +36,14 @@ from function_app.services.storage.retention import DAY_MS, Retention
 from function_app.services.storage.write_batcher import WriteBatcher
 
 LOOK_MS: Final = 15_000
-"""The timer looks at a chain so long after something was noted for it, at most twice that."""
+"""Delay after which the timer checks a chain for pending changes."""
 ABANDON_MS: Final = 60_000
-"""A change that was noted and not finished for so long was cut off."""
+"""Age at which a pending change counts as interrupted."""
 ANCHOR_MS: Final = 3_600_000
 KEEP_IDS_MS: Final = 30 * DAY_MS
-"""What is told comes again within seconds; a store may be away for longer."""
+"""Time that ids of recorded events are stored. Retries arrive within seconds, or after an outage of the store."""
 QUIET_MS: Final = 10_000
-"""The same refusal of the same person is recorded once in this time by a process: who tries on fills no table."""
+"""A process records the same rejection of the same person at most once in this time."""
 _AT_ONCE: Final = 30
 """Records in one batch: two rows each, and the head."""
 _TRIES: Final = 60
@@ -65,7 +64,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(eq=False, slots=True)
 class _Job:
-    """One record to be: with the note that it takes away, or the id by which it is recorded once."""
+    """A record to write, with the pending row to delete, or the id that makes it unique."""
 
     fields: dict[str, Any]
     waiting: Row | None = None
@@ -73,7 +72,7 @@ class _Job:
 
 
 class Change:
-    """A change that is being made. Until it ends, ``data`` may be added to, and it may have ``came_to_nothing``."""
+    """A change in progress. Its ``data`` may be extended until it ends; ``came_to_nothing`` discards it."""
 
     def __init__(self, chain: "AuditLog", owner: str, fields: Entry) -> None:
         self.data: dict[str, Any] = dict(fields.data)
@@ -84,16 +83,16 @@ class Change:
         self.came_to_nothing = False
 
     async def noted(self) -> None:
-        """Note it: to be called before the write that decides, any number of times.
+        """Store the pending change before the deciding write; may be called several times.
 
         Raises:
-            StoreError: The tables cannot be used; the change must not be made.
+            StoreError: The tables are not available; the change must not be made.
         """
         if self._row is None:
             self._row = await self._chain.open(self._owner, replace(self._entry, outcome="unknown"))
 
     async def end(self, outcome: Outcome) -> None:
-        """Say how it ended, where it was noted."""
+        """Record the outcome, if the change was stored as pending."""
         if self._row is not None and self.came_to_nothing and outcome == "done":
             await self._chain.drop(self._row)
         elif self._row is not None:
@@ -102,7 +101,7 @@ class Change:
 
 
 class AuditLog:
-    """Writes the chains. Reading and verifying them: ``services/audit_trail.py``."""
+    """Writes the chains. ``AuditReader`` reads and verifies them."""
 
     def __init__(
         self,
@@ -128,20 +127,20 @@ class AuditLog:
     async def change(
         self, owner: str, what: str, caller: Identity | None, *, on: str = "", **data: Any
     ) -> AsyncGenerator[Change]:
-        """Record a change that is made within: call ``noted`` before the write that decides it.
+        """Record a change: call ``noted`` in the context before the deciding write.
 
-        Where that is never called nothing was changed and nothing is recorded. A ``Problem`` after it is recorded as
-        refused; after any other end the timer records that nobody knows.
+        Without a call of ``noted`` nothing is recorded. A ``Problem`` after it is recorded as refused; after other
+        exceptions the timer records ``unknown``.
 
         Args:
-            owner: The account in whose chain it stands; ``CLOUD``: none.
-            what: A ``Deed`` or ``Fact``.
-            caller: Who does it.
-            on: To what.
-            data: What else is to be known. No secrets.
+            owner: Account of the chain, or ``CLOUD``.
+            what: An ``AccountEvent`` or ``Fact``.
+            caller: Who makes the change.
+            on: Target.
+            data: Further data without secrets.
 
         Raises:
-            StoreError: It could not be noted.
+            StoreError: The pending change cannot be stored.
         """
         at_ms = self._clock.now_ms()
         change = Change(self, owner, rules.entry(what, caller, entry_id=new_id(), at_ms=at_ms, on=on, **data))
@@ -156,10 +155,10 @@ class AuditLog:
     async def record(
         self, owner: str, what: str, caller: Identity | None, *, on: str = "", outcome: Outcome = "done", **data: Any
     ) -> None:
-        """Record what has happened.
+        """Record an event.
 
         Raises:
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         at_ms = self._clock.now_ms()
         await self.append(
@@ -169,10 +168,7 @@ class AuditLog:
     async def record_rejection(
         self, owner: str, what: str, caller: Identity | None, *, on: str = "", each: bool = False, **data: Any
     ) -> None:
-        """Record a refusal; the same again and again once in a while only, but where it says ``each``.
-
-        Whatever goes wrong with that: the refusal stands.
-        """
+        """Record a rejection, best effort. Repetitions are recorded once per interval, unless ``each`` is set."""
         now_ms = self._clock.now_ms()
         code = str(data.get("code", ""))
         key = (owner, what, on, code, caller.session if caller else str(data.get("address", "")))
@@ -186,10 +182,10 @@ class AuditLog:
             _log.warning("audit of a refusal: %s", error)
 
     async def append(self, owner: str, entry: Entry) -> None:
-        """Record ``entry``; where others are in the way for long, the timer does.
+        """Record ``entry``; under contention the timer writes it.
 
         Raises:
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         try:
             await self._batches.add(owner, [_Job(entry.fields())])
@@ -197,17 +193,17 @@ class AuditLog:
             await self.open(owner, entry)
 
     async def append_all(self, owner: str, entries: Sequence[Entry]) -> None:
-        """Record what comes at least once, each once by its id.
+        """Record events that may arrive more than once; each is recorded once by id.
 
         Raises:
-            Problem: ``busy``: tell it again.
-            StoreError: The tables cannot be used.
+            Problem: ``busy``: retry.
+            StoreError: The tables are not available.
         """
         jobs = []
         for each in entries:
             day = each.at_ms // DAY_MS
             if self._new(_ONCE, owner, day):
-                # Before the first id of a day, so that nothing stays that nobody forgets.
+                # Schedule the deletion before the first id of a day is written.
                 span = (f"{_ONCE}{day:08d}:", f"{_ONCE}{day:08d};")
                 due_ms = (self._clock.now_ms() // DAY_MS + 1) * DAY_MS + KEEP_IDS_MS
                 await self._retention.delete_rows_at(records.AUDIT, owner, first=span[0], last=span[1], due_ms=due_ms)
@@ -215,11 +211,11 @@ class AuditLog:
         await self._batches.add(owner, jobs)
 
     async def check(self, owner: str) -> None:
-        """The timer's look: record what was left.
+        """Called by the timer: record interrupted changes.
 
         Raises:
             Problem: ``busy``.
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         page = await self._tables.query(records.AUDIT, owner, first=_WAIT, last="wait;", limit=1000)
         now_ms = self._clock.now_ms()
@@ -230,10 +226,10 @@ class AuditLog:
             await self._reminders.schedule(f"{_NOTE}{owner}", now_ms + LOOK_MS)
 
     async def anchor(self, owner: str) -> None:
-        """Note the head where whoever can write the tables need not be able to.
+        """Store the head in the blob store, which other credentials may protect.
 
         Raises:
-            StoreError: The stores cannot be used.
+            StoreError: The stores are not available.
         """
         row = await self._tables.get(records.AUDIT, owner, _HEAD)
         if row is None:
@@ -243,10 +239,10 @@ class AuditLog:
         _log.info("audit head of %s: %s:%s", owner, row.data["seq"], row.data["hash"])
 
     async def open(self, owner: str, entry: Entry) -> Row:
-        """Note an entry for the timer.
+        """Store a pending entry for the timer.
 
         Raises:
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         now_ms = self._clock.now_ms()
         due_ms = (now_ms // LOOK_MS + 2) * LOOK_MS
@@ -255,7 +251,7 @@ class AuditLog:
         return await self._tables.create(records.AUDIT, Row(owner, f"{_WAIT}{entry.id}", entry.fields()))
 
     async def close(self, owner: str, entry: Entry, waiting: Row) -> None:
-        """Record how a noted change ended. It is made: whatever goes wrong here, the timer records it."""
+        """Record the outcome of a pending change, best effort: otherwise the timer records it."""
         fields = entry.fields()
         try:
             await self._batches.add(owner, [_Job(fields, waiting=waiting)])
@@ -265,12 +261,12 @@ class AuditLog:
                 await self._tables.replace(records.AUDIT, replace(waiting, data=fields))
 
     async def drop(self, waiting: Row) -> None:
-        """Take a note back: there is nothing to be recorded."""
+        """Delete a pending entry without a record."""
         with contextlib.suppress(Conflict):
             await self._tables.delete(records.AUDIT, waiting)
 
     def _new(self, what: str, owner: str, when: int) -> bool:
-        """Whether this process has not noted it yet."""
+        """Whether this process has not scheduled a check yet."""
         key = (what, owner, when)
         created = key not in self._noted
         self._noted[key] = None
@@ -297,14 +293,14 @@ class AuditLog:
         raise busy_store()
 
     async def _are_there(self, owner: str, seq: int, jobs: list[_Job]) -> bool:
-        """Whether a batch that was refused is there: its answer was lost, and what was sent again came too late."""
+        """Whether a rejected batch was in fact written: its response was lost, and the retry failed."""
         first, last = record_key(seq), record_key(seq + len(jobs))
         page = await self._tables.query(records.AUDIT, owner, first=first, last=last, limit=len(jobs))
         there = [(row.data.get("id"), row.data.get("outcome")) for row in page.rows]
         return there == [(job.fields["id"], job.fields["outcome"]) for job in jobs]
 
     async def _open(self, owner: str, jobs: list[_Job]) -> list[_Job]:
-        """Those that nobody else has recorded meanwhile."""
+        """The jobs that no other process has recorded."""
         still = []
         for job in jobs:
             if job.once and await self._tables.get(records.AUDIT, owner, job.once) is not None:
@@ -313,14 +309,14 @@ class AuditLog:
                 row = await self._tables.get(records.AUDIT, owner, job.waiting.key)
                 if row is None and job.fields["outcome"] == "unknown":
                     continue
-                # Where the timer has said that nobody knows, the end is told as well.
+                # The outcome is also recorded if the timer has recorded ``unknown`` before.
                 still.append(replace(job, waiting=row))
             else:
                 still.append(job)
         return still
 
     async def _try(self, owner: str, row: Row | None, head: Head, jobs: list[_Job]) -> None:
-        """Write ``jobs`` behind ``head``, which is what ``row`` says, all or none."""
+        """Append ``jobs`` behind ``head``, which ``row`` contains, all or none."""
         writes = []
         for job in jobs:
             head, record = rules.append(head, job.fields)
@@ -341,7 +337,7 @@ class AuditLog:
         return {"seq": head.seq, "hash": head.hash, "at_ms": at_ms, "key": name, "signature": signature}
 
     async def _note_anchor(self, owner: str) -> None:
-        """Before the write, so that no head stays without one; and list the chain."""
+        """Schedule the anchor of the head before the write, and list the chain."""
         due_ms = (self._clock.now_ms() // ANCHOR_MS + 1) * ANCHOR_MS
         if self._new(_ANCHOR, owner, due_ms):
             with contextlib.suppress(Conflict):
@@ -350,27 +346,27 @@ class AuditLog:
 
 
 def record_key(seq: int) -> str:
-    """The key of a record: they sort by number."""
+    """Row key of a record; keys sort by number."""
     return f"{_RECORD}{seq:012d}"
 
 
 def anchors(owner: str) -> str:
-    """The blob to which the heads of a chain are noted, a line each."""
+    """The blob with the heads of a chain, one per line."""
     return f"audit/{owner}/heads.jsonl"
 
 
 def chain_of(note: str) -> str | None:
-    """The chain that a note of the timer is about; ``None`` where it is about something else."""
+    """The chain that a reminder is about; ``None`` for other reminders."""
     return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None
 
 
 def anchor_of(note: str) -> str | None:
-    """The chain whose head is to be noted elsewhere; ``None`` where a note of the timer is about something else."""
+    """The chain whose head must be anchored; ``None`` for other reminders."""
     return note.removeprefix(_ANCHOR) if note.startswith(_ANCHOR) else None
 
 
 def _each_once(jobs: list[_Job]) -> list[_Job]:
-    """Without what two have brought at the same time: the later one of the same note knows more."""
+    """The jobs without duplicates; the later job with the same id has more data."""
     named = {job.once or (job.waiting.key if job.waiting else str(id(job))): job for job in jobs}
     return list(named.values())
 

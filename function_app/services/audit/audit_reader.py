@@ -1,4 +1,4 @@
-"""Reading the chains of ``services/audit_chain.py``, and seeing whether they are whole."""
+"""Reads and verifies the chains of the audit log."""
 
 import base64
 import binascii
@@ -20,7 +20,7 @@ from function_app.services.audit.audit_log import anchors, record_key
 from function_app.services.storage import records
 
 LOOKED_AT: Final = 1_000
-"""Records that are looked at for one page: where a filter lets few through, the page is short and has a cursor."""
+"""Records read for one page. With a selective filter a page may be short and still have a cursor."""
 _CURSOR_DIGITS: Final = 12
 _LETTERS: Final = "abcdefghijklmnopqrstuvwxyz234567"
 _MOST_NAMES: Final = 1_000
@@ -28,7 +28,7 @@ _MOST_NAMES: Final = 1_000
 
 @dataclass(frozen=True, slots=True)
 class AuditFilter:
-    """Which records: of one kind, on one thing, of a stretch of time (``None``: all of them)."""
+    """A filter by kind, target and time span (``None``: all)."""
 
     what: str | None = None
     on: str | None = None
@@ -36,7 +36,7 @@ class AuditFilter:
     until_ms: int | None = None
 
     def fits(self, record: Mapping[str, Any]) -> bool:
-        """Whether ``record`` is one of them."""
+        """Whether ``record`` matches."""
         at_ms = record["at_ms"]
         return (
             self.what in {None, record["what"]}
@@ -48,7 +48,7 @@ class AuditFilter:
 
 @dataclass(frozen=True, slots=True)
 class VerificationResult:
-    """How it stands with one chain. ``broken`` names the first place that is not as it was written; empty: whole."""
+    """The state of one chain. ``broken`` describes the first invalid place; empty: the chain is intact."""
 
     chain: str
     head: Head
@@ -57,7 +57,7 @@ class VerificationResult:
 
 
 class AuditReader:
-    """Reads and verifies."""
+    """Reads and verifies the audit log."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs, keys: SigningKeys) -> None:
         self._tables = tables
@@ -67,20 +67,20 @@ class AuditReader:
     async def read(
         self, caller: Identity, wanted: AuditFilter, *, cursor: str | None, limit: int
     ) -> tuple[list[Mapping[str, Any]], str | None]:
-        """Records of one's own chain, newest first, and where the next page begins.
+        """Records of the caller's chain, newest first, and the cursor of the next page.
 
         Raises:
-            Problem: ``cursor-invalid``; ``forbidden``: with a key that is kept to less than everything of its account.
+            Problem: ``cursor-invalid``; ``forbidden``: the API key is limited to some devices or roles.
         """
         if not caller.most.may_own or caller.only:
-            raise forbidden("Only who may do everything in this account reads who did what in it.")
+            raise forbidden("Reading the audit log requires full access to the account. Sign in, or use another key.")
         if cursor is None:
             row = await self._tables.get(records.AUDIT, caller.account, "head")
             newest = 0 if row is None else int(row.data["seq"])
         elif cursor.isdecimal() and cursor.isascii() and len(cursor) <= _CURSOR_DIGITS:
             newest = int(cursor)
         else:
-            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
+            raise invalid("The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid")
         oldest = max(FIRST, newest - LOOKED_AT + 1)
         result: list[Mapping[str, Any]] = []
         while newest >= oldest and len(result) < limit:
@@ -99,23 +99,23 @@ class AuditReader:
         return result, str(newest) if newest >= FIRST else None
 
     async def chains(self) -> list[str]:
-        """All chains there are, or that there have been: those noted elsewhere are named though their rows be gone."""
+        """All chains, including deleted ones whose heads are still in the blob store."""
         named = {row.key async for row in self._rows("chains", "", None)}
         for prefix in ("cloud", *_LETTERS):
             named |= {name.split("/")[1] for name in await self._noted(f"audit/{prefix}")}
         return sorted(named)
 
     async def head(self, chain: str) -> Head | None:
-        """Where a chain ends; ``None`` where there is none."""
+        """The end of a chain; ``None`` if it does not exist."""
         row = await self._tables.get(records.AUDIT, chain, "head")
         return None if row is None else Head(int(row.data["seq"]), str(row.data["hash"]))
 
     async def verify(self, chain: str, *, expected: tuple[Head, ...] = ()) -> VerificationResult:
-        """Whether a chain is as it was written.
+        """Verify a chain.
 
         Args:
-            chain: An account's id, or ``cloud``.
-            expected: Heads that somebody has noted elsewhere; those in the blob store are looked at in any case.
+            chain: Account id, or ``cloud``.
+            expected: Externally stored heads; those in the blob store are always checked.
         """
         noted = await self._anchors(chain)
         if isinstance(noted, str):
@@ -133,7 +133,7 @@ class AuditReader:
         return VerificationResult(chain, reached, broken, len(noted))
 
     async def _walk(self, chain: str, end: Row | None, existing: Mapping[int, Head]) -> tuple[Head, str]:
-        """How far the chain is whole up to ``end``, and what is wrong behind that."""
+        """Verify the chain up to ``end``; return the last valid head and the first error."""
         head = rules.genesis(chain)
         last = _number(end.data.get("seq")) if end is not None else 0
         async for row in self._rows(chain, record_key(0), record_key(last + 1)):
@@ -148,7 +148,7 @@ class AuditReader:
         return head, ""
 
     async def _end(self, chain: str, end: Row | None, reached: Head) -> str:
-        """What is wrong with the chain's own word for where it ends."""
+        """Verify the stored head of the chain."""
         after = await self._tables.query(
             records.AUDIT, chain, first=record_key(reached.seq + 1), last="record;", limit=1
         )

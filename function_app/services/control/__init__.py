@@ -1,1 +1,1 @@
-"""Control."""
+"""Leases, control requests, control events and broker credentials."""

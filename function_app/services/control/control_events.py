@@ -1,9 +1,8 @@
-"""What happened to the control over devices, into their events and their owner's chain: nothing of it is lost.
+"""Records control events in the device's events and in the owner's audit log, without loss.
 
-A change of a lease and the events that tell of it are one batch in the device's partition of ``Control``. From there
-they are moved to ``EventLog`` and to the chain (``services/audit_chain.py``) at once, by whoever makes the next change,
-or by the timer, which looks at a device with a lease by a note in ``Reminders``. A refusal changes nothing, so it is
-written straight there.
+A lease change and its events are one batch in the device's partition of ``Control``. From there they are moved to
+``EventLog`` and ``AuditLog``: at once, by the next change, or by the timer. Rejections change no lease and are recorded
+directly.
 """
 
 import contextlib
@@ -28,11 +27,11 @@ from function_app.services.storage.reminders import Reminders
 from function_app.services.telemetry.event_log import EventLog
 
 LOOK_MS: Final = 15_000
-"""The timer looks at a device so long after a change of its lease, in case that whoever made it was killed."""
+"""Delay after which the timer checks a changed lease, in case the process was killed."""
 QUIET_MS: Final = 10_000
-"""The same refusal of the same person is told once in this time by a process: who tries without end fills no table."""
+"""A process records the same rejection of the same person at most once in this time."""
 REFUSALS: Final = frozenset({"forbidden", "lease-held", "lease-lost", "lease-requested"})
-"""What is told: refused for want of a role or of the lease."""
+"""Recorded rejections: a missing role or lease."""
 _NOTE: Final = "lease:"
 _EVENT: Final = "event:"
 _KNOWN: Final = 1_000
@@ -41,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 
 class ControlEvents:
-    """Tells what happened."""
+    """Records control events."""
 
     def __init__(
         self, *, tables: Tables, events: EventLog, audit_log: AuditLog, reminders: Reminders, clock: Clock
@@ -54,15 +53,15 @@ class ControlEvents:
         self._refused: dict[tuple[str, ...], int] = {}
 
     async def schedule_check(self, device: str) -> None:
-        """Have the timer look at a device's lease; to be noted before the write that changes it."""
+        """Schedule a check of a device's lease; call it before the lease is written."""
         await self._reminders.schedule(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
 
     async def check(self, device: str) -> None:
-        """The timer's look: tell what was left, and what time has brought; note when to look again.
+        """Called by the timer: publish stored events and timeouts, and schedule the next check.
 
         Raises:
             Problem: ``busy``.
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         await self._move(device)
         lease = (await read_control_rows(self._tables, device)).lease
@@ -83,9 +82,9 @@ class ControlEvents:
                 await self._reminders.schedule(f"{_NOTE}{device}", min(ends))
 
     async def publish(self, device: str) -> None:
-        """Move what is noted to the device's events and its owner's chain. Safe to repeat and to be done by several.
+        """Move stored events to the device's events and the audit log. Idempotent, safe to run concurrently.
 
-        Where others are in the way for long, the timer does it.
+        Under contention the timer does it later.
         """
         try:
             await self._move(device)
@@ -102,11 +101,11 @@ class ControlEvents:
         for owner, entries in owned.items():
             await self._audit_log.append_all(owner, entries)
         for row in page.rows:
-            with contextlib.suppress(Conflict):  # another process tells the same
+            with contextlib.suppress(Conflict):  # another process publishes the same event
                 await self._tables.delete(records.CONTROL, row)
 
     async def _owner(self, device: str, pairing: str) -> str:
-        """Whose chain the events of a pairing stand in: told before the agent's row forgets whose it was."""
+        """The account whose audit log contains the events of a pairing."""
         agent_id, _ = split_device(device) or (device, "")
         row = await self._tables.get(records.AGENTS, agent_id, "agent")
         agent = None if row is None else records.read(row, Agent)
@@ -127,10 +126,10 @@ class ControlEvents:
         outcome: Outcome = "done",
         data: Mapping[str, Any],
     ) -> None:
-        """Tell of something that is no change of a lease.
+        """Record an event that does not change a lease.
 
         Raises:
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         event = await self.add_event(device, fact, message, severity=severity, data=data)
         await self._audit_log.append(device.owner or CLOUD, _entry(device.id, event, _by(caller), outcome))
@@ -138,10 +137,10 @@ class ControlEvents:
     async def add_event(
         self, device: Device, fact: Fact, message: str, *, severity: Any = "info", data: Mapping[str, Any]
     ) -> Mapping[str, Any]:
-        """The same among the device's events alone, for what has its record otherwise; gives the event.
+        """Add an event to the device's events only, for facts with an audit record of their own; return the event.
 
         Raises:
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         event = ControlEvent(new_id(), fact, self._clock.now_ms(), message, dict(data), severity).event(device.name)
         await self._events.add(device.id, device.pairing, event)
@@ -149,12 +148,12 @@ class ControlEvents:
 
     @contextlib.asynccontextmanager
     async def recording_rejections(self, device: Device, caller: Identity, what: str) -> AsyncGenerator[None]:
-        """Tell of it when what is done within is refused for want of a role or of the lease.
+        """Record a rejection inside the context that is due to a missing role or lease.
 
         Args:
-            device: On which device.
-            caller: Who is refused.
-            what: What they wanted, to go on after "was refused to".
+            device: Target device.
+            caller: The rejected caller.
+            what: The operation, as in "was refused to …".
         """
         try:
             yield
@@ -164,7 +163,7 @@ class ControlEvents:
             raise
 
     async def record_rejection(self, device: Device, caller: Identity, what: str, problem: Problem) -> None:
-        """Tell of a refusal. Whatever goes wrong with that: the refusal stands."""
+        """Record a rejection, best effort."""
         now_ms = self._clock.now_ms()
         key = (device.id, caller.session, what, problem.code)
         if now_ms - self._refused.get(key, -QUIET_MS) < QUIET_MS:
@@ -191,14 +190,14 @@ class ControlEvents:
 def event_writes(
     device: str, pairing: str, facts: Iterable[ControlEvent], *, owner: str = "", caller: Identity | None = None
 ) -> list[Write]:
-    """The writes that note facts, to go into one batch with the change that they tell of.
+    """The writes that store events, for the batch of the change that causes them.
 
     Args:
-        device: On which device.
-        pairing: In which.
-        facts: What happened.
-        owner: Whose device it is, where that is known.
-        caller: Who did it, where somebody did.
+        device: Device id.
+        pairing: Pairing of the agent.
+        facts: The events.
+        owner: Owner of the device, if known.
+        caller: The account that caused the events, if any.
     """
     more = ({"owner": owner} if owner else {}) | ({"by": _by(caller)} if caller else {})
     return [
@@ -211,14 +210,14 @@ def event_writes(
 
 
 def lease_of(note: str) -> str | None:
-    """The device whose lease a note of the timer is about; ``None`` where it is about something else."""
+    """The device of a lease reminder; ``None`` for other reminders."""
     return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None
 
 
 def lease_change(
     device: str, before: Lease | None, after: Lease, *, caller: Identity, now_ms: int, owner: str = ""
 ) -> list[Write]:
-    """The events of a change of a lease, to go into its batch."""
+    """The writes for the events of a lease change."""
     facts = control_events.lease_changes(before, after, by=caller.name, now_ms=now_ms)
     return event_writes(device, after.pairing, facts, owner=owner, caller=caller)
 

@@ -1,4 +1,4 @@
-"""Asking the holder for control, and the holder's answer."""
+"""Requests for control, and the answers of the holder."""
 
 import asyncio
 import logging
@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 class ControlRequests:
-    """Requests for control. The lease's row decides; the device shows it to everybody who watches."""
+    """Requests for control. The lease's row decides; the device shows the request to all viewers."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class ControlRequests:
         self._clock = clock
 
     async def get(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
-        """A device's last request for control, and its lease.
+        """The last request for control of a device, and its lease.
 
         Raises:
             Problem: ``device-unknown``, ``request-unknown``.
@@ -59,21 +59,21 @@ class ControlRequests:
     async def create(
         self, caller: Identity, device_id: str, *, within_ms: int, lease_ms: int, wait_ms: int
     ) -> tuple[Lease, ControlRequest, bool, bool]:
-        """Ask the holder for control.
+        """Request control from the holder.
 
         Args:
-            caller: Who asks.
-            device_id: For which device.
-            within_ms: How long the holder has for an answer.
-            lease_ms: How long control is wanted for.
-            wait_ms: How long it is waited for the device to show it.
+            caller: The requester.
+            device_id: The device.
+            within_ms: Time for the answer.
+            lease_ms: Duration of the requested lease.
+            wait_ms: Time to wait until the device shows the request.
 
         Returns:
-            The lease, the request, whether it is new (it is not when this session asks already), and whether the device
-            shows it.
+            The lease, the request, whether it is new, and whether the device shows it.
 
         Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``lease-free``, ``lease-already-held``, ``lease-requested``, ``busy``.
+            Problem: ``device-unknown``, ``forbidden``, ``lease-free``, ``lease-already-held``, ``lease-requested``,
+                ``busy``.
         """
         device = await self._devices.get(caller, device_id)
         created = new_id()
@@ -102,13 +102,14 @@ class ControlRequests:
     async def accept(
         self, caller: Identity, device_id: str, request: str, *, wait_ms: int
     ) -> tuple[Lease, ControlRequest, bool]:
-        """Hand control over, in one write: the next epoch is the asker's, and what moves is held.
+        """Transfer control to the requester in one write, with the next epoch. Moving joints are held.
 
         Returns:
-            The lease, the request, and whether the device has confirmed within ``wait_ms``.
+            The lease, the request, and whether the device confirmed it within ``wait_ms``.
 
         Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed``, ``requester-offline``, ``busy``.
+            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed``,
+                ``requester-offline``, ``busy``.
         """
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "hand control over"):
@@ -119,7 +120,7 @@ class ControlRequests:
                 await self._require_asker_still(device, lease)
         _, asked = rules.find(lease, request)
         if before is lease or before is None:
-            # Handed over already, by an earlier request of the same kind. The device hears of it with each renewal.
+            # Accepted by an earlier call. Each renewal announces the lease to the device.
             return lease, asked, False
         confirmed, _ = await asyncio.gather(
             self._leases.grant(device, lease, by=caller.name, wait_ms=wait_ms),
@@ -128,7 +129,7 @@ class ControlRequests:
         return lease, asked, confirmed
 
     async def reject(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
-        """Keep control.
+        """Reject the request.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed``, ``busy``.
@@ -142,7 +143,7 @@ class ControlRequests:
         return rules.find(lease, request)
 
     async def withdraw(self, caller: Identity, device_id: str, request: str) -> None:
-        """Ask no longer.
+        """Withdraw the request.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed``, ``busy``.
@@ -161,24 +162,24 @@ class ControlRequests:
         )
 
     async def _require_asker(self, device: Device, request: str) -> None:
-        """Whoever asked must still be there, and one who may operate. What is over already, the rule answers."""
+        """Check that the requester is signed in and may operate. The rule handles closed requests."""
         lease, asked = rules.find(await read_lease(self._tables, device), request)
         if asked.current_outcome(lease, self._clock.now_ms()) != "open":
             return
         asker = await self._devices.current_identity(Identity(asked.account, asked.by, asked.session))
         result = (await self._devices.find_with_link(asker, device.id))[0] if asker is not None else None
         if result is None or not result.role.may_operate:
-            raise _asker_gone(asked.by, "Control stays with you.")
+            raise _asker_gone(asked.by, "You keep control.")
 
     async def _require_asker_still(self, device: Device, lease: Lease) -> None:
         asker = Identity(lease.account, lease.holder, lease.session, key=key_of(lease.session))
         try:
             await self._leases.require_still_allowed(asker, device)
         except Problem as problem:
-            raise _asker_gone(lease.holder, "Nobody has control now.") from problem
+            raise _asker_gone(lease.holder, "The lease is free now.") from problem
 
     async def _drop(self, caller: Identity, device: Device, lease: Lease, request: str) -> None:
-        """Have the device show it no longer. Where that does not arrive, its time is over there soon by itself."""
+        """Remove the request from the device's state, best effort: it also expires there."""
         try:
             await self._command_sender.send(
                 device, WithdrawRequest(request=request), caller=caller.name, epoch=lease.epoch
@@ -189,4 +190,4 @@ class ControlRequests:
 
 def _asker_gone(by: str, then: str) -> Problem:
     detail = f"{by} has signed out, or may not operate this device any more. {then}"
-    return Problem("requester-offline", 409, "Who asked is gone", detail)
+    return Problem("requester-offline", 409, "The requester is gone", detail)

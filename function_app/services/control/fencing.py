@@ -1,4 +1,4 @@
-"""Ending control that somebody has lost the right to: the epoch is burned, and the device is brought to a hold."""
+"""Revokes control: increases the epoch, cuts the setpoint connection and holds the device."""
 
 import asyncio
 import logging
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 class ControlRevocation:
-    """Ends leases from outside."""
+    """Revokes leases when the permission of the holder has ended."""
 
     def __init__(self, *, tables: Tables, command_sender: CommandSender, access: BrokerAccess, clock: Clock) -> None:
         self._tables = tables
@@ -32,18 +32,18 @@ class ControlRevocation:
     async def revoke(
         self, device: Device, why: str, *, account: str | None = None, until_s: float | None = None
     ) -> bool:
-        """Raise the epoch, so that the holder's setpoints and orders are old, and have the device hold.
+        """Increase the epoch, so that setpoints and commands of the holder are fenced, and hold the device.
 
-        A lease that has run out is fenced too: what was ordered under it may still be on its way.
+        An expired lease is fenced too: its commands may still be in transit.
 
         Args:
-            device: Whose lease; of which pairing.
-            why: What has happened to the device.
-            account: Only if this account has it; ``None``: whoever has.
-            until_s: When to give up telling others, by the loop's clock [s]; ``None``: as soon as they do.
+            device: The device, with the pairing of the lease.
+            why: Reason.
+            account: Only if this account holds it; ``None``: any holder.
+            until_s: Deadline for notifying broker and device, by the loop's clock [s]; ``None``: no deadline.
 
         Returns:
-            Whether everybody who had to be told has been. The lease has ended in any case.
+            Whether broker and device were notified. The lease has ended in any case.
 
         Raises:
             Problem: ``busy``.
@@ -66,10 +66,10 @@ class ControlRevocation:
         return lease is None or await self._tell(device, lease, until_s)
 
     async def retry(self, device: Device, account: str, *, until_s: float) -> bool:
-        """Tell again of the end of a lease that ``account`` had; whether it could be told, until ``until_s``.
+        """Notify broker and device again about the end of an account's lease; return whether it succeeded.
 
-        Where somebody else has control by now, the device is told of them; until it has heard that, what counts is that
-        nothing of the account reaches it. Which epochs it had nobody knows any more, so all of its connections are cut.
+        If another account has control now, the device gets its lease. The former epochs are not known any more, so all
+        connections of the account are cut.
         """
         control = await read_control_rows(self._tables, device.id)
         lease = control.lease
@@ -86,7 +86,7 @@ class ControlRevocation:
         return True
 
     async def _tell(self, device: Device, lease: Lease, until_s: float | None) -> bool:
-        """Cut the connection that carries the setpoints of the epoch before, and tell the device, both at once."""
+        """Cut the setpoint connection of the previous epoch and notify the device, concurrently."""
         try:
             async with asyncio.timeout_at(until_s):
                 return all(await asyncio.gather(self._cut(device, lease.epoch - 1), self._release(device, lease.epoch)))
@@ -112,5 +112,5 @@ class ControlRevocation:
 
 
 def control_client(device: str, epoch: int) -> str:
-    """The MQTT client id of the connection that carries one epoch's setpoints."""
+    """MQTT client id of the connection for the setpoints of one epoch."""
     return f"c-{device}-{epoch}"

@@ -1,4 +1,4 @@
-"""Leases in their rows: the one place that changes them on purpose, so that every change is told and none is lost."""
+"""Stores leases together with the events of each change."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ from function_app.services.storage import records
 
 
 class LeaseStore:
-    """Changes leases. An action that gets a lease of its own writes it in its own batch."""
+    """Changes leases. An action that gets its own lease writes it in its own batch."""
 
     def __init__(self, *, tables: Tables, control_events: ControlEvents, clock: Clock) -> None:
         self._tables = tables
@@ -23,16 +23,16 @@ class LeaseStore:
     async def change(
         self, caller: Identity, device: Device, change: Callable[[Lease | None, int], Lease]
     ) -> tuple[Lease | None, Lease]:
-        """Put what ``change`` makes of the lease in its place, by ETag; the lease before and after.
+        """Apply ``change`` to the lease by ETag; return the lease before and after.
 
         Args:
-            caller: Who changes it.
-            device: Whose lease.
-            change: Decides, from the lease and the time; gives the same object when there is nothing to change. May be
-                called several times.
+            caller: The account that changes it.
+            device: The device.
+            change: Maps lease and time to the new lease; returns the same object for no change. May be called several
+                times.
 
         Raises:
-            Problem: ``busy``, and whatever ``change`` raises.
+            Problem: ``busy``, and the problems of ``change``.
         """
         watched = False
 

@@ -1,4 +1,4 @@
-"""Taking, renewing and releasing control of a device."""
+"""Acquires, renews and releases leases."""
 
 import logging
 
@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class Leases:
-    """Leases of devices. The row decides; the device is told by a signed command and also decides for itself."""
+    """Leases of devices. The row decides; the device gets a signed command and checks epochs itself."""
 
     def __init__(
         self,
@@ -69,21 +69,21 @@ class Leases:
         wait_ms: int,
         over: str = "",
     ) -> tuple[Lease, bool]:
-        """Take the lease, or renew epoch ``epoch`` of it; and whether the device has confirmed within ``wait_ms``.
+        """Acquire the lease, or renew ``epoch``; also return whether the device confirmed within ``wait_ms``.
 
         Args:
-            caller: Who takes it.
-            device_id: Of which device.
-            epoch: What is renewed; ``None``: take.
-            lease_ms: For how long; not longer than the device is shared with them.
-            wait_ms: How long the device's answer is waited for.
-            over: Why it is taken even from somebody else. Only an owner may.
+            caller: The new holder.
+            device_id: The device.
+            epoch: Epoch to renew; ``None``: acquire.
+            lease_ms: Duration, limited by the caller's permission on the device.
+            wait_ms: Time to wait for the device.
+            over: Reason for a takeover, which requires the role owner; empty: no takeover.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``lease-held``, ``lease-lost``, ``busy``.
         """
         device = await self._devices.get(caller, device_id)
-        what = "take control over" if over else "take control" if epoch is None else "go on in control"
+        what = "take control over" if over else "take control" if epoch is None else "renew control"
 
         def changed(lease: Lease | None, now_ms: int) -> Lease:
             for_ms = rules.granted_ms(lease_ms, device.until_ms - now_ms)
@@ -103,7 +103,7 @@ class Leases:
         return lease, confirmed
 
     async def release(self, caller: Identity, device_id: str, *, epoch: int) -> None:
-        """Give the lease back. The device holds, and credentials for this epoch's setpoints are taken back.
+        """Release the lease. The device holds, and the credentials for its setpoints are revoked.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``lease-lost``, ``busy``.
@@ -116,7 +116,7 @@ class Leases:
         async with self._control_events.recording_rejections(device, caller, "give control back"):
             require_operator(device)
             await self._lease_store.change(caller, device, changed)
-        # Released it is, whoever can be told: what the device was granted ends with the time it was granted for.
+        # The lease is released even if the device is not reachable: its grant expires there.
         try:
             await self._command_sender.send(device, ReleaseLease(), caller=caller.name, epoch=epoch)
         except BusUnavailable as error:
@@ -124,7 +124,7 @@ class Leases:
         await self.revoke(device, epoch)
 
     async def require_still_allowed(self, caller: Identity, device: Device) -> None:
-        """See that whoever has just got the lease may still have it; else it has ended before the device hears of it.
+        """Check that the new holder still has permission; otherwise revoke the lease before the device gets it.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``.
@@ -136,10 +136,7 @@ class Leases:
             raise
 
     async def grant(self, device: Device, lease: Lease, *, by: str, wait_ms: int) -> bool:
-        """Tell the device whose lease it is; whether it has confirmed.
-
-        The lease is theirs in any case; that the device could not be told is what ``False`` says.
-        """
+        """Send the lease to the device; return whether it confirmed. The lease is valid in any case."""
         order = GrantLease(holder=lease.holder, lease_ms=lease.lease_ms, reason=lease.reason)
         try:
             return await self._command_sender.send_confirmed(
@@ -150,7 +147,7 @@ class Leases:
             return False
 
     async def revoke(self, device: Device, epoch: int) -> None:
-        """Take back the credentials that carry this epoch's setpoints: fencing that does not need the device."""
+        """Revoke the broker credentials for the setpoints of an epoch: fencing without the device."""
         try:
             await self._access.revoke(client_id=control_client(device.id, epoch))
         except BrokerAccessError as error:

@@ -1,4 +1,4 @@
-"""Short-lived broker credentials, for exactly what their holder may do."""
+"""Short-lived broker credentials with minimal permissions."""
 
 from collections.abc import Awaitable
 from dataclasses import dataclass, field
@@ -24,12 +24,12 @@ WATCH_S = 15 * 60
 AGENT_S = 3600
 CONTROL_MIN_S = 60
 TOPIC_BYTES = 10_000
-"""Filters in one grant [bytes]: signed and in base 64 they fit into the 16 KiB that a CONNECT may have."""
+"""Filters in one grant [bytes]: signed and in base64 they fit into the 16 KiB of a CONNECT."""
 
 
 @dataclass(frozen=True, slots=True)
 class IssuedCredentials:
-    """Credentials, and the topics to use with them."""
+    """Credentials, and the topics that they allow."""
 
     client_id: str
     credentials: Credentials
@@ -58,11 +58,11 @@ class MqttCredentials:
         self._clock = clock
 
     async def watch(self, caller: Identity) -> IssuedCredentials:
-        """To see every device that the account may see, and to stop those it may operate.
+        """Credentials to view all visible devices, and to stop those that the caller may operate.
 
-        Where the account has a part in a whole space, what the broker is told is said by space and stays small however
-        many devices there are; a device that is shared by itself is named, topic by topic. The answer names each topic.
-        The credentials end with the first share that they rest on, and with the session or API key that asks.
+        For shared spaces the grant contains wildcard filters for the space, so its size does not depend on the number
+        of devices. Devices shared individually are listed by topic. The response lists each topic. The credentials
+        expire with the first share, session or API key that they depend on.
 
         Raises:
             Problem: ``broker-unavailable``, ``busy``.
@@ -72,7 +72,7 @@ class MqttCredentials:
         if any(device.owner != caller.account for device in devices) and _rights(
             await self._devices.all(caller)
         ) != _rights(devices):
-            # Something was un-shared meanwhile: its sessions were cut before these credentials were there to be cut.
+            # A share ended concurrently: its connections were cut before these credentials existed.
             await self._take_back(issued)
             raise busy_store()
         await self._require(issued, self._devices.require_key(caller))
@@ -104,7 +104,7 @@ class MqttCredentials:
             raise broker_unavailable(f"{error}.") from error
 
     async def control(self, caller: Identity, device_id: str, epoch: int) -> IssuedCredentials:
-        """To send setpoints under one epoch of a lease.
+        """Credentials to send setpoints in one epoch.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``lease-lost``, ``broker-unavailable``.
@@ -114,7 +114,7 @@ class MqttCredentials:
         async with self._control_events.recording_rejections(device, caller, "steer"):
             require_operator(device)
             lease = rules.require_held(await read_lease(self._tables, device), caller, epoch=epoch, now_ms=now_ms)
-        # Longer than the lease, which may be renewed; not than the right to it.
+        # Longer than the lease, which may be renewed, but not longer than the permission.
         lifetime_s = min(max(CONTROL_MIN_S, lease.lease_ms // 1000), max(1, (device.until_ms - now_ms) // 1000))
         publish = (f"{device.topic}/{topics.CTL}/{epoch}",)
         grant = Grant(
@@ -130,7 +130,7 @@ class MqttCredentials:
         return issued
 
     async def _require(self, issued: IssuedCredentials, still: Awaitable[object]) -> None:
-        """Take credentials back that were made while the right to them was ended: nobody found them to be cut then."""
+        """Revoke credentials whose permission ended while they were issued."""
         try:
             await still
         except Problem:
@@ -138,9 +138,9 @@ class MqttCredentials:
             raise
 
     async def agent(self, agent: Agent) -> IssuedCredentials:
-        """To speak for an agent's own devices and hear what is addressed to them.
+        """Credentials of an agent: publish for its devices and receive their commands.
 
-        It may also hear what its space measures; which of that it does, its own configuration says.
+        They also allow reading the measurements of its space; its configuration selects which.
 
         Raises:
             Problem: ``agent-unclaimed``, ``broker-unavailable``.
@@ -161,13 +161,13 @@ class MqttCredentials:
 
 @dataclass(slots=True)
 class _Watched:
-    """What one connection is given, and the devices that it reaches with that.
+    """The filters of one connection, and the devices that they cover.
 
     Attributes:
         publish: Filters.
         subscribe: Filters.
-        devices: Which are heard.
-        stops: Topics, one for each of them that may be stopped.
+        devices: Visible devices.
+        stops: Stop topics of the devices that may be stopped.
     """
 
     publish: list[str] = field(default_factory=list)
@@ -176,7 +176,7 @@ class _Watched:
     stops: list[str] = field(default_factory=list)
 
     def add(self, says: list[str], hears: tuple[str, ...], access: BrokerAccess) -> bool:
-        """Whether there was room for them."""
+        """Add filters; return whether they fit."""
         publish = list(dict.fromkeys([*self.publish, *says]))
         subscribe = list(dict.fromkeys([*self.subscribe, *hears]))
         size = sum(len(pattern) + 3 for pattern in (*publish, *subscribe))
@@ -187,10 +187,10 @@ class _Watched:
 
 
 def _watching(devices: list[Device], access: BrokerAccess) -> _Watched:
-    """What may be said and heard in order to watch these devices, and those of them that fit.
+    """The filters to view these devices, and the devices that fit.
 
-    Whole spaces come first. All filters travel in one CONNECT, which brokers bound, some more than others: devices
-    beyond what the broker takes are left out. Whoever has so many in one room is better given the room.
+    Whole spaces come first. All filters are part of one CONNECT, whose size brokers limit, so further devices are left
+    out. Share the space instead of many single devices.
     """
     result = _Watched()
     whole: set[str] = set()

@@ -1,1 +1,1 @@
-"""Devices."""
+"""Device lookup and permissions, spaces, labels and viewers."""

@@ -1,4 +1,4 @@
-"""The rows that decide who controls a device: lease, slot and queue, side by side in the device's partition."""
+"""The rows that control a device: lease, slot and queue in the device's partition."""
 
 from dataclasses import dataclass, field, replace
 
@@ -16,7 +16,7 @@ QUEUE = "now:queue"
 
 @dataclass(frozen=True, slots=True)
 class ControlRows:
-    """Lease, slot and queue as they were read, with their rows (none: not written yet)."""
+    """Lease, slot and queue with the rows that they were read from (missing: not written yet)."""
 
     lease: Lease | None = None
     action: str = ""
@@ -25,15 +25,15 @@ class ControlRows:
     rows: dict[str, Row] = field(default_factory=dict)
 
     def write_lease(self, device: str, lease: Lease) -> Write:
-        """The change that puts ``lease`` in place of what was read."""
+        """The write that replaces the lease."""
         return self._write(device, LEASE, records.to_data(lease))
 
     def write_slot(self, device: str, action: str, pairing: str) -> Write:
-        """The change that gives the slot to ``action`` (empty: to nobody)."""
+        """The write that assigns the slot to ``action`` (empty: free)."""
         return self._write(device, SLOT, {"action": action, "pairing": pairing})
 
     def write_queue(self, device: str, queue: ActionQueue) -> Write:
-        """The change that puts ``queue`` in place of what was read."""
+        """The write that replaces the queue."""
         return self._write(device, QUEUE, records.to_data(queue))
 
     def _write(self, device: str, key: str, data: dict[str, object]) -> Write:
@@ -44,7 +44,7 @@ class ControlRows:
 async def read_control(tables: Tables, device: Device) -> ControlRows:
     """Lease, slot and queue in one read.
 
-    What an earlier owner's pairing left behind is nobody's: an un-pairing that stopped half way blocks nobody.
+    Rows of an earlier pairing are ignored, so an interrupted unpairing does not block the device.
     """
     rows = await _rows(tables, device.id)
     lease = _lease(rows, device)
@@ -61,7 +61,7 @@ async def read_control(tables: Tables, device: Device) -> ControlRows:
 
 
 async def read_control_rows(tables: Tables, device: str) -> ControlRows:
-    """Lease, slot and queue, of whatever pairing."""
+    """Lease, slot and queue of any pairing."""
     rows = await _rows(tables, device)
     slot = rows.get(SLOT)
     return ControlRows(
@@ -76,10 +76,10 @@ async def read_control_rows(tables: Tables, device: str) -> ControlRows:
 async def apply_ended_epoch(
     tables: Tables, device: Device, control: ControlRows, caller: Identity, now_ms: int
 ) -> ControlRows:
-    """The same, without a lease of somebody else that the device itself has ended, as its ``state`` says.
+    """The rows without the lease of another session that the device has ended, according to its ``state``.
 
-    A hold, a Stop or a restart ends leases at the device. Such an epoch is never obeyed again, so what the state says
-    of it stays true however old it is.
+    A hold, Stop or restart ends leases at the device. An ended epoch is never accepted again, so an old state is still
+    valid.
     """
     lease = control.lease
     if lease is None or not lease.held_by_other(caller, now_ms) or not await ended_by_device(tables, device, lease):
@@ -88,14 +88,14 @@ async def apply_ended_epoch(
 
 
 async def ended_by_device(tables: Tables, device: Device, lease: Lease) -> bool:
-    """Whether the device has said that it will not obey this lease again."""
+    """Whether the device has ended this lease."""
     row = await tables.get(records.AGENTS, device.agent, f"state:{device.name}")
     last = records.read(row, LastState) if row else None
     return last is not None and last.pairing == device.pairing and last.ended_epoch >= lease.epoch
 
 
 async def read_lease(tables: Tables, device: Device) -> Lease | None:
-    """The lease row alone, live or not."""
+    """The lease, live or not, without slot and queue."""
     row = await tables.get(records.CONTROL, device.id, LEASE)
     return _lease({LEASE: row} if row else {}, device)
 

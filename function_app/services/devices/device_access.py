@@ -1,4 +1,4 @@
-"""Devices as an account may see them: the one place where it is looked up who may do what with which device."""
+"""Device lookup and permissions: the only place that decides what an account may do with a device."""
 
 import asyncio
 from collections.abc import Iterable
@@ -22,12 +22,12 @@ from function_app.services.storage import records
 T = TypeVar("T")
 
 _SHARED = "~shared:"
-"""Begins the cursors of pages that hold what is shared, behind the account's own."""
+"""Prefix of cursors for shared devices, which follow the account's own devices."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceView:
-    """A device with what is known of it now, and the name of its owner."""
+    """A device with its current state and the name of its owner."""
 
     device: Device
     owner_name: str
@@ -38,7 +38,7 @@ class DeviceView:
 
 
 class DeviceAccess:
-    """Looks devices up. What neither belongs to the account nor is shared with it does not exist for it."""
+    """Looks up devices. A device that is neither owned by nor shared with the account does not exist for it."""
 
     def __init__(self, *, tables: Tables, clock: Clock) -> None:
         self._tables = tables
@@ -54,7 +54,7 @@ class DeviceAccess:
         return result
 
     async def get_with_link(self, caller: Identity, device: str) -> tuple[Device, Link | None]:
-        """One device and the last word about its agent's connection, in one read.
+        """One device and the last connection state of its agent, in one read.
 
         Raises:
             Problem: ``device-unknown``.
@@ -65,7 +65,7 @@ class DeviceAccess:
         return result, link
 
     async def find_with_link(self, caller: Identity, device: str) -> tuple[Device | None, Link | None]:
-        """As ``with_link``, with ``None`` for a device that does not exist for ``caller``."""
+        """Like ``get_with_link``, but returns ``None`` for a device that is not visible to ``caller``."""
         parts = split_device(device)
         if parts is None:
             return None, None
@@ -81,11 +81,11 @@ class DeviceAccess:
         return _device(agent, spec, allowed), _of(agent, rows, "link", Link)
 
     async def require_still_allowed(self, caller: Identity, device: Device) -> None:
-        """See, after something was written for ``caller``, that they may still operate the device.
+        """Check, after a write for ``caller``, that the caller may still operate the device.
 
-        Whoever un-shares deletes the share first and then ends what it finds; whoever uses a share writes first and
-        then looks here: of the two at least one sees the other. An owner is told apart by the pairing, and not read.
-        An API key is looked at in the same way, whoever's it is: whoever revokes it deletes its row first.
+        Removing a share deletes the share first and then ends what depends on it. Using a share writes first and then
+        calls this. So at least one of both sees the other. Changes of ownership change the pairing. API keys are
+        checked in the same way.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``.
@@ -96,22 +96,22 @@ class DeviceAccess:
             require_operator(await self.get(caller, device.id))
 
     async def require_key(self, caller: Identity) -> Identity:
-        """``caller`` as their API key stands now; a person as they are.
+        """``caller`` with the current permissions of the API key; unchanged for a person.
 
         Raises:
             Problem: ``forbidden``.
         """
         now = await self.current_identity(caller) if caller.key else caller
         if now is None:
-            raise forbidden("This API key was revoked or has run out. Make a new one.")
+            raise forbidden("This API key was revoked or has expired. Create a new one.")
         return now
 
     async def current_identity(self, caller: Identity) -> Identity | None:
-        """As ``current_identity``: what they may do now, and ``None`` once their key or session was ended."""
+        """``caller`` with current permissions; ``None`` if the key or session has ended."""
         return await current_identity(self._tables, caller, self._clock.now_ms())
 
     async def view(self, caller: Identity, device: str) -> DeviceView:
-        """One device with what is known of it now.
+        """One device with its current state.
 
         Raises:
             Problem: ``device-unknown``.
@@ -123,7 +123,7 @@ class DeviceAccess:
         raise not_found("device", device)
 
     async def views(self, caller: Identity, *, cursor: str | None, limit: int) -> tuple[list[DeviceView], str | None]:
-        """All devices that the account may see, agent by agent: a page holds those of up to ``limit`` agents.
+        """All visible devices, in pages of up to ``limit`` agents.
 
         Raises:
             Problem: ``cursor-invalid``.
@@ -133,7 +133,7 @@ class DeviceAccess:
         return [view for views in result for view in views], following
 
     async def all(self, caller: Identity) -> list[Device]:
-        """Every device that the account may see, without what is known of it now."""
+        """All visible devices, without their current state."""
         result: list[Device] = []
         cursor: str | None = None
         while True:
@@ -144,7 +144,7 @@ class DeviceAccess:
                 return result
 
     async def agents(self, caller: Identity, *, cursor: str | None, limit: int) -> tuple[list[Agent], str | None]:
-        """The account's own agents, as far as ``caller`` may see a device of theirs.
+        """The account's own agents with at least one device visible to ``caller``.
 
         Raises:
             Problem: ``cursor-invalid``.
@@ -164,7 +164,7 @@ class DeviceAccess:
         return [_device(agent, spec, allowed[spec.name]) for spec in agent.devices if spec.name in allowed]
 
     async def _agent_ids(self, caller: Identity, cursor: str | None, limit: int) -> tuple[list[str], str | None]:
-        """The account's own agents, then those of which something is shared with it."""
+        """The account's own agents, then those with shared devices."""
         own: list[str] = []
         after = ""
         if cursor is not None and cursor.startswith(_SHARED):
@@ -184,11 +184,13 @@ class DeviceAccess:
                 records.MEMBERS, account, first="agent:", last="agent;", limit=limit, cursor=cursor
             )
         except ValueError as error:
-            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+            raise invalid(
+                "The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid"
+            ) from error
         return [row.key.removeprefix("agent:") for row in page.rows], page.cursor
 
     async def _shared_agent_ids(self, account: str) -> list[str]:
-        """Agents of which something may be shared with an account. The shares themselves decide."""
+        """Agents that may have shared devices. The shares themselves decide."""
         result: set[str] = set()
         cursor: str | None = None
         while True:
@@ -215,7 +217,7 @@ class DeviceAccess:
                 return result
 
     async def get_as_owner(self, device: str) -> Device | None:
-        """A device as its owner sees it, whoever that is."""
+        """A device with the permissions of its owner."""
         parts = split_device(device)
         row = await self._tables.get(records.AGENTS, parts[0], "agent") if parts else None
         if row is None:
@@ -223,7 +225,7 @@ class DeviceAccess:
         return next((result for result in devices_of(records.read(row, Agent)) if result.id == device), None)
 
     async def in_space(self, account: str, space: str) -> list[Device]:
-        """The devices of an account's space, as their owner sees them."""
+        """The devices of an account's space, with the permissions of the owner."""
         ids = await self._all_agent_ids(account)
         rows = await asyncio.gather(*(self._tables.get(records.AGENTS, agent, "agent") for agent in ids))
         agents = [records.read(row, Agent) for row in rows if row is not None]
@@ -237,9 +239,9 @@ class DeviceAccess:
     async def _standings(
         self, caller: Identity, agent: Agent, names: Iterable[str] | None = None
     ) -> dict[str, Permissions]:
-        """What ``caller`` may do with the devices of an agent; those that do not exist for them are left out.
+        """Permissions of ``caller`` on the devices of an agent, without devices that are not visible.
 
-        For the owner nothing is read.
+        For the owner no share is read.
         """
         wanted = [spec.name for spec in agent.devices] if names is None else list(names)
         shares: list[Share] = []
@@ -259,7 +261,7 @@ class DeviceAccess:
         return records.read(row, Account).name if row else ""
 
     async def of_agent(self, caller: Identity, agent_id: str, only: str | None = None) -> list[DeviceView]:
-        """The devices of one agent that the account may see, or the one called ``only``."""
+        """The visible devices of one agent, or the one called ``only``."""
         page = await self._tables.query(records.AGENTS, agent_id, limit=1000)
         rows = {row.key: row for row in page.rows}
         if "agent" not in rows:
@@ -294,74 +296,74 @@ class DeviceAccess:
 
 
 def require_operator(device: Device) -> Device:
-    """The same device, once it is seen that its role may operate.
+    """The device, if its role may operate.
 
     Raises:
         Problem: ``forbidden``.
     """
     if not device.role.may_operate:
-        raise forbidden("You may watch this device, not operate it. Ask its owner.")
+        raise forbidden("You may watch this device, but not operate it. Ask its owner.")
     return device
 
 
 def require_owner(device: Device) -> Device:
-    """The same device, once it is seen that its role is the owner's.
+    """The device, if its role is owner.
 
     Raises:
         Problem: ``forbidden``.
     """
     if not device.role.may_own:
-        raise forbidden("Only the owner of this device may do that. For control, ask who has it, at lease/requests.")
+        raise forbidden("Only the owner of this device may do that. Request control at lease/requests.")
     return device
 
 
 def require_claimed(agent: Agent) -> str:
-    """The space of an agent, once it is seen that somebody has claimed it.
+    """The space of an agent, if it is claimed.
 
     Raises:
         Problem: ``agent-unclaimed``.
     """
     if agent.space is None:
-        detail = "Nobody has claimed this agent yet. Wait for GET /agents/enrollment to say so."
+        detail = "This agent is not claimed yet. Wait until GET /agents/enrollment reports it."
         raise Problem("agent-unclaimed", 409, "The agent is not claimed", detail)
     return agent.space
 
 
 def require_online(link: Link | None, now_ms: int) -> None:
-    """Refuse what cannot arrive.
+    """Reject commands to an offline device.
 
     Raises:
-        Problem: ``device-offline``: the agent's last word was "offline", or it polls and has stopped to.
+        Problem: ``device-offline``: the agent reported "offline", or stopped polling.
     """
     if link is not None and not (devices.online(link, link.seen_ms, now_ms) if link.polled else link.online):
-        detail = "The device's agent is offline. Check that it runs and has network."
+        detail = "The device's agent is offline. Check that it is running and connected."
         raise Problem("device-offline", 409, "The device is offline", detail)
 
 
 def share_key(account: str) -> str:
-    """Of the share that an account has in something."""
+    """Row key of an account's share."""
     return f"account:{account}"
 
 
 def devices_of(agent: Agent) -> list[Device]:
-    """The devices of a claimed agent, as its owner sees them."""
+    """The devices of a claimed agent, with the permissions of the owner."""
     return [_device(agent, spec) for spec in agent.devices]
 
 
 def departed_devices(agent: Agent, leaving: Departure) -> list[Device]:
-    """The devices that an agent has left behind, as their owner saw them."""
+    """The devices of a departure, with the permissions of their former owner."""
     before = replace(agent, account=leaving.account, space=leaving.space, pairing=leaving.pairing)
     gone = DeviceSpec("", "", "", "")
     return [_device(before, replace(agent.device(name) or gone, name=name)) for name in leaving.devices]
 
 
 def _ended(lease: Lease, last: LastState | None) -> bool:
-    """Whether the device has said that it will not obey this lease again."""
+    """Whether the device has ended this lease."""
     return last is not None and last.ended_epoch >= lease.epoch
 
 
 def _of(agent: Agent, rows: dict[str, Row], key: str, kind: type[T]) -> T | None:
-    """What was said under the agent's present pairing."""
+    """The record in a row, if it belongs to the current pairing."""
     if key not in rows or rows[key].data.get("pairing", "") not in {"", agent.pairing}:
         return None
     return records.read(rows[key], kind)

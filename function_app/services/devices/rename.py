@@ -1,4 +1,4 @@
-"""What an owner calls a device: kept beside what its agent calls it, until it belongs to somebody else."""
+"""Labels that an owner gives to devices, stored until the owner changes."""
 
 from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.problems import not_found
@@ -12,7 +12,7 @@ from function_app.services.storage import records
 
 
 class DeviceRename:
-    """Names devices. The agent is not told: the name is the owner's, and the agent's own stays as it is."""
+    """Sets device labels. The agent keeps its own label and is not notified."""
 
     def __init__(self, *, tables: Tables, devices: DeviceAccess, audit_log: AuditLog) -> None:
         self._tables = tables
@@ -20,7 +20,7 @@ class DeviceRename:
         self._audit_log = audit_log
 
     async def rename(self, caller: Identity, device_id: str, label: str | None) -> None:
-        """Call a device ``label``; ``None``: as its agent does.
+        """Set the label of a device; ``None`` restores the agent's label.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``busy``.

@@ -1,4 +1,4 @@
-"""Spaces as an account may see them: its own, and those that are shared with it."""
+"""Spaces that are visible to an account: owned and shared."""
 
 import asyncio
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from function_app.services.storage import records
 
 @dataclass(frozen=True, slots=True)
 class SpaceView:
-    """A space, whose it is, and what the account may do in it."""
+    """A space with its owner and the caller's role."""
 
     space: Space
     role: Role
@@ -23,14 +23,14 @@ class SpaceView:
 
 
 class Spaces:
-    """Looks spaces up. What neither belongs to the account nor is shared with it does not exist for it."""
+    """Looks up spaces. A space that is neither owned by nor shared with the account does not exist for it."""
 
     def __init__(self, *, tables: Tables, clock: Clock) -> None:
         self._tables = tables
         self._clock = clock
 
     async def list(self, caller: Identity) -> tuple[SpaceView, ...]:
-        """The account's own, oldest first; then those that are shared with it, by id."""
+        """Own spaces, oldest first, then shared ones by id."""
         owner = Account(caller.account, await self._name(caller.account))
         page = await self._tables.query(records.ACCOUNTS, caller.account, first="space:", last="space;", limit=1000)
         own = sorted((records.read(row, Space) for row in page.rows), key=lambda space: space.created_ms)
@@ -63,7 +63,7 @@ class Spaces:
         return seen
 
     async def own(self, caller: Identity, space: str) -> SpaceView:
-        """One space of the account's own.
+        """One space of the account itself.
 
         Raises:
             Problem: ``space-unknown``, ``forbidden``.

@@ -1,7 +1,7 @@
-"""Who looks at a device at this moment: pages that are seen say so every few seconds, and are told who else does.
+"""Current viewers of a device: open pages report periodically and get the list of other viewers.
 
-A row for each sign-in session, good for a few seconds only: whoever says nothing more is gone by themselves, and so is
-whoever may not see the device any more, since they may not say so either. Nothing depends on it.
+One row per sign-in session expires after a few seconds, so closed pages and callers without permission disappear. No
+other function depends on it.
 """
 
 import contextlib
@@ -17,22 +17,22 @@ from function_app.services.storage import records
 from function_app.services.storage.retention import Retention
 
 GOOD_MS: Final = 25_000
-"""How long one word counts: pages say it every ten seconds."""
+"""Validity of a report [ms]; pages report every ten seconds."""
 MOST: Final = 50
-"""As many are remembered of one device; whoever comes when there are more is told of the others, and not shown."""
+"""Maximum number of viewers per device; further viewers see the list but are not in it."""
 _AGAIN_MS: Final = 5_000
-"""So soon after one word another is not written down."""
+"""Minimum interval between stored reports of a session [ms]."""
 _FORGOTTEN_MS: Final = 3_600_000
 
 
 @dataclass(frozen=True, slots=True)
 class Viewer:
-    """One sign-in session that looks at a device.
+    """A sign-in session that views a device.
 
     Attributes:
-        since_ms: From when on, without a pause [ms since 1970].
-        said_ms: Its newest word.
-        pairing: Of the device's agent then.
+        since_ms: Start of viewing without interruption [ms since 1970].
+        said_ms: Last report [ms since 1970].
+        pairing: Pairing of the device's agent.
     """
 
     account: str
@@ -46,7 +46,7 @@ class Viewer:
 
 
 class Viewers:
-    """Remembers and tells who watches."""
+    """Tracks the viewers of devices."""
 
     def __init__(self, *, tables: Tables, devices: DeviceAccess, retention: Retention, clock: Clock) -> None:
         self._tables = tables
@@ -55,10 +55,10 @@ class Viewers:
         self._clock = clock
 
     async def mark(self, caller: Identity, device_id: str) -> list[Viewer]:
-        """Say that ``caller`` looks at a device.
+        """Report that ``caller`` views a device.
 
         Returns:
-            Who else does, the longest first.
+            The other viewers, longest first.
 
         Raises:
             Problem: ``device-unknown``.
@@ -81,7 +81,7 @@ class Viewers:
         return sorted(others, key=lambda existing: existing.since_ms)
 
     async def leave(self, caller: Identity, device_id: str) -> None:
-        """Say that ``caller`` looks no longer.
+        """Report that ``caller`` stopped viewing.
 
         Raises:
             Problem: ``device-unknown``.
@@ -89,11 +89,11 @@ class Viewers:
         device = await self._devices.get(caller, device_id)
         row = await self._tables.get(records.WATCHERS, device.id, caller.session)
         if row is not None:
-            with contextlib.suppress(Conflict):  # another tab has just said that it does
+            with contextlib.suppress(Conflict):  # another tab has just reported
                 await self._tables.delete(records.WATCHERS, row)
 
     async def _note(self, device: Device, caller: Identity, now_ms: int) -> None:
-        # One note for all of an hour, and written first: nothing stays that nobody forgets.
+        # One deletion per hour, scheduled before the row is written.
         due_ms = (now_ms // _FORGOTTEN_MS + 2) * _FORGOTTEN_MS
         await self._retention.delete_rows_at(records.WATCHERS, device.id, first="", last=None, due_ms=due_ms)
 
@@ -114,7 +114,7 @@ class Viewers:
         await records.upsert(self._tables, records.WATCHERS, device.id, caller.session, said, Viewer)
 
     async def _tidy(self, over: list[Row]) -> None:
-        """Delete what is over, so that a device's rows stay few."""
+        """Delete expired rows of a device."""
         if over:
-            with contextlib.suppress(Conflict):  # somebody else tidies up
+            with contextlib.suppress(Conflict):  # deleted by another process
                 await self._tables.batch(records.WATCHERS, [Write("delete", row) for row in over[:MAX_BATCH]])

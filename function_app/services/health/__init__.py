@@ -1,1 +1,1 @@
-"""Health."""
+"""Diagnosis of measurements and fault records."""

@@ -1,8 +1,7 @@
-"""Health of devices: new measurements against what is usual and allowed, while they come in.
+"""Compares new measurements with usual and allowed values, and raises faults.
 
-Partition of ``Diagnostics``: device and pairing. Key: stream. A row keeps the watches of a stream's fields and the sums
-of the open window; it is written by ETag, after the faults that follow from it: a process killed in between leaves
-faults that the next one finds as they should be.
+Partition of ``Diagnostics``: device and pairing. Key: stream. A row contains the detector states of a stream and the
+sums of the current window. It is written by ETag after the faults, so a restart finds consistent faults.
 """
 
 import asyncio
@@ -28,9 +27,9 @@ from function_app.services.robot_types.catalogue import RobotTypes
 from function_app.services.storage import records
 
 MAX_FIELDS = 100
-"""Fields of one stream that are watched: those listed by the robot type, then others by name; a row stays small."""
+"""Maximum number of monitored fields per stream: first those listed by the robot type, then others by name."""
 RULES_MS = 60_000
-"""A device's rules are looked up again after this time."""
+"""Interval at which a device's rules are read again."""
 _RULES_KEPT = 1_000
 _AT_ONCE = 20
 
@@ -41,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class FieldView:
-    """One field and what is known of it."""
+    """One field with its limits and state."""
 
     stream: str
     name: str
@@ -51,20 +50,20 @@ class FieldView:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """One device's health in short."""
+    """A summary of a device's health."""
 
     view: DeviceView
     health: Health
     faults: tuple[Fault, ...]
 
     def count(self, severity: Severity) -> int:
-        """Open faults of this severity."""
+        """Number of open faults with this severity."""
         return sum(fault.severity is severity for fault in self.faults)
 
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """What a row keeps: the open window's start [ms], its sums and counts, and the watches."""
+    """Row content: start of the current window [ms], its sums and counts, and the detector states."""
 
     window_ms: int = 0
     sums: dict[str, tuple[float, int]] = field(default_factory=dict)
@@ -72,7 +71,7 @@ class _Kept:
 
 
 class Diagnostics:
-    """Watches what comes in, and says how devices are."""
+    """Monitors measurements and reports device health."""
 
     def __init__(
         self,
@@ -93,7 +92,7 @@ class Diagnostics:
         self._rules: dict[tuple[str, str], tuple[int, tuple[Diagnostic, ...]]] = {}
 
     async def observe(self, device: Device, stream: str, means: Sequence[tuple[int, Values]]) -> None:
-        """New measurements of a stream: when, and means over (a part of) ten seconds. Late ones are left out.
+        """Process new measurements of a stream: time and mean over at most ten seconds. Late values are ignored.
 
         Raises:
             Problem: ``busy``.
@@ -113,7 +112,7 @@ class Diagnostics:
                 after = _take(after, rules, at_ms, values)
             if after is existing:
                 return
-            # Looked at when something has changed, and each minute: what a killed process left is put right then.
+            # Faults are updated on changes and every minute, which also repairs the state after a kill.
             before = {name for name, watch in existing.watches.items() if watch.findings}
             now = {name for name, watch in after.watches.items() if watch.findings}
             minute = existing.window_ms // MINUTE_MS != after.window_ms // MINUTE_MS
@@ -129,7 +128,7 @@ class Diagnostics:
         await records.retry(attempt)
 
     async def of_device(self, caller: Identity, device_id: str) -> tuple[Summary, list[FieldView]]:
-        """A device's health, and each watched field.
+        """Health of a device and of each monitored field.
 
         Raises:
             Problem: ``device-unknown``.
@@ -150,7 +149,7 @@ class Diagnostics:
     async def summaries(
         self, caller: Identity, *, space: str | None, cursor: str | None, limit: int
     ) -> tuple[list[Summary], str | None]:
-        """Devices with their health, worst first; a page holds those of up to ``limit`` agents.
+        """Devices with their health, worst first, in pages of up to ``limit`` agents.
 
         Raises:
             Problem: ``space-unknown``, ``cursor-invalid``.
@@ -169,7 +168,7 @@ class Diagnostics:
         return Summary(view, diagnosis.health(faults, online=view.online), faults)
 
     async def _listed(self, device: Device) -> tuple[Diagnostic, ...]:
-        """What is said about its measurements: by itself, as a room's devices do, or else by its robot type."""
+        """The declared measurements of a device: from its description, or from its robot type."""
         now_ms = self._clock.now_ms()
         key = (device.id, device.pairing)
         existing = self._rules.get(key)
@@ -191,13 +190,13 @@ class Diagnostics:
         try:
             robot_type = await self._robot_types.get(Identity(agent.account, "", ""), device.robot_type)
         except Problem as problem:
-            _log.debug("%s is watched without limits: %s", device.id, problem.detail)
+            _log.debug("%s is monitored without limits: %s", device.id, problem.detail)
             return ()
         return robot_type.diagnostics
 
 
 def _rules(listed: Sequence[Diagnostic], stream: str, names: set[str]) -> dict[str, Rule]:
-    """The rule of each field that is watched. Of the joints' own stream only those that are listed."""
+    """The rule of each monitored field. Of the joint stream only listed fields are monitored."""
     result: dict[str, Rule] = {}
     for name in sorted(names):
         given = next((one for one in listed if one.stream == stream and fnmatch.fnmatchcase(name, one.fields)), None)
@@ -219,7 +218,7 @@ def _rules(listed: Sequence[Diagnostic], stream: str, names: set[str]) -> dict[s
 
 
 def _take(kept: _Kept, rules: Mapping[str, Rule], at_ms: int, values: Values) -> _Kept:
-    """One more mean; a later window closes the open one."""
+    """Add one mean; a mean of a later window closes the current window."""
     window_ms = at_ms // WINDOW_MS * WINDOW_MS
     if window_ms < kept.window_ms:
         return kept
@@ -241,7 +240,7 @@ def _take(kept: _Kept, rules: Mapping[str, Rule], at_ms: int, values: Values) ->
 
 
 def _worse(existing: _Kept, after: _Kept) -> bool:
-    """Whether a field has passed a limit that had not."""
+    """Whether a field has newly exceeded a limit."""
     return any(
         watch.breach.on and not (name in existing.watches and existing.watches[name].breach.on)
         for name, watch in after.watches.items()

@@ -1,8 +1,7 @@
-"""Faults of devices in their rows: one open fault for each code, however many processes see it at once.
+"""Fault records of devices, with at most one open fault per code.
 
 Partition of ``Faults``: device and pairing. Keys: ``open:<scope>:<code>``; ``past:<id>``, newest first; ``count:…``,
-how often a code was raised; ``event:<id>:<step>``, a step that is still to be told among the device's events: it is
-written together with the step, so that a process killed in between leaves it to the next.
+number of faults with a code; ``event:<id>:<step>``, an event to publish, written in the same batch as the step.
 """
 
 from collections.abc import Sequence
@@ -22,15 +21,15 @@ from function_app.services.storage.retention import DAY_MS, Retention
 from function_app.services.telemetry.event_log import EventLog
 
 KEEP_FAULTS_MS = 365 * DAY_MS
-"""Cleared faults are kept for so long, and so is the count of a code that is not raised any more."""
+"""Time that cleared faults and counts are stored."""
 MAX_OPEN = 64
-"""Open faults of one scope; what a device reports beyond is left out."""
+"""Maximum number of open faults per scope; further ones are ignored."""
 _OPEN, _PAST, _COUNT, _EVENT = "open:", "past:", "count:", "event:"
 _CODE_SHOWN = 200
 
 
 class Faults:
-    """Raises, acknowledges and clears."""
+    """Raises, acknowledges and clears faults."""
 
     def __init__(self, *, tables: Tables, events: EventLog, retention: Retention, clock: Clock) -> None:
         self._tables = tables
@@ -39,14 +38,14 @@ class Faults:
         self._clock = clock
 
     async def settle(self, device: Device, scope: str, reports: Sequence[Report]) -> None:
-        """Make the open faults of one scope those that are reported: raise what is new, clear what is gone.
+        """Make the open faults of a scope equal to ``reports``: raise new ones, clear missing ones.
 
-        Safe to repeat and to be done by several at once.
+        Idempotent and safe to run concurrently.
 
         Args:
             device: The device.
-            scope: Who reports: its reports say all that is wrong as it sees it.
-            reports: What is wrong now.
+            scope: Reporter; its reports are complete.
+            reports: All current faults of the reporter.
 
         Raises:
             Problem: ``busy``.
@@ -69,13 +68,13 @@ class Faults:
             await self._tell(device)
 
     async def open(self, device: Device) -> list[Fault]:
-        """What is wrong now, worst first, then newest first."""
+        """Open faults, worst first, then newest first."""
         rows = await self._read(device)
         result = [records.read(row, Fault) for row in rows if row.key.startswith(_OPEN)]
         return sorted(result, key=lambda fault: (-fault.severity.rank, fault.id))
 
     async def past(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Fault], str | None]:
-        """What was wrong, newest first.
+        """Cleared faults, newest first.
 
         Raises:
             Problem: ``cursor-invalid``.
@@ -85,11 +84,13 @@ class Faults:
                 records.FAULTS, _partition(device), first=_PAST, last="past;", limit=limit, cursor=cursor
             )
         except ValueError as error:
-            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+            raise invalid(
+                "The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid"
+            ) from error
         return [records.read(row, Fault) for row in page.rows], page.cursor
 
     async def acknowledge(self, device: Device, fault: str, *, by: str) -> Fault:
-        """Somebody has seen it; it stays open until it is cleared.
+        """Acknowledge a fault; it stays open until it is cleared.
 
         Raises:
             Problem: ``fault-unknown``, ``fault-cleared``, ``busy``.
@@ -114,12 +115,12 @@ class Faults:
         return result
 
     async def _read(self, device: Device) -> list[Row]:
-        """What is open, and what is still to be told."""
+        """Open faults, and events to publish."""
         page = await self._tables.query(records.FAULTS, _partition(device), first=_EVENT, last="open;", limit=1000)
         return list(page.rows)
 
     async def _report(self, device: Device, key: str, report: Report, row: Row | None) -> bool:
-        """Raise a fault or make it worse; whether that was news."""
+        """Raise a fault or increase its severity; return whether it changed."""
         partition = _partition(device)
         if row is not None:
             existing = records.read(row, Fault)
@@ -151,7 +152,7 @@ class Faults:
         await self._write(device, over, "cleared", [Write("delete", row), Write("create", past)])
 
     async def _write(self, device: Device, fault: Fault, step: str, writes: list[Write]) -> None:
-        """One step of a fault's life, with the event that tells of it."""
+        """Write one step of a fault with its event."""
         event = Row(_partition(device), f"{_EVENT}{fault.id}:{step}", _event(device, fault, step, self._clock.now_ms()))
         await self._tables.batch(records.FAULTS, [*writes, Write("create", event)])
 
@@ -162,7 +163,7 @@ class Faults:
             try:
                 await self._tables.delete(records.FAULTS, row)
             except Conflict:
-                continue  # another process tells the same
+                continue  # another process publishes the same event
 
 
 def _event(device: Device, fault: Fault, step: str, now_ms: int) -> dict[str, Any]:

@@ -1,8 +1,7 @@
-"""Faults that devices report in their state, and devices of which nothing is heard any more.
+"""Faults from device states, and faults for silent devices.
 
-For each agent that is online there is a note in ``Watched``, by the time at which a device of it may have been silent
-for too long: the timer looks at it then, and notes the next such time. A row beside the notes names the newest of an
-agent's notes, the only one that counts.
+Each online agent has a reminder in ``Watched`` for the time at which a device may count as silent. The timer then
+checks the agent and schedules the next check. A second row names the newest reminder, which is the only valid one.
 """
 
 import asyncio
@@ -26,7 +25,7 @@ _DEVICE, _CLOUD = "device", "cloud"
 
 
 class ReportedFaults:
-    """Compares what an agent says with what it said last."""
+    """Raises and clears faults from device states."""
 
     def __init__(self, *, tables: Tables, faults: Faults, clock: Clock) -> None:
         self._tables = tables
@@ -34,7 +33,7 @@ class ReportedFaults:
         self._clock = clock
 
     async def on_connected(self, agent: Agent, session: int) -> None:
-        """Its agent says that it is online; to be called before that is written down.
+        """Called when an agent connects, before the link is stored.
 
         Raises:
             Problem: ``busy``.
@@ -47,7 +46,7 @@ class ReportedFaults:
             await self._faults.settle(device, _CLOUD, [])
 
     async def on_state(self, agent: Agent, name: str, state: State) -> None:
-        """A device says how it is; to be called before that is written down.
+        """Called with a device state, before it is stored.
 
         Raises:
             Problem: ``busy``.
@@ -56,7 +55,7 @@ class ReportedFaults:
         row = await self._tables.get(records.AGENTS, agent.id, f"state:{name}")
         existing = None if row is None else records.read(row, LastState)
         if existing is not None and msgspec.convert(existing.state, State, strict=False) == state:
-            return  # delivered again: no sign of life
+            return  # redelivered: not a sign of life
         now_ms = self._clock.now_ms()
         if existing is None or now_ms - existing.seen_ms > SILENT_MS:
             await self._watch(agent.id, now_ms)
@@ -65,11 +64,11 @@ class ReportedFaults:
             await self._faults.settle(device, _DEVICE, [_reported(fault.code, fault.message) for fault in state.faults])
 
     async def check_silent(self, now_ms: int) -> None:
-        """One round: look at the agents whose time has come. Safe to repeat and to be run by many at once.
+        """Check the agents that are due. Idempotent and safe to run concurrently.
 
         Raises:
             Problem: ``busy``.
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         await asyncio.gather(*(self._shard(str(shard), now_ms) for shard in range(SHARDS)))
 
@@ -86,7 +85,7 @@ class ReportedFaults:
                 continue
 
     async def _look(self, agent_id: str, now_ms: int) -> None:
-        """Which devices of an agent that is said to be online are silent; and when to look again."""
+        """The silent devices of an online agent, and the time of the next check."""
         page = await self._tables.query(records.AGENTS, agent_id, limit=1000)
         rows = {row.key: row for row in page.rows}
         agent = records.read(rows["agent"], Agent) if "agent" in rows else None
@@ -105,7 +104,7 @@ class ReportedFaults:
             await self._watch(agent_id, min(heard))
 
     async def _watch(self, agent: str, seen_ms: int) -> None:
-        """Look at an agent when it may have been silent for too long: the note, then that it is the newest one."""
+        """Schedule a check of an agent: write the reminder, then mark it as the newest."""
         shard = str(hashlib.sha256(agent.encode()).digest()[0] % SHARDS)
         key = f"{seen_ms + SILENT_MS + 1:013d}:{agent}"
         with contextlib.suppress(Conflict):
@@ -122,13 +121,13 @@ class ReportedFaults:
 
 
 def _reported(code: str, message: str) -> Report:
-    said = message or f"The device reports '{code}'. Look at the device."
+    said = message or f"The device reports '{code}'. Check the device."
     return Report(code=code, source=Source.DEVICE, kind="reported", severity=Severity.ERROR, message=said)
 
 
 def _silent(device: Device) -> Report:
     message = (
-        f"Nothing was heard of {device.label or device.name} for {SILENT_MS // 1000} s, though its agent did not say "
-        "good-bye. Check the agent's power and network; once it is heard again this clears by itself."
+        f"No message from {device.label or device.name} for {SILENT_MS // 1000} s, although its agent is connected. "
+        "Check the agent's power and network. The fault clears with the next message."
     )
     return Report(code="silent", source=Source.CLOUD, kind="silent", severity=Severity.WARNING, message=message)

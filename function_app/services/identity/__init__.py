@@ -1,1 +1,1 @@
-"""Identity."""
+"""Authentication, sessions, accounts and rate limits."""

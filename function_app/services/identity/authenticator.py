@@ -1,4 +1,4 @@
-"""Who is asking: access tokens of people and apps, signed requests of agents."""
+"""Authenticates access tokens of people and programs, and signed requests of agents."""
 
 import math
 import secrets
@@ -28,14 +28,14 @@ API: Final = "telescope/api"
 SESSION: Final = "telescope/session"
 XMPP: Final = "telescope/xmpp"
 ACCESS_S = 15 * 60
-"""One that leaks is of no use for long. Who has signed in gets the next one by the cookie."""
+"""Lifetime of an access token [s]. The session cookie gets the next one."""
 SESSION_S = 12 * 3600
 AGENT_TOKEN_S = 60
 CLOCK_SKEW_S = 30
-"""How far an agent's clock may be off."""
+"""Tolerated clock difference of an agent [s]."""
 KNOWN_TOKENS = 4096
 RECHECK_MS = 5_000
-"""A token known to this process is checked against sign-outs again after this time."""
+"""Interval at which a cached token is checked for sign-out again [ms]."""
 
 Audience = Literal["telescope/api", "telescope/session", "telescope/xmpp"]
 
@@ -49,7 +49,7 @@ class _Known:
 
 
 class Authenticator:
-    """Issues and checks tokens. Verifying a signature costs 0.1 ms: what was verified is remembered until it ends."""
+    """Issues and verifies tokens. Verified tokens are cached, because a signature costs 0.1 ms."""
 
     def __init__(self, *, tables: Tables, keys: SigningKeys, retention: Retention, clock: Clock) -> None:
         self._tables = tables
@@ -59,13 +59,13 @@ class Authenticator:
         self._known: OrderedDict[tuple[str, str], _Known] = OrderedDict()
 
     async def issue(self, caller: Identity, audience: Audience, lifetime_s: int, *, csrf: str | None = None) -> str:
-        """A token of one sign-in session, good no longer than that.
+        """Issue a token for a sign-in session; it does not outlive the session.
 
         Args:
-            caller: Account, session, and when that ends.
-            audience: What it is for.
-            lifetime_s: How long it is good for at most [s].
-            csrf: In a cookie, what a page has to show beside it.
+            caller: Account, session and its end.
+            audience: Purpose of the token.
+            lifetime_s: Maximum lifetime [s].
+            csrf: CSRF token for a cookie.
         """
         key = await self._keys.current()
         now_ms = self._clock.now_ms()
@@ -85,7 +85,7 @@ class Authenticator:
         return jwt.encode(claims, key, ALGORITHM, headers={"kid": signing.key_id(key.public_key())})
 
     async def person(self, token: str, audience: Audience) -> Identity:
-        """The account and session behind a token.
+        """The identity behind an access token.
 
         Raises:
             Problem: ``unauthorized``: forged, expired, for another purpose, or signed out.
@@ -93,7 +93,7 @@ class Authenticator:
         return (await self._find(token, audience)).identity
 
     async def page(self, cookie: str) -> tuple[Identity, str]:
-        """The account and session behind a page's cookie, and the CSRF token that belongs to it.
+        """The identity behind a page's cookie, and its CSRF token.
 
         Raises:
             Problem: ``unauthorized``, as ``person``.
@@ -105,7 +105,7 @@ class Authenticator:
         now_ms = self._clock.now_ms()
         existing = self._known.get((audience, token))
         if existing is None or not self._fresh(existing, now_ms):
-            # In full, and not for sign-outs alone: its key may have leaked, and counts no more.
+            # Verify completely, not only the sign-out: the signing key may have leaked.
             existing = await self._verify(token, audience)
             self._remember((audience, token), existing)
         if now_ms >= existing.expires_ms:
@@ -114,7 +114,7 @@ class Authenticator:
         return existing
 
     def _remember(self, name: tuple[str, str], existing: _Known) -> None:
-        """Keep what was checked just now, and nothing that would have to be checked again in any case."""
+        """Cache a verified token, unless it expires before the next check."""
         self._known[name] = existing
         self._known.move_to_end(name)
         while len(self._known) > KNOWN_TOKENS or not self._fresh(next(iter(self._known.values())), existing.checked_ms):
@@ -125,7 +125,7 @@ class Authenticator:
         return 0 <= now_ms - existing.checked_ms < RECHECK_MS
 
     async def sign_out(self, caller: Identity) -> None:
-        """End the session: its tokens are refused from now on, by other instances within ``RECHECK_MS``."""
+        """End the session: other instances reject its tokens within ``RECHECK_MS``."""
         ends_ms = self._clock.now_ms() + SESSION_S * 1000
         row = Row(caller.account, signed_out_key(caller.session), {"expires_ms": ends_ms})
         await self._retention.delete_row_at(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
@@ -138,7 +138,7 @@ class Authenticator:
                 del self._known[name]
 
     async def enrolling(self, token: str, public_key: str) -> str:
-        """The id of the agent whose key is ``public_key`` and signed ``token``.
+        """The id of the agent with this ``public_key``, which must have signed ``token``.
 
         Raises:
             Problem: ``unauthorized``.
@@ -154,7 +154,7 @@ class Authenticator:
         """The enrolled agent that signed ``token``.
 
         Raises:
-            Problem: ``unauthorized``: unknown key, forged, expired or too long-lived.
+            Problem: ``unauthorized``: unknown key, forged, expired, or lifetime too long.
         """
         try:
             kid = str(jwt.get_unverified_header(token).get("kid", ""))
@@ -179,11 +179,11 @@ class Authenticator:
                 account=str(claims["sub"]),
                 name=str(claims["name"]),
                 session=str(claims["sid"]),
-                # A token from before sessions told their end ends what it gives with itself.
+                # A token without session end limits grants to its own lifetime.
                 until_ms=int(claims.get("until", claims["exp"])) * 1000,
             )
         except (jwt.PyJWTError, KeyError) as error:
-            raise unauthorized(f"The access token is refused: {error}. Sign in again.") from error
+            raise unauthorized(f"The access token is not valid: {error}. Sign in again.") from error
         await self._check_signed_out(identity)
         return _Known(identity, int(claims["exp"]) * 1000, self._clock.now_ms(), str(claims.get("csrf", "")))
 
@@ -195,9 +195,9 @@ class Authenticator:
         try:
             claims = decode(token, key, API, now_s=self._now_s(), leeway_s=CLOCK_SKEW_S)
         except jwt.PyJWTError as error:
-            raise unauthorized(f"The agent's token is refused: {error}.") from error
+            raise unauthorized(f"The agent's token is not valid: {error}.") from error
         if claims.get("iss") != "agent" or claims["exp"] - claims["iat"] > AGENT_TOKEN_S:
-            raise unauthorized(f"An agent's token has iss 'agent' and lives at most {AGENT_TOKEN_S} s.")
+            raise unauthorized(f"An agent's token needs iss 'agent' and a lifetime of at most {AGENT_TOKEN_S} s.")
 
     def _now_s(self) -> float:
         return self._clock.now_ms() / 1000
@@ -209,35 +209,35 @@ def new_session() -> str:
 
 
 def principal(caller: Identity) -> str:
-    """A sign-in session, as the broker knows it: signing out ends its connections and nobody else's."""
+    """Broker principal of a sign-in session; signing out revokes exactly this principal."""
     return f"account:{caller.account}:{caller.session}"
 
 
 def viewer_principal(caller: Identity) -> str:
-    """The part of a sign-in session that watches: it is cut apart from what steers, and by account (``all_viewers``)."""
+    """Part of the principal for viewing, which can be revoked separately and by account (``all_viewers``)."""
     return f"{principal(caller)}:watch"
 
 
 def all_viewers(account: str) -> str:
-    """All sessions of an account that watch, as a pattern for ``BrokerAccess.revoke``."""
+    """Pattern of all viewing connections of an account, for ``BrokerAccess.revoke``."""
     return f"account:{account}:{ANY}:watch"
 
 
 def everything(account: str) -> str:
-    """All connections of an account, for ``BrokerAccess.revoke``."""
+    """Pattern of all connections of an account, for ``BrokerAccess.revoke``."""
     return f"account:{account}"
 
 
 def new_secret() -> str:
-    """A one-time token: 256 random bits."""
+    """A random secret of 256 bits."""
     return secrets.token_urlsafe(32)
 
 
 def decode(token: str, key: Ed25519PublicKey, audience: str, *, now_s: float, leeway_s: float) -> dict[str, Any]:
-    """The claims of a signed token. Its times are judged here, by our own clock, once they are seen to be numbers.
+    """The claims of a signed token. Times are checked against our own clock.
 
     Raises:
-        jwt.PyJWTError: Forged, for another purpose, not yet good, or expired.
+        jwt.PyJWTError: Forged, for another purpose, not valid yet, or expired.
     """
     claims: dict[str, Any] = jwt.decode(
         token,
@@ -255,7 +255,7 @@ def decode(token: str, key: Ed25519PublicKey, audience: str, *, now_s: float, le
     if not all(isinstance(moment, int | float) and math.isfinite(moment) for moment in times):
         raise jwt.DecodeError("exp and iat must be seconds since 1970")
     if claims["iat"] > now_s + leeway_s:
-        raise jwt.ImmatureSignatureError("the token is from the future; set this machine's clock")
+        raise jwt.ImmatureSignatureError("the token was issued in the future; set this machine's clock")
     if claims["exp"] <= now_s - leeway_s:
         raise jwt.ExpiredSignatureError("the token has expired")
     return claims

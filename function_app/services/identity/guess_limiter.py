@@ -1,4 +1,4 @@
-"""How often something was tried in vain: what can be guessed is given few tries."""
+"""Limits failed attempts for guessable secrets."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,12 +12,12 @@ from function_app.services.storage.retention import Retention
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """What is tried.
+    """A kind of guessable secret.
 
     Attributes:
-        what: Names it in the rows.
-        window_ms: For so long a wrong try counts.
-        refusal: Of one too many: a sentence, to go before "Try again in …".
+        what: Name in the rows.
+        window_ms: Time for which a failure counts.
+        refusal: Sentence before "Try again in …".
     """
 
     what: str
@@ -33,7 +33,7 @@ class _Tries:
 
 
 class GuessLimiter:
-    """Counts tries by whom or whence they come. Right ones are taken back, so only wrong ones count."""
+    """Counts attempts by account or address. Successful attempts are removed from the count."""
 
     def __init__(self, *, tables: Tables, retention: Retention, clock: Clock) -> None:
         self._tables = tables
@@ -41,14 +41,14 @@ class GuessLimiter:
         self._clock = clock
 
     async def add_failure(self, guess: Guess, counters: Mapping[str, int]) -> None:
-        """Count a try before looking, so that parallel guesses are no way around.
+        """Count an attempt before it is checked, so that parallel attempts cannot bypass the limit.
 
         Args:
-            guess: What is tried.
-            counters: By what it is counted, and how many wrong tries each allows in a window.
+            guess: Kind of secret.
+            counters: Counters, and the number of failures that each allows per window.
 
         Raises:
-            Problem: ``too-many-tries`` by one of them; such a try counts nowhere.
+            Problem: ``too-many-tries``; such an attempt is not counted.
         """
         done: dict[str, int] = {}
         for counter, most in counters.items():
@@ -60,7 +60,7 @@ class GuessLimiter:
             done[counter] = most
 
     async def remove_failure(self, guess: Guess, counters: Mapping[str, int]) -> None:
-        """Take a try back: it was right."""
+        """Remove a successful attempt from the count."""
         for counter, most in counters.items():
             await self._change(guess, counter, -1, most)
 
@@ -76,12 +76,12 @@ class GuessLimiter:
                 raise Problem("too-many-tries", 429, "Too many tries", detail, retry_after_s=wait_s)
             return replace(tries, count=max(0, tries.count + change))
 
-        # One note for all tries of a while, and written first: nothing stays that nobody forgets.
+        # One deletion per window, scheduled before the row is written.
         due_ms = (now_ms // guess.window_ms + 2) * guess.window_ms
         await self._retention.delete_row_at(records.ATTEMPTS, counter, guess.what, due_ms=due_ms)
         await records.upsert(self._tables, records.ATTEMPTS, counter, guess.what, counted, _Tries)
 
 
 def by_address(address: str, most: int) -> dict[str, int]:
-    """The counter of the address that a request comes from; none where nothing tells it."""
+    """The counter of the client's address; empty if unknown."""
     return {f"address:{address}": most} if address else {}

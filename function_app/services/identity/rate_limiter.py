@@ -1,7 +1,6 @@
-"""Rates by address, account, API key and agent. Guards the functions, not secrets: for these see ``claim.py``.
+"""Rate limits by address, account, API key and agent. ``guess_limiter`` protects secrets.
 
-Each process counts for itself and writes nothing, so that a limit costs microseconds and never a request to the
-tables: of n instances all together let through n times as much. What is guessed at is counted in the tables instead.
+Each process counts in memory without table requests: n instances admit up to n times as many requests.
 """
 
 import math
@@ -13,9 +12,9 @@ from function_app.domain.common.rate_limit import Rate, request
 from function_app.ports.clock import Clock
 
 BURST_S: Final = 20
-"""So many seconds' worth may come at once: a page that opens asks for everything it shows."""
+"""Burst size in seconds of the rate: opening a page sends many requests."""
 KNOWN: Final = 50_000
-"""Of so many names the newest are remembered (5 MB)."""
+"""Number of remembered names (5 MB)."""
 
 Kind = Literal["address", "account", "key", "agent"]
 _WHOSE: Final = {"address": "this address", "account": "this account", "key": "this API key", "agent": "this agent"}
@@ -43,5 +42,5 @@ class RateLimiter:
             self._arrivals.popitem(last=False)
         if wait_ms > 0:
             wait_s = math.ceil(wait_ms / 1000)
-            detail = f"More requests come from {_WHOSE[kind]} than are answered here. Try again in {wait_s} s."
+            detail = f"Too many requests from {_WHOSE[kind]}. Try again in {wait_s} s."
             raise Problem("too-many-requests", 429, "Too many requests", detail, retry_after_s=wait_s)

@@ -1,4 +1,4 @@
-"""Who acts in the name of a sign-in session or an API key now: much may have changed since something was asked for."""
+"""The current permissions of a sign-in session or API key."""
 
 from dataclasses import replace
 from typing import Final
@@ -9,15 +9,15 @@ from function_app.ports.tables import Tables
 from function_app.services.storage import records
 
 API_KEY: Final = "key"
-"""The key of an API key's one row."""
+"""Row key of an API key."""
 
 
 async def current_identity(tables: Tables, caller: Identity, now_ms: int) -> Identity | None:
-    """``caller`` with what they may do now: an API key as it stands in the tables.
+    """``caller`` with current permissions; those of an API key are read from the tables.
 
     Returns:
-        ``None`` once the key was revoked or has run out, or somebody has ended the session. One that has only run out
-        by itself still counts: what its person has begun goes on.
+        ``None`` if the key was revoked or expired, or the session was ended explicitly. An expired session is still
+            valid here: its actions continue.
     """
     key_id = caller.key or key_of(caller.session)
     if not key_id:
@@ -30,5 +30,5 @@ async def current_identity(tables: Tables, caller: Identity, now_ms: int) -> Ide
 
 
 def signed_out_key(session: str) -> str:
-    """Of the row that says, in its account's partition, that somebody has ended a session."""
+    """Row key of the marker of an ended session."""
     return f"signed-out:{session}"

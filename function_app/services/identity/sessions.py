@@ -1,4 +1,4 @@
-"""Sign-in sessions: begun in one place however somebody came in, and listed for the one whose they are."""
+"""Sign-in sessions of an account."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -22,14 +22,14 @@ from function_app.services.storage.retention import Retention
 
 How = Literal["link", "password", "oidc"]
 FRESH_MS: Final = 10 * 60 * 1000
-"""A session begun by a one-time link so lately may set a password without the old one."""
+"""A session by one-time link of at most this age may set a password without the old one."""
 _SHOWN: Final = 200
 _ROW: Final = "session:"
 
 
 @dataclass(frozen=True, slots=True)
 class SignInOrigin:
-    """Whence somebody signs in, as far as the request tells; shown to the account alone."""
+    """Origin of a sign-in as known from the request; visible to the account only."""
 
     address: str = ""
     program: str = ""
@@ -37,11 +37,11 @@ class SignInOrigin:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One sign-in, as its account may see it.
+    """A sign-in as visible to its account.
 
     Attributes:
-        how: By what.
-        program: What the browser or program calls itself.
+        how: Sign-in method.
+        program: User agent of the browser or program.
     """
 
     id: str
@@ -52,7 +52,7 @@ class Session:
     program: str = ""
 
     def fresh_by_link(self, now_ms: int) -> bool:
-        """Whether a one-time link was redeemed for it just now."""
+        """Whether a one-time link was redeemed for it recently."""
         return self.how == "link" and 0 <= now_ms - self.since_ms < FRESH_MS
 
 
@@ -61,8 +61,8 @@ class SignedIn:
     """A new sign-in session.
 
     Attributes:
-        cookie: For the page, which no script there can read.
-        csrf: What the page has to show beside its cookie.
+        cookie: HTTP-only cookie for the page.
+        csrf: CSRF token that the page must send with the cookie.
     """
 
     account: Account
@@ -75,7 +75,7 @@ class SignedIn:
 
 
 class Sessions:
-    """Begins sessions, and knows those that an account has."""
+    """Creates and lists sign-in sessions."""
 
     def __init__(
         self, *, tables: Tables, authenticator: Authenticator, retention: Retention, audit_log: AuditLog, clock: Clock
@@ -87,7 +87,7 @@ class Sessions:
         self._clock = clock
 
     async def begin(self, account: Account, how: How, whence: SignInOrigin) -> SignedIn:
-        """A new session of somebody who has shown who they are."""
+        """Create a session for an authenticated account."""
         now_ms = self._clock.now_ms()
         ends_ms = now_ms + SESSION_S * 1000
         begun = Session(new_session(), how, now_ms, ends_ms, address=whence.address, program=whence.program[:_SHOWN])
@@ -109,12 +109,12 @@ class Sessions:
         )
 
     async def access_token(self, caller: Identity) -> tuple[str, int]:
-        """The next access token of a session, and how long it is good [s]: not longer than the session."""
+        """A new access token of a session and its lifetime [s], limited by the session."""
         lifetime_s = caller.lifetime_s(ACCESS_S, self._clock.now_ms())
         return await self._authenticator.issue(caller, API, lifetime_s), lifetime_s
 
     async def list(self, account: str) -> tuple[Session, ...]:
-        """The sessions of an account that have not ended, the newest first."""
+        """Open sessions of an account, newest first."""
         now_ms = self._clock.now_ms()
         result: list[Session] = []
         cursor: str | None = None
@@ -130,12 +130,12 @@ class Sessions:
         return tuple(sorted(live, key=lambda session: -session.since_ms))
 
     async def get(self, caller: Identity) -> Session | None:
-        """The session that asks, as it was begun."""
+        """The caller's own session."""
         row = await self._tables.get(records.ACCOUNTS, caller.account, _ROW + caller.session)
         return records.read(row, Session) if row else None
 
     async def drop(self, account: str, session: str) -> bool:
-        """Take one off the list; whether it was there."""
+        """Remove a session from the list; return whether it existed."""
         row = await self._tables.get(records.ACCOUNTS, account, _ROW + session)
         if row is None:
             return False

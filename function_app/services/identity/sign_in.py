@@ -1,4 +1,4 @@
-"""Signing in by a one-time link, and the accounts behind it."""
+"""Sign-in by one-time link, and account creation."""
 
 import hashlib
 
@@ -17,7 +17,7 @@ LINK_MS = 24 * 3600 * 1000
 FIRST_SPACE = "Home"
 _NAME = "name:"
 MOST_SPACES = 100
-"""More or less: two that are made at once may both be the last."""
+"""Approximate maximum: concurrent requests may exceed it by one."""
 
 
 class SignIn:
@@ -30,14 +30,14 @@ class SignIn:
         self._clock = clock
 
     async def account(self, name: str) -> Account:
-        """The local account of this name, made with its first space when there is none. It keeps its first spelling."""
+        """The local account with this name, created with its first space if missing. The first spelling is kept."""
         row = await self._named(name)
         return await self._account(row.partition if row else named_partition(name), name, keep=True)
 
     async def account_elsewhere(self, issuer: str, subject: str, name: str) -> Account:
-        """The account of somebody who signs in elsewhere: by who says so and who they are there, never by a name.
+        """The account of a person at an OIDC provider, identified by issuer and subject, never by name.
 
-        Names and e-mail addresses are given away again, and not every provider looks whose they are.
+        Names and e-mail addresses may be reassigned, and not every provider verifies them.
         """
         account = await self._account(_elsewhere(issuer, subject), name, keep=False)
         await records.upsert(
@@ -51,16 +51,16 @@ class SignIn:
         return account
 
     async def is_known_elsewhere(self, issuer: str, subject: str) -> bool:
-        """Whether somebody who signs in elsewhere has an account here."""
+        """Whether a person at a provider has an account here."""
         return await self._tables.get(records.ACCOUNTS, _elsewhere(issuer, subject), "account") is not None
 
     async def _account(self, partition: str, name: str, *, keep: bool) -> Account:
-        """Written so that a stop after any step leaves something the next call completes.
+        """Create or complete an account; an interrupted creation is completed by the next call.
 
         Args:
-            partition: Where it is written which account it is.
-            name: What it is called.
-            keep: It goes on being called what it was.
+            partition: Partition of the row that maps to the account.
+            name: Display name.
+            keep: Keep an existing display name.
         """
         row = await self._tables.get(records.ACCOUNTS, partition, "account")
         if row is None:
@@ -73,18 +73,18 @@ class SignIn:
         spaces = await self.spaces(account.id)
         if not spaces:
             space = Space(id=str(row.data["space"]), name=FIRST_SPACE)
-            # The space last: as long as it is not there, all of this is done again.
+            # The space is written last: while it is missing, all steps are repeated.
             await self._create(Row(account.id, "account", records.to_data(account)))
             await self._create(Row(account.id, f"space:{space.id}", records.to_data(space)))
         return account
 
     async def spaces(self, account: str) -> tuple[Space, ...]:
-        """The spaces of an account, the oldest first."""
+        """Spaces of an account, oldest first."""
         page = await self._tables.query(records.ACCOUNTS, account, first="space:", last="space;", limit=1000)
         return tuple(sorted((records.read(row, Space) for row in page.rows), key=lambda space: space.created_ms))
 
     async def add_space(self, caller: Identity, name: str) -> Space:
-        """A further space.
+        """Create a space.
 
         Raises:
             Problem: ``too-many-spaces``.
@@ -103,17 +103,17 @@ class SignIn:
         return space
 
     async def known(self, name: str) -> Account | None:
-        """The local account of this name, in whatever spelling; under the one that it was made with."""
+        """The local account with this name in any spelling, with its original name."""
         row = await self._named(name)
         return _of(row, name) if row else None
 
     async def named(self, account: str) -> str:
-        """The name of an account; empty when it is gone."""
+        """The name of an account; empty if it does not exist."""
         row = await self._tables.get(records.ACCOUNTS, account, "account")
         return records.read(row, Account).name if row else ""
 
     async def link(self, account: Account) -> str:
-        """A new one-time token that signs in to ``account``, good for a day. Only its hash is stored."""
+        """A new one-time sign-in token for ``account``, valid for one day. Only its hash is stored."""
         token = new_secret()
         hashed = _hash(token)
         data = {"account": account.id, "name": account.name, "expires_ms": self._clock.now_ms() + LINK_MS}
@@ -121,10 +121,10 @@ class SignIn:
         return token
 
     async def redeem(self, token: str, whence: SignInOrigin | None = None) -> SignedIn:
-        """Sign in. Of several that bring the same token one wins: whoever deletes the row.
+        """Sign in with a one-time token. Of concurrent requests one succeeds: the one that deletes the row.
 
         Raises:
-            Problem: ``unauthorized``: unknown, used or expired; the answer is the same.
+            Problem: ``unauthorized``: unknown, used or expired; the response is the same.
         """
         hashed = _hash(token)
         refused = unauthorized("This sign-in link is unknown, used or expired. Ask for a new one.")
@@ -145,7 +145,7 @@ class SignIn:
         return await self._sessions.begin(account, "link", whence or SignInOrigin())
 
     async def _named(self, name: str) -> Row | None:
-        """Rows from before names were folded are under their own spelling: by that they are found, and first."""
+        """Older rows are stored under their exact spelling, which is looked up first."""
         for partition in dict.fromkeys((f"{_NAME}{name}", named_partition(name))):
             row = await self._tables.get(records.ACCOUNTS, partition, "account")
             if row is not None:
@@ -160,17 +160,17 @@ class SignIn:
 
 
 def named_partition(name: str) -> str:
-    """Where it is written which local account has a name."""
+    """Partition that maps a name to a local account."""
     return f"{_NAME}{fold_name(name)}"
 
 
 def new_name(account: str, name: str) -> dict[str, str]:
-    """What is written there of a new account."""
+    """The row of a new name."""
     return {"account": account, "space": new_id(12), "name": name}
 
 
 def _of(row: Row, name: str) -> Account:
-    """The account that a name leads to. Where the row does not say how it is spelt, it was found by its spelling."""
+    """The account of a name row. Rows without a spelling were found by their exact spelling."""
     return Account(id=str(row.data["account"]), name=str(row.data.get("name", name)))
 
 

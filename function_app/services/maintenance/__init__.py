@@ -1,1 +1,1 @@
-"""Maintenance."""
+"""Periodic jobs and the readiness check."""

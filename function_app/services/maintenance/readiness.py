@@ -1,4 +1,4 @@
-"""Whether the functions can do their work."""
+"""Checks that stores and broker are usable."""
 
 from dataclasses import dataclass
 
@@ -9,21 +9,21 @@ from function_app.services.storage import records
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """``ok`` or a sentence, for each thing that the functions need."""
+    """``ok`` or an error text for each dependency."""
 
     tables: str
     broker: str
 
 
 class ReadinessCheck:
-    """Looks."""
+    """Checks dependencies."""
 
     def __init__(self, *, tables: Tables, bus: CommandBus) -> None:
         self._tables = tables
         self._bus = bus
 
     async def check(self) -> Health:
-        """Read a row, and ask the bus."""
+        """Read a row and check the bus."""
         try:
             await self.require_tables()
         except StoreError as error:
@@ -34,6 +34,6 @@ class ReadinessCheck:
         """Read a row.
 
         Raises:
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         await self._tables.get(records.ACCOUNTS, "health", "health")

@@ -1,6 +1,6 @@
-"""What time brings: commands that nobody answered, actions without an end, codes and links that ran out.
+"""Periodic jobs: unanswered commands, overdue actions, expired codes and links.
 
-Run every second by one or more timers; every step is safe to repeat and to be run by two at once.
+Run it every second in one or more processes; every job is idempotent and safe to run concurrently.
 """
 
 import logging
@@ -34,9 +34,9 @@ from function_app.services.telemetry.ingest import TelemetryIngest
 from function_app.services.telemetry.uploads import Uploads
 
 ORPHAN_MS = 2 * ABANDON_MS
-"""A note whose action was never written is kept this long: whoever writes it gives up before."""
+"""Time that a reminder without an action is kept; a start is abandoned before."""
 KEEP_ONCE_MS = DAY_MS
-"""An idempotency key is good for a day."""
+"""Validity of an idempotency key: one day."""
 _ENDING = frozenset({NextStep.ENDED, NextStep.LOSE, NextStep.EXPIRE})
 _HEX = "0123456789abcdef"
 
@@ -44,7 +44,7 @@ _log = logging.getLogger(__name__)
 
 
 class Scheduler:
-    """The timer's work."""
+    """Runs the periodic jobs."""
 
     def __init__(
         self,
@@ -93,10 +93,10 @@ class Scheduler:
         self._turn = 0
 
     async def run_due_jobs(self) -> None:
-        """One round. What fails is logged and comes again in the next round.
+        """Run all due jobs once. Failed jobs are logged and retried in the next run.
 
         Raises:
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         for shard in range(SHARDS):
             for action, note in await self._reminders.due(shard, self._clock.now_ms()):
@@ -154,10 +154,11 @@ class Scheduler:
             after = await self._ended(result, verdict, now_ms)
             if after is not None and after.status.terminal:
                 await self._keep_for_a_while(after)
-            elif after is not None:  # something was heard of it meanwhile
+            elif after is not None:  # an ack arrived concurrently
                 await self._reminders.schedule(action_id, next_check_ms(after, now_ms))
         else:
-            # The next note before this one goes: a stop in between leaves two, which is one too many, not too few.
+            # Schedule the next check before this reminder is deleted: a kill in between leaves one too many, not too
+            # few.
             await self._reminders.schedule(action_id, next_check_ms(result.action, now_ms))
             if verdict is NextStep.PUBLISH:
                 await self._publish(result, now_ms)
@@ -166,49 +167,49 @@ class Scheduler:
         await self._reminders.cancel(note)
 
     async def _ended(self, result: StoredAction, verdict: NextStep, now_ms: int) -> Action | None:
-        """The action with its end, known or given now, unless it has come to deserve another verdict."""
+        """The action after it ended, already or now; unchanged if another step is due."""
         if verdict is NextStep.ENDED:
             return result.action
         if verdict is NextStep.LOSE:
             await self._cancel(result.action)
-            message = "The device did not say how it ended before its time was over. Look at the device."
+            message = "The device did not report the end of the action before its deadline. Check the device."
             return await self._end(result, Status.FAILED, "lost", message, now_ms)
         if result.action.status is Status.QUEUED:
             return await self._end(result, Status.EXPIRED, "queue-timeout", TIMEOUT, now_ms)
         if result.action.cancel_id:
-            message = "Cancelled before the device took it."
+            message = "Cancelled before the device received it."
             return await self._end(result, Status.CANCELLED, "cancelled", message, now_ms)
-        message = "The device did not take the command in time. Check that it is online, then start it again."
+        message = "The device did not receive the command in time. Check that it is online, then start it again."
         return await self._end(result, Status.EXPIRED, "no-answer", message, now_ms)
 
     async def _look_at_queue(self, device: str, note: Row) -> None:
-        """Whoever freed the slot may have been killed before it gave the next one its turn."""
+        """Advance a queue after its process may have been killed."""
         if await self._queues.check(device):
             await self._queues.schedule_check(device)
         elif self._clock.now_ms() - int(note.key.partition(":")[0]) <= ORPHAN_MS:
-            return  # somebody may be about to put an action into it
+            return  # an action may be added concurrently
         await self._reminders.cancel(note)
 
     async def _look_at_leaver(self, agent: str, note: Row) -> None:
-        """Whoever un-paired or moved it may have been killed, or could not reach the broker."""
+        """Continue a departure whose process was killed or could not reach the broker."""
         if not await self._offboarding.finish(agent):
             await self._offboarding.watch(agent)
         elif self._clock.now_ms() - int(note.key.partition(":")[0]) <= ORPHAN_MS:
-            return  # somebody may be about to write what this is about
+            return  # the departure may be written concurrently
         await self._reminders.cancel(note)
 
     async def _end(self, result: StoredAction, status: Status, code: str, message: str, now_ms: int) -> Action | None:
         verdict = next_step(result.action, now_ms)
 
         def ended(action: Action) -> Action:
-            # An ack, or its turn, may have come since it was read.
+            # An ack may have arrived, or the action may have left the queue, since it was read.
             return end(action, status, code, message, now_ms) if next_step(action, now_ms) is verdict else action
 
         after = await self._queues.change(result.action.id, ended, existing=result)
         return None if after is None else after.action
 
     async def _keep_for_a_while(self, action: Action) -> None:
-        """See that an action that has ended, and the key it was started with, will be forgotten."""
+        """Schedule the deletion of an ended action and of its idempotency key."""
         where = row_location(action.id)
         if where is None:
             return
@@ -219,16 +220,16 @@ class Scheduler:
             )
 
     async def _publish(self, result: StoredAction, now_ms: int) -> None:
-        """Send the very same command again: same id, same time of issue, so the device runs it at most once."""
+        """Publish the identical command again: with the same id the device runs it at most once."""
         device = await self._dispatcher.device(result.action)
         if device is None:
-            message = "The device was un-paired before the command reached it."
+            message = "The device was unpaired before it received the command."
             await self._end(result, Status.FAILED, "unpaired", message, now_ms)
             return
         try:
             await self._dispatcher.send(result, device)
         except MovementUnavailable:
-            message = "The movement's script was changed before the command could be sent. Start it again."
+            message = "The movement's script changed before the command was sent. Start it again."
             await self._end(result, Status.FAILED, "movement-changed", message, now_ms)
         except PermissionEnded as ended:
             status, message = DROPPED[ended.why]
@@ -246,7 +247,7 @@ class Scheduler:
             _log.warning("cancel of %s: %s", action.id, error)
 
     async def _forget_expired(self) -> None:
-        """Claim codes and sign-in links whose time is over, a part of them each round."""
+        """Delete expired claim codes and sign-in links, a limited number per run."""
         self._turn += 1
         now_ms = self._clock.now_ms()
         for table, shards in ((records.CLAIMS, CLAIM_ALPHABET), (records.SIGN_INS, _HEX)):

@@ -1,1 +1,1 @@
-"""Messaging."""
+"""Delivery of commands and messages over MQTT, HTTP and XMPP."""

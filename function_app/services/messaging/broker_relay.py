@@ -1,4 +1,4 @@
-"""What came by another way than the broker, told there too: for the console, and for whoever else listens."""
+"""Republishes messages that arrived by HTTP or XMPP on the broker, for consoles and other subscribers."""
 
 import asyncio
 import logging
@@ -10,16 +10,16 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable, CommandBus
 
 GIVE_UP_S = 2.0
-"""An agent's request is not held up longer than this by a broker that is away."""
+"""Time limit, so that an unreachable broker does not delay an agent's request."""
 REST_MS = 5_000
-"""After a failure the broker is left alone for this long."""
+"""Pause after a failure."""
 _RETAINED = frozenset({topics.CONN, topics.DESC, topics.STATE})
 
 _log = logging.getLogger(__name__)
 
 
 class BrokerRelay:
-    """Publishes as well as it can: what is passed on is stored already."""
+    """Publishes messages that are already stored, best effort."""
 
     def __init__(self, *, bus: CommandBus, clock: Clock) -> None:
         self._bus = bus
@@ -27,7 +27,7 @@ class BrokerRelay:
         self._rests_until_ms = 0
 
     async def publish(self, told: Iterable[tuple[str, Topic, bytes]]) -> None:
-        """Publish messages, those of one topic in order, retained where the contract says so."""
+        """Publish messages in order per topic, retained where the wire contract requires it."""
         if self._clock.now_ms() < self._rests_until_ms:
             return
         by_topic: dict[str, list[tuple[Topic, bytes]]] = {}
@@ -39,12 +39,12 @@ class BrokerRelay:
                     group.create_task(self._publish(topic, messages))
         except* (BusUnavailable, TimeoutError) as errors:
             self._rests_until_ms = self._clock.now_ms() + REST_MS
-            _log.warning("what did not come by the broker does not reach it: %s", errors.exceptions[0])
+            _log.warning("relayed messages are not published: %s", errors.exceptions[0])
 
     async def _publish(self, topic: str, messages: Iterable[tuple[Topic, bytes]]) -> None:
         for parsed, payload in messages:
             retain = parsed.kind in _RETAINED
             if retain and len(payload) > codec.MAX_RETAINED_BYTES:
-                _log.warning("%s is too long to be retained on the broker", topic)
+                _log.warning("%s is too long for a retained message", topic)
                 continue
             await self._bus.publish(topic, payload, qos=0 if parsed.kind == topics.TELE else 1, retain=retain)

@@ -1,10 +1,10 @@
-"""The one way from the cloud to a device, whatever its agent speaks: publish, and hear the answer.
+"""Delivers commands to a device over the transport of its agent, and awaits acks.
 
-MQTT: the command bus. Otherwise the mailbox, from which the agent, or who speaks XMPP for it, fetches. Whoever uses it
-writes first and sends after: what is lost between the two is sent again by the timer; the device drops doubles by id.
+MQTT agents get commands from the command bus, other agents fetch them from the mailbox. Callers write first and send
+afterwards; the timer sends what was lost in between, and the device drops duplicates by id.
 
-Who speaks XMPP for an agent hears on the broker what is for it, and answers there: so neither waits for the tables. The
-mailbox is for when the broker, or that program, was away.
+The XMPP gateway also receives commands from the broker and publishes acks there, without a delay by the tables. The
+mailbox covers outages of the broker or the gateway.
 """
 
 import asyncio
@@ -21,11 +21,11 @@ from function_app.services.messaging.mailbox import Mailbox
 _POLL_S = 0.02
 _SLOWEST_POLL_S = 0.2
 CONFIRMING = frozenset({AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE})
-"""Answers that say yes; the other ones that say anything are terminal."""
+"""Confirming acks. All other decisive acks are terminal."""
 
 
 class SignedCommand(NamedTuple):
-    """A signed command, and until when it may be sent [ms since 1970]. ``first``: before all others, as Stop is."""
+    """A signed command and its expiry time [ms since 1970]. ``first``: before all others, as for Stop."""
 
     command: str
     payload: bytes
@@ -34,7 +34,7 @@ class SignedCommand(NamedTuple):
 
 
 class Delivery:
-    """Sends commands, and waits for the answers to them."""
+    """Sends commands and awaits their acks."""
 
     def __init__(self, *, bus: CommandBus, mailbox: Mailbox, relay: BrokerRelay) -> None:
         self._bus = bus
@@ -42,7 +42,7 @@ class Delivery:
         self._mailbox = mailbox
 
     async def send(self, device: Device, signed: SignedCommand) -> None:
-        """Publish a command, or put it where its agent fetches it.
+        """Publish a command, or put it into the agent's mailbox.
 
         Raises:
             BusUnavailable: The broker did not confirm it.
@@ -63,7 +63,7 @@ class Delivery:
             await self._pass_on(topic, signed.payload)
 
     async def stop(self, device: Device, payload: bytes) -> None:
-        """Publish the plain Stop message. An agent that polls gets the signed one alone: it is kept until answered.
+        """Publish the plain Stop message. A polling agent gets only the signed command, which stays until acknowledged.
 
         Raises:
             BusUnavailable: The broker did not confirm it.
@@ -74,13 +74,13 @@ class Delivery:
             await self._pass_on(f"{device.topic}/{topics.STOP}", payload)
 
     async def withdraw(self, device: Device, command: str) -> None:
-        """Take back what its agent has not fetched; what was published stays so."""
+        """Remove a command that the agent has not fetched. Published commands are not affected."""
         if device.transport != "mqtt":
             await self._mailbox.withdraw(device.agent, command)
 
     @contextlib.asynccontextmanager
     async def acks(self, device: Device, command: str) -> AsyncGenerator[AsyncIterator[Ack] | None]:
-        """Acks of one command from now on; ``None`` where they are to be read from the tables. See ``CommandBus``."""
+        """Acks of one command from now on; ``None``: read them from the tables. See ``CommandBus``."""
         if device.transport != "http":
             async with self._bus.acks(device.topic, command) as acks:
                 yield acks
@@ -88,7 +88,7 @@ class Delivery:
             yield None
 
     async def send_confirmed(self, device: Device, signed: SignedCommand, *, wait_ms: int) -> bool:
-        """Send a command; whether the device accepted it within ``wait_ms``.
+        """Send a command; return whether the device accepted it within ``wait_ms``.
 
         Raises:
             BusUnavailable: The broker did not confirm it.
@@ -104,7 +104,7 @@ class Delivery:
                 return False
 
     async def _answer(self, device: Device, command: str, acks: AsyncIterator[Ack] | None) -> AckStatus:
-        """The first answer that decides, from wherever it comes first."""
+        """The first decisive ack, from the broker or the tables."""
         if acks is None:
             return await self._noted(device, command)
         if device.transport == "mqtt":
@@ -122,7 +122,7 @@ class Delivery:
         await self._relay.publish([(topic, topics.parse(topic), payload)])
 
     async def _noted(self, device: Device, command: str) -> AckStatus:
-        """The answer, as soon as it is in the tables."""
+        """The ack, when it is stored in the tables."""
         pause_s = _POLL_S
         with self._mailbox.listen(device.agent) as bell:
             while True:
@@ -130,7 +130,7 @@ class Delivery:
                 status = await self._mailbox.stored_answer(device.agent, command)
                 if status is not None:
                     return status
-                # Not `wait_for`: it loses the end of the time that the caller set when the bell rings in that moment.
+                # Not `wait_for`: it loses the caller's timeout if the event is set at that moment.
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(pause_s):
                         await bell.wait()

@@ -1,4 +1,4 @@
-"""Tells agents of a new signing key while they still learn it: by an order that the key before has signed."""
+"""Announces a new signing key to agents, with a command signed by the previous key."""
 
 import logging
 
@@ -15,7 +15,7 @@ _log = logging.getLogger(__name__)
 
 
 class KeyAnnouncer:
-    """The word of mouth. Agents also ask by themselves, with every request for credentials."""
+    """Announces keys. Agents also request keys themselves, with every request for credentials."""
 
     def __init__(self, *, keys: SigningKeys, command_sender: CommandSender) -> None:
         self._keys = keys
@@ -24,7 +24,7 @@ class KeyAnnouncer:
         self._told: set[str] = set()
 
     async def on_state(self, agent: Agent, device: str) -> None:
-        """A device has said something: so its agent is there to be told, once by each process.
+        """Announce a new key to the agent of a device that has sent its state; once per process.
 
         Raises:
             StoreError: The keys cannot be read.
@@ -44,6 +44,6 @@ class KeyAnnouncer:
         try:
             await self._command_sender.send(result, RotateKey(statements=news.statements), caller=_WHO, epoch=0)
         except (BusUnavailable, Problem) as error:
-            _log.warning("agent %s could not be told of a new key: %s", agent.id, error)
+            _log.warning("the new key was not announced to agent %s: %s", agent.id, error)
             return
         self._told.add(agent.id)

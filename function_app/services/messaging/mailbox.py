@@ -1,7 +1,7 @@
-"""Commands for agents that ask for them, each until it is answered or its time is over; and answers somebody waits for.
+"""Commands for polling agents, and acks that a sender waits for.
 
-At least once: a command is given at every asking until an ack of it has come. The agent drops doubles by id. Rows are
-also deleted by ``Retention``, where an agent never asks again.
+At-least-once: a command is returned by every poll until it is acknowledged or expires. The agent drops duplicates by
+id. ``Retention`` deletes the rows of agents that do not poll.
 """
 
 import asyncio
@@ -19,15 +19,15 @@ from function_app.services.storage.retention import Retention
 
 PAGE = 100
 ANSWER_BYTES = 1_000_000
-"""Payloads in one answer hold at most this much, or are one."""
+"""Maximum size of a response [bytes], unless it has a single payload."""
 _FIRST, _OTHERS, _BEHIND = "0", "1", "2"
 _TIDY_MS = 3_600_000
-"""One note an hour for each agent is enough: ``Retention`` keeps what has not expired."""
+"""Deletions are scheduled at most once per hour and agent."""
 
 
 @dataclass(frozen=True, slots=True)
 class MailboxEntry:
-    """One command on its way, exactly as it would travel over MQTT. In its row as base64: any payload fits."""
+    """A command as it would be published with MQTT. The row stores the payload in base64."""
 
     command: str
     topic: str
@@ -38,14 +38,14 @@ class MailboxEntry:
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """The first answer that decides, to a command whose sender waits for it."""
+    """The first decisive ack of a command whose sender waits."""
 
     expires_ms: int
     status: AckStatus | None = None
 
 
 class Mailbox:
-    """The rows, and a bell for whoever waits in this process; others see the rows a moment later."""
+    """Stores commands, and notifies waiting polls in this process. Other processes poll the rows."""
 
     def __init__(self, *, tables: Tables, retention: Retention, clock: Clock) -> None:
         self._tables = tables
@@ -57,15 +57,15 @@ class Mailbox:
     async def put(
         self, device: Device, command: str, *, topic: str, payload: bytes, expires_ms: int, first: bool
     ) -> None:
-        """Keep a command for the device's agent. The same command twice is one.
+        """Store a command for the device's agent. Idempotent by command id.
 
         Args:
-            device: Whom it is for.
-            command: Its id.
-            topic: The topic it would be published on.
+            device: The device.
+            command: Command id.
+            topic: Topic for MQTT.
             payload: JSON.
-            expires_ms: From then on it is no longer given [ms since 1970].
-            first: Before all others that wait: a Stop.
+            expires_ms: Expiry time [ms since 1970].
+            first: Return it before all others: a Stop.
         """
         letter = MailboxEntry(command, topic, payload, expires_ms, device.pairing)
         await self._tidy_later(device.agent, expires_ms)
@@ -76,12 +76,12 @@ class Mailbox:
         self._ring(device.agent)
 
     async def pending(self, agent: Agent, *, limit: int, have: Collection[str] = ()) -> list[MailboxEntry]:
-        """Commands that nobody has answered, Stop first, then the oldest first.
+        """Unacknowledged commands, Stop first, then oldest first.
 
         Args:
-            agent: Whose; commands of an earlier pairing are not given.
-            limit: At most so many.
-            have: Ids of commands that are not to be given again.
+            agent: The agent; commands of earlier pairings are skipped.
+            limit: Maximum number.
+            have: Ids of commands to skip.
         """
         result: list[MailboxEntry] = []
         now_ms, size = self._clock.now_ms(), 0
@@ -105,7 +105,7 @@ class Mailbox:
                 return result
 
     async def withdraw(self, agent: str, command: str) -> None:
-        """Do not give this command any more: it was answered, or nobody wants it now."""
+        """Delete a command that was acknowledged or is obsolete."""
         for first in (False, True):
             row = await self._tables.get(records.MAILBOX, agent, _key(command, first=first))
             if row is not None:
@@ -114,14 +114,14 @@ class Mailbox:
                 return
 
     async def expect_answer(self, device: Device, command: str, *, expires_ms: int) -> None:
-        """Make a place for the answer to a command. Before it is sent: an answer without a place is not kept."""
+        """Create the row for the ack of a command, before the command is sent. Acks without this row are not stored."""
         await self._tidy_later(device.agent, expires_ms)
         place = Row(device.agent, _answer_key(command), records.to_data(Awaited(expires_ms)))
         with contextlib.suppress(Conflict):
             await self._tables.create(records.MAILBOX, place)
 
     async def store_answer(self, agent: str, ack: Ack) -> None:
-        """Note an answer, where a place was made for it and nothing more final stands there.
+        """Store an ack, if its row exists and has no later ack.
 
         Raises:
             Problem: ``busy``.
@@ -140,13 +140,13 @@ class Mailbox:
         self._ring(agent)
 
     async def stored_answer(self, agent: str, command: str) -> AckStatus | None:
-        """What was noted in the place for the answer."""
+        """The stored ack of a command."""
         row = await self._tables.get(records.MAILBOX, agent, _answer_key(command))
         return None if row is None else records.read(row, Awaited).status
 
     @contextlib.contextmanager
     def listen(self, agent: str) -> Iterator[asyncio.Event]:
-        """A bell that rings when this process has changed something in the agent's mailbox."""
+        """An event that is set when this process changes the agent's mailbox."""
         bell = asyncio.Event()
         bells = self._bells.setdefault(agent, set())
         bells.add(bell)

@@ -1,4 +1,4 @@
-"""An agent asks for its commands; that it asks shows that it is there."""
+"""Long polling of commands; each poll marks the agent as online."""
 
 import asyncio
 import contextlib
@@ -13,11 +13,11 @@ from function_app.services.storage import records
 
 _LOOK_S = 0.05
 _SLOWEST_LOOK_S = 0.25
-"""Another instance may have put a command into the mailbox: then nothing but looking tells."""
+"""Commands stored by another instance are only found by reading."""
 
 
 class CommandPolling:
-    """Polls, plain and long."""
+    """Plain and long polling."""
 
     def __init__(self, *, tables: Tables, mailbox: Mailbox, clock: Clock) -> None:
         self._tables = tables
@@ -25,7 +25,7 @@ class CommandPolling:
         self._clock = clock
 
     async def commands(self, agent: Agent, *, wait_ms: int, limit: int, have: Collection[str]) -> list[MailboxEntry]:
-        """Commands that wait for the agent, as soon as there is one, or none after ``wait_ms``.
+        """Commands for the agent, as soon as there is one; none after ``wait_ms``.
 
         Raises:
             Problem: ``agent-unclaimed``, ``busy``.
@@ -48,7 +48,7 @@ class CommandPolling:
                 pause_s = min(2 * pause_s, _SLOWEST_LOOK_S)
 
     async def mark_online(self, agent: Agent) -> None:
-        """Note that the agent is there; written only now and then. Of one on MQTT its connection tells.
+        """Mark the agent as online, written at intervals. MQTT agents report their connection themselves.
 
         Raises:
             Problem: ``busy``.

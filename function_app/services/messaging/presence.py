@@ -1,4 +1,4 @@
-"""What agents say of themselves and their devices, into the tables: presence, description, state, events."""
+"""Stores presence, descriptions, states and events of agents and devices."""
 
 from typing import TypeVar
 
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 class PresenceIngest:
-    """Writes down what arrives. Safe to repeat; what does not belong to a claimed agent is dropped."""
+    """Stores messages. Idempotent; messages that do not belong to a claimed agent are dropped."""
 
     def __init__(
         self,
@@ -40,14 +40,14 @@ class PresenceIngest:
         self._clock = clock
 
     async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
-        """Take one message in.
+        """Store one message.
 
-        What an agent has said by another way is told to the broker too and comes back from there, perhaps late: then
-        it is not taken a second time.
+        Messages from other transports are republished on the broker and return from there later; they are stored only
+        once.
 
         Raises:
-            ProtocolError: It is not what its topic says.
-            Problem: ``busy``: not stored, to be delivered again.
+            ProtocolError: The message does not match its topic.
+            Problem: ``busy``: not stored; deliver it again.
         """
         row = await self._tables.get(records.AGENTS, topic.agent, "agent")
         if row is None:
@@ -85,7 +85,7 @@ class PresenceIngest:
             await self._event(agent, topic, codec.decode(payload, Event))
 
     async def _event(self, agent: Agent, topic: Topic, event: Event) -> None:
-        """By its id, so that one that is delivered twice is stored once."""
+        """Store an event by its id, so that a duplicate has no effect."""
         if too_deep(event.data):
             raise ProtocolError(f"the event's data are nested more than {MAX_LEVELS} levels deep")
         if event.at_ms > LAST_MS:

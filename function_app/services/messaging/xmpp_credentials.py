@@ -1,8 +1,7 @@
-"""Who may log in at the XMPP server, for how long, and whom they know there: passwords made, and looked at again.
+"""XMPP passwords, and the contacts of each user.
 
-A password is a signed token for this purpose alone, so whoever sees it can do nothing else with it. The server asks at
-each login; nothing is written. A user is an agent, an account, or the cloud, and the first two know each other exactly
-while the one is paired with the other.
+A password is a signed token for this purpose only. The server verifies it at each login; nothing is stored. A user is
+an agent, an account or the cloud. Agents and accounts are contacts while they are paired.
 """
 
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ from function_app.services.storage import records
 
 AGENT_S: Final = 3600
 LOGIN_S: Final = 3600
-"""A connection of a person ends after this time: who has signed out does not come back then."""
+"""Maximum duration of a person's connection, so that a signed-out person cannot stay connected."""
 CLOUD_NAME: Final = "Telescope"
 _SERVICE: Final = "service:xmpp"
 _PAGE = 1000
@@ -35,7 +34,7 @@ _PAGE = 1000
 
 @dataclass(frozen=True, slots=True)
 class Password:
-    """What to log in with."""
+    """XMPP credentials."""
 
     user: str
     password: str
@@ -45,7 +44,7 @@ class Password:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """Somebody whom a user knows: the user part of a JID, and a name for people."""
+    """A contact: user part of the JID, and display name."""
 
     user: str
     name: str
@@ -53,7 +52,7 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class Admitted:
-    """Who has logged in, until when, and whom they know."""
+    """A successful login: user, expiry time and contacts."""
 
     user: str
     name: str
@@ -63,16 +62,16 @@ class Admitted:
 
 
 class XmppCredentials:
-    """Makes and checks passwords.
+    """Creates and verifies passwords.
 
     Args:
         tables: Agents.
-        keys: Signs, and checks.
-        identify: Tokens of people.
+        keys: Signing keys.
+        authenticator: Tokens of people.
         sign_in: Names of accounts.
-        devices: The agents of an account.
-        clock: Of the cloud.
-        domain: The part of every JID after the ``@``; empty where there is no XMPP server.
+        devices: Agents of an account.
+        clock: Cloud clock.
+        domain: Domain part of every JID; empty: no XMPP server.
     """
 
     def __init__(
@@ -95,7 +94,7 @@ class XmppCredentials:
         self._domain = domain
 
     async def agent(self, agent: Agent) -> Password:
-        """For an agent.
+        """Credentials of an agent.
 
         Raises:
             Problem: ``xmpp-unavailable``, ``agent-unclaimed``.
@@ -105,7 +104,7 @@ class XmppCredentials:
         return await self._signed(agent.id, f"agent:{agent.id}", AGENT_S, pairing=agent.pairing)
 
     async def account(self, caller: Identity) -> Password:
-        """For a person's own XMPP client; good as long as the sign-in session.
+        """Credentials of a person's XMPP client, valid as long as the sign-in session.
 
         Raises:
             Problem: ``xmpp-unavailable``.
@@ -117,7 +116,7 @@ class XmppCredentials:
         return Password(caller.account, token, now_ms + lifetime_s * 1000, lifetime_s)
 
     async def cloud(self) -> Password:
-        """For the program that speaks for the cloud.
+        """Credentials of the XMPP gateway.
 
         Raises:
             Problem: ``xmpp-unavailable``.
@@ -126,10 +125,10 @@ class XmppCredentials:
         return await self._signed(jids.CLOUD, _SERVICE, AGENT_S)
 
     async def verify(self, user: str, password: str) -> Admitted:
-        """Who this is.
+        """Verify a login.
 
         Raises:
-            Problem: ``unauthorized``: not with this password, or not any more; ``xmpp-unavailable``.
+            Problem: ``unauthorized``: wrong or expired password; ``xmpp-unavailable``.
         """
         self._require()
         if user == jids.CLOUD:
@@ -168,7 +167,7 @@ class XmppCredentials:
 
     def _require(self) -> None:
         if not self._domain:
-            detail = "These functions have no XMPP server. Use another transport, or set TELESCOPE_XMPP_DOMAIN here."
+            detail = "No XMPP server is configured. Use another transport, or set TELESCOPE_XMPP_DOMAIN."
             raise Problem("xmpp-unavailable", 409, "No XMPP here", detail)
 
     async def _signed(self, user: str, subject: str, lifetime_s: int, **more: str) -> Password:
@@ -204,4 +203,4 @@ class XmppCredentials:
 
 
 def _refused() -> Problem:
-    return unauthorized("Nobody logs in with this name and password. Ask for new credentials.")
+    return unauthorized("The XMPP name or password is wrong. Request new credentials.")

@@ -1,1 +1,1 @@
-"""Pairing."""
+"""Enrolment, claiming, unpairing and offboarding of agents."""

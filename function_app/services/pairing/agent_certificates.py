@@ -1,4 +1,4 @@
-"""Certificates of agents, where the broker wants to see them."""
+"""Client certificates of agents, for brokers that require them."""
 
 from function_app.domain.common.problems import Problem, broker_unavailable, invalid
 from function_app.domain.devices.devices import Agent
@@ -8,21 +8,21 @@ from function_app.services.devices.device_access import require_claimed
 
 
 class AgentCertificates:
-    """Gives an agent that is claimed a certificate of its own."""
+    """Issues certificates to claimed agents."""
 
     def __init__(self, *, certificates: Certificates) -> None:
         self._certificates = certificates
 
     async def certify(self, agent: Agent, request: str) -> Issued:
-        """Sign a request of the agent's.
+        """Sign a certificate request of the agent.
 
         Raises:
-            Problem: ``agent-unclaimed``; ``certificates-unused``: the broker wants none; ``invalid``: it is no request;
-                ``broker-unavailable``.
+            Problem: ``agent-unclaimed``; ``certificates-unused``: the broker requires none; ``invalid``: the request is
+                not valid; ``broker-unavailable``.
         """
         space = require_claimed(agent)
         if not self._certificates.wanted:
-            detail = "The broker here wants no certificates of agents."
+            detail = "This broker does not use certificates of agents."
             raise Problem("certificates-unused", 409, "No certificates here", detail)
         try:
             await self._certificates.place(agent.id, space)

@@ -1,4 +1,4 @@
-"""An account claims an agent with the code that the agent shows; and gives it up again."""
+"""Claiming an agent with the code that it displays."""
 
 import contextlib
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class _Member:
 
 
 class Claim:
-    """Pairing by claim code. What decides is one ETag write on the agent's row."""
+    """Pairing by claim code. One ETag write on the agent's row decides."""
 
     def __init__(
         self,
@@ -47,14 +47,12 @@ class Claim:
         self._clock = clock
 
     async def claim(self, caller: Identity, text: str, space: str | None, *, address: str = "") -> Agent:
-        """Make the agent that shows this code an agent of ``caller``.
+        """Claim the agent that displays this code for ``caller``.
 
-        Wrong codes are counted by the account and, where it is known, by the address that the request comes from; a
-        right code is not.
+        Wrong codes are counted by account and, if known, by client address.
 
         Raises:
-            Problem: ``claim-code-unknown`` for a wrong, used or expired code alike; ``too-many-tries``;
-                ``space-unknown``.
+            Problem: ``claim-code-unknown``: wrong, used or expired; ``too-many-tries``; ``space-unknown``.
         """
         spaces = await self._sign_in.spaces(caller.account)
         chosen = next((existing.id for existing in spaces if space in (None, existing.id)), None)
@@ -68,7 +66,7 @@ class Claim:
             await self._refused(caller, problem, address)
             raise
         if agent is None:
-            detail = "This code is wrong, used or expired. Codes live five minutes; the agent shows its newest."
+            detail = "This code is wrong, used or expired. Codes are valid for five minutes; use the newest one."
             unknown = Problem("claim-code-unknown", 404, "No such claim code", detail)
             await self._refused(caller, unknown, address)
             raise unknown
@@ -109,7 +107,7 @@ class Claim:
         await self._offboarding.settle(agent)
         await change.noted()
         claimed = devices.claim(agent, account=caller.account, space=space, pairing=new_id(), now_ms=now_ms)
-        # The index first: without the agent's row behind it it shows nothing, so a stop in between leaves no harm.
+        # Written first: without the agent's row the index entry has no effect.
         member = _Member(claimed.pairing)
         await records.upsert(
             self._tables, records.MEMBERS, caller.account, f"agent:{agent.id}", lambda _: member, _Member

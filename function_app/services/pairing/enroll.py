@@ -1,4 +1,4 @@
-"""An agent makes itself known with its own key, and waits to be claimed."""
+"""Enrolment: an agent registers with its own key and waits until it is claimed."""
 
 import asyncio
 from dataclasses import dataclass, replace
@@ -14,13 +14,13 @@ from function_app.services.storage.retention import DAY_MS, Retention
 
 CLAIM_MS = 300_000
 KEEP_UNCLAIMED_MS = 7 * DAY_MS
-"""An agent that waits shows a new code every few minutes: one that nobody has heard of for so long is gone."""
+"""An unclaimed agent requests a new code every few minutes; without a request for this time it is deleted."""
 _LOOK_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Enrollment:
-    """What an agent says about itself."""
+    """The agent's own description."""
 
     name: str
     public_key: str
@@ -30,7 +30,7 @@ class Enrollment:
 
 
 class Enroll:
-    """Enrolment of agents."""
+    """Enrolls agents."""
 
     def __init__(self, *, tables: Tables, offboarding: Offboarding, retention: Retention, clock: Clock) -> None:
         self._tables = tables
@@ -39,10 +39,9 @@ class Enroll:
         self._clock = clock
 
     async def enroll(self, agent: str, told: Enrollment) -> Agent:
-        """Make or refresh the agent's row; while nobody owns it, with a new claim code.
+        """Create or update the agent's row, with a new claim code while it is unclaimed.
 
-        What a device that is no longer named was doing ends. The code's row is written first: a code without an agent's
-        row behind it claims nothing.
+        Actions of removed devices end. The code's row is written first: without the agent's row it has no effect.
 
         Raises:
             Problem: ``agent-id-taken``: another key has the same id (one in 2⁵⁰).
@@ -56,7 +55,7 @@ class Enroll:
             else:
                 record = records.read(row, Agent)
                 if record.public_key != told.public_key:
-                    detail = "Another agent's key has the same id. Make a new key."
+                    detail = "Another agent's key has the same id. Create a new key."
                     raise Problem("agent-id-taken", 409, "The id is taken", detail)
                 before = record.leaving
                 record = replace(with_devices(record, told.devices), name=told.name, software=told.software)
@@ -81,7 +80,7 @@ class Enroll:
         return record
 
     async def wait(self, agent: Agent, wait_ms: int) -> Agent:
-        """The agent's row, as soon as somebody has claimed it, or as it is when the time is over."""
+        """The agent, as soon as it is claimed, or after the time limit."""
         loop = asyncio.get_running_loop()
         end = loop.time() + wait_ms / 1000
         while not agent.claimed:
@@ -96,7 +95,7 @@ class Enroll:
         return agent
 
     async def _new_code(self, agent: str, expires_ms: int) -> str:
-        """A code that no live row has."""
+        """A code without a live row."""
         while True:
             code = new_claim_code()
             try:

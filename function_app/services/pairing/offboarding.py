@@ -1,8 +1,7 @@
-"""What a device leaves behind when its agent is un-paired or moved to another space, or no longer has it.
+"""Cleanup after a device's agent was unpaired or moved, or a device was removed.
 
-The agent's row says it first, in the write that decides (``Agent.leaving``); all of this only tidies up, is safe to
-repeat, and is noted for the timer before that write. Everything here belongs to the pairing that is left: what a new
-owner has by then is not touched.
+The agent's row lists departures (``Agent.leaving``) in the deciding write. The cleanup is idempotent, is scheduled
+before that write, and only affects the former pairing.
 """
 
 import contextlib
@@ -35,7 +34,7 @@ from function_app.services.storage.retention import Retention
 from function_app.services.telemetry.series_writer import MARGIN_MS, SeriesWriter
 
 LOOK_MS: Final = 5_000
-"""The timer looks again so often, as long as the broker cannot be told."""
+"""Interval of retries while the broker is not reachable."""
 _NOTE: Final = "leave:"
 _RETAINED: Final = ((topics.STATE, ""), (topics.DESC, ""), (topics.DESC, topics.TWIN))
 
@@ -43,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 class Offboarding:
-    """Tidies up behind agents and devices."""
+    """Cleans up after agents and devices."""
 
     def __init__(
         self,
@@ -75,11 +74,11 @@ class Offboarding:
         self._clock = clock
 
     async def watch(self, agent: str) -> None:
-        """Have the timer look at an agent; to be noted before the write that has it, or a device of it, leave."""
+        """Schedule the cleanup of an agent, before the deciding write."""
         await self._reminders.schedule(f"{_NOTE}{agent}", self._clock.now_ms() + LOOK_MS)
 
     async def finish(self, agent_id: str) -> bool:
-        """Tidy up behind all that has left; whether everything is done.
+        """Clean up all departures of an agent; return whether the cleanup is complete.
 
         Raises:
             Problem: ``busy``.
@@ -102,7 +101,7 @@ class Offboarding:
         return len(done) == len(agent.leaving)
 
     async def settle(self, agent: Agent) -> None:
-        """The part of it that the tables alone decide: before somebody else claims the agent.
+        """The part of the cleanup that only needs the tables, before the agent can be claimed again.
 
         Raises:
             Problem: ``busy``.
@@ -112,10 +111,10 @@ class Offboarding:
 
     async def _settle(self, agent: Agent, leaving: Departure) -> None:
         for device in departed_devices(agent, leaving):
-            # Before its actions end: with them would go the lease that tells that somebody has moved it.
+            # Before the actions end, because their leases record who moved the device.
             await self._revocation.revoke(device, leaving.why)
             await self._end_actions(device, leaving.why)
-            # While the agent's row still knows whose it was.
+            # While the agent's row still contains the former owner.
             await self._control_events.publish(device.id)
             await self._delete(records.AGENTS, agent.id, f"state:{device.name}", leaving)
             if leaving.why == "unpaired":
@@ -129,7 +128,7 @@ class Offboarding:
             await self._delete(records.MEMBERS, leaving.account, f"agent:{agent.id}", leaving)
 
     async def _forget_measures(self, device: Device) -> None:
-        """Events, faults, what is watched, and times, once those who do not know yet have stopped to write."""
+        """Delete measurements, events and faults, after all processes have stopped writing to the former pairing."""
         due_ms = self._clock.now_ms() + MARGIN_MS
         for table in (records.EVENTS, records.FAULTS, records.DIAGNOSTICS, records.LATENCY):
             partition = f"{device.id}/{device.pairing}"
@@ -147,14 +146,14 @@ class Offboarding:
             )
 
     async def _delete(self, table: str, partition: str, key: str, leaving: Departure) -> None:
-        """Delete a row of the pairing that is left, not one that was written anew."""
+        """Delete a row of the former pairing, unless it was rewritten."""
         row = await self._tables.get(table, partition, key)
         if row is not None and row.data.get("pairing", "") in {"", leaving.pairing}:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(table, row)
 
     async def _tell_broker(self, agent_id: str, leaving: Departure) -> None:
-        """Cut the agent, then clear what is retained: its will may have spoken. Not what is said there anew."""
+        """Disconnect the agent, then clear its retained messages, including its will, but not new ones."""
         result = await self._tables.get(records.AGENTS, agent_id, "agent")
         now = records.read(result, Agent) if result else None
         if leaving.why != "removed":
@@ -179,9 +178,9 @@ class Offboarding:
                 await self._bus.publish(topic, b"", retain=True)
 
     async def _end_shares(self, device: str, pairing: str) -> None:
-        """Cut who watched by a share that has ended with the pairing; then forget the share.
+        """Disconnect viewers with a share of the former pairing, then delete the share.
 
-        They hold topics of this device by name, and would hear it again if its owner claimed it anew.
+        Their filters contain topics of the device, which would match again if the same owner claimed it.
         """
         on = device_target(device)
         page = await self._tables.query(records.SHARES, on, first="account:", last="account;", limit=1000)
@@ -212,5 +211,5 @@ class Offboarding:
 
 
 def offboarding_of(note: str) -> str | None:
-    """The agent that a note of the timer is about; ``None`` where it is about something else."""
+    """The agent of an offboarding reminder; ``None`` for other reminders."""
     return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None

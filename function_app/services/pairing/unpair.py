@@ -1,4 +1,4 @@
-"""Giving an agent up: its devices are gone for the account, its rights on the broker are taken back."""
+"""Unpairing an agent, and moving it to another space."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ from function_app.services.storage import records
 
 
 class Unpair:
-    """Ends a pairing, or takes it to another space."""
+    """Ends pairings and moves agents."""
 
     def __init__(self, *, tables: Tables, sign_in: SignIn, offboarding: Offboarding, audit_log: AuditLog) -> None:
         self._tables = tables
@@ -24,10 +24,9 @@ class Unpair:
         self._audit_log = audit_log
 
     async def unpair(self, caller: Identity, agent_id: str) -> None:
-        """End the pairing. The write on the agent's row decides; all that follows only tidies up.
+        """End the pairing. The write on the agent's row decides; the rest is cleanup.
 
-        Leases, slots and actions name the pairing they belong to: what a stop half way leaves is nobody's, and the
-        epochs go on from where they were.
+        Leases, slots and actions contain their pairing, so remaining rows are ignored. Epochs continue to increase.
 
         Raises:
             Problem: ``agent-unknown``, ``busy``.
@@ -37,7 +36,7 @@ class Unpair:
         await self._finish(changed)
 
     async def move(self, caller: Identity, agent_id: str, space: str) -> Agent:
-        """Take an agent to another space of its account. What is known of its devices stays; what they do ends.
+        """Move an agent to another space of its account. Its data remain; running actions end.
 
         Raises:
             Problem: ``agent-unknown``, ``space-unknown``, ``busy``.

@@ -1,1 +1,1 @@
-"""Sharing."""
+"""Shares, invitations and ownership transfers."""

@@ -1,14 +1,12 @@
-"""Ending what was done under a role that somebody has lost.
+"""Revokes what an account did with permissions that it has lost.
 
-At once, and not only what comes next: the lease and its epoch, what waits and what runs in their name, and the broker
-sessions that hear or tell the device. Whoever takes a right away means that this person shall move nothing any more,
-and a script may go on for minutes: the device holds, and nothing that waits begins by itself then.
+Lease, queued and running actions, and broker connections end at once. The device holds and starts no queued action.
 
-Who acts under a share looks again after something was written (``DeviceAccess.require_still``), and here is looked after the
-share was deleted: of the two at least one sees the other. All of it is safe to repeat.
+Users of a share write first and check the share again (``DeviceAccess.require_still_allowed``). This module runs after
+the share was deleted, so at least one of both sees the other. All steps are idempotent.
 
-What the tables decide is done in any case. The broker is waited for a moment: whoever asked is told that it did not
-answer, and the timer goes on telling it.
+The tables are changed in any case. If the broker does not respond within a short time, the caller is informed and the
+timer retries.
 """
 
 import asyncio
@@ -36,17 +34,17 @@ from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.storage import records
 
 TELL_S: Final = 1.5
-"""How long somebody who un-shares waits for the broker [s],"""
+"""Time limit for the broker when a caller waits [s]."""
 TELL_AGAIN_S: Final = 10.0
-"""and how long the timer does."""
+"""Time limit for the broker when the timer retries [s]."""
 INDEX: Final = "share:"
-"""Begins the keys of shares in an account's partition of ``Members``."""
+"""Key prefix of shares in an account's partition of ``Members``."""
 
 _log = logging.getLogger(__name__)
 
 
 class AccessRevocation:
-    """Takes from an account what it may no longer have."""
+    """Revokes lost permissions of an account."""
 
     def __init__(
         self,
@@ -70,11 +68,11 @@ class AccessRevocation:
         self._clock = clock
 
     async def settle(self, share: Share, *, again: bool = False) -> bool:
-        """End what the share's account may no longer do; whether everybody who had to be told has been.
+        """Revoke what the share's account may no longer do; return whether broker and devices were notified.
 
         Args:
-            share: As it was, or as it is now with less. What the account may do by another share stays.
-            again: Tell devices again: who was to do it was killed, or could not reach the broker.
+            share: The deleted or reduced share. Permissions of other shares remain.
+            again: Notify again after an interrupted or failed attempt.
 
         Raises:
             Problem: ``busy``.
@@ -90,7 +88,7 @@ class AccessRevocation:
         return all(done)
 
     async def _cut(self, account: str, until_s: float) -> bool:
-        """End the account's watching sessions: who has lost one device watches the others with new credentials."""
+        """Cut the account's viewing connections; it can view its other devices with new credentials."""
         try:
             async with asyncio.timeout_at(until_s):
                 await self._access.revoke(principal=all_viewers(account))
@@ -121,7 +119,7 @@ class AccessRevocation:
         result = await self._action_store.get(control.action) if control.action else None
         if result is None or result.action.account != account or result.action.pairing != device.pairing:
             return True
-        # Written before it is told. Where this is not heard, the lease's release is told until it is: it holds, too.
+        # Stored before it is sent. If it is lost, the repeated release of the lease also stops the action.
         status, message = DROPPED[UNSHARED]
         now_ms = self._clock.now_ms()
         await self._queues.change(result.action.id, lambda existing: end(existing, status, UNSHARED, message, now_ms))
@@ -145,7 +143,7 @@ class AccessRevocation:
         return await self._devices.in_space(owner, name) if owner else []
 
     async def _owner_in_index(self, share: Share) -> str:
-        """Of a space whose share is gone: the index is deleted last."""
+        """The owner of a space whose share is deleted; the index is deleted last."""
         row = await self._tables.get(records.MEMBERS, share.account, INDEX + share.on)
         return str(row.data["owner"]) if row else ""
 
@@ -155,11 +153,11 @@ class AccessRevocation:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(records.MEMBERS, row)
         if await self._tables.get(records.SHARES, share.on, share_key(share.account)) is not None:
-            # Shared again at this very moment: the index follows the share.
+            # Shared again concurrently: the index follows the share.
             await index(self._tables, share)
 
 
 async def index(tables: Tables, share: Share) -> None:
-    """Note with the account that something may be shared with it."""
+    """List a share in the account's index."""
     data = {"owner": share.owner}
     await records.upsert(tables, records.MEMBERS, share.account, INDEX + share.on, lambda _: data, dict)

@@ -1,7 +1,7 @@
-"""Invitations: sharing by link, and transfers, which somebody else must accept. Each is a secret of 256 random bits.
+"""Invitations: shares by link, and ownership transfers. Each has a secret of 256 random bits.
 
-Only its hash is stored, as the row's key. Of several who bring it one gets each use: whoever writes the row by its
-ETag. It counts only as long as what it offers belongs to whom it belonged to when it was made.
+Only the hash of the secret is stored, as row key. Concurrent redemptions are serialized by ETag. An invitation is void
+when its target changes owner.
 """
 
 import contextlib
@@ -29,21 +29,21 @@ from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import Retention
 
 LOOK_MS: Final = 10_000
-"""The timer goes on with a transfer that was accepted so long ago and is not done."""
+"""Delay after which the timer continues an accepted transfer."""
 _NOTE: Final = "transfer:"
 _INDEX: Final = "invitation:"
 
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """What is offered.
+    """A new invitation.
 
     Attributes:
-        role: ``owner``: it is transferred.
-        uses: How many may redeem it.
-        for_s: How long it can be redeemed [s].
-        share_s: How long a part lasts from then on [s]; 0: until it is ended.
-        account: Who alone may redeem it, by id; empty: whoever has the secret.
+        role: ``owner``: a transfer.
+        uses: Maximum number of redemptions.
+        for_s: Validity [s].
+        share_s: Duration of the share [s]; 0: unlimited.
+        account: Id of the only account that may redeem it; empty: any holder of the secret.
     """
 
     role: Role
@@ -62,7 +62,7 @@ class Known:
 
 
 class Invitations:
-    """Makes invitations, and has them redeemed."""
+    """Creates and redeems invitations."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class Invitations:
     # ------------------------------------------------------------ the owner's side
 
     async def agent(self, caller: Identity, agent_id: str) -> NewShare:
-        """An agent of the caller's own, to hand it over.
+        """An agent of the caller, for a transfer.
 
         Raises:
             Problem: ``agent-unknown``, ``forbidden``.
@@ -102,7 +102,7 @@ class Invitations:
         return NewShare(f"agent:{agent_id}", owner, agent.name, agent.pairing)
 
     async def space(self, caller: Identity, space: str) -> NewShare:
-        """A space of the caller's own, to hand it over.
+        """A space of the caller, for a transfer.
 
         Raises:
             Problem: ``space-unknown``, ``forbidden``, ``last-space``.
@@ -110,21 +110,21 @@ class Invitations:
         shared = await self._sharing.of(caller, "space", space)
         require_person(caller)
         if len(await self._sign_in.spaces(caller.account)) == 1:
-            raise _last_space("It is this account's only space. Make another one first.")
+            raise _last_space("It is this account's only space. Create another one first.")
         return shared
 
     async def make(self, caller: Identity, shared: NewShare, offer: Offer) -> tuple[str, Known]:
-        """A new invitation, and its secret, which nobody can be told again.
+        """A new invitation and its secret, which cannot be read again.
 
         Raises:
             Problem: ``already-owner``, ``too-many-invitations``.
         """
         if offer.role is Role.OWNER and offer.account == shared.owner.id:
             raise own_share_error(
-                "It belongs to this account already. Name another one, or none for whoever has the link."
+                "This account is already the owner. Name another account, or none to allow any holder of the link."
             )
         if len(await self.open(shared)) >= rules.MAX_INVITATIONS:
-            detail = f"There are {rules.MAX_INVITATIONS} open invitations to it, the most there can be. Take one back."
+            detail = f"There are already {rules.MAX_INVITATIONS} open invitations to it. Withdraw one."
             raise Problem("too-many-invitations", 409, "Too many invitations", detail)
         now_ms = self._clock.now_ms()
         created = Invitation(
@@ -142,7 +142,7 @@ class Invitations:
         )
         secret = new_secret()
         existing = Known(_hash(secret), created)
-        # Forgotten on time whatever happens from here on, and listed before it can be redeemed.
+        # Deletion is scheduled and the invitation is listed before it can be redeemed.
         await self._retention.delete_row_at(records.INVITATIONS, existing.id[0], existing.id, due_ms=created.expires_ms)
         await self._retention.delete_row_at(records.SHARES, created.on, _INDEX + existing.id, due_ms=created.expires_ms)
         await self._tables.create(
@@ -157,7 +157,7 @@ class Invitations:
         return secret, existing
 
     async def open(self, shared: NewShare) -> list[Known]:
-        """Open invitations to something, oldest first."""
+        """Open invitations to a target, oldest first."""
         page = await self._tables.query(records.SHARES, shared.on, first=_INDEX, last="invitation;", limit=1000)
         result = [await self._get(row.key.removeprefix(_INDEX)) for row in page.rows]
         now_ms = self._clock.now_ms()
@@ -172,7 +172,7 @@ class Invitations:
         return sorted(existing, key=lambda each: each.invitation.created_ms)
 
     async def withdraw(self, caller: Identity, shared: NewShare, invitation: str) -> None:
-        """Take an invitation back. What was redeemed stays shared.
+        """Withdraw an invitation. Existing shares remain.
 
         Raises:
             Problem: ``invitation-unknown``, ``busy``.
@@ -200,15 +200,15 @@ class Invitations:
     # ------------------------------------------------------------ the other side
 
     async def look(self, secret: str) -> Known:
-        """What an invitation offers.
+        """The invitation with this secret.
 
         Raises:
-            Problem: ``invitation-unknown``: wrong, used, expired, taken back or void, all the same.
+            Problem: ``invitation-unknown``: wrong, used, expired, withdrawn or void.
         """
         return await self.find(_hash(secret))
 
     async def find(self, invitation: str) -> Known:
-        """The same by the id, for whoever has shown the secret before.
+        """The invitation with this id, for a caller who has presented the secret before.
 
         Raises:
             Problem: ``invitation-unknown``.
@@ -224,25 +224,24 @@ class Invitations:
         return Known(row.key, existing)
 
     async def redeem(self, caller: Identity, existing: Known, *, space: str | None = None) -> None:
-        """Take what an invitation offers.
+        """Redeem an invitation.
 
         Args:
-            caller: Who takes it.
-            existing: The invitation, which they have shown the secret of.
-            space: The space of theirs for an agent that is handed over; ``None``: their first.
+            caller: The account that redeems it.
+            existing: The invitation, whose secret the caller has presented.
+            space: Space of the caller for a transferred agent; ``None``: the first one.
 
         Raises:
-            Problem: ``invitation-unknown``; ``forbidden``: it is for another account, or an API key asks;
-                ``already-owner``, ``last-space``, ``space-unknown``, ``too-many-shares``, ``transfer-impossible``, ``busy``.
+            Problem: ``invitation-unknown``; ``forbidden``: for another account, or called with an API key;
+                ``already-owner``, ``last-space``, ``space-unknown``, ``too-many-shares``, ``transfer-impossible``,
+                ``busy``.
         """
         require_person(caller)
         offered = existing.invitation
         if offered.account and offered.account != caller.account:
-            raise forbidden("This invitation is for another account. Sign in as the one it was made for.")
+            raise forbidden("This invitation is for another account. Sign in with that account.")
         if offered.owner == caller.account:
-            raise own_share_error(
-                "It belongs to this account: there is nothing to take. Send the link to somebody else."
-            )
+            raise own_share_error("This account is already the owner. Send the link to another person.")
         if offered.role is Role.OWNER:
             await self._take(caller, existing, space)
         else:
@@ -254,7 +253,7 @@ class Invitations:
             await self._sharing.give(giver, shared, Account(caller.account, caller.name), offered.role, ends_ms)
 
     async def go_on(self, what: str, note: Row) -> None:
-        """The timer's look at a transfer that was accepted."""
+        """Called by the timer: continue an accepted transfer."""
         row, existing = await self._get(what.removeprefix(_NOTE))
         if row is not None and existing is not None and existing.taken_by:
             with contextlib.suppress(_Void):
@@ -262,7 +261,7 @@ class Invitations:
         await self._reminders.cancel(note)
 
     async def _take(self, caller: Identity, existing: Known, space: str | None) -> None:
-        """Accept a transfer. The write on the invitation decides; from then on the timer sees to it as well."""
+        """Accept a transfer. The write on the invitation decides; then the timer also continues it."""
         kind, _ = split_target(existing.invitation.on)
         goal = new_id(12)
         if kind == "agent":
@@ -272,10 +271,8 @@ class Invitations:
                 raise not_found("space", space or "")
             goal = chosen
         elif len(await self._sign_in.spaces(existing.invitation.owner)) == 1:
-            # It was not when it was offered: another one was handed over since.
-            raise _last_space(
-                f"It is {existing.invitation.by}'s only space by now. Ask them to make another one first."
-            )
+            # Another transfer may have made it the last space.
+            raise _last_space(f"It is {existing.invitation.by}'s only space. The owner must create another one first.")
         note = await self._reminders.schedule(f"{_NOTE}{existing.id}", self._clock.now_ms() + LOOK_MS)
 
         async def attempt() -> Invitation:
@@ -314,7 +311,7 @@ class Invitations:
         await self._delete(invitation, taken)
 
     async def _use(self, caller: Identity, existing: Known) -> None:
-        """Count one use, or find that somebody else was faster."""
+        """Count one use; fails if another account was first."""
 
         async def attempt() -> None:
             row, created = await self._get(existing.id)
@@ -340,7 +337,7 @@ class Invitations:
             await records.retry(attempt)
 
     async def _good(self, existing: Invitation) -> bool:
-        """Whether what it offers is still the offerer's."""
+        """Whether the target still belongs to the inviting account."""
         kind, name = split_target(existing.on)
         if kind == "space":
             return await self._tables.get(records.ACCOUNTS, existing.owner, f"space:{name}") is not None
@@ -369,11 +366,11 @@ class Invitations:
 
 
 class _Void(Exception):  # noqa: N818 (an outcome)
-    """What was offered has gone elsewhere."""
+    """The target has another owner."""
 
 
 def about_transfer(note: str) -> bool:
-    """Whether a note of the timer is about a transfer."""
+    """Whether a reminder is about a transfer."""
     return note.startswith(_NOTE)
 
 
@@ -386,5 +383,5 @@ def _hash(secret: str) -> str:
 
 
 def _unknown() -> Problem:
-    detail = "This invitation is wrong, used, expired or taken back. Ask for a new one."
+    detail = "This invitation is wrong, used, expired or withdrawn. Ask for a new one."
     return Problem("invitation-unknown", 404, "No such invitation", detail)

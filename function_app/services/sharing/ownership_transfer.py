@@ -1,11 +1,10 @@
-"""Handing an agent, or a space with all that is in it, over to another account that has accepted it.
+"""Transfers an agent, or a space with its agents, to another account that has accepted it.
 
-One write on the agent's row takes it from one account to the other: it is nobody's at no time. Everything else is as
-after an un-pairing and a claim (``services/leave.py``): what the former owner, and with whom they shared it, saw and
-did ends, and nothing of it goes with the agent, which learns of its new owner by itself. A space becomes a new space of
-the new owner: topics name the space, and nobody who knew the former one's hears anything in the other.
+One write on the agent's row changes the owner. The rest follows unpairing and claiming (``Offboarding``): shares,
+leases and actions of the former owner end, and their data stay invisible. A space becomes a new space with another id,
+so subscribers of the former topics receive nothing from it.
 
-The accepted invitation stays until all of it is done, with a note for the timer.
+The accepted invitation and a reminder remain until the transfer is complete.
 """
 
 import contextlib
@@ -32,7 +31,7 @@ class _Member:
 
 
 class OwnershipTransfer:
-    """Carries out transfers that were accepted. Every step is safe to repeat."""
+    """Executes accepted transfers. Every step is idempotent."""
 
     def __init__(
         self, *, tables: Tables, devices: DeviceAccess, sharing: Sharing, offboarding: Offboarding, clock: Clock
@@ -44,10 +43,10 @@ class OwnershipTransfer:
         self._clock = clock
 
     async def carry_out(self, taken: Invitation) -> None:
-        """Do what is left of it.
+        """Execute the remaining steps.
 
         Raises:
-            Problem: ``busy``; ``transfer-impossible``: the agent is no longer whose it was offered by.
+            Problem: ``busy``; ``transfer-impossible``: the agent has another owner than the offering account.
         """
         kind, name = split_target(taken.on)
         if kind == "agent":
@@ -57,7 +56,7 @@ class OwnershipTransfer:
         await self._carry_space(name, taken)
 
     async def _carry_space(self, name: str, taken: Invitation) -> None:
-        """The new space, then the former one's end, so that nothing more comes into it, then what is in it."""
+        """Create the new space, close the former one, then move its agents."""
         row = Row(
             taken.taken_by,
             f"space:{taken.taken_space}",
@@ -74,7 +73,7 @@ class OwnershipTransfer:
         await self._sharing.end_all(space_target(name))
 
     async def _hand_over(self, agent_id: str, taken: Invitation, *, pairing: str = "", space: str = "") -> bool:
-        """Take an agent over, if it is still of that pairing, or in that space; whether it is the new owner's."""
+        """Transfer an agent of this pairing or space; return whether the new owner has it."""
         await self._offboarding.watch(agent_id)
 
         async def attempt() -> Agent | None:
@@ -104,6 +103,6 @@ class OwnershipTransfer:
 
 
 def invalidate() -> Problem:
-    """What was offered is not the offerer's any more."""
-    detail = "It has gone to somebody else, or was un-paired, since it was offered. Ask its owner for a new invitation."
-    return Problem("transfer-impossible", 409, "It cannot be handed over", detail)
+    """Mark an invitation as void because its target has another owner."""
+    detail = "It was transferred or unpaired after the invitation was created. Ask its owner for a new invitation."
+    return Problem("transfer-impossible", 409, "It cannot be transferred", detail)

@@ -1,7 +1,7 @@
-"""Sharing devices and spaces with other accounts, and ending that.
+"""Shares of devices and spaces with other accounts.
 
-A share's row decides from the moment in which it is written or deleted. What was done under a role that is lost ends
-then (``services/unshare.py``); a note for the timer, written first, has that done where this process is killed.
+A write or deletion of the share's row takes effect at once. ``AccessRevocation`` ends what depended on a lost role; a
+reminder, written first, continues this if the process is killed.
 """
 
 import asyncio
@@ -36,9 +36,9 @@ from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 
 LOOK_MS: Final = 10_000
-"""The timer sees to what a change has left undone after so long, where whoever made it was killed."""
+"""Delay after which the timer continues an interrupted change."""
 AGAIN_MS: Final = 1_000
-"""And so often, as long as the broker cannot be told."""
+"""Interval of retries while the broker is not reachable."""
 _CHANGED: Final = "share-changed:"
 _EXPIRES: Final = "share-expires:"
 
@@ -47,7 +47,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class NewShare:
-    """What is shared or handed over, once it is seen that it is the caller's."""
+    """A target that the caller owns and may share or transfer."""
 
     on: str
     owner: Account
@@ -56,7 +56,7 @@ class NewShare:
 
 
 class Sharing:
-    """Shares."""
+    """Manages shares."""
 
     def __init__(
         self,
@@ -84,11 +84,11 @@ class Sharing:
     # ------------------------------------------------------------ what people ask for
 
     async def of(self, caller: Identity, kind: Literal["device", "space"], name: str) -> NewShare:
-        """A device or space of the caller's own, to share it.
+        """A device or space of the caller, to share it.
 
         Raises:
-            Problem: ``device-unknown``, ``space-unknown``, ``forbidden``; to an API key always: what it shares would
-                outlive it.
+            Problem: ``device-unknown``, ``space-unknown``, ``forbidden``; always for an API key, because shares outlive
+                keys.
         """
         if kind == "space":
             view = await self._spaces.own(caller, name)
@@ -102,7 +102,7 @@ class Sharing:
         return NewShare(device_target(name), owner, device.label, device.pairing)
 
     async def shares(self, shared: NewShare) -> list[tuple[Share, str]]:
-        """With whom it is shared now, each with the account's name."""
+        """Current shares of a target, with account names."""
         page = await self._tables.query(records.SHARES, shared.on, first="account:", last="account;", limit=1000)
         now_ms = self._clock.now_ms()
         result = [share for row in page.rows if _holds(share := records.read(row, Share), shared, now_ms)]
@@ -112,11 +112,11 @@ class Sharing:
     async def put(
         self, caller: Identity, shared: NewShare, account: Account, role: Role, for_s: int | None
     ) -> tuple[Share, bool, bool]:
-        """Share it with an account, or change that.
+        """Create or change the share of an account.
 
         Returns:
-            The share, whether it is new, and whether everybody has been told of what was taken away, if anything was;
-            else the timer tells them.
+            The share, whether it is new, and whether broker and devices were notified of removed permissions. If not,
+            the timer retries.
 
         Raises:
             Problem: ``invalid``, ``too-many-shares``, ``busy``.
@@ -126,12 +126,12 @@ class Sharing:
         return await self._write(caller, shared, account, share, keep_more=False)
 
     async def give(self, caller: Identity, shared: NewShare, account: Account, role: Role, expires_ms: int) -> Share:
-        """The same by an invitation, which takes nothing away from who has more already."""
+        """Create or extend a share by invitation; never reduces an existing one."""
         share = self._share(shared, account.id, role, caller.name, expires_ms)
         return (await self._write(caller, shared, account, share, keep_more=True))[0]
 
     async def end(self, caller: Identity, shared: NewShare, account: str) -> bool:
-        """Un-share; whether everybody has been told. Else the timer tells them as soon as the broker answers.
+        """End a share; return whether broker and devices were notified. If not, the timer retries.
 
         Raises:
             Problem: ``share-unknown``, ``busy``.
@@ -142,7 +142,7 @@ class Sharing:
         return await self._end(caller, row)
 
     async def end_all(self, on: str) -> None:
-        """End all shares of something that its owner has given away.
+        """End all shares of a transferred target.
 
         Raises:
             Problem: ``busy``.
@@ -152,7 +152,7 @@ class Sharing:
             await self._end(None, row)
 
     async def leave(self, caller: Identity, on: str) -> bool:
-        """Give one's own part in something of another's back; whether everybody has been told, as ``end``.
+        """End the caller's own share; return whether broker and devices were notified.
 
         Raises:
             Problem: ``share-unknown``, ``already-owner``, ``forbidden``, ``busy``.
@@ -160,22 +160,20 @@ class Sharing:
         require_person(caller)
         row = await self._tables.get(records.SHARES, on, share_key(caller.account))
         if row is None and await self._owns(caller, on):
-            raise own_share_error(
-                "It is this account's own, which has no share in it. To be rid of it, transfer or un-pair it."
-            )
+            raise own_share_error("This account is the owner and has no share. Transfer or unpair it instead.")
         if row is None:
             raise not_found("share", caller.account)
         return await self._end(caller, row)
 
     async def person(self, name: str) -> Account:
-        """The account of this name.
+        """The account with this name.
 
         Raises:
             Problem: ``account-unknown``.
         """
         result = await self._sign_in.known(name)
         if result is None:
-            detail = f"There is no account '{name[:80]}'. Ask for the name they sign in with, or make an invitation."
+            detail = f"There is no account '{name[:80]}'. Ask for the exact sign-in name, or create an invitation."
             raise Problem("account-unknown", 404, "No such account", detail)
         return result
 
@@ -190,7 +188,7 @@ class Sharing:
 
     def _share(self, shared: NewShare, account: str, role: Role, by: str, expires_ms: int) -> Share:
         if account == shared.owner.id:
-            raise invalid("It is this account's own: there is nothing to share with it. To give it away, transfer it.")
+            raise invalid("This account is the owner and cannot get a share. Transfer it instead.")
         return Share(
             on=shared.on,
             account=account,
@@ -208,7 +206,7 @@ class Sharing:
         note = await self._reminders.schedule(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
         if share.expires_ms < NEVER_MS:
             await self._reminders.schedule(_note(_EXPIRES, share), share.expires_ms)
-        # The index first: without the share's row behind it it shows nothing.
+        # Written first: without the share's row the index entry has no effect.
         await index(self._tables, share)
         lowered = False
 
@@ -244,11 +242,11 @@ class Sharing:
         now_ms = self._clock.now_ms()
         dead = [row for row in page.rows if not records.read(row, Share).is_live(now_ms)]
         if len(page.rows) - len(dead) >= MAX_SHARES:
-            detail = f"It is shared with {MAX_SHARES} accounts, the most there can be. End one of these shares."
+            detail = f"It is already shared with {MAX_SHARES} accounts. End one of these shares."
             raise Problem("too-many-shares", 409, "Too many shares", detail)
 
     async def _end(self, caller: Identity | None, row: Row) -> bool:
-        """Delete the share's row, which decides, and end what was done under it; whether everybody has been told."""
+        """Delete the share's row and revoke the permissions; return whether broker and devices were notified."""
         share = records.read(row, Share)
         note = await self._reminders.schedule(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
         name = await self._sign_in.named(share.account)
@@ -261,7 +259,7 @@ class Sharing:
                 change.came_to_nothing = True
         if change.came_to_nothing:
             created = await self._tables.get(records.SHARES, row.partition, row.key)
-            # What time has ended, and somebody has shared anew at that moment, goes on.
+            # A share that expired and was renewed concurrently remains.
             if created is not None and (
                 caller is not None or not records.read(created, Share).is_live(self._clock.now_ms())
             ):
@@ -269,14 +267,14 @@ class Sharing:
             return True
         done = await self._settle(share, note)
         if caller is None:
-            await self._tell(share, Fact.UNSHARED, f"{name}'s share is over.", account=share.account)
+            await self._tell(share, Fact.UNSHARED, f"The share of {name} expired.", account=share.account)
         else:
-            message = f"{caller.name} ended {name}'s share."
+            message = f"{caller.name} ended the share of {name}."
             await self._tell(share, Fact.UNSHARED, message, by=caller.name, account=share.account)
         return done
 
     async def _settle(self, share: Share, note: Row | None) -> bool:
-        """End what is over the role that is left; what could not be told the timer tells soon, until it is."""
+        """Revoke what exceeds the remaining role; the timer retries failed notifications."""
         done = await self._access_revocation.settle(share)
         if not done:
             await self._reminders.schedule(_note(_CHANGED, share), self._clock.now_ms() + AGAIN_MS)
@@ -291,7 +289,7 @@ class Sharing:
             await self._control_events.add_event(device, fact, message, data=data)
 
     async def look(self, what: str, note: Row) -> None:
-        """The timer's look at a share that was changed, or whose time may be over."""
+        """Called by the timer for a changed or expiring share."""
         expired = what.startswith(_EXPIRES)
         on, _, account = what.removeprefix(_EXPIRES if expired else _CHANGED).rpartition("|")
         row = await self._tables.get(records.SHARES, on, share_key(account))
@@ -306,22 +304,22 @@ class Sharing:
 
 
 def require_person(caller: Identity) -> None:
-    """See that it is a person who shares, gives away or takes: an API key never does.
+    """Check that the caller is a person: API keys cannot share, transfer or accept.
 
     Raises:
         Problem: ``forbidden``.
     """
     if caller.key:
-        raise forbidden("An API key shares nothing, gives nothing away and takes nothing. Sign in for that.")
+        raise forbidden("An API key cannot share, transfer or accept anything. Sign in for that.")
 
 
 def own_share_error(detail: str) -> Problem:
-    """The refusal of what nobody can do with what is their own."""
+    """The error for operations that the owner cannot apply to an own target."""
     return Problem("already-owner", 409, "It is yours", detail)
 
 
 def about_share(note: str) -> bool:
-    """Whether a note of the timer is about a share."""
+    """Whether a reminder is about a share."""
     return note.startswith((_CHANGED, _EXPIRES))
 
 

@@ -1,1 +1,1 @@
-"""Storage."""
+"""Records, reminders, retention and batched writes."""

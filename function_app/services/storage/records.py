@@ -1,4 +1,4 @@
-"""Records in rows: which table, which key, and the one way to write when others write too."""
+"""Names of tables and keys, conversion of records, and optimistic concurrency."""
 
 import asyncio
 import random
@@ -22,10 +22,10 @@ AGENTS = "Agents"
 CLAIMS = "Claims"
 """Partition: first letter of the code; key: the code."""
 ATTEMPTS = "Attempts"
-"""Partition: account id, ``name:<name>`` or ``address:<address>``; key: what is being tried."""
+"""Partition: account id, ``name:<name>`` or ``address:<address>``; key: kind of secret."""
 MEMBERS = "Members"
-"""Partition: account id; keys ``agent:<agent id>``, ``share:device:<id>``, ``share:space:<id>``. Only an index: the
-agent's own row says whose it is, the share's own what is shared."""
+"""Partition: account id; keys ``agent:<agent id>``, ``share:device:<id>``, ``share:space:<id>``. An index only: the
+rows of agents and shares decide."""
 SHARES = "Shares"
 """Partition: ``device:<id>`` or ``space:<id>``; key ``account:<account id>``; and, as an index, with ``agent:<id>`` as
 well, ``invitation:<id>``."""
@@ -33,7 +33,7 @@ INVITATIONS = "Invitations"
 """Partition: first letter of the secret's hash; key: the hash, which is the invitation's id."""
 CONTROL = "Control"
 """Partition: device id; keys ``now:lease``, ``now:slot``, ``now:queue``, ``action:<suffix>``, ``once:<hash>``, and
-``event:<id>``, what is still to be told among the device's events."""
+``event:<id>`` for events to publish."""
 PENDING = "Pending"
 """Partition: shard; key: ``<due ms>:<what>``, an action's id, ``queue:<device id>``, ``lease:<device id>``,
 ``leave:<agent id>``, ``share-changed:<on>|<account id>``, ``share-expires:<on>|<account id>``
@@ -47,28 +47,29 @@ MOVEMENTS = "Movements"
 DESCRIPTIONS = "Descriptions"
 """Partition: agent id; key: device name."""
 FAULTS = "Faults"
-"""Partition: ``<device>/<pairing>``; see ``services/faults.py``."""
+"""Partition: ``<device>/<pairing>``; see ``services/health/faults.py``."""
 DIAGNOSTICS = "Diagnostics"
 """Partition: ``<device>/<pairing>``; key: stream."""
 WATCHERS = "Watchers"
-"""Partition: device id; key: sign-in session. Who looks at it now; see ``services/watchers.py``."""
+"""Partition: device id; key: sign-in session. Current viewers; see ``services/devices/viewers.py``."""
 WATCHED = "Watched"
 """Partition: shard; keys ``<due ms>:<agent id>``, ``agent:<agent id>``."""
 LATENCY = "Latency"
-"""Partition: ``<device>/<pairing>``; see ``services/latency.py``."""
+"""Partition: ``<device>/<pairing>``; see ``services/telemetry/latency.py``."""
 DATA = "Data"
-"""Partition: shard; key: ``<arrival ms>:<id>``. What has come in and is not yet in its series."""
+"""Partition: shard; key: ``<arrival ms>:<id>``. Received samples that are not yet in their series."""
 SERIES = "Series"
-"""Partition: ``<device>/<pairing>``, key: stream; and ``<device>/<pairing>/<stream>``, see ``domain/series.py``."""
+"""Partition: ``<device>/<pairing>``, key: stream; and ``<device>/<pairing>/<stream>``, see
+``domain/telemetry/series.py``."""
 UPLOADS = "Uploads"
-"""Partition: ``<device>/<pairing>``; see ``services/uploads.py``."""
+"""Partition: ``<device>/<pairing>``; see ``services/telemetry/uploads.py``."""
 EVENTS = "Events"
 """Partition: ``<device>/<pairing>``; key: counts down with time, newest first."""
 AUDIT = "Audit"
 """Partition: account id (or ``cloud``); keys ``head``, ``record:<number>``, ``wait:<id>``, ``once:<day>:<id>``; and
-``chains``, which lists them. See ``services/audit_chain.py``."""
+``chains``, which lists them. See ``services/audit/audit_log.py``."""
 FORGET = "Forget"
-"""Partition: shard; key: ``<due ms>:<hash of what is to be deleted>``."""
+"""Partition: shard; key: ``<due ms>:<hash of the target>``."""
 MAILBOX = "Mailbox"
 """Partition: agent id; keys ``<0 for Stop, 1>:<oldest first>:<command id>``, ``ack:<command id>``."""
 
@@ -79,21 +80,21 @@ T = TypeVar("T")
 
 
 def read(row: Row, kind: type[T]) -> T:
-    """The record in a row. Fields that a newer version wrote are ignored."""
+    """The record in a row. Fields of newer versions are ignored."""
     return msgspec.convert(row.data, kind, strict=False)
 
 
 def to_data(record: Any) -> dict[str, Any]:
-    """A record as the data of a row."""
+    """The row data of a record."""
     data: dict[str, Any] = msgspec.to_builtins(record)
     return data
 
 
 async def retry(change: Callable[[], Awaitable[T]]) -> T:
-    """Do ``change`` (read, decide, write by ETag) again from its reading while others get in between.
+    """Run ``change`` (read, decide, write by ETag) again after conflicts.
 
     Raises:
-        Problem: ``busy``, after a dozen tries.
+        Problem: ``busy``, after twelve attempts.
     """
     for attempt in range(TRIES):
         try:
@@ -107,7 +108,7 @@ async def retry(change: Callable[[], Awaitable[T]]) -> T:
 async def upsert(  # noqa: PLR0917 (a place, a change, a type: read best in this order)
     tables: Tables, table: str, partition: str, key: str, change: Callable[[T | None], T | None], kind: type[T]
 ) -> T | None:
-    """Change one record that may not exist yet; ``change`` gives ``None`` to leave it as it is."""
+    """Change or create one record; ``change`` returns ``None`` to leave it unchanged."""
 
     async def attempt() -> T | None:
         row = await tables.get(table, partition, key)

@@ -1,7 +1,6 @@
-"""Notes about open actions, by the time at which a timer has to look at them: nothing needs to be scanned.
+"""Durable timers: reminders by due time, so that no table is scanned.
 
-A note is written before its action and outlives it: an action without a note cannot be, a note without an open action
-is dropped when it is due.
+A reminder is written before the record that it refers to. When it is due and the record needs no action, it is deleted.
 """
 
 import hashlib
@@ -13,25 +12,25 @@ SHARDS = 8
 
 
 class Reminders:
-    """The notes."""
+    """Stores reminders."""
 
     def __init__(self, *, tables: Tables) -> None:
         self._tables = tables
 
     async def schedule(self, action: str, due_ms: int) -> Row | None:
-        """Look at ``action`` at ``due_ms``. The same note twice is one; whoever writes it second gets no row."""
+        """Schedule a check of ``action`` at ``due_ms``. Idempotent: the row is returned only by the first call."""
         try:
             return await self._tables.create(records.PENDING, Row(_shard(action), f"{due_ms:013d}:{action}", {}))
         except Conflict:
             return None
 
     async def due(self, shard: int, now_ms: int, *, limit: int = 100) -> list[tuple[str, Row]]:
-        """Actions whose time has come, with their notes."""
+        """Due reminders with their rows."""
         page = await self._tables.query(records.PENDING, str(shard), last=f"{now_ms + 1:013d}", limit=limit)
         return [(row.key.partition(":")[2], row) for row in page.rows]
 
     async def cancel(self, note: Row) -> None:
-        """Forget a note that was dealt with."""
+        """Delete a reminder that was processed."""
         try:
             await self._tables.delete(records.PENDING, note)
         except Conflict:

@@ -1,7 +1,7 @@
-"""Forgetting on time: notes that name rows or a blob, by the moment from which nobody may need them.
+"""Scheduled deletion of rows and blobs.
 
-A note is written by whoever knows when that moment comes, and outlives a process that is killed while it deletes: it is
-dropped last. A row that was renewed since says so itself, by ``expires_ms`` in its data; its writer noted it again.
+A deletion is scheduled together with the data and removed last, so it survives a killed process. Rows with a later
+``expires_ms`` are kept; their writer has scheduled another deletion.
 """
 
 import asyncio
@@ -17,47 +17,47 @@ from function_app.services.storage import records
 DAY_MS: Final = 86_400_000
 SHARDS = 8
 NOTES = 25
-"""Notes of one shard that are dealt with in one round."""
+"""Scheduled deletions per shard and run."""
 ROWS = 500
-"""Rows of one note that are looked at in one round; the next round goes on behind them."""
+"""Rows per deletion and run; the next run continues."""
 _BATCH_BYTES = 1_000_000
-"""Rows deleted in one batch hold at most this much: a transaction may count what it deletes."""
+"""Maximum size of the rows deleted in one batch: some stores count deleted data."""
 
 _log = logging.getLogger(__name__)
 
 
 class Retention:
-    """The notes, and the deleting."""
+    """Schedules and executes deletions."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs) -> None:
         self._tables = tables
         self._blobs = blobs
 
     async def delete_rows_at(self, table: str, partition: str, *, first: str, last: str | None, due_ms: int) -> None:
-        """Delete the rows with ``first`` ≤ key < ``last`` once ``due_ms`` has come; the same note twice is one.
+        """Delete the rows with ``first`` ≤ key < ``last`` at ``due_ms``. Idempotent.
 
         Args:
-            table: Their table.
-            partition: Their partition.
-            first: The first key.
-            last: Behind the last key; ``None``: to the end of the partition.
-            due_ms: When [ms since 1970]. Rows whose ``expires_ms`` is later then are kept.
+            table: Table.
+            partition: Partition.
+            first: First key.
+            last: End of the range (exclusive); ``None``: end of the partition.
+            due_ms: Time of deletion [ms since 1970]. Rows with a later ``expires_ms`` are kept.
         """
         await self._note({"table": table, "partition": partition, "first": first, "last": last}, due_ms)
 
     async def delete_row_at(self, table: str, partition: str, key: str, *, due_ms: int) -> None:
-        """Delete one row, as ``rows``."""
+        """Delete one row, like ``delete_rows_at``."""
         await self.delete_rows_at(table, partition, first=key, last=key + "\0", due_ms=due_ms)
 
     async def delete_blob_at(self, name: str, *, due_ms: int) -> None:
-        """Delete a blob once ``due_ms`` has come; the same note twice is one."""
+        """Delete a blob at ``due_ms``. Idempotent."""
         await self._note({"blob": name}, due_ms)
 
     async def delete_due(self, now_ms: int) -> None:
-        """One round: part of what is due. Safe to repeat and to be run by many at once.
+        """Execute a part of the due deletions. Idempotent and safe to run concurrently.
 
         Raises:
-            StoreError: The stores cannot be used.
+            StoreError: The stores are not available.
         """
         await asyncio.gather(*(self._shard(shard, now_ms) for shard in range(SHARDS)))
 
@@ -76,10 +76,10 @@ class Retention:
                 if await self._done(note, now_ms):
                     await self._tables.delete(records.FORGET, note)
             except Conflict:
-                _log.debug("another timer deals with %s, or a row has changed: the next round looks again", note.key)
+                _log.debug("another process executes %s, or a row has changed; retrying in the next run", note.key)
 
     async def _done(self, note: Row, now_ms: int) -> bool:
-        """Delete what ``note`` names; whether that was all of it."""
+        """Delete the target of ``note``; return whether it was deleted completely."""
         target = note.data
         if "blob" in target:
             await self._blobs.delete(target["blob"])

@@ -1,4 +1,4 @@
-"""Gathers what one process has to write to one place at the same time, so that it is written together."""
+"""Combines concurrent writes of one process to the same place into batches."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
@@ -11,7 +11,7 @@ J = TypeVar("J")
 
 
 class _Line(Generic[J]):
-    """Those who wait for one place."""
+    """The pending jobs of one place."""
 
     def __init__(self) -> None:
         self.lock = asyncio.Lock()
@@ -19,11 +19,11 @@ class _Line(Generic[J]):
 
 
 class WriteBatcher(Generic[J]):
-    """One batch at a time for each place; whoever comes meanwhile is in the next.
+    """Writes one batch at a time per place; jobs added meanwhile are in the next batch.
 
     Args:
-        write: Writes some to a place, all or none.
-        most: Not more than so many at once.
+        write: Writes jobs to a place, all or none.
+        most: Maximum number of jobs per batch.
     """
 
     def __init__(self, write: Callable[[str, list[J]], Awaitable[None]], *, most: int) -> None:
@@ -50,7 +50,7 @@ class WriteBatcher(Generic[J]):
                     if own[-1][1].done():
                         break
                     batch, line.jobs = line.jobs[: self._most], line.jobs[self._most :]
-                    # Whoever is called off does not take the others' jobs along.
+                    # Cancelling one caller must not cancel the jobs of others.
                     await asyncio.shield(asyncio.ensure_future(self._settle(place, batch)))
         finally:
             line.jobs = [each for each in line.jobs if each not in own]
@@ -65,7 +65,7 @@ class WriteBatcher(Generic[J]):
         except (Problem, StoreError, ValueError) as error:
             for _, done in batch:
                 done.set_exception(error)
-                done.exception()  # whoever waits may have gone
+                done.exception()  # the caller may have been cancelled
         else:
             for _, done in batch:
                 done.set_result(None)

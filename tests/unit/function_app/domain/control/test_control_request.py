@@ -73,7 +73,7 @@ def test_what_cannot_be_is_refused(what: Any, code: str) -> None:
 
 def test_who_has_been_given_control_gives_it_back_instead_of_withdrawing() -> None:
     given_ = control_request.accept(ask(HELD), ANNA, request="r1", now_ms=START)
-    with pytest.raises(Problem, match="whoever asked has control"):
+    with pytest.raises(Problem, match="requester has control"):
         control_request.withdraw(given_, BERT, request="r1", now_ms=START)
     kept = control_request.refuse(ask(HELD), ANNA, request="r1", now_ms=START)
     assert control_request.refuse(kept, ANNA, request="r1", now_ms=START) is kept
