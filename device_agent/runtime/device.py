@@ -216,8 +216,8 @@ class Device:
         self._events.record(EventRecord(EventKind.AGENT_STARTED, message, data=data))
         self.publisher.scripts = scripts = self._sandbox.status()
         if scripts.mode in _SCRIPTS:
-            data = {"reason": scripts.reason}
-            self._events.record(EventRecord(_SCRIPTS[scripts.mode], scripts.reason, "warning", data))
+            kind = _SCRIPTS[scripts.mode]
+            self._events.record(EventRecord(kind, scripts.reason, "warning", {"reason": scripts.reason}))
         self._commands.start(None if isinstance(self._driver, RoomDevice) else self._driver.twin())
 
     def stop(self) -> None:
