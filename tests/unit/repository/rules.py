@@ -12,7 +12,9 @@ MAX_LINES: Final = 400
 SOURCES: Final = frozenset({".py", ".ts", ".tsx", ".css", ".mjs", ".cjs", ".lua"})
 TEXTS: Final = SOURCES | {".md", ".toml", ".html", ".yml", ".service"}
 WIDE_FOLDERS: Final = {
-    ".": "root: files that a Functions host, package tools and repository hosts look for there",
+    ".": "files that a Functions host, package tools and repository hosts expect in the root",
+    "docs/decisions": "numbered decision records, one file each",
+    "docs/pictures": "screenshots that the browser tests write",
 }
 """Folders that may have more entries, each with the reason."""
 LONG_FILES: Final = {
