@@ -1,1 +1,1 @@
-"""Robot types."""
+"""Robot types, movements and their validation."""

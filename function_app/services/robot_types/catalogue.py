@@ -1,4 +1,4 @@
-"""Robot types: those that come with the installation, and an account's own. The one place where one is looked up."""
+"""Lookup of robot types: those of the installation and those of an account."""
 
 import asyncio
 import io
@@ -28,14 +28,14 @@ _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class KnownType:
-    """A robot type as its account sees it.
+    """A robot type as visible to its account.
 
     Attributes:
-        manifest: Of the version in use; of the newest upload where none is in use yet.
-        version: Whose manifest it is.
-        files: Name → bytes, of the same version.
-        usable: Whether devices and movements may have it.
-        upload: The newest upload, of an account's own type.
+        manifest: Manifest of the active version; without one, of the newest upload.
+        version: Version of the manifest.
+        files: Name → size [bytes], of the same version.
+        usable: Whether devices and movements may use it.
+        upload: Newest upload of an account's own type.
     """
 
     manifest: RobotType
@@ -46,13 +46,13 @@ class KnownType:
 
     @property
     def built_in(self) -> bool:
-        """Whether it comes with the installation."""
+        """Whether it is part of the installation."""
         return self.upload is None
 
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """The model of a robot type as a page can draw it, and what is in it."""
+    """The drawing of a robot type for display, and its contents."""
 
     twin: Twin
     actuators: tuple[str, ...]
@@ -60,7 +60,7 @@ class Model:
 
 
 class RobotTypes:
-    """All robot types that an account may use."""
+    """Robot types that an account may use."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs, catalogue: RobotCatalogue, integrity: IntegritySeals) -> None:
         self._integrity = integrity
@@ -77,7 +77,7 @@ class RobotTypes:
             Problem: ``cursor-invalid``.
         """
         if cursor is not None and not ID.match(cursor):
-            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
+            raise invalid("The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid")
         after = "" if cursor is None else cursor + "\0"
         page = await self._tables.query(
             records.MEMBERS, caller.account, first=INDEX + after, last=INDEX + "\x7f", limit=limit
@@ -91,7 +91,7 @@ class RobotTypes:
         return tuple(each for each in result if each is not None), last
 
     async def get(self, caller: Identity, robot_type: str) -> RobotType:
-        """A robot type that can be used.
+        """A usable robot type.
 
         Raises:
             Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``robot-type-damaged``.
@@ -101,13 +101,13 @@ class RobotTypes:
             return built_in
         where, head = await self._head(caller, robot_type)
         if not head.ready:
-            detail = f"No version of '{robot_type}' is ready. Look at the robot type: it says why."
+            detail = f"No version of '{robot_type}' is ready. See the robot type for the reason."
             raise Problem("robot-type-not-ready", 409, "The robot type is not ready", detail)
         await self._integrity.check(where.account, robot_type, head)
         return msgspec.convert(head.manifest, RobotType)
 
     async def view(self, caller: Identity, robot_type: str) -> KnownType:
-        """A robot type with what is known of it.
+        """A robot type with its state.
 
         Raises:
             Problem: ``robot-type-unknown``.
@@ -118,7 +118,7 @@ class RobotTypes:
         return result
 
     async def file(self, caller: Identity, robot_type: str, name: str) -> bytes:
-        """One file of the version in use; ``robot.toml`` is the manifest.
+        """One file of the active version; ``robot.toml`` is the manifest.
 
         Raises:
             Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``robot-type-damaged``, ``file-unknown``.
@@ -139,11 +139,10 @@ class RobotTypes:
         return content
 
     async def model(self, caller: Identity, robot_type: str) -> Model:
-        """The drawing of the version in use.
+        """The drawing of the active version.
 
         Raises:
-            Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``model-unknown``: it cannot be drawn, or was
-                checked before checkers drew.
+            Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``model-unknown``: there is no drawing.
         """
         if robot_type in await self._catalogue.types():
             drawing = await self._catalogue.drawing(robot_type)
@@ -158,7 +157,7 @@ class RobotTypes:
         return await self.checked_model(where, version)
 
     async def checked_model(self, where: Place, version: TypeVersion) -> Model:
-        """What a checker has drawn.
+        """The drawing that the validator stored.
 
         Raises:
             Problem: ``model-unknown``.
@@ -169,7 +168,7 @@ class RobotTypes:
         return _model(version.manifest["type"], msgspec.json.decode(content, type=ModelReport))
 
     async def archive(self, caller: Identity, robot_type: str) -> bytes:
-        """All files of the version in use as a zip, in a folder of the type's name.
+        """All files of the active version as a zip archive, in a folder with the type's name.
 
         Raises:
             Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``file-unknown``.
@@ -218,7 +217,7 @@ def _zip(files: Mapping[str, bytes]) -> bytes:
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w") as archive:
         for name, content in files.items():
-            entry = zipfile.ZipInfo(name, _ZIP_TIME)  # a fixed time: the same files are the same archive
+            entry = zipfile.ZipInfo(name, _ZIP_TIME)  # fixed time: equal files give equal archives
             archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
     return held.getvalue()
 

@@ -1,4 +1,4 @@
-"""What time brings for robot types: uploads without a verdict, versions and files that nobody needs any more."""
+"""Periodic cleanup of robot types: unvalidated uploads, unused versions and files."""
 
 import contextlib
 import logging
@@ -26,19 +26,19 @@ from function_app.services.storage.retention import DAY_MS
 
 AGAIN_MS = 30_000
 LONGEST_MS = 5 * GIVE_UP_MS
-"""While checkers are busy, an upload may wait for its turn so long."""
+"""Maximum time that an upload waits while validators are busy."""
 NOTES = 25
 NO_CHECKER = (
-    "No checker has looked at the model in time. Run `python -m function_app work` or `check-models` on a machine that "
-    "has MuJoCo, then upload it again."
+    "No validator checked the model in time. Run `python -m function_app work` or `check-models` on a machine with "
+    "MuJoCo, then upload it again."
 )
-CUT_OFF = "The upload was cut off. Upload it again."
+CUT_OFF = "The upload was interrupted. Upload it again."
 
 _log = logging.getLogger(__name__)
 
 
 class RobotTypeCleanup:
-    """The timer's part."""
+    """The cleanup jobs of the scheduler."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs, clock: Clock) -> None:
         self._tables = tables
@@ -46,10 +46,10 @@ class RobotTypeCleanup:
         self._clock = clock
 
     async def run_due_jobs(self) -> None:
-        """One round. Safe to repeat and to be run by many at once: each note goes last.
+        """Run the due jobs. Idempotent and safe to run concurrently: each reminder is deleted last.
 
         Raises:
-            StoreError: The stores cannot be used.
+            StoreError: The stores are not available.
         """
         last = f"{self._clock.now_ms() + 1:013d}"
         page = await self._tables.query(records.MODEL_CHECKS, LOOKS, last=last, limit=NOTES)
@@ -78,7 +78,7 @@ class RobotTypeCleanup:
             await self._look_at(where, head, row)
 
     async def _look_at_trial(self, where: Place, head: TypeHead, rows: Sequence[Row]) -> None:
-        """One version, for a while; then all of it goes, what leads to it last."""
+        """Check a preview: expire its version, then delete all of it, its index last."""
         now_ms = self._clock.now_ms()
         versions = [records.read(row, TypeVersion) for row in rows]
         if not head.deleted and any(now_ms < version.created_ms + KEEP_LOOK_MS for version in versions):
@@ -95,7 +95,7 @@ class RobotTypeCleanup:
         await self._forget(where)
 
     async def _forget(self, where: Place) -> None:
-        """Take a look off its account's list."""
+        """Remove a preview from its account's list."""
         row = await self._tables.get(records.MEMBERS, where.account, preview_index(where))
         if row is not None:
             with contextlib.suppress(Conflict):
@@ -107,7 +107,7 @@ class RobotTypeCleanup:
         if version.state == "rejected" and version.version < head.last:
             await self._drop(where, row, version)
         elif not head.needs(version.version):
-            # Superseded ones stay for a day, for who has begun to download.
+            # Superseded versions remain for one day, for running downloads.
             due_ms = 0 if head.deleted or version.version < head.since else head.ready_ms + DAY_MS
             if now_ms >= due_ms:
                 await self._drop(where, row, version)
@@ -127,12 +127,12 @@ class RobotTypeCleanup:
             await store_verdict(self._tables, where, version.version, (why,), now_ms)
 
     async def _busy(self, now_ms: int) -> bool:
-        """Whether a checker is at work: then this one's turn will come."""
+        """Whether a validator is working, so that this upload will get its turn."""
         page = await self._tables.query(records.MODEL_CHECKS, CHECKS, limit=100)
         return any(note.data["until_ms"] > now_ms for note in page.rows)
 
     async def _drop(self, where: Place, row: Row, version: TypeVersion) -> None:
-        """Files first: a row without its files is dropped again, files without a row are never found."""
+        """Delete the files first: rows without files are deleted again, files without rows would be lost."""
         await drop_files(self._blobs, where, version.version)
         with contextlib.suppress(Conflict):
             await self._tables.delete(records.ROBOT_TYPES, row)

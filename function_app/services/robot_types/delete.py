@@ -1,4 +1,4 @@
-"""Deleting a robot type that nothing needs any more."""
+"""Deletion of unused robot types."""
 
 import contextlib
 from dataclasses import replace
@@ -16,12 +16,12 @@ from function_app.services.robot_types.rows import INDEX, place, read_head, sche
 from function_app.services.storage import records
 
 AFTER_MS = 60_000
-"""The files of a deleted type stay so long: who has just begun to download them may go on."""
+"""Time that files of a deleted type remain, for running downloads."""
 _NAMED = 5
 
 
 class RobotTypeDeletion:
-    """Takes an account's own robot type out of use."""
+    """Deletes an account's own robot types."""
 
     def __init__(
         self,
@@ -41,13 +41,13 @@ class RobotTypeDeletion:
         self._clock = clock
 
     async def delete(self, caller: Identity, robot_type: str) -> None:
-        """Delete it, all versions. The write on its row decides; the timer deletes versions and files.
+        """Delete all versions. The write on the type's row decides; the timer deletes versions and files.
 
         Raises:
-            Problem: ``robot-type-unknown``, ``robot-type-built-in``, ``robot-type-in-use`` with who uses it.
+            Problem: ``robot-type-unknown``, ``robot-type-built-in``, ``robot-type-in-use`` with its users.
         """
         if robot_type in await self._catalogue.types():
-            detail = f"'{robot_type}' comes with the installation and cannot be deleted."
+            detail = f"'{robot_type}' is part of the installation and cannot be deleted."
             raise Problem("robot-type-built-in", 409, "Built-in", detail)
         where = place(caller, robot_type)
         if where is None:
@@ -81,6 +81,6 @@ class RobotTypeDeletion:
         users = [f"device {name}" for name in devices] + [f"movement {name}" for name in movements]
         if users:
             more = f" and {len(users) - _NAMED} more" if len(users) > _NAMED else ""
-            detail = f"'{robot_type}' is used by {', '.join(users[:_NAMED])}{more}. Un-pair or delete these first."
+            detail = f"'{robot_type}' is used by {', '.join(users[:_NAMED])}{more}. Unpair or delete these first."
             extras = {"devices": devices[:_NAMED], "movements": movements[:_NAMED]}
             raise Problem("robot-type-in-use", 409, "The robot type is in use", detail, extras=extras)

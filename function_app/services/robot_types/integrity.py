@@ -1,4 +1,4 @@
-"""The seal on an uploaded robot type: what was checked is what is used, whoever else can write to the stores."""
+"""Integrity of uploaded robot types: a signature proves that the validated files are the used ones."""
 
 import hashlib
 import json
@@ -16,7 +16,7 @@ _CONTEXT = b"telescope/v1/robot-type\n"
 
 
 class IntegritySeals:
-    """Signs uploads, and checks what is read again."""
+    """Signs uploads and verifies them."""
 
     def __init__(self, *, keys: SigningKeys) -> None:
         self._keys = keys
@@ -24,7 +24,7 @@ class IntegritySeals:
     async def sealed(
         self, account: str, robot_type: str, upload: TypeVersion, files: Mapping[str, bytes]
     ) -> TypeVersion:
-        """The upload with a signature over its place, version, manifest, and each file's hash."""
+        """The upload with a signature over its place, version, manifest and file hashes."""
         key = await self._keys.current()
         hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
         text = _text(account, robot_type, upload.version, upload.manifest, hashes)
@@ -32,7 +32,7 @@ class IntegritySeals:
         return replace(upload, seal=Seal(signing.key_id(key.public_key()), signature, hashes))
 
     async def check(self, account: str, robot_type: str, used: TypeHead | TypeVersion) -> Seal:
-        """The seal, once it is seen to be ours, on this manifest.
+        """The seal, if it is valid for this manifest.
 
         Raises:
             Problem: ``robot-type-damaged``.
@@ -41,23 +41,23 @@ class IntegritySeals:
         seal = used.seal
         key = (await self._keys.archive()).get(seal.key)
         if key is None:
-            raise _damaged(robot_type, "was sealed with a key that has leaked or is not ours")
+            raise _damaged(robot_type, "was signed with an unknown or leaked key")
         text = _text(account, robot_type, version, used.manifest, seal.hashes)
         try:
             signing.verify_text(text, seal.signature, key, context=_CONTEXT)
         except SignatureError as error:
-            raise _damaged(robot_type, "is not what was uploaded") from error
+            raise _damaged(robot_type, "differs from the upload") from error
         return seal
 
 
 def require_intact(robot_type: str, seal: Seal, name: str, content: bytes) -> None:
-    """A file is the one that was uploaded.
+    """Check that a file equals the uploaded one.
 
     Raises:
         Problem: ``robot-type-damaged``.
     """
     if seal.hashes.get(name) != hashlib.sha256(content).hexdigest():
-        raise _damaged(robot_type, f"has a file that was changed in the store, {name}")
+        raise _damaged(robot_type, f"has a file that was changed in the store: {name}")
 
 
 def _text(account: str, robot_type: str, version: int, manifest: Mapping[str, Any], hashes: Mapping[str, str]) -> str:

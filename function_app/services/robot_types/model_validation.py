@@ -1,6 +1,6 @@
-"""Checking uploaded models: whoever has MuJoCo takes a note, compiles, and writes the verdict.
+"""Validates uploaded models: a validator with MuJoCo takes a job, compiles the model and stores the verdict.
 
-A note is taken for a time by its ETag: two checkers never hold the same one, and a killed one's is taken up again.
+A job is leased by its ETag, so two validators never have the same job. The job of a killed validator is taken again.
 """
 
 import asyncio
@@ -22,9 +22,9 @@ from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS
 
 LEASE_MS = 60_000
-"""How long a checker may hold a note: longer than a compiler may take."""
+"""Lease of a job [ms]: longer than the time limit of a compilation."""
 MAX_TRIES = 3
-"""So many checkers may end while they hold a note; then the model is to blame."""
+"""After this number of interrupted attempts the model is rejected."""
 MAX_ERRORS = 20
 MAX_ERROR = 500
 
@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 
 class ModelValidator:
-    """The checker's work."""
+    """Processes validation jobs."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs, compiler: ModelCompiler, clock: Clock) -> None:
         self._tables = tables
@@ -41,19 +41,19 @@ class ModelValidator:
         self._clock = clock
 
     def require(self) -> None:
-        """See that models can be compiled here.
+        """Check that models can be compiled here.
 
         Raises:
-            CompilerMissingError: They cannot.
+            CompilerMissingError: There is no compiler.
         """
         self._compiler.require()
 
     async def run(self) -> bool:
-        """Deal with one upload; whether there was one.
+        """Process one job; return whether there was one.
 
         Raises:
-            CompilerMissingError: Models cannot be compiled here; the note is free again.
-            StoreError: The stores cannot be used.
+            CompilerMissingError: There is no compiler; the job is released.
+            StoreError: The stores are not available.
         """
         page = await self._tables.query(records.MODEL_CHECKS, CHECKS, limit=100)
         for note in page.rows:
@@ -62,7 +62,7 @@ class ModelValidator:
             try:
                 taken = await self._take(note)
             except Conflict:
-                continue  # another checker has it
+                continue  # taken by another validator
             try:
                 await self._check(taken)
                 await self._tables.delete(records.MODEL_CHECKS, taken)
@@ -70,7 +70,7 @@ class ModelValidator:
                 await self._tables.replace(records.MODEL_CHECKS, replace(note, etag=taken.etag))
                 raise
             except Conflict:
-                _log.warning("check %s took too long: another checker has taken it up", note.key)
+                _log.warning("check %s took too long and was taken by another validator", note.key)
             return True
         return False
 
@@ -84,23 +84,23 @@ class ModelValidator:
         _, upload = await read_version(self._tables, where, number)
         if upload is not None and upload.state == "checking":
             if note.data["tries"] > MAX_TRIES:
-                looked = ModelReport((f"The check was cut off {MAX_TRIES} times. Simplify the model.",))
+                looked = ModelReport((f"The validation was interrupted {MAX_TRIES} times. Simplify the model.",))
             else:
                 looked = await self._look(where, upload)
-            # The drawing first: a version that is ready has one.
+            # The drawing is stored first: a ready version has one.
             await self._blobs.put(where.prefix(number) + LOOKED, msgspec.json.encode(looked))
             warnings = _sentences(looked.warnings)
             await store_verdict(self._tables, where, number, looked.errors, self._clock.now_ms(), warnings=warnings)
             _, upload = await read_version(self._tables, where, number)
         if upload is None:
-            await drop_files(self._blobs, where, number)  # the timer may have been here in between
+            await drop_files(self._blobs, where, number)  # the cleanup may have run concurrently
 
     async def _look(self, where: Place, upload: TypeVersion) -> ModelReport:
         names = list(upload.files)
         contents = await asyncio.gather(*(self._blobs.get(where.prefix(upload.version) + name) for name in names))
         files = {name: content for name, content in zip(names, contents, strict=True) if content is not None}
         if len(files) < len(names):
-            return ModelReport(("A file of the upload is gone. Upload it again.",))
+            return ModelReport(("A file of the upload is missing. Upload it again.",))
         manifest = msgspec.convert(upload.manifest, RobotType)
         del files[MANIFEST]
         lost = missing(files)
@@ -120,9 +120,9 @@ async def drop_files(blobs: Blobs, where: Place, number: int) -> None:
 async def store_verdict(
     tables: Tables, where: Place, number: int, errors: Sequence[str], now_ms: int, *, warnings: tuple[str, ...] = ()
 ) -> None:
-    """Write what was found, beside what was known before; what nobody waits for any more stays as it is.
+    """Store the verdict together with earlier errors; a version that is no longer open stays unchanged.
 
-    A version that is ready takes the place of those before it in the same batch; these are looked at a day later.
+    A ready version becomes active in the same batch; earlier versions are cleaned up after one day.
     """
 
     async def attempt() -> None:

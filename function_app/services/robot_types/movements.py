@@ -1,8 +1,8 @@
-"""Movement scripts: those that come with a robot type, and an account's own, which may shadow them.
+"""Movement scripts: built-in ones, and those of an account, which may shadow them.
 
-One partition holds an account's movements of one robot type: a row for each name, which decides by its ETag which
-version is the newest, and a row for each version, written with it in one batch. The script is a blob of that version
-alone, so that deleting one version's never takes another's.
+One partition contains an account's movements of one robot type: a row per name, whose ETag decides which version is the
+newest, and a row per version in the same batch. Each version has its own blob, so deletions do not affect other
+versions.
 """
 
 import asyncio
@@ -30,20 +30,20 @@ from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS, Retention
 
 MAX_OWN = 1_000
-"""Movements an account may keep for one robot type."""
+"""Maximum number of movements of an account for one robot type."""
 KEPT_MS = 3 * DAY_MS
-"""The script of a deleted movement stays so long: an action that was started with it before may be sent again."""
+"""Time that the script of a deleted movement remains, for republished commands of running actions."""
 _VERSIONS = "~"
-"""Begins the keys of version rows: behind every name."""
+"""Key prefix of version rows, which sort after all names."""
 _LAST_VERSION = 10**8
 
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """What somebody saves. Without description or schema the script's own count.
+    """A movement to save. Description and schema default to those in the script.
 
     Attributes:
-        based_on: The version that it was made from, which has to be the newest still; 0: there has to be none.
+        based_on: Version that it is derived from, which must still be the newest; 0: the name must be new.
     """
 
     source: str
@@ -53,7 +53,7 @@ class Draft:
 
 
 class Movements:
-    """The library of an account, robot type by robot type."""
+    """The movements of an account, by robot type."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class Movements:
     async def list(
         self, caller: Identity, robot_type: str, *, cursor: str | None, limit: int
     ) -> tuple[tuple[Movement, ...], str | None]:
-        """Newest versions, by name; an account's own in place of a built-in one of the same name.
+        """Newest versions by name; an account's own movement replaces the built-in one with the same name.
 
         Raises:
             Problem: ``robot-type-unknown``, ``cursor-invalid``.
@@ -105,7 +105,7 @@ class Movements:
     async def versions(
         self, caller: Identity, robot_type: str, name: str, *, cursor: str | None, limit: int
     ) -> tuple[tuple[Movement, ...], str | None]:
-        """Every version of one movement, newest first; at the end the built-in one that it shadows.
+        """All versions of a movement, newest first; the shadowed built-in one is last.
 
         Raises:
             Problem: ``robot-type-unknown``, ``movement-unknown``, ``cursor-invalid``.
@@ -135,7 +135,7 @@ class Movements:
     async def get(
         self, caller: Identity, robot_type: str, name: str, version: int | None = None
     ) -> tuple[Movement, str]:
-        """One movement and its source: the newest version, or the one that is asked for.
+        """A movement and its source, in the newest or the given version.
 
         Raises:
             Problem: ``robot-type-unknown``, ``movement-unknown``, ``movement-version-unknown``, ``movement-damaged``.
@@ -152,9 +152,9 @@ class Movements:
         return result, await self._scripts.get(caller, robot_type, result)
 
     async def put(self, caller: Identity, robot_type: str, name: str, draft: Draft) -> tuple[Movement, bool]:
-        """Store a new version; and whether the account had none of this name.
+        """Store a new version; also return whether the name is new.
 
-        The script is stored before the rows that name it: a row without its script cannot be.
+        The script is stored before the rows, so that no row exists without its script.
 
         Raises:
             Problem: ``robot-type-unknown``, ``movement-invalid`` with the line, ``schema-invalid``, ``movements-full``,
@@ -162,7 +162,7 @@ class Movements:
         """
         await self._types.get(caller, robot_type)
         if not ID.match(name):
-            raise invalid("A movement's name has letters, digits, _ and -, 1 to 64 of them.")
+            raise invalid("A movement's name consists of 1 to 64 letters, digits, _ and -.")
         script = read_script(draft.source)
         new = Movement(
             name=name,
@@ -202,9 +202,9 @@ class Movements:
         return done
 
     async def delete(self, caller: Identity, robot_type: str, name: str) -> None:
-        """Delete the account's own movement, all versions; a built-in one of the same name shows again.
+        """Delete all versions of an own movement; a built-in one with the same name becomes visible again.
 
-        An action that was started with it goes on to its end: its script stays for ``KEPT_MS``.
+        Running actions continue: the script remains for ``KEPT_MS``.
 
         Raises:
             Problem: ``robot-type-unknown``, ``movement-unknown``, ``movement-built-in``.
@@ -218,7 +218,7 @@ class Movements:
                 if old is not None:
                     await self._forget_versions(caller, robot_type, old)
                 if name in await self._catalogue.movements(robot_type):
-                    detail = f"'{name}' comes with the robot type and cannot be deleted."
+                    detail = f"'{name}' is part of the robot type and cannot be deleted."
                     raise Problem("movement-built-in", 409, "Built-in", detail)
                 raise not_found("movement", name)
             gone = replace(old, deleted=True, updated_ms=self._clock.now_ms())
@@ -233,13 +233,13 @@ class Movements:
         await self._forget_versions(caller, robot_type, gone)
 
     async def own(self, caller: Identity, robot_type: str) -> tuple[str, ...]:
-        """Names of the account's own movements of a robot type."""
+        """Names of the account's own movements for a robot type."""
         partition = _partition(caller, robot_type)
         page = await self._tables.query(records.MOVEMENTS, partition, last=_VERSIONS, limit=MAX_OWN)
         return tuple(row.key for row in page.rows if not records.read(row, Movement).deleted)
 
     async def pinned_source(self, caller: Identity, name: str, pinned: Mapping[str, Any]) -> str | None:
-        """The script of an action that is sent again, by what was pinned at its start; ``None`` when it is gone."""
+        """The pinned script of a republished action; ``None`` if it was deleted."""
         result = (await self._catalogue.movements(pinned["robot_type"])).get(name)
         if result is not None and result.sha256 == pinned["sha256"]:
             return result.source
@@ -272,37 +272,39 @@ class Movements:
         return await self._tables.get(records.MOVEMENTS, _partition(caller, robot_type), name)
 
     async def _check_newest(self, robot_type: str, name: str, old: Movement | None, based_on: int | None) -> None:
-        """Refuse to save over what somebody has saved meanwhile."""
+        """Reject saving over a version that was saved concurrently."""
         built_in = (await self._catalogue.movements(robot_type)).get(name)
         newest = old.version if old and not old.deleted else built_in.version if built_in else 0
         if based_on is None or based_on == newest:
             return
         made = f"Version {newest} of '{name}' is the newest" if newest else f"'{name}' has been deleted meanwhile"
-        detail = f"{made}, and this was made from version {based_on}." if based_on else f"There is a '{name}' already."
-        raise Problem("movement-changed", 409, "Somebody has saved it meanwhile", detail, extras={"version": newest})
+        detail = f"{made}, but this draft is based on version {based_on}." if based_on else f"'{name}' exists already."
+        raise Problem(
+            "movement-changed", 409, "The movement was changed concurrently", detail, extras={"version": newest}
+        )
 
     async def _check_room(self, caller: Identity, robot_type: str) -> None:
         partition = _partition(caller, robot_type)
         page = await self._tables.query(records.MOVEMENTS, partition, last=_VERSIONS, limit=MAX_OWN)
         if len(page.rows) >= MAX_OWN:
-            detail = f"An account keeps at most {MAX_OWN} movements for one robot type."
+            detail = f"An account has at most {MAX_OWN} movements for one robot type."
             raise Problem("movements-full", 409, "Too many movements", detail)
 
     async def _numbered(self, robot_type: str, new: Movement, old: Movement | None) -> Movement:
-        """The next version, and since which version the name has been in use."""
+        """The next version, and the first version since the last deletion."""
         built_in = (await self._catalogue.movements(robot_type)).get(new.name)
         version = max(old.version if old else 0, built_in.version if built_in else 0) + 1
         return replace(new, version=version, since=old.since if old and not old.deleted else version)
 
     async def _drop_lost(self, caller: Identity, robot_type: str, tried: Movement) -> None:
-        """Delete the script of a version that another writer got, unless it is that very script."""
+        """Delete the script of a version number that another request got, unless it is the same script."""
         key = _version_key(tried.name, tried.version)
         row = await self._tables.get(records.MOVEMENTS, _partition(caller, robot_type), key)
         if row is None or row.data["sha256"] != tried.sha256:
             await self._scripts.delete(caller, robot_type, tried)
 
     async def _forget_versions(self, caller: Identity, robot_type: str, gone: Movement) -> None:
-        """Note scripts, then rows, of a deleted movement. Whoever meets one again notes the same again."""
+        """Schedule the deletion of scripts, then of rows. Idempotent."""
         due_ms = gone.updated_ms + KEPT_MS
         partition = _partition(caller, robot_type)
         first, last = _version_key(gone.name, gone.version), _version_key(gone.name, gone.since) + "\0"
@@ -340,7 +342,7 @@ def _writes(partition: str, movement: Movement, row: Row | None) -> list[Write]:
 
 
 def _bad_cursor() -> Problem:
-    return invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
+    return invalid("The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid")
 
 
 def _partition(caller: Identity, robot_type: str) -> str:

@@ -1,4 +1,4 @@
-"""The files of an uploaded robot type: what may be among them, and what its XML may refer to."""
+"""Reads the files of an uploaded robot type and checks their names, sizes and references."""
 
 import base64
 import binascii
@@ -18,11 +18,11 @@ from function_app.domain.common.problems import Problem, invalid
 
 MAX_FILES = 32
 MAX_BYTES = 6_000_000
-"""Of all files together."""
+"""Maximum size of all files [bytes]."""
 MAX_MANIFEST = 48_000
 MAX_VERSION = 1_000_000
 MAX_TOLD = 20
-"""Of things that are wrong so many are told."""
+"""Maximum number of reported errors."""
 TEXT = ".xml"
 BINARY = (".stl", ".obj", ".png")
 _NAME = re.compile(r"\A(?=.{1,120}\Z)([A-Za-z0-9_-][A-Za-z0-9_.-]*/){0,3}[A-Za-z0-9_-][A-Za-z0-9_.-]*\.[a-z]{3}\Z")
@@ -34,22 +34,22 @@ _OUTSIDE = re.compile(r"\A[/~]|[\\:\x00]|(\A|/)\.\.(/|\Z)")
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """A robot type as it was uploaded: its manifest as text is one of ``files``."""
+    """An uploaded robot type; ``files`` includes the manifest."""
 
     robot_type: RobotType
     files: dict[str, bytes]
 
 
 def read_upload(manifest: str, files: Mapping[str, str]) -> Upload:
-    """Check all that can be said without MuJoCo.
+    """Check everything that does not need MuJoCo.
 
     Args:
         manifest: Text of ``robot.toml``.
-        files: Name → text of an ``.xml``; base64 of any other.
+        files: Name → text of an ``.xml`` file; base64 of other files.
 
     Raises:
-        Problem: ``manifest-invalid`` with the field, ``robot-type-invalid`` with the file; of several things that are
-            wrong the first, and all in ``errors``.
+        Problem: ``manifest-invalid`` with the field, ``robot-type-invalid`` with the file; the first error, with all
+            errors in ``errors``.
     """
     if not 1 <= len(files) <= MAX_FILES:
         raise _bad(f"A robot type has 1 to {MAX_FILES} files, not {len(files)}.")
@@ -73,7 +73,7 @@ def read_upload(manifest: str, files: Mapping[str, str]) -> Upload:
 
 
 def missing(files: Mapping[str, bytes]) -> tuple[tuple[str, str, int], ...]:
-    """Files that the XML names and that are in no folder of the upload: who names it, what, and in which line."""
+    """Referenced files that are not in the upload: the referring file, the name and the line."""
     existing = {name.rpartition("/")[2] for name in files}
     result: list[tuple[str, str, int]] = []
 
@@ -96,7 +96,7 @@ def missing(files: Mapping[str, bytes]) -> tuple[tuple[str, str, int], ...]:
 
 
 def malformed(files: Mapping[str, bytes]) -> tuple[str, ...]:
-    """Files that are not well-formed XML: their references could not be looked at, so they are never good."""
+    """Files that are not well-formed XML, whose references cannot be checked."""
     errors = []
     for name, text in files.items():
         if name.endswith(TEXT):
@@ -109,7 +109,7 @@ def malformed(files: Mapping[str, bytes]) -> tuple[str, ...]:
 
 def _unfit(content: Mapping[str, bytes]) -> Iterator[Problem]:
     if sum(map(len, content.values())) > MAX_BYTES:
-        yield _bad(f"The files have at most {MAX_BYTES} bytes together. Simplify the meshes.")
+        yield _bad(f"All files together have at most {MAX_BYTES} bytes. Simplify the meshes.")
     for name in content:
         folder = next((other for other in content if name.startswith(other + "/")), None)
         if folder is not None:
@@ -125,7 +125,7 @@ def _unnamed(robot_type: RobotType, content: Mapping[str, bytes]) -> Iterator[Pr
 
 
 def _or_note(wrong: list[Problem], read: Callable[[], T]) -> T | None:
-    """What ``read`` gives; ``None`` where it refuses, which is noted."""
+    """The result of ``read``, or ``None`` after recording its error."""
     try:
         return read()
     except Problem as problem:
@@ -141,7 +141,7 @@ def _manifest(text: str) -> RobotType:
     except (ProtocolError, RecursionError) as error:
         raise _bad_manifest(f"{error}.") from error
     if not ID.match(result.type):
-        raise _bad_manifest("type has letters, digits, _ and -, 1 to 64 of them.")
+        raise _bad_manifest("type consists of 1 to 64 letters, digits, _ and -.")
     if not 1 <= result.version <= MAX_VERSION:
         raise _bad_manifest(f"version is {result.version}; it must be 1 to {MAX_VERSION}.")
     return result
@@ -150,7 +150,7 @@ def _manifest(text: str) -> RobotType:
 def _content(name: str, text: str) -> bytes:
     if not _NAME.match(name) or not name.endswith((TEXT, *BINARY)):
         endings = ", ".join((TEXT, *BINARY))
-        raise _bad(f"A file cannot be called '{name[:120]}': letters, digits, _, - and ., then one of {endings}.")
+        raise _bad(f"File name '{name[:120]}' is not valid: use letters, digits, _, - and ., then one of {endings}.")
     if name.endswith(TEXT):
         return text.encode()
     try:
@@ -160,7 +160,7 @@ def _content(name: str, text: str) -> bytes:
 
 
 def _check_references(name: str, text: bytes) -> None:
-    """Refuse what leads out of the folder. What is not well formed is left to MuJoCo, which says so best."""
+    """Reject references outside the folder. MuJoCo reports malformed XML."""
     outside: list[str] = []
 
     def element(tag: str, attributes: dict[str, str]) -> None:
@@ -181,7 +181,7 @@ def _check_references(name: str, text: bytes) -> None:
 
 
 def _parser() -> expat.XMLParserType:
-    """One that reads bytes as MuJoCo's does: UTF-8, whatever the file says."""
+    """A parser that decodes UTF-8 like MuJoCo, regardless of the XML declaration."""
     return expat.ParserCreate("utf-8")
 
 

@@ -1,7 +1,7 @@
-"""What a movement lets an operator set: a small part of JSON Schema, and checking parameters against it.
+"""Parameter schemas of movements: a subset of JSON Schema, and validation of parameters.
 
-The structs are the metaschema. What they leave out, they leave out on purpose: references and patterns, with which a
-schema could make a check run for ever.
+The structs are the metaschema. References and patterns are excluded on purpose: they allow schemas whose validation
+does not end.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from function_app.domain.common.problems import Problem, invalid
 
 MAX_SCHEMA_BYTES = 8_192
 MAX_PARAMETERS_BYTES = 16_384
-"""JSON of the parameters of one action, with the defaults filled in."""
+"""Maximum size of the parameters of an action with defaults, as JSON [bytes]."""
 SCHEMA_LEVELS = 24
 _SHOWN = 300
 
@@ -35,7 +35,7 @@ class _Value(
     rename="camel",
     tag_field="type",
 ):
-    """What any parameter may say about itself. ``unit`` is for people."""
+    """Common fields of all values. ``unit`` is for display."""
 
     title: _Words | UnsetType = UNSET
     description: _Words | UnsetType = UNSET
@@ -53,14 +53,14 @@ class NumberSchema(_Value, frozen=True, kw_only=True, tag="number"):
 
 
 class IntegerSchema(_Value, frozen=True, kw_only=True, tag="integer"):
-    """A whole number."""
+    """An integer."""
 
     minimum: _Whole | UnsetType = UNSET
     maximum: _Whole | UnsetType = UNSET
 
 
 class StringSchema(_Value, frozen=True, kw_only=True, tag="string"):
-    """Text, or one of some words."""
+    """Text, or one of several words."""
 
     enum: Annotated[tuple[_Words, ...], Meta(min_length=1, max_length=64)] | UnsetType = UNSET
     min_length: _Count | UnsetType = UNSET
@@ -68,11 +68,11 @@ class StringSchema(_Value, frozen=True, kw_only=True, tag="string"):
 
 
 class BooleanSchema(_Value, frozen=True, kw_only=True, tag="boolean"):
-    """Yes or no."""
+    """A Boolean."""
 
 
 class ArraySchema(_Value, frozen=True, kw_only=True, tag="array"):
-    """A list of values of one kind."""
+    """A list of values of one type."""
 
     items: "ValueSchema"
     min_items: _Count | UnsetType = UNSET
@@ -80,7 +80,7 @@ class ArraySchema(_Value, frozen=True, kw_only=True, tag="array"):
 
 
 class ObjectSchema(_Value, frozen=True, kw_only=True, tag="object"):
-    """Values by name. Names that are not listed are refused unless ``additionalProperties`` is true."""
+    """Values by name. Unlisted names are rejected unless ``additionalProperties`` is true."""
 
     properties: Annotated[dict[_Name, "ValueSchema"], Meta(max_length=64)] = {}
     required: Annotated[tuple[_Name, ...], Meta(max_length=64)] = ()
@@ -91,10 +91,10 @@ ValueSchema = NumberSchema | IntegerSchema | StringSchema | BooleanSchema | Arra
 
 
 def schema_of(given: Any) -> ObjectSchema:
-    """A schema out of JSON.
+    """A schema from JSON.
 
     Raises:
-        Problem: ``schema-invalid``, with the place and what may stand there.
+        Problem: ``schema-invalid``, with the place and the allowed values.
     """
     if too_deep(given, SCHEMA_LEVELS):
         raise _bad_schema(f"It is nested more than {SCHEMA_LEVELS} levels deep.")
@@ -107,7 +107,7 @@ def schema_of(given: Any) -> ObjectSchema:
 
 
 def of_properties(properties: Mapping[str, Any]) -> ObjectSchema:
-    """The schema of a script's ``PARAMETERS``: name → what it may be; one without a default must be given.
+    """The schema from ``PARAMETERS`` of a script: name → schema; a value without default is required.
 
     Raises:
         Problem: ``schema-invalid``.
@@ -117,14 +117,14 @@ def of_properties(properties: Mapping[str, Any]) -> ObjectSchema:
 
 
 def plain(schema: ObjectSchema) -> dict[str, Any]:
-    """The schema as JSON; also as another program's validator of JSON Schema reads it."""
+    """The schema as JSON, compatible with other JSON Schema validators."""
     result: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(schema))
     _close(result)
     return result
 
 
 def check_schema(schema: ObjectSchema) -> None:
-    """Refuse what the structs alone cannot see: contradictions, wrong defaults, sheer size.
+    """Check what the structs cannot express: contradictions, defaults and size.
 
     Raises:
         Problem: ``schema-invalid``.
@@ -137,14 +137,14 @@ def check_schema(schema: ObjectSchema) -> None:
 
 
 def fit(schema: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters with the schema's defaults filled in. Without a schema a script takes what it is given.
+    """The parameters with defaults. Without a schema all parameters are accepted.
 
     Args:
-        schema: As ``plain`` gave it.
-        given: What the operator set.
+        schema: Result of ``plain``.
+        given: Parameters of the operator.
 
     Raises:
-        Problem: ``parameters-invalid``, with the place and what may stand there.
+        Problem: ``parameters-invalid``, with the place and the allowed values.
     """
     check(given)
     if schema is None:
@@ -159,7 +159,7 @@ def fit(schema: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str,
 
 
 def _named(given: Any) -> str:
-    """The first parameter that is wrong, by name, which the whole schema's error does not have."""
+    """The first invalid parameter by name, which the error of the whole schema does not contain."""
     properties = given.get("properties") if isinstance(given, dict) else None
     for name, value in properties.items() if isinstance(properties, dict) else ():
         try:
@@ -176,10 +176,10 @@ def _check_size(parameters: Mapping[str, Any]) -> None:
 
 
 def check(given: Mapping[str, Any]) -> None:
-    """Refuse what no script takes.
+    """Reject parameters that no script accepts.
 
     Raises:
-        Problem: ``parameters-invalid``: too deep or too long.
+        Problem: ``parameters-invalid``: nested too deeply or too large.
     """
     if too_deep(given):
         raise _bad_parameters(f"The parameters are nested more than {MAX_LEVELS} levels deep.")
@@ -187,7 +187,7 @@ def check(given: Mapping[str, Any]) -> None:
 
 
 def _filled(schema: Mapping[str, Any], value: Any) -> Any:
-    """A copy with defaults in every object that is there; an object that is not there stays away."""
+    """A copy with the defaults of all present objects."""
     if schema["type"] == "object" and isinstance(value, dict):
         existing = schema["properties"]
         result = {name: _filled(existing[name], part) if name in existing else part for name, part in value.items()}
@@ -201,7 +201,7 @@ def _filled(schema: Mapping[str, Any], value: Any) -> Any:
 
 
 def _close(schema: dict[str, Any]) -> None:
-    """Write out what a validator of JSON Schema takes differently where it is left out."""
+    """Make defaults explicit where other validators assume different ones."""
     if schema["type"] == "object":
         schema.setdefault("properties", {})
         schema.setdefault("additionalProperties", False)
@@ -221,7 +221,7 @@ def _check(schema: dict[str, Any], place: str) -> None:
     if "default" in schema:
         error = _first_error(schema, schema["default"])
         if error is not None:
-            raise _bad_schema(f"{place}: the default does not fit: {error[1]}")
+            raise _bad_schema(f"{place}: the default is not valid: {error[1]}")
     for name, value in schema.get("properties", {}).items():
         _check(value, f"{place}.{name}")
     if "items" in schema:
@@ -229,7 +229,7 @@ def _check(schema: dict[str, Any], place: str) -> None:
 
 
 def _first_error(schema: Mapping[str, Any], value: Any) -> tuple[str, str] | None:
-    """Place and sentence of what fits least."""
+    """Place and message of the most relevant error."""
     from jsonschema import Draft202012Validator  # noqa: PLC0415 (80 ms, which a cold start need not wait for)
     from jsonschema.exceptions import best_match  # noqa: PLC0415
 
@@ -241,7 +241,7 @@ def _first_error(schema: Mapping[str, Any], value: Any) -> tuple[str, str] | Non
 
 
 def _bad_schema(detail: str) -> Problem:
-    return invalid(f"The schema of the parameters cannot be used. {detail}", code="schema-invalid")
+    return invalid(f"The parameter schema is not valid. {detail}", code="schema-invalid")
 
 
 def _bad_parameters(detail: str, **extras: Any) -> Problem:

@@ -1,4 +1,4 @@
-"""Looking at a robot type before it is saved: stored and compiled as one, where nobody else finds it, for a while."""
+"""Previews of robot types: an upload is stored and validated in a separate place, and expires unless it is saved."""
 
 import asyncio
 from collections.abc import Mapping
@@ -35,13 +35,13 @@ from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_LOOK_MS,
 from function_app.services.storage import records
 
 MAX_LOOKS = 4
-"""Uploads of an account that are looked at and not saved; one more ends the oldest."""
+"""Maximum number of previews per account; a new one replaces the oldest."""
 _ONLY = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Preview:
-    """An upload that is looked at."""
+    """A previewed upload."""
 
     id: str
     upload: TypeVersion
@@ -49,12 +49,12 @@ class Preview:
 
     @property
     def expires_ms(self) -> int:
-        """When it goes by itself [ms since 1970]."""
+        """Expiry time [ms since 1970]."""
         return self.upload.created_ms + KEEP_LOOK_MS
 
 
 class RobotTypePreview:
-    """Every look is a place of its own with one version, which the checkers and the timer treat as any other."""
+    """Manages previews. Each one has its own place with one version, processed like any robot type."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class RobotTypePreview:
     async def begin(
         self, caller: Identity, manifest: str, files: Mapping[str, str], scripts: Mapping[str, str], *, wait_ms: int
     ) -> Preview:
-        """Store an upload for a look. The notes for the timer come first: whatever a stop cuts off goes by itself.
+        """Store an upload as a preview. The cleanup is scheduled first, so interrupted previews expire.
 
         Raises:
             Problem: ``manifest-invalid``, ``robot-type-invalid`` with ``errors``, ``robot-type-built-in``.
@@ -130,11 +130,7 @@ class RobotTypePreview:
         return await self._types.checked_model(where, upload)
 
     async def save(self, caller: Identity, look: str, *, wait_ms: int) -> tuple[KnownType, bool]:
-        """Make what was looked at the next version of its robot type; it is checked as any upload is.
-
-        Raises:
-            Problem: ``look-unknown``, ``robot-type-not-ready``, ``robot-type-damaged``, and those of an upload.
-        """
+        """Save a preview as the next version of its robot type, which is validated like any upload."""
         where, upload = await self._find(caller, look)
         _require_good(upload)
         seal = await self._integrity.check(where.account, where.type, upload)
@@ -150,11 +146,7 @@ class RobotTypePreview:
         return result
 
     async def drop(self, caller: Identity, look: str) -> None:
-        """End it; the timer deletes what it has stored.
-
-        Raises:
-            Problem: ``look-unknown``.
-        """
+        """Delete a preview; the timer deletes its files."""
         where, _ = await self._find(caller, look)
         await self._end(where)
 
@@ -169,7 +161,7 @@ class RobotTypePreview:
         await records.retry(attempt)
 
     async def _list(self, where: Place, now_ms: int) -> None:
-        """See that there are not too many: the oldest ones end."""
+        """List a preview; the oldest ones beyond the limit expire."""
         page = await self._tables.query(records.MEMBERS, where.account, first=TRIALS, last=TRIALS + "\x7f", limit=100)
         there = sorted(page.rows, key=lambda row: row.data["created_ms"])
         for row in there[: max(0, len(there) - MAX_LOOKS + 1)]:
@@ -192,16 +184,16 @@ def _require_good(upload: TypeVersion) -> None:
     if upload.state == "rejected":
         raise refused(upload)
     if upload.state != "ready":
-        raise Problem("robot-type-not-ready", 409, "Not checked yet", "The upload is still being checked.")
+        raise Problem("robot-type-not-ready", 409, "Not checked yet", "The upload is still being validated.")
 
 
 def _wrong_scripts(scripts: Mapping[str, str]) -> tuple[str, ...]:
-    """What is wrong with movements, as far as one can say without running them."""
+    """Errors in movements that are found without running them."""
     result = []
     for name, source in scripts.items():
         file = f"movements/{name[:80]}.py"
         if not ID.match(name):
-            result.append(f"{file}: a movement's name has letters, digits, _ and -, 1 to 64 of them.")
+            result.append(f"{file}: a movement's name consists of 1 to 64 letters, digits, _ and -.")
             continue
         try:
             read_script(source)

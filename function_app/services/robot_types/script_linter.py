@@ -1,7 +1,7 @@
-"""What is wrong with a script, with the place, before it is run. Nothing of it runs here.
+"""Static checks of movement scripts, without running them.
 
-Two kinds: ``error`` cannot be saved; ``warning`` would most likely fail at the robot. A warning is given only where the
-text alone is proof enough: names that a script builds itself are not followed.
+An ``error`` prevents saving; a ``warning`` would most likely fail at the robot. Warnings require proof in the text:
+names built at run time are not followed.
 """
 
 import ast
@@ -31,7 +31,7 @@ _ONE_OF: Final = {
 
 @dataclass(frozen=True, slots=True)
 class LintMessage:
-    """Something wrong, from one place to another: lines from 1, columns from 0, in characters."""
+    """A message for a range: lines from 1, columns from 0 in characters."""
 
     severity: Literal["error", "warning"]
     message: str
@@ -43,14 +43,14 @@ class LintMessage:
 
 @dataclass(frozen=True, slots=True)
 class LintResult:
-    """What a check has found; ``script`` is there where it could be saved."""
+    """The result of a check; ``script`` is set if the script can be saved."""
 
     marks: tuple[LintMessage, ...]
     script: Script | None
 
 
 def names_of(robot_type: RobotType) -> dict[str, tuple[str, ...]]:
-    """What a robot type has by name, as ``scripting.Names`` sorts it."""
+    """Names that a robot type defines, grouped as in ``scripting.Names``."""
     return {
         "joints": tuple(joint.name for joint in robot_type.joints),
         "frames": robot_type.frames,
@@ -61,7 +61,7 @@ def names_of(robot_type: RobotType) -> dict[str, tuple[str, ...]]:
 
 
 def check_script(source: str, robot_type: RobotType) -> LintResult:
-    """Everything that is wrong with a script for robots of this type."""
+    """All messages for a script of this robot type."""
     try:
         script = read_script(source)
     except Problem as problem:
@@ -72,7 +72,7 @@ def check_script(source: str, robot_type: RobotType) -> LintResult:
 
 
 def _refusal(source: str, problem: Problem) -> LintMessage:
-    """Where it is that a script cannot be saved."""
+    """The place of an error that prevents saving."""
     try:
         tree = ast.parse(source)
     except SyntaxError as error:
@@ -90,7 +90,7 @@ def _refusal(source: str, problem: Problem) -> LintMessage:
 
 
 class _Reader:
-    """One pass over a script's tree."""
+    """One pass over a script's syntax tree."""
 
     def __init__(self, tree: ast.Module, names: Mapping[str, Sequence[str]]) -> None:
         self._nodes = list(ast.walk(tree))
@@ -102,7 +102,7 @@ class _Reader:
         self._values = {each.name: each for each in api.values}
 
     def marks(self) -> Iterator[LintMessage]:
-        """All of them, in no order."""
+        """All messages, unordered."""
         for node in self._nodes:
             match node:
                 case ast.Import(names=names):
@@ -161,7 +161,7 @@ class _Reader:
                 yield from self._strings(value, parameter.names)
 
     def _strings(self, value: ast.expr, kind: str) -> Iterator[LintMessage]:
-        """Names that are written out and that the robot type does not have; a type that lists none may have any."""
+        """Literal names that the robot type does not define; a type without a list accepts all names."""
         there = self._names.get(kind, ())
         for text in _texts(value) if there else ():
             name = str(text.value)
@@ -190,7 +190,7 @@ def _wrong_arguments(node: ast.Call, call: Call) -> Iterator[LintMessage]:
 
 
 def _texts(value: ast.expr) -> Iterable[ast.Constant]:
-    """The strings of a string, of a list, of a dictionary's keys."""
+    """The literals of a string, a list, or the keys of a dictionary."""
     match value:
         case ast.Constant(value=str()):
             return (value,)
@@ -200,7 +200,7 @@ def _texts(value: ast.expr) -> Iterable[ast.Constant]:
 
 
 def _bound_by(node: ast.AST) -> set[str]:
-    """The names that a node gives something to, wherever they are known."""
+    """All names that a node binds."""
     result: set[str] = set()
     match node:
         case (
@@ -231,7 +231,7 @@ def _mark(severity: Literal["error", "warning"], node: ast.stmt | ast.expr | ast
 
 
 def _in_characters(marks: Iterable[LintMessage], source: str) -> Iterator[LintMessage]:
-    """Python's tree counts bytes of UTF-8 in a line."""
+    """Convert a UTF-8 byte offset of the syntax tree to characters."""
     lines = re.split(r"\r\n|\r|\n", source)
 
     def characters(line: int, column: int) -> int:

@@ -1,4 +1,4 @@
-"""Movement scripts as text: whether one can be sent at all, and what it says about itself."""
+"""Text of movement scripts: size limits, description and parameter schema."""
 
 import ast
 import json
@@ -11,25 +11,25 @@ from function_app.domain.common.problems import Problem, invalid
 from function_app.services.robot_types import parameter_schema
 
 MAX_SOURCE = 64_000
-"""Characters of a script: what a ``RunMovement`` command carries."""
+"""Maximum number of characters, as in a ``RunMovement`` command."""
 MAX_SOURCE_BYTES = 96 * 1024
-"""The same as JSON: with ``MAX_PARAMETERS_BYTES`` and the rest of a command it stays below ``codec.MAX_BYTES``."""
+"""Maximum size as JSON [bytes]: with parameters and the rest of the command it stays below ``codec.MAX_BYTES``."""
 PARAMETERS = "PARAMETERS"
 _DESCRIPTION = 200
 
 
 @dataclass(frozen=True, slots=True)
 class Script:
-    """What a script says about itself: the first line of its docstring, and the schema of its parameters."""
+    """Description (first docstring line) and parameter schema of a script."""
 
     description: str
     schema: dict[str, Any] | None
 
 
 def read_script(source: str) -> Script:
-    """Refuse what is not Python or cannot be sent. Nothing of it runs.
+    """Check that a script is Python and can be sent, without running it.
 
-    ``PARAMETERS = {...}`` at the top level, a plain literal, says what an operator may set: name → JSON Schema.
+    ``PARAMETERS = {...}`` at the top level, a literal, defines the parameters: name → JSON Schema.
 
     Raises:
         Problem: ``movement-invalid``, with the line; ``schema-invalid``.
@@ -64,7 +64,7 @@ def _literal(value: ast.expr) -> dict[str, Any]:
     try:
         result = json.loads(json.dumps(ast.literal_eval(value), allow_nan=False))
     except (ValueError, TypeError) as error:
-        detail = f"Line {value.lineno}: {PARAMETERS} must be a plain dictionary, with nothing in it to compute."
+        detail = f"Line {value.lineno}: {PARAMETERS} must be a literal dictionary without expressions."
         raise _bad(detail, line=value.lineno) from error
     if not isinstance(result, dict):
         raise _bad(f"Line {value.lineno}: {PARAMETERS} must be a dictionary: name → schema.", line=value.lineno)

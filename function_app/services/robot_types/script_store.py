@@ -1,4 +1,4 @@
-"""The scripts of movements in the blob store, each signed when it is saved and checked before it is used."""
+"""Blob store of movement scripts, signed when saved and verified before use."""
 
 import hashlib
 from collections import OrderedDict
@@ -16,7 +16,7 @@ _KEPT = 256
 
 
 class ScriptStore:
-    """Scripts by account, robot type, name, version and hash: one version's deletion never takes another's script."""
+    """Scripts by account, robot type, name, version and hash, so that deletions do not affect other versions."""
 
     def __init__(self, *, blobs: Blobs, keys: SigningKeys) -> None:
         self._blobs = blobs
@@ -30,13 +30,13 @@ class ScriptStore:
         return replace(movement, key=signing.key_id(key.public_key()), signature=signature)
 
     async def put(self, caller: Identity, robot_type: str, movement: Movement, source: str) -> None:
-        """Store a script; before the rows that name it, so that a row without its script cannot be."""
+        """Store a script, before the rows that refer to it."""
         await self._blobs.put(blob_name(caller, robot_type, movement), source.encode())
 
     async def get(self, caller: Identity, robot_type: str, movement: Movement) -> str:
-        """A script, once signature and hash are seen to be right.
+        """A script with valid signature and hash.
 
-        From memory where this process has read it before: content under its own hash never changes.
+        Content is cached by hash, because it never changes.
 
         Raises:
             Problem: ``movement-damaged``.
@@ -55,35 +55,35 @@ class ScriptStore:
         return source
 
     async def find(self, caller: Identity, robot_type: str, movement: Movement) -> str | None:
-        """The script with the movement's hash; ``None`` when it is gone or was changed."""
+        """The script with the movement's hash; ``None`` if it was deleted or changed."""
         content = await self._blobs.get(blob_name(caller, robot_type, movement))
         if content is None or hashlib.sha256(content).hexdigest() != movement.sha256:
             return None
         return content.decode()
 
     async def delete(self, caller: Identity, robot_type: str, movement: Movement) -> None:
-        """Delete a script that no row names."""
+        """Delete a script without rows."""
         await self._blobs.delete(blob_name(caller, robot_type, movement))
 
     async def _verify(self, robot_type: str, movement: Movement) -> None:
         key = (await self._keys.archive()).get(movement.key)
         if key is None:
-            raise _damaged(movement, "was signed with a key that has leaked or is not ours")
+            raise _damaged(movement, "was signed with an unknown or leaked key")
         try:
             signing.verify_text(
                 signed_text(robot_type, movement), movement.signature, key, context=signing.MOVEMENT_CONTEXT
             )
         except SignatureError as error:
-            raise _damaged(movement, "is not the one that was signed") from error
+            raise _damaged(movement, "differs from the signed script") from error
 
 
 def signed_text(robot_type: str, movement: Movement) -> str:
-    """What the signature of a movement says."""
+    """The signed text of a movement."""
     return signing.movement_text(robot_type, movement.name, movement.version, movement.sha256)
 
 
 def blob_name(caller: Identity, robot_type: str, movement: Movement) -> str:
-    """Where a version's script is."""
+    """Blob name of a version's script."""
     return f"movements/{caller.account}/{robot_type}/{movement.name}/{movement.version}-{movement.sha256}.py"
 
 

@@ -1,4 +1,4 @@
-"""Adding a robot type: stored first, then compiled by a checker somewhere, then in use."""
+"""Adds robot types: stores the files, then waits for validation."""
 
 import contextlib
 from collections.abc import Mapping
@@ -29,11 +29,11 @@ from function_app.services.robot_types.versions import GIVE_UP_MS, TypeVersions,
 from function_app.services.storage import records
 
 MAX_OWN = 100
-"""Robot types an account may have."""
+"""Maximum number of robot types per account."""
 
 
 class RobotTypeUpload:
-    """Stores an upload and waits for the checker's verdict."""
+    """Stores an upload and waits for the verdict."""
 
     def __init__(
         self,
@@ -57,10 +57,10 @@ class RobotTypeUpload:
     async def upload(
         self, caller: Identity, manifest: str, files: Mapping[str, str], *, wait_ms: int
     ) -> tuple[KnownType, bool]:
-        """Add a robot type, or the next version of one; and whether the account had none of this id.
+        """Add a robot type or its next version; also return whether the type is new.
 
-        The note for a look comes first: an upload that a stop cuts off is refused by the timer. Until a version is
-        found good, the one before it stays in use.
+        The cleanup is scheduled first, so interrupted uploads are rejected. The previous version stays active until the
+        new one is valid.
 
         Raises:
             Problem: ``manifest-invalid``, ``robot-type-invalid``, ``robot-type-built-in``, ``robot-types-full``,
@@ -69,7 +69,7 @@ class RobotTypeUpload:
         return await self.add(caller, read_upload(manifest, files), wait_ms=wait_ms)
 
     async def add(self, caller: Identity, given: Upload, *, wait_ms: int) -> tuple[KnownType, bool]:
-        """As ``upload``, of files that have been read."""
+        """Like ``upload``, for files that were already read."""
         where = Place(caller.account, given.robot_type.type)
         await require_own(self._catalogue, where.type)
         await schedule_check(self._tables, where, self._clock.now_ms() + GIVE_UP_MS)
@@ -86,7 +86,7 @@ class RobotTypeUpload:
         return await self._types.view(caller, where.type), new
 
     async def _index(self, where: Place) -> None:
-        """List the type. A new ETag each time keeps a deletion that began before from taking it off the list."""
+        """List the type. The new ETag prevents a concurrent deletion from removing it from the list."""
         key = INDEX + where.type
         row = await self._tables.get(records.MEMBERS, where.account, key)
         with contextlib.suppress(Conflict):
@@ -97,12 +97,12 @@ class RobotTypeUpload:
                 records.MEMBERS, where.account, first=INDEX, last=INDEX + "\x7f", limit=MAX_OWN
             )
             if len(page.rows) >= MAX_OWN:
-                detail = f"An account keeps at most {MAX_OWN} robot types. Delete one that is not in use."
+                detail = f"An account has at most {MAX_OWN} robot types. Delete an unused one."
                 raise Problem("robot-types-full", 409, "Too many robot types", detail)
             await self._tables.create(records.MEMBERS, Row(where.account, key, {}))
 
     async def _number(self, where: Place, given: Upload, change: Change) -> tuple[int, bool]:
-        """Take the next version's number, and write that it is on its way."""
+        """Assign the next version number."""
         manifest = msgspec.to_builtins(given.robot_type)
         sizes = {name: len(content) for name, content in given.files.items()}
 
@@ -126,16 +126,16 @@ class RobotTypeUpload:
     async def _require_no_other(self, where: Place, head: TypeHead) -> None:
         _, newest = await read_version(self._tables, where, head.last)
         if newest is not None and newest.open:
-            detail = f"Version {newest.version} of '{where.type}' is still being checked. Wait for its verdict."
+            detail = f"Version {newest.version} of '{where.type}' is still being validated. Wait for the result."
             raise Problem("robot-type-checking", 409, "Still being checked", detail)
 
 
 async def require_own(catalogue: RobotCatalogue, robot_type: str) -> None:
-    """An id that an account's own robot type may have.
+    """The id, if an account's own robot type may have it.
 
     Raises:
         Problem: ``robot-type-built-in``.
     """
     if robot_type in await catalogue.types():
-        detail = f"'{robot_type}' comes with the installation. Give your robot type another id."
+        detail = f"'{robot_type}' is part of the installation. Use another id."
         raise Problem("robot-type-built-in", 409, "Built-in", detail)

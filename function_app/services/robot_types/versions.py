@@ -1,4 +1,4 @@
-"""Versions of robot types on their way: files stored, a checker asked, its verdict waited for."""
+"""Stores the files of new versions, creates validation jobs and awaits verdicts."""
 
 import asyncio
 import contextlib
@@ -14,14 +14,14 @@ from function_app.services.robot_types.rows import CHECKS, Place, read_version
 from function_app.services.storage import records as store
 
 GIVE_UP_MS = 120_000
-"""From then on an upload without a verdict is refused."""
+"""Time after which an upload without a verdict is rejected."""
 KEEP_LOOK_MS = 30 * 60_000
-"""So long an upload that was only looked at can be saved."""
+"""Time for which a preview can be saved."""
 _LOOK_S = 0.1
 
 
 class TypeVersions:
-    """What follows once a version has its row, be it of a robot type or of a look at one."""
+    """Processes versions of robot types and previews."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs, clock: Clock) -> None:
         self._tables = tables
@@ -29,10 +29,10 @@ class TypeVersions:
         self._clock = clock
 
     async def store(self, where: Place, version: int, files: Mapping[str, bytes]) -> None:
-        """Store the files of a version that is ``uploading``, and leave a note for the checkers.
+        """Store the files of an ``uploading`` version, and create a validation job.
 
         Raises:
-            Problem: ``busy``: it took so long that the timer has given it up.
+            Problem: ``busy``: it took too long, and the cleanup has rejected the version.
         """
         for name, content in files.items():
             await self._blobs.put(where.prefix(version) + name, content)
@@ -44,14 +44,14 @@ class TypeVersions:
                 await self._tables.replace(store.ROBOT_TYPES, Row(row.partition, row.key, data, row.etag))
                 there = True
         if not there:
-            # It took so long that the timer gave it up, or the type was deleted: nobody needs the files.
+            # The version was rejected or the type deleted: the files are not needed.
             await drop_files(self._blobs, where, version)
             raise busy_store()
         key = f"{self._clock.now_ms():013d}:{where.partition}:{version}"
         await self._tables.create(store.MODEL_CHECKS, Row(CHECKS, key, {"version": version, "until_ms": 0, "tries": 0}))
 
     async def verdict(self, where: Place, version: int, wait_ms: int) -> TypeVersion | None:
-        """The version once there is a verdict, or as it is after ``wait_ms``."""
+        """The version after its validation, or after ``wait_ms``."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + wait_ms / 1000
         while True:
@@ -63,6 +63,6 @@ class TypeVersions:
 
 
 def refused(upload: TypeVersion) -> Problem:
-    """The refusal with all that is wrong."""
-    detail = " ".join(upload.errors) or "The model was refused."
+    """The rejection with all errors."""
+    detail = " ".join(upload.errors) or "The model was rejected."
     return invalid(detail, code="robot-type-rejected", errors=list(upload.errors), version=upload.version)

@@ -1,1 +1,1 @@
-"""Telemetry."""
+"""Ingest, storage and retrieval of telemetry, events, latencies and uploads."""

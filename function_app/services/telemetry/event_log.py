@@ -1,4 +1,4 @@
-"""What happened to devices, newest first: told by agents, or found here."""
+"""Events of devices, newest first."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,11 +13,11 @@ from function_app.services.storage.retention import DAY_MS, Retention
 
 KEEP_EVENTS_MS = 90 * DAY_MS
 _NOTED = 4096
-"""Days of devices whose end a process knows to be noted."""
+"""Cache of scheduled deletions, by device and day."""
 
 
 class EventLog:
-    """The events of all devices."""
+    """Stores the events of all devices."""
 
     def __init__(self, *, tables: Tables, retention: Retention, clock: Clock) -> None:
         self._tables = tables
@@ -26,12 +26,12 @@ class EventLog:
         self._noted: dict[tuple[str, int, int], None] = {}
 
     async def add(self, device: str, pairing: str, event: Mapping[str, Any]) -> None:
-        """Store an event by its ``id`` and ``at_ms``: one that comes twice is stored once.
+        """Store an event. Idempotent by ``id`` and ``at_ms``.
 
         Args:
-            device: The device's id.
-            pairing: In which it happened: a later owner is not shown it.
-            event: As ``messages.Event``.
+            device: Device id.
+            pairing: Pairing of the event; later owners cannot read it.
+            event: Fields of ``Event``.
         """
         partition = _partition(device, pairing)
         now_ms = self._clock.now_ms()
@@ -46,7 +46,7 @@ class EventLog:
     async def read(
         self, device: Device, *, cursor: str | None, limit: int
     ) -> tuple[list[Mapping[str, Any]], str | None]:
-        """What happened since the device was paired, newest first, and where the next page begins.
+        """Events since the pairing, newest first, and the cursor of the next page.
 
         Raises:
             Problem: ``cursor-invalid``.
@@ -56,15 +56,17 @@ class EventLog:
                 records.EVENTS, _partition(device.id, device.pairing), limit=limit, cursor=cursor
             )
         except ValueError as error:
-            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+            raise invalid(
+                "The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid"
+            ) from error
         return [row.data for row in page.rows], page.cursor
 
     async def _note(self, partition: str, day: int, seen_day: int) -> None:
-        """See that the events of one day that were seen on another will be forgotten: one note for all of them."""
+        """Schedule one deletion for all events of one day that arrived on another day."""
         existing = (partition, day, seen_day)
         if existing in self._noted:
             return
-        # Keys count down with time: the day's last moment comes first.
+        # Keys decrease with time: the last moment of the day comes first.
         first, last = (new_suffix((day + 1) * DAY_MS - 1)[:9], new_suffix(day * DAY_MS)[:9] + ";")
         due_ms = (seen_day + 1) * DAY_MS + KEEP_EVENTS_MS
         await self._retention.delete_rows_at(records.EVENTS, partition, first=first, last=last, due_ms=due_ms)

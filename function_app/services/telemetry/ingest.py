@@ -1,8 +1,7 @@
-"""Telemetry of all devices into one joined queue, and from there to each device's series.
+"""Ingests telemetry of all devices through one queue into the series of each device.
 
-What arrives together is written down as one row (the paper's data buffer), then distributed to the series of the
-devices (its device-related data buffers), then dropped. A process that is killed in between leaves the row, which a
-timer distributes; a sample counts once however often it comes.
+Messages that arrive together are stored as one row, distributed to the series, and then deleted. If the process is
+killed, a timer distributes the row; duplicate samples have no effect.
 """
 
 import asyncio
@@ -29,30 +28,30 @@ from function_app.services.telemetry.series_writer import Place, SeriesWriter
 
 SHARDS = 8
 KNOWN_MS = 3_000
-"""An agent's row is read again after this time: until then an un-paired agent's data still go to its former pairing."""
+"""Cache time of an agent's row. For this time data of an unpaired agent are stored in its former pairing."""
 MAX_KNOWN = 1_000
 LEFT_MS = 30_000
-"""What has lain in the queue for so long was left by a process that has ended."""
+"""Rows older than this were left by a terminated process."""
 GIVE_UP_MS = 3_600_000
-"""What could not be distributed for so long never can be."""
+"""Rows that could not be distributed for this time are dropped."""
 MAX_ROW_BYTES = 200_000
-"""A row of the queue holds at most about so much."""
+"""Approximate maximum size of a queue row [bytes]."""
 _BYTES_PER_VALUE = 11
-"""Eight bytes that do not compress, in base64."""
+"""Eight incompressible bytes in base64."""
 _JOINT = re.compile(r"\A[A-Za-z0-9_-]{1,60}\Z")
 _LEFT = 20
 _AT_ONCE = 20
-"""Messages that are read before others get their turn: an ack must not wait for telemetry."""
+"""Messages processed before the event loop runs other tasks: telemetry must not delay acks."""
 
 Values = Mapping[str, float]
 Observer = Callable[[Device, str, Sequence[tuple[int, Values]]], Awaitable[None]]
-"""Told of new samples of a device's stream: the time of the last one in each (part of a) window of 10 s, and means."""
+"""Called with new samples of a stream: the last time in each window of 10 s, and the means."""
 
 _log = logging.getLogger(__name__)
 
 
 class InboundMessage(NamedTuple):
-    """One message, as it came."""
+    """A received message."""
 
     topic: Topic
     payload: bytes
@@ -60,7 +59,7 @@ class InboundMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Agent:
-    """What is known of an agent for a moment."""
+    """Cached data of an agent."""
 
     space: str | None
     devices: Mapping[str, Device]
@@ -69,7 +68,7 @@ class _Agent:
 
 
 class TelemetryIngest:
-    """Takes telemetry in. Safe to repeat; what does not belong to a claimed agent's device is dropped."""
+    """Ingests telemetry. Idempotent; messages of unclaimed agents are dropped."""
 
     def __init__(
         self, *, tables: Tables, writer: SeriesWriter, clock: Clock, observers: Sequence[Observer] = ()
@@ -82,13 +81,13 @@ class TelemetryIngest:
         self._turn = 0
 
     async def ingest(self, messages: Iterable[InboundMessage]) -> dict[int, str]:
-        """Take messages in: once this returns they are in their series.
+        """Ingest messages; on return their samples are stored in their series.
 
         Returns:
-            What cannot be read and is dropped: its place among ``messages``, and why.
+            Invalid, dropped messages: index in ``messages``, and reason.
 
         Raises:
-            Problem: ``busy``: what is not in its series yet is in the queue, or is to be delivered again.
+            Problem: ``busy``: samples not yet in their series are in the queue, or must be delivered again.
             StoreError: As above.
         """
         dropped: dict[int, str] = {}
@@ -115,10 +114,10 @@ class TelemetryIngest:
         return dropped
 
     async def distribute_backlog(self) -> None:
-        """Distribute what others have left behind: a part of the queue each time.
+        """Distribute a part of the rows that terminated processes left in the queue.
 
         Raises:
-            StoreError: The tables cannot be used.
+            StoreError: The tables are not available.
         """
         self._turn += 1
         now_ms = self._clock.now_ms()
@@ -152,7 +151,7 @@ class TelemetryIngest:
         await self._drop(row)
 
     async def _parts(self, row: Row) -> list["_Part"]:
-        """What is in a row of the queue. A device that was un-paired since has no place for it any more."""
+        """The samples in a queue row. Samples of unpaired devices are dropped."""
         parts: list[_Part] = []
         for part in row.data["parts"]:
             agent, name = split_device(part["device"]) or ("", "")
@@ -207,7 +206,7 @@ class _Part(NamedTuple):
 
 
 def _batches(parts: Iterable[_Part]) -> Iterator[list[_Part]]:
-    """Parts that fit into one row of the queue each."""
+    """Groups of parts that fit into one queue row."""
     batch: list[_Part] = []
     left = MAX_ROW_BYTES
     for device, stream, samples in parts:
@@ -226,7 +225,7 @@ def _batches(parts: Iterable[_Part]) -> Iterator[list[_Part]]:
 
 
 def _joints(description: Description) -> Sequence[str]:
-    """The joints' names as fields take them; the number of a joint whose name they do not take."""
+    """Field names of the joints; the index for names that are not valid field names."""
     return [joint.name if _JOINT.match(joint.name) else str(index) for index, joint in enumerate(description.joints)]
 
 
@@ -234,7 +233,7 @@ def _sample(message: InboundMessage, joints: Sequence[str]) -> tuple[int, Values
     """Time and values of a message.
 
     Raises:
-        ProtocolError: It is not what its stream carries.
+        ProtocolError: The message does not match its stream.
     """
     values: dict[str, float]
     if message.topic.name == topics.JOINTS:
@@ -251,7 +250,7 @@ def _sample(message: InboundMessage, joints: Sequence[str]) -> tuple[int, Values
 
 
 def _joint_values(telemetry: JointTelemetry, joints: Sequence[str]) -> dict[str, float]:
-    """Position, velocity and effort of each joint; and while an operator streams setpoints, how old these are."""
+    """Position, velocity and effort of each joint; while streaming, also the setpoint age."""
     values: dict[str, float] = {}
     for quantity, measured in (
         ("position_rad", telemetry.position_rad),

@@ -1,7 +1,7 @@
-"""How long things take: samples of operators, agents and the cloud itself, as histograms by the hour and the day.
+"""Latencies measured by operators, agents and the cloud, as histograms per hour and day.
 
-Partition of ``Latency``: device and pairing. Keys: ``hour:<transport>:<path>:<start>`` and ``day:…`` hold histograms,
-``recent:<transport>:<path>`` the newest samples as they came, ``once:<day>:<hash>`` marks a batch that is in.
+Partition of ``Latency``: device and pairing. Keys: ``hour:<transport>:<path>:<start>`` and ``day:…`` contain
+histograms, ``recent:<transport>:<path>`` the newest samples, ``once:<day>:<hash>`` marks a stored batch.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS, Retention
 
 Transport = Literal["mqtt", "websocket", "http", "http-poll", "xmpp"]
-"""What carried it: ``http`` is long polling, ``http-poll`` plain polling at an interval, as in the paper."""
+"""Transport of the message: ``http`` is long polling, ``http-poll`` plain polling at an interval."""
 Path = Literal[
     "operator-device",
     "operator-cloud",
@@ -33,23 +33,24 @@ Path = Literal[
     "command-started",
     "received-started",
 ]
-"""From where to where. Each is measured on one clock: there and back by the operator's (``operator-device``,
-``operator-cloud``) or the agent's (``device-cloud``); from the command's publishing to the answer heard by the cloud's
-(``command-answered``, ``command-started``); between two of its own acks by the agent's (``received-started``)."""
+"""Measured path; each uses one clock. Round trips use the clock of the operator (``operator-device``,
+``operator-cloud``) or the agent (``device-cloud``). ``command-answered`` and ``command-started`` use the cloud
+clock, ``received-started`` the agent clock.
+"""
 
 HOUR_MS = 3_600_000
 RECENT = 1_000
-"""Newest samples that are kept as they came."""
+"""Number of newest samples that are stored individually."""
 OLDEST_MS = 7 * DAY_MS
 NEWEST_MS = HOUR_MS
-"""A sample may be this old, or its clock this far ahead."""
+"""Maximum age of a sample, and maximum lead of its clock [ms]."""
 BY_HOUR_MS = 40 * DAY_MS
-"""Up to this span answers are summed from hours, beyond it from days; both within one page of rows."""
+"""Longest span that is summed from hours; longer spans are summed from days."""
 LONGEST_SPAN_MS = 990 * DAY_MS
 KEEP_HOURS_MS = 90 * DAY_MS
-"""Hours are forgotten after this time; days stay."""
+"""Time that hours are stored; days are stored without limit."""
 _HOURS_A_BATCH = 40
-"""With their days, the newest samples and the note of the batch they stay below the tables' limit."""
+"""With their days, newest samples and marker they stay below the batch limit of the tables."""
 
 
 _log = logging.getLogger(__name__)
@@ -57,21 +58,21 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Times of one kind: when, by the sender's clock [ms since 1970], and how long [ms]."""
+    """Samples of one kind: time by the sender's clock [ms since 1970], and duration [ms]."""
 
     transport: Transport
     path: Path
     samples: tuple[tuple[int, float], ...]
 
     def fingerprint(self) -> str:
-        """The same for the same samples."""
+        """A hash that is equal for equal samples."""
         text = json.dumps([self.transport, self.path, self.samples])
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class LatencySeries:
-    """What is known of one transport and path in a span of time; ``recent`` are its newest samples, in time's order."""
+    """Latencies of one transport and path in a time span; ``recent`` contains the newest samples in order of time."""
 
     transport: Transport
     path: Path
@@ -81,7 +82,7 @@ class LatencySeries:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """From (included) to (excluded) [ms since 1970], in whole hours or days."""
+    """A time span (end exclusive) [ms since 1970], in whole hours or days."""
 
     first_ms: int
     last_ms: int
@@ -94,7 +95,7 @@ class _Recent:
 
 
 class LatencyStore:
-    """The latency store."""
+    """Stores latencies."""
 
     def __init__(self, *, tables: Tables, retention: Retention, clock: Clock) -> None:
         self._tables = tables
@@ -102,16 +103,16 @@ class LatencyStore:
         self._clock = clock
 
     async def add(self, device: Device, given: Samples, *, caller: str, once: str = "") -> None:
-        """Count samples in. A batch that comes again changes nothing: same ``once``, or else the same samples.
+        """Add samples. Idempotent by ``once``, or by equality of the samples.
 
         Args:
-            device: Whose they are.
+            device: The device.
             given: The samples.
-            caller: Who measured.
-            once: The sender's idempotency key for this batch.
+            caller: Who measured them.
+            once: Idempotency key of the batch.
 
         Raises:
-            Problem: ``invalid``: a time that cannot be; ``idempotency-key-reused``; ``busy``.
+            Problem: ``invalid``: an impossible time; ``idempotency-key-reused``; ``busy``.
         """
         self._check(given)
         fingerprint = given.fingerprint()
@@ -129,7 +130,7 @@ class LatencyStore:
             await records.retry(partial(self._count, place, f"{mark}:{number}", fingerprint, parts))
 
     async def measured(self, action: Action, transport: Transport) -> None:
-        """Count what the end of an action tells: once, however often its end is heard. Nothing waits for it."""
+        """Add the latencies of an ended action, once, in the background."""
         samples = _times(action)
         if not samples:
             return
@@ -149,7 +150,7 @@ class LatencyStore:
         transport: Transport | None = None,
         path: Path | None = None,
     ) -> list[LatencySeries]:
-        """What is known in ``span``: one for each transport and path that has ever had samples, by name."""
+        """Latencies in ``span`` for each transport and path with samples, sorted by name."""
         partition = _partition(device.id, device.pairing)
         first, last = "recent:", "recent;"
         page = await self._tables.query(records.LATENCY, partition, first=first, last=last, limit=1000)
@@ -165,7 +166,7 @@ class LatencyStore:
         ]
 
     def span(self, first_ms: int | None, last_ms: int | None) -> Span:
-        """The span asked for, widened to whole hours or days; the last 24 hours when nothing is asked for.
+        """The requested span, extended to whole hours or days; by default the last 24 hours.
 
         Raises:
             Problem: ``invalid``.
@@ -175,7 +176,7 @@ class LatencyStore:
         if not 0 <= since_ms < until_ms:
             raise invalid("'from' must be before 'to'.")
         if until_ms - since_ms > LONGEST_SPAN_MS:
-            raise invalid(f"Ask for {LONGEST_SPAN_MS // DAY_MS} days at most.")
+            raise invalid(f"Request at most {LONGEST_SPAN_MS // DAY_MS} days.")
         step_ms = HOUR_MS if until_ms - since_ms <= BY_HOUR_MS else DAY_MS
         return Span(since_ms // step_ms * step_ms, -(-until_ms // step_ms) * step_ms, step_ms)
 
@@ -191,7 +192,7 @@ class LatencyStore:
     async def _count(
         self, partition: str, mark: str, fingerprint: str, parts: Mapping[str, Sequence[tuple[int, float]]]
     ) -> None:
-        """One batch: histograms and newest samples of each transport and path, and the note that they are in."""
+        """Write one batch: histograms, newest samples and the marker."""
         existing = await self._tables.get(records.LATENCY, partition, mark)
         if existing is not None:
             if existing.data["fingerprint"] != fingerprint:
@@ -219,14 +220,14 @@ class LatencyStore:
         await self._tables.batch(records.LATENCY, writes)
 
     async def _keep_for_a_while(self, partition: str, kind: str, day_ms: int) -> None:
-        """See that the hours of a new day will be forgotten, and what tells its batches apart: before there are any."""
+        """Schedule the deletion of a new day's hours and markers, before they are written."""
         end_ms = day_ms + DAY_MS
         first, last = _key("hour", kind, day_ms), _key("hour", kind, end_ms)
         await self._retention.delete_rows_at(
             records.LATENCY, partition, first=first, last=last, due_ms=end_ms + KEEP_HOURS_MS
         )
         first, last = _mark(day_ms // DAY_MS), _mark(end_ms // DAY_MS)
-        # Later than this its samples are too old to be taken in again.
+        # After this time its samples are too old to be accepted again.
         due_ms = end_ms + OLDEST_MS + DAY_MS
         await self._retention.delete_rows_at(records.LATENCY, partition, first=first, last=last, due_ms=due_ms)
 
@@ -255,7 +256,7 @@ def _key(step: str, kind: str, at_ms: int) -> str:
 
 
 def _times(action: Action) -> dict[str, tuple[int, float]]:
-    """What an action's times tell: differences of one clock each. What a clock makes that was set back is left out."""
+    """Latencies of an action, as differences of one clock each. Negative differences are skipped."""
     result: dict[str, tuple[int, float]] = {}
     published_ms = action.times.get("published")
     if published_ms is not None and action.heard:

@@ -1,4 +1,4 @@
-"""Reading series: which streams a device has, and a range of one, as fine as the caller has room for."""
+"""Reads time series: the streams of a device, and ranges at a suitable resolution."""
 
 import asyncio
 import math
@@ -28,24 +28,24 @@ from function_app.services.telemetry.series_writer import ABOUT, MAX_STREAMS, Pl
 
 MAX_POINTS = 1_000
 _DIGITS = 13
-"""Of a time in a key [ms]."""
+"""Number of digits of a time in a key [ms]."""
 RAW_ROWS = 100
-"""Windows that are looked through for raw samples in one query."""
+"""Windows per query for raw samples."""
 RAW_QUERIES = 10
-"""Queries in one page of raw samples: where windows are nearly empty the page ends early, with a cursor."""
+"""Queries per page of raw samples: with sparse windows a page ends early, with a cursor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Range:
-    """What to read: ``first_ms`` ≤ time < ``last_ms``.
+    """A range to read: ``first_ms`` ≤ time < ``last_ms``.
 
     Attributes:
         first_ms: ``None``: from the beginning.
         last_ms: ``None``: to the end.
-        points: At most so many points in a page.
-        level: Which buckets; ``None``: the finest of which ``points`` are enough.
-        fields: Which fields; ``None``: all.
-        cursor: Where the page before ended.
+        points: Maximum number of points per page.
+        level: Resolution; ``None``: the finest with at most ``points`` points.
+        fields: Fields; ``None``: all.
+        cursor: Cursor of the previous page.
     """
 
     first_ms: int | None = None
@@ -58,7 +58,7 @@ class Range:
 
 @dataclass(slots=True)
 class Part:
-    """One page: times, and for each field a value or summary for each of them; ``None`` where there is none."""
+    """One page: times, and for each field a value or summary per time; ``None``: missing."""
 
     level: Level
     first_ms: int
@@ -70,7 +70,7 @@ class Part:
 
 
 class _Question(NamedTuple):
-    """A range, once it is settled."""
+    """A range with all defaults resolved."""
 
     place: Place
     first_ms: int
@@ -80,7 +80,7 @@ class _Question(NamedTuple):
 
 
 class StreamView(NamedTuple):
-    """A stream and what is known of all of it."""
+    """A stream and its metadata."""
 
     name: str
     about: StreamInfo
@@ -145,7 +145,7 @@ class SeriesReader:
         return None if row is None else records.read(row, StreamInfo)
 
     async def _buckets(self, level: Level, asked: _Question) -> tuple[Part, int]:
-        """A page of buckets, and how many samples are in them."""
+        """A page of buckets, and their number of samples."""
         page = await self._tables.query(
             records.SERIES,
             asked.place.partition,
@@ -166,7 +166,7 @@ class SeriesReader:
         return part, samples
 
     async def _raw(self, asked: _Question) -> Part:
-        """A page of samples as they came."""
+        """A page of raw samples."""
         part = Part(RAW, asked.first_ms, asked.last_ms, values={name: [] for name in asked.names})
         begin_ms = series.floor(asked.first_ms, WINDOW_MS)
         rows = min(RAW_ROWS, asked.points)
@@ -229,5 +229,5 @@ def _read_cursor(cursor: str) -> tuple[Level, int]:
     name, _, at = cursor.partition(".")
     level = next((level for level in (RAW, *LEVELS) if level.name == name), None)
     if level is None or not at.isascii() or not at.isdecimal() or len(at) > _DIGITS:
-        raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
+        raise invalid("The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid")
     return level, int(at)

@@ -1,6 +1,6 @@
-"""Samples into their series, each of them once.
+"""Writes samples to their series, each sample once.
 
-The raw window knows which times it has, and all buckets that a sample belongs to change in the same batch as it.
+The raw window contains the stored times. All buckets of a sample change in the same batch.
 """
 
 import asyncio
@@ -18,17 +18,17 @@ from function_app.services.storage.records import retry
 from function_app.services.storage.retention import Retention
 
 ABOUT = "about"
-"""Key of what is known of a whole stream."""
+"""Row key of a stream's metadata."""
 MAX_STREAMS = 64
-"""Streams of one device."""
+"""Maximum number of streams per device."""
 AHEAD_MS = 300_000
-"""A device's clock may be wrong by so much towards the future; what is from later than that is not taken in."""
+"""Tolerated lead of a device clock; later samples are rejected."""
 MARGIN_MS = 3_600_000
-"""Rows stay so much longer than late samples are taken in: a writer may be slow, and clocks differ."""
+"""Additional time that rows remain, for slow writers and clock differences."""
 MAX_WRITTEN = 100
-"""Streams whose newest rows are kept in memory."""
+"""Streams whose newest rows are cached."""
 _MAX_BYTES = MAX_BATCH_BYTES * 3 // 4
-"""Of a batch; what is known of the stream, and the rows' other fields, need some of it."""
+"""Maximum size of a batch [bytes], with a reserve for metadata."""
 _BYTES_PER_SUMMARY = 240
 _BYTES_PER_NAME = 84
 
@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 
 class Place(NamedTuple):
-    """Where samples belong: a device in one pairing, so that a new owner sees nothing of the former one's."""
+    """The place of a stream: device and pairing, so that a new owner cannot read earlier data."""
 
     device: str
     pairing: str
@@ -44,18 +44,18 @@ class Place(NamedTuple):
 
     @property
     def streams(self) -> str:
-        """The partition that lists the device's streams."""
+        """Partition that lists the streams of the device."""
         return f"{self.device}/{self.pairing}"
 
     @property
     def partition(self) -> str:
-        """The partition of this stream."""
+        """Partition of the stream."""
         return f"{self.device}/{self.pairing}/{self.stream}"
 
 
 @dataclass(frozen=True, slots=True)
 class StreamInfo:
-    """What is known of a whole stream: ``count`` samples ever, the first and the last time, names of its fields."""
+    """Metadata of a stream: number of samples, first and last time, field names."""
 
     count: int = 0
     first_ms: int = 0
@@ -65,15 +65,15 @@ class StreamInfo:
 
 @dataclass(slots=True)
 class _Known:
-    """Rows of one stream as they were read."""
+    """Rows of one stream as read."""
 
     about: Row | None
     rows: dict[str, Row] = field(default_factory=dict)
     last_ms: int = 0
-    """Start of the newest window among them."""
+    """Start of the newest window in the rows."""
 
     def write(self, partition: str, key: str, data: dict[str, Any]) -> Write:
-        """The write that puts ``data`` where the row was, or was not."""
+        """The write that creates or replaces a row."""
         row = self.about if key == ABOUT else self.rows.get(key)
         if row is None:
             return Write("create", Row(partition, key, data))
@@ -84,7 +84,7 @@ _Windows = Sequence[tuple[int, Samples]]
 
 
 class SeriesWriter:
-    """Adds samples. Safe to repeat, by any number at once, in any order."""
+    """Adds samples. Idempotent, safe to run concurrently, in any order."""
 
     def __init__(self, *, tables: Tables, retention: Retention, keep: RetentionPolicy, clock: Clock) -> None:
         self._tables = tables
@@ -94,13 +94,13 @@ class SeriesWriter:
         self._written: dict[str, _Known] = {}
 
     async def add(self, place: Place, samples: Samples) -> Samples:
-        """Add what is not there yet; gives what was new.
+        """Add new samples; return those that were new.
 
-        Samples from before raw data are forgotten, from more than five minutes ahead, and what no longer fits into its
-        window are left out, with a line in the log.
+        Samples that are too old, more than five minutes ahead, or beyond the size of their window are dropped and
+        logged.
 
         Raises:
-            Problem: ``busy``: part of it may be written. Safe to repeat.
+            Problem: ``busy``: some samples may be written. Retry.
             StoreError: As above.
         """
         now_ms = self._clock.now_ms()
@@ -113,7 +113,7 @@ class SeriesWriter:
         return new
 
     async def forget(self, device: str, pairing: str) -> None:
-        """Retention all streams of a pairing that has ended, once those who do not know yet have stopped to write."""
+        """Delete all streams of an ended pairing, after all processes have stopped writing."""
         due_ms = self._clock.now_ms() + MARGIN_MS
         place = Place(device, pairing, "")
         listed = await self._tables.query(records.SERIES, place.streams, limit=MAX_STREAMS)
@@ -123,11 +123,11 @@ class SeriesWriter:
         await self._retention.delete_rows_at(records.SERIES, place.streams, first="", last=None, due_ms=due_ms)
 
     async def _add(self, place: Place, windows: _Windows) -> Samples:
-        """A part that fits into one batch, or, where what is known already makes it too large, into several."""
+        """Add samples in one batch, or in several if they do not fit."""
         first_ms, last_ms = windows[0][0], windows[-1][0]
 
         async def attempt() -> Samples | None:
-            # What this instance wrote last, as long as nobody else has: if so, the ETags say it, and it is read.
+            # Rows cached from the last write; their ETags show whether they are current.
             existing = self._written.pop(place.partition, None)
             if existing is None or first_ms < existing.last_ms:
                 existing = await self._read(place.partition, first_ms, last_ms)
@@ -140,10 +140,10 @@ class SeriesWriter:
         return series.merge(await self._add(place, windows[:half]), await self._add(place, windows[half:]))
 
     async def _write(self, place: Place, windows: _Windows, existing: _Known) -> Samples | None:
-        """Decide and write; ``None``: too much for one batch.
+        """Decide and write; ``None``: too large for one batch.
 
         Raises:
-            Conflict: Somebody else has written meanwhile.
+            Conflict: Another process has written concurrently.
         """
         partition = place.partition
         about = records.read(existing.about, StreamInfo) if existing.about else StreamInfo()
@@ -181,7 +181,7 @@ class SeriesWriter:
         return new
 
     def _remember(self, partition: str, start_ms: int, written: Sequence[Row]) -> None:
-        """Keep the rows that samples from the same window on will change: a live stream needs no reading then."""
+        """Cache the rows that further samples of this window change, so that live streams need no reads."""
         rows = {row.key: row for row in written}
         about = rows.pop(ABOUT)
         keys = {series.key(level, _start(level, start_ms)) for level in (RAW, *LEVELS)}
@@ -191,7 +191,7 @@ class SeriesWriter:
             self._written[partition] = _Known(about, {key: rows[key] for key in keys}, start_ms)
 
     async def _read(self, partition: str, first_ms: int, last_ms: int) -> _Known:
-        """All rows that samples between the two windows can change."""
+        """All rows that samples between the two windows may change."""
         ranges = [(level, _start(level, first_ms), _start(level, last_ms)) for level in (RAW, *LEVELS)]
         keys = [(ABOUT, ABOUT), *((series.key(level, first), series.key(level, last)) for level, first, last in ranges)]
         pages = await asyncio.gather(*(self._rows(partition, first, last) for first, last in keys))
@@ -206,7 +206,7 @@ class SeriesWriter:
         return page.rows
 
     async def _announce(self, place: Place) -> bool:
-        """List a new stream; ``False``: the device has too many already."""
+        """List a new stream; ``False``: the device has too many streams."""
         listed = await self._tables.query(records.SERIES, place.streams, limit=MAX_STREAMS)
         if any(row.key == place.stream for row in listed.rows):
             return True
@@ -220,7 +220,7 @@ class SeriesWriter:
         return True
 
     async def _note(self, partition: str, existing: _Known, buckets: dict[str, Bucket]) -> None:
-        """See that each new day's rows will be forgotten, before there are any."""
+        """Schedule the deletion of a new day's rows, before they are written."""
         for key in buckets:
             if not key.startswith(f"{DAY.name}:") or key in existing.rows:
                 continue
@@ -237,7 +237,7 @@ class SeriesWriter:
 
 
 def _chunks(samples: Samples) -> Iterator[_Windows]:
-    """Stretches whose rows fit into one batch."""
+    """Time spans whose rows fit into one batch."""
     chunk: list[tuple[int, Samples]] = []
     keys: set[str] = {ABOUT}
     for start_ms, window in samples.windows():
@@ -256,7 +256,7 @@ def _start(level: Level, at_ms: int) -> int:
 
 
 def _into(buckets: dict[str, Bucket], existing: _Known, start_ms: int, summary: Bucket) -> None:
-    """Add a summary to every bucket that the window is in."""
+    """Add a summary to all buckets that contain the window."""
     for level in LEVELS:
         key = series.key(level, _start(level, start_ms))
         if key not in buckets:
@@ -265,7 +265,7 @@ def _into(buckets: dict[str, Bucket], existing: _Known, start_ms: int, summary: 
 
 
 def _names(about: StreamInfo, windows: _Windows) -> dict[str, None]:
-    """The stream's fields: those it has, and new ones up to the limit."""
+    """The fields of the stream: existing ones, and new ones up to the limit."""
     names = dict.fromkeys(about.fields)
     for _, window in windows:
         for name in window.columns:

@@ -1,7 +1,7 @@
-"""Captures of devices (pictures, scans, bags): straight into the blob store by a presigned upload, registered after.
+"""Captures of devices (images, scans, bags): uploaded directly to the blob store, then registered.
 
-A row and a note that it ends are written before anybody has the address. A capture that is not registered in time is
-forgotten with its blob; one that is registered is kept for its time.
+A row and a scheduled deletion are written before the URL is returned. Captures that are not registered in time are
+deleted with their blob.
 """
 
 import hashlib
@@ -19,16 +19,16 @@ from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services.storage import records
 
 LIFETIME_S = 3_600
-"""An address for an upload or a download is good for so long [s]."""
+"""Lifetime of upload and download URLs [s]."""
 UNREGISTERED_MS = 24 * 3_600_000
-"""Longer than an upload can last that was begun within the address's lifetime."""
+"""Time until an unregistered upload is deleted: longer than any upload takes."""
 MAX_UNREGISTERED = 100
-"""Uploads of one device that may be under way."""
+"""Maximum number of unregistered uploads per device."""
 SHARDS = 8
 _NOTES = 25
 _DUE = "due"
 _SLACK_MS = 600_000
-"""Registering ends so long before forgetting begins: clocks differ."""
+"""Registration ends this long before the deletion, because clocks differ [ms]."""
 _ID = 64
 
 _log = logging.getLogger(__name__)
@@ -36,17 +36,17 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """What was, or is to be, uploaded.
+    """An announced or registered capture.
 
     Attributes:
-        stream: What it is of: ``camera``, ``lidar``.
-        at_ms: When it was taken [ms since 1970].
-        length: Bytes.
-        sha256: Of the content, in hex; empty when nobody has said it.
-        verified: The content was seen to have that hash.
-        blob: Name of the blob.
+        stream: Source: ``camera``, ``lidar``.
+        at_ms: Time of capture [ms since 1970].
+        length: Size [bytes].
+        sha256: Hash of the content (hex); empty if unknown.
+        verified: The content was compared with the hash.
+        blob: Blob name.
         by: Account or agent that uploaded it.
-        expires_ms: It and its blob are gone from here on [ms since 1970].
+        expires_ms: Time of deletion [ms since 1970].
     """
 
     id: str
@@ -67,7 +67,7 @@ class Capture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Announced:
-    """What somebody wants to upload."""
+    """An announced upload."""
 
     stream: str
     length: int
@@ -86,7 +86,7 @@ class Found:
 
 
 class Uploads:
-    """The captures of devices. ``device`` is one that the caller may see."""
+    """Captures of devices. ``device`` must be visible to the caller."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs, keep_ms: int, clock: Clock) -> None:
         self._tables = tables
@@ -96,7 +96,7 @@ class Uploads:
         self._turn = 0
 
     async def begin(self, device: Device, wanted: Announced, *, by: str) -> tuple[Capture, port.Upload]:
-        """A place for a capture, and the request that uploads it.
+        """A new capture, and the request that uploads it.
 
         Raises:
             Problem: ``invalid``, ``too-many-uploads``.
@@ -127,7 +127,7 @@ class Uploads:
         return capture, request
 
     async def complete(self, device: Device, upload: str) -> Capture:
-        """Register what was uploaded. Safe to repeat.
+        """Register an uploaded capture. Idempotent.
 
         Raises:
             Problem: ``upload-unknown``, ``upload-missing``, ``upload-mismatch``, ``busy``.
@@ -164,13 +164,15 @@ class Uploads:
                 records.UPLOADS, _partition(device), first=first, last=last, limit=limit, cursor=cursor
             )
         except ValueError as error:
-            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+            raise invalid(
+                "The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid"
+            ) from error
         result = [records.read(row, Capture) for row in page.rows]
         now_ms = self._clock.now_ms()
         return [capture for capture in result if capture.expires_ms > now_ms], page.cursor
 
     async def get(self, device: Device, upload: str) -> tuple[Capture, str]:
-        """One registered capture, and an address from which it can be read.
+        """A registered capture, and a URL to download it.
 
         Raises:
             Problem: ``upload-unknown``.
@@ -182,7 +184,7 @@ class Uploads:
         return capture, address
 
     async def delete(self, device: Device, upload: str) -> None:
-        """Forget a registered capture, with its content.
+        """Delete a registered capture with its content.
 
         Raises:
             Problem: ``upload-unknown``, ``busy``.
@@ -190,7 +192,7 @@ class Uploads:
         result = await self._stored(device, upload)
         now_ms = self._clock.now_ms()
         await self._note(device, result.capture.id, now_ms)
-        # From here on it is not there, whether or not this process comes to delete it.
+        # From here on it is deleted for all callers, even if this process is killed.
         ended = replace(result.capture, expires_ms=now_ms)
         row = Row(result.row.partition, result.row.key, records.to_data(ended), result.row.etag)
         try:
@@ -201,10 +203,10 @@ class Uploads:
             raise busy_store() from error
 
     async def forget_due(self) -> None:
-        """Forget what was not registered in time, and what was kept for its time: a part of it each round.
+        """Delete a part of the unregistered and expired captures.
 
         Raises:
-            StoreError: The stores cannot be used.
+            StoreError: The stores are not available.
         """
         self._turn += 1
         now_ms = self._clock.now_ms()
@@ -214,13 +216,13 @@ class Uploads:
             try:
                 for key in (_waiting(note.data["id"]), _registered(note.data["id"])):
                     row = await self._tables.get(records.UPLOADS, note.data["partition"], key)
-                    # One that ends later has another note.
+                    # A later expiry time has its own deletion.
                     if row is not None and row.data["expires_ms"] <= now_ms:
                         await self._blobs.delete(row.data["blob"])
                         await self._tables.delete(records.UPLOADS, row)
                 await self._tables.delete(records.UPLOADS, note)
             except Conflict:
-                _log.debug("another timer forgets %s", note.key)
+                _log.debug("another process deletes %s", note.key)
 
     async def _stored(self, device: Device, upload: str) -> Found:
         row = await self._tables.get(records.UPLOADS, _partition(device), _registered(upload[:_ID]))
@@ -229,14 +231,14 @@ class Uploads:
         return Found(records.read(row, Capture), row)
 
     async def _check(self, capture: Capture) -> bool:
-        """Whether its content has the hash it was said to have; what is too large to read here is not looked at.
+        """Compare the content with the announced hash, if it is small enough to be read here.
 
         Raises:
             Problem: ``upload-missing``, ``upload-mismatch``.
         """
         length = await self._blobs.size(capture.blob)
         if length is None:
-            detail = "There is no content yet. Send it to the address first, then complete the upload."
+            detail = "There is no content yet. Upload it to the URL first, then complete the upload."
             raise Problem("upload-missing", 409, "Nothing was uploaded", detail)
         if length != capture.length:
             await self._refuse(capture, f"The content has {length} bytes; {capture.length} were announced")
@@ -244,12 +246,12 @@ class Uploads:
             return False
         content = await self._blobs.get(capture.blob) or b""
         if hashlib.sha256(content).hexdigest() != capture.sha256:
-            await self._refuse(capture, "The content has not the hash that was announced")
+            await self._refuse(capture, "The content does not have the announced hash")
         return True
 
     async def _refuse(self, capture: Capture, why: str) -> NoReturn:
         await self._blobs.delete(capture.blob)
-        raise Problem("upload-mismatch", 409, "Something else was uploaded", f"{why}. It was deleted; upload it again.")
+        raise Problem("upload-mismatch", 409, "The content does not match", f"{why}. It was deleted; upload it again.")
 
     async def _refuse_too_many(self, device: Device) -> None:
         page = await self._tables.query(
@@ -260,7 +262,7 @@ class Uploads:
             raise Problem("too-many-uploads", 409, "Too many uploads", detail)
 
     async def _note(self, device: Device, upload: str, due_ms: int) -> None:
-        """See that somebody looks at it then. Written before what it is about."""
+        """Schedule the deletion, before the capture is written."""
         partition = _partition(device)
         shard = hashlib.sha256(upload.encode()).digest()[0] % SHARDS
         row = Row(f"{_DUE}:{shard}", f"{due_ms:013d}:{partition}/{upload}", {"partition": partition, "id": upload})
