@@ -69,7 +69,7 @@ def _pattern(machine: Machine) -> _Pattern:
         found: dict[str, bytes] = {}
 
         def complete() -> bool:
-            found.update({message.topic: message.payload for message in client.heard()})
+            found.update({message.topic: message.payload for message in client.pending()})
             return found.keys() >= set(wanted)
 
         wait_until(complete, "what the arm says of itself")

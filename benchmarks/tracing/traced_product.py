@@ -11,7 +11,7 @@ from function_app import settings
 from tests.harness.browser.product import Machine, free_ports, start_program
 from tests.harness.cloud.cloud import Cloud
 from tests.harness.network.brokers import BrokerKind
-from tests.harness.network.delay import Way, start_delay
+from tests.harness.network.delay import DelayedNetwork, start_delay
 
 
 class TracedProduct(MeasuredProduct):
@@ -21,7 +21,9 @@ class TracedProduct(MeasuredProduct):
         marks: Receives the timestamps of its programs.
     """
 
-    def __init__(self, machine: Machine, kind: BrokerKind, cloud: Cloud, *, marks: TimestampReceiver, way: Way) -> None:
+    def __init__(
+        self, machine: Machine, kind: BrokerKind, cloud: Cloud, *, marks: TimestampReceiver, way: DelayedNetwork
+    ) -> None:
         super().__init__(machine, kind, cloud)
         self.marks = marks
         self._way = way

@@ -53,7 +53,7 @@ def act(api: Api, device: dict[str, Any], wait_for: str = "done", **request: Any
 
 
 def measured(client: Client) -> list[Measurements]:
-    return [codec.decode(each.payload, Measurements) for each in client.heard() if f"/{topics.TELE}/" in each.topic]
+    return [codec.decode(each.payload, Measurements) for each in client.pending() if f"/{topics.TELE}/" in each.topic]
 
 
 def refused(api: Api, device: dict[str, Any], **request: Any) -> httpx.Response:
@@ -149,7 +149,7 @@ def test_pictures_come_to_who_may_see_them(api: Api) -> None:
         pictures: list[bytes] = []
 
         def enough() -> bool:
-            pictures.extend(each.payload for each in watcher.heard())
+            pictures.extend(each.payload for each in watcher.pending())
             return len(pictures) >= 5
 
         wait_until(enough, "pictures")
@@ -223,7 +223,7 @@ def test_home_assistant_is_shown_the_room_and_moves_its_door(
         client.subscribe("homeassistant/#", "telescope/#")
 
         def there(topic: str) -> bool:
-            shown.update((each.topic, each.payload) for each in client.heard())
+            shown.update((each.topic, each.payload) for each in client.pending())
             return topic in shown
 
         slider = f"homeassistant/number/{door['id']}/set-opening/config"

@@ -57,7 +57,7 @@ def covers(template: str, wanted: str) -> bool:
 
 @dataclass(frozen=True)
 class Client:
-    """Somebody whom the webhook has let in."""
+    """A client that the webhook has admitted."""
 
     name: str
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -137,7 +137,7 @@ class _Nothing:
 
 
 class EventGrid(TelescopeBroker):
-    """The namespace's MQTT broker. ``webhook`` is to be set before anybody connects."""
+    """The namespace's MQTT broker. Set ``webhook`` before the first connection."""
 
     def __init__(self, namespace: Namespace, sockets: Mapping[str, socket.socket]) -> None:
         nothing: Any = _Nothing()
@@ -148,7 +148,7 @@ class EventGrid(TelescopeBroker):
         self.said: list[str] = []
         """What was published over HTTPS; it goes no further."""
         self.everything: str = ""
-        """Somebody of this client id may say and hear all, for tests."""
+        """Grant all rights to this client id, for tests."""
 
     def admit(self, connect: Connect) -> Admission:
         if self.everything and connect.client_id == self.everything:
@@ -242,7 +242,7 @@ async def _known(token: str) -> bool:
 def _ask(cloud: Cloud, asked: dict[str, Any]) -> dict[str, Any]:
     try:
         status, answer = cloud.run(admit(cloud.functions, f"Bearer {CALLER}", json.dumps(asked).encode()))
-    except Exception:  # noqa: BLE001 (as the namespace: whatever went wrong, nobody is let in)
+    except Exception:  # noqa: BLE001 (like the namespace: every failure rejects the client)
         return {}
     return answer if status == 200 else {}
 

@@ -1,4 +1,4 @@
-"""Look left, right, up and down, as somebody who has just come in."""
+"""Look left, right, up and down."""
 
 PARAMETERS = {
     "speed": {

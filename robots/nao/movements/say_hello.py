@@ -1,4 +1,4 @@
-"""Look up at whoever stands in front, say hello with a wave, and bow the head."""
+"""Look up at the person in front, say hello with a wave, and bow the head."""
 
 PARAMETERS = {
     "text": {"type": "string", "maxLength": 200, "default": "Hello, I am NAO.", "description": "What it says"},

@@ -1,4 +1,4 @@
-"""Look up at whoever stands in front, say hello, and nod."""
+"""Look up at the person in front, say hello, and nod."""
 
 PARAMETERS = {
     "text": {"type": "string", "maxLength": 200, "default": "Hello, I am Qbo.", "description": "What it says"},

@@ -1,4 +1,4 @@
-"""Go to somebody whom the room sees, around what stands between, stop before them, and greet."""
+"""Drive to a person or robot that the room locates, avoid obstacles, stop in front, and greet."""
 
 import math
 
@@ -17,12 +17,12 @@ PARAMETERS = {
         "minimum": 1,
         "maximum": 20,
         "default": 4,
-        "description": "How often it goes after somebody who has gone on meanwhile",
+        "description": "How often it follows a person who moves on",
     },
 }
 
 SIDES_RAD = (0.0, 0.7, -0.7, 1.4, -1.4)  # where to stand around them, from the side where it is
-NEAR_M = 0.3  # so much further than asked is near enough to greet somebody who moves
+NEAR_M = 0.3  # tolerance for greeting a moving person
 TURN_RAD_S, STRAIGHT_RAD = 0.6, 0.1
 LOOK_S, PATIENCE_S = 0.3, 35.0  # it waits so long for them to come by
 OLD_S = 2.0
@@ -33,15 +33,15 @@ tries = min(20, max(1, int(parameters.get("tries", 4))))
 
 
 def apart():
-    """How far they are [m], and which way [rad]; where they are, x, y [m]. The script ends where nobody knows."""
+    """Distance [m], direction [rad] and position x, y [m]. Ends the script if the position is unknown."""
     found = room.latest("perception", "positions")
     if found is None or found["age_s"] > OLD_S:
-        raise RobotError("the room does not say where anybody is")
+        raise RobotError("the room reports no positions")
     seen = found["values"]
     for name in ("qbo", who):
         known = sorted(field[4:] for field in seen if field.startswith("x_m."))
         if f"x_m.{name}" not in seen or seen[f"age_s.{name}"] > OLD_S:
-            raise RobotError(f"the room does not see '{name}'; it sees: {', '.join(known) or 'nobody'}")
+            raise RobotError(f"the room does not locate '{name}'; it locates: {', '.join(known) or 'none'}")
     x_m, y_m = seen[f"x_m.{who}"], seen[f"y_m.{who}"]
     across_m, up_m = x_m - seen["x_m.qbo"], y_m - seen["y_m.qbo"]
     return math.hypot(across_m, up_m), math.atan2(up_m, across_m), (x_m, y_m)

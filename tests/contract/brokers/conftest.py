@@ -23,7 +23,7 @@ def running(kind: BrokerKind, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 @pytest.fixture
 def broker(running: RunningBroker) -> Iterator[RunningBroker]:
-    """One broker for all tests, which keep apart by their spaces. Whatever a test does, it must live and stay calm."""
+    """One broker for all tests, which use separate spaces. It must survive every test without errors."""
     yield running
     assert running.process.poll() is None, running.stderr()
     for word in ("Traceback", "internal error"):

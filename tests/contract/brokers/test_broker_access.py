@@ -1,4 +1,4 @@
-"""The port by which the functions give and take rights, over each broker."""
+"""``BrokerAccess`` of each broker."""
 
 import asyncio
 import math
@@ -15,7 +15,7 @@ from tests.harness.network.brokers import HOST, PATIENCE_S, BrokerKind, RunningB
 
 
 def another_instance(broker: RunningBroker) -> BrokerAccess:
-    """As a second function instance has it."""
+    """The access of a second function instance."""
     if broker.kind == "mosquitto":
         return MosquittoBrokerAccess(
             host=HOST, port=broker.tcp_port, username="service", password_file=broker.home / "service.password"
@@ -91,12 +91,12 @@ def test_service_connections_have_distinct_client_ids(broker: RunningBroker) -> 
 def test_an_unavailable_broker_is_an_error_until_it_returns(kind: BrokerKind, tmp_path: Path) -> None:
     with start_broker(kind, tmp_path) as broker:
         access = another_instance(broker)
-        broker.run(access.revoke(client_id="nobody"))
+        broker.run(access.revoke(client_id="unknown"))
         broker.kill()
         with pytest.raises(BrokerAccessError):
-            broker.run(access.revoke(client_id="nobody"))
+            broker.run(access.revoke(client_id="unknown"))
         with start_broker(kind, tmp_path, tcp_port=broker.tcp_port, websocket_port=broker.websocket_port) as again:
-            again.run(access.revoke(client_id="nobody"))
+            again.run(access.revoke(client_id="unknown"))
             broker.run(access.close()) if kind == "amqtt" else again.run(access.close())
 
 
@@ -127,4 +127,4 @@ def test_a_token_of_another_key_is_rejected(tmp_path: Path) -> None:
 
 
 async def _nowhere(_: str, __: bytes) -> None:
-    raise AssertionError("nothing is to be published")
+    raise AssertionError("unexpected publish")

@@ -1,4 +1,4 @@
-"""mosquitto that wants certificates of agents: without one nobody is heard, and a revoked one is none."""
+"""mosquitto with client certificates: required, and revocable."""
 
 import asyncio
 import datetime as dt
@@ -112,7 +112,7 @@ def test_a_revoked_certificate_is_disconnected_and_rejected(site: Path, broker: 
     broker.run(broker.access.revoke(principal=f"agent:{leaving.name}"))
     wait_until(gone.disconnected.is_set, "the cut")
 
-    # Credentials that are right by themselves: what keeps it out is the certificate.
+    # Valid credentials: only the certificate is revoked.
     grant = agent_grant("space", leaving.name, token_id=new_id(), lifetime_s=600)
     leaving.credentials = broker.run(broker.access.issue(grant))
     wait_until(lambda: not leaving.connect().connected.is_set(), "the broker to read what is revoked")
@@ -122,7 +122,7 @@ def test_a_revoked_certificate_is_disconnected_and_rejected(site: Path, broker: 
 
     before = leaving.certificate()[0].read_bytes()
     later_ms = dt.datetime.now(dt.UTC).timestamp() * 1000 + 2000
-    assert leaving.certificate(after_ms=later_ms)[0].read_bytes() != before, "claimed again, it asks for another"
+    assert leaving.certificate(after_ms=later_ms)[0].read_bytes() != before, "a new pairing needs a new certificate"
     assert leaving.connect().connected.is_set()
 
 

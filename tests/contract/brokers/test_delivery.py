@@ -1,4 +1,4 @@
-"""What is granted arrives: at its QoS, in order, once, without delay, and retained only where it was asked for."""
+"""Delivery: QoS, order, deduplication, latency and retained messages."""
 
 import statistics
 import time
@@ -9,7 +9,7 @@ import pytest
 from device_agent.protocol import codec
 from tests.harness.network import raw_mqtt
 from tests.harness.network.brokers import SILENCE_S, Message, RunningBroker, Transport, wait_until
-from tests.harness.network.raw_mqtt import Wire
+from tests.harness.network.raw_mqtt import RawConnection
 
 
 @pytest.mark.parametrize(("said", "heard"), [(0, 0), (0, 1), (1, 0), (1, 1)])
@@ -68,7 +68,7 @@ def test_unsubscribe_stops_delivery(broker: RunningBroker, space: str) -> None:
         client.paho.unsubscribe(topic)
         client.publish_acknowledged(topic, b"x")
         client.publish_acknowledged(other, b"end")
-        assert [m.topic for m in (client.receive(), *client.heard())] == [other]
+        assert [m.topic for m in (client.receive(), *client.pending())] == [other]
 
 
 def test_new_subscribers_get_retained_and_existing_ones_live_messages(
@@ -89,7 +89,7 @@ def test_new_subscribers_get_retained_and_existing_ones_live_messages(
         ]
         late.subscribe(topic)
         assert late.receive() == Message(topic, b"new", 1, retain=True)
-        assert late.heard() == []
+        assert late.pending() == []
 
 
 def test_an_empty_message_deletes_the_retained_one(broker: RunningBroker, space: str) -> None:
@@ -101,12 +101,12 @@ def test_an_empty_message_deletes_the_retained_one(broker: RunningBroker, space:
         arm.publish_acknowledged(topic, b"x", retain=True)
         arm.publish_acknowledged(topic, b"", retain=True)
         late.subscribe(topic)
-        with pytest.raises(AssertionError, match="heard nothing"):
+        with pytest.raises(AssertionError, match="received nothing"):
             late.receive(SILENCE_S)
 
 
 def test_retained_messages_go_to_the_new_subscription_only(broker: RunningBroker, space: str) -> None:
-    """The leak: a new client got what is retained for every filter that anybody held."""
+    """Regression: a new client received the retained messages of all clients' filters."""
     mine, others = f"ts/v1/{space}/mine/conn", f"ts/v1/{space}/others/conn"
     with (
         broker.client(f"{space}-agents", publish=(mine, others)) as agents,
@@ -120,12 +120,12 @@ def test_retained_messages_go_to_the_new_subscription_only(broker: RunningBroker
             new.subscribe(mine)
             assert new.receive().topic == mine
             agents.publish_acknowledged(mine, b"end")
-            assert [m.payload for m in (new.receive(), *new.heard())] == [b"end"]
-            assert [m.payload for m in (everything.receive(), *everything.heard())] == [b"end"]
+            assert [m.payload for m in (new.receive(), *new.pending())] == [b"end"]
+            assert [m.payload for m in (everything.receive(), *everything.pending())] == [b"end"]
 
 
 def test_a_denied_publish_is_not_acknowledged(broker: RunningBroker, space: str) -> None:
-    """In the newest protocol that the broker speaks; mosquitto acknowledges whatever 3.1.1 publishes."""
+    """With the broker's newest protocol; mosquitto acknowledges every publish of 3.1.1."""
     protocol = paho.MQTTv311 if broker.kind == "amqtt" else paho.MQTTv5
     allowed = f"ts/v1/{space}/arm/conn"
     with broker.client(space, publish=(allowed,), protocol=protocol) as client:
@@ -182,7 +182,7 @@ def test_small_messages_are_sent_without_delay(broker: RunningBroker, space: str
     credentials = broker.issue(broker.grant(space, subscribe=(topic,)))
     with (
         broker.client(f"{space}-arm", publish=(topic,)) as arm,
-        Wire(broker.port(transport), transport) as listener,
+        RawConnection(broker.port(transport), transport) as listener,
     ):
         listener.send(raw_mqtt.connect_packet(space, credentials))
         assert listener.read() == (raw_mqtt.CONNACK, 0, b"\0\0")

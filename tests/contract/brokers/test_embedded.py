@@ -1,4 +1,4 @@
-"""What only the embedded broker promises: tokens and their keys, its control topic, refusing by closing."""
+"""The embedded broker only: tokens, keys, control topic, strict rejection."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from device_agent.protocol.security import grants, revocation, signing
 from function_app.ports.broker_access import Credentials
 from tests.harness.network import raw_mqtt
 from tests.harness.network.brokers import SILENCE_S, Message, RunningBroker, start_broker, wait_until
-from tests.harness.network.raw_mqtt import Wire
+from tests.harness.network.raw_mqtt import RawConnection
 
 
 @pytest.fixture(scope="module")
@@ -78,10 +78,10 @@ def test_control_messages_are_neither_delivered_nor_retained(broker: RunningBrok
         broker.service() as functions,
     ):
         nosy.subscribe(revocation.TOPIC, "$CONTROL/#", own)
-        functions.publish_acknowledged(revocation.TOPIC, json.dumps({"revoke": {"client_id": "nobody"}}), retain=True)
+        functions.publish_acknowledged(revocation.TOPIC, json.dumps({"revoke": {"client_id": "unknown"}}), retain=True)
         nosy.subscribe(revocation.TOPIC)
         nosy.publish_acknowledged(own, b"end")
-        assert [m.topic for m in (nosy.receive(), *nosy.heard())] == [own]
+        assert [m.topic for m in (nosy.receive(), *nosy.pending())] == [own]
 
 
 def test_a_will_cannot_use_the_control_topic(broker: RunningBroker) -> None:
@@ -93,7 +93,7 @@ def test_a_will_cannot_use_the_control_topic(broker: RunningBroker) -> None:
 
 def test_mqtt_5_is_rejected_immediately_in_the_old_format(broker: RunningBroker, space: str) -> None:
     for credentials in (None, broker.issue(broker.grant(space))):
-        with Wire(broker.tcp_port) as raw:
+        with RawConnection(broker.tcp_port) as raw:
             raw.send(raw_mqtt.connect_packet(space, credentials, level=5))
             assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\1")
             assert raw.closed()
@@ -118,7 +118,7 @@ def test_qos_2_is_rejected(broker: RunningBroker, space: str) -> None:
 def test_a_denied_filter_does_not_affect_others(broker: RunningBroker, space: str) -> None:
     mine = f"ts/v1/{space}/arm/+"
     refused = ("#", "ts/v1/+/arm/conn", f"{mine}/#", "$SYS/#", "", "ts/v1/#/conn", f"ts/v1/{space}/arm/a+", "x" * 600)
-    with Wire(broker.tcp_port) as raw:
+    with RawConnection(broker.tcp_port) as raw:
         raw.send(raw_mqtt.connect_packet(space, broker.issue(broker.grant(space, subscribe=(mine,)))))
         assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
         raw.send(raw_mqtt.subscribe_packet(*refused[:4], mine, *refused[4:]))
@@ -129,11 +129,11 @@ def test_sessions_are_always_clean(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     credentials = broker.issue(broker.grant(space, publish=(topic,), subscribe=(topic,)))
     for _ in range(2):
-        with Wire(broker.tcp_port) as raw:
+        with RawConnection(broker.tcp_port) as raw:
             raw.send(raw_mqtt.connect_packet(space, credentials, clean=False))
             assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
             raw.send(raw_mqtt.publish_packet(topic, b"x", qos=1))
-            assert raw.read() == (raw_mqtt.PUBACK, 0, b"\0\1"), "a subscription of the session before has survived"
+            assert raw.read() == (raw_mqtt.PUBACK, 0, b"\0\1"), "a subscription survived the session"
             raw.send(raw_mqtt.subscribe_packet(topic, qos=1))
             assert raw.read() == (raw_mqtt.SUBACK, 0, b"\0\1\1")
 
@@ -161,7 +161,7 @@ def test_the_log_names_rejected_clients_but_no_secrets(broker: RunningBroker, sp
     credentials = broker.issue(broker.grant(space))
     with broker.connect(f"{space}-thief", credentials):
         pass
-    said = f"CONNECT as '{space}-thief' refused: its token is for another client id"
+    said = f"CONNECT as '{space}-thief' refused: the token belongs to another client id"
     wait_until(lambda: said in broker.stderr(), "the refusal in the log")
     assert credentials.password not in broker.stderr()
 
@@ -187,7 +187,7 @@ def test_changed_keys_are_reloaded(tmp_path: Path) -> None:
         with broker.connect("agent", by_old) as client:
             assert client.connected.is_set()
             path.write_text("{ not json")
-            assert not client.disconnected.wait(SILENCE_S), "keys that cannot be read must not take those in force away"
+            assert not client.disconnected.wait(SILENCE_S), "invalid keys must not replace the current ones"
             write(new)
             wait_until(client.disconnected.is_set, "the end of a session whose key was withdrawn")
         with broker.connect("agent", by_old) as client:

@@ -1,6 +1,6 @@
-"""Whatever one connection sends, or does not, the broker lives and the others notice nothing.
+"""Hostile input of one connection affects neither the broker nor other clients.
 
-That it lives and prints no traceback is looked at after every test, by the fixture.
+The fixture checks after every test that the broker runs and has printed no traceback.
 """
 
 import socket
@@ -9,7 +9,7 @@ import pytest
 
 from tests.harness.network import raw_mqtt
 from tests.harness.network.brokers import HOST, PATIENCE_S, RunningBroker, Transport
-from tests.harness.network.raw_mqtt import Wire
+from tests.harness.network.raw_mqtt import RawConnection
 
 GARBAGE = {
     "nothing": b"",
@@ -52,7 +52,7 @@ NOT_MQTT = {
 def test_garbage_before_connect_does_not_affect_others(
     broker: RunningBroker, space: str, transport: Transport, garbage: bytes
 ) -> None:
-    """Raw, on both listeners: the one for WebSocket gets what is not even HTTP."""
+    """Raw bytes on both listeners; the WebSocket listener receives non-HTTP data."""
     with broker.client(space, publish=("ts/v1/+/+/conn",), subscribe=("ts/v1/+/+/conn",)) as client:
         topic = f"ts/v1/{space}/arm/conn"
         client.subscribe(topic)
@@ -66,9 +66,9 @@ def test_garbage_before_connect_does_not_affect_others(
 @pytest.mark.parametrize("garbage", GARBAGE.values(), ids=GARBAGE.keys())
 def test_garbage_in_websocket_frames_does_not_affect_others(broker: RunningBroker, space: str, garbage: bytes) -> None:
     with broker.client(space) as client:
-        with Wire(broker.websocket_port, "websockets") as raw:
+        with RawConnection(broker.websocket_port, "websockets") as raw:
             raw.send(garbage)
-        with Wire(broker.websocket_port, "websockets") as raw:
+        with RawConnection(broker.websocket_port, "websockets") as raw:
             raw.send(garbage + garbage)
         assert client.subscribe("x") != []
 
@@ -79,7 +79,7 @@ def test_invalid_packets_close_their_connection_only(
 ) -> None:
     credentials = broker.issue(broker.grant(space, publish=("ts/v1/#",), subscribe=("ts/v1/#",)))
     with broker.client(f"{space}-other") as other:
-        with Wire(broker.port(transport), transport) as raw:
+        with RawConnection(broker.port(transport), transport) as raw:
             raw.send(raw_mqtt.connect_packet(space, credentials))
             assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
             raw.send(sent)
@@ -89,7 +89,7 @@ def test_invalid_packets_close_their_connection_only(
 
 
 def test_a_connect_in_single_bytes_is_accepted(broker: RunningBroker, space: str, transport: Transport) -> None:
-    with Wire(broker.port(transport), transport) as raw:
+    with RawConnection(broker.port(transport), transport) as raw:
         for byte in raw_mqtt.connect_packet(space, broker.issue(broker.grant(space))):
             raw.send(bytes([byte]))
         assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
@@ -98,7 +98,7 @@ def test_a_connect_in_single_bytes_is_accepted(broker: RunningBroker, space: str
 def test_packets_in_one_segment_are_all_answered(broker: RunningBroker, space: str, transport: Transport) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     credentials = broker.issue(broker.grant(space, publish=(topic,), subscribe=(topic,)))
-    with Wire(broker.port(transport), transport) as raw:
+    with RawConnection(broker.port(transport), transport) as raw:
         raw.send(
             raw_mqtt.connect_packet(space, credentials)
             + raw_mqtt.subscribe_packet(topic)
@@ -119,7 +119,7 @@ def test_a_blocked_subscriber_does_not_delay_others(broker: RunningBroker, space
     with (
         broker.client(f"{space}-arm", publish=(topic,)) as arm,
         broker.client(f"{space}-page", subscribe=(topic,)) as page,
-        Wire(broker.port(transport), transport) as stuck,
+        RawConnection(broker.port(transport), transport) as stuck,
     ):
         stuck.send(raw_mqtt.connect_packet(f"{space}-stuck", credentials))
         assert stuck.read() == (raw_mqtt.CONNACK, 0, b"\0\0")

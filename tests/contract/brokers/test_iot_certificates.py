@@ -1,4 +1,4 @@
-"""Certificates of agents by AWS IoT Core, as moto plays it."""
+"""Agent certificates of AWS IoT Core, emulated by moto."""
 
 import asyncio
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The brokers as programs: what they print, how they end, what a second start finds."""
+"""The brokers as programs: output, exit codes, restart."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from tests.harness.paths import ROOT
 
 
 def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    """A start that is expected to fail."""
+    """Run a command that must fail."""
     return subprocess.run(
         [sys.executable, "-m", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )

@@ -8,7 +8,7 @@ import pytest
 
 from tests.harness.network import raw_mqtt
 from tests.harness.network.brokers import SILENCE_S, Message, RunningBroker, Transport, wait_until
-from tests.harness.network.raw_mqtt import Wire
+from tests.harness.network.raw_mqtt import RawConnection
 
 
 def test_a_rejected_connect_does_not_affect_the_existing_session(broker: RunningBroker, space: str) -> None:
@@ -28,7 +28,7 @@ def test_a_rejected_connect_does_not_affect_the_existing_session(broker: Running
 
 def test_a_takeover_closes_the_old_socket(broker: RunningBroker, space: str, transport: Transport) -> None:
     credentials = broker.issue(broker.grant(space))
-    with Wire(broker.port(transport), transport) as old:
+    with RawConnection(broker.port(transport), transport) as old:
         old.send(raw_mqtt.connect_packet(space, credentials))
         assert old.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
         with broker.connect(space, credentials) as new:
@@ -48,7 +48,7 @@ def test_after_a_takeover_only_the_new_connection_receives(broker: RunningBroker
             for number in range(5):
                 new.publish_acknowledged(topic, b"%d" % number)
             assert [new.receive().payload for _ in range(5)] == [b"0", b"1", b"2", b"3", b"4"]
-            assert old.heard() == []
+            assert old.pending() == []
 
 
 def test_a_lost_connection_publishes_and_retains_the_will(
@@ -71,7 +71,10 @@ def test_a_lost_connection_publishes_and_retains_the_will(
 def test_a_keep_alive_timeout_publishes_the_will(broker: RunningBroker, space: str, transport: Transport) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     credentials = broker.issue(broker.grant(space, publish=(topic,)))
-    with broker.client(f"{space}-page", subscribe=(topic,)) as page, Wire(broker.port(transport), transport) as silent:
+    with (
+        broker.client(f"{space}-page", subscribe=(topic,)) as page,
+        RawConnection(broker.port(transport), transport) as silent,
+    ):
         page.subscribe(topic)
         began = time.monotonic()
         silent.send(raw_mqtt.connect_with_will(space, credentials, topic, b"offline", keep_alive_s=1))
@@ -84,7 +87,7 @@ def test_a_keep_alive_timeout_publishes_the_will(broker: RunningBroker, space: s
 def test_pings_keep_a_silent_client_alive(broker: RunningBroker, space: str) -> None:
     credentials = broker.issue(broker.grant(space))
     for keep_alive_s in (1, 2, 4, 8, 16):
-        with Wire(broker.tcp_port) as silent:
+        with RawConnection(broker.tcp_port) as silent:
             said_s = [time.monotonic()]
             silent.send(raw_mqtt.connect_packet(space, credentials, keep_alive_s=keep_alive_s))
             answers = [silent.read()]
@@ -96,8 +99,8 @@ def test_pings_keep_a_silent_client_alive(broker: RunningBroker, space: str) -> 
         if max(after - before for before, after in pairwise(said_s)) < keep_alive_s:
             assert answers == [(raw_mqtt.CONNACK, 0, b"\0\0"), *[(raw_mqtt.PINGRESP, 0, b"")] * (len(said_s) - 1)]
             return
-        # The machine itself was silent for too long: with more time, once more.
-    pytest.fail("this machine says nothing for as long as 16 s")
+        # The machine was too slow: retry with a longer keep-alive.
+    pytest.fail("the machine is too slow for a keep-alive of 16 s")
 
 
 def test_a_disconnect_discards_the_will(broker: RunningBroker, space: str) -> None:
@@ -107,7 +110,7 @@ def test_a_disconnect_discards_the_will(broker: RunningBroker, space: str) -> No
         with broker.client(space, publish=(topic,), will=Message(topic, b"offline", 1, retain=True)) as agent:
             agent.publish_acknowledged(topic, b"online")
         assert page.receive().payload == b"online"
-        with pytest.raises(AssertionError, match="heard nothing"):
+        with pytest.raises(AssertionError, match="received nothing"):
             page.receive(SILENCE_S)
 
 
@@ -140,7 +143,7 @@ def test_revoking_a_client_id_closes_and_rejects_it(broker: RunningBroker, space
     ):
         broker.revoke(client_id=space)
         wait_until(client.disconnected.is_set, "the end of a revoked session")
-        for revoked in (credentials, spare):  # the spare one was never used
+        for revoked in (credentials, spare):  # the spare one is unused
             with broker.connect(space, revoked) as again:
                 assert not again.connected.is_set()
         with broker.connect(space, broker.issue(broker.grant(space))) as renewed:
@@ -209,14 +212,14 @@ def test_messages_to_offline_clients_are_not_retained(broker: RunningBroker, spa
     topic = f"ts/v1/{space}/arm/ur5/event"
     credentials = broker.issue(broker.grant(space, subscribe=(topic,)))
     with broker.client(f"{space}-agent", publish=(topic,)) as agent:
-        with Wire(broker.tcp_port) as away:
+        with RawConnection(broker.tcp_port) as away:
             away.send(raw_mqtt.connect_packet(space, credentials, clean=False))
             assert away.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
             away.send(raw_mqtt.subscribe_packet(topic, qos=1))
             assert away.read() == (raw_mqtt.SUBACK, 0, b"\0\1\1")
         for number in range(20):
             agent.publish_acknowledged(topic, b"%d" % number)
-        with Wire(broker.tcp_port) as back:
+        with RawConnection(broker.tcp_port) as back:
             back.send(raw_mqtt.connect_packet(space, credentials, clean=False))
             answer = back.read()
             assert answer is not None
@@ -243,7 +246,7 @@ def test_a_client_that_starts_with_mqtt_5_ends_up_connected(broker: RunningBroke
     client = broker.connect(space, credentials, protocol=paho.MQTTv5)
     if not client.connected.is_set():
         assert client.answer == "Unsupported protocol version"
-        assert time.monotonic() - began < PAHO_GIVES_UP_S, "paho was left waiting for its CONNACK"
+        assert time.monotonic() - began < PAHO_GIVES_UP_S, "no CONNACK in time"
         client.close()
         client = broker.connect(space, credentials)
     with client:
@@ -257,7 +260,7 @@ PAHO_GIVES_UP_S = 5.0
 
 @pytest.mark.parametrize("level", [3, 5, 6, 255])
 def test_another_protocol_version_is_rejected_immediately(broker: RunningBroker, space: str, level: int) -> None:
-    with Wire(broker.tcp_port) as raw:
+    with RawConnection(broker.tcp_port) as raw:
         raw.send(raw_mqtt.connect_packet(space, broker.issue(broker.grant(space)), level=level))
         answer = raw.read()
         if broker.kind == "amqtt":

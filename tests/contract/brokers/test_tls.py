@@ -1,4 +1,4 @@
-"""Brokers that speak TLS do so alone, and only with who trusts the site's authority."""
+"""Brokers with TLS: no plaintext, certificates of the site's CA."""
 
 import datetime as dt
 import socket
@@ -104,7 +104,7 @@ def test_old_tls_versions_are_rejected(broker: RunningBroker, site: Path) -> Non
 
 
 def test_decrypted_data_is_processed_completely(broker: RunningBroker, trusting: ssl.SSLContext, space: str) -> None:
-    """Several messages come in one record of TLS: the socket tells of the first alone."""
+    """One TLS record may contain several messages, but the socket only becomes readable once."""
     heard: list[object] = []
     link = MqttConnection(
         Broker(host=HOST, port=broker.tcp_port, credentials=broker.access.service_credentials, tls=trusting),

@@ -26,7 +26,7 @@ class TestMqtt(BusContract):
         came: list[Heard] = []
 
         def heard() -> list[Heard]:
-            came.extend(Heard(message.topic, message.payload) for message in ear.heard())
+            came.extend(Heard(message.topic, message.payload) for message in ear.pending())
             return came
 
         def kept(topic: str) -> bytes | None:

@@ -132,7 +132,7 @@ class Resident:
         return self._states[-1] if self._states else None
 
     def _hear(self) -> None:
-        for message in self.ear.heard():
+        for message in self.ear.pending():
             kind = topics.parse(message.topic).kind
             if kind == topics.ACK:
                 self._acks.append(codec.decode(message.payload, Ack))

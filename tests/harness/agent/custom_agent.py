@@ -158,7 +158,7 @@ class OwnAgent:
     # ------------------------------------------------------------ from it
 
     def _listen(self) -> list[tuple[str, bytes]]:
-        self.heard += [(message.topic, message.payload) for message in self.line.heard()]
+        self.heard += [(message.topic, message.payload) for message in self.line.pending()]
         return self.heard
 
     def told(self, kind: str, message: type[Any], name: str = "") -> list[Any]:

@@ -249,7 +249,7 @@ class Link:
 
     def heard(self, kind: str) -> list[bytes]:
         """Payloads of a class that the broker's subscribers have heard of this agent so far."""
-        self._heard += self.ear.heard()
+        self._heard += self.ear.pending()
         return [message.payload for message in self._heard if topics.parse(message.topic).kind == kind]
 
     def presences(self) -> list[tuple[bool, int]]:

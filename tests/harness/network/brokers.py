@@ -1,4 +1,4 @@
-"""Real brokers for tests: each a process on free loopback ports, with credentials as the functions make them.
+"""Real brokers for tests: one process each on free loopback ports, with credentials issued like the functions' own.
 
 with start_broker("amqtt", tmp_path) as broker:
     credentials = broker.issue(broker.grant(client_id="arm", publish=("ts/v1/lab/arm/#",)))
@@ -37,21 +37,21 @@ BROKERS: tuple[BrokerKind, ...] = ("amqtt", "mosquitto")
 TRANSPORTS: tuple[Transport, ...] = ("tcp", "websockets")
 HOST = "127.0.0.1"
 PATIENCE_S = 120.0
-"""How long a test waits for what has to happen [s]: the machine may be slow, and busy."""
+"""Timeout for expected events [s]; generous, because the machine may be slow and busy."""
 SILENCE_S = 0.4
-"""How long a test waits for what must not happen [s], after something later on the same way has happened."""
+"""Waiting time for events that must not happen [s], after a later event on the same path."""
 
 T = TypeVar("T")
 
 
 def wait_until(condition: Callable[[], object], what: str, timeout_s: float = PATIENCE_S) -> None:
-    """Look until ``condition`` holds; fails with ``what`` was waited for.
+    """Poll until ``condition`` holds; fails with ``what`` after the timeout.
 
-    Looks come further apart the longer it takes: who waits must not keep busy the machine that it waits for.
+    The interval grows with the waiting time, to keep the load low.
     """
-    began = time.monotonic()
+    start = time.monotonic()
     while not condition():
-        waited_s = time.monotonic() - began
+        waited_s = time.monotonic() - start
         assert waited_s < timeout_s, f"waited {timeout_s} s for {what}"
         time.sleep(min(max(0.002, 0.1 * waited_s), 0.025))
 
@@ -65,7 +65,7 @@ class Message:
 
 
 class Client:
-    """One paho client and what came to it. ``with`` disconnects it."""
+    """One paho client and its received messages; a context manager that disconnects."""
 
     def __init__(
         self,
@@ -107,10 +107,10 @@ class Client:
         self.paho.on_message = self._on_message
         self.paho.on_subscribe = self._on_subscribe
         self.paho.on_publish = self._on_publish
-        self.paho.on_socket_open = _send_at_once
+        self.paho.on_socket_open = _disable_nagle
 
     def open(self) -> Self:
-        """Connect, and wait for the broker's answer: see ``connected``, ``answer``."""
+        """Connect and wait for the broker's response: see ``connected``, ``answer``."""
         with contextlib.suppress(OSError):
             self.paho.connect(HOST, self._port, self._keep_alive_s)
             self.paho.loop_start()
@@ -118,18 +118,18 @@ class Client:
         return self
 
     def subscribe(self, *filters: str, qos: int = 1) -> list[int]:
-        """The SUBACK's codes."""
+        """Subscribe; returns the codes of the SUBACK."""
         _, mid = self.paho.subscribe([(each, qos) for each in filters])
         assert mid is not None
         wait_until(lambda: mid in self._granted or self.disconnected.is_set(), "a SUBACK")
         return self._granted.get(mid, [])
 
     def publish(self, topic: str, payload: bytes | str = b"", *, qos: int = 1, retain: bool = False) -> int:
-        """Send without waiting; the message's id, for ``acknowledged``."""
+        """Publish without waiting; returns the message id for ``acknowledged``."""
         return self.paho.publish(topic, payload, qos, retain).mid
 
     def publish_acknowledged(self, topic: str, payload: bytes | str = b"", *, retain: bool = False) -> None:
-        """Send at QoS 1 and wait until the broker has it."""
+        """Publish at QoS 1 and wait for the acknowledgement."""
         mid = self.publish(topic, payload, retain=retain)
         wait_until(lambda: mid in self._acknowledged, f"a PUBACK for {topic}")
 
@@ -140,18 +140,18 @@ class Client:
         try:
             return self.messages.get(timeout=timeout_s)
         except queue.Empty:
-            raise AssertionError(f"{self.client_id} heard nothing in {timeout_s} s") from None
+            raise AssertionError(f"{self.client_id} received nothing in {timeout_s} s") from None
 
-    def heard(self) -> list[Message]:
-        """What has come and was not received yet."""
-        found = []
+    def pending(self) -> list[Message]:
+        """All pending messages."""
+        messages = []
         with contextlib.suppress(queue.Empty):
             while True:
-                found.append(self.messages.get_nowait())
-        return found
+                messages.append(self.messages.get_nowait())
+        return messages
 
     def vanish(self) -> None:
-        """Drop the socket without a word, as a machine that lost its power."""
+        """Close the socket without DISCONNECT."""
         opened = self.paho.socket()
         assert opened is not None
         raw: Any = getattr(opened, "_socket", opened)
@@ -188,7 +188,7 @@ class Client:
 
 @dataclass
 class RunningBroker:
-    """A broker process and the functions' way to give and take rights on it."""
+    """A broker process and the functions' access to it."""
 
     kind: BrokerKind
     home: Path
@@ -204,7 +204,7 @@ class RunningBroker:
         return self.tcp_port if transport == "tcp" else self.websocket_port
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
-        """Run one of the ``access`` port's calls from a test that is not async."""
+        """Run a coroutine of ``access`` from a synchronous test."""
         return asyncio.run_coroutine_threadsafe(coroutine, self.loop).result(PATIENCE_S)
 
     def grant(
@@ -232,22 +232,22 @@ class RunningBroker:
         self.run(self.access.revoke(client_id=client_id, principal=principal))
 
     def short_lived(self, client_id: str, *, publish: tuple[str, ...] = (), **options: Any) -> tuple[Grant, Client]:
-        """A connected client whose credentials run out soon; on a machine too slow to connect until then, later."""
+        """A connected client whose credentials expire soon; longer lifetimes on slow machines."""
         for lifetime_s in (3, 6, 12, 24, 48):
             grant = self.grant(client_id, publish=publish, lifetime_s=lifetime_s)
             client = self.connect(client_id, self.issue(grant), **options)
             if client.connected.is_set():
                 return grant, client
             client.close()
-            assert time.time() >= grant.expires_at, f"{client_id} was refused before its time: {client.answer}"
+            assert time.time() >= grant.expires_at, f"{client_id} was rejected too early: {client.answer}"
         raise AssertionError(f"{client_id} could not connect in {lifetime_s} s")
 
     def expire(self) -> None:
-        """What the functions' timer does every few seconds."""
+        """Run the functions' expiry timer."""
         self.run(self.access.expire(time.time()))
 
     def connect(self, client_id: str, credentials: Credentials | None, **options: Any) -> Client:
-        """A client that has tried to connect; ``transport`` defaults to TCP, ``protocol`` to 3.1.1."""
+        """A client after a connection attempt; defaults: TCP and MQTT 3.1.1."""
         transport: Transport = options.pop("transport", "tcp")
         return Client(client_id, credentials, port=self.port(transport), transport=transport, **options).open()
 
@@ -258,26 +258,26 @@ class RunningBroker:
         client = self.connect(
             client_id, self.issue(self.grant(client_id, publish=publish, subscribe=subscribe)), **options
         )
-        assert client.connected.is_set(), f"{client_id} was refused: {client.answer}"
+        assert client.connected.is_set(), f"{client_id} was rejected: {client.answer}"
         return client
 
     def service(self, **options: Any) -> Client:
-        """A connection as the functions make their own."""
+        """A connection with the functions' own credentials."""
         service = self.access.service_credentials()
         client = self.connect(service.client_id, Credentials(service.username, service.password), **options)
-        assert client.connected.is_set(), f"the functions were refused: {client.answer}"
+        assert client.connected.is_set(), f"the functions were rejected: {client.answer}"
         return client
 
     def stderr(self) -> str:
         return (self.home / "broker.stderr").read_text()
 
     def stop(self) -> int:
-        """End it as an operator does; its exit code."""
+        """Stop the broker by SIGTERM; returns its exit code."""
         self.process.terminate()
         return self.process.wait(PATIENCE_S)
 
     def kill(self) -> None:
-        """End it as a crash does."""
+        """Kill the broker."""
         self.process.kill()
         self.process.wait(PATIENCE_S)
 
@@ -293,16 +293,16 @@ def start_broker(
     more: Sequence[str] = (),
     tls: ssl.SSLContext | None = None,
 ) -> Iterator[RunningBroker]:
-    """Run a broker for the time of a ``with``.
+    """Run a broker within a ``with`` block.
 
     Args:
-        kind: Which one.
-        home: Its folder; a second start with the same folder finds what the first has left.
-        tcp_port: 0 for a free one.
-        websocket_port: 0 for a free one.
-        keys: For amqtt: public keys of functions that are under test themselves. ``access`` cannot issue then.
-        more: Arguments of the program.
-        tls: How the functions' own clients are to connect, where ``more`` asks for TLS.
+        kind: The broker.
+        home: Its folder; a second start with the same folder reuses its files.
+        tcp_port: 0 selects a free port.
+        websocket_port: 0 selects a free port.
+        keys: For amqtt: public keys of the functions under test; ``access`` cannot issue grants then.
+        more: Additional arguments of the program.
+        tls: TLS context of the functions' own clients, if ``more`` enables TLS.
     """
     home.mkdir(parents=True, exist_ok=True)
     ports = [*more, "--host", HOST, "--tcp-port", str(tcp_port), "--websocket-port", str(websocket_port)]
@@ -335,14 +335,18 @@ def start_broker(
 
 def _ready(process: "subprocess.Popen[str]", home: Path) -> tuple[int, int]:
     assert process.stdout is not None
-    line = process.stdout.readline()
-    said = dict(part.split("=") for part in line.split()[1:]) if line.startswith("ready ") else {}
-    assert {"tcp", "websocket"} <= set(said), f"broker did not start: {line!r} {(home / 'broker.stderr').read_text()}"
-    return int(said["tcp"]), int(said["websocket"])
+    connections = process.stdout.readline()
+    ports_by_name = (
+        dict(part.split("=") for part in connections.split()[1:]) if connections.startswith("ready ") else {}
+    )
+    assert {"tcp", "websocket"} <= set(ports_by_name), (
+        f"broker did not start: {connections!r} {(home / 'broker.stderr').read_text()}"
+    )
+    return int(ports_by_name["tcp"]), int(ports_by_name["websocket"])
 
 
 def _keys(home: Path) -> tuple[Any, Path]:
-    """A signing key that stays the same for one home, as the functions' does."""
+    """A signing key that stays the same for one home."""
     path, private = home / "public.json", home / "private.bin"
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -360,14 +364,14 @@ def _access(broker: RunningBroker, tls: ssl.SSLContext | None) -> BrokerAccess:
         return MosquittoBrokerAccess(
             host=HOST, port=broker.tcp_port, username="service", password_file=broker.home / "service.password", tls=tls
         )
-    line: list[Client] = []
+    connections: list[Client] = []
 
     async def publish(topic: str, payload: bytes) -> None:
         def send() -> None:
-            if not line:
-                line.append(broker.service())
-                broker.closers.append(line[0].close)
-            line[0].publish_acknowledged(topic, payload)
+            if not connections:
+                connections.append(broker.service())
+                broker.closers.append(connections[0].close)
+            connections[0].publish_acknowledged(topic, payload)
 
         await asyncio.to_thread(send)
 
@@ -391,5 +395,5 @@ def _running_loop() -> Iterator[asyncio.AbstractEventLoop]:
         loop.close()
 
 
-def _send_at_once(_: Any, __: Any, opened: Any) -> None:
+def _disable_nagle(_: Any, __: Any, opened: Any) -> None:
     getattr(opened, "_socket", opened).setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,19 +1,18 @@
-"""TCP with a network between client and server: a delay each way, and stalls as lost segments cause them.
+"""A TCP proxy with a delay in each direction, and stalls as caused by lost segments.
 
-with start_delay(broker.tcp_port, rtt_ms=15) as way:
-    connect(way.ports[broker.tcp_port])
-    way.set(rtt_ms=30, loss=0.02)
+with start_delay(broker.tcp_port, rtt_ms=15) as network:
+    connect(network.ports[broker.tcp_port])
+    network.set(rtt_ms=30, loss=0.02)
 
-It is a process of its own (``python -m tests.harness.network.delay RTT_MS LOSS SEED PORT …``), so that its timing does not
-share an interpreter with who measures. What it imitates, and why so:
+It runs in its own process (``python -m tests.harness.network.delay RTT_MS LOSS SEED PORT …``), so that its timing is
+independent of the measuring interpreter. The model:
 
-- Each chunk comes out half a round trip after it went in, in order. Bandwidth is not limited.
-- A new connection costs a round trip before its first byte, as the handshake would: the kernel of this machine shakes
-  hands at once, so the first chunk is kept for one round trip more.
-- A lost segment: TCP sends it again after its retransmission time, which on Linux is a round trip and 200 ms, and the
-  receiver hands on nothing that came after it until it is there. So the chunk, and all behind it in its direction,
-  come later by that time. A chunk here is what one read gives: for small messages that are sent at once, a segment.
-  Faster ways to notice a loss (three segments behind it) are left out: small messages rarely have them.
+- Each chunk is delivered in order, half a round trip after it was sent. Bandwidth is unlimited.
+- A new connection costs a round trip before its first byte, like the handshake: the local kernel completes the
+  handshake immediately, so the first chunk is delayed by one more round trip.
+- A lost segment: TCP retransmits after a round trip and 200 ms on Linux, and the receiver delivers nothing that
+  follows before it has arrived. So this chunk, and all later ones in its direction, are delayed by that time. A chunk
+  is the result of one read: for small messages sent without delay, one segment. Fast retransmission is not modelled.
 """
 
 import asyncio
@@ -33,31 +32,31 @@ from tests.harness.network.brokers import HOST
 from tests.harness.paths import ROOT
 
 RTO_MIN_S = 0.2
-"""Linux: the least that a retransmission waits beyond the round trip."""
+"""Linux: minimum retransmission timeout beyond the round trip."""
 _MOST_BYTES = 4_000_000
-"""Of one direction, on its way; who sends faster waits."""
+"""Buffer limit per direction; a faster sender is paused."""
 
 
 @dataclass
 class Conditions:
-    """Of all connections, from now on."""
+    """Parameters of all connections."""
 
     rtt_s: float
     loss: float
-    chance: random.Random
+    random: random.Random
 
-    def late_s(self) -> float:
-        """How long the next chunk takes, one way [s]."""
-        lost = self.loss > 0 and self.chance.random() < self.loss
+    def delay_s(self) -> float:
+        """One-way delay of the next chunk [s]."""
+        lost = self.loss > 0 and self.random.random() < self.loss
         return self.rtt_s / 2 + (self.rtt_s + RTO_MIN_S if lost else 0.0)
 
 
 class Pipe:
-    """One direction of one connection: what goes in comes out later, in order.
+    """One direction of one connection: delivers data later, in order.
 
     Args:
         conditions: Of the network.
-        not_before_s: The first chunk comes out at this time of the loop at the soonest.
+        not_before_s: Earliest delivery of the first chunk [s, loop time].
     """
 
     def __init__(self, conditions: Conditions, not_before_s: float) -> None:
@@ -71,14 +70,14 @@ class Pipe:
         self.source: asyncio.Transport | None = None
         self._sink: asyncio.Transport | None = None
 
-    def lead_to(self, sink: asyncio.Transport) -> None:
-        """Where it comes out is there; until then it is kept."""
+    def set_sink(self, sink: asyncio.Transport) -> None:
+        """Set the destination; data is queued until then."""
         self._sink = sink
         self._flush()
 
-    def carry(self, chunk: bytes) -> None:
-        """Take a chunk; an empty one is the end."""
-        self._last_s = max(self._last_s, self._loop.time() + self._conditions.late_s())
+    def send(self, chunk: bytes) -> None:
+        """Queue a chunk; an empty one closes the destination."""
+        self._last_s = max(self._last_s, self._loop.time() + self._conditions.delay_s())
         self._queue.append((self._last_s, chunk))
         self._bytes += len(chunk)
         if self._bytes > _MOST_BYTES and self.source is not None and not self._paused:
@@ -108,58 +107,58 @@ class Pipe:
 
 
 class _End(asyncio.Protocol):
-    """One socket: what it hears goes into one pipe, and another pipe's sink it is."""
+    """One socket: source of one pipe and destination of the other."""
 
-    def __init__(self, heard: Pipe, said: Pipe) -> None:
-        self._heard = heard
-        self._said = said
+    def __init__(self, incoming: Pipe, outgoing: Pipe) -> None:
+        self._incoming = incoming
+        self._outgoing = outgoing
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         opened = cast("asyncio.Transport", transport)
         opened.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._heard.source = opened
-        self._said.lead_to(opened)
+        self._incoming.source = opened
+        self._outgoing.set_sink(opened)
 
     def data_received(self, data: bytes) -> None:
-        self._heard.carry(data)
+        self._incoming.send(data)
 
     def connection_lost(self, _why: Exception | None) -> None:
-        self._heard.carry(b"")
+        self._incoming.send(b"")
 
 
-async def _meet(port: int, there: Pipe, back: Pipe) -> None:
-    """Connect to the server behind; where nobody listens, the client is let go."""
+async def _connect(port: int, forward: Pipe, back: Pipe) -> None:
+    """Connect to the server; closes the client if nothing listens there."""
     try:
-        await asyncio.get_running_loop().create_connection(lambda: _End(back, there), HOST, port)
+        await asyncio.get_running_loop().create_connection(lambda: _End(back, forward), HOST, port)
     except OSError:
-        if there.source is not None:
-            there.source.close()
+        if forward.source is not None:
+            forward.source.close()
 
 
 async def _serve(conditions: Conditions, ports: list[int]) -> None:
     loop = asyncio.get_running_loop()
-    meeting: set[asyncio.Task[None]] = set()
+    tasks: set[asyncio.Task[None]] = set()
 
     def made(port: int) -> Callable[[], asyncio.Protocol]:
         return lambda: end(port)
 
     def end(port: int) -> asyncio.Protocol:
-        shaken_s = loop.time() + 1.5 * conditions.rtt_s
-        there, back = Pipe(conditions, shaken_s), Pipe(conditions, shaken_s)
-        task = loop.create_task(_meet(port, there, back))
-        meeting.add(task)
-        task.add_done_callback(meeting.discard)
-        return _End(there, back)
+        handshake_s = loop.time() + 1.5 * conditions.rtt_s
+        forward, back = Pipe(conditions, handshake_s), Pipe(conditions, handshake_s)
+        task = loop.create_task(_connect(port, forward, back))
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+        return _End(forward, back)
 
     servers = [await loop.create_server(made(port), HOST, 0) for port in ports]
     print("ready", *(server.sockets[0].getsockname()[1] for server in servers), flush=True)
     ended = asyncio.Event()
-    threading.Thread(target=_obey, args=(conditions, loop, ended), daemon=True).start()
+    threading.Thread(target=_read_conditions, args=(conditions, loop, ended), daemon=True).start()
     await ended.wait()
 
 
-def _obey(conditions: Conditions, loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
-    """Lines on standard input change the conditions; its end is ours."""
+def _read_conditions(conditions: Conditions, loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
+    """Apply conditions read from standard input; stop at its end."""
     for line in sys.stdin:
         rtt_ms, loss = line.split()
         loop.call_soon_threadsafe(_change, conditions, float(rtt_ms) / 1000, float(loss))
@@ -171,21 +170,21 @@ def _change(conditions: Conditions, rtt_s: float, loss: float) -> None:
     conditions.rtt_s, conditions.loss = rtt_s, loss
 
 
-class Way:
+class DelayedNetwork:
     """A running delay.
 
     Attributes:
-        ports: A server's port → where clients connect to reach it through the delay.
+        ports: Port of a server → port of the delay in front of it.
     """
 
     def __init__(self, process: "subprocess.Popen[str]", behind: tuple[int, ...]) -> None:
         self._process = process
-        words = self._line().split()
-        assert words[:1] == ["ready"], f"the delay did not start: {words}"
-        self.ports: dict[int, int] = dict(zip(behind, map(int, words[1:]), strict=True))
+        fields = self._line().split()
+        assert fields[:1] == ["ready"], f"the delay did not start: {fields}"
+        self.ports: dict[int, int] = dict(zip(behind, map(int, fields[1:]), strict=True))
 
     def set(self, *, rtt_ms: float, loss: float = 0.0) -> None:
-        """For whatever goes in from now on."""
+        """Change the conditions for data sent from now on."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{rtt_ms} {loss}\n")
         self._process.stdin.flush()
@@ -197,14 +196,14 @@ class Way:
 
 
 @contextlib.contextmanager
-def start_delay(*behind: int, rtt_ms: float, loss: float = 0.0, seed: int = 1) -> Iterator[Way]:
-    """A network before these ports of this machine.
+def start_delay(*behind: int, rtt_ms: float, loss: float = 0.0, seed: int = 1) -> Iterator[DelayedNetwork]:
+    """Run a delay in front of these local ports.
 
     Args:
         behind: Ports of servers.
-        rtt_ms: The round trip between client and server [ms].
+        rtt_ms: Round-trip time between client and server [ms].
         loss: Share of chunks that stall.
-        seed: Of what is lost.
+        seed: Random seed of the losses.
     """
     command = [
         sys.executable,
@@ -219,7 +218,7 @@ def start_delay(*behind: int, rtt_ms: float, loss: float = 0.0, seed: int = 1) -
         command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
         try:
-            yield Way(process, behind)
+            yield DelayedNetwork(process, behind)
         finally:
             assert process.stdin is not None
             process.stdin.close()
@@ -227,9 +226,9 @@ def start_delay(*behind: int, rtt_ms: float, loss: float = 0.0, seed: int = 1) -
 
 
 def main(rtt_ms: str, loss: str, seed: str, *ports: str) -> None:
-    """Until standard input ends."""
+    """Run until standard input ends."""
     conditions = Conditions(float(rtt_ms) / 1000, float(loss), random.Random(int(seed)))
-    # Not the default selector: epoll waits in whole milliseconds, and would round half a round trip up.
+    # epoll has a resolution of 1 ms, which is too coarse.
     selector: Any = selectors.SelectSelector()
     with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(selector)) as runner:
         runner.run(_serve(conditions, [int(port) for port in ports]))

@@ -1,4 +1,4 @@
-"""TCP between a client and a server, which a test can cut, loudly or without a sign.
+"""A TCP proxy whose connections a test can cut, with or without notice to the peers.
 
 with start_proxy(broker.tcp_port) as proxy:
     connect(proxy.port)
@@ -16,16 +16,16 @@ HOST = "127.0.0.1"
 
 
 class Proxy:
-    """Passes bytes both ways.
+    """Forwards data in both directions.
 
     Args:
-        behind: The server's port.
-        heard: Told what goes to clients, before it does.
+        behind: Port of the server.
+        heard: Called with data for clients before it is forwarded.
 
     Attributes:
-        port: Where clients connect.
-        accepted: Number of connections so far.
-        arrivals: What came since ``acknowledge_late``: when [s], whether from the server, and what.
+        port: Port for clients.
+        accepted: Number of accepted connections.
+        arrivals: Data since ``acknowledge_late``: time [s], whether from the server, content.
     """
 
     def __init__(self, behind: int, heard: Callable[[bytes], None] | None = None) -> None:
@@ -43,7 +43,7 @@ class Proxy:
         self._selector.register(self._woken, selectors.EVENT_READ)
         self._peers: dict[socket.socket, socket.socket] = {}
         self._servers: set[socket.socket] = set()
-        self._forgotten: list[socket.socket] = []
+        self._swallowed: list[socket.socket] = []
         self._lock = threading.Lock()
         self._ended = False
         self._refuses = False
@@ -51,30 +51,30 @@ class Proxy:
         self._thread.start()
 
     def freeze(self) -> None:
-        """Nothing comes through, and nobody is told: what is sent waits for ``thaw``, as on a link that stalls."""
+        """Stop forwarding without closing; data is queued until ``thaw``, as on a stalled link."""
         with self._lock:
             self._frozen = True
             for each in (self._listener, *self._peers):
                 self._selector.unregister(each)
 
     def thaw(self) -> None:
-        """Go on, with all that was sent meanwhile."""
+        """Forward again, including queued data."""
         with self._lock:
             self._frozen = False
             for each in (self._listener, *self._peers):
                 self._selector.register(each, selectors.EVENT_READ)
 
     def swallow(self) -> None:
-        """Nothing comes through on the connections of now, and nobody is told: as when a router forgets them."""
+        """Drop all traffic of the current connections silently, like a router that lost its state."""
         with self._lock:
             for each in self._peers:
                 self._selector.unregister(each)
-            self._forgotten.extend(self._peers)
+            self._swallowed.extend(self._peers)
             self._peers.clear()
             self._servers.clear()
 
     def cut(self) -> None:
-        """Close the connections of now."""
+        """Close the current connections."""
         with self._lock:
             for each in self._peers:
                 self._selector.unregister(each)
@@ -83,16 +83,16 @@ class Proxy:
             self._servers.clear()
 
     def refuse(self) -> None:
-        """Close every connection, now and from now on, as soon as it is there."""
+        """Close all current and future connections."""
         self._refuses = True
         self.cut()
 
     def admit(self) -> None:
-        """Let connections through again."""
+        """Accept connections again."""
         self._refuses = False
 
     def acknowledge_late(self) -> None:
-        """As a kernel may: after 40 ms, or with the next answer. Who does not set TCP_NODELAY then waits for it."""
+        """Delay TCP acknowledgements by up to 40 ms, as a kernel may; reveals a missing TCP_NODELAY."""
         with self._lock:
             self._late = True
             for each in self._peers:
@@ -105,7 +105,7 @@ class Proxy:
         self._wake.send(b"x")
         self._thread.join()
         self.cut()
-        for each in (*self._forgotten, self._listener, self._wake, self._woken):
+        for each in (*self._swallowed, self._listener, self._wake, self._woken):
             each.close()
         self._selector.close()
 
@@ -113,15 +113,15 @@ class Proxy:
         while not self._ended:
             for key, _ in self._selector.select():
                 with self._lock:
-                    self._turn(key.fileobj)
+                    self._handle(key.fileobj)
 
-    def _turn(self, ready: object) -> None:
+    def _handle(self, ready: object) -> None:
         if self._frozen:
             return
         if ready is self._listener:
             self._accept()
         elif isinstance(ready, socket.socket) and ready in self._peers:
-            self._pass_on(ready, self._peers[ready])
+            self._forward(ready, self._peers[ready])
 
     def _accept(self) -> None:
         client, _ = self._listener.accept()
@@ -142,7 +142,7 @@ class Proxy:
             self._peers[one] = other
             self._selector.register(one, selectors.EVENT_READ)
 
-    def _pass_on(self, ready: socket.socket, other: socket.socket) -> None:
+    def _forward(self, ready: socket.socket, other: socket.socket) -> None:
         content = b""
         with contextlib.suppress(OSError):
             content = ready.recv(65_536)
@@ -163,14 +163,14 @@ class Proxy:
 
 
 def _acknowledge_late(one: socket.socket) -> None:
-    """To be said again after each read: the kernel forgets it."""
-    with contextlib.suppress(OSError):  # it has just ended
+    """Must be set again after each read."""
+    with contextlib.suppress(OSError):  # already closed
         one.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 0)
 
 
 @contextlib.contextmanager
 def start_proxy(behind: int, heard: Callable[[bytes], None] | None = None) -> Iterator[Proxy]:
-    """A proxy before a port of this machine."""
+    """A proxy in front of a local port."""
     proxy = Proxy(behind, heard)
     try:
         yield proxy

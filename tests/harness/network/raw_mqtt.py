@@ -1,4 +1,4 @@
-"""MQTT by hand, for what a client library hides: bytes over TCP or WebSocket, and nothing that answers by itself."""
+"""Raw MQTT over TCP or WebSocket, for behaviour that client libraries hide."""
 
 import contextlib
 import socket
@@ -64,8 +64,8 @@ def subscribe_packet(*filters: str, qos: int = 0, packet_id: int = 1) -> bytes:
     return packet(8, packet_id.to_bytes(2) + b"".join(text(each) + bytes([qos]) for each in filters), 2)
 
 
-class Wire:
-    """One connection; ``read`` gives whole packets, and ``None`` once the broker has closed it."""
+class RawConnection:
+    """One connection; ``read`` returns complete packets, and ``None`` after the broker has closed it."""
 
     def __init__(self, port: int, transport: Transport = "tcp") -> None:
         self._buffer = bytearray()
@@ -84,7 +84,7 @@ class Wire:
             )
 
     def send(self, data: bytes) -> None:
-        """Send; a connection that the broker has closed already takes it without complaint."""
+        """Send data; ignored if the broker has closed the connection."""
         with contextlib.suppress(OSError, ConnectionClosed):
             if self._websocket is not None:
                 self._websocket.send(data)
@@ -95,19 +95,19 @@ class Wire:
         """Type, flags and body of the next packet.
 
         Raises:
-            TimeoutError: None came.
+            TimeoutError: No packet arrived in time.
         """
         while True:
-            found = self._cut()
-            if found is not None:
-                return found
+            frame = self._next_packet()
+            if frame is not None:
+                return frame
             data = self._receive(timeout_s)
             if not data:
                 return None
             self._buffer += data
 
     def closed(self, timeout_s: float = PATIENCE_S) -> bool:
-        """Whether the broker closes the connection in time; packets on the way are passed over."""
+        """Whether the broker closes the connection in time; skips pending packets."""
         try:
             while self.read(timeout_s) is not None:
                 pass
@@ -137,7 +137,7 @@ class Wire:
         except (ConnectionError, ConnectionClosed):
             return b""
 
-    def _cut(self) -> tuple[int, int, bytes] | None:
+    def _next_packet(self) -> tuple[int, int, bytes] | None:
         length = shift = 0
         for at, byte in enumerate(self._buffer[1:5], start=2):
             length |= (byte & 0x7F) << shift

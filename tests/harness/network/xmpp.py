@@ -1,6 +1,6 @@
-"""A real Prosody, who speaks for the cloud beside the functions, and a toy robot that speaks nothing but XMPP.
+"""A real Prosody, an XMPP gateway beside the functions, and a fake robot that uses XMPP.
 
-with open_site(...) as site:                        # functions, their HTTP, Prosody, and one speaker
+with open_site(...) as site:                        # functions, HTTP, Prosody and one gateway
     with site.robot() as robot:
         robot.pair(anna)
         robot.connect()
@@ -47,14 +47,14 @@ def free_port() -> int:
 
 @dataclass
 class Prosody:
-    """An XMPP server's process."""
+    """A Prosody process."""
 
     process: "subprocess.Popen[str]"
     home: Path
     port: int
 
     def kill(self) -> None:
-        """End it as a crash does, both the program that runs it and Prosody itself."""
+        """Kill Prosody and the program that runs it."""
         self.process.kill()
         self.process.wait(PATIENCE_S)
         wait_until(self._gone, "the end of Prosody")
@@ -92,7 +92,7 @@ def start_prosody(home: Path, verify_url: str, *, port: int = 0, more: tuple[str
 
 
 class ProsodyEnd:
-    """Prosody, as what a transport's connection ends at."""
+    """Prosody as an endpoint of a transport."""
 
     def __init__(self, home: Path, verify_url: str, port: int, stack: contextlib.ExitStack) -> None:
         self.port = port
@@ -108,7 +108,7 @@ class ProsodyEnd:
 
 @contextlib.contextmanager
 def served(cloud: Cloud, listener: socket.socket) -> Iterator[None]:
-    """The functions' HTTP at a socket that listens already."""
+    """Serve the functions' HTTP API on a listening socket."""
     server = uvicorn.Server(uvicorn.Config(cloud.app, log_level="warning", lifespan="off"))
     running = asyncio.run_coroutine_threadsafe(server.serve(sockets=[listener]), cloud.loop)
     try:
@@ -119,7 +119,7 @@ def served(cloud: Cloud, listener: socket.socket) -> Iterator[None]:
 
 
 class Speaking:
-    """One who speaks for the cloud, in the loop of the functions."""
+    """An XMPP gateway in the functions' event loop."""
 
     def __init__(self, cloud: Cloud) -> None:
         self.cloud = cloud
@@ -143,7 +143,7 @@ class Speaking:
 
 @dataclass
 class XmppSite:
-    """Functions, an XMPP server, and who speaks for the cloud there."""
+    """Functions, an XMPP server, and gateways."""
 
     cloud: Cloud
     prosody: Prosody
@@ -161,14 +161,14 @@ class XmppSite:
         return XmppClient(self.prosody.port, user, password, **options)
 
     def watcher(self, broker: RunningBroker) -> Client:
-        """A connection to the broker with the functions' own rights."""
+        """A broker connection with the functions' rights."""
         service = self.cloud.functions.access.service_credentials()
         client = broker.connect(service.client_id, Credentials(service.username, service.password))
         assert client.connected.is_set(), client.answer
         return client
 
     def person(self, who: Person) -> "XmppClient":
-        """A person's own XMPP client."""
+        """An XMPP client of a person."""
         given = who.post("/xmpp/credentials", {"purpose": "view"}).json()
         return self.client(who.account, given["password"])
 
@@ -177,13 +177,13 @@ class XmppSite:
 def open_site(
     open_cloud: Callable[[Settings], Cloud], settings: Settings, folder: Path, *, speak: bool = True
 ) -> Iterator[XmppSite]:
-    """All of it.
+    """Start the site.
 
     Args:
-        open_cloud: Makes the functions.
-        settings: Theirs, without XMPP.
+        open_cloud: Creates the functions.
+        settings: Their settings, without XMPP.
         folder: For Prosody's files.
-        speak: Whether to start who speaks for the cloud.
+        speak: Whether to start a gateway.
     """
     with contextlib.ExitStack() as stack:
         listener = stack.enter_context(socket.create_server((HOST, 0)))
@@ -202,13 +202,13 @@ def open_site(
 
 
 class XmppRobot(Robot):
-    """As ``Robot``, over XMPP, with the agent's own transport.
+    """``Robot`` over XMPP, with the agent's own transport.
 
     Attributes:
-        setpoints: What came on ``ctl``, as it came.
-        changes: What the transport has told of its link.
-        listen: Topics of others that it wants to hear, and
-        overheard: what came of them.
+        setpoints: Received setpoints.
+        changes: Link states reported by the transport.
+        listen: Additional topics to subscribe to.
+        overheard: Messages received on those.
     """
 
     def __init__(self, place: Any, names: tuple[str, ...]) -> None:
@@ -236,7 +236,7 @@ class XmppRobot(Robot):
         return self.session
 
     def connect(self) -> Self:
-        """Connect, and wait until it has been heard."""
+        """Connect and wait for the link."""
         line: Any = _Line(self)
         self.link = line
         wait_until(lambda: self.changes[-1:] == [True], "the link over XMPP")
@@ -251,7 +251,7 @@ class XmppRobot(Robot):
 
 
 class _Line:
-    """In the place of the toy robot's MQTT connection."""
+    """Replaces the fake robot's MQTT connection."""
 
     def __init__(self, robot: XmppRobot) -> None:
         self.transport = XmppTransport(
@@ -278,7 +278,7 @@ class _Line:
 
 
 class XmppClient:
-    """Any XMPP client: logs in, hears, and may say what it likes. ``with`` ends it."""
+    """A generic XMPP client; a context manager that disconnects."""
 
     def __init__(self, port: int, user: str, password: str, *, resource: str = "test") -> None:
         self.messages: list[Element] = []
@@ -308,7 +308,7 @@ class XmppClient:
         self._loop.call_soon_threadsafe(self.stream.send, stanza)
 
     def there(self, user: str) -> bool:
-        """Whether this user's newest presence says that they are there."""
+        """Whether the newest presence of this user is available."""
         heard = [each for each in self.presences if each.get("from", "").startswith(f"{user}@")]
         return bool(heard) and heard[-1].get("type") is None
 
@@ -333,7 +333,7 @@ class XmppClient:
 
 @contextlib.contextmanager
 def start_xmpp_ground(folder: Path) -> Iterator[Ground]:
-    """A ground with Prosody, and a program beside it that speaks for the cloud."""
+    """Cloud processes with Prosody and an XMPP gateway."""
     port = free_port()
     settings = {"TELESCOPE_XMPP_DOMAIN": DOMAIN, "TELESCOPE_XMPP_HOST": HOST, "TELESCOPE_XMPP_PORT": str(port)}
     with start_ground("mosquitto", folder, settings) as ground:

@@ -55,15 +55,15 @@ def test_watching_hears_every_device_of_the_account_and_no_other(
             heard = {page.receive().topic}
             while len(heard & {robot.topic(topics.EVENT), second.topic(topics.EVENT, "right")}) < 2:
                 heard.add(page.receive(PATIENCE_S).topic)
-            heard |= {message.topic for message in page.heard()}
+            heard |= {message.topic for message in page.pending()}
             assert not [topic for topic in heard if foreign.space in topic]
             page.publish(f"{bases[0]}/stop", b'{"id":"s1","caller":"anna"}')
             wait_until(lambda: robot.stops, "the Stop")
         assert robot.link is not None
-        robot.link.heard()
+        robot.link.pending()
         for topic in (f"{bases[0]}/ctl/1", f"{bases[0]}/cmd", f"{bases[0]}/state"):
             try_to_publish(broker, issued, topic)
-        with pytest.raises(AssertionError, match="heard nothing"):
+        with pytest.raises(AssertionError, match="received nothing"):
             robot.link.receive(SILENCE_S)
 
 
@@ -76,13 +76,13 @@ def test_control_sends_this_epochs_setpoints_and_nothing_else(broker: RunningBro
     assert (issued["publish"], issued["subscribe"]) == ([f"{base}/ctl/{epoch}"], [])
     assert issued["lifetime_s"] == 60
     assert robot.link is not None
-    robot.link.heard()
+    robot.link.pending()
     with connect(broker, issued) as page:
         page.publish(f"{base}/ctl/{epoch}", b"{}")
         assert robot.link.receive().topic == f"{base}/ctl/{epoch}"
     for kind in (f"ctl/{epoch + 1}", "stop", "cmd", "ack"):
         try_to_publish(broker, issued, f"{base}/{kind}")
-    with pytest.raises(AssertionError, match="heard nothing"):
+    with pytest.raises(AssertionError, match="received nothing"):
         robot.link.receive(SILENCE_S)
 
 

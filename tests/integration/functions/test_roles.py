@@ -272,7 +272,7 @@ def hear(broker: RunningBroker, principal: Principal, topic: dict[str, str], rol
             if not inside and each not in granted:
                 assert client.subscribe(each) == [128], f"{role} hears {each}"
         if not principal.hears:
-            assert client.heard() == [], "nothing that is retained either"
+            assert client.pending() == [], "nothing that is retained either"
 
 
 def _watched(pattern: str) -> bool:

@@ -93,7 +93,7 @@ def test_a_connection_that_lived_through_the_frost_is_used_on(
         time.sleep(0.3)
         frozen.publish(str(number))
     assert [robot.receive().payload for _ in range(3)] == [b"0", b"1", b"2"]
-    assert robot.heard() == []
+    assert robot.pending() == []
     assert proxy.accepted == known
 
 

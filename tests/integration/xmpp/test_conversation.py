@@ -99,7 +99,7 @@ def test_what_it_says_is_heard_on_the_broker_and_kept_there_where_the_contract_s
         for _ in range(3):
             assert line.transport.publish(tele, b'{"not": "telemetry"}', qos=0)  # type: ignore[attr-defined]
         wait_until(lambda: watcher.messages.qsize() >= 3, "telemetry on the broker")
-        watcher.heard()
+        watcher.pending()
         watcher.subscribe(robot.topic(topics.STATE))
         message = watcher.receive()
         assert message.retain

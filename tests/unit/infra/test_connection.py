@@ -19,7 +19,7 @@ from infra.embedded_broker.listeners import TcpTransport, WebSocketTransport
 from infra.embedded_broker.public_keys import KeyRing
 from infra.embedded_broker.revocations import Revocations
 from tests.harness.network import raw_mqtt
-from tests.harness.network.raw_mqtt import Wire
+from tests.harness.network.raw_mqtt import RawConnection
 
 TOPIC = "ts/v1/s/a/conn"
 
@@ -237,7 +237,7 @@ def test_accepted_sockets_have_tcp_nodelay(tmp_path: Path, kind: str) -> None:
         port = sockets[TCP if kind == "tcp" else WEBSOCKET].getsockname()[1]
         broker = ObservedBroker(sockets=sockets, keys=harness.broker._keys, revocations=harness.broker._revocations)
         await broker.start()
-        client = await asyncio.to_thread(Wire, port, kind)  # type: ignore[arg-type]
+        client = await asyncio.to_thread(RawConnection, port, kind)  # type: ignore[arg-type]
         await accepted.wait()
         await broker.shutdown()
         await asyncio.to_thread(client.close)

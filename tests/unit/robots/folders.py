@@ -1,6 +1,6 @@
 """Every robot folder of the project, so that a new one is tested without a new line of code.
 
-Those in the folders that ``TELESCOPE_ROBOTS_PATH`` names are tested as well: somebody else's can be held to the same.
+Types in the folders of ``TELESCOPE_ROBOTS_PATH`` are tested as well.
 """
 
 from pathlib import Path
@@ -66,7 +66,7 @@ def heard(kind: robot_type.RobotType, yaw_rad: float) -> dict[str, Any]:
 
 
 def whereabouts(kind: robot_type.RobotType, x_m: float, y_m: float, yaw_rad: float) -> dict[str, Any]:
-    """What a room tells of a robot where it is, and of somebody who stands before its place."""
+    """Room data with a robot at its position and a person in front of it."""
     values = {"age_s.person": 0.1, "x_m.person": 1.9, "y_m.person": 0.35}
     name = kind.type
     values |= {f"age_s.{name}": 0.1, f"x_m.{name}": x_m, f"y_m.{name}": y_m, f"yaw_rad.{name}": yaw_rad}

@@ -35,7 +35,7 @@ class LimitedRobot:
         self.joints = tuple(joint.name for joint in self.type.joints)
         self.can = ("say",)
         self.now_s = 0.0
-        self.place = (0.0, 0.0, 0.0)  # x, y [m] and yaw [rad] of a base that does as it is told
+        self.place = (0.0, 0.0, 0.0)  # x, y [m] and yaw [rad] of an ideal base
         self.tightest_m = 1.0
         self.limited: set[str] = set()
 

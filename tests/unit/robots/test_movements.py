@@ -135,7 +135,7 @@ class PlayedRobot:
 
 
 class PlayedRoom:
-    """The script's ``room``: sees the robot where it is, and somebody who stands before it."""
+    """The script's ``room``: locates the robot and a person in front of it."""
 
     def __init__(self, robot: PlayedRobot | WalkedRobot) -> None:
         self.robot = robot

@@ -76,5 +76,5 @@ def test_every_viseme_is_reached(folder: Path) -> None:
     score = BehaviourTrajectory(shower.kind, shower.controller.commanded_rad)
     score.add_speech(SpokenLine(0.0, TEXT, estimate_duration_s(TEXT)))
     jaws = [place for place in score.trajectory().position_rad.T if place.max() - place.min() > 0.05]
-    assert jaws, "nobody would see that it speaks"
+    assert jaws, "the jaw does not move"
     shower.go(score, TEXT)

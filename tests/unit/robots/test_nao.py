@@ -186,7 +186,7 @@ def test_a_stop_ends_a_walk_on_both_feet_within_the_brakes() -> None:
         walking.period()
     base = TYPE.base
     assert base is not None
-    walking.controller.stop(StopLatch(caller="somebody", at_ms=0, reason=""))
+    walking.controller.stop(StopLatch(caller="ann", at_ms=0, reason=""))
     braking_s = 0.1 / base.braking_linear_m_s2 + 0.05
     walking.wait(braking_s)
     assert walking.twist == pytest.approx(REST, abs=1e-6)
@@ -251,7 +251,7 @@ def test_the_torso_support_is_limited_and_only_active_during_a_walk() -> None:
     assert TYPE.simulation is not None
     walk = TYPE.simulation.walk
     assert walk is not None
-    help_now = walking.world._data.xfrc_applied[walking.body]  # nobody else can see it
+    help_now = walking.world._data.xfrc_applied[walking.body]  # not part of a snapshot
     walking.wait(0.5)
     assert not help_now.any()
     course = walking.controller.start_drive(walking.tenure, FORWARD, duration_s=3.0)

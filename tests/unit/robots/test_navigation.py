@@ -41,7 +41,7 @@ def _present() -> Iterator[None]:
 
 
 class Meanwhile(threading.Event):
-    """While somebody waits for it, the laboratory goes on, so that all of it is one thread."""
+    """Waiting steps the laboratory, so that everything runs in one thread."""
 
     def __init__(self, lab: "Laboratory") -> None:
         super().__init__()
@@ -140,7 +140,7 @@ class Laboratory:
         return others - {"floor"}
 
     def free(self, x_m: float, y_m: float) -> bool:
-        """Whether there is room for it, and a little more: somebody's legs may be seen a cell further on later."""
+        """Whether the robot fits there with a margin of one cell for moving legs."""
         grid = self.watched.sight.grid
         return not grid.blocked(QBO.base.radius_m + 0.15).at(x_m, y_m)  # type: ignore[union-attr]
 
@@ -174,7 +174,7 @@ def play(lab: Laboratory, movement: str, parameters: dict[str, Any]) -> list[str
         if kind == "say":
             return heard.append(arguments["text"])
         if kind == "look":
-            return None  # without a look at its shape nobody can tell where; its own tests do
+            return None  # checked by its own tests
         try:
             return lab.robot.execute(script_calls.parse(json.dumps({"kind": kind, **arguments}).encode()))  # type: ignore[arg-type]
         except Refused as refused:

@@ -257,7 +257,7 @@ def test_every_stream_of_the_manifest_is_reported(connected: WheeledDriver) -> N
 def test_sonars_measure_a_person_in_the_laboratory() -> None:
     world = world_registry.get_world(ROBOTS / "rooms" / "lab")
     world.build()
-    world._processes = ()  # nobody walks by himself
+    world._processes = ()  # no walking person
     driver = WheeledDriver(
         robot_type=robot_type.load(FOLDER), world=world, device="qbo", prefix=world_registry.prefix("qbo")
     )

@@ -1,4 +1,4 @@
-"""What a simulated robot sees through the cameras of its model."""
+"""Cameras of simulated robots."""
 
 import msgspec
 import numpy as np
@@ -28,7 +28,7 @@ def test_a_robot_camera_shows_its_world(monkeypatch: pytest.MonkeyPatch) -> None
         assert taken is not None
         pixels = simplejpeg.decode_jpeg(taken.content)
         assert pixels.shape == (taken.height, taken.width, 3)
-        assert float(np.std(pixels)) > 5, "it sees nothing but one colour"
+        assert float(np.std(pixels)) > 5, "uniform image"
         with pytest.raises(DriverError, match="no camera 'ears'; available cameras: eyes"):
             driver.frame("ears")
     finally:

@@ -18,7 +18,7 @@ CREATE: object = mujoco_driver.create
 
 
 def third_party(monkeypatch: pytest.MonkeyPatch, **points: str) -> None:
-    """Let installed packages offer these entry points."""
+    """Simulate installed packages with these entry points."""
     offered = EntryPoints(EntryPoint(name, value, drivers.GROUP) for name, value in points.items())
     monkeypatch.setattr(plugins, "entry_points", lambda *, group: offered.select(group=group))
 

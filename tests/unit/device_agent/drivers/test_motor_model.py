@@ -1,4 +1,4 @@
-"""How simulated robots feel: models of heat, load and battery, and faults that are put into them."""
+"""Motor temperature, load, battery, and injected faults."""
 
 import logging
 import time
@@ -34,7 +34,7 @@ BATTERY = Battery(capacity_wh=50.0, full_v=25.0, empty_v=20.0, idle_w=25.0)
 
 
 class Life:
-    """A robot's days, in steps of a tenth of a second that are not waited for."""
+    """A motor model in simulated time."""
 
     def __init__(self, battery: Battery | None = None, *, share: float = 0.0) -> None:
         self.health = MotorModel(UR5.joints, battery, seed="arm")
@@ -131,9 +131,9 @@ def test_a_motor_at_its_limit_without_motion_has_stalled() -> None:
     health.clear()
     assert health.stalled(0.1, behind, effort, STILL) == []
     for innocent in (
-        (np.zeros(6), effort, STILL),  # where it should be: it carries
-        (behind, effort * 0.5, STILL),  # it could give more
-        (behind, effort, np.full(6, 0.1)),  # it moves
+        (np.zeros(6), effort, STILL),  # in position under load
+        (behind, effort * 0.5, STILL),  # below its limit
+        (behind, effort, np.full(6, 0.1)),  # in motion
     ):
         health.clear()
         assert [name for _ in range(30) for name in health.stalled(0.1, *innocent)] == []
@@ -226,7 +226,7 @@ def test_a_stuck_joint_is_an_error_until_reconnect(arm: MujocoDriver, faults: Pa
 
     hold(arm, target, failed)
     assert said[0].startswith("elbow does not move at full motor effort")
-    arm.connect()  # as the control loop does, a second later
+    arm.connect()  # as the control loop does
     seen = arm.observe()
     assert seen.position_rad[2] == pytest.approx(home[2], abs=0.05)
     faults.unlink()

@@ -42,7 +42,7 @@ def test_frames_are_relative_to_the_base(arm: MujocoDriver, tmp_path: Path):
     away.connect()
     try:
         for here, there in zip(arm.observe().frames, away.observe().frames, strict=True):
-            assert there == pytest.approx(here, abs=2e-3)  # hanging sideways, gravity differs; compensation is exact
+            assert there == pytest.approx(here, abs=2e-3)  # gravity differs, but its compensation is exact
     finally:
         away.close()
 
@@ -150,7 +150,7 @@ def test_a_hanging_simulation_is_detected(arm: MujocoDriver, monkeypatch: pytest
 
 
 def test_periodic_targets_give_smooth_motion():
-    """Driven by hand at a steady rate: velocity stays within 1 % once the servo follows."""
+    """The velocity stays within 1 % once the servo follows."""
     world = World(UR5 / "scene.xml", home=TYPE.home_rad)
     world.build()
     driver = MujocoDriver(robot_type=TYPE, world=world, device="arm")

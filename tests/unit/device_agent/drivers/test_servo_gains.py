@@ -1,4 +1,4 @@
-"""Servos that hold less: a limp arm hangs, holds others still, and is caught where it is."""
+"""Stiffness of simulated servos."""
 
 import mujoco
 import numpy as np
@@ -16,7 +16,7 @@ STAGE: Stage = None  # type: ignore[assignment]
 
 
 class Arm:
-    """A simulated arm, stepped by hand."""
+    """A manually stepped arm."""
 
     def __init__(self) -> None:
         self.world = World(ROBOT / KIND.scene, home=KIND.home_rad)

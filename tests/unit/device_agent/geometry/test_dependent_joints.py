@@ -1,4 +1,4 @@
-"""Poses and jogs of frames that hang on rods, or on joints of one motor: what the motors can do, or a clear no."""
+"""IK and jogs with dependent and mirrored joints."""
 
 import math
 
@@ -24,13 +24,13 @@ def loaded(name: str) -> tuple[RobotType, MujocoGeometry, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def head() -> tuple[RobotType, MujocoGeometry, np.ndarray]:
-    """Its motors move it by rods alone, but for the neck's turning."""
+    """Moved by rods, except for the neck's rotation."""
     return loaded("hanson")
 
 
 @pytest.fixture(scope="module")
 def walker() -> tuple[RobotType, MujocoGeometry, np.ndarray]:
-    """One motor turns a joint of both of its legs."""
+    """One motor turns a joint of both legs."""
     return loaded("nao")
 
 
@@ -75,7 +75,7 @@ def test_ik_moves_mirrored_joints_together(
 @pytest.mark.parametrize(
     ("robot", "frame", "twist"),
     [
-        ("hanson", "head", (0.0, 0.0, 0.0, 0.0, 0.05, 0.0)),  # a nod, which rods make
+        ("hanson", "head", (0.0, 0.0, 0.0, 0.0, 0.05, 0.0)),  # a nod by rods
         ("nao", "RLeg", (0.02, 0.0, 0.0, 0.0, 0.0, 0.0)),
     ],
 )
@@ -93,4 +93,4 @@ def test_jogs_use_motor_joints_only(
     asked, does = (
         (np.array(twist[:3]), linear) if any(twist[:3]) else (np.array([np.linalg.norm(twist)]), np.array([turned]))
     )
-    assert np.linalg.norm(does - asked) < 0.4 * np.linalg.norm(asked), "most of it; near its ends it is damped"
+    assert np.linalg.norm(does - asked) < 0.4 * np.linalg.norm(asked), "damped near the limits"

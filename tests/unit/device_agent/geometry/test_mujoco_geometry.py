@@ -1,4 +1,4 @@
-"""The shape of a robot: against MuJoCo's own contacts, and against looking at very many places."""
+"""Robot geometry, compared with MuJoCo's contacts and dense sampling."""
 
 import builtins
 import math
@@ -112,7 +112,7 @@ def test_glance_estimates_the_clear_share(shape: MujocoGeometry) -> None:
         assert shape.glance(HOME, down) == pytest.approx(shape.sweep([HOME, down]).share, abs=0.04)
     low = [0.0, -0.86, *HOME[2:]]
     assert shape.glance(low, HOME) == 1.0
-    assert shape.glance(low, [0.0, 0.3, *HOME[2:]]) < 1.0, "something else comes too near on that way"
+    assert shape.glance(low, [0.0, 0.3, *HOME[2:]]) < 1.0, "another pair is too close on that path"
 
 
 def test_no_point_is_faster_than_the_bound(shape: MujocoGeometry) -> None:
@@ -145,7 +145,7 @@ def test_no_point_is_faster_than_the_bound(shape: MujocoGeometry) -> None:
 
 
 def test_the_workspace_keeps_frames_inside(shape: MujocoGeometry) -> None:
-    beside = [1.2, -0.05, 0.3, HOME[3], HOME[4], 0.0]  # beside the table, and below its top
+    beside = [1.2, -0.05, 0.3, HOME[3], HOME[4], 0.0]  # beside the table, below its top
     found = shape.clearance(beside)
     assert found.room_m < 0
     narrow = msgspec.structs.replace(
@@ -355,7 +355,7 @@ def test_poses_in_a_room_are_relative_to_the_base(shape: MujocoGeometry, tmp_pat
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.7, -2.2])
 def test_room_objects_are_transformed_by_the_base_pose(tmp_path: Path, yaw_rad: float):
-    # As far from the base as the flange; the arm turns there about its base.
+    # At the flange's distance from the base.
     x, y = -0.36, -0.36
     place = (2.0 + x * math.cos(yaw_rad) - y * math.sin(yaw_rad), -1.0 + x * math.sin(yaw_rad) + y * math.cos(yaw_rad))
     post = f'<geom name="post" type="cylinder" size="0.05 0.6" pos="{place[0]} {place[1]} 1.3"/>'

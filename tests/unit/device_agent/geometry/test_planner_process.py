@@ -1,4 +1,4 @@
-"""Plans in a process of their own: the same ways, a clear end whatever becomes of that process, and never an orphan."""
+"""The planner process: equal results, cancellation, failures, and no orphans."""
 
 import math
 import os
@@ -36,12 +36,12 @@ HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
 BEYOND = [1.6, *HOME[1:]]
 PATIENCE_S = 60.0
 ANGLE = math.atan2(-0.414, -0.249)
-"""Half way between the two, seen from the arm."""
+"""Direction of the wall from the arm."""
 WALL = '<geom name="{}" type="box" size="0.9 0.02 1.5" pos="{} {} 1.5" euler="0 0 {}"/>'
 
 
 def walls() -> str:
-    """Two, that leave the arm no way from one side to the other."""
+    """Two walls that separate both sides."""
     return "".join(
         WALL.format(name, 1.1 * math.cos(at), 1.1 * math.sin(at), at)
         for name, at in (("before", ANGLE), ("behind", ANGLE + math.pi))
@@ -50,7 +50,7 @@ def walls() -> str:
 
 @pytest.fixture(scope="module")
 def divided(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The arm's table, divided: whoever looks for a way across looks until the end of the time."""
+    """The arm's scene divided by walls: planning across always times out."""
     folder = tmp_path_factory.mktemp("ur5")
     (folder / "ur5.xml").write_bytes((UR5 / "ur5.xml").read_bytes())
     text = (UR5 / KIND.scene).read_text(encoding="utf-8").replace("<worldbody>", f"<worldbody>{walls()}", 1)
@@ -112,7 +112,7 @@ def test_cancelling_kills_the_process(shape: MujocoGeometry) -> None:
 
 
 class Arm:
-    """An action on the arm."""
+    """An action of the arm."""
 
     def __init__(self, shape: MujocoGeometry) -> None:
         self.controller = Controller(KIND, LeaseGate(), geometry=shape)
@@ -129,7 +129,7 @@ class Arm:
         self.robot.reserve(1, lambda _: self.robot.end())
 
     def cross(self) -> Refused:
-        """Ask for what there is no way to; gives why it did not go."""
+        """Request an impossible motion; returns the rejection."""
         with pytest.raises(Refused) as refused:
             self.robot.execute(MoveJoints(position_rad={KIND.joints[0].name: BEYOND[0]}, speed=0.5, plan=True))
         return refused.value
@@ -150,7 +150,7 @@ def test_a_killed_planner_fails_the_action(shape: MujocoGeometry) -> None:
     assert "SIGKILL" in refused.message
     assert not arm.controller.moving
     assert arm.controller.commanded_rad == HOME
-    assert shape.plan(HOME, HOME), "asked again, another one does it"
+    assert shape.plan(HOME, HOME), "a new process starts"
 
 
 def test_a_hanging_planner_times_out(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:

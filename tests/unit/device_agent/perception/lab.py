@@ -33,7 +33,7 @@ WALK = (Twist(0.1, 0.0, 0.0), Twist(0.08, 0.0, 0.3), Twist(-0.05, 0.0, 0.3), Twi
 
 @contextlib.contextmanager
 def by_hand() -> Iterator[None]:
-    """Time is driven by hand: everything that looks sees the present, and nobody minds how long a picture takes."""
+    """Manual time: no cached views and no timeouts."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shared_view, "OLDEST_S", -1.0)
         patch.setattr(cameras, "FRESH_S", -1.0)
@@ -109,7 +109,7 @@ class Watched:
         self.sight.advance(self.now_s)
 
     def truth(self) -> dict[str, tuple[float, float]]:
-        """Where everybody is."""
+        """True positions of all objects."""
         found = {person.name: self.world.place(person.name)[:2] for person in self.world.manifest.people}
         for robot in self.world.manifest.robots:
             found[robot.name] = self.world.place(robot_base(self.world.model, robot.name))[:2]

@@ -184,7 +184,7 @@ class Playground:
         )
 
     def in_view(self, name: str) -> bool:
-        """Whether the middle of somebody is in the depth camera's picture."""
+        """Whether an object's centre is visible to the depth camera."""
         walker = self.walkers[name]
         seen = (np.array([walker.x_m, walker.y_m, 0.3]) - self.camera_m) @ self.camera
         per_pixel = 2 * math.tan(FOVY_RAD / 2) / HEIGHT

@@ -16,9 +16,9 @@ MEDIAN_M = 0.15
 """What issue 5 promises."""
 ALL = {"person", "ur5", "nao", "qbo", "hanson"}
 UNKNOWN = 0.05
-"""Share of looks in which somebody may be nowhere."""
+"""Tolerated share of missing detections."""
 KNOWN_S = 4.4
-"""Until then whoever stands on a table must be known [s]."""
+"""Time until a fixed robot must be located [s]."""
 SAME = 0.01
 """Share of beams and pixels that may see something else than the survey."""
 
@@ -40,7 +40,7 @@ def test_the_shipped_background_matches_the_room() -> None:
     """When this fails the furniture has moved: `python robots/rooms/survey.py lab`."""
     manifest = StillWorld().manifest
     watched = Watched(msgspec.structs.replace(manifest, robots=(), people=()))
-    watched.world.add(Nobody())
+    watched.world.add(EmptyRoom())
     watched.world.go_on(4.0)
     try:
         for name in EYES:
@@ -49,7 +49,7 @@ def test_the_shipped_background_matches_the_room() -> None:
         watched.close()
 
 
-class Nobody:
+class EmptyRoom:
     def step(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ARG002 - as `Process` has it
         data.mocap_pos[:, 2] = -50.0
 
@@ -65,7 +65,7 @@ def kept(found: dict[str, list[float]]) -> None:
 
 @pytest.fixture(scope="module")
 def seen() -> tuple[Watched, dict[str, list[float]]]:
-    """The laboratory after a while of watching, and how far off everybody was meanwhile."""
+    """The laboratory after some time, and the position errors during it."""
     watched = Watched(walks=True)
     try:
         watched.look(KNOWN_S)

@@ -18,7 +18,7 @@ PERIOD_S = 0.2
 NEAR_M = 0.15
 
 
-def somebody(x_m: float, y_m: float, height_m: float = LOW_M) -> np.ndarray:
+def cylinder(x_m: float, y_m: float, height_m: float = LOW_M) -> np.ndarray:
     """What a depth camera sees of something round."""
     turn, up = np.meshgrid(np.linspace(-1.3, 1.3, 12), np.linspace(0.1, height_m, 12))
     return np.column_stack((x_m + 0.1 * np.cos(turn.ravel()), y_m + 0.1 * np.sin(turn.ravel()), up.ravel()))
@@ -32,13 +32,13 @@ class Floor:
         self.now_s = 0.0
 
     def watch(self, *seen: tuple[float, float], for_s: float = 2.0, height_m: float = LOW_M) -> None:
-        points = np.concatenate([np.zeros((0, 3)), *(somebody(x, y, height_m) for x, y in seen)])
+        points = np.concatenate([np.zeros((0, 3)), *(cylinder(x, y, height_m) for x, y in seen)])
         for _ in range(round(for_s / PERIOD_S)):
             self.now_s += PERIOD_S
             self.tracks.update("depth", points, CAMERA_M, self.now_s)
 
     def holds(self, **expected: tuple[float, float]) -> bool:
-        """Whether those are known, nobody else, and each about there."""
+        """Whether exactly these objects are located, each near its position."""
         places = self.tracks.positions(self.now_s)
         off = {name: math.dist(at, (places[name].x_m, places[name].y_m)) for name, at in expected.items()}
         return set(places) == set(expected) and max(off.values()) < NEAR_M
@@ -70,7 +70,7 @@ def test_the_last_position_takes_precedence_over_the_start() -> None:
         floor.watch((one[0], one[1]), (other[0], other[1]), for_s=0.4)
     assert floor.holds(nao=(-0.9, 0.4), qbo=(0.0, 0.0))
     floor.watch(for_s=5.0)
-    assert floor.holds(nao=(-0.9, 0.4), qbo=(0.0, 0.0)), "nobody saw them leave"
+    assert floor.holds(nao=(-0.9, 0.4), qbo=(0.0, 0.0)), "still at their last positions"
     floor.watch((0.1, 0.1), (-0.9, 0.5), for_s=3.0)
     assert floor.holds(nao=(-0.9, 0.5), qbo=(0.1, 0.1))
 
@@ -117,7 +117,7 @@ def test_a_hidden_fixed_robot_is_reported_with_its_age() -> None:
     robot = FixedRobot(ARM)
     now_s = look(robot, on_table(1.0, 1.0), from_s=0.0)
     before = robot.position(now_s)
-    # Somebody's hand within its reach is not its base.
+    # A hand within reach is not the base.
     now_s = look(robot, on_table(1.3, 1.0), from_s=now_s, for_s=6.0)
     place = robot.position(now_s)
     assert before is not None

@@ -104,7 +104,7 @@ def test_blocked_keeps_the_radius_from_walls():
     assert not floor.at(3.65, 1.5)
     assert not floor.at(1.0, 1.0)
     assert floor.at(9.0, 1.0), "outside of the grid"
-    assert floor.at(-0.4, 1.0), "behind the wall nobody has looked"
+    assert floor.at(-0.4, 1.0), "unknown behind the wall"
     assert not grid.blocked(0.1, unknown=False).at(-0.4, 1.0)
 
 
@@ -168,7 +168,7 @@ def test_scripts_can_decode_the_rows():
         (-2.5, 0.6, True),
         (0.0, 0.0, False),
         (1.5, -1.0, False),
-        (0.0, 2.0, None),  # nobody looked there
+        (0.0, 2.0, None),  # unknown
         (3.1, 0.0, None),  # behind the wall
         (50.0, 0.0, None),
     ):

@@ -28,7 +28,7 @@ def empty():
 
 
 def errors(empty, seed, seconds):
-    """Distances to the truth of those in view, by name; who was in view and not told of; names that nobody has."""
+    """Position errors by name, undetected objects in view, and unexpected names."""
     ground, eyes = Playground(seed), sight(empty)
     found: dict[str, list[float]] = {}
     missed: list[str] = []

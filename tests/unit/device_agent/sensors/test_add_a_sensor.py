@@ -1,4 +1,4 @@
-"""``docs/guides/add-a-sensor.md``, done as it stands: the files, found by the agent, through the suite."""
+"""The files of ``docs/guides/add-a-sensor.md`` work as they are."""
 
 import os
 import re
@@ -42,6 +42,6 @@ def test_the_guides_driver_passes_the_contract(folder: Path) -> None:
 
 
 def test_the_agent_lists_room_and_driver(folder: Path) -> None:
-    done = run(folder, "-m", "device_agent", "devices", "--home", str(folder / "nobody"))
+    done = run(folder, "-m", "device_agent", "devices", "--home", str(folder / "missing"))
     assert "room    roof: Roof" in done.stdout, done.stdout + done.stderr
     assert "sensor  weather_station" in done.stdout

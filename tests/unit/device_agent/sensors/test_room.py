@@ -80,7 +80,7 @@ def met_by(scan: Scan) -> np.ndarray:
     return points[seen, :2]
 
 
-# ---------------------------------------------------------------- somebody moves
+# ---------------------------------------------------------------- motion
 
 
 def test_the_motion_detector_only_detects_motion(world: StillWorld) -> None:
@@ -93,13 +93,13 @@ def test_the_motion_detector_only_detects_motion(world: StillWorld) -> None:
     assert {present for present, _ in told} == {True, False}
     rose = [speed for (before, _), (after, speed) in pairwise(told) if after and not before]
     assert rose, "it never woke"
-    assert min(rose) > 0.1, "it woke while nobody walked"
+    assert min(rose) > 0.1, "false detection"
 
 
 def test_the_motion_detector_ignores_cold_and_hidden_bodies(world: StillWorld) -> None:
     entry = world.entry("pir")
     still = connected(world, changed(entry, options={"warm": ["chair"]}))
-    door = connected(world, changed(entry, options={"warm": ["nobody"]}))
+    door = connected(world, changed(entry, options={"warm": ["unknown"]}))
     world.set("door", 1.5)
     for _ in range(20):
         world.go_on(0.25)

@@ -1,4 +1,4 @@
-"""Joints without a motor of their own: what is worked out is where the physics takes them."""
+"""Dependent joints are computed as the physics moves them."""
 
 import mujoco
 import numpy as np

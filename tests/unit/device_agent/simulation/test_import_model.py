@@ -1,4 +1,4 @@
-"""Other people's models become robot types, or are refused with what to do."""
+"""Importing MuJoCo models as robot types."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What is left out of a picture to save time would not have shown in it."""
+"""Culling does not change images."""
 
 import mujoco
 import numpy as np
@@ -19,7 +19,7 @@ def lab() -> StillWorld:
 def drawn(
     lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch, *, depth: bool
 ) -> tuple[renderer.RenderedImage, ...]:
-    """A picture as it is, and one with everything in it, by the same lamps."""
+    """An image with culling, and one without."""
     wish = (mujoco.mj_name2id(lab.model, mujoco.mjtObj.mjOBJ_CAMERA, camera), SIZE[0], SIZE[1])
     seen = renderer.Renderer(lab)
     seen.open()
@@ -34,7 +34,7 @@ def drawn(
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_culling_does_not_change_depth_images(lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch) -> None:
     quick, whole = drawn(lab, camera, monkeypatch, depth=True)
-    # Specks below a pixel may be missing: of 19,200 pixels not one in a hundred.
+    # Geoms below a pixel may be missing: less than 1 % of 19,200 pixels.
     assert np.mean(np.abs(quick.pixels - whole.pixels) > 0.01) < 0.01
 
 

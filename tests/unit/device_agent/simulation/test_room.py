@@ -1,4 +1,4 @@
-"""A room in simulation: robots that share a world, somebody who walks, what air, light and sound do."""
+"""A simulated room: shared world, walking person, air, light and sound."""
 
 import gc
 import math
@@ -32,7 +32,7 @@ def lab(manifest: Room = MANIFEST) -> World:
 
 
 EMPTY = msgspec.structs.replace(MANIFEST, robots=())
-"""Without its robots it is five times as fast."""
+"""Without robots, five times faster."""
 
 
 def changed(**climate: float) -> Room:
@@ -124,8 +124,8 @@ def test_a_driver_uses_the_robot_of_its_name():
         )
     finally:
         arm.close()
-    stranger = driver.create(kind, ROBOTS / "ur5", {"room": str(LAB)}, "nobody")
-    with pytest.raises(DriverError, match="no joint 'nobody/shoulder_pan'"):
+    stranger = driver.create(kind, ROBOTS / "ur5", {"room": str(LAB)}, "unknown")
+    with pytest.raises(DriverError, match="no joint 'unknown/shoulder_pan'"):
         stranger.connect()
 
 
@@ -196,7 +196,7 @@ def test_the_persons_path_is_free_of_obstacles():
     hit = np.full(1, -1, dtype=np.int32)
     corners = np.array(MANIFEST.people[0].path_m)
     for here, there in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        for side_m in (-0.25, 0.0, 0.25):  # at its hips, elbows included
+        for side_m in (-0.25, 0.0, 0.25):  # at hip width including elbows
             way = (there - here) / np.linalg.norm(there - here)
             start = np.array((*(here + side_m * np.array((-way[1], way[0]))), 0.3))
             away_m = mujoco.mj_ray(world.model, data, start, np.array((*way, 0.0)), None, True, -1, hit, None)
@@ -225,9 +225,9 @@ def test_the_person_stops_for_a_robot_and_turns_around():
 
 
 def test_a_missing_body_of_the_person_is_an_error():
-    manifest = msgspec.structs.replace(MANIFEST, people=(room.Person(name="nobody", path_m=((0.0, 0.0), (1.0, 0.0))),))
+    manifest = msgspec.structs.replace(MANIFEST, people=(room.Person(name="unknown", path_m=((0.0, 0.0), (1.0, 0.0))),))
     world = lab(manifest)
-    with pytest.raises(DriverError, match="no mocap body 'nobody'"):
+    with pytest.raises(DriverError, match="no mocap body 'unknown'"):
         world.step(2)
 
 

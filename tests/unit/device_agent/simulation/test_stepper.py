@@ -1,4 +1,4 @@
-"""Many steps in one call are those that one call each would have made."""
+"""Batched steps equal single steps."""
 
 import copy
 
@@ -19,7 +19,7 @@ def test_batched_steps_equal_single_steps() -> None:
     stepper, chance = Stepper(model), np.random.default_rng(5)
     for count in (1, 2, 4, 2, 4, 1, 4):
         rows = one.ctrl + chance.normal(0.0, 0.02, (count, model.nu))
-        push = chance.normal(0.0, 0.5, (model.nbody, 6))  # what processes of the world do is kept, too
+        push = chance.normal(0.0, 0.5, (model.nbody, 6))  # external forces are kept
         one.xfrc_applied[:], many.xfrc_applied[:] = push, push
         one.mocap_pos[:] += 0.01
         many.mocap_pos[:] += 0.01

@@ -1,4 +1,4 @@
-"""The twin moves as the simulation does: the page computes exactly this."""
+"""The twin's kinematics equal the simulation's."""
 
 import json
 import math
@@ -40,7 +40,7 @@ def transform(turn: Matrix, position: Any = (0.0, 0.0, 0.0)) -> Matrix:
 
 
 def geometry_poses(twin: Twin, position_rad: dict[str, float]) -> list[Matrix]:
-    """Forward kinematics of the drawing alone, in the base's frame: one 4 by 4 pose per shape."""
+    """Forward kinematics of the twin in the base's frame: one 4x4 pose per shape."""
     bodies: list[Matrix] = []
     shapes: list[Matrix] = []
     for body in twin.bodies:
@@ -99,7 +99,7 @@ def test_forward_kinematics_of_the_twin_equals_the_simulation(folder: Path):
     base = int(model.body_rootid[model.jnt_bodyid[model.joint(manifest.joints[0].name).id]])
     twin = build_twin(model, base=base, device="arm", scenery_m=math.inf)
     read_back = codec.decode(codec.encode(twin, limit=codec.MAX_RETAINED_BYTES), Twin)
-    # What stands around a robot that goes away from it is not drawn in its own frame.
+    # The twin of a mobile robot excludes the scene.
     assert_same_poses(model, read_back, base, scenery=bool(model.body_weldid[base] == 0))
 
 
@@ -139,7 +139,7 @@ def test_a_moving_base_is_the_origin():
     model = mujoco.MjModel.from_xml_string(floating)
     base = model.body("base").id
     twin = build_twin(model, base=base, device="x", scenery_m=math.inf)
-    assert "scene" not in [body.name for body in twin.bodies], "what stands still would move with the robot"
+    assert "scene" not in [body.name for body in twin.bodies], "static objects would move with the robot"
     assert_same_poses(model, twin, base, scenery=False)
 
 
@@ -183,7 +183,7 @@ def test_colours_come_from_material_or_geom():
 
 
 def test_the_web_fixture_is_up_to_date() -> None:
-    """Else run ``.venv/bin/python web/tests/fixtures/make.py``."""
+    """If it fails, run ``.venv/bin/python web/tests/fixtures/make.py``."""
     fixtures = ROBOTS.parent / "web" / "tests" / "fixtures"
     made = runpy.run_path(str(fixtures / "make.py"))["content"]()
     kept = json.loads((fixtures / "ur5.json").read_text(encoding="utf-8"))
@@ -191,7 +191,7 @@ def test_the_web_fixture_is_up_to_date() -> None:
 
 
 def alike(one: Any, other: Any) -> bool:
-    """The same but for the last digits of numbers: another machine may round otherwise."""
+    """Equal except for rounding differences."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(alike(one[name], other[name]) for name in one)
     if isinstance(one, list | tuple) and isinstance(other, list | tuple):

@@ -1,4 +1,4 @@
-"""The world: time, commands, snapshots, trace, faults."""
+"""The simulated world: time, commands, snapshots, trace, faults."""
 
 import json
 import logging
@@ -124,8 +124,8 @@ def test_effort_includes_gravity_compensation(tmp_path: Path, counted_by_the_mod
     (tmp_path / "arm.xml").write_text(model)
     world = World(tmp_path / "arm.xml", home=HOME)
     world.build()
-    assert abs(world.step(10).effort[1]) > 10  # the shoulder carries the arm
-    assert abs(world.step(10).effort[0]) < 0.1  # the base turns about the vertical
+    assert abs(world.step(10).effort[1]) > 10  # gravity load of the arm
+    assert abs(world.step(10).effort[0]) < 0.1  # vertical axis, no gravity load
 
 
 def test_real_time_runs_while_there_are_users():
@@ -195,7 +195,7 @@ def test_lost_time_is_reported(monkeypatch: pytest.MonkeyPatch, caplog: pytest.L
     lost_s = snapshot.lag_ms / 1000
     assert lost_s >= MAX_CATCH_UP_S * 9
     assert "cannot keep up" in caplog.text
-    # What is lost stays lost: stepping it after all, in a burst, would be a jump.
+    # Lost time must not be caught up in a burst.
     assert snapshot.time_s + lost_s <= snapshot.taken_s - before + 0.005
 
 
