@@ -190,7 +190,7 @@ def test_a_survey_can_be_captured(driver, monkeypatch):
     [
         ({"lenses": []}, "lenses.*lidars, cameras"),
         ({"look_hz": 0}, "look_hz"),
-        ({"kinds": [{"name": "x", "lowest_m": 2, "highest_m": 1, "radius_m": 0}]}, "heights rise"),
+        ({"kinds": [{"name": "x", "lowest_m": 2, "highest_m": 1, "radius_m": 0}]}, "heights must increase"),
     ],
 )
 def test_invalid_options_are_rejected(folder, eyes, more, says):
