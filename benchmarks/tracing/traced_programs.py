@@ -58,7 +58,7 @@ def functions(arguments: Sequence[str]) -> int:
     from function_app import __main__ as program
     from function_app.adapters.local.tables import SqliteTables
     from function_app.entrypoints.hosts import uvicorn
-    from function_app.entrypoints.http.framework.authentication import Caller
+    from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
     from function_app.services.actions import acks
     from function_app.services.messaging.delivery import Delivery
     from function_app.services.storage import records
@@ -69,7 +69,7 @@ def functions(arguments: Sequence[str]) -> int:
         return lambda _self, table, *_: tell(name) if table == records.CONTROL else None
 
     _wrap(uvicorn, "create_app", lambda create: lambda *given: _Door(create(*given), tell))
-    _wrap(Caller, "account", _told_after(lambda *_: tell("identified")))
+    _wrap(RequestAuthenticator, "account", _told_after(lambda *_: tell("identified")))
     _wrap(SqliteTables, "batch", _told_first(to_control("writing")))
     _wrap(SqliteTables, "batch", _told_after(to_control("written")))
     _wrap(Delivery, "send", _told_first(lambda *_: tell("publishing")))

@@ -22,7 +22,7 @@ from function_app.entrypoints.http.console import Console
 from function_app.entrypoints.http.control import lease, mqtt_credentials
 from function_app.entrypoints.http.devices import devices
 from function_app.entrypoints.http.framework.api_reference import reference
-from function_app.entrypoints.http.framework.authentication import COOKIE, Caller, is_stop
+from function_app.entrypoints.http.framework.authentication import COOKIE, RequestAuthenticator, is_stop
 from function_app.entrypoints.http.framework.client_address import client_address
 from function_app.entrypoints.http.framework.responses import JSON, problem
 from function_app.entrypoints.http.framework.route_index import RouteIndex
@@ -71,35 +71,35 @@ def create_app(functions: Functions) -> FastAPI:
         lifespan=lifespan,
         redirect_slashes=False,
     )
-    caller = Caller(functions.authenticator, functions.api_keys, functions.rate_limiter)
+    authenticator = RequestAuthenticator(functions.authenticator, functions.api_keys, functions.rate_limiter)
     resources = (
-        auth.router(functions, caller),
-        me.router(functions, caller),
+        auth.router(functions, authenticator),
+        me.router(functions, authenticator),
         oidc.router(functions),
-        api_keys.router(functions, caller),
-        agents.router(functions, caller),
-        polling.router(functions, caller),
-        audit.router(functions, caller),
-        devices.router(functions, caller),
-        device_library.router(functions, caller),
-        shares.router(functions, caller),
-        invitations.router(functions, caller),
-        lease.router(functions, caller),
-        stop.router(functions, caller),
-        actions.router(functions, caller),
-        many.router(functions, caller),
-        robot_types.router(functions, caller),
-        previews.router(functions, caller),
-        movements.router(functions, caller),
-        script_editor.router(functions, caller),
-        mqtt_credentials.router(functions, caller),
-        xmpp.router(functions, caller),
-        latency.router(functions, caller),
-        faults.router(functions, caller),
-        events.router(functions, caller),
-        diagnostics.router(functions, caller),
-        series.router(functions, caller),
-        uploads.router(functions, caller),
+        api_keys.router(functions, authenticator),
+        agents.router(functions, authenticator),
+        polling.router(functions, authenticator),
+        audit.router(functions, authenticator),
+        devices.router(functions, authenticator),
+        device_library.router(functions, authenticator),
+        shares.router(functions, authenticator),
+        invitations.router(functions, authenticator),
+        lease.router(functions, authenticator),
+        stop.router(functions, authenticator),
+        actions.router(functions, authenticator),
+        many.router(functions, authenticator),
+        robot_types.router(functions, authenticator),
+        previews.router(functions, authenticator),
+        movements.router(functions, authenticator),
+        script_editor.router(functions, authenticator),
+        mqtt_credentials.router(functions, authenticator),
+        xmpp.router(functions, authenticator),
+        latency.router(functions, authenticator),
+        faults.router(functions, authenticator),
+        events.router(functions, authenticator),
+        diagnostics.router(functions, authenticator),
+        series.router(functions, authenticator),
+        uploads.router(functions, authenticator),
         health_check.router(functions),
     )
     routers = [*(routes.router for routes in resources), blob_transfers.router(functions.transfers)]

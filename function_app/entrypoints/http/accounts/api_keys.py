@@ -1,4 +1,4 @@
-"""``api-keys``."""
+"""API keys."""
 
 from fastapi import Request, Response
 
@@ -7,49 +7,49 @@ from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.identity.accounts import Role
 from function_app.domain.identity.api_keys import ApiKey
 from function_app.entrypoints.http.accounts import schemas
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer, empty, read
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.services.accounts.api_keys import ApiKeyRequest
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes. None of them takes a key: a key makes no keys."""
     routes = Routes("accounts")
 
-    @routes.add("GET", "/api-keys", summary="One's API keys", answers={200: schemas.ApiKeyList})
+    @routes.add("GET", "/api-keys", summary="List API keys", responses={200: schemas.ApiKeyList})
     async def list_api_keys(request: Request) -> Response:
-        """The newest first, without their secrets; those that have run out are shown for thirty days more."""
-        who = await caller.account(request)
+        """Newest first, without secrets. Expired keys stay listed for 30 days."""
+        caller = await auth.account(request)
         now_ms = functions.clock.now_ms()
-        items = tuple(_show(key, now_ms) for key in await functions.api_keys.of(who.account))
-        return answer(schemas.ApiKeyList(items=items, cursor=None))
+        items = tuple(_show(key, now_ms) for key in await functions.api_keys.of(caller.account))
+        return json_response(schemas.ApiKeyList(items=items, cursor=None))
 
     @routes.add(
         "POST",
         "/api-keys",
-        summary="Make an API key",
+        summary="Create an API key",
         body=schemas.ApiKeyRequest,
-        answers={201: schemas.ApiKeyCreated},
+        responses={201: schemas.ApiKeyCreated},
         problems=(404, 409),
     )
     async def create_api_key(request: Request) -> Response:
-        """For a program of somebody else's, which shows ``token`` as a bearer token. It is told this once.
+        """The response contains ``token``, a bearer token for another program. It is returned only once.
 
-        A key watches, or operates too; it never owns, shares, pairs, saves movements, resets a Stop or makes keys. It
-        may be kept to some devices (their ids) and spaces (``space:<id>``).
+        A key has the role viewer or operator. It cannot own, share, pair, save movements, reset a Stop or create keys.
+        ``only`` restricts it to devices (ids) and spaces (``space:<id>``).
         """
-        who = await caller.account(request)
-        asked: schemas.ApiKeyRequest = await read(request, schemas.ApiKeyRequest)
-        wanted = ApiKeyRequest(label=asked.name, most=Role(asked.role), only=asked.only, days=asked.days)
-        key, token = await functions.api_keys.make(who, wanted)
+        caller = await auth.account(request)
+        payload: schemas.ApiKeyRequest = await read(request, schemas.ApiKeyRequest)
+        wanted = ApiKeyRequest(label=payload.name, most=Role(payload.role), only=payload.only, days=payload.days)
+        key, token = await functions.api_keys.make(caller, wanted)
         body = schemas.ApiKeyCreated(api_key=_show(key, functions.clock.now_ms()), token=token)
-        return answer(body, 201, {"Cache-Control": "no-store"})
+        return json_response(body, 201, {"Cache-Control": "no-store"})
 
-    @routes.add("DELETE", "/api-keys/{key}", summary="Revoke an API key", answers={204: None}, problems=(404,))
+    @routes.add("DELETE", "/api-keys/{key}", summary="Revoke an API key", responses={204: None}, problems=(404,))
     async def revoke_api_key(request: Request, key: str) -> Response:
-        """It is refused, its connections to the broker are cut, and what it controls is let go."""
-        await functions.api_keys.revoke(await caller.account(request), key)
+        """Rejects the key, closes its broker connections and releases its leases."""
+        await functions.api_keys.revoke(await auth.account(request), key)
         return empty()
 
     return routes

@@ -1,4 +1,4 @@
-"""``accounts/me/audit``: who did what in one's own account."""
+"""The audit log of the signed-in account."""
 
 from typing import Annotated
 
@@ -7,8 +7,8 @@ from fastapi import Query, Request, Response
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import LAST_MS, rfc3339
 from function_app.entrypoints.http.accounts import schemas
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import json_response
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
 from function_app.services.audit.audit_reader import AuditFilter
 
@@ -24,12 +24,16 @@ Until = Annotated[
 ]
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("accounts")
 
     @routes.add(
-        "GET", "/accounts/me/audit", summary="Who did what", answers={200: schemas.AuditList}, problems=(403, 422)
+        "GET",
+        "/accounts/me/audit",
+        summary="Read the audit log",
+        responses={200: schemas.AuditList},
+        problems=(403, 422),
     )
     async def read_audit(  # noqa: PLR0917 (FastAPI names them)
         request: Request,
@@ -40,12 +44,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
         cursor: Cursor = None,
         limit: Limit = 100,
     ) -> Response:
-        """In the account that asks, and on its devices, whoever did it: who took and lost control, what was refused,
-        every Stop, claim, share, key and sign-in. Each record's hash covers the one before it.
-        """  # noqa: D205
-        who = await caller.account(request)
+        """Records of the account and its devices, for every actor.
+
+        They cover control changes, rejected requests, Stops, claims, shares, keys and sign-ins. Each hash covers the
+        record before it.
+        """
+        caller = await auth.account(request)
         wanted = AuditFilter(what=event, on=target, since_ms=since, until_ms=until)
-        records, following = await functions.audit_reader.read(who, wanted, cursor=cursor, limit=limit)
+        records, following = await functions.audit_reader.read(caller, wanted, cursor=cursor, limit=limit)
         items = tuple(
             schemas.AuditRecordOut(
                 seq=record["seq"],
@@ -62,6 +68,6 @@ def router(functions: Functions, caller: Caller) -> Routes:
             )
             for record in records
         )
-        return answer(schemas.AuditList(items=items, cursor=following))
+        return json_response(schemas.AuditList(items=items, cursor=following))
 
     return routes

@@ -1,11 +1,11 @@
-"""The page's cookie, and what is answered to somebody who has signed in."""
+"""The session cookie, and the response to a sign-in."""
 
 from fastapi import Request, Response
 
 from function_app.entrypoints.http.accounts import schemas
 from function_app.entrypoints.http.framework.authentication import COOKIE
 from function_app.entrypoints.http.framework.client_address import client_address
-from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.responses import json_response
 from function_app.entrypoints.http.framework.schemas import AccountRef
 from function_app.services.identity.sessions import SignedIn, SignInOrigin
 from function_app.settings import Settings
@@ -36,7 +36,7 @@ def signed_in(settings: Settings, done: SignedIn, status: int = 200) -> Response
         session=done.session,
         csrf_token=done.csrf,
     )
-    return answer(body, status, {"Set-Cookie": set_session(settings, done), "Cache-Control": "no-store"})
+    return json_response(body, status, {"Set-Cookie": set_session(settings, done), "Cache-Control": "no-store"})
 
 
 def whence(request: Request, settings: Settings) -> SignInOrigin:

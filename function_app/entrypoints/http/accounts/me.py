@@ -1,4 +1,4 @@
-"""``accounts/me``: who is signed in, their password, their sessions."""
+"""The signed-in account: password and sessions."""
 
 from fastapi import Request, Response
 
@@ -6,42 +6,45 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.accounts import schemas
 from function_app.entrypoints.http.accounts.cookies import whence
-from function_app.entrypoints.http.framework.authentication import Caller, bearer
-from function_app.entrypoints.http.framework.responses import answer, empty, read
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, bearer
+from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("accounts")
 
-    @routes.add("GET", "/accounts/me", summary="Who is signed in", answers={200: schemas.AccountOut})
+    @routes.add("GET", "/accounts/me", summary="Get the signed-in account", responses={200: schemas.AccountOut})
     async def me(request: Request) -> Response:
-        """The account and sign-in session behind the token or cookie; to a page, what it shows with its cookie."""
-        who, csrf = (await caller.account(request), None) if bearer(request) else await caller.page(request)
-        body = schemas.AccountOut(id=who.account, name=who.name, session=who.session, csrf_token=csrf)
-        return answer(body, headers={"Cache-Control": "no-store"})
+        """The account and session of the token or cookie. With a cookie also the CSRF token."""
+        caller, csrf = (await auth.account(request), None) if bearer(request) else await auth.page(request)
+        body = schemas.AccountOut(id=caller.account, name=caller.name, session=caller.session, csrf_token=csrf)
+        return json_response(body, headers={"Cache-Control": "no-store"})
 
     @routes.add(
         "PUT",
         "/accounts/me/password",
         summary="Set or change the password",
         body=schemas.PasswordRequest,
-        answers={204: None},
+        responses={204: None},
         problems=(409, 429),
     )
     async def put_password(request: Request) -> Response:
-        """Ends every other session. Without the old one only within 10 minutes of signing in by a one-time link."""
-        who = await caller.account(request)
-        asked: schemas.PasswordRequest = await read(request, schemas.PasswordRequest)
+        """Ends every other session.
+
+        The old password is not required within 10 minutes of signing in with a one-time link.
+        """
+        caller = await auth.account(request)
+        payload: schemas.PasswordRequest = await read(request, schemas.PasswordRequest)
         place = whence(request, functions.settings)
-        await functions.passwords.put(who, asked.password, old=asked.old_password, whence=place)
+        await functions.passwords.put(caller, payload.password, old=payload.old_password, whence=place)
         return empty()
 
-    @routes.add("GET", "/accounts/me/sessions", summary="One's sign-in sessions", answers={200: schemas.SessionList})
+    @routes.add("GET", "/accounts/me/sessions", summary="List sign-in sessions", responses={200: schemas.SessionList})
     async def list_sessions(request: Request) -> Response:
-        """Those that have not ended, the newest first."""
-        who = await caller.account(request)
+        """Active sessions, newest first."""
+        caller = await auth.account(request)
         items = tuple(
             schemas.SessionOut(
                 id=each.id,
@@ -50,28 +53,28 @@ def router(functions: Functions, caller: Caller) -> Routes:
                 expires_at=rfc3339(each.expires_ms),
                 address=each.address,
                 program=each.program,
-                mine=each.id == who.session,
+                mine=each.id == caller.session,
             )
-            for each in await functions.sessions.list(who.account)
+            for each in await functions.sessions.list(caller.account)
         )
-        return answer(schemas.SessionList(items=items, cursor=None))
+        return json_response(schemas.SessionList(items=items, cursor=None))
 
     @routes.add(
         "DELETE",
         "/accounts/me/sessions",
-        summary="End every other session",
-        answers={200: schemas.SessionsEnded},
+        summary="End all other sessions",
+        responses={200: schemas.SessionsEnded},
     )
     async def end_other_sessions(request: Request) -> Response:
-        """The one that asks stays."""
-        return answer(schemas.SessionsEnded(ended=await functions.sign_out.others(await caller.account(request))))
+        """The session of the request stays."""
+        return json_response(schemas.SessionsEnded(ended=await functions.sign_out.others(await auth.account(request))))
 
     @routes.add(
-        "DELETE", "/accounts/me/sessions/{session}", summary="End a session", answers={204: None}, problems=(404,)
+        "DELETE", "/accounts/me/sessions/{session}", summary="End a session", responses={204: None}, problems=(404,)
     )
     async def end_session(request: Request, session: str) -> Response:
-        """Its tokens are refused, its connections to the broker cut, what it controls let go."""
-        await functions.sign_out.one(await caller.account(request), session)
+        """Rejects its tokens, closes its broker connections and releases its leases."""
+        await functions.sign_out.one(await auth.account(request), session)
         return empty()
 
     return routes

@@ -1,4 +1,4 @@
-"""``auth/methods``, ``auth/oidc``: how one may sign in, and signing in elsewhere."""
+"""Sign-in methods, and sign-in with OpenID Connect."""
 
 from typing import Annotated
 
@@ -9,7 +9,7 @@ from function_app.domain.common.problems import Problem
 from function_app.entrypoints.http.accounts import schemas
 from function_app.entrypoints.http.accounts.cookies import secure, set_session, whence
 from function_app.entrypoints.http.framework.authentication import refuse_other_sites
-from function_app.entrypoints.http.framework.responses import answer, read
+from function_app.entrypoints.http.framework.responses import json_response, read
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
 from function_app.services.accounts.oidc_sign_in import BEGUN_S, OidcCallback, OidcRedirect
 from function_app.settings import Settings
@@ -26,26 +26,30 @@ def router(functions: Functions) -> Routes:
     settings = functions.settings
 
     @routes.add(
-        "GET", "/auth/methods", summary="How one may sign in", answers={200: schemas.SignInMethodsOut}, caller="nobody"
+        "GET",
+        "/auth/methods",
+        summary="List sign-in methods",
+        responses={200: schemas.SignInMethodsOut},
+        caller="nobody",
     )
     async def sign_in_methods(_request: Request) -> Response:
-        """For the page. A one-time link works everywhere."""
+        """For the sign-in page. A one-time link is always accepted."""
         known = settings.oidc
         elsewhere = schemas.OidcProviderOut(name=known.name, url=f"{PREFIX}{_PATH}/start") if known else None
-        return answer(schemas.SignInMethodsOut(link=True, password=True, oidc=elsewhere))
+        return json_response(schemas.SignInMethodsOut(link=True, password=True, oidc=elsewhere))
 
     @routes.add(
         "GET",
         f"{_PATH}/start",
-        summary="Sign in elsewhere",
-        answers={303: None},
+        summary="Sign in with OpenID Connect",
+        responses={303: None},
         problems=(404,),
         caller="nobody",
     )
     async def start_oidc_sign_in(_request: Request) -> Response:
-        """Sends the browser to the OpenID Connect provider (code flow with PKCE), and marks it with a cookie.
+        """Redirects the browser to the OpenID Connect provider (code flow with PKCE) and sets a cookie.
 
-        That cookie is ``SameSite=Lax``, for the browser comes back from another site, and is good for that alone.
+        The cookie is ``SameSite=Lax``, because the browser returns from another site. It is valid once.
         """
         begun = await functions.oidc_sign_in.begin()
         return _redirect(begun.address, _mark(settings, begun))
@@ -53,40 +57,39 @@ def router(functions: Functions) -> Routes:
     @routes.add(
         "POST",
         f"{_PATH}/start",
-        summary="Sign in elsewhere with an invitation",
+        summary="Sign in with OpenID Connect and an invitation",
         body=schemas.OidcSignInRequest,
-        answers={200: schemas.OidcSignInOut},
+        responses={200: schemas.OidcSignInOut},
         problems=(403, 404),
         caller="nobody",
     )
     async def start_oidc_sign_in_with_invitation(request: Request) -> Response:
-        """For who was invited and has no account: as above, and the account that is then made redeems the invitation.
+        """For an invited user without an account: the new account redeems the invitation.
 
-        The page goes on to ``url`` by itself: an invitation's secret belongs in no address. Who has an account
-        already is signed in, and redeems it afterwards as always.
+        The page opens ``url`` itself, because an invitation's secret must not be part of a URL. A user with an account
+        is signed in and redeems the invitation afterwards.
         """
         refuse_other_sites(request)
-        asked: schemas.OidcSignInRequest = await read(request, schemas.OidcSignInRequest)
-        begun = await functions.oidc_sign_in.begin(asked.invitation)
+        payload: schemas.OidcSignInRequest = await read(request, schemas.OidcSignInRequest)
+        begun = await functions.oidc_sign_in.begin(payload.invitation)
         headers = {"Set-Cookie": _mark(settings, begun), "Cache-Control": "no-store"}
-        return answer(schemas.OidcSignInOut(url=begun.address), headers=headers)
+        return json_response(schemas.OidcSignInOut(url=begun.address), headers=headers)
 
     @routes.add(
         "GET",
         f"{_PATH}/callback",
-        summary="Come back from there",
-        answers={303: None},
+        summary="Finish the OpenID Connect sign-in",
+        responses={303: None},
         problems=(404, 422),
         caller="nobody",
     )
     async def finish_oidc_sign_in(
         request: Request, state: Said = "", code: Said = "", iss: Said | None = None, error: Said = ""
     ) -> Response:
-        """Sets the page's cookie and leads to the page; it says there why somebody was not signed in.
+        """Sets the session cookie and redirects to the console, which shows the reason if the sign-in failed.
 
-        The session's cookie is ``SameSite=Strict``. A browser stores it from here, for this is what its address bar
-        shows, and does not send it with the next step of a way that began at another site. It need not: the page is the
-        same for everybody, and what it asks for then is asked by our own site.
+        The session cookie is ``SameSite=Strict``. The browser stores it but does not send it with the redirect, which
+        began at another site. The page itself is public; its requests then come from this site and carry the cookie.
         """
         returned = OidcCallback(state, code, request.cookies.get(COOKIE, ""), iss, error)
         try:

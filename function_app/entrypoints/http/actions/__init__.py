@@ -1,1 +1,1 @@
-"""Actions."""
+"""Routes of actions and Stop."""

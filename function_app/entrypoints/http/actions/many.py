@@ -1,4 +1,4 @@
-"""``actions``: one action, many devices."""
+"""One action on many devices."""
 
 import asyncio
 
@@ -8,14 +8,14 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem, invalid
 from function_app.entrypoints.http.actions import schemas
 from function_app.entrypoints.http.actions.actions import Key, show_action
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer, problem_type, read
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import json_response, problem_type, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.framework.schemas import Problem as Refusal
 from function_app.services.actions.start_many import StartResult
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("actions")
 
@@ -24,25 +24,25 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "/actions",
         summary="Start an action on many devices",
         body=schemas.BatchActionRequest,
-        answers={200: schemas.BatchActionOut, 202: schemas.BatchActionOut, 207: schemas.BatchActionOut},
+        responses={200: schemas.BatchActionOut, 202: schemas.BatchActionOut, 207: schemas.BatchActionOut},
     )
     async def start_actions(request: Request, once: Key = None) -> Response:
-        """200: all have come as far as ``wait_for``, or have ended. 202: some are not there yet. 207: some are refused.
+        """200: all have reached ``wait_for`` or have ended. 202: some have not yet. 207: some were rejected.
 
-        The key counts for each device by itself.
+        The idempotency key applies to each device separately.
         """
-        who = await caller.account(request)
-        asked: schemas.BatchActionRequest = await read(request, schemas.BatchActionRequest)
-        if len(set(asked.devices)) != len(asked.devices):
+        caller = await auth.account(request)
+        payload: schemas.BatchActionRequest = await read(request, schemas.BatchActionRequest)
+        if len(set(payload.devices)) != len(payload.devices):
             raise invalid("A device is named twice.")
-        if not asked.epochs.keys() <= set(asked.devices):
+        if not payload.epochs.keys() <= set(payload.devices):
             raise invalid("epochs names a device that devices does not.")
-        requests = {device: asked.for_device(device) for device in asked.devices}
-        found = await functions.start_many.start(who, requests, idempotency_key=once or "")
+        requests = {device: payload.for_device(device) for device in payload.devices}
+        found = await functions.start_many.start(caller, requests, idempotency_key=once or "")
         items = await asyncio.gather(*(item(each) for each in found))
         refused = any(isinstance(each.result, Problem) for each in found)
         there = all(each.reached for each in found)
-        return answer(schemas.BatchActionOut(items=tuple(items)), 207 if refused else 200 if there else 202)
+        return json_response(schemas.BatchActionOut(items=tuple(items)), 207 if refused else 200 if there else 202)
 
     async def item(found: StartResult) -> schemas.BatchActionItem:
         if isinstance(found.result, Problem):

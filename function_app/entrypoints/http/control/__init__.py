@@ -1,1 +1,1 @@
-"""Control."""
+"""Routes of leases, control requests and MQTT credentials."""

@@ -1,4 +1,4 @@
-"""``devices/{id}/lease``, and ``lease/requests``: asking for control."""
+"""Leases and control requests."""
 
 from typing import Annotated
 
@@ -9,34 +9,34 @@ from function_app.domain.common.problems import invalid
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.control import schemas
 from function_app.entrypoints.http.control.serializers import control_request_out, lease_out
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer, empty, read_or
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import empty, json_response, read_or
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
 
 EpochQuery = Annotated[int, Query(ge=1, le=2**53, description="The epoch to give back.")]
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("control")
-    _holding(routes, functions, caller)
-    _asking(routes, functions, caller)
+    _holding(routes, functions, auth)
+    _asking(routes, functions, auth)
     return routes
 
 
-def _holding(routes: Routes, functions: Functions, caller: Caller) -> None:
+def _holding(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
     @routes.add(
         "GET",
         "/devices/{device}/lease",
-        summary="Who controls it",
-        answers={200: schemas.LeaseStatus},
+        summary="Get the lease of a device",
+        responses={200: schemas.LeaseStatus},
         problems=(404,),
     )
     async def get_lease(request: Request, device: str) -> Response:
-        """The live lease with the open request for it, or null."""
-        who = await caller.account(request)
-        lease = await functions.leases.get(who, device)
-        return answer(schemas.LeaseStatus(lease=lease_out(lease, who, functions.clock.now_ms())))
+        """The active lease with its open control request, or null."""
+        caller = await auth.account(request)
+        lease = await functions.leases.get(caller, device)
+        return json_response(schemas.LeaseStatus(lease=lease_out(lease, caller, functions.clock.now_ms())))
 
     @routes.add(
         "POST",
@@ -44,21 +44,22 @@ def _holding(routes: Routes, functions: Functions, caller: Caller) -> None:
         summary="Take, renew or take over control",
         body=schemas.LeaseRequest,
         body_required=False,
-        answers={200: schemas.LeaseGranted},
+        responses={200: schemas.LeaseGranted},
         problems=(404, 409),
     )
     async def take_lease(request: Request, device: str) -> Response:
-        """Without ``epoch``: take control, with a new epoch. With it: renew that epoch.
+        """Without ``epoch``: takes control with a new epoch. With it: renews that epoch.
 
-        ``take_over`` takes it from whoever holds it: what moves is held, and they read the ``reason``. Owners only.
+        ``take_over`` takes control from its holder: the device holds position, and the holder sees the ``reason``.
+        Owners only.
         """
-        who = await caller.account(request)
-        asked = await read_or(request, schemas.LeaseRequest, schemas.LeaseRequest())
-        over = asked.reason.strip() if asked.take_over else ""
-        if asked.take_over and (not over or asked.epoch is not None):
+        caller = await auth.account(request)
+        payload = await read_or(request, schemas.LeaseRequest, schemas.LeaseRequest())
+        over = payload.reason.strip() if payload.take_over else ""
+        if payload.take_over and (not over or payload.epoch is not None):
             raise invalid("take_over wants a reason, which the one who had control will read, and no epoch.")
         lease, confirmed = await functions.leases.acquire(
-            who, device, epoch=asked.epoch, lease_ms=asked.lease_ms, wait_ms=asked.wait_ms, over=over
+            caller, device, epoch=payload.epoch, lease_ms=payload.lease_ms, wait_ms=payload.wait_ms, over=over
         )
         body = schemas.LeaseGranted(
             epoch=lease.epoch,
@@ -67,103 +68,109 @@ def _holding(routes: Routes, functions: Functions, caller: Caller) -> None:
             lease_ms=lease.lease_ms,
             confirmed=confirmed,
         )
-        return answer(body)
+        return json_response(body)
 
     @routes.add(
         "DELETE",
         "/devices/{device}/lease",
-        summary="Give control back",
-        answers={204: None},
+        summary="Release control",
+        responses={204: None},
         problems=(404, 409, 422),
     )
     async def release_lease(request: Request, device: str, epoch: EpochQuery) -> Response:
-        """What moves is held; credentials for this epoch's setpoints end. Who asks for control may take it then."""
-        await functions.leases.release(await caller.account(request), device, epoch=epoch)
+        """The device holds position, and setpoint credentials of this epoch end. A requester may take control then."""
+        await functions.leases.release(await auth.account(request), device, epoch=epoch)
         return empty()
 
 
-def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
+def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
     @routes.add(
         "POST",
         "/devices/{device}/lease/requests",
-        summary="Ask for control",
+        summary="Request control",
         body=schemas.NewControlRequest,
         body_required=False,
-        answers={200: schemas.ControlRequestCreated, 201: schemas.ControlRequestCreated},
+        responses={200: schemas.ControlRequestCreated, 201: schemas.ControlRequestCreated},
         problems=(404, 409),
     )
     async def request_control(request: Request, device: str) -> Response:
-        """Of whoever has it; the device shows it in its ``state``. Who asks already is given their request (200).
+        """Asks the lease holder.
 
-        Silence takes control from nobody: without an answer within ``within_ms`` it lapses. It also ends with the lease
-        that it asks for. What has become of it stays readable until the next request.
+        The device shows the request in its ``state``. A repeated request returns the open one (200).
+
+        Without a response within ``within_ms`` the request expires and the holder keeps control. It also ends with the
+        lease. The outcome can be read until the next request.
         """
-        who = await caller.account(request)
-        wanted = await read_or(request, schemas.NewControlRequest, schemas.NewControlRequest())
-        lease, asked, fresh, shown = await functions.control_requests.create(
-            who, device, within_ms=wanted.within_ms, lease_ms=wanted.lease_ms, wait_ms=wanted.wait_ms
+        caller = await auth.account(request)
+        payload = await read_or(request, schemas.NewControlRequest, schemas.NewControlRequest())
+        lease, control_request, created, confirmed = await functions.control_requests.create(
+            caller, device, within_ms=payload.within_ms, lease_ms=payload.lease_ms, wait_ms=payload.wait_ms
         )
         now_ms = functions.clock.now_ms()
-        body = schemas.ControlRequestCreated(request=control_request_out(asked, lease, who, now_ms), confirmed=shown)
-        where = {"Location": f"{PREFIX}/devices/{device}/lease/requests/{asked.id}"}
-        return answer(body, 201 if fresh else 200, where)
+        body = schemas.ControlRequestCreated(
+            request=control_request_out(control_request, lease, caller, now_ms), confirmed=confirmed
+        )
+        where = {"Location": f"{PREFIX}/devices/{device}/lease/requests/{control_request.id}"}
+        return json_response(body, 201 if created else 200, where)
 
     @routes.add(
         "GET",
         "/devices/{device}/lease/requests/{request_id}",
-        summary="What became of a request for control",
-        answers={200: schemas.ControlRequestOut},
+        summary="Get a control request",
+        responses={200: schemas.ControlRequestOut},
         problems=(404,),
     )
     async def get_control_request(request: Request, device: str, request_id: str) -> Response:
-        """The last one is known, whatever has become of it."""
-        who = await caller.account(request)
-        lease, asked = await functions.control_requests.get(who, device, request_id)
-        return answer(control_request_out(asked, lease, who, functions.clock.now_ms()))
+        """The last request of a device can be read, with any outcome."""
+        caller = await auth.account(request)
+        lease, control_request = await functions.control_requests.get(caller, device, request_id)
+        return json_response(control_request_out(control_request, lease, caller, functions.clock.now_ms()))
 
     @routes.add(
         "POST",
         "/devices/{device}/lease/requests/{request_id}/accept",
-        summary="Hand control over",
+        summary="Accept a control request",
         body=schemas.AcceptControlRequest,
         body_required=False,
-        answers={200: schemas.ControlRequestAccepted},
+        responses={200: schemas.ControlRequestAccepted},
         problems=(404, 409),
     )
     async def accept_control_request(request: Request, device: str, request_id: str) -> Response:
-        """Only by who has control. In one write the next epoch is the asker's; what moves is held."""
-        who = await caller.account(request)
-        wanted = await read_or(request, schemas.AcceptControlRequest, schemas.AcceptControlRequest())
-        lease, asked, confirmed = await functions.control_requests.accept(
-            who, device, request_id, wait_ms=wanted.wait_ms
+        """Only for the lease holder. One write gives the requester the next epoch; the device holds position."""
+        caller = await auth.account(request)
+        payload = await read_or(request, schemas.AcceptControlRequest, schemas.AcceptControlRequest())
+        lease, control_request, confirmed = await functions.control_requests.accept(
+            caller, device, request_id, wait_ms=payload.wait_ms
         )
         now_ms = functions.clock.now_ms()
         body = schemas.ControlRequestAccepted(
-            request=control_request_out(asked, lease, who, now_ms), epoch=asked.epoch + 1, confirmed=confirmed
+            request=control_request_out(control_request, lease, caller, now_ms),
+            epoch=control_request.epoch + 1,
+            confirmed=confirmed,
         )
-        return answer(body)
+        return json_response(body)
 
     @routes.add(
         "POST",
         "/devices/{device}/lease/requests/{request_id}/reject",
-        summary="Keep control",
-        answers={200: schemas.ControlRequestOut},
+        summary="Reject a control request",
+        responses={200: schemas.ControlRequestOut},
         problems=(404, 409),
     )
     async def reject_control_request(request: Request, device: str, request_id: str) -> Response:
-        """Only by who has control."""
-        who = await caller.account(request)
-        lease, asked = await functions.control_requests.reject(who, device, request_id)
-        return answer(control_request_out(asked, lease, who, functions.clock.now_ms()))
+        """Only for the lease holder."""
+        caller = await auth.account(request)
+        lease, control_request = await functions.control_requests.reject(caller, device, request_id)
+        return json_response(control_request_out(control_request, lease, caller, functions.clock.now_ms()))
 
     @routes.add(
         "DELETE",
         "/devices/{device}/lease/requests/{request_id}",
-        summary="Ask no longer",
-        answers={204: None},
+        summary="Withdraw a control request",
+        responses={204: None},
         problems=(404, 409),
     )
     async def withdraw_control_request(request: Request, device: str, request_id: str) -> Response:
-        """Only by who asked. 409 when it was accepted: control is theirs then, to be given back."""
-        await functions.control_requests.withdraw(await caller.account(request), device, request_id)
+        """Only for the requester. 409 if it was accepted: the requester then holds the lease and must release it."""
+        await functions.control_requests.withdraw(await auth.account(request), device, request_id)
         return empty()

@@ -1,4 +1,4 @@
-"""``mqtt/credentials``."""
+"""MQTT credentials."""
 
 from typing import Any
 
@@ -8,30 +8,30 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.devices.devices import Agent
 from function_app.entrypoints.http.control import schemas
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer, read
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.services.control.mqtt_credentials import IssuedCredentials
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("broker")
 
     @routes.add(
         "POST",
         "/mqtt/credentials",
-        summary="Short-lived broker credentials",
+        summary="Get MQTT credentials",
         body=schemas.MqttCredentialsRequest,
-        answers={200: schemas.MqttCredentialsOut},
+        responses={200: schemas.MqttCredentialsOut},
         problems=(404, 409),
         caller="account or agent",
     )
     async def mqtt_credentials(request: Request) -> Response:
-        """For watching, for sending setpoints under a lease, or for an agent's own devices."""
-        asked: Any = await read(request, schemas.MqttCredentialsRequest)
-        agent = await caller.agent(request) if isinstance(asked, schemas.AgentCredentialsRequest) else None
-        issued = await _issue(request, asked, agent)
+        """Short-lived, for viewing, for setpoints under a lease, or for an agent's own devices."""
+        payload: Any = await read(request, schemas.MqttCredentialsRequest)
+        agent = await auth.agent(request) if isinstance(payload, schemas.AgentCredentialsRequest) else None
+        issued = await _issue(request, payload, agent)
         wanted = agent is not None and functions.certificates.wanted
         certificate_after_ms = agent.claimed_ms if agent is not None and wanted else None
         settings = functions.settings
@@ -55,14 +55,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
             key_statements=() if news is None else news.statements,
             signing_key="" if news is None else news.signing,
         )
-        return answer(body, headers={"Cache-Control": "no-store"})
+        return json_response(body, headers={"Cache-Control": "no-store"})
 
-    async def _issue(request: Request, asked: Any, agent: Agent | None) -> IssuedCredentials:
+    async def _issue(request: Request, payload: Any, agent: Agent | None) -> IssuedCredentials:
         if agent is not None:
             return await functions.mqtt_credentials.agent(agent)
-        who = await caller.account(request)
-        if isinstance(asked, schemas.ControlCredentialsRequest):
-            return await functions.mqtt_credentials.control(who, asked.device, asked.epoch)
-        return await functions.mqtt_credentials.watch(who)
+        caller = await auth.account(request)
+        if isinstance(payload, schemas.ControlCredentialsRequest):
+            return await functions.mqtt_credentials.control(caller, payload.device, payload.epoch)
+        return await functions.mqtt_credentials.watch(caller)
 
     return routes

@@ -1,1 +1,1 @@
-"""Devices."""
+"""Routes of devices and viewers."""

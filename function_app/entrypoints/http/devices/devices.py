@@ -1,4 +1,4 @@
-"""``devices``: what they are, what their owner calls them, and who looks at them."""
+"""Devices, their labels and their viewers."""
 
 from fastapi import Request, Response
 
@@ -6,82 +6,85 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.devices import schemas
 from function_app.entrypoints.http.devices.serializers import device_out
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer, empty, read
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
 
 _AGAIN_MS = 10_000
 """How soon a page that looks at a device is to say so again."""
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("devices")
 
-    @routes.add("GET", "/devices", summary="Devices one may see", answers={200: schemas.DeviceList}, problems=(422,))
+    @routes.add("GET", "/devices", summary="List devices", responses={200: schemas.DeviceList}, problems=(422,))
     async def list_devices(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """With presence, newest state and lease. A page holds the devices of up to ``limit`` agents."""
-        who = await caller.account(request)
-        views, following = await functions.devices.views(who, cursor=cursor, limit=limit)
-        items = tuple(device_out(view, who, functions.clock.now_ms()) for view in views)
-        return answer(schemas.DeviceList(items=items, cursor=following))
+        caller = await auth.account(request)
+        views, following = await functions.devices.views(caller, cursor=cursor, limit=limit)
+        items = tuple(device_out(view, caller, functions.clock.now_ms()) for view in views)
+        return json_response(schemas.DeviceList(items=items, cursor=following))
 
-    @routes.add("GET", "/devices/{device}", summary="One device", answers={200: schemas.DeviceOut}, problems=(404,))
+    @routes.add("GET", "/devices/{device}", summary="Get a device", responses={200: schemas.DeviceOut}, problems=(404,))
     async def get_device(request: Request, device: str) -> Response:
         """With presence, newest state and lease."""
-        who = await caller.account(request)
-        return answer(device_out(await functions.devices.view(who, device), who, functions.clock.now_ms()))
+        caller = await auth.account(request)
+        return json_response(device_out(await functions.devices.view(caller, device), caller, functions.clock.now_ms()))
 
-    _named_and_seen(routes, functions, caller)
+    _named_and_seen(routes, functions, auth)
     return routes
 
 
-def _named_and_seen(routes: Routes, functions: Functions, caller: Caller) -> None:
+def _named_and_seen(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
     @routes.add(
         "PUT",
         "/devices/{device}/label",
-        summary="Name a device",
+        summary="Rename a device",
         body=schemas.RenameDeviceRequest,
-        answers={200: schemas.DeviceOut},
+        responses={200: schemas.DeviceOut},
         problems=(403, 404),
     )
     async def rename_device(request: Request, device: str) -> Response:
-        """For its owner. Whoever takes it over later finds it called as its agent calls it."""
-        who = await caller.account(request)
-        asked: schemas.RenameDeviceRequest = await read(request, schemas.RenameDeviceRequest)
-        label = None if asked.label is None else " ".join(asked.label.split())
-        await functions.rename.rename(who, device, label)
-        return answer(device_out(await functions.devices.view(who, device), who, functions.clock.now_ms()))
+        """Owners only. After a transfer the device has its agent's label again."""
+        caller = await auth.account(request)
+        payload: schemas.RenameDeviceRequest = await read(request, schemas.RenameDeviceRequest)
+        label = None if payload.label is None else " ".join(payload.label.split())
+        await functions.rename.rename(caller, device, label)
+        return json_response(device_out(await functions.devices.view(caller, device), caller, functions.clock.now_ms()))
 
     @routes.add(
         "PUT",
         "/devices/{device}/viewers",
-        summary="Say that one looks at it, and learn who else does",
-        answers={200: schemas.ViewersOut},
+        summary="Register as a viewer and list other viewers",
+        responses={200: schemas.ViewersOut},
         problems=(404,),
     )
     async def add_viewer(request: Request, device: str) -> Response:
-        """For whoever may see it. It counts for 25 s; what is said more often than every 5 s changes nothing."""
-        who = await caller.account(request)
+        """For every account that may see the device.
+
+        The registration lasts 25 s; repeating it within 5 s changes nothing.
+        """
+        caller = await auth.account(request)
         others = tuple(
             schemas.ViewerOut(
                 name=other.name,
                 role=other.role.value,
-                mine=other.account == who.account,
+                mine=other.account == caller.account,
                 since=rfc3339(other.since_ms),
             )
-            for other in await functions.viewers.mark(who, device)
+            for other in await functions.viewers.mark(caller, device)
         )
-        return answer(schemas.ViewersOut(items=others, refresh_ms=_AGAIN_MS))
+        return json_response(schemas.ViewersOut(items=others, refresh_ms=_AGAIN_MS))
 
     @routes.add(
         "DELETE",
         "/devices/{device}/viewers",
-        summary="Say that one looks no longer",
-        answers={204: None},
+        summary="Unregister as a viewer",
+        responses={204: None},
         problems=(404,),
     )
     async def remove_viewer(request: Request, device: str) -> Response:
-        """Of this sign-in. Whoever says nothing is gone after 25 s too."""
-        await functions.viewers.leave(await caller.account(request), device)
+        """For this sign-in session. A registration ends after 25 s without renewal."""
+        await functions.viewers.leave(await auth.account(request), device)
         return empty()

@@ -1,4 +1,4 @@
-"""``devices``: what they are, and how they are now."""
+"""Requests and responses of devices."""
 
 from typing import Annotated, Literal
 

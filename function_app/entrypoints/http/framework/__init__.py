@@ -1,1 +1,1 @@
-"""Framework."""
+"""What all routes share: registration, lookup, authentication, responses."""

@@ -31,8 +31,8 @@ def _operation(method: str, path: str, operation: dict[str, Any]) -> list[str]:
         f"<h2><code>{method.upper()} {escape(path)}</code></h2>",
         f"<p><b>{escape(operation.get('summary', ''))}.</b> {escape(operation.get('description', ''))}</p>",
     ]
-    who = " or ".join(name for scheme in operation.get("security", []) for name in scheme)
-    parts.append(f"<p>Who: {escape(who) or 'anybody'}</p>")
+    caller = " or ".join(name for scheme in operation.get("security", []) for name in scheme)
+    parts.append(f"<p>Caller: {escape(caller) or 'anyone'}</p>")
     given = [f"<code>{escape(item['name'])}</code> ({escape(item['in'])})" for item in operation.get("parameters", [])]
     if given:
         parts.append(f"<p>Parameters: {', '.join(given)}</p>")

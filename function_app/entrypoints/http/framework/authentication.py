@@ -20,7 +20,7 @@ _STOP = re.compile(r"/api/v1/((devices|spaces)/[^/]+/)?stop")
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
-class Caller:
+class RequestAuthenticator:
     """Finds out who makes a request."""
 
     def __init__(self, authenticator: Authenticator, api_keys: ApiKeys, limits: RateLimiter) -> None:

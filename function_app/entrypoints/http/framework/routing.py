@@ -54,7 +54,7 @@ class Routes:
         path: str,
         *,
         summary: str,
-        answers: Mapping[int, Any],
+        responses: Mapping[int, Any],
         problems: Sequence[int] = (),
         body: Any = None,
         body_required: bool = True,
@@ -66,7 +66,7 @@ class Routes:
             method: HTTP method.
             path: Below the API's prefix.
             summary: One line.
-            answers: Status → struct of the body (``None``: no body; text: the media type of a file).
+            responses: Status → struct of the body (``None``: no body; text: the media type of a file).
             problems: Statuses of refusals beside 401, 413, 422, 429 and 503, which follow from the rest.
             body: Struct of the request's body.
             body_required: Whether it may be left out.
@@ -80,15 +80,15 @@ class Routes:
             refusals.add(403)  # for want of a role or of the page's token, or since an API key may not
         if body is not None:
             refusals |= {413, 422}
-        responses: dict[int | str, dict[str, Any]] = {}
-        for status, kind in answers.items():
-            responses[status] = {"description": _MEANINGS[status]}
+        documented: dict[int | str, dict[str, Any]] = {}
+        for status, kind in responses.items():
+            documented[status] = {"description": _MEANINGS[status]}
             if isinstance(kind, str):
-                responses[status]["content"] = {kind: {"schema": {"type": "string", "format": "binary"}}}
+                documented[status]["content"] = {kind: {"schema": {"type": "string", "format": "binary"}}}
             elif kind is not None:
-                responses[status]["content"] = {JSON: {"schema": self._reference(kind)}}
+                documented[status]["content"] = {JSON: {"schema": self._reference(kind)}}
         for status in sorted(refusals):
-            responses[status] = {
+            documented[status] = {
                 "description": _MEANINGS[status],
                 "content": {PROBLEM_JSON: {"schema": _reference(contract.Problem)}},
             }
@@ -105,10 +105,10 @@ class Routes:
                 summary=summary,
                 description=(handler.__doc__ or "").strip() or None,
                 operation_id=handler.__name__,
-                status_code=min(answers),
+                status_code=min(responses),
                 response_class=Response,
                 response_model=None,
-                responses=responses,
+                responses=documented,
                 openapi_extra=extra,
             )
             return handler

@@ -1,4 +1,4 @@
-"""What all of them share."""
+"""Base classes and types that all schemas share."""
 
 from typing import Annotated
 

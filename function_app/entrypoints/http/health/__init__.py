@@ -1,1 +1,1 @@
-"""Health."""
+"""Routes of faults, diagnostics and the health check."""

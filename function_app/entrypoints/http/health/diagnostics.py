@@ -1,4 +1,4 @@
-"""``devices/{id}/diagnostics``, ``spaces/{id}/diagnostics`` and ``diagnostics``."""
+"""Health of one device, a space or all devices."""
 
 from fastapi import Request, Response
 
@@ -6,29 +6,29 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.health.diagnosis import Health, usual_range
 from function_app.domain.health.faults import Severity
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import json_response
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
 from function_app.entrypoints.http.health import schemas
 from function_app.entrypoints.http.health.serializers import fault_out
 from function_app.services.health.diagnostics import FieldView, Summary
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("diagnostics")
 
     @routes.add(
         "GET",
         "/devices/{device}/diagnostics",
-        summary="How a device is",
-        answers={200: schemas.DeviceDiagnostics},
+        summary="Diagnose a device",
+        responses={200: schemas.DeviceDiagnostics},
         problems=(404,),
     )
     async def get_diagnostics(request: Request, device: str) -> Response:
-        """Open faults, and each measurement beside what is usual, allowed and to be expected."""
-        who = await caller.account(request)
-        summary, fields = await functions.diagnostics.of_device(who, device)
+        """Open faults, and each measurement with its usual range, limits and trend."""
+        caller = await auth.account(request)
+        summary, fields = await functions.diagnostics.of_device(caller, device)
         body = schemas.DeviceDiagnostics(
             device=summary.view.device.id,
             label=summary.view.device.label,
@@ -39,35 +39,35 @@ def router(functions: Functions, caller: Caller) -> Routes:
             faults=tuple(fault_out(fault) for fault in summary.faults),
             fields=tuple(_field(field) for field in fields),
         )
-        return answer(body)
+        return json_response(body)
 
     @routes.add(
         "GET",
         "/diagnostics",
-        summary="How all devices are",
-        answers={200: schemas.DeviceHealthList},
+        summary="Summarize the health of all devices",
+        responses={200: schemas.DeviceHealthList},
         problems=(422,),
     )
     async def list_diagnostics(request: Request, cursor: Cursor = None, limit: Limit = 1000) -> Response:
         """Worst first, with counts."""
-        who = await caller.account(request)
-        found, following = await functions.diagnostics.summaries(who, space=None, cursor=cursor, limit=limit)
-        return answer(_list(found, following))
+        caller = await auth.account(request)
+        found, following = await functions.diagnostics.summaries(caller, space=None, cursor=cursor, limit=limit)
+        return json_response(_list(found, following))
 
     @routes.add(
         "GET",
         "/spaces/{space}/diagnostics",
-        summary="How a space's devices are",
-        answers={200: schemas.DeviceHealthList},
+        summary="Summarize the health of a space's devices",
+        responses={200: schemas.DeviceHealthList},
         problems=(404, 422),
     )
     async def list_space_diagnostics(
         request: Request, space: str, cursor: Cursor = None, limit: Limit = 1000
     ) -> Response:
         """Worst first, with counts."""
-        who = await caller.account(request)
-        found, following = await functions.diagnostics.summaries(who, space=space, cursor=cursor, limit=limit)
-        return answer(_list(found, following))
+        caller = await auth.account(request)
+        found, following = await functions.diagnostics.summaries(caller, space=space, cursor=cursor, limit=limit)
+        return json_response(_list(found, following))
 
     return routes
 

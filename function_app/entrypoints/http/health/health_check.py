@@ -1,10 +1,10 @@
-"""``health``."""
+"""The health check of the server."""
 
 from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import store_unavailable
-from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.responses import json_response
 from function_app.entrypoints.http.framework.routing import VERSION, Routes
 from function_app.entrypoints.http.health import schemas
 
@@ -13,11 +13,9 @@ def router(functions: Functions) -> Routes:
     """The routes."""
     routes = Routes("health")
 
-    @routes.add(
-        "GET", "/health", summary="Whether the functions can work", answers={200: schemas.HealthOut}, caller="nobody"
-    )
+    @routes.add("GET", "/health", summary="Check the server", responses={200: schemas.HealthOut}, caller="nobody")
     async def health(_request: Request) -> Response:
-        """503 when the tables cannot be used; a broker that is away is said, and comes back by itself."""
+        """503 if the tables cannot be used. An unreachable broker is reported and recovers by itself."""
         found = await functions.health.check()
         if found.tables != "ok":
             raise store_unavailable(found.tables)
@@ -27,6 +25,6 @@ def router(functions: Functions) -> Routes:
             tables=found.tables,
             broker=found.broker,
         )
-        return answer(body)
+        return json_response(body)
 
     return routes

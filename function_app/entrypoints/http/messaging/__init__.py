@@ -1,1 +1,1 @@
-"""Messaging."""
+"""Routes of the polling transport and of XMPP."""

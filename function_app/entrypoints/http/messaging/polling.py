@@ -1,4 +1,4 @@
-"""``agents/{agent}/commands`` and ``agents/{agent}/messages``: for agents that cannot speak MQTT."""
+"""HTTP polling transport for agents without MQTT."""
 
 from typing import Annotated
 
@@ -8,8 +8,8 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.problems import not_found
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.devices.devices import Agent
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer, read
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.messaging import schemas
 from function_app.entrypoints.ingest.agent_messages import tell
@@ -22,15 +22,15 @@ Have = Annotated[
 ]
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("agents")
 
     @routes.add(
         "GET",
         "/agents/{agent}/commands",
-        summary="Commands that wait for this agent",
-        answers={200: schemas.CommandList},
+        summary="Poll commands",
+        responses={200: schemas.CommandList},
         problems=(404, 409, 422),
         caller="agent",
     )
@@ -41,7 +41,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         limit: Limit = 10,
         have: Have = (),  # type: ignore[assignment]
     ) -> Response:
-        """Called by an agent that said ``http`` when it enrolled. A command comes again until an ack of it was told."""
+        """For agents enrolled with transport ``http``. A command is returned until the agent posts an ack of it."""
         asking = await _asking(request, agent)
         found = await functions.polling.commands(asking, wait_ms=wait_ms, limit=limit, have=frozenset(have))
         items = tuple(
@@ -53,36 +53,36 @@ def router(functions: Functions, caller: Caller) -> Routes:
             )
             for letter in found
         )
-        return answer(schemas.CommandList(items=items), headers={"Cache-Control": "no-store"})
+        return json_response(schemas.CommandList(items=items), headers={"Cache-Control": "no-store"})
 
     @routes.add(
         "POST",
         "/agents/{agent}/messages",
-        summary="What this agent has to say",
+        summary="Post messages of an agent",
         body=schemas.MessagesRequest,
-        answers={200: schemas.MessageResults},
+        responses={200: schemas.MessageResults},
         problems=(404, 409),
         caller="agent",
     )
     async def post_agent_messages(request: Request, agent: str) -> Response:
-        """Acks, state, description, events, telemetry, as over MQTT; told to the broker's subscribers too.
+        """Acks, state, description, events and telemetry as over MQTT. The broker's subscribers receive them too.
 
-        Each message has its own result. All may be told again: what was taken already changes nothing.
+        Each message has its own result. Messages may be sent again: stored ones change nothing.
         """
         asking = await _asking(request, agent)
         require_claimed(asking)
-        asked: schemas.MessagesRequest = await read(request, schemas.MessagesRequest)
+        payload: schemas.MessagesRequest = await read(request, schemas.MessagesRequest)
         await functions.polling.mark_online(asking)  # first: what it says of itself counts more
-        told = [(each.topic, bytes(each.payload)) for each in asked.messages]
+        told = [(each.topic, bytes(each.payload)) for each in payload.messages]
         results = (
             schemas.MessageResult(status="stored" if why is None else "rejected", detail=why and f"{why.rstrip('.')}.")
             for why in await tell(functions, asking, told, by="http")
         )
-        return answer(schemas.MessageResults(results=tuple(results)))
+        return json_response(schemas.MessageResults(results=tuple(results)))
 
     async def _asking(request: Request, agent: str) -> Agent:
         """The agent that asks, once it is seen that the path names it."""
-        found = await caller.agent(request)
+        found = await auth.agent(request)
         if found.id != agent:
             raise not_found("agent", agent)
         return found

@@ -1,4 +1,4 @@
-"""``xmpp/credentials`` for who connects, and ``xmpp/verify`` for the XMPP server."""
+"""XMPP credentials, and logins of the XMPP server."""
 
 from typing import Any
 
@@ -8,37 +8,37 @@ from device_agent.protocol.xmpp import jids
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.control.schemas import AgentCredentialsRequest
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer, read
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.messaging import schemas
 
 _NOT_KEPT = {"Cache-Control": "no-store"}
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("broker")
 
     @routes.add(
         "POST",
         "/xmpp/credentials",
-        summary="Credentials for the XMPP server",
+        summary="Get XMPP credentials",
         body=schemas.XmppCredentialsRequest,
-        answers={200: schemas.XmppCredentialsOut},
+        responses={200: schemas.XmppCredentialsOut},
         problems=(409,),
         caller="account or agent",
     )
     async def xmpp_credentials(request: Request) -> Response:
-        """For an agent that said ``xmpp`` when it enrolled; or to watch one's agents with any XMPP client."""
-        asked: Any = await read(request, schemas.XmppCredentialsRequest)
+        """For an agent that enrolled with transport ``xmpp``, or to view one's agents with an XMPP client."""
+        payload: Any = await read(request, schemas.XmppCredentialsRequest)
         space: str | None = None
-        if isinstance(asked, AgentCredentialsRequest):
-            agent = await caller.agent(request)
+        if isinstance(payload, AgentCredentialsRequest):
+            agent = await auth.agent(request)
             given = await functions.xmpp_credentials.agent(agent)
             space = agent.space
         else:
-            given = await functions.xmpp_credentials.account(await caller.account(request))
+            given = await functions.xmpp_credentials.account(await auth.account(request))
         settings = functions.settings
         news = None if space is None else await functions.keys.news()
         body = schemas.XmppCredentialsOut(
@@ -54,21 +54,21 @@ def router(functions: Functions, caller: Caller) -> Routes:
             key_statements=() if news is None else news.statements,
             signing_key="" if news is None else news.signing,
         )
-        return answer(body, headers=_NOT_KEPT)
+        return json_response(body, headers=_NOT_KEPT)
 
     @routes.add(
         "POST",
         "/xmpp/verify",
-        summary="Whether somebody may log in at the XMPP server",
+        summary="Verify an XMPP login",
         body=schemas.XmppVerifyRequest,
-        answers={200: schemas.XmppIdentityOut},
+        responses={200: schemas.XmppIdentityOut},
         problems=(401, 409),
         caller="nobody",
     )
     async def xmpp_verify(request: Request) -> Response:
-        """Asked by the XMPP server; who has no valid password learns nothing here."""
-        asked: schemas.XmppVerifyRequest = await read(request, schemas.XmppVerifyRequest)
-        found = await functions.xmpp_credentials.verify(asked.user, asked.password)
+        """Called by the XMPP server. A caller without a valid password learns nothing."""
+        payload: schemas.XmppVerifyRequest = await read(request, schemas.XmppVerifyRequest)
+        found = await functions.xmpp_credentials.verify(payload.user, payload.password)
         body = schemas.XmppIdentityOut(
             user=found.user,
             name=found.name,
@@ -76,6 +76,6 @@ def router(functions: Functions, caller: Caller) -> Routes:
             lifetime_s=found.lifetime_s,
             contacts=tuple(schemas.XmppContactOut(user=each.user, name=each.name) for each in found.contacts),
         )
-        return answer(body, headers=_NOT_KEPT)
+        return json_response(body, headers=_NOT_KEPT)
 
     return routes

@@ -1,1 +1,1 @@
-"""Pairing."""
+"""Routes of agents."""

@@ -1,4 +1,4 @@
-"""``agents``: enrolment, claim, list, un-pairing."""
+"""Enrolment, claim and unpairing of agents."""
 
 from typing import Annotated
 
@@ -12,9 +12,9 @@ from function_app.domain.common.problems import invalid
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.devices.devices import Agent, DeviceSpec
 from function_app.entrypoints.http.devices.serializers import device_out
-from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
 from function_app.entrypoints.http.framework.client_address import client_address
-from function_app.entrypoints.http.framework.responses import answer, empty, read
+from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
 from function_app.entrypoints.http.framework.schemas import AccountRef
 from function_app.entrypoints.http.pairing import schemas
@@ -23,30 +23,33 @@ from function_app.services.pairing.enroll import Enrollment
 Wait = Annotated[int, Query(ge=0, le=30_000, description="Wait at most this long for the claim [ms].")]
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("agents")
 
     @routes.add(
         "POST",
         "/agents/enroll",
-        summary="Make an agent known",
+        summary="Enrol an agent",
         body=schemas.EnrollRequest,
-        answers={200: schemas.EnrollmentOut, 201: schemas.EnrollmentOut},
+        responses={200: schemas.EnrollmentOut, 201: schemas.EnrollmentOut},
         problems=(409,),
         caller="agent",
     )
     async def enroll_agent(request: Request) -> Response:
-        """Called by an agent, with a token that the key in the body signed. Gives a claim code while unclaimed."""
-        asked: schemas.EnrollRequest = await read(request, schemas.EnrollRequest)
-        if len({device.name for device in asked.devices}) != len(asked.devices):
+        """Called by an agent with a token signed by the key in the body.
+
+        Returns a claim code until the agent is claimed.
+        """
+        payload: schemas.EnrollRequest = await read(request, schemas.EnrollRequest)
+        if len({device.name for device in payload.devices}) != len(payload.devices):
             raise invalid("Two devices have the same name.")
-        agent = await caller.enrolling(request, asked.public_key)
-        specs = tuple(msgspec.convert(device, DeviceSpec, from_attributes=True) for device in asked.devices)
-        told = Enrollment(asked.name, asked.public_key, asked.software, specs, asked.transport)
+        agent = await auth.enrolling(request, payload.public_key)
+        specs = tuple(msgspec.convert(device, DeviceSpec, from_attributes=True) for device in payload.devices)
+        told = Enrollment(payload.name, payload.public_key, payload.software, specs, payload.transport)
         done = await functions.enroll.enroll(agent, told)
         if done.claimed:
-            return answer(schemas.EnrollmentOut(agent=done.id, claim_code=None, expires_at=None, expires_in_s=0))
+            return json_response(schemas.EnrollmentOut(agent=done.id, claim_code=None, expires_at=None, expires_in_s=0))
         left_ms = max(0, done.claim_expires_ms - functions.clock.now_ms())
         body = schemas.EnrollmentOut(
             agent=done.id,
@@ -54,19 +57,19 @@ def router(functions: Functions, caller: Caller) -> Routes:
             expires_at=rfc3339(done.claim_expires_ms),
             expires_in_s=left_ms // 1000,
         )
-        return answer(body, 201)
+        return json_response(body, 201)
 
     @routes.add(
         "GET",
         "/agents/enrollment",
-        summary="Whether this agent is claimed",
-        answers={200: schemas.EnrollmentState},
+        summary="Get the enrolment state",
+        responses={200: schemas.EnrollmentState},
         problems=(422,),
         caller="agent",
     )
     async def enrollment(request: Request, wait_ms: Wait = 0) -> Response:
-        """Called by an agent: its space, its owner, and the keys whose commands it is to obey."""
-        agent = await functions.enroll.wait(await caller.agent(request), wait_ms)
+        """Called by an agent: its space, its owner, and the keys whose commands it must accept."""
+        agent = await functions.enroll.wait(await auth.agent(request), wait_ms)
         news = await functions.keys.news()
         body = schemas.EnrollmentState(
             agent=agent.id,
@@ -82,72 +85,72 @@ def router(functions: Functions, caller: Caller) -> Routes:
             key_statements=news.statements,
             signing_key=news.signing,
         )
-        return answer(body)
+        return json_response(body)
 
     @routes.add(
         "POST",
         "/agents/certificate",
-        summary="A certificate to show to the broker",
+        summary="Issue a broker certificate",
         body=schemas.CertificateRequest,
-        answers={200: schemas.CertificateOut},
+        responses={200: schemas.CertificateOut},
         problems=(409,),
         caller="agent",
     )
     async def certify(request: Request) -> Response:
-        """Where the broker wants certificates of agents. It ends with the pairing."""
-        agent = await caller.agent(request)
-        asked: schemas.CertificateRequest = await read(request, schemas.CertificateRequest)
-        issued = await functions.agent_certificates.certify(agent, asked.request)
-        return answer(schemas.CertificateOut(chain=issued.chain, expires_at=rfc3339(issued.expires_ms)))
+        """For brokers that require agent certificates. The certificate ends with the pairing."""
+        agent = await auth.agent(request)
+        payload: schemas.CertificateRequest = await read(request, schemas.CertificateRequest)
+        issued = await functions.agent_certificates.certify(agent, payload.request)
+        return json_response(schemas.CertificateOut(chain=issued.chain, expires_at=rfc3339(issued.expires_ms)))
 
     @routes.add(
         "POST",
         "/agents/claim",
-        summary="Claim an agent with the code it shows",
+        summary="Claim an agent by its code",
         body=schemas.ClaimRequest,
-        answers={200: schemas.ClaimOut},
+        responses={200: schemas.ClaimOut},
         problems=(404, 429),
     )
     async def claim_agent(request: Request) -> Response:
-        """A wrong, used and expired code are answered alike."""
-        who = await caller.account(request)
-        asked: schemas.ClaimRequest = await read(request, schemas.ClaimRequest)
+        """Wrong, used and expired codes get the same response."""
+        caller = await auth.account(request)
+        payload: schemas.ClaimRequest = await read(request, schemas.ClaimRequest)
         agent = await functions.claim.claim(
-            who,
-            asked.code,
-            asked.space,
+            caller,
+            payload.code,
+            payload.space,
             address=client_address(request, functions.settings.trusted_proxies),
         )
-        views = await functions.devices.of_agent(who, agent.id)
-        found = tuple(device_out(view, who, functions.clock.now_ms()) for view in views)
-        return answer(schemas.ClaimOut(agent=agent.id, space=agent.space or "", devices=found))
+        views = await functions.devices.of_agent(caller, agent.id)
+        found = tuple(device_out(view, caller, functions.clock.now_ms()) for view in views)
+        return json_response(schemas.ClaimOut(agent=agent.id, space=agent.space or "", devices=found))
 
-    @routes.add("GET", "/agents", summary="The account's agents", answers={200: schemas.AgentList}, problems=(422,))
+    @routes.add("GET", "/agents", summary="List agents", responses={200: schemas.AgentList}, problems=(422,))
     async def list_agents(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """Agents that the account has claimed."""
-        who = await caller.account(request)
-        agents, following = await functions.devices.agents(who, cursor=cursor, limit=limit)
+        caller = await auth.account(request)
+        agents, following = await functions.devices.agents(caller, cursor=cursor, limit=limit)
         items = tuple(_shown(agent) for agent in agents)
-        return answer(schemas.AgentList(items=items, cursor=following))
+        return json_response(schemas.AgentList(items=items, cursor=following))
 
     @routes.add(
         "PUT",
         "/agents/{agent}/space",
         summary="Move an agent to another space",
         body=schemas.MoveAgentRequest,
-        answers={200: schemas.AgentOut},
+        responses={200: schemas.AgentOut},
         problems=(404,),
     )
     async def move_agent(request: Request, agent: str) -> Response:
-        """Its history stays; what its devices do ends, control is lost, and its broker connection is cut."""
-        who = await caller.account(request)
-        asked: schemas.MoveAgentRequest = await read(request, schemas.MoveAgentRequest)
-        return answer(_shown(await functions.unpair.move(who, agent, asked.space)))
+        """Its history stays. Running actions end, leases are revoked, and its broker connection is closed."""
+        caller = await auth.account(request)
+        payload: schemas.MoveAgentRequest = await read(request, schemas.MoveAgentRequest)
+        return json_response(_shown(await functions.unpair.move(caller, agent, payload.space)))
 
-    @routes.add("DELETE", "/agents/{agent}", summary="Un-pair an agent", answers={204: None}, problems=(404,))
+    @routes.add("DELETE", "/agents/{agent}", summary="Unpair an agent", responses={204: None}, problems=(404,))
     async def unpair_agent(request: Request, agent: str) -> Response:
-        """Its devices disappear, its broker connection is cut, and it waits to be claimed again."""
-        await functions.unpair.unpair(await caller.account(request), agent)
+        """Removes its devices, closes its broker connection, and makes it claimable again."""
+        await functions.unpair.unpair(await auth.account(request), agent)
         return empty()
 
     return routes

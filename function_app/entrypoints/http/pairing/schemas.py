@@ -1,4 +1,4 @@
-"""``agents``."""
+"""Requests and responses of agents."""
 
 from typing import Annotated, Literal
 

@@ -1,1 +1,1 @@
-"""Robot types."""
+"""Routes of robot types, previews, movements and the script editor."""

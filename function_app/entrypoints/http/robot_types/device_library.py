@@ -1,12 +1,12 @@
-"""``devices/{id}/robot-type`` and ``devices/{id}/movements``: what its owner has for a device, whoever asks."""
+"""Robot type and movements of a device, from its owner's library."""
 
 from fastapi import Request, Response
 
 from device_agent.protocol.security import signing
 from function_app.bootstrap import Functions
 from function_app.domain.identity.accounts import Identity
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer, content
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import content, json_response
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
 from function_app.entrypoints.http.robot_types import schemas
 from function_app.entrypoints.http.robot_types.schemas import RobotTypeOut
@@ -14,65 +14,65 @@ from function_app.entrypoints.http.robot_types.serializers import movement_out, 
 from function_app.services.devices.device_access import require_operator
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("devices")
 
     @routes.add(
         "GET",
         "/devices/{device}/robot-type",
-        summary="A device's robot type",
-        answers={200: RobotTypeOut},
+        summary="Get a device's robot type",
+        responses={200: RobotTypeOut},
         problems=(404,),
     )
     async def get_device_robot_type(request: Request, device: str) -> Response:
-        """As its owner has it: one's own of the same name may be another."""
-        found = await functions.devices.get(await caller.account(request), device)
-        return answer(robot_type_out(await functions.robot_types.view(_owner(found.owner), found.robot_type)))
+        """As its owner has it. The caller's own robot type of the same name may differ."""
+        found = await functions.devices.get(await auth.account(request), device)
+        return json_response(robot_type_out(await functions.robot_types.view(_owner(found.owner), found.robot_type)))
 
     @routes.add(
         "GET",
         "/devices/{device}/robot-type/files/{name:path}",
-        summary="One file of a device's robot type",
-        answers={200: "application/octet-stream"},
+        summary="Get a file of a device's robot type",
+        responses={200: "application/octet-stream"},
         problems=(404, 409),
     )
     async def get_device_robot_type_file(request: Request, device: str, name: str) -> Response:
-        """Of the version in use; ``robot.toml`` is the manifest."""
-        found = await functions.devices.get(await caller.account(request), device)
+        """Of the version in use. ``robot.toml`` is the manifest."""
+        found = await functions.devices.get(await auth.account(request), device)
         body = await functions.robot_types.file(_owner(found.owner), found.robot_type, name)
         return content(body, "application/octet-stream", name.rpartition("/")[2])
 
     @routes.add(
         "GET",
         "/devices/{device}/movements",
-        summary="Movements that can be run on a device",
-        answers={200: schemas.MovementList},
+        summary="List movements for a device",
+        responses={200: schemas.MovementList},
         problems=(403, 404, 409, 422),
     )
     async def list_device_movements(
         request: Request, device: str, cursor: Cursor = None, limit: Limit = 100
     ) -> Response:
-        """Built-in ones and its owner's, by name. For who may run them."""
-        found = require_operator(await functions.devices.get(await caller.account(request), device))
+        """Built-in movements and its owner's, by name. For accounts that may run them."""
+        found = require_operator(await functions.devices.get(await auth.account(request), device))
         items, following = await functions.movements.list(
             _owner(found.owner), found.robot_type, cursor=cursor, limit=limit
         )
-        return answer(schemas.MovementList(items=tuple(movement_out(each) for each in items), cursor=following))
+        return json_response(schemas.MovementList(items=tuple(movement_out(each) for each in items), cursor=following))
 
     @routes.add(
         "GET",
         "/devices/{device}/movements/{name}",
-        summary="One movement that can be run on a device, with its source",
-        answers={200: schemas.MovementSource},
+        summary="Get a movement for a device, with its source",
+        responses={200: schemas.MovementSource},
         problems=(403, 404, 409),
     )
     async def get_device_movement(request: Request, device: str, name: str) -> Response:
-        """Whoever may run it may read what it does. Its newest version."""
-        found = require_operator(await functions.devices.get(await caller.account(request), device))
+        """The newest version. For accounts that may run it."""
+        found = require_operator(await functions.devices.get(await auth.account(request), device))
         movement, source = await functions.movements.get(_owner(found.owner), found.robot_type, name)
         public = signing.public_text((await functions.keys.public())[movement.key])
-        return answer(movement_source_out(found.robot_type, movement, source, public))
+        return json_response(movement_source_out(found.robot_type, movement, source, public))
 
     return routes
 

@@ -1,10 +1,10 @@
-"""``robot-type-previews``: a robot type before it is saved."""
+"""Robot type previews: validated before they are saved."""
 
 from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer, empty, read, read_or
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import empty, json_response, read, read_or
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
 from function_app.entrypoints.http.robot_types import schemas
 from function_app.entrypoints.http.robot_types.serializers import preview_out, robot_type_out, twin_out
@@ -12,72 +12,72 @@ from function_app.entrypoints.http.robot_types.serializers import preview_out, r
 _ONE = "/robot-type-previews/{preview}"
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("robot types")
 
     @routes.add(
         "POST",
         "/robot-type-previews",
-        summary="Look at a robot type before it is saved",
+        summary="Create a robot type preview",
         body=schemas.RobotTypePreviewRequest,
-        answers={201: schemas.RobotTypePreviewOut, 202: schemas.RobotTypePreviewOut},
+        responses={201: schemas.RobotTypePreviewOut, 202: schemas.RobotTypePreviewOut},
         problems=(409,),
     )
     async def add_robot_type_preview(request: Request) -> Response:
-        """Compiled and compared with its manifest as an upload is. 201: there is a verdict; 202: look at it again.
+        """Compiles the model and compares it with the manifest, like an upload. 201: validated; 202: poll it.
 
-        Four of an account are kept, each for half an hour.
+        An account has at most four previews, each for 30 min.
         """
-        who = await caller.account(request)
-        asked: schemas.RobotTypePreviewRequest = await read(
+        caller = await auth.account(request)
+        payload: schemas.RobotTypePreviewRequest = await read(
             request, schemas.RobotTypePreviewRequest, limit=schemas.MAX_UPLOAD
         )
         found = await functions.robot_type_preview.begin(
-            who, asked.manifest, asked.files, asked.movements, wait_ms=asked.wait_ms
+            caller, payload.manifest, payload.files, payload.movements, wait_ms=payload.wait_ms
         )
         status = 202 if found.upload.open else 201
-        return answer(preview_out(found), status, {"Location": f"{PREFIX}/robot-type-previews/{found.id}"})
+        return json_response(preview_out(found), status, {"Location": f"{PREFIX}/robot-type-previews/{found.id}"})
 
-    @routes.add("GET", _ONE, summary="How a look fares", answers={200: schemas.RobotTypePreviewOut}, problems=(404,))
+    @routes.add("GET", _ONE, summary="Get a preview", responses={200: schemas.RobotTypePreviewOut}, problems=(404,))
     async def get_robot_type_preview(request: Request, preview: str) -> Response:
-        """One's own."""
-        return answer(preview_out(await functions.robot_type_preview.get(await caller.account(request), preview)))
+        """Only the account's own."""
+        return json_response(preview_out(await functions.robot_type_preview.get(await auth.account(request), preview)))
 
     @routes.add(
         "GET",
         _ONE + "/twin",
-        summary="The drawing of what is looked at",
-        answers={200: schemas.RobotTypeTwin},
+        summary="Get the geometry of a preview",
+        responses={200: schemas.RobotTypeTwin},
         problems=(404, 409, 422),
     )
     async def get_robot_type_preview_twin(request: Request, preview: str) -> Response:
-        """As of a robot type."""
-        return answer(twin_out(await functions.robot_type_preview.model(await caller.account(request), preview)))
+        """As for a robot type."""
+        return json_response(twin_out(await functions.robot_type_preview.model(await auth.account(request), preview)))
 
     @routes.add(
         "POST",
         _ONE + "/save",
-        summary="Save what is looked at",
+        summary="Save a preview as a robot type",
         body=schemas.SaveRobotTypePreviewRequest,
         body_required=False,
-        answers={200: schemas.RobotTypeOut, 201: schemas.RobotTypeOut, 202: schemas.RobotTypeOut},
+        responses={200: schemas.RobotTypeOut, 201: schemas.RobotTypeOut, 202: schemas.RobotTypeOut},
         problems=(404, 409),
     )
     async def save_robot_type_preview(request: Request, preview: str) -> Response:
-        """It becomes a robot type, or the next version of one, as if it were uploaded now; the look ends."""
-        who = await caller.account(request)
-        asked = await read_or(request, schemas.SaveRobotTypePreviewRequest, schemas.SaveRobotTypePreviewRequest())
-        found, new = await functions.robot_type_preview.save(who, preview, wait_ms=asked.wait_ms)
+        """Creates a robot type, or the next version of one, like an upload. The preview ends."""
+        caller = await auth.account(request)
+        payload = await read_or(request, schemas.SaveRobotTypePreviewRequest, schemas.SaveRobotTypePreviewRequest())
+        found, new = await functions.robot_type_preview.save(caller, preview, wait_ms=payload.wait_ms)
         status = 201 if new else 200
         if found.upload is not None and found.upload.open:
             status = 202
-        return answer(robot_type_out(found), status, {"Location": f"{PREFIX}/robot-types/{found.manifest.type}"})
+        return json_response(robot_type_out(found), status, {"Location": f"{PREFIX}/robot-types/{found.manifest.type}"})
 
-    @routes.add("DELETE", _ONE, summary="End a look", answers={204: None}, problems=(404,))
+    @routes.add("DELETE", _ONE, summary="Delete a preview", responses={204: None}, problems=(404,))
     async def delete_robot_type_preview(request: Request, preview: str) -> Response:
-        """What it has stored goes."""
-        await functions.robot_type_preview.drop(await caller.account(request), preview)
+        """With all stored files."""
+        await functions.robot_type_preview.drop(await auth.account(request), preview)
         return empty()
 
     return routes

@@ -1,1 +1,1 @@
-"""Sharing."""
+"""Routes of shares, invitations and transfers."""

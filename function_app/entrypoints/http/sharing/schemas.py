@@ -1,4 +1,4 @@
-"""``devices/{id}/shares``, ``spaces/{id}/shares``: with whom something is shared."""
+"""Requests and responses of shares, invitations and transfers."""
 
 from typing import Annotated, Literal
 

@@ -1,1 +1,1 @@
-"""Telemetry."""
+"""Routes of measurements, events, latency and uploads."""

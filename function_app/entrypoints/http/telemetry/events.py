@@ -1,30 +1,30 @@
-"""``devices/{id}/events``."""
+"""Events of a device."""
 
 from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import json_response
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
 from function_app.entrypoints.http.telemetry import schemas
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("diagnostics")
 
     @routes.add(
         "GET",
         "/devices/{device}/events",
-        summary="What happened",
-        answers={200: schemas.EventList},
+        summary="List events",
+        responses={200: schemas.EventList},
         problems=(404, 422),
     )
     async def list_events(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
-        """Since the device was paired: who got and lost control, what was refused and why, faults, the room."""
-        who = await caller.account(request)
-        found = await functions.devices.get(who, device)
+        """Since the device was paired: control changes, rejected requests with reasons, faults, room events."""
+        caller = await auth.account(request)
+        found = await functions.devices.get(caller, device)
         events, following = await functions.events.read(found, cursor=cursor, limit=limit)
         items = tuple(
             schemas.EventOut(
@@ -38,6 +38,6 @@ def router(functions: Functions, caller: Caller) -> Routes:
             )
             for event in events
         )
-        return answer(schemas.EventList(items=items, cursor=following))
+        return json_response(schemas.EventList(items=items, cursor=following))
 
     return routes

@@ -1,4 +1,4 @@
-"""``devices/{id}/latency`` and ``agents/{id}/latency``."""
+"""Latency samples and statistics."""
 
 from typing import Annotated, Any
 
@@ -7,8 +7,8 @@ from fastapi import Header, Query, Request, Response
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import not_found
 from function_app.domain.common.timestamps import rfc3339
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer, empty, read
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.telemetry import schemas
 from function_app.services.devices.device_access import devices_of, require_operator
@@ -32,52 +32,52 @@ Until = Annotated[int | None, Query(alias="to", ge=0, le=2**48, description="To 
 Recent = Annotated[int, Query(ge=0, le=1000, description="At most so many of the newest samples of each.")]
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("latency")
 
     @routes.add(
         "POST",
         "/devices/{device}/latency",
-        summary="Add an operator's samples",
+        summary="Add latency samples of an operator",
         body=schemas.LatencyRequest,
-        answers={204: None},
+        responses={204: None},
         problems=(404,),
     )
     async def add_latency(request: Request, device: str, once: Key = None) -> Response:
-        """Times that the operator's side has measured, on its own clock alone. Who only watches adds none."""
-        who = await caller.account(request)
-        asked: schemas.LatencyRequest = await read(request, schemas.LatencyRequest)
-        found = require_operator(await functions.devices.get(who, device))
-        await functions.latencies.add(found, _samples(asked), caller=f"account:{who.account}", once=once or "")
+        """Durations that the operator's side measured on its own clock. Viewers add none."""
+        caller = await auth.account(request)
+        payload: schemas.LatencyRequest = await read(request, schemas.LatencyRequest)
+        found = require_operator(await functions.devices.get(caller, device))
+        await functions.latencies.add(found, _samples(payload), caller=f"account:{caller.account}", once=once or "")
         return empty()
 
     @routes.add(
         "POST",
         "/agents/{agent}/latency",
-        summary="Add an agent's samples",
+        summary="Add latency samples of an agent",
         body=schemas.AgentLatencyRequest,
-        answers={204: None},
+        responses={204: None},
         problems=(404,),
         caller="agent",
     )
     async def add_agent_latency(request: Request, agent: str, once: Key = None) -> Response:
-        """Called by an agent: times that it has measured for one of its devices, on its own clock alone."""
-        known = await caller.agent(request)
-        asked: schemas.AgentLatencyRequest = await read(request, schemas.AgentLatencyRequest)
+        """Called by an agent: durations that it measured for one of its devices on its own clock."""
+        known = await auth.agent(request)
+        payload: schemas.AgentLatencyRequest = await read(request, schemas.AgentLatencyRequest)
         if known.id != agent or not known.claimed:
             raise not_found("agent", agent)
-        device = next((found for found in devices_of(known) if found.name == asked.device), None)
+        device = next((found for found in devices_of(known) if found.name == payload.device), None)
         if device is None:
-            raise not_found("device", asked.device)
-        await functions.latencies.add(device, _samples(asked), caller=f"agent:{known.id}", once=once or "")
+            raise not_found("device", payload.device)
+        await functions.latencies.add(device, _samples(payload), caller=f"agent:{known.id}", once=once or "")
         return empty()
 
     @routes.add(
         "GET",
         "/devices/{device}/latency",
-        summary="How long things take",
-        answers={200: schemas.LatencyList},
+        summary="Get latency statistics",
+        responses={200: schemas.LatencyList},
         problems=(404, 422),
     )
     async def get_latency(  # noqa: PLR0917 (FastAPI names them)
@@ -89,9 +89,9 @@ def router(functions: Functions, caller: Caller) -> Routes:
         until: Until = None,
         samples: Recent = 1000,
     ) -> Response:
-        """Percentiles and histograms of each transport and path, side by side, since the device was paired."""
-        who = await caller.account(request)
-        found = await functions.devices.get(who, device)
+        """Percentiles and histograms of each transport and path since the device was paired."""
+        caller = await auth.account(request)
+        found = await functions.devices.get(caller, device)
         span = functions.latencies.span(since, until)
         items = await functions.latencies.find(found, span, transport=transport, path=path)
         body = schemas.LatencyList(
@@ -99,13 +99,13 @@ def router(functions: Functions, caller: Caller) -> Routes:
             until=rfc3339(span.last_ms),
             items=tuple(_show(item, samples) for item in items),
         )
-        return answer(body)
+        return json_response(body)
 
     return routes
 
 
-def _samples(asked: schemas.LatencyRequest | schemas.AgentLatencyRequest) -> Samples:
-    return Samples(asked.transport, asked.path, tuple((sample.at_ms, sample.ms) for sample in asked.samples))
+def _samples(payload: schemas.LatencyRequest | schemas.AgentLatencyRequest) -> Samples:
+    return Samples(payload.transport, payload.path, tuple((sample.at_ms, sample.ms) for sample in payload.samples))
 
 
 def _show(found: LatencySeries, samples: int) -> schemas.LatencyOut:

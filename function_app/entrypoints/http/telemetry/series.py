@@ -1,4 +1,4 @@
-"""``devices/{id}/data``: what devices have measured."""
+"""Measurements of a device."""
 
 from typing import Annotated, cast
 
@@ -6,8 +6,8 @@ from fastapi import Query, Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import LAST_MS, rfc3339
-from function_app.entrypoints.http.framework.authentication import Caller
-from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.responses import json_response
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.telemetry import schemas
 from function_app.services.telemetry.series_reader import MAX_POINTS, Part, Range
@@ -26,20 +26,20 @@ Resolution = Annotated[
 ]
 
 
-def router(functions: Functions, caller: Caller) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("data")
 
     @routes.add(
         "GET",
         "/devices/{device}/data",
-        summary="What a device measures",
-        answers={200: schemas.StreamList},
+        summary="List measurement streams",
+        responses={200: schemas.StreamList},
         problems=(404,),
     )
     async def list_streams(request: Request, device: str) -> Response:
-        """Its streams since it was paired."""
-        views = await functions.series.streams(await caller.account(request), device)
+        """Since the device was paired."""
+        views = await functions.series.streams(await auth.account(request), device)
         items = tuple(
             schemas.StreamOut(
                 name=view.name,
@@ -50,13 +50,13 @@ def router(functions: Functions, caller: Caller) -> Routes:
             )
             for view in views
         )
-        return answer(schemas.StreamList(items=items, cursor=None))
+        return json_response(schemas.StreamList(items=items, cursor=None))
 
     @routes.add(
         "GET",
         "/devices/{device}/data/{stream}",
-        summary="A stretch of a stream",
-        answers={200: schemas.DataOut},
+        summary="Read a measurement stream",
+        responses={200: schemas.DataOut},
         problems=(404, 422),
     )
     async def read_stream(  # noqa: PLR0917 (FastAPI names them)
@@ -70,7 +70,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         resolution: Resolution = None,
         cursor: Cursor = None,
     ) -> Response:
-        """Samples as they came where these are few; else mean, least, greatest and last of even stretches of time."""
+        """Raw samples if there are few; otherwise mean, minimum, maximum and last value of equal time spans."""
         wanted = Range(
             first_ms=since,
             last_ms=until,
@@ -79,8 +79,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
             fields=None if fields is None else fields.split(","),
             cursor=cursor,
         )
-        part = await functions.series.read(await caller.account(request), device, stream, wanted)
-        return answer(_show(stream, part))
+        part = await functions.series.read(await auth.account(request), device, stream, wanted)
+        return json_response(_show(stream, part))
 
     return routes
 
