@@ -1,4 +1,4 @@
-"""The files of ``docs/guides/add-a-sensor.md`` work as they are."""
+"""``docs/guides/add-a-sensor.md``: its files are found by the agent and pass the contract suite."""
 
 import os
 import re
@@ -8,40 +8,42 @@ from pathlib import Path
 
 import pytest
 
+from tests.harness.documents import blocks
 from tests.harness.paths import ROOT
 
-PAGE = (Path(ROOT) / "docs" / "guides" / "add-a-sensor.md").read_text()
-FILES = dict(re.findall(r"<!-- file: (\S+) -->\n```\w+\n(.*?)```", PAGE, re.DOTALL))
+FILES = [each for each in blocks(ROOT / "docs" / "guides" / "add-a-sensor.md") if each.use == "file"]
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for name, content in FILES.items():
-        path = tmp_path / name
+    assert len(FILES) == 4
+    for each in FILES:
+        path = tmp_path / each.argument
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content)
+        path.write_text(each.text)
     return tmp_path
 
 
-def run(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
+def run(folder: Path, *arguments: str) -> str:
     paths = os.pathsep.join((str(folder), str(ROOT)))
-    environment = os.environ | {"PYTHONPATH": paths, "TELESCOPE_ROBOTS_PATH": str(folder)}
-    return subprocess.run(
-        [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": paths, "TELESCOPE_ROBOTS_PATH": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
     )
-
-
-def test_the_guide_has_four_files() -> None:
-    assert len(FILES) == 4
-
-
-def test_the_guides_driver_passes_the_contract(folder: Path) -> None:
-    done = run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_weather_station.py")
     assert done.returncode == 0, done.stdout + done.stderr
-    assert re.search(r"\b9 passed", done.stdout), done.stdout
+    return done.stdout
 
 
-def test_the_agent_lists_room_and_driver(folder: Path) -> None:
-    done = run(folder, "-m", "device_agent", "devices", "--home", str(folder / "missing"))
-    assert "room    roof: Roof" in done.stdout, done.stdout + done.stderr
-    assert "sensor  weather_station" in done.stdout
+def test_the_driver_passes_the_contract_suite(folder: Path) -> None:
+    output = run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_weather_station.py")
+    assert re.search(r"\b9 passed", output), output
+
+
+def test_the_agent_finds_the_room_and_the_driver(folder: Path) -> None:
+    output = run(folder, "-m", "device_agent", "devices", "--home", str(folder / "agent"))
+    assert "room    roof: Roof" in output
+    assert "sensor  weather_station" in output
