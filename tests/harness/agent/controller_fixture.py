@@ -1,6 +1,7 @@
 """A controller, an operator and a clock, and what may come between them; no thread, no wait."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from device_agent.ports.geometry import Clearance, RobotGeometry, Sweep, never
 from device_agent.protocol import JointTarget, Mode, Pose, Setpoint, StopLatch
 from device_agent.protocol.manifests.robot_type import Base
+from device_agent.runtime.authority.authority import Reservation
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
@@ -26,6 +28,10 @@ class ControllerFixture:
         self.now_s = 100.0
         self.sequence = 0
         self.velocities: list[float] = []
+
+    def reserve(self) -> Reservation:
+        """Reserve the device for an action with lease 1."""
+        return self.controller.reserve(epoch=1, on_revoked=ignore_revocation)
 
     @property
     def tick_ms(self) -> int:
@@ -75,7 +81,22 @@ class ControllerFixture:
         pytest.fail(f"still moving after {limit_s} s")
 
 
-def lost(_: Refused) -> None:
+def leased() -> ControllerFixture:
+    """A controller whose operator has lease 1."""
+    fixture = ControllerFixture()
+    fixture.take(1)
+    return fixture
+
+
+@contextmanager
+def refuses(code: str) -> Iterator[None]:
+    """Expect a rejection with this code."""
+    with pytest.raises(Refused) as refused:
+        yield
+    assert refused.value.code == code
+
+
+def ignore_revocation(_: Refused) -> None:
     pass
 
 

@@ -95,6 +95,10 @@ class DeviceHarness:
             uploads=uploads,
         )
 
+    def start(self) -> None:
+        self.device.start()
+        self.device.link_changed(True)
+
     def stop(self) -> None:
         self.device.stop()
         self.outbox.stop()
@@ -154,6 +158,12 @@ class DeviceHarness:
     def end(self, command: str) -> Ack:
         ended: Ack = eventually(lambda: next((ack for ack in self.acks(command) if ack.status.terminal), None))
         return ended
+
+    def end_code(self, command: str) -> str:
+        """The code with which a command was rejected."""
+        reason = self.end(command).reason
+        assert reason is not None
+        return reason.code
 
     def telemetry(self) -> JointTelemetry:
         seen: JointTelemetry = eventually(lambda: self.heard(topics.TELE, JointTelemetry, "joints")[-1:])[0]

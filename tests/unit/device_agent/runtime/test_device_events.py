@@ -1,6 +1,5 @@
 """Every change of authority at a device and every refusal leaves an event."""
 
-import queue
 import sqlite3
 import time
 from pathlib import Path
@@ -29,17 +28,6 @@ from device_agent.protocol import (
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.security import signing
 from tests.harness.agent.device_harness import DeviceHarness, eventually
-
-
-@pytest.fixture
-def harness(tmp_path: Path):
-    harness = DeviceHarness(tmp_path)
-    harness.device.start()
-    harness.device.link_changed(True)
-    yield harness
-    harness.device.stop()
-    harness.outbox.stop()
-    harness.journal.close()
 
 
 def events(harness: DeviceHarness, kind: EventKind) -> list[Event]:
@@ -183,17 +171,6 @@ def test_a_journal_that_fails_at_the_end_is_told_too(harness: DeviceHarness) -> 
     assert event(harness, EventKind.AGENT_STOPPED)
 
 
-def test_commands_beyond_what_can_wait_are_refused_and_told(
-    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(_: bytes) -> None:
-        raise queue.Full
-
-    monkeypatch.setattr(harness.device._commands._commands, "put_nowait", full)
-    harness.command(ResetStop())
-    assert event(harness, EventKind.COMMAND_REJECTED).data == {"code": "overrun"}
-
-
 def test_a_mistake_in_the_office_ends_neither_the_office_nor_the_device(
     harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -209,22 +186,18 @@ def test_a_mistake_in_the_office_ends_neither_the_office_nor_the_device(
 def test_what_is_not_for_a_device_is_let_go_and_the_drawing_is_shown(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path)
     harness.driver.twin = lambda: Twin(device="arm", bodies=())  # type: ignore[method-assign]
-    harness.device.start()
-    harness.device.link_changed(True)
+    harness.start()
     harness.receive(topics.TELE, b"{}", "joints")
     assert eventually(lambda: harness.heard(topics.DESC, Twin, topics.TWIN)) == [Twin(device="arm", bodies=())]
     assert harness.device.quiet
     assert harness.device.publisher.rejections == {}
-    harness.device.stop()
-    harness.outbox.stop()
-    harness.journal.close()
+    harness.stop()
 
 
 def test_a_room_that_is_not_known_holds_and_is_shown(tmp_path: Path) -> None:
     rule = InterlockRule(device="sensors-pir", stream="presence", field="present", equals=True)
     harness = DeviceHarness(tmp_path, interlocks=(rule,))
-    harness.device.start()
-    harness.device.link_changed(True)
+    harness.start()
     (acted,) = eventually(lambda: events(harness, EventKind.INTERLOCK_ENGAGED))
     assert acted.data["interlock"] == rule.name
     (shown,) = eventually(lambda: [state.restrictions for state in harness.heard(topics.STATE, State)][-1:])
@@ -234,9 +207,7 @@ def test_a_room_that_is_not_known_holds_and_is_shown(tmp_path: Path) -> None:
     refused = harness.end(harness.command(MoveJoints(position_rad={"elbow": 1.0}), epoch=1))
     assert refused.status is AckStatus.FAILED
     assert not harness.device._controller.moving
-    harness.device.stop()
-    harness.outbox.stop()
-    harness.journal.close()
+    harness.stop()
 
 
 def test_a_state_that_the_link_did_not_take_is_told_again(
@@ -263,8 +234,7 @@ def test_an_answer_that_nobody_confirmed_is_given_again_over_the_next_link(harne
 def test_while_a_link_is_young_answers_are_not_believed_to_have_arrived_and_given_once_more(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path)
     harness.outbox.settle_s = 1000.0
-    harness.device.start()
-    harness.device.link_changed(True)
+    harness.start()
     command = harness.command(StopDevice())
     answer = harness.end(command)
     time.sleep(0.3)
@@ -276,6 +246,4 @@ def test_while_a_link_is_young_answers_are_not_believed_to_have_arrived_and_give
     harness.end(later)
     eventually(lambda: harness.journal.undelivered("arm") == ())
     assert [ack.status for ack in harness.acks(later)] == [AckStatus.DONE]
-    harness.device.stop()
-    harness.outbox.stop()
-    harness.journal.close()
+    harness.stop()

@@ -123,8 +123,7 @@ def make(folder: Path, **more: Any) -> DeviceHarness:
     harness = DeviceHarness(
         folder, driver=more.pop("driver", None) or Servos(), kind=more.pop("kind", None) or actor(), **more
     )
-    harness.device.start()
-    harness.device.link_changed(True)
+    harness.start()
     return harness
 
 
@@ -206,9 +205,7 @@ def test_stop_ends_speech_without_a_mouth(tmp_path: Path) -> None:
     running = harness.command(Say(text="a" * 1000), epoch=1)
     eventually(lambda: said(harness))
     harness.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
-    reason = harness.end(running).reason
-    assert reason is not None
-    assert reason.code == "stopped"
+    assert harness.end_code(running) == "stopped"
     harness.stop()
 
 
@@ -253,9 +250,7 @@ def test_stop_ends_a_behaviour_before_its_next_words(harness: DeviceHarness) -> 
     running = harness.command(RunBehaviour(name="speech"), epoch=1)
     eventually(lambda: said(harness))
     harness.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
-    reason = harness.end(running).reason
-    assert reason is not None
-    assert reason.code == "stopped"
+    assert harness.end_code(running) == "stopped"
     assert [event.message for event in said(harness)] == ["so much to say"]
 
 

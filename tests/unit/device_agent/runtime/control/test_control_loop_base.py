@@ -11,7 +11,7 @@ from device_agent.runtime.control.control_loop import ControlLoop
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import GoalResult
 from tests.fakes.drivers import BASE, FakeDriver, robot_type
-from tests.harness.agent.controller_fixture import lost
+from tests.harness.agent.controller_fixture import ignore_revocation
 
 WITHIN_S = 60.0
 
@@ -53,7 +53,7 @@ def test_the_driver_is_told_the_twist_until_the_drive_has_ended() -> None:
     loop = ControlLoop(kind, cart, controller, name="cart", publish=ignore, check_interlocks=unwatched)
     loop.start()
     try:
-        reservation = controller.reserve(epoch=1, on_revoked=lost)
+        reservation = controller.reserve(epoch=1, on_revoked=ignore_revocation)
         drive = controller.start_drive(reservation, Twist(0.2), duration_s=0.3)
         assert cart.drove.wait(WITHIN_S)
         assert drive.finished.wait(WITHIN_S)
@@ -71,7 +71,7 @@ def test_a_drive_that_the_driver_does_not_follow_says_so(cart: Cart, limited: tu
     loop = ControlLoop(kind, cart, controller, name="cart", publish=ignore, check_interlocks=unwatched)
     loop.start()
     try:
-        reservation = controller.reserve(epoch=1, on_revoked=lost)
+        reservation = controller.reserve(epoch=1, on_revoked=ignore_revocation)
         drive = controller.start_drive(reservation, Twist(0.2), duration_s=0.5)
         assert drive.finished.wait(WITHIN_S)
         assert drive.limited == limited

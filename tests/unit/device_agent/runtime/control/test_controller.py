@@ -6,40 +6,28 @@ from device_agent.protocol import Mode, StopLatch
 from device_agent.runtime.control.goals import GoalResult
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S
-from tests.harness.agent.controller_fixture import ControllerFixture, interruptions, lost
+from tests.harness.agent.controller_fixture import ControllerFixture, ignore_revocation, interruptions, leased, refuses
 
 
-def test_streamed_setpoints_move_the_device_and_end_at_the_target() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+def test_streamed_setpoints_move_the_device_to_the_target_and_keep_the_lease() -> None:
+    fixture = leased()
     assert fixture.stream(1, 3.5) is Mode.STREAMING
     assert fixture.elbow == pytest.approx(2.0, abs=1e-4)
+    assert 1.0 < max(fixture.velocities) <= 0.35 * 3.0 + 1e-6, "the streaming share of the velocity limit"
+    assert fixture.run(1.0) is Mode.IDLE
+    lease = fixture.controller.lease(fixture.now_s)
+    assert lease is not None
+    assert lease.epoch == 1
 
 
-def test_velocity_stays_under_the_streaming_share_of_the_limit() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
-    fixture.stream(1, 3.5)
-    assert 1.0 < max(fixture.velocities) <= 0.35 * 3.0 + 1e-6
-
-
-def test_motion_is_at_rest_within_350_ms_of_the_last_setpoint() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+def test_after_the_watchdog_nothing_moves_until_control_is_taken_again() -> None:
+    fixture = leased()
     fixture.stream(1, 1.0)
     assert fixture.controller.moving
     assert fixture.at_rest_after(1.0) <= 0.35
     assert fixture.controller.mode is Mode.HOLDING
-
-
-def test_after_the_watchdog_nothing_moves_until_control_is_taken_again() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
-    fixture.stream(1, 1.0)
-    fixture.run(0.5)
-    with pytest.raises(Refused) as refused:
+    with refuses("no_lease"):
         fixture.offer(1)
-    assert refused.value.code == "no_lease"
     with pytest.raises(Refused):
         fixture.take(1)
     rest = fixture.elbow
@@ -50,39 +38,24 @@ def test_after_the_watchdog_nothing_moves_until_control_is_taken_again() -> None
     assert fixture.elbow > rest
 
 
-def test_setpoints_that_end_at_the_target_keep_the_lease() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
-    fixture.stream(1, 3.5)
-    assert fixture.run(1.0) is Mode.IDLE
-    lease = fixture.controller.lease(fixture.now_s)
-    assert lease is not None
-    assert lease.epoch == 1
-
-
 @pytest.mark.parametrize("age_ms", [201, 5_000, -1])
 def test_a_setpoint_that_answers_old_or_invented_telemetry_is_refused(age_ms: int) -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
-    with pytest.raises(Refused) as refused:
+    fixture = leased()
+    with refuses("too_old"):
         fixture.offer(1, age_ms=age_ms)
-    assert refused.value.code == "too_old"
     fixture.run(0.2)
     assert fixture.elbow == 0.0
 
 
 def test_an_older_setpoint_that_arrives_late_is_dropped() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.offer(1, sequence=7)
-    with pytest.raises(Refused) as refused:
+    with refuses("out_of_order"):
         fixture.offer(1, sequence=7)
-    assert refused.value.code == "out_of_order"
 
 
 def test_a_setpoint_beyond_the_range_is_clamped_and_says_so() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.offer(1, elbow=9.0)
     assert fixture.controller.update(fixture.now_s + PERIOD_S).limited == ("elbow: range",)
     fixture.stream(1, 6.0, elbow=9.0)
@@ -90,15 +63,13 @@ def test_a_setpoint_beyond_the_range_is_clamped_and_says_so() -> None:
 
 
 def test_a_newer_lease_fences_the_older() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.stream(1, 0.5)
     fixture.take(2)
     with pytest.raises(Refused):
         fixture.offer(1)
-    with pytest.raises(Refused) as refused:
+    with refuses("stale_epoch"):
         fixture.take(1)
-    assert refused.value.code == "stale_epoch"
     assert fixture.at_rest_after(0.5) < 0.2
     lease = fixture.controller.lease(fixture.now_s)
     assert lease is not None
@@ -117,31 +88,29 @@ def test_a_lease_that_runs_out_in_mid_motion_is_a_hold() -> None:
 
 
 def test_stop_latches_and_reset_resumes_nothing() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.stream(1, 1.0)
-    fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    for caller in ("bob", "eve"):
+        fixture.controller.stop(StopLatch(caller=caller, reason="", at_ms=1))
+    assert fixture.controller.latch == StopLatch(caller="bob", reason="", at_ms=1), "the first one is shown"
     assert fixture.at_rest_after(0.5) < 0.2
     assert fixture.controller.mode is Mode.STOPPED
     fixture.take(2)
-    with pytest.raises(Refused) as refused:
+    with refuses("stopped"):
         fixture.offer(2)
-    assert refused.value.code == "stopped"
     rest = fixture.elbow
     fixture.controller.reset_stop(epoch=3)
     fixture.run(0.5)
     assert fixture.elbow == pytest.approx(rest, abs=1e-9)
-    with pytest.raises(Refused) as refused:
+    with refuses("no_lease"):
         fixture.offer(2)
-    assert refused.value.code == "no_lease", "a lease from before the reset ends with it: its setpoints resume nothing"
     fixture.take(4)
     fixture.stream(4, 0.5)
     assert fixture.elbow != rest
 
 
 def test_a_reset_that_comes_again_or_late_does_not_release_a_later_stop() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     fixture.controller.reset_stop(epoch=3)
     fixture.controller.stop(StopLatch(caller="eve", reason="", at_ms=2))
@@ -155,8 +124,7 @@ def test_a_reset_that_comes_again_or_late_does_not_release_a_later_stop() -> Non
 
 
 def test_what_was_ordered_before_a_reset_is_not_obeyed_after_it() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     fixture.controller.reset_stop(epoch=3)
     for epoch in (1, 2, 3):
@@ -167,17 +135,9 @@ def test_what_was_ordered_before_a_reset_is_not_obeyed_after_it() -> None:
             fixture.take(epoch)
 
 
-def test_the_first_stop_stays_the_one_shown() -> None:
-    fixture = ControllerFixture()
-    fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    fixture.controller.stop(StopLatch(caller="eve", reason="", at_ms=2))
-    assert fixture.controller.latch is not None
-    assert fixture.controller.latch.caller == "bob"
-
-
 def test_a_move_reaches_its_target_and_says_so() -> None:
     fixture = ControllerFixture()
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     move = fixture.controller.start_joint_goal(reservation, {"elbow": 1.0}, speed=1.0)
     fixture.run(2.0)
     assert move.result is GoalResult.REACHED
@@ -189,7 +149,7 @@ def test_a_move_reaches_its_target_and_says_so() -> None:
 @pytest.mark.parametrize(("position_rad", "code"), [({"elbow": 3.1}, "out_of_range"), ({"knee": 0.0}, "unknown_joint")])
 def test_a_move_that_cannot_be_is_refused_whole(position_rad: dict[str, float], code: str) -> None:
     fixture = ControllerFixture()
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     with pytest.raises(Refused) as refused:
         fixture.controller.start_joint_goal(reservation, {"shoulder": 1.0} | position_rad, speed=1.0)
     assert refused.value.code == code
@@ -215,29 +175,18 @@ def test_an_action_that_loses_the_device_moves_it_no_more(cause: str) -> None:
 
 
 def test_setpoints_are_refused_while_an_action_runs() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
-    with pytest.raises(Refused) as refused:
+    fixture = leased()
+    reservation = fixture.reserve()
+    with refuses("busy"):
         fixture.offer(1)
-    assert refused.value.code == "busy"
     with pytest.raises(Refused):
-        fixture.controller.reserve(epoch=1, on_revoked=lost)
+        fixture.controller.reserve(epoch=1, on_revoked=ignore_revocation)
     fixture.controller.end_reservation(reservation)
     fixture.offer(1)
 
 
-def test_epochs_burned_before_a_restart_stay_burned() -> None:
-    fixture = ControllerFixture(epoch=4, burned=4)
-    with pytest.raises(Refused):
-        fixture.take(4)
-    fixture.take(5)
-    fixture.offer(5)
-
-
 def test_losing_the_link_at_rest_keeps_the_lease() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.controller.interrupt(Refused("link_lost", ""))
     assert fixture.controller.lease(fixture.now_s) is not None
 

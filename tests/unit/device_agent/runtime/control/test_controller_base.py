@@ -6,13 +6,12 @@ from itertools import pairwise
 import pytest
 
 from device_agent.ports.driver import REST, Twist
-from device_agent.protocol import StopLatch
 from device_agent.runtime.control.base_motion import BaseMotion
 from device_agent.runtime.control.goals import DriveGoal, GoalResult
 from device_agent.runtime.control.joint_motion import MotionError
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE, PERIOD_S
-from tests.harness.agent.controller_fixture import ControllerFixture, interruptions, lost
+from tests.harness.agent.controller_fixture import ControllerFixture, interruptions, refuses
 
 
 def twists(fixture: ControllerFixture, seconds: float) -> list[Twist]:
@@ -24,7 +23,7 @@ def twists(fixture: ControllerFixture, seconds: float) -> list[Twist]:
 
 
 def driving(fixture: ControllerFixture, duration_s: float = 2.0) -> DriveGoal:
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     return fixture.controller.start_drive(reservation, Twist(0.4, 0.0, -0.5), duration_s=duration_s)
 
 
@@ -79,7 +78,7 @@ def test_a_drive_is_slowed_by_the_room() -> None:
 
 def test_a_drive_takes_the_place_of_a_move_and_the_other_way_round() -> None:
     fixture = ControllerFixture(base=BASE)
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     move = fixture.controller.start_joint_goal(reservation, {"elbow": 2.0}, speed=1.0)
     fixture.run(0.3)
     drive = fixture.controller.start_drive(reservation, Twist(0.4), duration_s=5.0)
@@ -105,7 +104,7 @@ def refusals() -> dict[str, tuple[Twist, float]]:
 @pytest.mark.parametrize("case", refusals())
 def test_what_cannot_be_driven_is_refused(case: str) -> None:
     fixture = ControllerFixture(base=BASE)
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     twist, duration_s = refusals()[case]
     with pytest.raises(Refused) as refused:
         fixture.controller.start_drive(reservation, twist, duration_s=duration_s)
@@ -115,10 +114,9 @@ def test_what_cannot_be_driven_is_refused(case: str) -> None:
 
 def test_a_robot_without_a_base_does_not_drive() -> None:
     fixture = ControllerFixture()
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
-    with pytest.raises(Refused) as refused:
+    reservation = fixture.reserve()
+    with refuses("no_base"):
         fixture.controller.start_drive(reservation, Twist(0.1), duration_s=1.0)
-    assert refused.value.code == "no_base"
 
 
 def test_a_driver_that_comes_back_finds_the_base_at_rest() -> None:
@@ -130,12 +128,6 @@ def test_a_driver_that_comes_back_finds_the_base_at_rest() -> None:
     assert twists(fixture, 0.1)[0] == REST
 
 
-def test_a_stop_while_nothing_moves_leaves_the_base_at_rest() -> None:
-    fixture = ControllerFixture(base=BASE)
-    fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    assert twists(fixture, 0.1)[-1] == REST
-
-
 def test_a_base_without_a_way_to_go_on_says_so() -> None:
     motion = BaseMotion(BASE, PERIOD_S)
     motion.follow(Twist(math.nan))
@@ -145,7 +137,7 @@ def test_a_base_without_a_way_to_go_on_says_so() -> None:
 
 def test_an_action_may_end_while_it_drives() -> None:
     fixture = ControllerFixture(base=BASE)
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     drive = fixture.controller.start_drive(reservation, Twist(0.4), duration_s=5.0)
     twists(fixture, 0.5)
     fixture.controller.end_reservation(reservation)

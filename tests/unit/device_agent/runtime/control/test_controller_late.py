@@ -3,7 +3,7 @@
 import pytest
 
 from tests.fakes.drivers import PERIOD_S
-from tests.harness.agent.controller_fixture import ControllerFixture
+from tests.harness.agent.controller_fixture import ControllerFixture, leased
 
 LIMIT_S = 0.3
 FASTEST_RAD_S = 3.0
@@ -11,8 +11,7 @@ FASTEST_RAD_S = 3.0
 
 @pytest.fixture
 def fixture() -> ControllerFixture:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.stream(1, 1.0, elbow=2.9)
     assert fixture.controller._state.motion.fastest_rad_s > 0.5
     return fixture

@@ -16,7 +16,7 @@ from device_agent.runtime.control.latency_limiter import LatencyLimiter
 from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S, robot_type
-from tests.harness.agent.controller_fixture import WALL_RAD, ControllerFixture, Wall, lost
+from tests.harness.agent.controller_fixture import WALL_RAD, ControllerFixture, Wall, leased, refuses
 
 
 def test_a_streamed_arm_stops_before_the_wall_and_says_so() -> None:
@@ -44,7 +44,7 @@ def test_an_operator_who_pushes_against_the_wall_moves_nothing() -> None:
 
 def test_a_wall_that_is_met_at_full_speed_is_not_touched() -> None:
     fixture = ControllerFixture(geometry=Wall(2.0))
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     wall = Wall(2.0)
     fixture.controller._state.limits._geometry = None  # the target is not looked at: only the way is
     move = fixture.controller.start_joint_goal(reservation, {"elbow": 2.9}, speed=1.0)
@@ -63,7 +63,7 @@ def test_a_wall_that_is_met_at_full_speed_is_not_touched() -> None:
 
 def test_a_move_to_where_there_is_no_room_is_refused_and_says_what_is_there() -> None:
     fixture = ControllerFixture(geometry=Wall())
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     with pytest.raises(Refused) as refused:
         fixture.controller.start_joint_goal(reservation, {"elbow": 1.25}, speed=1.0)
     assert refused.value.code == "no_room"
@@ -75,7 +75,7 @@ def test_a_move_to_where_there_is_no_room_is_refused_and_says_what_is_there() ->
 def test_who_is_too_near_already_may_leave_but_not_go_on() -> None:
     fixture = ControllerFixture(geometry=Wall())
     fixture.controller.start_at([0.0, 1.3])
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     with pytest.raises(Refused):
         fixture.controller.start_joint_goal(reservation, {"elbow": 1.4}, speed=1.0)
     assert fixture.controller.start_joint_goal(reservation, {"elbow": 1.2}, speed=1.0)
@@ -88,23 +88,19 @@ def test_who_is_too_near_already_may_leave_but_not_go_on() -> None:
 @pytest.mark.parametrize("speed", [0.0, -1.0, 1.1, math.nan, math.inf])
 def test_a_speed_that_is_none_is_refused(speed: float) -> None:
     fixture = ControllerFixture()
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
-    with pytest.raises(Refused) as refused:
+    reservation = fixture.reserve()
+    with refuses("bad_speed"):
         fixture.controller.start_joint_goal(reservation, {"elbow": 1.0}, speed=speed)
-    assert refused.value.code == "bad_speed"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_position_that_is_no_number_is_refused_for_every_source(value: float) -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
-    with pytest.raises(Refused) as refused:
+    fixture = leased()
+    with refuses("not_finite"):
         fixture.offer(1, elbow=value)
-    assert refused.value.code == "not_finite"
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
-    with pytest.raises(Refused) as refused:
+    reservation = fixture.reserve()
+    with refuses("not_finite"):
         fixture.controller.start_joint_goal(reservation, {"elbow": value}, speed=1.0)
-    assert refused.value.code == "not_finite"
 
 
 def test_speed_falls_before_the_wall_by_how_old_the_picture_is() -> None:
@@ -132,18 +128,15 @@ def test_with_a_young_picture_and_room_the_stream_has_its_full_speed() -> None:
 
 
 def test_where_nobody_knows_the_shape_age_alone_slows() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.stream(1, 1.0, age_ms=90)
     assert max(fixture.velocities) == pytest.approx(0.35 * 3.0, rel=1e-6)
     assert fixture.limited == set()
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.stream(1, 1.5, age_ms=150)
     assert fixture.velocities[-1] == pytest.approx(0.5 * 0.35 * 3.0, rel=1e-3)
     assert fixture.limited == {"speed: loop age"}
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.stream(1, 1.0, age_ms=200)
     assert 0 < fixture.velocities[-1] <= 0.1 * 0.35 * 3.0 + 1e-6
 
@@ -162,7 +155,7 @@ def test_one_late_answer_is_no_slow_link() -> None:
 
 def test_what_the_driver_changes_is_told() -> None:
     fixture = ControllerFixture()
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     move = fixture.controller.start_joint_goal(reservation, {"elbow": 1.0}, speed=1.0)
     fixture.run(0.1)
     fixture.controller.record_applied([0.0, fixture.elbow - 0.01])
@@ -180,7 +173,7 @@ def test_a_shape_that_fails_under_way_is_no_permission() -> None:
             raise RuntimeError("no shape")
 
     fixture = ControllerFixture(geometry=Broken())
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     fixture.controller.start_joint_goal(reservation, {"elbow": 0.5}, speed=1.0)
     with pytest.raises(RuntimeError):
         fixture.run(0.1)
@@ -190,8 +183,7 @@ def test_a_shape_that_fails_under_way_is_no_permission() -> None:
 
 
 def test_a_new_order_in_the_middle_of_hard_braking_does_not_turn_the_arm_round() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.stream(1, 1.5, elbow=2.9)
     fixture.take(2)
     fixture.run(2 * PERIOD_S)
@@ -228,8 +220,7 @@ def test_a_way_that_rounding_hides_from_the_planner_is_found_with_a_little_less_
 
 
 def test_a_motion_that_cannot_be_planned_holds_and_ends_the_lease() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.stream(1, 0.5)
     fixture.controller._state.motion._jerk_limits = [math.nan, math.nan]
     assert fixture.stream(1, 0.024) is Mode.HOLDING
@@ -239,8 +230,7 @@ def test_a_motion_that_cannot_be_planned_holds_and_ends_the_lease() -> None:
 
 
 def test_where_not_even_braking_can_be_planned_the_command_stands_still_at_once() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.stream(1, 0.5)
     fixture.controller._state.motion._jerk_limits = [math.nan, math.nan]
     fixture.controller._state.motion._braking = math.nan

@@ -8,7 +8,7 @@ from device_agent.protocol import Mode
 from device_agent.runtime.authority.speed_restrictions import Restriction, Restrictions
 from device_agent.runtime.control.goals import GoalResult
 from device_agent.runtime.errors import Refused
-from tests.harness.agent.controller_fixture import ControllerFixture, lost
+from tests.harness.agent.controller_fixture import ControllerFixture, ignore_revocation, leased, refuses
 
 
 def test_the_strictest_of_several_sources_counts_until_it_is_lifted() -> None:
@@ -31,8 +31,7 @@ def test_a_speed_that_is_no_share_means_hold(speed: float) -> None:
 
 
 def test_a_slowed_stream_is_slower_says_why_and_speeds_up_again_by_itself() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.controller.restrict("zone", 0.25, "somebody is near")
     assert fixture.controller.restrictions == (Restriction("zone", 0.25, "somebody is near"),)
     fixture.stream(1, 1.5)
@@ -45,7 +44,7 @@ def test_a_slowed_stream_is_slower_says_why_and_speeds_up_again_by_itself() -> N
 
 def test_a_move_in_mid_motion_is_slowed_and_goes_on_when_the_zone_is_free() -> None:
     fixture = ControllerFixture()
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     move = fixture.controller.start_joint_goal(reservation, {"elbow": 2.5}, speed=1.0)
     fixture.run(0.5)
     fixture.controller.restrict("zone", 0.1, "somebody is near")
@@ -59,17 +58,15 @@ def test_a_move_in_mid_motion_is_slowed_and_goes_on_when_the_zone_is_free() -> N
 
 
 def test_a_hold_stops_a_stream_and_lifting_it_resumes_nothing() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.stream(1, 1.0)
     fixture.controller.restrict("zone", 0.0, "somebody is there")
     assert fixture.at_rest_after(0.5) < 0.2
     assert fixture.controller.mode is Mode.HOLDING
     fixture.controller.lift("zone")
     rest = fixture.elbow
-    with pytest.raises(Refused) as refused:
+    with refuses("no_lease"):
         fixture.offer(1)
-    assert refused.value.code == "no_lease"
     fixture.run(1.0)
     assert fixture.elbow == pytest.approx(rest, abs=1e-9)
     fixture.take(2)
@@ -88,14 +85,13 @@ def test_a_hold_ends_an_action_and_refuses_the_next() -> None:
     assert (move.result, [refused.code for refused in why]) == (GoalResult.INTERRUPTED, ["interlock"])
     assert not fixture.controller.moving
     with pytest.raises(Refused) as refused:
-        fixture.controller.reserve(epoch=2, on_revoked=lost)
+        fixture.controller.reserve(epoch=2, on_revoked=ignore_revocation)
     assert refused.value.code == "interlock"
     assert "somebody is there" in refused.value.message
 
 
 def test_an_operator_at_rest_keeps_control_through_a_hold_unless_they_push_against_it() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.controller.restrict("zone", 0.0, "somebody is there")
     assert fixture.run(0.1) is Mode.HOLDING
     fixture.controller.lift("zone")
@@ -104,18 +100,15 @@ def test_an_operator_at_rest_keeps_control_through_a_hold_unless_they_push_again
     fixture.stream(1, 2.0, elbow=0.0)
     fixture.run(0.5)
     fixture.controller.restrict("zone", 0.0, "somebody is there")
-    with pytest.raises(Refused) as refused:
+    with refuses("interlock"):
         fixture.offer(1)
-    assert refused.value.code == "interlock"
     fixture.controller.lift("zone")
-    with pytest.raises(Refused) as refused:
+    with refuses("no_lease"):
         fixture.offer(1)
-    assert refused.value.code == "no_lease", "the arm must not start because a person leaves"
 
 
 def test_a_setpoint_that_waits_for_its_first_period_is_held_too() -> None:
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = leased()
     fixture.offer(1)
     fixture.controller.restrict("zone", 0.0, "somebody is there")
     fixture.controller.lift("zone")

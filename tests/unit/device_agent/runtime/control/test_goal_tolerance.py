@@ -10,7 +10,7 @@ from device_agent.runtime.control.goal_tolerance import SETTLE_TIMEOUT_S, TOLERA
 from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.planning.motion_planner import MotionPlanner
 from tests.fakes.drivers import PERIOD_S, robot_type
-from tests.harness.agent.controller_fixture import ControllerFixture, Wall, lost
+from tests.harness.agent.controller_fixture import ControllerFixture, Wall, ignore_revocation
 
 Servo = Callable[[Sequence[float]], Sequence[float]]
 
@@ -21,7 +21,7 @@ class Loaded(ControllerFixture):
     def __init__(self, servo: Servo) -> None:
         super().__init__()
         self.servo = servo
-        self.reservation = self.controller.reserve(epoch=1, on_revoked=lost)
+        self.reservation = self.controller.reserve(epoch=1, on_revoked=ignore_revocation)
 
     def go(self, course: MotionGoal, *, most_s: float = 10.0) -> float:
         """Until its end; gives how long the command had rested by then [s]."""

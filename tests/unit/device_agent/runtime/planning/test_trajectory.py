@@ -17,7 +17,7 @@ from device_agent.runtime.planning import trajectory
 from device_agent.runtime.planning.motion_planner import MotionPlanner, quaternion_of
 from device_agent.runtime.planning.trajectory import Floats, Trajectory
 from tests.fakes.drivers import PERIOD_S, robot_type
-from tests.harness.agent.controller_fixture import ControllerFixture, Wall, interruptions, lost
+from tests.harness.agent.controller_fixture import ControllerFixture, Wall, interruptions
 
 JOINTS = robot_type().joints
 CORNER = [[0.0, 0.0], [1.2, 0.0], [1.2, 1.0]]
@@ -68,7 +68,7 @@ def test_a_way_of_one_leg_is_straight_and_nearly_as_quick_as_a_move() -> None:
     found = along([[0.0, 0.0], [2.0, 1.0]])
     assert found.position_rad[:, 0] == pytest.approx(2 * found.position_rad[:, 1], abs=1e-9)
     fixture = ControllerFixture()
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     move = fixture.controller.start_joint_goal(reservation, {"shoulder": 2.0, "elbow": 1.0}, speed=1.0)
     began_s = fixture.now_s
     while not move.finished.is_set():
@@ -92,7 +92,7 @@ def test_corners_are_rounded_off_as_widely_as_there_is_room() -> None:
 
 def test_the_device_goes_along_a_way_and_rests_at_its_end() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     passage = fixture.controller.start_trajectory(reservation, found)
     gone = ride(fixture, found.duration_s + 0.1)
     assert passage.result is GoalResult.REACHED
@@ -120,7 +120,7 @@ def check_on(found: Trajectory, gone: Floats) -> None:
 def test_whatever_takes_the_device_away_brakes_it_on_its_way(cause: str, after_s: float) -> None:
     fixture, found = ControllerFixture(), along(CORNER)
     fixture.take(1, lease_s=5.0)
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     passage = fixture.controller.start_trajectory(reservation, found)
     before = ride(fixture, after_s)
     assert before[-1] != pytest.approx(before[-2], abs=1e-6)
@@ -135,7 +135,7 @@ def test_whatever_takes_the_device_away_brakes_it_on_its_way(cause: str, after_s
 
 def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     passage = fixture.controller.start_trajectory(reservation, found)
     gone = [ride(fixture, 0.4)]
     fixture.controller.restrict("room", 0.3, "somebody is near")
@@ -153,7 +153,7 @@ def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> 
 
 def test_what_appears_on_a_way_holds_it_before() -> None:
     fixture, found = ControllerFixture(geometry=Wall(0.5)), along(CORNER)
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     passage = fixture.controller.start_trajectory(reservation, found)
     gone = ride(fixture, 3.0)
     assert passage.why is not None
@@ -164,7 +164,7 @@ def test_what_appears_on_a_way_holds_it_before() -> None:
 
 def test_a_late_control_loop_counts_what_it_missed_as_braked_on_a_way_too() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     fixture.controller.start_trajectory(reservation, found)
     ride(fixture, 0.5)
     fixture.controller.end_reservation(reservation)
@@ -177,7 +177,7 @@ def test_a_late_control_loop_counts_what_it_missed_as_braked_on_a_way_too() -> N
 
 def test_a_move_that_follows_waits_until_the_device_rests_on_its_way() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     passage = fixture.controller.start_trajectory(reservation, found)
     ride(fixture, 0.5)
     move = fixture.controller.start_joint_goal(reservation, {"shoulder": 0.0, "elbow": 0.0}, speed=1.0)
@@ -189,7 +189,7 @@ def test_a_move_that_follows_waits_until_the_device_rests_on_its_way() -> None:
 
 def test_a_way_that_begins_elsewhere_or_leaves_a_range_is_refused() -> None:
     fixture = ControllerFixture()
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     for corners, code in (
         ([[0.1, 0.0], [1.0, 0.0]], "moved"),
         ([[0.0, 0.0], [0.0, 3.2]], "out_of_range"),
@@ -210,7 +210,7 @@ def test_a_way_that_begins_elsewhere_or_leaves_a_range_is_refused() -> None:
 
 def test_a_target_is_looked_at_before_a_way_to_it() -> None:
     fixture = ControllerFixture(geometry=Wall())
-    reservation = fixture.controller.reserve(epoch=1, on_revoked=lost)
+    reservation = fixture.reserve()
     assert fixture.controller.resolve_target(reservation, {"elbow": 0.5}) == [0.0, 0.5]
     with pytest.raises(Refused, match="no room there"):
         fixture.controller.resolve_target(reservation, {"elbow": 1.5})

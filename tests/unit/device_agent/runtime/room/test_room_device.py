@@ -23,11 +23,9 @@ from device_agent.protocol import (
     Measurements,
     Mode,
     MoveJoints,
-    ReleaseLease,
     ResetStop,
     RoomTask,
     SetControl,
-    Stop,
     StopDevice,
     Stream,
     TakePicture,
@@ -343,13 +341,6 @@ def test_stop_holds_what_moves_and_refuses_until_it_is_reset_and_measuring_goes_
     assert harness.done(SetControl(control="opening", value=0.1)).status is AckStatus.DONE
 
 
-def test_the_loss_of_the_lease_ends_a_gathering(harness: RoomBench) -> None:
-    gathering = harness.command(CollectData(rate_hz=20.0, duration_s=3000.0), epoch=harness.epoch())
-    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in harness.acks(gathering)))
-    harness.command(ReleaseLease(), epoch=harness.given)
-    assert harness.end(gathering).reason.code == "lease_lost"  # type: ignore[union-attr]
-
-
 def test_a_sensor_that_does_not_answer_is_a_fault_that_ends_when_it_answers(harness: RoomBench) -> None:
     harness.device.link_changed(True)
     grows(harness.measured)
@@ -413,13 +404,6 @@ def test_what_it_measures_is_what_the_agents_others_read_of_the_room(harness: Ro
     room = ReadingCache(space="s", agent="a", own=["arm"], named=[("arm", "air")])
     harness.device._readings = room
     eventually(lambda: room.latest("arm", "air"))
-
-
-def test_stop_by_message_latches(harness: RoomBench) -> None:
-    harness.device.link_changed(True)
-    harness.receive(topics.STOP, b'{"id":"x","caller":"ann"}')
-    assert shown(harness, lambda state: state.stop).mode in {Mode.STOPPED, Mode.IDLE}
-    assert Stop(id="x", caller="ann").caller == shown(harness, lambda state: state.stop).stop.caller  # type: ignore[union-attr]
 
 
 def test_it_lets_the_driver_go_at_the_end_also_when_it_is_ended_twice(tmp_path: Path) -> None:

@@ -54,8 +54,7 @@ def watched(
 def test_a_device_describes_its_cameras_and_tells_what_they_see(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), cameras=(EYES,))
     harness = DeviceHarness(tmp_path, kind=kind, driver=Seeing(lambda: JPEG))
-    harness.device.start()
-    harness.device.link_changed(True)
+    harness.start()
     (described,) = eventually(lambda: harness.heard(topics.DESC, Description))[:1]
     shown = eventually(lambda: [payload for topic, payload in list(harness.said) if topic.endswith("/cam/eyes")][:3])
     harness.stop()
