@@ -12,18 +12,18 @@ WHOLE = 1_000_000
 PART = 50_000
 
 
-def test_no_stale_order_is_obeyed() -> None:
+def test_no_stale_command_is_applied() -> None:
     tally = play(PART)
     assert tally.stale == 0
     assert tally.obeyed > PART / 4, "most handovers must lead to something"
 
 
 @pytest.mark.parametrize("mutant", [no_check, expiry_only])
-def test_a_gate_without_the_fence_is_caught(mutant: MakeGate) -> None:
+def test_a_gate_without_fencing_is_detected(mutant: MakeGate) -> None:
     assert play(PART // 20, gate=mutant).stale > 10
 
 
-def test_a_journal_that_is_written_after_obeying_is_caught() -> None:
+def test_a_journal_written_after_applying_is_detected() -> None:
     assert play(PART // 5, journal_first=False).stale > 0
 
 

@@ -56,23 +56,23 @@ def whole(tmp_path: Path):
     whole.harness.journal.close()
 
 
-def test_a_device_holds_before_anybody_can_speak_to_it(whole: Whole) -> None:
+def test_a_device_holds_before_the_link_starts(whole: Whole) -> None:
     assert whole.link.held_first
     assert whole.agent.quiet
 
 
-def test_what_arrives_reaches_its_device(whole: Whole) -> None:
+def test_messages_reach_their_device(whole: Whole) -> None:
     whole.link.receive("ts/v1/s/a/arm/stop", codec.encode(Stop(id="s1", caller="bob")))
     eventually(lambda: whole.harness.telemetry().mode is Mode.STOPPED)
 
 
 @pytest.mark.parametrize("topic", ["ts/v1/s/a/leg/stop", "ts/v2/s/a/arm/stop", "$SYS", "", "ts/v1/x/y/arm/stop"])
-def test_what_is_for_nobody_here_harms_nothing(whole: Whole, topic: str) -> None:
+def test_foreign_topics_are_ignored(whole: Whole, topic: str) -> None:
     whole.link.receive(topic, codec.encode(Stop(id="s1", caller="bob")))
     assert whole.harness.telemetry().mode is Mode.IDLE
 
 
-def test_what_others_of_the_space_measure_goes_to_the_room(whole: Whole) -> None:
+def test_measurements_of_other_agents_are_cached(whole: Whole) -> None:
     measured = Measurements(tick_ms=1, at_ms=1, sequence=1, values={"present": True})
     topic = topics.device("s", "other", "pir", topics.TELE, "presence")
     whole.link.receive(topic, codec.encode(measured))
@@ -81,7 +81,7 @@ def test_what_others_of_the_space_measure_goes_to_the_room(whole: Whole) -> None
     assert reading.values == {"present": True}
 
 
-def test_a_lost_link_is_told_to_every_device(whole: Whole) -> None:
+def test_a_lost_link_reaches_every_device(whole: Whole) -> None:
     running = whole.harness.command(whole.harness.script("wait(600)"), epoch=1)
     eventually(lambda: whole.harness.acks(running)[1:])
     assert not whole.agent.quiet
@@ -91,7 +91,7 @@ def test_a_lost_link_is_told_to_every_device(whole: Whole) -> None:
     assert reason.code == "link_lost"
 
 
-def test_it_may_be_stopped_twice(whole: Whole) -> None:
+def test_stop_is_idempotent(whole: Whole) -> None:
     whole.agent.stop()
     whole.agent.stop()
     assert whole.link.stopped == 2

@@ -36,7 +36,7 @@ from device_agent.runtime.control.controller import Controller
 from tests.harness.agent.device_harness import WITHIN_S, DeviceHarness, eventually, shown
 
 
-def test_it_introduces_itself_when_the_link_comes_up(harness: DeviceHarness) -> None:
+def test_description_and_state_are_published_on_connection(harness: DeviceHarness) -> None:
     described: Description = eventually(lambda: harness.heard(topics.DESC, Description))[0]
     assert [joint.name for joint in described.joints] == ["shoulder", "elbow"]
     state: State = eventually(lambda: harness.heard(topics.STATE, State))[0]
@@ -79,20 +79,20 @@ def test_a_command_out_of_its_time_does_not_run(
     assert harness.driver.position == (0.0, 0.0)
 
 
-def test_without_the_clouds_time_nothing_that_moves_is_obeyed(harness: DeviceHarness) -> None:
+def test_without_cloud_time_motion_commands_are_rejected(harness: DeviceHarness) -> None:
     harness.clock.__init__()  # type: ignore[misc]
     assert harness.end_code(harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1)) == "no_clock"
 
 
 @pytest.mark.parametrize("changes", [{"space": "x"}, {"agent": "x"}, {"device": "x"}])
-def test_a_command_for_somebody_else_is_not_even_answered(harness: DeviceHarness, changes: dict[str, str]) -> None:
+def test_a_command_for_another_device_gets_no_ack(harness: DeviceHarness, changes: dict[str, str]) -> None:
     foreign = harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1, **changes)
     harness.end(harness.command(GrantLease(holder="ann", lease_ms=5000), epoch=1))
     assert harness.acks(foreign) == []
     assert harness.device.publisher.rejections == {"wrong_address": 1}
 
 
-def test_what_the_cloud_did_not_sign_is_not_obeyed(harness: DeviceHarness) -> None:
+def test_unsigned_commands_are_rejected(harness: DeviceHarness) -> None:
     harness.key = signing.generate()
     harness.command(GrantLease(holder="eve", lease_ms=5000), epoch=9)
     harness.receive(topics.CMD, b"{}")
@@ -144,13 +144,13 @@ def test_stop_needs_no_lease_and_survives_a_restart(harness: DeviceHarness, tmp_
     again.stop()
 
 
-def test_a_signed_stop_is_obeyed_however_late(harness: DeviceHarness) -> None:
+def test_a_late_signed_stop_is_applied(harness: DeviceHarness) -> None:
     ack = harness.end(harness.command(StopDevice(reason="late"), issued_at_ms=1))
     assert ack.status is AckStatus.DONE
     eventually(lambda: harness.telemetry().mode is Mode.STOPPED)
 
 
-def test_it_follows_to_the_clouds_new_key_when_told_by_the_one_it_has_pinned(harness: DeviceHarness) -> None:
+def test_a_key_rotation_needs_a_pinned_signer(harness: DeviceHarness) -> None:
     new = signing.generate()
 
     def statement(by: Ed25519PrivateKey, of: Ed25519PrivateKey = new, serial: int = 2) -> str:
@@ -178,7 +178,7 @@ def test_a_second_action_is_refused_while_one_runs_and_the_first_can_be_cancelle
     assert harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=1)).status is AckStatus.DONE
 
 
-def test_a_lost_link_ends_what_runs_and_the_answer_is_sent_when_it_is_back(harness: DeviceHarness) -> None:
+def test_a_lost_link_ends_the_action_and_the_ack_is_sent_on_reconnection(harness: DeviceHarness) -> None:
     running = harness.command(harness.script("wait(600)"), epoch=1)
     eventually(lambda: [ack for ack in harness.acks(running) if ack.status is AckStatus.STARTED])
     gone = threading.Event()
@@ -195,7 +195,7 @@ def test_a_lost_link_ends_what_runs_and_the_answer_is_sent_when_it_is_back(harne
     assert harness.end_code(running) == "link_lost"
 
 
-def test_a_driver_that_stops_answering_is_a_fault_that_ends_when_it_answers(harness: DeviceHarness) -> None:
+def test_a_driver_error_is_a_fault_until_the_driver_responds(harness: DeviceHarness) -> None:
     harness.driver.broken = True
     state: State = eventually(lambda: [s for s in harness.heard(topics.STATE, State) if s.faults])[-1]
     assert "switched on" in state.faults[0].message
@@ -205,7 +205,7 @@ def test_a_driver_that_stops_answering_is_a_fault_that_ends_when_it_answers(harn
     assert harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=1)).status is AckStatus.DONE
 
 
-def test_a_lease_from_before_a_restart_is_not_obeyed(harness: DeviceHarness, tmp_path: Path) -> None:
+def test_a_lease_from_before_a_restart_is_rejected(harness: DeviceHarness, tmp_path: Path) -> None:
     harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000), epoch=4))
     again = DeviceHarness(tmp_path)
     again.device.start()
@@ -216,7 +216,7 @@ def test_a_lease_from_before_a_restart_is_not_obeyed(harness: DeviceHarness, tmp
     again.stop()
 
 
-def test_garbage_is_counted_and_harms_nothing(harness: DeviceHarness) -> None:
+def test_malformed_messages_are_counted_and_ignored(harness: DeviceHarness) -> None:
     for kind in (topics.CTL, topics.STOP, topics.CMD):
         for payload in (b"", b"\x00" * 10, b'{"id":1}', b"NaN"):
             harness.receive(kind, payload, "1")
@@ -224,7 +224,7 @@ def test_garbage_is_counted_and_harms_nothing(harness: DeviceHarness) -> None:
     assert harness.telemetry().mode is Mode.IDLE
 
 
-def test_state_shows_who_asks_for_control_until_that_is_dropped(harness: DeviceHarness) -> None:
+def test_state_shows_a_control_request_until_it_is_withdrawn(harness: DeviceHarness) -> None:
     early = harness.end(
         harness.command(RequestControl(request="r1", requester="bob", answer_within_ms=30_000), epoch=1)
     )
@@ -249,7 +249,7 @@ def test_state_shows_who_asks_for_control_until_that_is_dropped(harness: DeviceH
     assert lease.reason == "needed in the lab", "a renewal does not wipe it out"
 
 
-def test_state_tells_which_leases_will_never_be_obeyed_again(harness: DeviceHarness) -> None:
+def test_state_contains_the_ended_epoch(harness: DeviceHarness) -> None:
     harness.end(harness.command(GrantLease(holder="ann", lease_ms=60_000), epoch=4))
     assert shown(harness, lambda state: state.lease).ended_epoch < 4
     harness.end(harness.command(ReleaseLease(), epoch=4))
@@ -272,7 +272,7 @@ def test_nothing_gets_past_stop(harness: DeviceHarness, tmp_path: Path) -> None:
     assert harness.driver.position == again.driver.position == (0.0, 0.0)
 
 
-def test_a_reset_that_is_played_again_or_comes_late_leaves_a_later_stop_alone(harness: DeviceHarness) -> None:
+def test_a_replayed_or_late_reset_does_not_release_a_later_stop(harness: DeviceHarness) -> None:
     harness.end(harness.command(StopDevice()))
     harness.command(ResetStop(), epoch=3, command_id="reset")
     harness.end("reset")
@@ -287,7 +287,7 @@ def test_a_reset_that_is_played_again_or_comes_late_leaves_a_later_stop_alone(ha
     assert harness.device._controller.latch is not None
 
 
-def test_a_new_epoch_stands_in_the_journal_before_it_is_obeyed(
+def test_a_new_epoch_is_journalled_before_it_is_applied(
     harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: list[int] = []

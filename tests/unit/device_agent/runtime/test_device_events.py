@@ -47,13 +47,13 @@ def take_control(harness: DeviceHarness, epoch: int = 1, holder: str = "ann") ->
     )
 
 
-def test_a_start_and_an_orderly_end_are_told(harness: DeviceHarness) -> None:
+def test_start_and_shutdown_are_events(harness: DeviceHarness) -> None:
     assert event(harness, EventKind.AGENT_STARTED).data == {"epoch": 0, "stopped": False}
     harness.device.stop()
     assert event(harness, EventKind.AGENT_STOPPED)
 
 
-def test_a_lease_is_told_when_granted_and_ended_but_not_when_renewed(harness: DeviceHarness) -> None:
+def test_grant_and_end_of_a_lease_are_events_but_renewal_is_not(harness: DeviceHarness) -> None:
     take_control(harness)
     take_control(harness)
     assert harness.end(harness.command(ReleaseLease(), epoch=1)).status is AckStatus.DONE
@@ -62,21 +62,21 @@ def test_a_lease_is_told_when_granted_and_ended_but_not_when_renewed(harness: De
     assert [granted.data for granted in events(harness, EventKind.LEASE_GRANTED)] == [{"epoch": 1, "holder": "ann"}]
 
 
-def test_a_lease_that_ran_out_is_told_with_its_holder(harness: DeviceHarness) -> None:
+def test_an_expired_lease_is_an_event_with_its_holder(harness: DeviceHarness) -> None:
     harness.end(harness.command(GrantLease(holder="ann", lease_ms=50), epoch=1))
     ended = event(harness, EventKind.LEASE_ENDED)
     assert ended.data["holder"] == "ann"
     assert "expired" in ended.message
 
 
-def test_a_take_over_ends_the_lease_before(harness: DeviceHarness) -> None:
+def test_a_takeover_ends_the_previous_lease(harness: DeviceHarness) -> None:
     take_control(harness)
     take_control(harness, epoch=2, holder="bert")
     assert event(harness, EventKind.LEASE_ENDED).data == {"epoch": 1, "holder": "ann", "code": "lease_lost"}
     assert [granted.data["holder"] for granted in events(harness, EventKind.LEASE_GRANTED)] == ["ann", "bert"]
 
 
-def test_a_stop_in_motion_is_told_as_what_it_did(harness: DeviceHarness) -> None:
+def test_a_stop_in_motion_records_its_effects_once(harness: DeviceHarness) -> None:
     take_control(harness)
     command = harness.command(MoveJoints(position_rad={"elbow": 2.0}), epoch=1)
     eventually(lambda: harness.telemetry().velocity_rad_s and harness.device._controller.moving)
@@ -112,7 +112,7 @@ def test_a_flood_of_setpoints_without_a_lease_is_one_event(harness: DeviceHarnes
     assert (first.id, rest.data) == (refused.id, {"code": "no_lease", "count": 199})
 
 
-def test_refused_commands_are_told_with_what_could_be_read(harness: DeviceHarness) -> None:
+def test_rejected_commands_are_events_with_the_readable_fields(harness: DeviceHarness) -> None:
     harness.receive(topics.CMD, signing.sign(b"{}", signing.generate()))
     assert event(harness, EventKind.COMMAND_REJECTED).data == {"code": "bad_signature"}
     harness.command(StopDevice(reason=""), device="other")
@@ -126,12 +126,12 @@ def test_refused_commands_are_told_with_what_could_be_read(harness: DeviceHarnes
     eventually(lambda: events(harness, EventKind.COMMAND_REJECTED)[-1].data == {"code": "malformed"})
 
 
-def test_a_stop_that_cannot_be_read_is_told(harness: DeviceHarness) -> None:
+def test_a_malformed_stop_is_an_event(harness: DeviceHarness) -> None:
     harness.receive(topics.STOP, b"stop!")
     assert event(harness, EventKind.STOP_REJECTED).data == {"code": "malformed"}
 
 
-def test_a_driver_that_fails_and_comes_back_is_told(harness: DeviceHarness) -> None:
+def test_driver_failure_and_recovery_are_events(harness: DeviceHarness) -> None:
     take_control(harness)
     harness.driver.broken = True
     assert "switched on" in event(harness, EventKind.DRIVER_FAILED).message
@@ -140,7 +140,7 @@ def test_a_driver_that_fails_and_comes_back_is_told(harness: DeviceHarness) -> N
     assert event(harness, EventKind.DRIVER_RECOVERED)
 
 
-def test_a_journal_that_cannot_be_written_is_told_and_the_command_not_obeyed(
+def test_a_journal_error_is_an_event_and_the_command_is_not_applied(
     harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class FullDisk:
@@ -163,7 +163,7 @@ def test_a_journal_that_cannot_be_written_is_told_and_the_command_not_obeyed(
     eventually(lambda: harness.journal.device("arm").latch is not None)
 
 
-def test_a_journal_that_fails_at_the_end_is_told_too(harness: DeviceHarness) -> None:
+def test_a_journal_error_at_shutdown_is_an_event(harness: DeviceHarness) -> None:
     harness.journal.close()
     harness.device._controller.changed.set()
     harness.device.stop()
@@ -171,7 +171,7 @@ def test_a_journal_that_fails_at_the_end_is_told_too(harness: DeviceHarness) -> 
     assert event(harness, EventKind.AGENT_STOPPED)
 
 
-def test_a_mistake_in_the_office_ends_neither_the_office_nor_the_device(
+def test_an_unexpected_error_does_not_end_the_command_processor(
     harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def mistake(_: object) -> None:
@@ -183,7 +183,7 @@ def test_a_mistake_in_the_office_ends_neither_the_office_nor_the_device(
     take_control(harness)
 
 
-def test_what_is_not_for_a_device_is_let_go_and_the_drawing_is_shown(tmp_path: Path) -> None:
+def test_foreign_classes_are_ignored_and_the_twin_is_published(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path)
     harness.driver.twin = lambda: Twin(device="arm", bodies=())  # type: ignore[method-assign]
     harness.start()
@@ -194,7 +194,7 @@ def test_what_is_not_for_a_device_is_let_go_and_the_drawing_is_shown(tmp_path: P
     harness.stop()
 
 
-def test_a_room_that_is_not_known_holds_and_is_shown(tmp_path: Path) -> None:
+def test_an_interlock_without_reading_holds_and_is_published(tmp_path: Path) -> None:
     rule = InterlockRule(device="sensors-pir", stream="presence", field="present", equals=True)
     harness = DeviceHarness(tmp_path, interlocks=(rule,))
     harness.start()
@@ -210,9 +210,7 @@ def test_a_room_that_is_not_known_holds_and_is_shown(tmp_path: Path) -> None:
     harness.stop()
 
 
-def test_a_state_that_the_link_did_not_take_is_told_again(
-    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unsent_state_is_published_again(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
     eventually(lambda: harness.heard(topics.STATE, State))
     with monkeypatch.context() as patch:
         patch.setattr(harness.device.publisher, "_publish", lambda *_, **__: False)
@@ -222,7 +220,7 @@ def test_a_state_that_the_link_did_not_take_is_told_again(
     eventually(lambda: len(harness.heard(topics.STATE, State)) > before)
 
 
-def test_an_answer_that_nobody_confirmed_is_given_again_over_the_next_link(harness: DeviceHarness) -> None:
+def test_an_unconfirmed_ack_is_sent_again_on_reconnection(harness: DeviceHarness) -> None:
     with mock.patch.object(harness.device.publisher, "_delivered"):
         command = harness.command(StopDevice())
         harness.end(command)
@@ -231,7 +229,7 @@ def test_an_answer_that_nobody_confirmed_is_given_again_over_the_next_link(harne
     eventually(lambda: len(harness.acks(command)) > before)
 
 
-def test_while_a_link_is_young_answers_are_not_believed_to_have_arrived_and_given_once_more(tmp_path: Path) -> None:
+def test_acks_are_sent_again_after_the_settle_time(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path)
     harness.outbox.settle_s = 1000.0
     harness.start()

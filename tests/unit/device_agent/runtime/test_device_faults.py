@@ -30,7 +30,7 @@ def code(harness: DeviceHarness, command: str) -> str:
     return ack.reason.code
 
 
-def test_an_action_that_meets_a_bug_has_failed_and_the_next_one_runs(
+def test_an_unexpected_error_fails_the_action_and_the_next_one_runs(
     harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(RobotApi, "move_joints", broken)
@@ -39,13 +39,13 @@ def test_an_action_that_meets_a_bug_has_failed_and_the_next_one_runs(
     assert harness.end(harness.command(MOVE, epoch=1)).status is AckStatus.DONE
 
 
-def test_a_command_that_meets_a_bug_has_failed(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_error_fails_the_command(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CommandProcessor, "_apply", broken)
     assert code(harness, harness.command(GrantLease(holder="ann", lease_ms=1000), epoch=1)) == "internal"
 
 
 @pytest.mark.parametrize("what", ["its start cannot be journalled", "the disk does not take it"])
-def test_nothing_moves_where_what_has_come_could_not_be_written(
+def test_nothing_moves_if_the_journal_cannot_be_written(
     harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     record = Journal.record
@@ -68,7 +68,7 @@ def test_nothing_moves_where_what_has_come_could_not_be_written(
     assert harness.end(harness.command(MOVE, epoch=1)).status is AckStatus.DONE
 
 
-def test_a_control_loop_that_meets_a_bug_is_a_fault_until_it_runs_again(harness: DeviceHarness) -> None:
+def test_an_unexpected_error_in_the_control_loop_is_a_fault(harness: DeviceHarness) -> None:
     whole = harness.driver.observe
     harness.driver.observe = broken  # type: ignore[method-assign]
     eventually(lambda: harness.device._controller.fault == "internal error: a bug")
@@ -76,7 +76,7 @@ def test_a_control_loop_that_meets_a_bug_is_a_fault_until_it_runs_again(harness:
     eventually(lambda: harness.telemetry().mode is Mode.IDLE and harness.device._controller.fault is None)
 
 
-def test_of_too_many_commands_the_last_are_refused(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_beyond_the_queue_are_rejected(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
     busy, go_on = threading.Event(), threading.Event()
 
     def wait(*_: Any) -> None:
@@ -92,14 +92,14 @@ def test_of_too_many_commands_the_last_are_refused(harness: DeviceHarness, monke
     go_on.set()
 
 
-def test_an_agent_that_goes_down_ends_what_runs(harness: DeviceHarness) -> None:
+def test_shutdown_ends_the_running_action(harness: DeviceHarness) -> None:
     running = harness.command(harness.script("wait(600)"), epoch=1)
     eventually(lambda: harness.acks(running)[1:])
     harness.device.stop()
     assert code(harness, running) == "agent_stopping"
 
 
-def test_it_comes_to_rest_before_it_goes_down(harness: DeviceHarness) -> None:
+def test_shutdown_waits_for_rest(harness: DeviceHarness) -> None:
     harness.command(MoveJoints(position_rad={"elbow": 2.5}, speed=1.0), epoch=1)
     eventually(lambda: harness.device._controller.moving)
     harness.device.stop()
@@ -112,7 +112,7 @@ def test_a_device_that_never_started_can_be_stopped(tmp_path: Path) -> None:
     harness.stop()
 
 
-def test_a_driver_that_is_not_there_is_named_at_the_start(tmp_path: Path) -> None:
+def test_a_missing_driver_fails_the_start(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path)
     harness.driver.broken = True
     with pytest.raises(DriverError, match="switched on"):
@@ -120,7 +120,7 @@ def test_a_driver_that_is_not_there_is_named_at_the_start(tmp_path: Path) -> Non
     harness.stop()
 
 
-def test_a_fault_that_outlives_the_agent_lets_it_go_down(harness: DeviceHarness) -> None:
+def test_shutdown_works_during_a_fault(harness: DeviceHarness) -> None:
     harness.driver.broken = True
     eventually(lambda: harness.device._controller.fault)
     harness.device.stop()

@@ -43,7 +43,7 @@ def value(room: ReadingCache) -> float | None:
     return None if reading is None else reading.values["present"]
 
 
-def test_it_subscribes_to_what_is_named_of_others_by_exact_name(room: ReadingCache) -> None:
+def test_sources_of_other_agents_are_subscribed_by_exact_topic(room: ReadingCache) -> None:
     assert room.topics() == ("ts/v1/lab/sensors/arm/tele/joints", "ts/v1/lab/sensors/pir/tele/presence")
 
 
@@ -64,7 +64,7 @@ def test_an_own_device_is_named_by_its_name_or_its_id(room: ReadingCache) -> Non
         room.latest("arm", "heat")
 
 
-def test_joints_are_read_by_their_place(room: ReadingCache) -> None:
+def test_joints_are_read_by_index(room: ReadingCache) -> None:
     telemetry = JointTelemetry(
         tick_ms=1,
         at_ms=1,
@@ -81,7 +81,7 @@ def test_joints_are_read_by_their_place(room: ReadingCache) -> None:
     assert (reading.values["position_rad.1"], reading.values["effort_nm.0"]) == (1.0, 1.0)
 
 
-def test_what_is_not_listened_to_is_refused_and_says_what_is(room: ReadingCache) -> None:
+def test_unsubscribed_streams_are_rejected_with_the_subscribed_ones(room: ReadingCache) -> None:
     with pytest.raises(Refused, match=r"add it under \[\[room\]\].*own-lamp/light, sensors-arm/joints") as refused:
         room.latest("sensors-door", "open")
     assert refused.value.code == "unknown_stream"
@@ -89,7 +89,7 @@ def test_what_is_not_listened_to_is_refused_and_says_what_is(room: ReadingCache)
         ReadingCache(space="lab", agent="own", own=["arm"]).latest("x-y", "z")
 
 
-def test_what_was_not_asked_for_costs_no_memory(room: ReadingCache) -> None:
+def test_unsubscribed_messages_are_not_stored(room: ReadingCache) -> None:
     for number in range(1000):
         hear(room, measured(present=1.0), topic(f"d{number}"))
     hear(room, measured(present=1.0), topic(space="elsewhere"))
@@ -98,16 +98,14 @@ def test_what_was_not_asked_for_costs_no_memory(room: ReadingCache) -> None:
 
 
 @pytest.mark.parametrize("payload", [b"", b"{}", b'{"tick_ms":1,"at_ms":1,"sequence":1,"values":{"present":NaN}}'])
-def test_what_cannot_be_read_changes_nothing(room: ReadingCache, payload: bytes) -> None:
+def test_malformed_measurements_change_nothing(room: ReadingCache, payload: bytes) -> None:
     hear(room, measured(present=0.0))
     with pytest.raises(ProtocolError):
         room.receive(topic(), payload)
     assert value(room) == 0.0
 
 
-def test_a_message_that_was_overtaken_is_left_out_but_a_sender_that_began_anew_is_heard(
-    room: ReadingCache, clock: Clock
-) -> None:
+def test_overtaken_messages_are_dropped_but_a_restarted_sender_is_accepted(room: ReadingCache, clock: Clock) -> None:
     hear(room, measured(7, tick_ms=700, present=1.0))
     hear(room, measured(6, tick_ms=600, present=0.0))
     hear(room, measured(7, tick_ms=700, present=0.0))

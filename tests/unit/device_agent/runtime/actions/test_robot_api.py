@@ -171,7 +171,7 @@ def play(harness: DeviceHarness, source: str) -> str:
     return ack.output
 
 
-def test_a_robot_that_can_all_of_it_does_all_of_it(harness: DeviceHarness) -> None:
+def test_every_call_reaches_a_fully_capable_robot(harness: DeviceHarness) -> None:
     printed = play(
         harness,
         "robot.say('hello', language='en')\n"
@@ -199,7 +199,7 @@ def test_a_robot_that_can_all_of_it_does_all_of_it(harness: DeviceHarness) -> No
     assert all(call in printed for call in ("move_to", "look", "say", "drive", "behaviour"))
 
 
-def test_a_frame_goes_straight_to_a_pose_and_says_where_it_cannot(harness: DeviceHarness) -> None:
+def test_a_straight_motion_reaches_the_pose_or_reports_why_not(harness: DeviceHarness) -> None:
     printed = play(
         harness,
         "robot.move_to((0.1, 0, 0), rpy_rad=(0, 0, 0.6), speed=1, straight=True)\n"
@@ -211,7 +211,7 @@ def test_a_frame_goes_straight_to_a_pose_and_says_where_it_cannot(harness: Devic
     assert "of the way there: face cannot come nearer than 0.5 m" in printed[1]
 
 
-def test_keyframes_are_played_in_their_time_and_what_takes_longer_is_said(harness: DeviceHarness) -> None:
+def test_keyframes_are_played_in_time_and_delays_are_reported(harness: DeviceHarness) -> None:
     keyframes = "{'time_s': 0, 'position_rad': {'elbow': 0.1}}, {'time_s': %s, 'position_rad': {'elbow': 0.3}}"
     begun_s = time.monotonic()
     play(harness, f"robot.play([{keyframes % 0.8}])")
@@ -221,7 +221,7 @@ def test_keyframes_are_played_in_their_time_and_what_takes_longer_is_said(harnes
     assert ack.result["limited"] == ["keyframes: later"]
 
 
-def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> None:
+def test_unsupported_calls_are_rejected_with_the_supported_ones(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path)
     harness.device.start()
     asked = (
@@ -267,14 +267,14 @@ def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> N
         ("robot.play([{'time_s': 0}, {'time_s': 1}], speed=3)", "speed must be above 0 and at most 2, not 3.0"),
     ],
 )
-def test_what_is_not_done_says_why_and_in_which_line(harness: DeviceHarness, call: str, says: str) -> None:
+def test_failed_calls_report_reason_and_line(harness: DeviceHarness, call: str, says: str) -> None:
     ack = harness.end(harness.command(harness.script(f"\n{call}"), epoch=1))
     assert ack.reason is not None
     assert ack.reason.message.startswith("line 2: RobotError: ")
     assert says in ack.reason.message
 
 
-def test_stop_ends_a_skill_and_nothing_more_is_performed(harness: DeviceHarness) -> None:
+def test_stop_ends_a_skill_and_the_script(harness: DeviceHarness) -> None:
     running = harness.command(harness.script("robot.behaviour('dance')\nrobot.say('still here')"), epoch=1)
     eventually(lambda: driver_of(harness).performed)
     harness.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="smoke")))
@@ -291,7 +291,7 @@ def test_a_cancel_ends_a_skill(harness: DeviceHarness, name: str) -> None:
     assert harness.end(running).status is AckStatus.CANCELLED
 
 
-def test_a_script_is_ended_when_its_time_is_over(harness: DeviceHarness) -> None:
+def test_a_script_times_out(harness: DeviceHarness) -> None:
     order = msgspec.structs.replace(harness.script("print('begun')\nwait(600)"), timeout_ms=300)
     ack = harness.end(harness.command(order, epoch=1))
     assert ack.reason is not None
@@ -299,7 +299,7 @@ def test_a_script_is_ended_when_its_time_is_over(harness: DeviceHarness) -> None
     assert "after its 0.3 s" in ack.reason.message
 
 
-def test_progress_and_prints_are_told_while_it_runs(harness: DeviceHarness) -> None:
+def test_progress_and_output_are_acknowledged_while_it_runs(harness: DeviceHarness) -> None:
     source = "for i in range(4):\n    progress(i / 4)\n    print('part', i)\n    wait(0.25)\n"
     running = harness.command(harness.script(source), epoch=1)
     harness.end(running)
@@ -324,7 +324,7 @@ def test_a_script_of_another_account_runs_behind_bubblewrap(harness: DeviceHarne
     assert strange < min(own, *parents), "it does not see process ids of its own"
 
 
-def test_a_move_says_what_limited_it(harness: DeviceHarness) -> None:
+def test_a_result_contains_the_limits(harness: DeviceHarness) -> None:
     harness.device._controller.restrict("room", 0.2, "somebody is near")
     ack = harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.05}, speed=1.0), epoch=1))
     assert ack.status is AckStatus.DONE
@@ -332,7 +332,7 @@ def test_a_move_says_what_limited_it(harness: DeviceHarness) -> None:
 
 
 @pytest.mark.parametrize("how", ["unavailable", "unconfined"])
-def test_where_scripts_cannot_be_locked_in_it_is_said_at_once(
+def test_a_missing_sandbox_is_described_and_scripts_are_rejected(
     tmp_path: Path, how: Literal["unavailable", "unconfined"]
 ) -> None:
     harness = DeviceHarness(tmp_path, sandbox=NoSandbox(how))
@@ -351,7 +351,7 @@ def test_desc_reports_the_sandbox(harness: DeviceHarness) -> None:
     assert (described.scripts, described.scripts_note) == ("sandboxed", "")
 
 
-def test_a_script_reads_what_the_room_measured() -> None:
+def test_a_script_reads_room_measurements() -> None:
     room = ReadingCache(space="s", agent="a", own=["arm"], named=[("b-pir", "presence")])
     body = replace(body_of(robot_type()), readings=room)
     robot = RobotApi(body)
@@ -383,14 +383,14 @@ def body_of(
     )
 
 
-def test_before_the_first_measurement_there_is_no_state() -> None:
+def test_state_needs_a_measurement() -> None:
     body = body_of(robot_type(), seen=False)
     assert body.measured() == {}
     with pytest.raises(Refused, match="not been measured"):
         body.observation()
 
 
-def test_a_robot_that_has_ended_performs_nothing_more() -> None:
+def test_no_skill_runs_after_the_action_has_ended() -> None:
     able = AbleDriver()
     kind = msgspec.structs.replace(able_type(), gaze=None, capabilities=("gaze", "speech"))
     robot = RobotApi(body_of(kind, able=able))
@@ -402,7 +402,7 @@ def test_a_robot_that_has_ended_performs_nothing_more() -> None:
     assert len(able.performed) == 1
 
 
-def test_without_model_or_skills_nothing_is_guessed() -> None:
+def test_calls_without_model_or_skills_are_rejected() -> None:
     robot = RobotApi(body_of(robot_type()))
     with pytest.raises(Refused, match="no model"):
         robot._geometry()
@@ -413,21 +413,21 @@ def test_without_model_or_skills_nothing_is_guessed() -> None:
 
 
 @pytest.mark.parametrize("point", [(1.0, 1.0, 1.0), (2.0, -1.0, 0.2), (0.3, 0.1, 1.8), (-0.5, 0.8, 1.0)])
-def test_a_gaze_meets_its_point(point: tuple[float, float, float]) -> None:
+def test_gaze_reaches_the_point(point: tuple[float, float, float]) -> None:
     found = gaze.solve_gaze(able_type(), Head(), (0.1, -0.1), point)
     left, up = math.atan2(point[1], point[0]), math.atan2(point[2] - 1, math.hypot(point[0], point[1]))
     assert found["shoulder"] == pytest.approx(left, abs=5e-3)
     assert found["elbow"] == pytest.approx(up, abs=5e-3)
 
 
-def test_a_gaze_that_cannot_turn_far_enough_says_so() -> None:
+def test_gaze_out_of_reach_is_rejected() -> None:
     kind = able_type()
     narrow = tuple(msgspec.structs.replace(joint, lower_rad=-0.2, upper_rad=0.2) for joint in kind.joints)
     with pytest.raises(Refused, match="shoulder, elbow cannot turn far enough"):
         gaze.solve_gaze(msgspec.structs.replace(kind, joints=narrow), Head(), (0.0, 0.0), (0.0, 1.0, 1.0))
 
 
-def test_nothing_is_left_of_a_tenure_that_nobody_has() -> None:
+def test_releasing_without_a_reservation_is_harmless() -> None:
     robot = RobotApi(body_of(robot_type()))
     robot.reservation.on_revoked(Refused("x", "y"))
     robot.release()
@@ -452,7 +452,7 @@ def showing_type() -> RobotType:
         (TakePosture(name="Bow", speed=1.0), {"shoulder": 0.0, "elbow": 0.25}),
     ],
 )
-def test_what_the_manifest_says_is_shown_without_a_driver_that_could(
+def test_expressions_and_postures_of_the_manifest_need_no_driver(
     tmp_path: Path, request_: Express | TakePosture, there: dict[str, float]
 ) -> None:
     harness = DeviceHarness(tmp_path, kind=showing_type())
@@ -478,7 +478,7 @@ def test_what_the_manifest_says_is_shown_without_a_driver_that_could(
         (Say(text="hello"), "this robot has no say"),
     ],
 )
-def test_an_order_that_the_robot_cannot_do_fails_with_what_it_can(tmp_path: Path, request_: Task, says: str) -> None:
+def test_an_unsupported_task_fails_with_the_supported_ones(tmp_path: Path, request_: Task, says: str) -> None:
     harness = DeviceHarness(tmp_path, kind=showing_type())
     harness.device.start()
     reason = harness.end(harness.command(request_, epoch=1)).reason
@@ -487,7 +487,7 @@ def test_an_order_that_the_robot_cannot_do_fails_with_what_it_can(tmp_path: Path
     harness.stop()
 
 
-def test_orders_reach_the_skills_that_scripts_reach(harness: DeviceHarness) -> None:
+def test_tasks_reach_the_same_skills_as_scripts(harness: DeviceHarness) -> None:
     orders: tuple[Task, ...] = (
         Say(text="ahoj", language="sk"),
         SetStiffness(value=0.5, joints=("elbow",)),

@@ -151,7 +151,7 @@ def test_a_script_moves_prints_and_reads_its_parameters() -> None:
     assert told.progress == [0.5]
 
 
-def test_every_call_of_the_api_arrives_as_it_was_meant() -> None:
+def test_every_call_of_the_api_is_received_unchanged() -> None:
     notes, _ = run(
         "robot.move_to([0.1, 0, 0.3], rpy_rad=(0, 0, 1), speed=0.2)\n"
         "robot.move_to((0.1, 0, 0.3), quaternion=(1, 0, 0, 0), frame='camera')\n"
@@ -176,7 +176,7 @@ def test_every_call_of_the_api_arrives_as_it_was_meant() -> None:
     ]
 
 
-def test_keyframes_are_played_up_to_each_at_which_something_is_done() -> None:
+def test_play_is_split_at_keyframes_with_other_calls() -> None:
     notes, _ = run(
         "robot.play([\n"
         "    {'time_s': 1, 'position_rad': {'elbow': 0.1}, 'say': 'off'},\n"
@@ -230,13 +230,13 @@ def test_keyframes_are_played_up_to_each_at_which_something_is_done() -> None:
         ("import ctypes\nctypes.CDLL(None).ptrace(0, 0, 0, 0)", "did: it made a forbidden system call"),
     ],
 )
-def test_a_script_that_fails_says_where(source: str, says: str) -> None:
+def test_a_failed_script_reports_the_line(source: str, says: str) -> None:
     with pytest.raises(ScriptFailed) as failed:
         run(source)
     assert says in str(failed.value)
 
 
-def test_a_script_may_catch_what_the_robot_refuses() -> None:
+def test_a_script_can_catch_rejections() -> None:
     _, told = run("try:\n    robot.move_joints({'knee': 1})\nexcept RobotError as e:\n    print(e)\n")
     assert told.printed == "no joint 'knee'\n"
 
@@ -251,7 +251,7 @@ def test_a_script_may_catch_what_the_robot_refuses() -> None:
         "import time; print(time.localtime().tm_year > 2000, 'é'.encode('cp1252'))",
     ],
 )
-def test_what_a_script_usually_imports_works(source: str) -> None:
+def test_common_imports_work_in_scripts(source: str) -> None:
     _, told = run(source)
     assert told.printed
 
@@ -293,7 +293,7 @@ def test_a_script_is_killed_at_once() -> None:
     assert [str(failure) for failure in failures] == ["the script's process ended before the script did"]
 
 
-def test_a_script_that_dies_in_the_middle_of_a_call_lets_go_of_the_robot_at_once() -> None:
+def test_a_script_that_dies_in_a_call_releases_the_robot_at_once() -> None:
     let_go = threading.Event()
 
     class Busy(Notes):
@@ -316,7 +316,7 @@ def test_a_script_that_dies_in_the_middle_of_a_call_lets_go_of_the_robot_at_once
         script.run()
 
 
-def test_a_process_that_cannot_be_killed_does_not_hold_up_the_action() -> None:
+def test_a_process_that_survives_kill_does_not_block_the_action() -> None:
     process = FakeProcess(dies=False)
     process.say(b'{"kind":"ready"}', b'{"kind":"ended"}')
     died = threading.Event()
@@ -326,7 +326,7 @@ def test_a_process_that_cannot_be_killed_does_not_hold_up_the_action() -> None:
     assert not died.is_set()
 
 
-def test_a_script_killed_before_it_began_does_not_run() -> None:
+def test_a_script_killed_before_its_start_does_not_run() -> None:
     notes = Notes()
     script = ScriptAction(
         order("robot.home()"), notes, Told(), sandbox=ScriptSandbox(warm_sandbox(), untrusted=False), on_exit=nothing
@@ -337,7 +337,7 @@ def test_a_script_killed_before_it_began_does_not_run() -> None:
     assert notes.received == []
 
 
-def test_without_a_process_it_says_why() -> None:
+def test_a_failed_process_start_is_reported() -> None:
     script = ScriptAction(
         order(""), Notes(), Told(), sandbox=ScriptSandbox(FakeSandbox(None), untrusted=False), on_exit=nothing
     )
@@ -353,20 +353,20 @@ def test_a_broken_sandbox_receives_no_script() -> None:
 
 
 @pytest.mark.parametrize("first", [b'{"kind": "nonsense"}', b"", b"\xff\xfe"])
-def test_a_process_that_does_not_begin_as_it_should_gets_no_script(first: bytes) -> None:
+def test_a_process_with_an_invalid_first_message_gets_no_script(first: bytes) -> None:
     process = FakeProcess()
     process.say(first)
     with pytest.raises(ScriptFailed, match="ended before the script did: it crashed"):
         run_fake(process)
 
 
-def test_a_process_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_process_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(script_action, "_READY_TIMEOUT_S", 0.05)
     with pytest.raises(ScriptFailed, match="it stopped following the protocol"):
         run_fake(FakeProcess(dies=False))
 
 
-def test_a_line_without_end_is_the_end() -> None:
+def test_an_endless_line_ends_the_script() -> None:
     process = FakeProcess()
     process.say(b'{"kind": "ready"}')
     flood = threading.Thread(target=_flood, args=(process.theirs,))
@@ -381,7 +381,7 @@ def _flood(link: socket.socket) -> None:
         link.sendall(b" " * (4 * script_calls.MAX_LINE))
 
 
-def test_a_line_that_is_too_long_is_the_end() -> None:
+def test_a_line_that_is_too_long_ends_the_script() -> None:
     with socket.socket() as unread:
         lines = script_action._LineReader(unread, threading.Event())
         lines._buffer = b" " * script_calls.MAX_LINE + b"\n"
@@ -389,7 +389,7 @@ def test_a_line_that_is_too_long_is_the_end() -> None:
             lines.read()
 
 
-def test_what_is_said_twice_or_is_no_message_is_answered_with_an_error() -> None:
+def test_repeated_and_invalid_messages_are_answered_with_errors() -> None:
     process = FakeProcess()
     process.say(
         b'{"kind": "ready"}',
@@ -408,7 +408,7 @@ def test_what_is_said_twice_or_is_no_message_is_answered_with_an_error() -> None
     answers.close()
 
 
-def test_a_script_that_floods_is_read_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flooding_script_is_throttled(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         killed = threading.Event()

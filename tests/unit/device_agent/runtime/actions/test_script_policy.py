@@ -40,7 +40,7 @@ def refusal(trust: ScriptPolicy, order: RunMovement) -> str:
     return refused.value.code
 
 
-def test_a_script_that_the_cloud_signed_is_run(journal: Journal) -> None:
+def test_a_signed_script_is_accepted(journal: Journal) -> None:
     trust_of(journal).verify(movement())
 
 
@@ -58,7 +58,7 @@ def test_a_script_that_the_cloud_signed_is_run(journal: Journal) -> None:
         ({"key": "another"}, "bad_signature"),
     ],
 )
-def test_a_script_of_which_anything_was_changed_is_not_run(journal: Journal, changes: object, code: str) -> None:
+def test_a_modified_script_is_rejected(journal: Journal, changes: object, code: str) -> None:
     changed = msgspec.structs.replace(movement(), **changes)  # type: ignore[arg-type]
     assert refusal(trust_of(journal), changed) == code
 
@@ -72,7 +72,7 @@ def test_every_character_of_the_signature_counts(journal: Journal) -> None:
         assert refusal(trust, msgspec.structs.replace(good, signature=flipped)) == "bad_signature"
 
 
-def test_a_signature_made_for_a_command_is_none_for_a_movement(journal: Journal) -> None:
+def test_a_command_signature_is_not_valid_for_a_movement(journal: Journal) -> None:
     good = movement()
     text = signing.movement_text(good.robot_type, good.name, good.version, good.sha256)
     stolen = signing.sign_text(text, KEY, context=signing.COMMAND_CONTEXT)
@@ -93,7 +93,7 @@ def test_an_older_version_than_one_that_ran_is_refused_also_after_a_restart(jour
     assert (tmp_path / "journal.db").exists()
 
 
-def test_what_only_asked_to_run_locks_nothing_out(journal: Journal) -> None:
+def test_a_rejected_version_does_not_block_older_ones(journal: Journal) -> None:
     trust = trust_of(journal)
     trust.verify(movement(9))
     trust.verify(movement(3))
@@ -102,7 +102,7 @@ def test_what_only_asked_to_run_locks_nothing_out(journal: Journal) -> None:
 @pytest.mark.parametrize(
     ("device", "author"), [("other", OWNER), ("arm", SHIPPED), ("arm", OTHER)], ids=["device", "shipped", "account"]
 )
-def test_each_device_and_author_counts_by_itself(journal: Journal, device: str, author: str) -> None:
+def test_versions_count_per_device_and_author(journal: Journal, device: str, author: str) -> None:
     trust_of(journal).record_version(movement(9))
     trust_of(journal, device=device).verify(movement(1, author))
 

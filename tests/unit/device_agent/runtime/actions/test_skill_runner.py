@@ -158,7 +158,7 @@ def why(harness: DeviceHarness, request: Any, epoch: int = 1) -> str:
 # ---------------------------------------------------------------- speech
 
 
-def test_what_is_said_is_told_as_text_and_the_mouth_moves(harness: DeviceHarness) -> None:
+def test_speech_is_published_as_text_and_moves_the_mouth(harness: DeviceHarness) -> None:
     ends(harness, Say(text="Aha, mama!", language="sk"))
     (event,) = eventually(lambda: said(harness))
     assert (event.message, event.data["language"]) == ("Aha, mama!", "sk")
@@ -169,9 +169,7 @@ def test_what_is_said_is_told_as_text_and_the_mouth_moves(harness: DeviceHarness
 
 
 @pytest.mark.parametrize(("how", "upload"), [("", "u1"), ("fails", None), ("hangs", None)])
-def test_with_a_voice_the_sound_is_stored_and_named_if_that_is_done_in_time(
-    tmp_path: Path, how: str, upload: str | None
-) -> None:
+def test_synthesized_audio_is_uploaded_and_named_if_in_time(tmp_path: Path, how: str, upload: str | None) -> None:
     voice, store = Voice(), Store(how)
     harness = make(tmp_path, speech=voice, uploads=store)
     ends(harness, Say(text="hello"))
@@ -186,14 +184,14 @@ def test_with_a_voice_the_sound_is_stored_and_named_if_that_is_done_in_time(
     harness.stop()
 
 
-def test_a_voice_that_fails_leaves_the_text(tmp_path: Path) -> None:
+def test_failed_synthesis_leaves_the_text(tmp_path: Path) -> None:
     harness = make(tmp_path, speech=Voice(broken=True), kind=msgspec.structs.replace(actor(), visemes={}))
     ends(harness, Say(text="hi"))
     assert [event.message for event in eventually(lambda: said(harness))] == ["hi"]
     harness.stop()
 
 
-def test_a_voice_without_a_place_for_its_sounds_speaks_all_the_same(tmp_path: Path) -> None:
+def test_synthesis_without_storage_still_speaks(tmp_path: Path) -> None:
     harness = make(tmp_path, speech=Voice())
     ends(harness, Say(text="hi"))
     assert [event.message for event in eventually(lambda: said(harness))] == ["hi"]
@@ -212,17 +210,17 @@ def test_stop_ends_speech_without_a_mouth(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "language", "says"), [("  ", "", "nothing to say"), ("a", "-v x", "is not a language")]
 )
-def test_what_cannot_be_said_is_refused(text: str, language: str, says: str) -> None:
+def test_invalid_speech_is_rejected(text: str, language: str, says: str) -> None:
     with pytest.raises(Refused, match=says):
         SpeechOutput().prepare(text, language)
 
 
-def test_a_speaker_whom_nobody_hears_begins_all_the_same() -> None:
+def test_speech_without_observers_starts() -> None:
     speaker = SpeechOutput()
     speaker.start(speaker.prepare("hello", ""))
 
 
-def test_who_stands_around_hears_for_how_long_something_is_said() -> None:
+def test_the_driver_receives_the_speech_duration() -> None:
     heard: list[float] = []
     speaker = SpeechOutput(on_start=heard.append)
     said = speaker.prepare("hello, how are you today", "")
@@ -242,11 +240,11 @@ def test_a_behaviour_moves_and_speaks_in_its_time(harness: DeviceHarness) -> Non
     assert harness.driver.position == pytest.approx([0.0, 0.0], abs=1e-3)
 
 
-def test_an_unknown_behaviour_is_refused_with_those_there_are(harness: DeviceHarness) -> None:
+def test_an_unknown_behaviour_is_rejected_with_the_known_ones(harness: DeviceHarness) -> None:
     assert "no behaviour 'dance'; there are bow, speech" in why(harness, RunBehaviour(name="dance"))
 
 
-def test_stop_ends_a_behaviour_before_its_next_words(harness: DeviceHarness) -> None:
+def test_stop_ends_a_behaviour_before_its_next_line(harness: DeviceHarness) -> None:
     running = harness.command(RunBehaviour(name="speech"), epoch=1)
     eventually(lambda: said(harness))
     harness.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
@@ -269,7 +267,7 @@ class Speaking(Servos):
         self.heard.append(skill.text)
 
 
-def test_a_robot_with_a_voice_of_its_own_says_the_words_of_a_behaviour(tmp_path: Path) -> None:
+def test_a_driver_with_speech_speaks_the_lines_of_a_behaviour(tmp_path: Path) -> None:
     driver = Speaking()
     harness = make(tmp_path, driver=driver)
     ends(harness, RunBehaviour(name="bow"))
@@ -280,7 +278,7 @@ def test_a_robot_with_a_voice_of_its_own_says_the_words_of_a_behaviour(tmp_path:
 # ---------------------------------------------------------------- stiffness
 
 
-def test_a_limp_joint_is_followed_and_does_not_jump_when_it_holds_again(harness: DeviceHarness) -> None:
+def test_a_compliant_joint_is_tracked_and_does_not_jump_when_stiffened(harness: DeviceHarness) -> None:
     ends(harness, SetStiffness(value=0.0))
     assert servos(harness).stiffness == 0.0
     state: State = eventually(lambda: [one for one in harness.heard(topics.STATE, State) if one.stiffness])[-1]
@@ -301,7 +299,7 @@ def test_a_limp_joint_is_followed_and_does_not_jump_when_it_holds_again(harness:
     ends(harness, MoveJoints(position_rad={"elbow": 1.0}, speed=1.0))
 
 
-def test_after_an_action_a_setpoint_leaves_the_other_joints_where_they_are(harness: DeviceHarness) -> None:
+def test_after_an_action_setpoints_keep_unnamed_joints(harness: DeviceHarness) -> None:
     harness.end(harness.command(GrantLease(holder="ann", lease_ms=30_000), epoch=1))
     harness.setpoint(1, 1, elbow=0.2)
     ends(harness, MoveJoints(position_rad={"shoulder": 0.3}, speed=1.0))
@@ -311,7 +309,7 @@ def test_after_an_action_a_setpoint_leaves_the_other_joints_where_they_are(harne
     assert harness.driver.position[0] == pytest.approx(0.3, abs=1e-3)
 
 
-def test_servos_that_do_not_change_are_not_taken_for_limp(harness: DeviceHarness) -> None:
+def test_failed_stiffness_changes_leave_joints_stiff(harness: DeviceHarness) -> None:
     servos(harness).fails = True
     assert "the servos do not answer" in why(harness, SetStiffness(value=0.0))
     assert eventually(lambda: harness.telemetry().limited == ())
@@ -325,11 +323,11 @@ def test_servos_that_do_not_change_are_not_taken_for_limp(harness: DeviceHarness
         ("robot.stiffness(2)", "not a valid message: Expected `float` <= 1.0 - at `$.value`"),
     ],
 )
-def test_a_stiffness_that_is_none_is_refused(harness: DeviceHarness, request_: Any, says: str) -> None:
+def test_an_invalid_stiffness_is_rejected(harness: DeviceHarness, request_: Any, says: str) -> None:
     assert says in why(harness, harness.script(request_) if isinstance(request_, str) else request_)
 
 
-def test_a_limp_joint_beyond_its_range_is_commanded_to_its_end() -> None:
+def test_a_compliant_joint_outside_its_range_is_clamped() -> None:
     slack = JointStiffness(robot_type())
     slack.set({"elbow": 0.0})
     assert slack.track((0.5, 3.3)) == {1: 3.0}
@@ -352,7 +350,7 @@ class Restless:
     moving = True
 
 
-def test_what_still_moves_is_waited_for_and_a_lost_action_does_not_wait() -> None:
+def test_a_skill_waits_for_rest_unless_its_action_ended() -> None:
     mover: Any = Late()
     controller: Any = Restless()
     body = DeviceContext(

@@ -16,7 +16,7 @@ def asked(handover: PendingControlRequest, lease: Lease | None = LEASE, now_s: f
     return None if found is None else found.id
 
 
-def test_a_request_is_shown_until_its_time_is_over() -> None:
+def test_a_request_expires() -> None:
     handover = PendingControlRequest()
     assert asked(handover) is None
     handover.open(ASKED, epoch=5, lease=LEASE, now_s=100.0)
@@ -28,7 +28,7 @@ def test_a_request_is_shown_until_its_time_is_over() -> None:
 
 
 @pytest.mark.parametrize("lease", [None, Lease("ann", 6, 1_000.0)])
-def test_it_ends_with_the_lease_that_it_asks_for(lease: Lease | None) -> None:
+def test_a_request_ends_with_its_lease(lease: Lease | None) -> None:
     handover = PendingControlRequest()
     handover.open(ASKED, epoch=5, lease=LEASE, now_s=100.0)
     assert asked(handover, lease) is None
@@ -36,14 +36,14 @@ def test_it_ends_with_the_lease_that_it_asks_for(lease: Lease | None) -> None:
 
 
 @pytest.mark.parametrize(("epoch", "lease"), [(4, LEASE), (6, LEASE), (5, None)])
-def test_a_lease_that_is_not_in_force_cannot_be_asked_for(epoch: int, lease: Lease | None) -> None:
+def test_a_request_for_another_lease_is_rejected(epoch: int, lease: Lease | None) -> None:
     handover = PendingControlRequest()
     with refuses("no_lease"):
         handover.open(ASKED, epoch=epoch, lease=lease, now_s=100.0)
     assert asked(handover) is None
 
 
-def test_the_end_of_a_request_counts_even_before_the_request_itself_and_for_no_other() -> None:
+def test_a_withdrawal_may_precede_its_request_and_affects_no_other() -> None:
     handover = PendingControlRequest()
     handover.withdraw("r1")
     handover.open(ASKED, epoch=5, lease=LEASE, now_s=100.0)

@@ -9,7 +9,7 @@ def refusal(message: str = "too late") -> EventRecord:
     return EventRecord(EventKind.SETPOINTS_REJECTED, message, "warning", {"code": "too_old"})
 
 
-def test_facts_come_out_once_in_their_order_with_their_own_time() -> None:
+def test_events_are_drained_once_in_order_with_their_time() -> None:
     audit = EventRecorder()
     audit.record(EventRecord(EventKind.LEASE_GRANTED, "ann took control", at_ms=5))
     audit.record(EventRecord(EventKind.LEASE_ENDED, "ann let go"))
@@ -20,7 +20,7 @@ def test_facts_come_out_once_in_their_order_with_their_own_time() -> None:
     assert audit.drain(100.0) == []
 
 
-def test_a_flood_of_refusals_is_told_at_once_and_then_with_its_count() -> None:
+def test_repeated_rejections_are_counted() -> None:
     audit = EventRecorder()
     for _ in range(1000):
         audit.record_rejection(refusal(), code="too_old", now_s=10.0)
@@ -34,7 +34,7 @@ def test_a_flood_of_refusals_is_told_at_once_and_then_with_its_count() -> None:
     assert len(audit.drain(30.0)) == 1, "and a later one is told at once again"
 
 
-def test_at_the_end_a_flood_is_told_however_young_it_is() -> None:
+def test_the_last_drain_returns_all_counts() -> None:
     audit = EventRecorder()
     audit.record_rejection(refusal(), code="too_old", now_s=10.0)
     audit.record_rejection(refusal("later"), code="too_old", now_s=10.1)
@@ -42,7 +42,7 @@ def test_at_the_end_a_flood_is_told_however_young_it_is() -> None:
     assert (first.message, last.message, last.data["count"]) == ("too late", "later", 1)
 
 
-def test_different_codes_are_told_by_themselves_up_to_a_bound_and_the_rest_is_counted() -> None:
+def test_different_codes_are_counted_separately_up_to_a_bound() -> None:
     audit = EventRecorder()
     for number in range(module._MAX_COUNTED + 3):
         audit.record_rejection(refusal(), code=f"code{number}", now_s=0.0)
@@ -52,7 +52,7 @@ def test_different_codes_are_told_by_themselves_up_to_a_bound_and_the_rest_is_co
     assert audit.drain(0.1) == []
 
 
-def test_an_office_that_is_stuck_costs_no_memory() -> None:
+def test_memory_is_bounded_without_drains() -> None:
     audit = EventRecorder()
     for _ in range(module._MAX_WAITING + 7):
         audit.record(EventRecord(EventKind.MOTION_HELD, "held"))
@@ -61,5 +61,5 @@ def test_an_office_that_is_stuck_costs_no_memory() -> None:
     assert told[-1].data == {"count": 7}
 
 
-def test_nobody_needs_to_listen() -> None:
+def test_events_can_be_ignored() -> None:
     ignore_event(refusal())

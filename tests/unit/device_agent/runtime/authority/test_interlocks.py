@@ -109,14 +109,14 @@ class DeviceHarness:
 NAME = "pir/presence present = true"
 
 
-def test_a_room_that_is_not_known_yet_holds() -> None:
+def test_an_interlock_without_a_reading_holds() -> None:
     harness = DeviceHarness(rule(equals=True))
     assert harness.step() == [(NAME, 0.0, "no measurement of pir/presence has arrived")]
     assert harness.step(1.0) == [], "once"
     assert [happened.kind for happened in harness.told] == [EventKind.INTERLOCK_ENGAGED]
 
 
-def test_presence_slows_absence_frees_and_silence_slows_again() -> None:
+def test_presence_and_silence_slow_and_absence_clears() -> None:
     harness = DeviceHarness(rule(equals=True, action="slow", speed=0.25))
     harness.measure(present=False)
     assert harness.step() == [(NAME,)]
@@ -134,7 +134,7 @@ def test_presence_slows_absence_frees_and_silence_slows_again() -> None:
     assert harness.told[0].data == {"interlock": NAME, "action": "slow", "reason": "present = true"}
 
 
-def test_each_rule_acts_by_itself() -> None:
+def test_rules_act_independently() -> None:
     harness = DeviceHarness(rule(field="distance_m", below=2, action="slow"), rule(field="distance_m", below=1))
     harness.measure(distance_m=1.5)
     assert harness.step() == [
@@ -145,7 +145,7 @@ def test_each_rule_acts_by_itself() -> None:
     assert harness.step() == [("pir/presence distance_m < 1", 0.0, "distance_m < 1")]
 
 
-def test_what_could_not_be_done_is_done_in_the_next_period() -> None:
+def test_a_failed_change_is_retried_in_the_next_period() -> None:
     harness = DeviceHarness(rule(equals=True))
 
     def fail(*_: object) -> None:

@@ -35,7 +35,7 @@ def envelope(request: Request) -> bytes:
     [GrantLease(holder="ann", lease_ms=30_000), signed_movement("print(1)\n", KEY)],
     ids=["lease", "movement"],
 )
-def test_no_bit_of_a_signed_order_may_differ(request_: Request) -> None:
+def test_a_command_with_a_flipped_bit_is_rejected(request_: Request) -> None:
     good = envelope(request_)
     codec.decode(signing.verify(good, PINS), Command)
     for place in range(len(good)):
@@ -55,7 +55,7 @@ def trust() -> ScriptPolicy:
     return ScriptPolicy(device="arm", robot_type="toy", owner="", keys=PINS, journal=_NoJournal())  # type: ignore[arg-type]
 
 
-def test_no_byte_of_a_movement_may_differ_though_the_order_around_it_is_signed_anew() -> None:
+def test_a_changed_movement_is_rejected_in_a_newly_signed_command() -> None:
     """Who changes what the cloud has stored has the cloud itself sign the order."""
     good = signed_movement('"""Wave."""\nrobot.home()\n', KEY)
     trust().verify(good)

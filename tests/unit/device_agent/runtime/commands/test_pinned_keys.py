@@ -57,7 +57,7 @@ def refusal(pins: PinnedKeys, *statements: str) -> str:
     return refused.value.code
 
 
-def test_a_new_key_counts_beside_the_old_one_until_that_is_over(kept: Kept) -> None:
+def test_a_new_key_is_valid_beside_the_old_one_until_it_expires(kept: Kept) -> None:
     kept.pins.follow([statement(SECOND, FIRST, 2)])
     assert set(kept.pins) == {name(FIRST), name(SECOND)}
     kept.now_ms = ENDS_MS - 1
@@ -68,7 +68,7 @@ def test_a_new_key_counts_beside_the_old_one_until_that_is_over(kept: Kept) -> N
         kept.pins[name(FIRST)]
 
 
-def test_it_is_written_down_before_it_counts(kept: Kept, tmp_path: Path) -> None:
+def test_a_new_key_is_stored_before_it_is_valid(kept: Kept, tmp_path: Path) -> None:
     kept.pins.follow([statement(SECOND, FIRST, 2)])
     again = kept.load()
     assert dict(again) == dict(kept.pins)
@@ -76,7 +76,7 @@ def test_it_is_written_down_before_it_counts(kept: Kept, tmp_path: Path) -> None
     assert (tmp_path / "agent" / "pairing.json").stat().st_mode & 0o077 == 0
 
 
-def test_a_key_that_cannot_be_written_down_does_not_count(kept: Kept, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_that_cannot_be_stored_is_not_valid(kept: Kept, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_: Pairing) -> None:
         raise ConfigError("no space left on device")
 
@@ -84,7 +84,7 @@ def test_a_key_that_cannot_be_written_down_does_not_count(kept: Kept, monkeypatc
     assert refusal(kept.pins, statement(SECOND, FIRST, 2)) == "journal"
 
 
-def test_a_chain_is_followed_and_told_twice_changes_nothing(kept: Kept) -> None:
+def test_a_chain_is_followed_once(kept: Kept) -> None:
     chain = [statement(SECOND, FIRST, 2), statement(THIRD, SECOND, 3)]
     kept.pins.follow(chain)
     kept.pins.follow(chain)
@@ -107,11 +107,11 @@ def test_a_chain_is_followed_and_told_twice_changes_nothing(kept: Kept) -> None:
         ("{}", "malformed"),
     ],
 )
-def test_what_is_no_statement_of_a_pinned_key_changes_nothing(kept: Kept, told: str, code: str) -> None:
+def test_statements_without_a_pinned_signer_are_rejected(kept: Kept, told: str, code: str) -> None:
     assert refusal(kept.pins, told) == code
 
 
-def test_no_byte_of_a_statement_may_differ(kept: Kept) -> None:
+def test_a_statement_with_a_changed_byte_is_rejected(kept: Kept) -> None:
     good = statement(SECOND, FIRST, 2).encode()
     for place in range(len(good)):
         bad = bytearray(good)
@@ -131,14 +131,14 @@ def test_no_statement_leads_back_to_an_older_key(kept: Kept) -> None:
     assert refusal(kept.pins, statement(old, THIRD, 3)) == "rolled_back"
 
 
-def test_a_key_that_has_a_successor_tells_of_no_other(kept: Kept) -> None:
+def test_a_key_with_a_successor_signs_no_other(kept: Kept) -> None:
     """Who stole the old key cannot use its overlap to have a key of theirs pinned."""
     kept.pins.follow([statement(SECOND, FIRST, 2)])
     assert refusal(kept.pins, statement(THIRD, FIRST, 3)) == "rolled_back"
     assert refusal(kept.load(), statement(THIRD, FIRST, 3)) == "rolled_back"
 
 
-def test_who_was_away_for_the_whole_overlap_is_told_what_to_do(kept: Kept, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_agent_that_missed_the_overlap_gets_advice(kept: Kept, caplog: pytest.LogCaptureFixture) -> None:
     kept.now_ms = ENDS_MS
     with pytest.raises(Refused, match="repin"):
         kept.pins.follow([statement(SECOND, FIRST, 2)])
@@ -147,14 +147,14 @@ def test_who_was_away_for_the_whole_overlap_is_told_what_to_do(kept: Kept, caplo
     assert caplog.text.count("repin") == 1
 
 
-def test_without_the_time_no_key_is_taken_up_and_none_ends(kept: Kept) -> None:
+def test_without_cloud_time_no_key_is_added_or_expires(kept: Kept) -> None:
     kept.pins.follow([statement(SECOND, FIRST, 2)])
     kept.now_ms = None
     assert refusal(kept.pins, statement(THIRD, SECOND, 3)) == "no_clock"
     assert set(kept.pins) == {name(FIRST), name(SECOND)}
 
 
-def test_what_is_told_again_by_a_key_that_was_dropped_changes_nothing(kept: Kept) -> None:
+def test_a_repeated_statement_of_an_expired_key_changes_nothing(kept: Kept) -> None:
     first = statement(SECOND, FIRST, 2)
     kept.pins.follow([first])
     kept.now_ms = ENDS_MS
@@ -164,7 +164,7 @@ def test_what_is_told_again_by_a_key_that_was_dropped_changes_nothing(kept: Kept
     assert (set(kept.pins), kept.pins.serial) == ({name(SECOND), name(THIRD)}, 3)
 
 
-def test_a_key_that_counts_is_no_complaint(kept: Kept, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_valid_key_is_not_logged(kept: Kept, caplog: pytest.LogCaptureFixture) -> None:
     assert len(kept.pins) == 1
     kept.pins.check(name(FIRST))
     kept.pins.check("")

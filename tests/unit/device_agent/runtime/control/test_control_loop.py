@@ -77,7 +77,7 @@ def test_a_device_at_rest_follows_a_setpoint_at_once(desk: Desk) -> None:
     wait_until(lambda: desk.told[-1].setpoint_sequence == 1, "telemetry of it")
 
 
-def test_a_flood_of_setpoints_makes_one_more_period_and_not_one_each(desk: Desk) -> None:
+def test_a_flood_of_setpoints_adds_one_period(desk: Desk) -> None:
     desk.ask(0.5)
     wait_until(lambda: desk.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
     desk.ask(0.7)
@@ -99,7 +99,7 @@ class PromptDriver(FakeDriver):
         return super().send(position_rad)
 
 
-def test_a_prompt_driver_is_commanded_by_the_thread_that_brings_the_setpoint() -> None:
+def test_an_inline_driver_is_commanded_by_the_callers_thread() -> None:
     desk = Desk(PromptDriver())
     desk.start()
     try:
@@ -117,7 +117,7 @@ def test_a_prompt_driver_is_commanded_by_the_thread_that_brings_the_setpoint() -
     assert len(desk.driver.threads) == 2, "who has stopped commands nothing more"
 
 
-def test_the_period_after_a_setpoints_own_comes_a_whole_period_later() -> None:
+def test_a_full_period_follows_an_early_one() -> None:
     driver = PromptDriver()
     desk = Desk(driver, period_ms=300)
     desk.start()
@@ -133,7 +133,7 @@ def test_the_period_after_a_setpoints_own_comes_a_whole_period_later() -> None:
         desk.loop.stop()
 
 
-def test_a_period_that_does_not_end_keeps_nobody_from_stopping() -> None:
+def test_a_blocked_period_does_not_prevent_stop() -> None:
     desk = Desk()
     desk.start()
     with desk.loop._period_lock:
@@ -141,7 +141,7 @@ def test_a_period_that_does_not_end_keeps_nobody_from_stopping() -> None:
     assert desk.loop._stopping.is_set()
 
 
-def test_of_two_that_hurry_at_once_one_begins_a_period() -> None:
+def test_concurrent_wakes_run_one_period() -> None:
     """The other finds out when it has the turn, not before; so does the loop's own thread."""
     driver = PromptDriver()
     desk = Desk(driver)
@@ -177,7 +177,7 @@ def test_of_two_that_hurry_at_once_one_begins_a_period() -> None:
         desk.loop.stop()
 
 
-def test_what_goes_wrong_in_a_setpoints_own_period_is_a_fault_until_the_driver_answers() -> None:
+def test_an_error_in_an_early_period_is_a_fault_until_the_driver_responds() -> None:
     desk = Desk(PromptDriver(), period_ms=8)
     desk.start()
     try:
@@ -209,7 +209,7 @@ def signed(harness: DeviceHarness) -> None:
 
 @pytest.mark.parametrize("stop", [plainly, signed])
 @pytest.mark.parametrize("driver", [FakeDriver, PromptDriver])
-def test_a_stop_of_a_device_at_rest_waits_for_no_period(
+def test_a_stop_at_rest_does_not_wait_for_a_period(
     tmp_path: Path, driver: type[FakeDriver], stop: Callable[[DeviceHarness], object]
 ) -> None:
     harness = DeviceHarness(tmp_path, driver=driver(), kind=robot_type(period_ms=LONG_MS))
@@ -254,7 +254,7 @@ def moving(period_ms: int, periods: int = 20) -> Desk:
     return desk
 
 
-def test_a_stop_in_motion_brakes_at_once_and_by_no_more_than_has_passed() -> None:
+def test_a_stop_in_motion_brakes_at_once_for_the_elapsed_time() -> None:
     desk = moving(period_ms=4)
     assert isinstance(desk.driver, PromptDriver)
     before_rad, speed_rad_s = desk.driver.position[1], desk.controller._state.motion.velocity_rad_s[1]
@@ -271,7 +271,7 @@ def test_a_stop_in_motion_brakes_at_once_and_by_no_more_than_has_passed() -> Non
     assert len(desk.driver.threads) == commanded + 1, "only once: then periods keep their length again"
 
 
-def test_a_stop_waits_for_no_period_after_a_setpoints_own_either() -> None:
+def test_a_stop_after_an_early_period_does_not_wait() -> None:
     desk = moving(period_ms=4)
     desk.loop._out_of_turn = True
     desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
@@ -279,7 +279,7 @@ def test_a_stop_waits_for_no_period_after_a_setpoints_own_either() -> None:
     assert desk.controller.mode is Mode.STOPPED
 
 
-def test_what_has_passed_is_never_more_than_a_period_and_never_nothing() -> None:
+def test_the_elapsed_time_is_bounded() -> None:
     desk = moving(period_ms=4)
     desk.loop._next_s = 10.0
     assert [desk.loop._passed_s(now_s) for now_s in (9.0, 9.996, 9.998, 10.0, 11.0)] == pytest.approx(
@@ -287,7 +287,7 @@ def test_what_has_passed_is_never_more_than_a_period_and_never_nothing() -> None
     )
 
 
-def test_a_stop_waits_for_the_end_of_a_period_that_may_not_know_of_it() -> None:
+def test_a_stop_waits_for_the_running_period() -> None:
     desk = moving(period_ms=100, periods=3)
     desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     desk.loop._period_lock.acquire()
@@ -296,7 +296,7 @@ def test_a_stop_waits_for_the_end_of_a_period_that_may_not_know_of_it() -> None:
     assert desk.controller.mode is Mode.STOPPED
 
 
-def test_telemetry_tells_of_a_new_setpoint_but_not_more_often_than_in_motion() -> None:
+def test_telemetry_follows_setpoints_within_its_rate_limit() -> None:
     desk = Desk()
     desk.controller.start_at((0.0, 0.0))
     seen, tick = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ()), desk.controller.update(0.0)
@@ -310,7 +310,7 @@ def test_telemetry_tells_of_a_new_setpoint_but_not_more_often_than_in_motion() -
     assert [told(now_s, sequence) for now_s, sequence in asked] == [True, False, True, True, False, True]
 
 
-def test_while_setpoints_come_telemetry_goes_with_them_and_else_33_times_a_second() -> None:
+def test_telemetry_is_in_step_with_setpoints_or_at_33_hz() -> None:
     desk = Desk()
     desk.controller.start_at((0.0, 0.0))
     seen = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())

@@ -47,7 +47,7 @@ def unwatched(_now_s: float) -> None:
     pass
 
 
-def test_the_driver_is_told_the_twist_until_the_drive_has_ended() -> None:
+def test_the_driver_receives_twists_until_the_drive_ends() -> None:
     kind, cart = robot_type(BASE), Cart()
     controller = Controller(kind, LeaseGate())
     loop = ControlLoop(kind, cart, controller, name="cart", publish=ignore, check_interlocks=unwatched)
@@ -65,7 +65,7 @@ def test_the_driver_is_told_the_twist_until_the_drive_has_ended() -> None:
 
 
 @pytest.mark.parametrize(("cart", "limited"), [(Cart(), ()), (Sitting(), ("base: driver",))])
-def test_a_drive_that_the_driver_does_not_follow_says_so(cart: Cart, limited: tuple[str, ...]) -> None:
+def test_a_twist_that_the_driver_changed_is_reported(cart: Cart, limited: tuple[str, ...]) -> None:
     kind = robot_type(BASE)
     controller = Controller(kind, LeaseGate())
     loop = ControlLoop(kind, cart, controller, name="cart", publish=ignore, check_interlocks=unwatched)
@@ -79,7 +79,7 @@ def test_a_drive_that_the_driver_does_not_follow_says_so(cart: Cart, limited: tu
         loop.stop()
 
 
-def test_a_driver_that_cannot_drive_does_not_start_with_a_type_that_has_a_base() -> None:
+def test_a_type_with_a_base_needs_a_mobile_driver() -> None:
     kind = robot_type(BASE)
     loop = ControlLoop(
         kind, FakeDriver(), Controller(kind, LeaseGate()), name="cart", publish=ignore, check_interlocks=unwatched

@@ -39,7 +39,7 @@ def test_after_the_watchdog_nothing_moves_until_control_is_taken_again() -> None
 
 
 @pytest.mark.parametrize("age_ms", [201, 5_000, -1])
-def test_a_setpoint_that_answers_old_or_invented_telemetry_is_refused(age_ms: int) -> None:
+def test_a_setpoint_with_an_old_or_future_echo_is_rejected(age_ms: int) -> None:
     fixture = leased()
     with refuses("too_old"):
         fixture.offer(1, age_ms=age_ms)
@@ -54,7 +54,7 @@ def test_an_older_setpoint_that_arrives_late_is_dropped() -> None:
         fixture.offer(1, sequence=7)
 
 
-def test_a_setpoint_beyond_the_range_is_clamped_and_says_so() -> None:
+def test_a_setpoint_beyond_the_range_is_clamped_and_reported() -> None:
     fixture = leased()
     fixture.offer(1, elbow=9.0)
     assert fixture.controller.update(fixture.now_s + PERIOD_S).limited == ("elbow: range",)
@@ -76,7 +76,7 @@ def test_a_newer_lease_fences_the_older() -> None:
     assert lease.epoch == 2
 
 
-def test_a_lease_that_runs_out_in_mid_motion_is_a_hold() -> None:
+def test_a_lease_that_expires_in_motion_holds() -> None:
     fixture = ControllerFixture()
     fixture.take(1, lease_s=0.5)
     fixture.stream(1, 0.48)
@@ -109,7 +109,7 @@ def test_stop_latches_and_reset_resumes_nothing() -> None:
     assert fixture.elbow != rest
 
 
-def test_a_reset_that_comes_again_or_late_does_not_release_a_later_stop() -> None:
+def test_a_repeated_or_late_reset_does_not_release_a_later_stop() -> None:
     fixture = leased()
     fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     fixture.controller.reset_stop(epoch=3)
@@ -123,7 +123,7 @@ def test_a_reset_that_comes_again_or_late_does_not_release_a_later_stop() -> Non
     assert fixture.controller.latch is None
 
 
-def test_what_was_ordered_before_a_reset_is_not_obeyed_after_it() -> None:
+def test_commands_from_before_a_reset_are_rejected() -> None:
     fixture = leased()
     fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     fixture.controller.reset_stop(epoch=3)
@@ -135,7 +135,7 @@ def test_what_was_ordered_before_a_reset_is_not_obeyed_after_it() -> None:
             fixture.take(epoch)
 
 
-def test_a_move_reaches_its_target_and_says_so() -> None:
+def test_a_joint_goal_is_reached() -> None:
     fixture = ControllerFixture()
     reservation = fixture.reserve()
     move = fixture.controller.start_joint_goal(reservation, {"elbow": 1.0}, speed=1.0)
@@ -147,7 +147,7 @@ def test_a_move_reaches_its_target_and_says_so() -> None:
 
 
 @pytest.mark.parametrize(("position_rad", "code"), [({"elbow": 3.1}, "out_of_range"), ({"knee": 0.0}, "unknown_joint")])
-def test_a_move_that_cannot_be_is_refused_whole(position_rad: dict[str, float], code: str) -> None:
+def test_an_invalid_goal_is_rejected_completely(position_rad: dict[str, float], code: str) -> None:
     fixture = ControllerFixture()
     reservation = fixture.reserve()
     with pytest.raises(Refused) as refused:
@@ -158,7 +158,7 @@ def test_a_move_that_cannot_be_is_refused_whole(position_rad: dict[str, float], 
 
 
 @pytest.mark.parametrize("cause", interruptions())
-def test_an_action_that_loses_the_device_moves_it_no_more(cause: str) -> None:
+def test_a_revoked_action_cannot_move_the_device(cause: str) -> None:
     fixture = ControllerFixture()
     why: list[Refused] = []
     fixture.take(1, lease_s=5.0)
@@ -174,7 +174,7 @@ def test_an_action_that_loses_the_device_moves_it_no_more(cause: str) -> None:
         fixture.controller.start_joint_goal(reservation, {"elbow": -1.0}, speed=1.0)
 
 
-def test_setpoints_are_refused_while_an_action_runs() -> None:
+def test_setpoints_are_rejected_while_an_action_runs() -> None:
     fixture = leased()
     reservation = fixture.reserve()
     with refuses("busy"):
@@ -191,7 +191,7 @@ def test_losing_the_link_at_rest_keeps_the_lease() -> None:
     assert fixture.controller.lease(fixture.now_s) is not None
 
 
-def test_a_driver_that_fails_again_is_one_fault_and_one_that_never_failed_does_not_recover() -> None:
+def test_repeated_faults_are_one_fault_and_recovery_needs_a_fault() -> None:
     fixture = ControllerFixture()
     fixture.controller.clear_fault([1.0, 1.0])
     fixture.run(PERIOD_S)

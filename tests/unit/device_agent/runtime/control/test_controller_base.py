@@ -27,7 +27,7 @@ def driving(fixture: ControllerFixture, duration_s: float = 2.0) -> DriveGoal:
     return fixture.controller.start_drive(reservation, Twist(0.4, 0.0, -0.5), duration_s=duration_s)
 
 
-def test_a_drive_speeds_up_keeps_its_twist_and_ends_by_itself() -> None:
+def test_a_drive_accelerates_keeps_its_twist_and_ends() -> None:
     fixture = ControllerFixture(base=BASE)
     drive = driving(fixture)
     found = twists(fixture, 2.0)
@@ -41,7 +41,7 @@ def test_a_drive_speeds_up_keeps_its_twist_and_ends_by_itself() -> None:
 
 
 @pytest.mark.parametrize("cause", interruptions())
-def test_whatever_takes_the_device_away_brakes_the_base(cause: str) -> None:
+def test_every_revocation_brakes_the_base(cause: str) -> None:
     fixture = ControllerFixture(base=BASE)
     fixture.take(1, lease_s=5.0)
     drive = driving(fixture, duration_s=50.0)
@@ -53,7 +53,7 @@ def test_whatever_takes_the_device_away_brakes_the_base(cause: str) -> None:
     assert not fixture.controller.moving
 
 
-def test_a_base_that_is_told_to_go_on_while_it_brakes_does_not_run_backwards() -> None:
+def test_a_new_twist_while_braking_does_not_reverse_the_base() -> None:
     motion = BaseMotion(BASE, PERIOD_S)
     motion.follow(Twist(-0.2))
     for _ in range(100):
@@ -67,7 +67,7 @@ def test_a_base_that_is_told_to_go_on_while_it_brakes_does_not_run_backwards() -
     assert motion.twist == pytest.approx(Twist(-0.2))
 
 
-def test_a_drive_is_slowed_by_the_room() -> None:
+def test_a_restriction_slows_a_drive() -> None:
     fixture = ControllerFixture(base=BASE)
     drive = driving(fixture)
     twists(fixture, 1.0)
@@ -76,7 +76,7 @@ def test_a_drive_is_slowed_by_the_room() -> None:
     assert drive.limited == ("interlock: somebody is near",)
 
 
-def test_a_drive_takes_the_place_of_a_move_and_the_other_way_round() -> None:
+def test_drive_and_joint_goals_replace_each_other() -> None:
     fixture = ControllerFixture(base=BASE)
     reservation = fixture.reserve()
     move = fixture.controller.start_joint_goal(reservation, {"elbow": 2.0}, speed=1.0)
@@ -102,7 +102,7 @@ def refusals() -> dict[str, tuple[Twist, float]]:
 
 
 @pytest.mark.parametrize("case", refusals())
-def test_what_cannot_be_driven_is_refused(case: str) -> None:
+def test_invalid_drives_are_rejected(case: str) -> None:
     fixture = ControllerFixture(base=BASE)
     reservation = fixture.reserve()
     twist, duration_s = refusals()[case]
@@ -119,7 +119,7 @@ def test_a_robot_without_a_base_does_not_drive() -> None:
         fixture.controller.start_drive(reservation, Twist(0.1), duration_s=1.0)
 
 
-def test_a_driver_that_comes_back_finds_the_base_at_rest() -> None:
+def test_after_a_fault_the_base_is_at_rest() -> None:
     fixture = ControllerFixture(base=BASE)
     driving(fixture)
     twists(fixture, 0.5)
@@ -128,14 +128,14 @@ def test_a_driver_that_comes_back_finds_the_base_at_rest() -> None:
     assert twists(fixture, 0.1)[0] == REST
 
 
-def test_a_base_without_a_way_to_go_on_says_so() -> None:
+def test_an_impossible_base_motion_is_an_error() -> None:
     motion = BaseMotion(BASE, PERIOD_S)
     motion.follow(Twist(math.nan))
     with pytest.raises(MotionError):
         motion.update()
 
 
-def test_an_action_may_end_while_it_drives() -> None:
+def test_the_end_of_an_action_brakes_its_drive() -> None:
     fixture = ControllerFixture(base=BASE)
     reservation = fixture.reserve()
     drive = fixture.controller.start_drive(reservation, Twist(0.4), duration_s=5.0)

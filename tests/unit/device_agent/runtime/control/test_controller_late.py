@@ -31,14 +31,12 @@ def rest_after(fixture: ControllerFixture, *gaps_s: float) -> float:
 
 
 @pytest.mark.parametrize("gap_s", [PERIOD_S, 0.012, 0.016, 0.024, 0.04])
-def test_a_loop_that_is_late_every_time_is_at_rest_at_most_one_call_later(
-    fixture: ControllerFixture, gap_s: float
-) -> None:
+def test_a_constantly_late_loop_rests_at_most_one_call_later(fixture: ControllerFixture, gap_s: float) -> None:
     assert rest_after(fixture, gap_s) <= LIMIT_S + gap_s
 
 
 @pytest.mark.parametrize("gap_s", [0.016, 0.024, 0.04, 0.06])
-def test_a_loop_that_has_been_late_begins_to_brake_the_sooner(fixture: ControllerFixture, gap_s: float) -> None:
+def test_a_loop_that_was_late_brakes_earlier(fixture: ControllerFixture, gap_s: float) -> None:
     for _ in range(20):
         fixture.offer(1, 2.9)
         fixture.now_s += gap_s
@@ -47,7 +45,7 @@ def test_a_loop_that_has_been_late_begins_to_brake_the_sooner(fixture: Controlle
     assert rest_after(fixture, gap_s) <= LIMIT_S
 
 
-def test_what_a_loop_was_late_is_forgotten(fixture: ControllerFixture) -> None:
+def test_loop_delay_decays(fixture: ControllerFixture) -> None:
     fixture.now_s += 0.1
     fixture.offer(1, 2.9)
     fixture.controller.update(fixture.now_s)
@@ -59,7 +57,7 @@ def test_what_a_loop_was_late_is_forgotten(fixture: ControllerFixture) -> None:
     assert sooner_s + 0.05 < rest_after(fixture, PERIOD_S) <= LIMIT_S
 
 
-def test_a_setpoint_that_comes_late_moves_it_no_longer_than_one_in_time(fixture: ControllerFixture) -> None:
+def test_a_late_setpoint_does_not_extend_the_motion(fixture: ControllerFixture) -> None:
     fixture.run(0.12)
     fixture.offer(1, 2.9, age_ms=140)
     assert rest_after(fixture, PERIOD_S) <= LIMIT_S - 0.09
@@ -74,7 +72,7 @@ def test_a_loop_that_hangs_past_the_limit_is_at_rest_at_once(fixture: Controller
     assert rest_after(fixture, 0.6, *[PERIOD_S] * 200) <= 0.6 + 3 * PERIOD_S
 
 
-def test_what_does_not_brake_is_not_hurried(fixture: ControllerFixture) -> None:
+def test_a_delay_does_not_slow_motion_that_is_not_braking(fixture: ControllerFixture) -> None:
     before = fixture.controller._state.motion.fastest_rad_s
     fixture.offer(1, 2.9)
     fixture.now_s += 0.1

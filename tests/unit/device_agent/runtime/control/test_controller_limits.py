@@ -19,7 +19,7 @@ from tests.fakes.drivers import PERIOD_S, robot_type
 from tests.harness.agent.controller_fixture import WALL_RAD, ControllerFixture, Wall, leased, refuses
 
 
-def test_a_streamed_arm_stops_before_the_wall_and_says_so() -> None:
+def test_a_streamed_arm_stops_before_the_wall_and_reports_it() -> None:
     fixture = ControllerFixture(geometry=Wall())
     fixture.take(1)
     assert fixture.stream(1, 4.0) is Mode.STREAMING
@@ -42,7 +42,7 @@ def test_an_operator_who_pushes_against_the_wall_moves_nothing() -> None:
     assert fixture.elbow <= WALL_RAD + 1e-6
 
 
-def test_a_wall_that_is_met_at_full_speed_is_not_touched() -> None:
+def test_a_goal_at_full_speed_stops_before_the_wall() -> None:
     fixture = ControllerFixture(geometry=Wall(2.0))
     reservation = fixture.reserve()
     wall = Wall(2.0)
@@ -61,7 +61,7 @@ def test_a_wall_that_is_met_at_full_speed_is_not_touched() -> None:
     assert fixture.elbow == pytest.approx(0.0, abs=1e-4)
 
 
-def test_a_move_to_where_there_is_no_room_is_refused_and_says_what_is_there() -> None:
+def test_a_goal_without_clearance_is_rejected_with_the_obstacle() -> None:
     fixture = ControllerFixture(geometry=Wall())
     reservation = fixture.reserve()
     with pytest.raises(Refused) as refused:
@@ -72,7 +72,7 @@ def test_a_move_to_where_there_is_no_room_is_refused_and_says_what_is_there() ->
     assert fixture.elbow == 0.0
 
 
-def test_who_is_too_near_already_may_leave_but_not_go_on() -> None:
+def test_a_robot_that_is_too_near_may_only_move_away() -> None:
     fixture = ControllerFixture(geometry=Wall())
     fixture.controller.start_at([0.0, 1.3])
     reservation = fixture.reserve()
@@ -86,7 +86,7 @@ def test_who_is_too_near_already_may_leave_but_not_go_on() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, 1.1, math.nan, math.inf])
-def test_a_speed_that_is_none_is_refused(speed: float) -> None:
+def test_an_invalid_speed_is_rejected(speed: float) -> None:
     fixture = ControllerFixture()
     reservation = fixture.reserve()
     with refuses("bad_speed"):
@@ -94,7 +94,7 @@ def test_a_speed_that_is_none_is_refused(speed: float) -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_position_that_is_no_number_is_refused_for_every_source(value: float) -> None:
+def test_a_position_that_is_not_finite_is_rejected_for_every_source(value: float) -> None:
     fixture = leased()
     with refuses("not_finite"):
         fixture.offer(1, elbow=value)
@@ -103,7 +103,7 @@ def test_a_position_that_is_no_number_is_refused_for_every_source(value: float) 
         fixture.controller.start_joint_goal(reservation, {"elbow": value}, speed=1.0)
 
 
-def test_speed_falls_before_the_wall_by_how_old_the_picture_is() -> None:
+def test_speed_before_the_wall_falls_with_loop_age() -> None:
     """v <= clearance / (loop age + watchdog + braking time), all the way."""
     fastest = {}
     for age_ms in (20, 190):
@@ -119,7 +119,7 @@ def test_speed_falls_before_the_wall_by_how_old_the_picture_is() -> None:
         assert fixture.elbow == pytest.approx(1.5, abs=0.02)
 
 
-def test_with_a_young_picture_and_room_the_stream_has_its_full_speed() -> None:
+def test_a_low_loop_age_with_clearance_allows_full_speed() -> None:
     fixture = ControllerFixture(geometry=Wall(2.9))
     fixture.take(1)
     fixture.stream(1, 1.2, age_ms=40)
@@ -127,7 +127,7 @@ def test_with_a_young_picture_and_room_the_stream_has_its_full_speed() -> None:
     assert fixture.limited == set()
 
 
-def test_where_nobody_knows_the_shape_age_alone_slows() -> None:
+def test_without_geometry_loop_age_alone_limits_the_speed() -> None:
     fixture = leased()
     fixture.stream(1, 1.0, age_ms=90)
     assert max(fixture.velocities) == pytest.approx(0.35 * 3.0, rel=1e-6)
@@ -141,7 +141,7 @@ def test_where_nobody_knows_the_shape_age_alone_slows() -> None:
     assert 0 < fixture.velocities[-1] <= 0.1 * 0.35 * 3.0 + 1e-6
 
 
-def test_one_late_answer_is_no_slow_link() -> None:
+def test_one_late_setpoint_does_not_limit_the_speed() -> None:
     pace = LatencyLimiter(None, watchdog_s=0.3, max_age_s=0.2)
     assert pace.age_s == 0.0
     for _ in range(50):
@@ -153,7 +153,7 @@ def test_one_late_answer_is_no_slow_link() -> None:
     assert pace.age_s == 0.0
 
 
-def test_what_the_driver_changes_is_told() -> None:
+def test_changes_by_the_driver_are_reported() -> None:
     fixture = ControllerFixture()
     reservation = fixture.reserve()
     move = fixture.controller.start_joint_goal(reservation, {"elbow": 1.0}, speed=1.0)
@@ -165,7 +165,7 @@ def test_what_the_driver_changes_is_told() -> None:
     assert fixture.controller.update(fixture.now_s + 2 * PERIOD_S).limited == ()
 
 
-def test_a_shape_that_fails_under_way_is_no_permission() -> None:
+def test_a_geometry_error_in_motion_is_not_permission() -> None:
     """The loop that calls ``step`` takes any error for a fault, and holds."""
 
     class Broken(Wall):
@@ -182,7 +182,7 @@ def test_a_shape_that_fails_under_way_is_no_permission() -> None:
     assert fixture.elbow == pytest.approx(0.0, abs=1e-4)
 
 
-def test_a_new_order_in_the_middle_of_hard_braking_does_not_turn_the_arm_round() -> None:
+def test_a_new_target_while_braking_does_not_reverse_the_arm() -> None:
     fixture = leased()
     fixture.stream(1, 1.5, elbow=2.9)
     fixture.take(2)
@@ -193,7 +193,7 @@ def test_a_new_order_in_the_middle_of_hard_braking_does_not_turn_the_arm_round()
     assert fixture.elbow > 1.0
 
 
-def test_a_motion_without_a_way_to_brake_is_an_error() -> None:
+def test_a_motion_that_cannot_brake_is_an_error() -> None:
     motion = JointMotion(robot_type())
     motion.follow([1.0, 1.0])
     motion._braking = math.nan
@@ -206,7 +206,7 @@ def test_a_planner_that_finds_nothing_is_an_error() -> None:
         generate(lambda _order, _answer: Result.ErrorExecutionTimeCalculation, None, None)
 
 
-def test_a_way_that_rounding_hides_from_the_planner_is_found_with_a_little_less_speed() -> None:
+def test_a_trajectory_hidden_by_rounding_is_found_at_a_lower_speed() -> None:
     order = InputParameter(1)
     # A joint that would meet both limits, and leave them again, at one moment.
     order.current_position, order.target_position = [0.8000000000000002], [0.5]
@@ -229,7 +229,7 @@ def test_a_motion_that_cannot_be_planned_holds_and_ends_the_lease() -> None:
     assert fixture.controller.lease(fixture.now_s) is None
 
 
-def test_where_not_even_braking_can_be_planned_the_command_stands_still_at_once() -> None:
+def test_a_motion_that_cannot_brake_stops_at_once() -> None:
     fixture = leased()
     fixture.stream(1, 0.5)
     fixture.controller._state.motion._jerk_limits = [math.nan, math.nan]
@@ -239,7 +239,7 @@ def test_where_not_even_braking_can_be_planned_the_command_stands_still_at_once(
     assert fixture.elbow == rest
 
 
-def test_it_says_what_it_holds_and_what_it_cannot_know() -> None:
+def test_limits_are_listed_by_available_model() -> None:
     known = ("position", "velocity", "acceleration", "jerk")
     assert ControllerFixture().controller.limits == known
     assert ControllerFixture(geometry=Wall()).controller.limits == (*known, "clearance")
@@ -248,7 +248,7 @@ def test_it_says_what_it_holds_and_what_it_cannot_know() -> None:
     assert MotionLimits(kind, Wall()).names == (*known, "clearance", "workspace")
 
 
-def test_a_path_that_leads_nowhere_is_not_looked_at() -> None:
+def test_a_path_without_motion_is_not_checked() -> None:
     envelope = MotionLimits(robot_type(), Wall(-1.0))
     assert envelope.find_obstacle([[0.0, 0.0], [0.0, 0.0]]) is None
     assert envelope.find_obstacle([[0.0, 0.0], [0.0, 0.1]]) is not None

@@ -305,12 +305,12 @@ class Chance:
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_limits_and_authority_hold_whatever_comes(seed: int) -> None:
+def test_random_runs_respect_limits_and_authority(seed: int) -> None:
     Chance(seed).live()
 
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_limits_and_authority_hold_over_many_lives() -> None:
+def test_many_random_runs_respect_limits_and_authority() -> None:
     for seed in range(1000, 3000):
         Chance(seed).live()

@@ -11,7 +11,7 @@ from device_agent.runtime.errors import Refused
 from tests.harness.agent.controller_fixture import ControllerFixture, ignore_revocation, leased, refuses
 
 
-def test_the_strictest_of_several_sources_counts_until_it_is_lifted() -> None:
+def test_the_strictest_restriction_applies_until_it_is_lifted() -> None:
     restrictions = Restrictions()
     assert (restrictions.speed, restrictions.strictest, restrictions.all) == (1.0, None, ())
     restrictions.set("door", 0.5, "the door is open")
@@ -24,13 +24,13 @@ def test_the_strictest_of_several_sources_counts_until_it_is_lifted() -> None:
 
 
 @pytest.mark.parametrize("speed", [math.nan, math.inf, -0.1, 1.1])
-def test_a_speed_that_is_no_share_means_hold(speed: float) -> None:
+def test_an_invalid_speed_means_hold(speed: float) -> None:
     restrictions = Restrictions()
     restrictions.set("zone", speed, "?")
     assert restrictions.speed == 0.0
 
 
-def test_a_slowed_stream_is_slower_says_why_and_speeds_up_again_by_itself() -> None:
+def test_a_restriction_slows_a_stream_and_is_reported() -> None:
     fixture = leased()
     fixture.controller.restrict("zone", 0.25, "somebody is near")
     assert fixture.controller.restrictions == (Restriction("zone", 0.25, "somebody is near"),)
@@ -42,7 +42,7 @@ def test_a_slowed_stream_is_slower_says_why_and_speeds_up_again_by_itself() -> N
     assert max(fixture.velocities) > 0.9
 
 
-def test_a_move_in_mid_motion_is_slowed_and_goes_on_when_the_zone_is_free() -> None:
+def test_a_restriction_slows_a_goal_until_it_is_lifted() -> None:
     fixture = ControllerFixture()
     reservation = fixture.reserve()
     move = fixture.controller.start_joint_goal(reservation, {"elbow": 2.5}, speed=1.0)
@@ -74,7 +74,7 @@ def test_a_hold_stops_a_stream_and_lifting_it_resumes_nothing() -> None:
     assert fixture.elbow > rest
 
 
-def test_a_hold_ends_an_action_and_refuses_the_next() -> None:
+def test_a_hold_ends_an_action_and_rejects_the_next() -> None:
     fixture = ControllerFixture()
     why: list[Refused] = []
     reservation = fixture.controller.reserve(epoch=1, on_revoked=why.append)
@@ -90,7 +90,7 @@ def test_a_hold_ends_an_action_and_refuses_the_next() -> None:
     assert "somebody is there" in refused.value.message
 
 
-def test_an_operator_at_rest_keeps_control_through_a_hold_unless_they_push_against_it() -> None:
+def test_a_hold_at_rest_keeps_the_lease_until_a_setpoint_arrives() -> None:
     fixture = leased()
     fixture.controller.restrict("zone", 0.0, "somebody is there")
     assert fixture.run(0.1) is Mode.HOLDING
@@ -107,7 +107,7 @@ def test_an_operator_at_rest_keeps_control_through_a_hold_unless_they_push_again
         fixture.offer(1)
 
 
-def test_a_setpoint_that_waits_for_its_first_period_is_held_too() -> None:
+def test_a_hold_discards_a_waiting_setpoint() -> None:
     fixture = leased()
     fixture.offer(1)
     fixture.controller.restrict("zone", 0.0, "somebody is there")

@@ -50,7 +50,7 @@ def late(periods: int) -> Servo:
 
 
 @pytest.mark.parametrize("periods", [0, 30])
-def test_a_move_ends_when_the_joints_have_followed(periods: int) -> None:
+def test_a_goal_ends_when_the_measured_joints_arrive(periods: int) -> None:
     fixture = Loaded(late(periods))
     move = fixture.move(elbow=1.0)
     rested_s = fixture.go(move)
@@ -60,7 +60,7 @@ def test_a_move_ends_when_the_joints_have_followed(periods: int) -> None:
     assert rested_s < 0.4
 
 
-def test_who_only_comes_through_has_not_arrived() -> None:
+def test_passing_through_is_not_arrival() -> None:
     swing = iter(range(10_000))
     fixture = Loaded(lambda told: (told[0], told[1] + 0.2 * math.cos(next(swing) * PERIOD_S * 20)))
     move = fixture.move(elbow=1.0)
@@ -70,7 +70,7 @@ def test_who_only_comes_through_has_not_arrived() -> None:
 
 
 @pytest.mark.parametrize("off_rad", [0.12, -0.12, math.nan])
-def test_what_never_comes_fails_names_the_joint_and_is_held_there(off_rad: float) -> None:
+def test_a_joint_that_never_arrives_fails_the_goal(off_rad: float) -> None:
     fixture = Loaded(lambda told: (told[0] - 0.2, told[1] - off_rad))
     move = fixture.move(elbow=1.0)
     rested_s = fixture.go(move)
@@ -88,7 +88,7 @@ def test_what_never_comes_fails_names_the_joint_and_is_held_there(off_rad: float
     assert again.result is GoalResult.REACHED
 
 
-def test_a_joint_that_holds_softly_is_where_it_sags_to() -> None:
+def test_a_soft_joint_is_not_checked() -> None:
     fixture = Loaded(lambda told: (told[0], told[1] - 0.3))
     fixture.controller.set_stiffness({"elbow": 0.4}, reservation=fixture.reservation)
     move = fixture.move(elbow=1.0)
@@ -96,7 +96,7 @@ def test_a_joint_that_holds_softly_is_where_it_sags_to() -> None:
     assert move.result is GoalResult.REACHED
 
 
-def test_the_end_of_a_planned_way_is_looked_at_too() -> None:
+def test_the_end_of_a_trajectory_is_checked() -> None:
     class Open(Wall):
         def plan(
             self, start_rad: Sequence[float], goal_rad: Sequence[float], **_: object

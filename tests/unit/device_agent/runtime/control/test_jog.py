@@ -70,7 +70,7 @@ def jogger(*, base: bool = False) -> Jogger:
     return found
 
 
-def test_a_frame_goes_where_it_is_pushed_and_keeps_its_orientation() -> None:
+def test_a_jog_moves_the_frame_and_keeps_its_orientation() -> None:
     fixture = jogger()
     begin = fixture.flange()
     fixture.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 1.2)
@@ -83,7 +83,7 @@ def test_a_frame_goes_where_it_is_pushed_and_keeps_its_orientation() -> None:
     assert fixture.controller.lease(fixture.now_s) is not None, "letting go is no loss"
 
 
-def test_a_tool_goes_along_its_own_axes() -> None:
+def test_a_tool_jog_uses_the_frames_axes() -> None:
     fixture = jogger()
     begin = fixture.flange()
     fixture.hold(JogTarget(linear_m_s=(0.0, 0.0, 0.05), tool=True, frame="flange"), 0.8)
@@ -93,7 +93,7 @@ def test_a_tool_goes_along_its_own_axes() -> None:
     assert abs(sum(a * b for a, b in zip(begin[3:], fixture.flange()[3:], strict=True))) < math.cos(0.1)
 
 
-def test_a_jog_that_ends_in_motion_is_an_operator_lost() -> None:
+def test_a_jog_that_stops_arriving_ends_the_lease() -> None:
     fixture = jogger()
     fixture.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.8)
     assert fixture.controller.moving
@@ -114,7 +114,7 @@ def test_a_jog_is_held_before_the_table_and_can_leave_it() -> None:
     assert fixture.flange()[2] > low + 0.03
 
 
-def test_near_a_singularity_it_is_slow_instead_of_jumping() -> None:
+def test_a_jog_near_a_singularity_is_slow() -> None:
     fixture = jogger()
     fixture.hold(JogTarget(linear_m_s=(-0.5, 0.0, 0.2)), 5.0)
     steps = np.abs(np.diff(fixture.gone, axis=0)) / 0.008
@@ -130,7 +130,7 @@ def test_near_a_singularity_it_is_slow_instead_of_jumping() -> None:
         max_size=4,
     )
 )
-def test_whatever_is_pushed_every_limit_holds(
+def test_random_jogs_stay_within_every_limit(
     twists: list[tuple[float, ...]],
 ) -> None:
     fixture = jogger()
@@ -146,7 +146,7 @@ def test_whatever_is_pushed_every_limit_holds(
     assert all(SHAPE.clearance(place).room_m > -0.004 for place in gone[::10].tolist())
 
 
-def test_joints_go_on_from_where_a_jog_has_left_them() -> None:
+def test_joint_setpoints_continue_from_the_jogged_position() -> None:
     fixture = jogger()
     fixture.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.8)
     fixture.hold(JointTarget(position_rad={"wrist_3": 0.3}), 1.5)
@@ -165,7 +165,7 @@ def test_a_base_drives_while_setpoints_are_fresh_and_no_longer() -> None:
         fixture.hold(DriveTarget(forward_m_s=0.3), 0.1)
 
 
-def test_a_base_that_is_let_go_brakes_at_once_and_its_operator_keeps_control() -> None:
+def test_a_zero_twist_brakes_and_keeps_the_lease() -> None:
     fixture = jogger(base=True)
     fixture.hold(DriveTarget(forward_m_s=0.5, turn_rad_s=0.4), 1.5)
     fixture.hold(DriveTarget(), 0.25)  # half of the time that it would take at the acceleration of a start
@@ -175,7 +175,7 @@ def test_a_base_that_is_let_go_brakes_at_once_and_its_operator_keeps_control() -
     assert fixture.twists[-1] == pytest.approx((0.3, 0.0, 0.0), abs=1e-6)
 
 
-def test_a_drive_beyond_the_limits_is_bounded_and_says_so() -> None:
+def test_a_drive_setpoint_beyond_the_limits_is_clamped_and_reported() -> None:
     fixture = jogger(base=True)
     fixture.hold(DriveTarget(forward_m_s=9.0, left_m_s=1.0), 1.5)
     assert fixture.twists[-1] == pytest.approx((0.5, 0.0, 0.0), abs=1e-6)
@@ -184,7 +184,7 @@ def test_a_drive_beyond_the_limits_is_bounded_and_says_so() -> None:
     assert fixture.twists[-1][0] < 0.4, "an old picture slows it"
 
 
-def test_joints_that_are_still_asked_let_the_base_stand() -> None:
+def test_joint_setpoints_stop_the_base() -> None:
     fixture = jogger(base=True)
     fixture.hold(DriveTarget(forward_m_s=0.3), 1.0)
     fixture.hold(JointTarget(position_rad={"elbow": 1.0}), 0.6)
@@ -192,7 +192,7 @@ def test_joints_that_are_still_asked_let_the_base_stand() -> None:
     assert fixture.controller.mode is Mode.STREAMING
 
 
-def test_an_action_that_begins_takes_the_base_from_the_joystick() -> None:
+def test_an_action_stops_a_streamed_base() -> None:
     fixture = jogger(base=True)
     fixture.hold(DriveTarget(forward_m_s=0.3), 1.0)
     fixture.controller.reserve(epoch=1, on_revoked=ignore_revocation)
@@ -200,7 +200,7 @@ def test_an_action_that_begins_takes_the_base_from_the_joystick() -> None:
     assert fixture.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
-def test_stop_brakes_a_base_that_is_driven_and_nothing_resumes() -> None:
+def test_stop_brakes_a_streamed_base_and_nothing_resumes() -> None:
     fixture = jogger(base=True)
     fixture.hold(DriveTarget(forward_m_s=0.3), 1.0)
     fixture.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))
@@ -220,7 +220,7 @@ def test_stop_brakes_a_base_that_is_driven_and_nothing_resumes() -> None:
         (JogTarget(angular_rad_s=(0.0, math.inf, 0.0)), "not_finite"),
     ],
 )
-def test_what_makes_no_sense_is_refused(target: Target, code: str) -> None:
+def test_invalid_targets_are_rejected(target: Target, code: str) -> None:
     with pytest.raises(Refused) as refused:
         jogger().hold(target, 0.03)
     assert refused.value.code == code
@@ -243,9 +243,7 @@ _ODD: st.SearchStrategy[object] = st.one_of(
 
 @settings(max_examples=100, deadline=None)
 @given(st.dictionaries(st.sampled_from([*DriveTarget.__struct_fields__, "up_m_s", ""]), _ODD), st.integers(0, 220))
-def test_whatever_is_sent_to_drive_a_base_is_refused_or_driven_inside_its_limits(
-    sent: dict[str, object], age_ms: int
-) -> None:
+def test_random_drive_messages_are_rejected_or_stay_within_limits(sent: dict[str, object], age_ms: int) -> None:
     text = json.dumps(
         {"epoch": 1, "sequence": 1, "echo_tick_ms": 1, "sent_ms": 1.0, "target": {"kind": "drive"} | sent}
     )

@@ -17,7 +17,7 @@ def way_to(yaw: float) -> Trajectory:
     return score.trajectory()
 
 
-def test_a_way_that_begins_elsewhere_is_not_taken() -> None:
+def test_a_trajectory_that_starts_elsewhere_is_not_followed() -> None:
     motion, one, other = JointMotion(head()), way_to(1.0), way_to(-1.0)
     for _ in range(50):
         motion.follow_trajectory(one, share=1.0)
@@ -31,7 +31,7 @@ def test_a_way_that_begins_elsewhere_is_not_taken() -> None:
     assert 0.4 < motion.position_rad[0] < 0.7, "it came to rest on the way that it was on"
 
 
-def test_without_joints_there_is_nothing_to_plan() -> None:
+def test_a_device_without_joints_needs_no_plan() -> None:
     motion = JointMotion(
         msgspec.structs.replace(head(), joints=(), mimic_joints=(), position_dependent_limits=(), home_rad={})
     )
@@ -65,7 +65,7 @@ def test_two_parts_of_a_period_brake_as_much_as_a_whole_one() -> None:
         assert motion._generator.delta_time == pytest.approx(motion._period_s)
 
 
-def test_who_brakes_for_a_moment_and_goes_on_does_not_run_backwards_meanwhile() -> None:
+def test_a_short_brake_does_not_reverse_the_motion() -> None:
     for periods in range(1, 12):
         motion = JointMotion(robot_type())
         motion.start_at([3.0, 3.0])

@@ -45,7 +45,7 @@ def check_limits(way: Trajectory, kind: RobotType) -> None:
             assert np.abs(jerk).max() <= joint.max_jerk_rad_s3 * 1.001
 
 
-def test_joints_are_where_a_keyframe_says_when_it_says() -> None:
+def test_joints_reach_keyframes_in_time() -> None:
     score = BehaviourTrajectory(head(), HOME)
     assert score.add_keyframes([frame(1.0, yaw=0.5), frame(2.0, left=-0.4), frame(3.0, yaw=0.0)], {}) == []
     way = score.trajectory()
@@ -58,7 +58,7 @@ def test_joints_are_where_a_keyframe_says_when_it_says() -> None:
     check_limits(way, head())
 
 
-def test_what_cannot_be_reached_in_time_is_reached_later_and_the_rest_after_it() -> None:
+def test_unreachable_times_delay_all_later_keyframes() -> None:
     score = BehaviourTrajectory(head(), HOME)
     score.add_keyframes([frame(0.1, yaw=2.0), frame(0.2, yaw=-2.0)], {})
     way = score.trajectory()
@@ -69,7 +69,7 @@ def test_what_cannot_be_reached_in_time_is_reached_later_and_the_rest_after_it()
     assert at(way, way.duration_s)[0] == pytest.approx(-2.0)
 
 
-def test_words_begin_when_their_keyframe_is_set_out_for() -> None:
+def test_lines_start_with_the_motion_to_their_keyframe() -> None:
     score = BehaviourTrajectory(head(), HOME)
     frames = [frame(1.0, yaw=0.2), frame(2.0, say="there"), frame(2.5, yaw=0.0, say="and back")]
     lines = score.add_keyframes(frames, {"there": 0.5, "and back": 3.0})
@@ -77,7 +77,7 @@ def test_words_begin_when_their_keyframe_is_set_out_for() -> None:
     assert score.trajectory().duration_s >= 5.0, "it lasts until all is said"
 
 
-def test_nothing_to_do_is_a_way_of_rest() -> None:
+def test_an_empty_behaviour_is_a_resting_trajectory() -> None:
     way = BehaviourTrajectory(head(), (0.3, 0.0, 0.0, 0.0)).trajectory()
     assert way.duration_s > 0
     assert at(way, 0.0) == at(way, 9.0) == [0.3, 0.0, 0.0, 0.0]
@@ -96,7 +96,7 @@ def test_nothing_to_do_is_a_way_of_rest() -> None:
     ),
     table=st.sampled_from((None, BENT)),
 )
-def test_a_way_stays_inside_of_every_range_and_limit(
+def test_a_trajectory_stays_within_ranges_and_limits(
     steps: list[tuple[float, dict[str, float], str]], table: tuple[tuple[float, float, float], ...] | None
 ) -> None:
     kind = talking() if table is None else head(table)
@@ -118,7 +118,7 @@ def _range(name: str) -> tuple[float, float]:
     return RANGES[("yaw", "pitch", "left").index(name)]
 
 
-def test_a_mouth_opens_for_vowels_and_is_as_before_in_the_end() -> None:
+def test_the_mouth_opens_for_vowels_and_closes_at_the_end() -> None:
     score = BehaviourTrajectory(talking(), (0.0, -0.1, 0.0, 0.0))
     score.add_speech(SpokenLine(0.0, "mama", 3.0))
     way = score.trajectory()
@@ -127,7 +127,7 @@ def test_a_mouth_opens_for_vowels_and_is_as_before_in_the_end() -> None:
     check_limits(way, talking())
 
 
-def test_a_mouth_goes_on_where_the_keyframes_had_it_and_they_go_on_after() -> None:
+def test_mouth_shapes_start_from_and_return_to_the_keyframes() -> None:
     score = BehaviourTrajectory(talking(), HOME)
     score.add_keyframes([frame(0.5, pitch=-0.2), frame(1.0, say="baba"), frame(4.0, pitch=0.1)], {"baba": 1.0})
     way = score.trajectory()
@@ -136,7 +136,7 @@ def test_a_mouth_goes_on_where_the_keyframes_had_it_and_they_go_on_after() -> No
     assert at(way, way.duration_s)[1] == pytest.approx(0.1)
 
 
-def test_words_that_begin_before_others_have_ended_wait_for_the_mouth() -> None:
+def test_overlapping_lines_wait_for_the_mouth() -> None:
     score = BehaviourTrajectory(talking(), HOME)
     score.add_speech(SpokenLine(0.0, "mama", 3.0))
     score.add_speech(SpokenLine(2.9, "mama", 3.0))
@@ -149,7 +149,7 @@ def test_words_that_begin_before_others_have_ended_wait_for_the_mouth() -> None:
 # ---------------------------------------------------------------- letters
 
 
-def test_letters_become_shapes_in_their_order_and_time() -> None:
+def test_letters_map_to_visemes_in_order() -> None:
     there = ("sil", "PP", "aa", "TH", "SS")
     shapes = visemes.visemes_of("Path: súm!", 2.0, there)
     assert [shape for _, shape in shapes] == ["PP", "aa", "TH", "sil", "sil", "SS", "aa", "PP", "sil"]
@@ -157,12 +157,12 @@ def test_letters_become_shapes_in_their_order_and_time() -> None:
     assert 0 < shapes[0][0] < shapes[-1][0] < 2.0
 
 
-def test_a_shape_that_a_robot_lacks_is_the_nearest_it_has() -> None:
+def test_missing_visemes_are_substituted() -> None:
     assert [shape for _, shape in visemes.visemes_of("o", 1.0, ("aa",))] == ["aa"]
     assert [shape for _, shape in visemes.visemes_of("m", 1.0, ("aa",))] == []
     assert visemes.visemes_of("…", 1.0, ("aa",)) == []
 
 
-def test_where_nobody_speaks_it_takes_as_long_as_it_would() -> None:
+def test_the_duration_of_silent_speech_is_estimated() -> None:
     assert visemes.estimate_duration_s("a" * 140) == pytest.approx(10.0)
     assert visemes.estimate_duration_s("a") > 0.1

@@ -126,7 +126,7 @@ def live(neck: Neck, life: list[tuple[str, dict[str, float], int]]) -> None:
 @pytest.mark.parametrize("table", [WIDE, BENT], ids=["wide", "bent"])
 @settings(max_examples=30, deadline=None)
 @given(life=acts)
-def test_no_command_ever_leaves_the_range_that_is_left(
+def test_no_command_leaves_the_dependent_range(
     table: tuple[tuple[float, float, float], ...], life: list[tuple[str, dict[str, float], int]]
 ) -> None:
     live(Neck(table), life)
@@ -136,14 +136,14 @@ def test_no_command_ever_leaves_the_range_that_is_left(
 @pytest.mark.parametrize("table", [WIDE, BENT], ids=["wide", "bent"])
 @settings(max_examples=3000, deadline=None)
 @given(life=acts)
-def test_no_command_ever_leaves_the_range_that_is_left_in_thousands_of_lives(
+def test_no_command_leaves_the_dependent_range_in_thousands_of_runs(
     table: tuple[tuple[float, float, float], ...], life: list[tuple[str, dict[str, float], int]]
 ) -> None:
     live(Neck(table), life)
 
 
 @pytest.mark.parametrize("table", [WIDE, BENT], ids=["wide", "bent"])
-def test_from_corner_to_corner_it_arrives(table: tuple[tuple[float, float, float], ...]) -> None:
+def test_coupled_joints_arrive_from_corner_to_corner(table: tuple[tuple[float, float, float], ...]) -> None:
     neck = Neck(table)
     narrowing = neck.kind.position_dependent_limits[0]
     for yaw in (2.0, -2.0, 0.0, 2.0):
@@ -152,14 +152,14 @@ def test_from_corner_to_corner_it_arrives(table: tuple[tuple[float, float, float
             assert neck.position[:2] == pytest.approx([yaw, edge], abs=2e-4)
 
 
-def test_a_setpoint_is_clamped_to_where_the_other_joint_will_be_and_says_so() -> None:
+def test_a_setpoint_is_clamped_to_the_dependent_range_and_reported() -> None:
     neck = Neck()
     neck.stream(3.0, yaw=2.0, pitch=0.5)
     assert neck.position[:2] == pytest.approx([2.0, 0.1], abs=1e-3)
     assert "pitch: range at yaw" in neck.limited
 
 
-def test_a_joint_waits_until_the_other_is_out_of_its_way() -> None:
+def test_a_joint_waits_for_the_coupled_joint() -> None:
     neck = Neck()
     assert neck.move(pitch=0.5) is GoalResult.REACHED
     assert neck.move(yaw=2.0) is GoalResult.REACHED
@@ -167,7 +167,7 @@ def test_a_joint_waits_until_the_other_is_out_of_its_way() -> None:
     assert "yaw: waits for pitch" in neck.limited
 
 
-def test_a_move_that_asks_for_more_than_is_left_is_refused_with_what_is() -> None:
+def test_a_goal_outside_the_dependent_range_is_rejected() -> None:
     neck = Neck()
     with pytest.raises(
         Refused, match=r"pitch can go from -0\.4000 to 0\.1000 rad at the target of yaw, not to 0\.3000"
@@ -175,7 +175,7 @@ def test_a_move_that_asks_for_more_than_is_left_is_refused_with_what_is() -> Non
         neck.move(yaw=2.0, pitch=0.3)
 
 
-def test_either_joint_of_a_mirror_moves_both() -> None:
+def test_either_joint_of_a_mimic_pair_moves_both() -> None:
     neck = Neck()
     assert neck.move(left=-0.4) is GoalResult.REACHED
     assert neck.position[3] == pytest.approx(0.2, abs=2e-4)
@@ -184,7 +184,7 @@ def test_either_joint_of_a_mirror_moves_both() -> None:
     assert neck.move(left=-0.4, right=0.2) is GoalResult.REACHED
 
 
-def test_a_mirror_cannot_be_asked_to_differ() -> None:
+def test_contradictory_mimic_positions_are_rejected() -> None:
     neck = Neck()
     with pytest.raises(Refused, match="one motor moves right and another joint"):
         neck.move(left=-0.4, right=-0.4)
@@ -194,7 +194,7 @@ def test_a_mirror_cannot_be_asked_to_differ() -> None:
     assert "right: mirror" in neck.limited
 
 
-def test_who_is_set_up_outside_is_led_back_and_never_farther_out() -> None:
+def test_a_joint_outside_its_range_returns_and_never_moves_further_out() -> None:
     neck = Neck(start=(2.0, 0.4, 0.0, 0.0))
     farthest = 0.4
     for _ in range(100):
@@ -206,7 +206,7 @@ def test_who_is_set_up_outside_is_led_back_and_never_farther_out() -> None:
     assert farthest == pytest.approx(0.1, abs=1e-3)
 
 
-def test_what_would_leave_its_range_is_held_at_its_edge() -> None:
+def test_a_command_beyond_the_range_is_clamped_to_its_edge() -> None:
     """The last word, for whatever comes to the motors by a way of its own."""
     couplings = Couplings(head())
     position = [2.0, 0.3, 0.0, 0.0]
@@ -217,7 +217,7 @@ def test_what_would_leave_its_range_is_held_at_its_edge() -> None:
     assert outside[1] == 0.55
 
 
-def test_a_joint_that_cannot_get_inside_stays_where_it_is() -> None:
+def test_a_joint_that_cannot_return_stays() -> None:
     heading, waits = Couplings(head(BENT)).limit_target(
         [2.0, 0.3, 0.0, 0.0], [-2.0, 0.3, 0.0, 0.0], [(-2.0, 2.0), (0.3, 0.3)]
     )
@@ -233,7 +233,7 @@ def test_a_joint_that_cannot_get_inside_stays_where_it_is() -> None:
         ([[0.0, 0.0, -0.4, 0.2], [2.0, 0.1, 0.0, 0.1]], "separates right from left, which the same motor moves"),
     ],
 )
-def test_a_way_must_not_part_what_hangs_together(places: list[list[float]], says: str) -> None:
+def test_a_trajectory_that_violates_couplings_is_rejected(places: list[list[float]], says: str) -> None:
     envelope = MotionLimits(head(), None)
     if says:
         with pytest.raises(Refused, match=says):
@@ -242,7 +242,7 @@ def test_a_way_must_not_part_what_hangs_together(places: list[list[float]], says
         envelope.check_trajectory(np.array(places))
 
 
-def test_limp_joints_are_commanded_to_where_they_are() -> None:
+def test_compliant_joints_track_the_measurement() -> None:
     motion = JointMotion(head())
     motion.start_at([0.0, 0.0, 0.0, 0.0])
     motion.track_measured({0: 0.8})

@@ -47,7 +47,7 @@ def check_limits(way: Trajectory, kind: RobotType, joints: tuple[int, ...]) -> N
         assert np.abs(jerk).max() <= joint.max_jerk_rad_s3 * 1.01
 
 
-def test_joints_are_where_a_keyframe_says_when_it_says_and_pass_where_they_go_on() -> None:
+def test_joints_reach_keyframes_in_time_and_pass_through() -> None:
     made = timeline(frame(1.0, yaw=0.5), frame(2.0, yaw=1.0, left=0.3), frame(4.0, yaw=0.0))
     way = made.trajectory()
     assert made.limited == ()
@@ -61,7 +61,7 @@ def test_joints_are_where_a_keyframe_says_when_it_says_and_pass_where_they_go_on
     check_limits(way, head(), (0, 2))
 
 
-def test_what_cannot_be_there_in_time_comes_later_and_the_rest_with_it() -> None:
+def test_keyframes_that_are_too_early_are_delayed() -> None:
     made = timeline(frame(0.01, yaw=1.0), frame(1.0, left=0.3))
     way = made.trajectory()
     assert made.limited == ("keyframes: later",)
@@ -70,7 +70,7 @@ def test_what_cannot_be_there_in_time_comes_later_and_the_rest_with_it() -> None
     check_limits(way, head(), (0, 2))
 
 
-def test_speed_stretches_time_and_limits_hold_all_the_same() -> None:
+def test_speed_scales_time_within_the_limits() -> None:
     keyframes = (frame(1.0, yaw=0.8), frame(2.0, yaw=0.0))
     assert timeline(*keyframes, speed=0.5).trajectory().duration_s == pytest.approx(4.0, abs=0.021)
     fast = timeline(*keyframes, speed=2.0)
@@ -78,13 +78,13 @@ def test_speed_stretches_time_and_limits_hold_all_the_same() -> None:
     check_limits(fast.trajectory(), head(), (0,))
 
 
-def test_keyframes_without_joints_only_take_their_time() -> None:
+def test_keyframes_without_joints_only_take_time() -> None:
     way = timeline(frame(0.5)).trajectory()
     assert way.duration_s == pytest.approx(0.5, abs=0.021)
     assert np.ptp(way.position_rad) == 0
 
 
-def test_poses_are_those_at_the_keyframes_by_the_joints_that_count() -> None:
+def test_poses_contain_leading_joints_at_each_keyframe() -> None:
     first, second = timeline(frame(1.0, yaw=0.5, right=0.1), frame(2.0, pitch=-0.2)).poses()
     assert first == pytest.approx({"yaw": 0.5, "left": -0.2})
     assert second == pytest.approx({"yaw": 0.5, "left": -0.2, "pitch": -0.2})
@@ -100,13 +100,13 @@ def test_poses_are_those_at_the_keyframes_by_the_joints_that_count() -> None:
         ([frame(1.0, left=0.1, right=0.1)], "keyframe 1: one motor moves right and another joint"),
     ],
 )
-def test_what_is_no_timeline_is_refused_by_the_number_of_its_keyframe(keyframes: list[Moment], says: str) -> None:
+def test_invalid_keyframes_are_rejected_with_their_number(keyframes: list[Moment], says: str) -> None:
     with pytest.raises(Refused) as refused:
         timeline(*keyframes)
     assert says in refused.value.message
 
 
-def test_where_again_and_again_does_not_do_all_of_it_becomes_slower(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_the_last_iteration_the_whole_trajectory_is_slowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("device_agent.runtime.planning.keyframe_trajectory._ITERATIONS", 1)
     way = timeline(frame(0.1, yaw=1.5), frame(0.12, yaw=1.6), frame(0.5, yaw=-1.0)).trajectory()
     assert np.abs(way.velocity_rad_s).max() <= 4.0
@@ -125,7 +125,7 @@ def movements(draw: st.DrawFn) -> list[Moment]:
 
 @settings(max_examples=150, deadline=None)
 @given(movements())
-def test_any_movement_stays_in_its_limits_and_between_its_places(keyframes: list[Moment]) -> None:
+def test_random_movements_stay_within_limits_and_do_not_overshoot(keyframes: list[Moment]) -> None:
     kind = head()
     way = KeyframeTrajectory(kind, START, Play(keyframes=tuple(keyframes), speed=1.0)).trajectory()
     MotionLimits(kind, None).check_trajectory(way.position_rad)
@@ -150,7 +150,7 @@ def reckoned(case: dict[str, Any]) -> dict[str, Any]:
     return {"reached_s": moments[1:].tolist(), "position_rad": way}
 
 
-def test_the_page_reckons_the_same() -> None:
+def test_the_preview_computes_the_same_timeline() -> None:
     cases = json.loads(SHARED.read_text())
     assert cases
     for case in cases:

@@ -77,24 +77,24 @@ def check_around(scene: Path, shape: MujocoGeometry, seed: int) -> float:
     return math.dist(physics.flange_m(), shape.poses(BEYOND)["flange"][:3])
 
 
-def test_the_straight_way_leads_through_the_post(shape: MujocoGeometry) -> None:
+def test_the_straight_path_collides_with_the_post(shape: MujocoGeometry) -> None:
     swept = shape.sweep([HOME, BEYOND])
     assert swept.clearance is not None
     assert "post" in swept.clearance.text
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_arm_goes_around_a_post_and_rests_where_it_should(scene: Path, shape: MujocoGeometry, seed: int) -> None:
+def test_a_plan_avoids_the_post_and_reaches_the_goal(scene: Path, shape: MujocoGeometry, seed: int) -> None:
     assert check_around(scene, shape, seed) <= 0.001
 
 
 @pytest.mark.long
-def test_it_does_so_with_twenty_seeds_of_twenty(scene: Path, shape: MujocoGeometry) -> None:
+def test_planning_succeeds_with_twenty_seeds(scene: Path, shape: MujocoGeometry) -> None:
     errors_m = [check_around(scene, shape, 100 + seed) for seed in range(20)]
     assert max(errors_m) <= 0.001
 
 
-def test_a_straight_way_is_straight_in_physics_too(scene: Path, shape: MujocoGeometry) -> None:
+def test_a_straight_path_is_straight_in_simulation(scene: Path, shape: MujocoGeometry) -> None:
     physics = Physics(scene, shape)
     begin = shape.poses(HOME)["flange"]
     pose = (begin[0], begin[1] + 0.25, begin[2] - 0.05, *begin[3:])
@@ -112,22 +112,22 @@ def test_a_straight_way_is_straight_in_physics_too(scene: Path, shape: MujocoGeo
     assert max(float(np.linalg.norm(one - line * (one @ line) / (line @ line))) for one in ways) <= 0.0005
 
 
-def test_where_there_is_no_room_the_end_is_refused_and_named(shape: MujocoGeometry) -> None:
+def test_a_goal_without_clearance_is_rejected_with_the_obstacle(shape: MujocoGeometry) -> None:
     with pytest.raises(GeometryError, match="the goal is not clear: clearance: post"):
         shape.plan(HOME, [0.8, *HOME[1:]])
 
 
-def test_a_search_ends_when_its_time_is_over(shape: MujocoGeometry) -> None:
+def test_a_search_times_out(shape: MujocoGeometry) -> None:
     with pytest.raises(GeometryError, match="found no path in 0 s"):
         shape.plan(HOME, BEYOND, within_s=0.0)
 
 
-def test_who_no_longer_wants_a_way_does_not_wait_for_it(shape: MujocoGeometry) -> None:
+def test_a_cancelled_search_returns_at_once(shape: MujocoGeometry) -> None:
     with pytest.raises(GeometryError, match="cancelled"):
         shape.plan(HOME, BEYOND, ended=lambda: True)
 
 
-def test_whoever_looks_for_a_way_may_be_lost(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_planner_is_reported(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
     def lost(*_: object, **__: object) -> None:
         raise PlannerLostError("the planner process has ended; try again")
 
@@ -137,18 +137,18 @@ def test_whoever_looks_for_a_way_may_be_lost(shape: MujocoGeometry, monkeypatch:
     assert refused.value.code == "planner_lost"
 
 
-def test_the_same_seed_finds_the_same_way(shape: MujocoGeometry) -> None:
+def test_the_same_seed_gives_the_same_plan(shape: MujocoGeometry) -> None:
     assert shape.plan(HOME, BEYOND, seed=7) == shape.plan(HOME, BEYOND, seed=7)
     assert shape.plan(HOME, BEYOND, seed=7) != shape.plan(HOME, BEYOND, seed=8)
 
 
-def test_every_leg_of_a_plan_is_clear_for_the_gate_too(shape: MujocoGeometry) -> None:
+def test_every_segment_of_a_plan_passes_the_clearance_check(shape: MujocoGeometry) -> None:
     path = shape.plan(HOME, BEYOND, seed=3)
     assert (path[0], path[-1]) == (tuple(HOME), tuple(BEYOND))
     assert shape.sweep(path).clearance is None
 
 
-def test_a_straight_way_that_needs_another_posture_or_leads_through_something_is_refused(shape: MujocoGeometry) -> None:
+def test_a_straight_path_with_a_configuration_change_or_collision_is_rejected(shape: MujocoGeometry) -> None:
     routes, begin = MotionPlanner(KIND, shape), shape.poses(HOME)["flange"]
     through = (-0.249, -0.414, begin[2], *begin[3:])
     for pose in (through, (-begin[0], -begin[1], *begin[2:]), (begin[0], begin[1], -0.05, *begin[3:])):

@@ -56,7 +56,7 @@ def go(errand: Navigator, grid: OccupancyGrid, place: Pose2D, *, seconds: float 
     pytest.fail(f"not there: {places[-1]}")
 
 
-def test_it_goes_around_a_wall_and_stands_as_asked() -> None:
+def test_the_robot_avoids_a_wall_and_reaches_the_heading() -> None:
     grid = room((-0.1, -2.0, 0.1, 0.8))
     errand = Navigator((1.2, -1.0), 1.5, limits=LIMITS, radius_m=0.25)
     places = go(errand, grid, Pose2D(-1.2, -1.0, 2.0))
@@ -66,12 +66,12 @@ def test_it_goes_around_a_wall_and_stands_as_asked() -> None:
     assert not any(taken.at(place.x_m, place.y_m) for place in places)
 
 
-def test_without_a_heading_it_ends_as_it_comes() -> None:
+def test_without_a_heading_any_heading_is_final() -> None:
     places = go(Navigator((1.0, 0.0), None, limits=LIMITS, radius_m=0.25), room(), Pose2D(0.0, 0.0, 0.0))
     assert abs(places[-1].yaw_rad) < 0.4
 
 
-def test_where_no_way_leads_is_refused() -> None:
+def test_unreachable_goals_are_rejected() -> None:
     shut = room((-0.1, -2.0, 0.1, 2.0))
     for goal, code in (((1.0, 0.0), "no_way"), ((0.0, 0.0), "taken"), ((9.0, 0.0), "out_of_room")):
         with pytest.raises(Refused) as refused:
@@ -79,7 +79,7 @@ def test_where_no_way_leads_is_refused() -> None:
         assert refused.value.code == code
 
 
-def test_somebody_who_stands_in_the_way_is_gone_around_or_waited_for() -> None:
+def test_a_person_in_the_way_is_avoided_or_waited_for() -> None:
     floor = GridFloorMap(np.zeros((5, 5), dtype=bool), (0.0, 0.0), 1.0)
     assert find_path(floor, (0.5, 0.5), (4.5, 0.5))[-1] == (4.5, 0.5)
     floor.blocked[:, 2] = True
@@ -87,7 +87,7 @@ def test_somebody_who_stands_in_the_way_is_gone_around_or_waited_for() -> None:
         find_path(floor, (0.5, 0.5), (4.5, 0.5))
 
 
-def test_a_refusal_names_the_nearest_place_that_has_a_way() -> None:
+def test_a_rejection_names_the_nearest_reachable_place() -> None:
     for goal, code, near in (((1.0, 0.0), "no_way", r"x_m -0\.\d+, y_m -?0\.0"), ((0.0, 0.3), "taken", r"y_m 0\.\d+")):
         with pytest.raises(Refused, match=f"nearest reachable place is .*{near}") as refused:
             Navigator(goal, None, limits=LIMITS, radius_m=0.25).compute_twist(
@@ -99,7 +99,7 @@ def test_a_refusal_names_the_nearest_place_that_has_a_way() -> None:
         find_path(full, (0.5, 0.5), (4.5, 0.5))
 
 
-def test_who_stands_too_near_to_something_leaves_it_for_the_nearest_free_place() -> None:
+def test_a_robot_too_near_to_something_starts_from_the_nearest_free_cell() -> None:
     floor = GridFloorMap(np.zeros((40, 40), dtype=bool), (0.0, 0.0), 0.05)
     floor.blocked[:, :6] = True
     places = find_path(floor, (0.08, 1.0), (1.5, 1.0))
@@ -109,13 +109,13 @@ def test_who_stands_too_near_to_something_leaves_it_for_the_nearest_free_place()
         find_path(floor, (0.08, 1.0), (1.5, 1.0))
 
 
-def test_a_way_leads_between_things_corner_by_corner() -> None:
+def test_a_path_leads_between_obstacles() -> None:
     floor = GridFloorMap(np.eye(6, dtype=bool)[::-1].copy(), (0.0, 0.0), 1.0)
     floor.blocked[0, 5] = False
     assert find_path(floor, (0.5, 0.5), (5.5, 5.5))[-1] == (5.5, 5.5)
 
 
-def test_a_place_that_is_taken_from_the_beginning_is_not_waited_for_long() -> None:
+def test_an_occupied_goal_has_a_short_timeout_before_the_start() -> None:
     errand = Navigator((1.0, 0.0), None, limits=LIMITS, radius_m=0.25)
     taken = Refused("taken", "")
     assert errand.timeout_s(taken) == START_TIMEOUT_S
@@ -124,7 +124,7 @@ def test_a_place_that_is_taken_from_the_beginning_is_not_waited_for_long() -> No
     assert errand.timeout_s(taken) == BLOCKED_TIMEOUT_S
 
 
-def test_the_room_corrects_what_the_wheels_believe() -> None:
+def test_room_positions_correct_the_odometry() -> None:
     where = PoseEstimator("qbo")
     wheels = Reading({"x_m": 1.0, "y_m": 0.0, "yaw_rad": 0.5}, 0.02)
     seen = Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "age_s.qbo": 0.2}, 0.1)
@@ -134,7 +134,7 @@ def test_the_room_corrects_what_the_wheels_believe() -> None:
     assert where.estimate(wheels, None).x_m == pytest.approx(1.2), "what it has learned stays"
 
 
-def test_without_wheels_that_count_the_room_alone_tells() -> None:
+def test_without_odometry_the_room_position_is_used() -> None:
     seen = Reading({"x_m.nao": 1.2, "y_m.nao": 0.1, "yaw_rad.nao": 0.3}, 0.1)
     assert PoseEstimator("nao").estimate(None, seen) == Pose2D(1.2, 0.1, 0.3)
 
@@ -150,12 +150,12 @@ def test_without_wheels_that_count_the_room_alone_tells() -> None:
         Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "yaw_rad.qbo": 0.3}, 0.1),
     ],
 )
-def test_a_robot_that_nobody_sees_does_not_go(seen: Reading | None) -> None:
+def test_a_robot_without_a_position_does_not_drive(seen: Reading | None) -> None:
     with pytest.raises(Refused, match="the position of the robot is unknown"):
         PoseEstimator("nao").estimate(None, seen)
 
 
-def test_at_its_place_it_only_turns() -> None:
+def test_at_the_goal_the_robot_only_turns() -> None:
     errand = Navigator((0.0, 0.0), 1.0, limits=LIMITS, radius_m=0.25)
     twist = errand.compute_twist(Pose2D(0.01, 0.0, 0.0), room())
     assert twist is not None
@@ -203,7 +203,7 @@ class Toy:
         self.thread.join()
 
 
-def test_a_robot_goes_to_a_place_and_rests_there() -> None:
+def test_go_to_reaches_the_goal_and_rests() -> None:
     toy = Toy(room())
     toy.robot.execute(GoTo(x_m=0.3, y_m=0.0, yaw_rad=0.3))
     assert math.dist((toy.at.x_m, toy.at.y_m), (0.3, 0.0)) < 0.15
@@ -211,7 +211,7 @@ def test_a_robot_goes_to_a_place_and_rests_there() -> None:
     toy.end()
 
 
-def test_who_cannot_see_the_room_or_waits_in_vain_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_go_to_without_a_map_or_after_the_timeout_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(errand_module, "BLOCKED_TIMEOUT_S", 0.15)
     monkeypatch.setattr(errand_module, "START_TIMEOUT_S", 0.15)
     shut = room((0.5, -2, 0.7, 2))
@@ -223,7 +223,7 @@ def test_who_cannot_see_the_room_or_waits_in_vain_says_so(monkeypatch: pytest.Mo
         toy.end()
 
 
-def test_an_errand_that_loses_the_device_ends() -> None:
+def test_go_to_ends_with_the_reservation() -> None:
     toy = Toy(room())
     threading.Timer(0.3, lambda: toy.fixture.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))).start()
     with pytest.raises(Refused, match="stopped"):
@@ -233,7 +233,7 @@ def test_an_errand_that_loses_the_device_ends() -> None:
         toy.robot.execute(GoTo(x_m=1.5, y_m=0.0))
 
 
-def test_a_place_is_finite_and_a_robot_without_a_base_goes_nowhere() -> None:
+def test_go_to_needs_finite_numbers_and_a_base() -> None:
     with pytest.raises(Refused, match="does not drive"):
         Navigator.for_robot(0.0, 0.0, None, robot_type())
     with pytest.raises(Refused, match="finite"):

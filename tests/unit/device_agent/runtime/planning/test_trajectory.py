@@ -47,7 +47,7 @@ positions = st.lists(st.floats(-2.9, 2.9), min_size=2, max_size=2)
 
 @settings(max_examples=25, deadline=None)
 @given(corners=st.lists(positions, min_size=2, max_size=5), speed=st.floats(0.05, 1.0))
-def test_whatever_the_corners_every_limit_holds(corners: list[list[float]], speed: float) -> None:
+def test_random_corners_stay_within_every_limit(corners: list[list[float]], speed: float) -> None:
     found = along(corners, speed=speed)
     velocity, acceleration, jerk = slopes(found.position_rad)
     assert velocity <= 3.0 * speed * 1.01
@@ -58,13 +58,13 @@ def test_whatever_the_corners_every_limit_holds(corners: list[list[float]], spee
     assert not found.velocity_rad_s[[0, -1]].any()
 
 
-def test_a_way_to_where_the_device_is_ends_at_once() -> None:
+def test_a_trajectory_to_the_present_position_ends_at_once() -> None:
     found = along([[0.5, 0.1], [0.5, 0.1]])
     assert found.duration_s < 1.0
     assert not found.velocity_rad_s.any()
 
 
-def test_a_way_of_one_leg_is_straight_and_nearly_as_quick_as_a_move() -> None:
+def test_a_single_segment_is_straight_and_nearly_time_optimal() -> None:
     found = along([[0.0, 0.0], [2.0, 1.0]])
     assert found.position_rad[:, 0] == pytest.approx(2 * found.position_rad[:, 1], abs=1e-9)
     fixture = ControllerFixture()
@@ -76,7 +76,7 @@ def test_a_way_of_one_leg_is_straight_and_nearly_as_quick_as_a_move() -> None:
     assert found.duration_s <= 1.3 * (fixture.now_s - began_s)
 
 
-def test_corners_are_rounded_off_as_widely_as_there_is_room() -> None:
+def test_corners_are_blended_as_widely_as_obstacles_allow() -> None:
     def near(path: Floats) -> bool:
         """Only what stays near to the corner's two legs is clear."""
         away = np.minimum(np.abs(path[:, 1]), np.abs(path[:, 0] - 1.2))
@@ -90,7 +90,7 @@ def test_corners_are_rounded_off_as_widely_as_there_is_room() -> None:
     assert trajectory.blend_corners(CORNER, lambda _: False) is None
 
 
-def test_the_device_goes_along_a_way_and_rests_at_its_end() -> None:
+def test_a_trajectory_is_followed_to_rest() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
     reservation = fixture.reserve()
     passage = fixture.controller.start_trajectory(reservation, found)
@@ -117,7 +117,7 @@ def check_on(found: Trajectory, gone: Floats) -> None:
 
 @pytest.mark.parametrize("cause", sorted(set(interruptions()) - {"expiry"}))
 @pytest.mark.parametrize("after_s", [0.1, 0.45, 0.7])
-def test_whatever_takes_the_device_away_brakes_it_on_its_way(cause: str, after_s: float) -> None:
+def test_every_revocation_brakes_on_the_path(cause: str, after_s: float) -> None:
     fixture, found = ControllerFixture(), along(CORNER)
     fixture.take(1, lease_s=5.0)
     reservation = fixture.reserve()
@@ -133,7 +133,7 @@ def test_whatever_takes_the_device_away_brakes_it_on_its_way(cause: str, after_s
     assert slopes(np.concatenate((before[-4:], gone)))[1] <= 20.0 + 0.5
 
 
-def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> None:
+def test_a_restriction_slows_a_trajectory_within_the_limits() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
     reservation = fixture.reserve()
     passage = fixture.controller.start_trajectory(reservation, found)
@@ -151,7 +151,7 @@ def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> 
     assert slopes(whole)[1] <= 8.0 * 1.05
 
 
-def test_what_appears_on_a_way_holds_it_before() -> None:
+def test_an_obstacle_on_the_trajectory_holds_the_device_before_it() -> None:
     fixture, found = ControllerFixture(geometry=Wall(0.5)), along(CORNER)
     reservation = fixture.reserve()
     passage = fixture.controller.start_trajectory(reservation, found)
@@ -162,7 +162,7 @@ def test_what_appears_on_a_way_holds_it_before() -> None:
     check_on(found, gone)
 
 
-def test_a_late_control_loop_counts_what_it_missed_as_braked_on_a_way_too() -> None:
+def test_a_late_control_loop_catches_up_braking_on_a_trajectory() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
     reservation = fixture.reserve()
     fixture.controller.start_trajectory(reservation, found)
@@ -175,7 +175,7 @@ def test_a_late_control_loop_counts_what_it_missed_as_braked_on_a_way_too() -> N
     check_on(found, gone)
 
 
-def test_a_move_that_follows_waits_until_the_device_rests_on_its_way() -> None:
+def test_a_new_goal_waits_until_the_trajectory_has_braked() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
     reservation = fixture.reserve()
     passage = fixture.controller.start_trajectory(reservation, found)
@@ -187,7 +187,7 @@ def test_a_move_that_follows_waits_until_the_device_rests_on_its_way() -> None:
     assert slopes(gone)[1] <= 20.5
 
 
-def test_a_way_that_begins_elsewhere_or_leaves_a_range_is_refused() -> None:
+def test_a_trajectory_that_starts_elsewhere_or_leaves_a_range_is_rejected() -> None:
     fixture = ControllerFixture()
     reservation = fixture.reserve()
     for corners, code in (
@@ -208,7 +208,7 @@ def test_a_way_that_begins_elsewhere_or_leaves_a_range_is_refused() -> None:
     assert fixture.controller.mode is Mode.ACTION
 
 
-def test_a_target_is_looked_at_before_a_way_to_it() -> None:
+def test_a_target_is_checked_before_planning() -> None:
     fixture = ControllerFixture(geometry=Wall())
     reservation = fixture.reserve()
     assert fixture.controller.resolve_target(reservation, {"elbow": 0.5}) == [0.0, 0.5]
@@ -216,7 +216,7 @@ def test_a_target_is_looked_at_before_a_way_to_it() -> None:
         fixture.controller.resolve_target(reservation, {"elbow": 1.5})
 
 
-def test_an_orientation_has_a_direction_and_is_given_once() -> None:
+def test_an_orientation_is_valid_and_unique() -> None:
     poses = {"hand": (0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)}
     assert quaternion_of(poses, "hand", None, None) == (0.0, 1.0, 0.0, 0.0)
     assert quaternion_of(poses, "hand", (2.0, 0.0, 0.0, 0.0), None) == (1.0, 0.0, 0.0, 0.0)
@@ -230,7 +230,7 @@ def test_an_orientation_has_a_direction_and_is_given_once() -> None:
             quaternion_of(poses, frame, quaternion, rpy)
 
 
-def test_samples_of_a_way_are_joined_smoothly() -> None:
+def test_interpolation_between_samples_is_smooth() -> None:
     found = along(CORNER)
     fine = np.array([found.at(time_s)[0] for time_s in np.arange(-0.1, found.duration_s + 0.1, 0.001)])
     steps = [float(np.linalg.norm(b - a)) for a, b in pairwise(fine)]
@@ -238,7 +238,7 @@ def test_samples_of_a_way_are_joined_smoothly() -> None:
     assert max(abs(b - a) for a, b in pairwise(steps)) <= math.hypot(8.0, 8.0) * 1e-6 * 1.5
 
 
-def test_after_its_last_try_a_way_is_taken_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_the_last_iteration_the_trajectory_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trajectory, "_ITERATIONS", 1)
     assert along(CORNER).position_rad[-1] == pytest.approx([1.2, 1.0], abs=1e-9)
 
@@ -276,7 +276,7 @@ class Sliding(Narrow):
         return (pose[0], 0.0)
 
 
-def test_a_way_that_is_too_narrow_is_refused() -> None:
+def test_a_path_that_is_too_narrow_is_rejected() -> None:
     with pytest.raises(Refused, match="too narrow"):
         MotionPlanner(robot_type(), Narrow()).plan([0.0, 0.0], [1.0, 1.0], speed=1.0, ended=never)
     with pytest.raises(Refused, match="something is in the way: clearance: hand"):

@@ -154,7 +154,7 @@ def grows(things: Callable[[], list[Any]], by: int = 3) -> None:
     eventually(lambda: len(things()) >= before + by)
 
 
-def test_it_says_what_it_has_and_which_actions_it_takes(harness: RoomBench) -> None:
+def test_description_lists_streams_and_actions(harness: RoomBench) -> None:
     harness.device.link_changed(True)
     described: Description = eventually(lambda: harness.heard(topics.DESC, Description))[-1]
     assert described.joints == ()
@@ -169,7 +169,7 @@ def test_it_says_what_it_has_and_which_actions_it_takes(harness: RoomBench) -> N
     assert described.simulated
 
 
-def test_streams_are_told_in_order_and_what_says_nothing_is_not_told(harness: RoomBench) -> None:
+def test_streams_are_published_in_order_and_empty_readings_are_not(harness: RoomBench) -> None:
     grows(harness.measured)
     told = harness.measured()
     assert [each.sequence for each in told] == list(range(1, len(told) + 1))
@@ -179,13 +179,13 @@ def test_streams_are_told_in_order_and_what_says_nothing_is_not_told(harness: Ro
     assert harness.measured("rain") == []
 
 
-def test_numbers_that_are_none_are_left_out(harness: RoomBench) -> None:
+def test_values_that_are_not_finite_are_omitted(harness: RoomBench) -> None:
     harness.sensor.values = {"hot": math.nan, "cold": -math.inf, "well": True}
     eventually(lambda: any("well" in each.values for each in harness.measured()))
     assert not any({"hot", "cold"} & set(each.values) for each in harness.measured())
 
 
-def test_pictures_travel_with_their_header_and_are_not_kept(harness: RoomBench) -> None:
+def test_frames_have_a_header_and_are_not_stored(harness: RoomBench) -> None:
     grows(harness.pictures)
     told = [camera_frames.decode(picture) for picture in harness.pictures()]
     assert [each.sequence for each in told] == list(range(1, len(told) + 1))
@@ -193,7 +193,7 @@ def test_pictures_travel_with_their_header_and_are_not_kept(harness: RoomBench) 
     assert not any(topics.CAM in item.topic for item in harness.outbox._incoming)
 
 
-def test_a_camera_that_has_no_picture_yet_films_none(harness: RoomBench) -> None:
+def test_a_camera_without_a_picture_publishes_no_frame(harness: RoomBench) -> None:
     grows(harness.pictures)
     harness.sensor.picture = b""
     grows(harness.measured)
@@ -202,14 +202,14 @@ def test_a_camera_that_has_no_picture_yet_films_none(harness: RoomBench) -> None
     assert len(harness.pictures()) <= filmed + 1, "one may have been on its way"
 
 
-def test_a_picture_that_is_too_large_is_a_fault_that_says_what_to_do(harness: RoomBench) -> None:
+def test_a_picture_that_is_too_large_is_a_fault_with_advice(harness: RoomBench) -> None:
     harness.device.link_changed(True)
     harness.sensor.picture = bytes(MAX_BYTES)
     state = shown(harness, lambda state: state.faults)
     assert "smaller pictures" in state.faults[0].message
 
 
-def test_a_gathering_changes_the_rate_tells_how_far_it_is_and_ends_by_itself(harness: RoomBench) -> None:
+def test_collecting_changes_the_rate_reports_progress_and_ends(harness: RoomBench) -> None:
     before = harness.sensor.reads["rain"]
     command = harness.command(CollectData(streams=("air", "rain"), rate_hz=50.0, duration_s=1.5), epoch=harness.epoch())
     ack = harness.end(command)
@@ -222,7 +222,7 @@ def test_a_gathering_changes_the_rate_tells_how_far_it_is_and_ends_by_itself(har
     assert harness.device._driver.rate_hz("air") == 20.0  # type: ignore[union-attr]
 
 
-def test_a_gathering_can_be_cancelled_and_nobody_else_gathers_meanwhile(harness: RoomBench) -> None:
+def test_collecting_can_be_cancelled_and_excludes_other_actions(harness: RoomBench) -> None:
     first = harness.command(CollectData(rate_hz=1.0, duration_s=3000.0), epoch=harness.epoch())
     eventually(lambda: any(ack.status is AckStatus.STARTED for ack in harness.acks(first)))
     second = harness.end(harness.command(CollectData(rate_hz=2.0, duration_s=1.0), epoch=harness.given))
@@ -232,7 +232,7 @@ def test_a_gathering_can_be_cancelled_and_nobody_else_gathers_meanwhile(harness:
     grows(harness.measured)
 
 
-def test_one_shot_gives_the_values_in_its_answer(harness: RoomBench) -> None:
+def test_take_picture_returns_the_values(harness: RoomBench) -> None:
     harness.sensor.values = {"temperature_c": 21.5}
     ack = harness.done(TakePicture(streams=("air",)))
     assert ack.status is AckStatus.DONE
@@ -240,7 +240,7 @@ def test_one_shot_gives_the_values_in_its_answer(harness: RoomBench) -> None:
     assert set(harness.done(TakePicture()).result["values"]) == {"air", "rain"}
 
 
-def test_a_capture_is_stored_and_named_in_the_answer(harness: RoomBench) -> None:
+def test_a_capture_is_uploaded_and_named_in_the_result(harness: RoomBench) -> None:
     ack = harness.done(CaptureRaw(name="image"))
     assert ack.result == {"upload": "u1", "media_type": "image/png", "length": 3}
     stored = harness.store.stored[0]
@@ -254,7 +254,7 @@ def test_a_capture_is_stored_and_named_in_the_answer(harness: RoomBench) -> None
     assert stored["name"].endswith(".png")
 
 
-def test_a_control_is_set_within_its_limits_and_says_what_was_applied(harness: RoomBench) -> None:
+def test_a_control_is_set_within_its_limits_and_returns_the_applied_value(harness: RoomBench) -> None:
     ack = harness.done(SetControl(control="opening", value=0.4))
     assert (ack.status, ack.result) == (AckStatus.DONE, {"applied": {"opening": 0.2}})
     for value, code in ((0.6, "out_of_range"), (-0.1, "out_of_range")):
@@ -273,7 +273,9 @@ def test_a_control_is_set_within_its_limits_and_says_what_was_applied(harness: R
         (MoveJoints(position_rad={"elbow": 1.0}), "cannot", "it has"),
     ],
 )
-def test_what_it_has_not_is_refused_with_what_it_has(harness: RoomBench, request_: Any, code: str, said: str) -> None:
+def test_unknown_names_are_rejected_with_the_valid_ones(
+    harness: RoomBench, request_: Any, code: str, said: str
+) -> None:
     ack = harness.done(request_)
     assert ack.status is AckStatus.FAILED
     assert ack.reason is not None
@@ -281,14 +283,14 @@ def test_what_it_has_not_is_refused_with_what_it_has(harness: RoomBench, request
     assert said in ack.reason.message
 
 
-def test_an_instrument_checks_numbers_itself() -> None:
+def test_a_control_value_must_be_finite() -> None:
     instrument = RoomDevice(FakeSensor(), ENTRY, None)
     for value in (math.nan, math.inf):
         with pytest.raises(Exception, match="must be a finite number"):
             instrument.set("opening", value)
 
 
-def test_a_robot_takes_no_orders_for_room_devices(tmp_path: Path) -> None:
+def test_a_robot_rejects_actions_of_room_devices(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path)
     harness.device.start()
     try:
@@ -298,7 +300,7 @@ def test_a_robot_takes_no_orders_for_room_devices(tmp_path: Path) -> None:
         harness.stop()
 
 
-def test_a_device_without_streams_or_store_says_so(tmp_path: Path) -> None:
+def test_actions_without_streams_or_storage_are_rejected(tmp_path: Path) -> None:
     harness = RoomBench(tmp_path, uploads=None, entry=RoomDeviceManifest(
         name="arm", kind="window", label="Window", driver="toy", captures=("image",)
     ))  # fmt: skip
@@ -310,7 +312,7 @@ def test_a_device_without_streams_or_store_says_so(tmp_path: Path) -> None:
         harness.stop()
 
 
-def test_what_fails_is_told_as_it_was_said(harness: RoomBench) -> None:
+def test_errors_of_driver_and_storage_are_reported(harness: RoomBench) -> None:
     harness.store.full = True
     ack = harness.done(CaptureRaw(name="image"))
     assert ack.reason is not None
@@ -327,7 +329,7 @@ def test_what_fails_is_told_as_it_was_said(harness: RoomBench) -> None:
             deed()
 
 
-def test_stop_holds_what_moves_and_refuses_until_it_is_reset_and_measuring_goes_on(harness: RoomBench) -> None:
+def test_stop_holds_until_reset_while_streams_continue(harness: RoomBench) -> None:
     gathering = harness.command(CollectData(rate_hz=20.0, duration_s=3000.0), epoch=harness.epoch())
     eventually(lambda: any(ack.status is AckStatus.STARTED for ack in harness.acks(gathering)))
     harness.command(StopDevice(), epoch=0)
@@ -341,7 +343,7 @@ def test_stop_holds_what_moves_and_refuses_until_it_is_reset_and_measuring_goes_
     assert harness.done(SetControl(control="opening", value=0.1)).status is AckStatus.DONE
 
 
-def test_a_sensor_that_does_not_answer_is_a_fault_that_ends_when_it_answers(harness: RoomBench) -> None:
+def test_a_sensor_error_is_a_fault_until_the_sensor_responds(harness: RoomBench) -> None:
     harness.device.link_changed(True)
     grows(harness.measured)
     harness.sensor.broken = "no answer on the bus; is it plugged in?"
@@ -355,7 +357,7 @@ def test_a_sensor_that_does_not_answer_is_a_fault_that_ends_when_it_answers(harn
     grows(harness.measured)
 
 
-def test_a_sensor_that_is_not_there_at_the_start_is_a_fault_and_keeps_nobody_from_starting(tmp_path: Path) -> None:
+def test_a_missing_sensor_at_start_is_a_fault(tmp_path: Path) -> None:
     started = threading.Event()
     original = FakeSensor.connect
 
@@ -376,7 +378,7 @@ def test_a_sensor_that_is_not_there_at_the_start_is_a_fault_and_keeps_nobody_fro
             harness.stop()
 
 
-def test_an_error_of_the_driver_is_a_fault_and_not_the_end_of_it(harness: RoomBench) -> None:
+def test_an_unexpected_driver_error_is_a_fault_and_the_loop_continues(harness: RoomBench) -> None:
     harness.device.link_changed(True)
 
     def odd(_stream: str) -> dict[str, float]:
@@ -389,7 +391,7 @@ def test_an_error_of_the_driver_is_a_fault_and_not_the_end_of_it(harness: RoomBe
     grows(harness.measured)
 
 
-def test_the_room_holds_a_room_device_too(tmp_path: Path) -> None:
+def test_an_interlock_holds_a_room_device(tmp_path: Path) -> None:
     rule = InterlockRule(device="other-zone", stream="presence", field="near", equals=1.0, stale_s=5.0)
     harness = RoomBench(tmp_path, interlocks=(rule,))
     try:
@@ -400,13 +402,13 @@ def test_the_room_holds_a_room_device_too(tmp_path: Path) -> None:
         harness.stop()
 
 
-def test_what_it_measures_is_what_the_agents_others_read_of_the_room(harness: RoomBench) -> None:
+def test_measurements_are_available_to_other_devices_of_the_agent(harness: RoomBench) -> None:
     room = ReadingCache(space="s", agent="a", own=["arm"], named=[("arm", "air")])
     harness.device._readings = room
     eventually(lambda: room.latest("arm", "air"))
 
 
-def test_it_lets_the_driver_go_at_the_end_also_when_it_is_ended_twice(tmp_path: Path) -> None:
+def test_the_driver_is_closed_once_on_repeated_stops(tmp_path: Path) -> None:
     harness = RoomBench(tmp_path)
     harness.device.stop()
     harness.stop()
@@ -434,7 +436,7 @@ class ToyThermometer:
     def close(self) -> None: ...
 
 
-def test_what_cannot_move_need_not_be_held_and_what_is_no_camera_films_nothing() -> None:
+def test_hold_and_cameras_are_optional() -> None:
     instrument = RoomDevice(ToyThermometer(), ENTRY, None)
     instrument.hold()
     assert instrument.cameras == ()

@@ -21,57 +21,57 @@ class Bedside:
         return [fault.code for fault in self.vigil.faults()]
 
 
-def test_what_gives_something_is_well() -> None:
+def test_a_source_with_readings_has_no_fault() -> None:
     assert Bedside(Watch(source="air", silent_s=5.0, stuck_s=20.0)).pass_s(100, {"x": 1.0}, {"x": 1.1}) == []
 
 
-def test_what_gives_nothing_is_silent_until_it_is_heard() -> None:
+def test_a_source_without_readings_is_silent_until_the_next_one() -> None:
     bed = Bedside(Watch(source="air", silent_s=5.0))
     assert bed.pass_s(5) == []
     assert bed.pass_s(1) == ["silent.air"]
     assert bed.pass_s(1, {"x": 1.0}) == []
 
 
-def test_nothing_is_wrong_before_anything_is_expected() -> None:
+def test_there_is_no_fault_before_the_first_reset() -> None:
     vigil = StreamWatchdog((Watch(source="air", silent_s=5.0),), lambda _: 1.0, lambda: 100.0)
     vigil.record("air", {"x": 1.0})
     assert vigil.faults() == ()
 
 
-def test_what_is_there_again_has_its_time_anew() -> None:
+def test_a_reset_restarts_the_timeout() -> None:
     bed = Bedside(Watch(source="air", silent_s=5.0))
     assert bed.pass_s(60) == ["silent.air"]
     bed.vigil.reset()
     assert bed.pass_s(5) == []
 
 
-def test_what_is_read_seldom_may_be_silent_longer() -> None:
+def test_a_low_rate_extends_the_timeout() -> None:
     bed = Bedside(Watch(source="air", silent_s=5.0), rate_hz=0.1)
     assert bed.pass_s(30) == []
     assert bed.pass_s(1) == ["silent.air"]
 
 
-def test_what_is_always_the_same_is_stuck_and_one_difference_clears_it() -> None:
+def test_equal_readings_are_a_stuck_fault_until_one_differs() -> None:
     bed = Bedside(Watch(source="air", stuck_s=20.0))
     assert bed.pass_s(21, {"x": 1.0}) == []
     assert bed.pass_s(1, {"x": 1.0}) == ["stuck.air"]
     assert bed.pass_s(1, {"x": 1.01}) == []
 
 
-def test_a_few_readings_that_are_alike_are_chance() -> None:
+def test_few_equal_readings_are_no_fault() -> None:
     bed = Bedside(Watch(source="air", stuck_s=2.0))
     assert bed.pass_s(9, b"picture") == []
     assert bed.pass_s(1, b"picture") == ["stuck.air"]
 
 
-def test_what_may_be_silent_and_the_same_is_never_wrong() -> None:
+def test_a_source_without_limits_has_no_faults() -> None:
     bed = Bedside(Watch(source="air"))
     assert bed.pass_s(1000) == []
     assert bed.pass_s(1000, {"open": False}) == []
     assert Bedside().pass_s(1000) == []
 
 
-def test_a_fault_that_goes_on_keeps_its_time_and_says_what_to_do() -> None:
+def test_a_continuing_fault_keeps_its_time_and_gives_advice() -> None:
     bed = Bedside(Watch(source="air", silent_s=5.0, stuck_s=20.0))
     bed.pass_s(10)
     (first,) = bed.vigil.faults()

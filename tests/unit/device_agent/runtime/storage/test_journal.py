@@ -21,7 +21,7 @@ def journal(tmp_path: Path):
     journal.close()
 
 
-def test_a_command_begins_once(journal: Journal) -> None:
+def test_a_command_is_recorded_once(journal: Journal) -> None:
     assert journal.begin("arm", ack("c1")) is None
     journal.record(ack("c1", AckStatus.STARTED, 2))
     seen = journal.begin("arm", ack("c1"))
@@ -29,7 +29,7 @@ def test_a_command_begins_once(journal: Journal) -> None:
     assert seen.status is AckStatus.STARTED
 
 
-def test_an_end_stays(journal: Journal) -> None:
+def test_a_terminal_ack_is_final(journal: Journal) -> None:
     journal.begin("arm", ack("c1"))
     journal.record(ack("c1", AckStatus.DONE, 2))
     journal.record(ack("c1", AckStatus.FAILED, 3))
@@ -38,7 +38,7 @@ def test_an_end_stays(journal: Journal) -> None:
     assert seen.status is AckStatus.DONE
 
 
-def test_what_a_former_run_left_open_is_failed_and_never_run_again(tmp_path: Path) -> None:
+def test_open_commands_of_a_previous_run_are_failed(tmp_path: Path) -> None:
     before = Journal(tmp_path / "journal.db")
     before.open(now_ms=0)
     before.begin("arm", ack("c1"))
@@ -59,7 +59,7 @@ def test_what_a_former_run_left_open_is_failed_and_never_run_again(tmp_path: Pat
     before.close()
 
 
-def test_answers_are_sent_again_until_the_newest_is_delivered(journal: Journal) -> None:
+def test_acks_are_undelivered_until_the_newest_is_delivered(journal: Journal) -> None:
     first, second = ack("c1"), ack("c1", AckStatus.DONE, 2)
     journal.begin("arm", first)
     journal.record(second)
@@ -70,7 +70,7 @@ def test_answers_are_sent_again_until_the_newest_is_delivered(journal: Journal) 
     assert journal.undelivered("arm") == ()
 
 
-def test_epochs_and_latch_survive_and_epochs_never_fall(tmp_path: Path) -> None:
+def test_epochs_and_latch_persist_and_epochs_never_decrease(tmp_path: Path) -> None:
     before = Journal(tmp_path / "journal.db")
     before.open(now_ms=0)
     before.save_epoch("arm", epoch=7, burned=5)
@@ -89,7 +89,7 @@ def test_epochs_and_latch_survive_and_epochs_never_fall(tmp_path: Path) -> None:
     before.close()
 
 
-def test_session_numbers_rise(tmp_path: Path) -> None:
+def test_session_numbers_increase(tmp_path: Path) -> None:
     numbers = []
     for _ in range(3):
         journal = Journal(tmp_path / "journal.db")
@@ -99,7 +99,7 @@ def test_session_numbers_rise(tmp_path: Path) -> None:
     assert numbers == [1, 2, 3, 4, 5, 6]
 
 
-def test_old_ended_commands_are_forgotten_and_open_ones_are_not(tmp_path: Path) -> None:
+def test_old_terminal_commands_are_deleted(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal.db")
     journal.open(now_ms=0)
     journal.begin("arm", ack("old"))
@@ -112,7 +112,7 @@ def test_old_ended_commands_are_forgotten_and_open_ones_are_not(tmp_path: Path) 
     journal.close()
 
 
-def test_a_file_that_is_no_journal_is_named_and_kept(tmp_path: Path) -> None:
+def test_an_invalid_journal_file_is_named_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "journal.db"
     path.write_bytes(b"this is not a database, but long enough to look like one" * 100)
     journal = Journal(path)
@@ -122,7 +122,7 @@ def test_a_file_that_is_no_journal_is_named_and_kept(tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b"this is not")
 
 
-def test_a_closed_journal_says_so(tmp_path: Path) -> None:
+def test_a_closed_journal_raises(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal.db")
     with pytest.raises(JournalError):
         journal.next_session()
@@ -135,13 +135,13 @@ def test_epochs_are_on_disk_when_they_are_saved(journal: Journal, tmp_path: Path
     other.close()
 
 
-def test_a_confirmation_that_comes_after_the_end_is_passed_over(journal: Journal) -> None:
+def test_a_delivery_after_close_is_ignored(journal: Journal) -> None:
     journal.close()
     journal.delivered(ack("c1"))
     journal.close()
 
 
-def test_what_is_settled_is_on_the_disk_while_others_write(
+def test_sync_writes_to_disk_without_blocking_writers(
     journal: Journal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[int] = []
@@ -152,7 +152,7 @@ def test_what_is_settled_is_on_the_disk_while_others_write(
     assert synced == [next(tmp_path.glob("*-wal")).stat().st_ino]
 
 
-def test_what_is_not_on_the_disk_is_not_settled(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_sync_raises(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(_: int) -> None:
         raise OSError(errno.EIO, "I/O error")
 

@@ -44,7 +44,7 @@ def dropped(shelf: OutboxStore) -> list[DroppedCount]:
     return told
 
 
-def test_it_gives_back_what_was_put_in_oldest_first_page_by_page(shelf: OutboxStore) -> None:
+def test_items_are_returned_oldest_first_in_pages(shelf: OutboxStore) -> None:
     shelf.put([item(1), item(2, EVENT), item(3)], now_ms=NOW_MS)
     shelf.put([item(4)], now_ms=NOW_MS)
     assert numbers(shelf) == [1, 3, 4]
@@ -56,7 +56,7 @@ def test_it_gives_back_what_was_put_in_oldest_first_page_by_page(shelf: OutboxSt
     assert numbers(shelf) == [3, 4]
 
 
-def test_a_restart_keeps_all_but_what_was_for_another_space(tmp_path: Path) -> None:
+def test_a_restart_keeps_items_except_those_of_another_space(tmp_path: Path) -> None:
     before = make(tmp_path / "db")
     before.open()
     before.put([item(1), item(2, EVENT)], now_ms=NOW_MS)
@@ -73,7 +73,7 @@ def test_a_restart_keeps_all_but_what_was_for_another_space(tmp_path: Path) -> N
     moved.close()
 
 
-def test_beyond_its_bound_the_oldest_measurements_go_first_then_events_and_are_counted(tmp_path: Path) -> None:
+def test_beyond_the_bound_oldest_measurements_then_events_are_dropped_and_counted(tmp_path: Path) -> None:
     shelf = make(tmp_path / "db", max_bytes=200_000)
     shelf.open()
     for number in range(300):
@@ -94,7 +94,7 @@ def test_beyond_its_bound_the_oldest_measurements_go_first_then_events_and_are_c
     shelf.close()
 
 
-def test_the_sum_of_what_is_kept_is_true_after_anything(tmp_path: Path) -> None:
+def test_the_stored_size_is_always_correct(tmp_path: Path) -> None:
     shelf = make(tmp_path / "db", max_bytes=50_000)
     shelf.open()
     for number in range(200):
@@ -110,7 +110,7 @@ def test_the_sum_of_what_is_kept_is_true_after_anything(tmp_path: Path) -> None:
     again.close()
 
 
-def test_what_is_too_old_is_dropped_and_counted(shelf: OutboxStore) -> None:
+def test_old_measurements_are_dropped_and_counted(shelf: OutboxStore) -> None:
     shelf.put([item(1), item(2, at_ms=NOW_MS + 3_000_000), item(3, EVENT)], now_ms=NOW_MS)
     shelf.enforce_bounds(now_ms=NOW_MS + 3_700_000)
     assert (numbers(shelf), numbers(shelf, late=False)) == ([2], [3])
@@ -120,21 +120,21 @@ def test_what_is_too_old_is_dropped_and_counted(shelf: OutboxStore) -> None:
     assert dropped(shelf) == [], "told once"
 
 
-def test_what_nobody_confirms_is_dropped_and_counted(shelf: OutboxStore) -> None:
+def test_unacknowledged_items_are_dropped_and_counted(shelf: OutboxStore) -> None:
     shelf.put([item(1), item(2)], now_ms=NOW_MS)
     shelf.drop([number for number, _ in shelf.after(0, late=True, limit=1)])
     assert numbers(shelf) == [2]
     assert dropped(shelf)[0].measurements == 1
 
 
-def test_the_event_that_tells_is_kept_in_the_same_step(shelf: OutboxStore) -> None:
+def test_drop_events_are_stored_atomically(shelf: OutboxStore) -> None:
     shelf.count({(OWN + "arm", True): 2, (OWN + "arm", False): 1, (OWN + "leg", True): 5})
     shelf.count({(OWN + "arm", True): 2})
     assert dropped(shelf) == [DroppedCount(OWN + "arm", 4, 1), DroppedCount(OWN + "leg", 5, 0)]
     assert [found.topic for _, found in shelf.after(0, late=False, limit=9)] == [OWN + "arm/event", OWN + "leg/event"]
 
 
-def test_a_damaged_file_is_laid_aside(tmp_path: Path) -> None:
+def test_a_damaged_file_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "outbox.db"
     path.write_bytes(b"no database" * 1000)
     shelf = make(path)
@@ -145,7 +145,7 @@ def test_a_damaged_file_is_laid_aside(tmp_path: Path) -> None:
     shelf.close()
 
 
-def test_where_nothing_can_be_written_it_says_so(tmp_path: Path) -> None:
+def test_an_unusable_file_raises(tmp_path: Path) -> None:
     with pytest.raises(OutboxStoreError, match="cannot be used"):
         make(tmp_path / "none" / "outbox.db").open()
     closed = make(tmp_path / "db")
@@ -154,7 +154,7 @@ def test_where_nothing_can_be_written_it_says_so(tmp_path: Path) -> None:
             call()
 
 
-def test_a_full_disk_changes_nothing_and_is_named(tmp_path: Path, shelf: OutboxStore) -> None:
+def test_a_full_disk_changes_nothing_and_raises(tmp_path: Path, shelf: OutboxStore) -> None:
     shelf.put([item(1)], now_ms=NOW_MS)
     before = shelf._bytes
     shelf._connection().execute("PRAGMA max_page_count = 1")

@@ -51,7 +51,7 @@ def watched(
     return filmer
 
 
-def test_a_device_describes_its_cameras_and_tells_what_they_see(tmp_path: Path) -> None:
+def test_a_device_describes_and_streams_its_cameras(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), cameras=(EYES,))
     harness = DeviceHarness(tmp_path, kind=kind, driver=Seeing(lambda: JPEG))
     harness.start()
@@ -63,7 +63,7 @@ def test_a_device_describes_its_cameras_and_tells_what_they_see(tmp_path: Path) 
     assert (first.sequence, first.width, first.height, first.jpeg) == (1, 4, 3, JPEG)
 
 
-def test_pictures_are_counted_and_one_that_is_not_there_is_none() -> None:
+def test_frames_are_numbered_and_missing_ones_are_skipped() -> None:
     given = iter([JPEG, None, JPEG])
     driver, told = Seeing(lambda: next(given, None)), list[CameraFrame]()
     filmer = watched(driver, lambda _, frame: told.append(frame))
@@ -73,7 +73,7 @@ def test_pictures_are_counted_and_one_that_is_not_there_is_none() -> None:
     assert [frame.sequence for frame in told] == [1, 2]
 
 
-def test_trouble_is_logged_once_with_what_to_do_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_camera_error_is_logged_once_with_advice(caplog: pytest.LogCaptureFixture) -> None:
     well, told = threading.Event(), threading.Event()
 
     def dark() -> bytes:
@@ -101,7 +101,7 @@ def test_trouble_is_logged_once_with_what_to_do_and_ends_nothing(caplog: pytest.
     ]
 
 
-def test_without_eyes_nothing_is_filmed() -> None:
+def test_without_cameras_there_are_no_frames() -> None:
     told = list[CameraFrame]()
     filmer = watched(None, lambda _, frame: told.append(frame))
     filmer.stop()
@@ -117,7 +117,7 @@ def paced(pictures: list[CameraFrame], count: int) -> float:
     return time.monotonic() - began_s
 
 
-def test_a_robot_that_nobody_controls_is_filmed_once_a_second_and_live_from_the_moment_somebody_does() -> None:
+def test_frames_are_slow_without_control_and_live_during_control() -> None:
     told, controlled = list[CameraFrame](), threading.Event()
     driver = Seeing(lambda: JPEG)
     filmer = watched(driver, lambda _, frame: told.append(frame), controlled=controlled.is_set, linger_s=0.5)
@@ -133,7 +133,7 @@ def test_a_robot_that_nobody_controls_is_filmed_once_a_second_and_live_from_the_
         filmer.stop()
 
 
-def test_who_has_just_let_go_goes_on_seeing_live() -> None:
+def test_frames_stay_live_for_a_while_after_control_ends() -> None:
     told, controlled = list[CameraFrame](), threading.Event()
     controlled.set()
     filmer = watched(
@@ -148,7 +148,7 @@ def test_who_has_just_let_go_goes_on_seeing_live() -> None:
     assert time.monotonic() - began_s < 15
 
 
-def test_without_a_link_nothing_is_filmed() -> None:
+def test_without_a_link_there_are_no_frames() -> None:
     driver = Seeing(lambda: JPEG)
     filmer = watched(driver, lambda _, __: None)
     eventually(lambda: driver.asked)

@@ -73,7 +73,7 @@ def made() -> Iterator[Callable[..., Timed]]:
         assert timed.link.stopped == 1
 
 
-def test_a_confirmed_message_gives_a_sample_and_its_sender_hears_of_it(made: Callable[..., Timed]) -> None:
+def test_an_acknowledged_message_gives_a_sample_and_calls_the_sender(made: Callable[..., Timed]) -> None:
     timed, heard = made(), list[str]()
     assert timed.say(delivered=lambda: heard.append("delivered"))
     time.sleep(0.05)
@@ -96,9 +96,7 @@ def test_a_confirmed_message_gives_a_sample_and_its_sender_hears_of_it(made: Cal
         ("ts/v1/s/a/arm/desc", 1),
     ],
 )
-def test_what_nobody_confirms_or_is_sent_in_bulk_is_passed_on_as_it_is(
-    made: Callable[..., Timed], topic: str, qos: int
-) -> None:
+def test_unacknowledged_and_bulk_messages_are_not_measured(made: Callable[..., Timed], topic: str, qos: int) -> None:
     timed = made()
 
     def mine() -> None:
@@ -108,7 +106,7 @@ def test_what_nobody_confirms_or_is_sent_in_bulk_is_passed_on_as_it_is(
     assert timed.link.sent == [(topic, mine)]
 
 
-def test_a_message_that_was_not_sent_gives_none(made: Callable[..., Timed]) -> None:
+def test_an_unsent_message_gives_no_sample(made: Callable[..., Timed]) -> None:
     timed = made()
     timed.link.up = False
     assert not timed.say()
@@ -116,7 +114,7 @@ def test_a_message_that_was_not_sent_gives_none(made: Callable[..., Timed]) -> N
     assert timed.told == []
 
 
-def test_of_what_is_said_in_quick_succession_one_is_timed_for_each_device(made: Callable[..., Timed]) -> None:
+def test_one_of_several_rapid_messages_per_device_is_measured(made: Callable[..., Timed]) -> None:
     timed = made(spacing_s=60.0)
     for _ in range(3):
         timed.say()
@@ -124,14 +122,14 @@ def test_of_what_is_said_in_quick_succession_one_is_timed_for_each_device(made: 
     assert [delivered is not None for _, delivered in timed.link.sent] == [True, False, False, True]
 
 
-def test_samples_that_wait_are_bounded_and_the_newest_stay(made: Callable[..., Timed]) -> None:
+def test_waiting_samples_are_bounded_and_the_newest_are_kept(made: Callable[..., Timed]) -> None:
     timed = made(upload_period_s=0.5)
     for _ in range(MAX_SAMPLES + 20):
         timed.trip()
     assert len(eventually(lambda: timed.told)[0][1]) == MAX_SAMPLES
 
 
-def test_one_device_after_another_is_told_and_each_only_so_often(made: Callable[..., Timed]) -> None:
+def test_devices_are_uploaded_in_turn_at_a_limited_rate(made: Callable[..., Timed]) -> None:
     timed = made(device_period_s=60.0)
     timed.trip()
     timed.trip("ts/v1/s/a/leg/state")
@@ -142,7 +140,7 @@ def test_one_device_after_another_is_told_and_each_only_so_often(made: Callable[
     assert len(timed.told) == 2
 
 
-def test_samples_of_before_are_dropped_when_the_link_is_lost(made: Callable[..., Timed]) -> None:
+def test_a_lost_link_drops_samples(made: Callable[..., Timed]) -> None:
     timed = made(upload_period_s=0.3)
     timed.link.link_changed(True)
     timed.trip()
@@ -153,9 +151,7 @@ def test_samples_of_before_are_dropped_when_the_link_is_lost(made: Callable[...,
 
 
 @pytest.mark.parametrize("trouble", [OSError("not reached"), ValueError("refused"), RuntimeError("a mistake")])
-def test_what_the_cloud_does_not_take_is_dropped_and_the_next_is_told(
-    made: Callable[..., Timed], trouble: Exception
-) -> None:
+def test_a_failed_upload_is_dropped_and_the_next_continues(made: Callable[..., Timed], trouble: Exception) -> None:
     timed = made()
     timed.trouble.append(trouble)
     timed.trip()

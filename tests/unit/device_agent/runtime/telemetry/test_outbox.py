@@ -92,7 +92,7 @@ def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
     harness.shelf.close()
 
 
-def test_an_event_is_on_disk_before_it_is_sent_and_gone_once_it_is_confirmed(harness: DeviceHarness) -> None:
+def test_an_event_is_stored_before_it_is_sent_and_deleted_after_the_ack(harness: DeviceHarness) -> None:
     harness.outbox.link_changed(True)
     harness.link.confirms = False
     harness.event("held")
@@ -106,7 +106,7 @@ def test_an_event_is_on_disk_before_it_is_sent_and_gone_once_it_is_confirmed(har
     assert harness.kept(late=False) == []
 
 
-def test_what_was_not_confirmed_when_the_link_was_lost_is_sent_again_in_order(harness: DeviceHarness) -> None:
+def test_unacknowledged_messages_are_resent_in_order_after_a_lost_link(harness: DeviceHarness) -> None:
     harness.outbox.link_changed(True)
     harness.link.confirms = False
     for name in ("one", "two", "three"):
@@ -124,7 +124,7 @@ def test_what_was_not_confirmed_when_the_link_was_lost_is_sent_again_in_order(ha
     assert harness.kept(late=False) == []
 
 
-def test_a_restart_sends_what_was_kept(harness: DeviceHarness) -> None:
+def test_stored_messages_are_sent_after_a_restart(harness: DeviceHarness) -> None:
     harness.event("before")
     harness.measure(0, 3, sent=False)
     harness.rounds()
@@ -135,7 +135,7 @@ def test_a_restart_sends_what_was_kept(harness: DeviceHarness) -> None:
     assert [payload for _, payload in harness.link.said] == [b"before", b"0", b"1", b"2"], "events first"
 
 
-def test_measurements_are_kept_thinned_only_while_nobody_hears_them(harness: DeviceHarness) -> None:
+def test_measurements_are_stored_at_a_reduced_rate_without_a_link(harness: DeviceHarness) -> None:
     harness.outbox.link_changed(True)
     harness.measure(0, 1000, sent=True, each_s=0.02)
     harness.rounds()
@@ -145,7 +145,7 @@ def test_measurements_are_kept_thinned_only_while_nobody_hears_them(harness: Dev
     assert 19 <= len(harness.kept()) <= 21, "one a second of twenty seconds"
 
 
-def test_what_was_sent_shortly_before_the_link_was_found_lost_is_kept_too(harness: DeviceHarness) -> None:
+def test_measurements_sent_shortly_before_a_lost_link_are_stored(harness: DeviceHarness) -> None:
     harness.outbox.link_changed(True)
     harness.rounds()
     harness.measure(0, 30, sent=True)
@@ -155,7 +155,7 @@ def test_what_was_sent_shortly_before_the_link_was_found_lost_is_kept_too(harnes
     assert harness.kept() == [str(number) for number in range(19, 32)], "the last ten seconds, in order"
 
 
-def test_it_sends_slowly_and_more_slowly_while_something_moves(harness: DeviceHarness) -> None:
+def test_the_send_rate_is_low_and_lower_during_motion(harness: DeviceHarness) -> None:
     harness.measure(0, 500, sent=False)
     harness.rounds()
     harness.outbox.link_changed(True)
@@ -171,7 +171,7 @@ def test_it_sends_slowly_and_more_slowly_while_something_moves(harness: DeviceHa
     assert harness.link.payloads() == [str(number).encode() for number in range(len(harness.link.said))]
 
 
-def test_after_the_link_has_come_it_waits_for_whoever_stores_to_be_back_too(tmp_path: Path) -> None:
+def test_sending_starts_after_the_settle_time(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path)
     harness.outbox.settle_s = 8.0
     harness.event("held")
@@ -187,7 +187,7 @@ def test_after_the_link_has_come_it_waits_for_whoever_stores_to_be_back_too(tmp_
     harness.shelf.close()
 
 
-def test_no_more_than_a_window_is_under_way(harness: DeviceHarness) -> None:
+def test_messages_in_flight_are_limited(harness: DeviceHarness) -> None:
     harness.measure(0, 100, sent=False)
     harness.link.confirms = False
     harness.outbox.link_changed(True)
@@ -198,7 +198,7 @@ def test_no_more_than_a_window_is_under_way(harness: DeviceHarness) -> None:
     assert len(harness.link.said) == 2 * module._WINDOW
 
 
-def test_a_link_whose_queue_is_full_is_tried_again(harness: DeviceHarness) -> None:
+def test_a_full_link_queue_is_retried(harness: DeviceHarness) -> None:
     harness.outbox.link_changed(True)
     harness.link.takes = False
     harness.event("held")
@@ -208,7 +208,7 @@ def test_a_link_whose_queue_is_full_is_tried_again(harness: DeviceHarness) -> No
     assert harness.link.payloads(topics.EVENT) == [b"held"]
 
 
-def test_what_is_never_confirmed_is_sent_some_times_and_then_dropped_and_counted(harness: DeviceHarness) -> None:
+def test_messages_without_ack_are_retried_then_dropped_and_counted(harness: DeviceHarness) -> None:
     harness.outbox.link_changed(True)
     harness.link.confirms = False
     harness.event("refused")
@@ -222,7 +222,7 @@ def test_what_is_never_confirmed_is_sent_some_times_and_then_dropped_and_counted
     assert told.data == {"measurements": 0, "events": 1}
 
 
-def test_what_did_not_fit_is_told_after_the_link_has_come_back(tmp_path: Path) -> None:
+def test_dropped_messages_are_reported_after_reconnection(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path, max_bytes=50_000)
     harness.measure(0, 2000, sent=False)
     harness.rounds()
@@ -235,7 +235,7 @@ def test_what_did_not_fit_is_told_after_the_link_has_come_back(tmp_path: Path) -
     harness.shelf.close()
 
 
-def test_a_thread_that_is_stuck_costs_a_bounded_memory_and_what_it_costs_is_counted(
+def test_a_stuck_thread_uses_bounded_memory_and_counts_drops(
     harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_MAX_INCOMING", 10)
@@ -313,7 +313,7 @@ class TestFullDisk:
         assert harness.outbox._unsaved == {}
 
 
-def test_a_folder_that_cannot_be_used_stops_nothing(tmp_path: Path) -> None:
+def test_an_unusable_folder_does_not_stop_the_outbox(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path)
     harness.path = tmp_path / "missing" / "outbox.db"
     harness.renew()
@@ -330,7 +330,7 @@ def test_a_folder_that_cannot_be_used_stops_nothing(tmp_path: Path) -> None:
     harness.shelf.close()
 
 
-def test_an_error_in_reading_is_trouble_too_and_one_nobody_thought_of_ends_nothing(
+def test_read_errors_are_reported_and_unexpected_errors_do_not_stop_the_thread(
     harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     harness.outbox.link_changed(True)
@@ -354,7 +354,7 @@ def test_an_error_in_reading_is_trouble_too_and_one_nobody_thought_of_ends_nothi
     assert b"one" in harness.link.payloads(topics.EVENT)
 
 
-def test_as_a_thread_it_sends_at_once_and_its_last_words_before_it_ends(tmp_path: Path) -> None:
+def test_the_thread_sends_at_once_and_drains_before_it_stops(tmp_path: Path) -> None:
     harness = DeviceHarness(tmp_path)
     harness.outbox.start()
     harness.outbox.link_changed(True)

@@ -64,7 +64,7 @@ def run(gauge: Gauge | None, *streams: Stream, tell: Callable[[str, Measurements
     return reporter
 
 
-def test_each_stream_but_the_joints_is_measured_and_counted() -> None:
+def test_each_stream_except_joints_is_sampled_and_numbered() -> None:
     gauge, bell = Gauge(sonar=lambda: {"distance_m.left": 0.8}, health=lambda: {"charging": True}), Bell()
     reporter = run(gauge, JOINTS, SONAR, HEALTH, tell=bell)
     sonar, health = bell.wait("sonar", 3), bell.wait("health", 3)
@@ -87,7 +87,7 @@ def test_each_stream_has_its_own_rate() -> None:
     assert len(bell.of("slow")) == 1
 
 
-def test_what_is_no_number_is_left_out_and_nothing_tells_nothing() -> None:
+def test_values_that_are_not_finite_and_empty_readings_are_not_published() -> None:
     gauge = Gauge(sonar=lambda: {"a": math.nan, "b": math.inf, "c": 0.5}, health=lambda: {"a": math.nan})
     bell = Bell()
     reporter = run(gauge, SONAR, HEALTH, tell=bell)
@@ -98,7 +98,7 @@ def test_what_is_no_number_is_left_out_and_nothing_tells_nothing() -> None:
     assert gauge.asked.count("health") > 0
 
 
-def test_trouble_with_one_stream_is_logged_once_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_error_of_one_stream_is_logged_once_and_does_not_stop_others(caplog: pytest.LogCaptureFixture) -> None:
     well = threading.Event()
 
     def broken() -> Mapping[str, float | bool]:
@@ -120,7 +120,7 @@ def test_trouble_with_one_stream_is_logged_once_and_ends_nothing(caplog: pytest.
     assert sum("internal error: ZeroDivisionError" in text for text in told) == 1
 
 
-def test_a_driver_that_measures_only_joints_is_asked_for_nothing() -> None:
+def test_a_driver_without_streams_is_not_polled() -> None:
     bell = Bell()
     for reporter in (run(None, SONAR, tell=bell), run(Gauge(), JOINTS, tell=bell)):
         reporter.stop()
@@ -128,7 +128,7 @@ def test_a_driver_that_measures_only_joints_is_asked_for_nothing() -> None:
     assert bell.told == []
 
 
-def test_a_device_tells_its_streams(tmp_path: Path) -> None:
+def test_a_device_publishes_its_streams(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
     harness = DeviceHarness(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": 0.8}))
     harness.device.start()
@@ -143,7 +143,7 @@ def test_a_device_tells_its_streams(tmp_path: Path) -> None:
     assert codec.decode(payload, Measurements).values == {"distance_m": 0.8}
 
 
-def test_a_script_reads_what_its_own_robot_measures(tmp_path: Path) -> None:
+def test_a_script_reads_the_streams_of_its_robot(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
     harness = DeviceHarness(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": 0.8}))
     harness.device.start()
@@ -157,7 +157,7 @@ def test_a_script_reads_what_its_own_robot_measures(tmp_path: Path) -> None:
     harness.stop()
 
 
-def test_an_interlock_holds_a_robot_by_what_it_measures_itself(tmp_path: Path) -> None:
+def test_an_interlock_can_use_the_robots_own_stream(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
     near = InterlockRule(device="arm", stream="sonar", field="distance_m", below=0.5)
     away_m = [0.8]
@@ -183,7 +183,7 @@ class Island(DeviceHarness):
         return super().publish(topic, payload, **more)
 
 
-def test_what_was_measured_while_the_link_was_down_is_told_late(tmp_path: Path) -> None:
+def test_measurements_without_a_link_are_published_late(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
     gauge = Gauge(sonar=lambda: {"distance_m": 0.8})
     harness = Island(tmp_path, kind=kind, driver=gauge)
