@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from device_agent.ports.driver import DriverError, Observation
-from device_agent.protocol import Ack, AckStatus, GrantLease, Mode, MoveJoints, topics
+from device_agent.protocol import Ack, AckStatus, Event, GrantLease, Mode, MoveJoints, topics
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.commands import command_processor
 from device_agent.runtime.commands.command_processor import CommandProcessor
@@ -42,6 +42,20 @@ def test_an_unexpected_error_fails_the_action_and_the_next_one_runs(
 def test_an_unexpected_error_fails_the_command(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CommandProcessor, "_apply", broken)
     assert code(harness, harness.command(GrantLease(holder="ann", lease_ms=1000), epoch=1)) == "internal"
+
+
+def test_a_command_whose_epoch_cannot_be_journalled_is_not_applied(
+    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise JournalError("is the disk full?")
+
+    monkeypatch.setattr(Journal, "save_epoch", full)
+    command = harness.command(MOVE, epoch=7)
+    eventually(lambda: [event for event in harness.heard(topics.EVENT, Event) if "disk" in event.message])
+    assert {ack.status for ack in harness.acks(command)} <= {AckStatus.RECEIVED}
+    assert harness.driver.position == (0.0, 0.0)
+    monkeypatch.undo()
 
 
 @pytest.mark.parametrize("what", ["its start cannot be journalled", "the disk does not take it"])

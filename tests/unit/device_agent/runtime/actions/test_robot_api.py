@@ -180,6 +180,7 @@ def test_every_call_reaches_a_fully_capable_robot(harness: DeviceHarness) -> Non
         "robot.posture('Sit', 0.9)\n"
         "robot.behaviour('nod')\n"
         "robot.drive(0.1, turn_rad_s=0.2, duration_s=0.05)\n"
+        "robot.home(1)\n"
         "robot.move_joints({'elbow': 0.2}, speed=1)\n"
         "robot.move_to((0.1, 0, 0), rpy_rad=(0, 0, 0.6), speed=1)\n"
         "robot.move_joints({'elbow': 0.1}, speed=1, plan=True)\n"
