@@ -75,7 +75,7 @@ class Blobs(Protocol):
         """Close all connections."""
 
 
-class TransferRefused(Exception):  # noqa: N818 (an answer to whoever tries)
+class TransferRefused(Exception):  # noqa: N818 (the caller answers the request with it)
     """A presigned URL is not valid for this request; ``status`` is the HTTP status."""
 
     def __init__(self, status: int, message: str) -> None:

@@ -125,15 +125,15 @@ class OidcSignIn:
                 ``oidc-uninvited``: there is no account, and none is created.
         """
         provider = self._known()
-        begun = await self._begun(returned)
+        started = await self._begun(returned)
         if returned.error or not returned.code:
             _log.warning("OIDC sign-in: the provider reports %r", returned.error[:200])
             raise _refused()
         try:
             subject = await provider.redeem(
                 code=returned.code,
-                verifier=begun["verifier"],
-                nonce=begun["nonce"],
+                verifier=started["verifier"],
+                nonce=started["nonce"],
                 redirect=self._redirect,
                 issuer=returned.issuer,
             )
@@ -141,7 +141,7 @@ class OidcSignIn:
             _log.error("sign-in elsewhere: %s", error)
             raise _refused() from error
         is_new = not await self._sign_in.is_known_elsewhere(subject.issuer, subject.id)
-        existing = await self._invited(begun["invitation"]) if is_new else None
+        existing = await self._invited(started["invitation"]) if is_new else None
         if is_new and existing is None and not self._anyone:
             await self._refuse_stranger(subject, whence)
         account = await self._sign_in.account_elsewhere(subject.issuer, subject.id, subject.name)

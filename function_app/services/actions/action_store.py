@@ -124,8 +124,8 @@ def _freed(action: Action, control: ControlRows) -> list[Write]:
     if queue != control.queue:
         writes.append(control.write_queue(action.device, queue))
     if control.lease is not None and control.lease.action == action.id:
-        nobody = release(control.lease, now_ms=action.ended_ms)
-        writes.append(control.write_lease(action.device, nobody))
+        free = release(control.lease, now_ms=action.ended_ms)
+        writes.append(control.write_lease(action.device, free))
         caller = Identity(action.account, action.who, action.session)
-        writes += lease_change(action.device, control.lease, nobody, caller=caller, now_ms=action.ended_ms)
+        writes += lease_change(action.device, control.lease, free, caller=caller, now_ms=action.ended_ms)
     return writes

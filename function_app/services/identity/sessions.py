@@ -90,10 +90,10 @@ class Sessions:
         """Create a session for an authenticated account."""
         now_ms = self._clock.now_ms()
         ends_ms = now_ms + SESSION_S * 1000
-        begun = Session(new_session(), how, now_ms, ends_ms, address=whence.address, program=whence.program[:_SHOWN])
-        row = Row(account.id, _ROW + begun.id, records.to_data(begun))
+        session = Session(new_session(), how, now_ms, ends_ms, address=whence.address, program=whence.program[:_SHOWN])
+        row = Row(account.id, _ROW + session.id, records.to_data(session))
         await self._retention.delete_row_at(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
-        caller = Identity(account.id, account.name, begun.id, until_ms=ends_ms)
+        caller = Identity(account.id, account.name, session.id, until_ms=ends_ms)
         async with self._audit_log.change(
             account.id, AccountEvent.SIGNED_IN, caller, how=how, address=whence.address
         ) as change:
@@ -102,7 +102,7 @@ class Sessions:
         csrf = new_secret()
         return SignedIn(
             account=account,
-            session=begun.id,
+            session=session.id,
             access_token=await self._authenticator.issue(caller, API, ACCESS_S),
             cookie=await self._authenticator.issue(caller, SESSION, SESSION_S, csrf=csrf),
             csrf=csrf,

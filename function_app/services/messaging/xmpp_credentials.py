@@ -198,7 +198,7 @@ class XmppCredentials:
 
     def _left_s(self, claims: dict[str, object]) -> int:
         ends_s = claims["exp"]
-        assert isinstance(ends_s, int | float)  # noqa: S101 (`decode` has seen to it)
+        assert isinstance(ends_s, int | float)  # noqa: S101 (checked by `decode`)
         return max(1, int(ends_s - self._clock.now_ms() / 1000))
 
 

@@ -266,7 +266,7 @@ def test_who_may_no_longer_operate_is_given_nothing(held: Three, monkeypatch: py
         return known, link
 
     monkeypatch.setattr(devices_service.DeviceAccess, "find_with_link", found)
-    assert "stays with you" in problem(anna.post(at(robot, request, "accept")), 409, "requester-offline")["detail"]
+    assert "You keep control" in problem(anna.post(at(robot, request, "accept")), 409, "requester-offline")["detail"]
     assert lease(anna, robot)["epoch"] == 1
 
 

@@ -69,7 +69,7 @@ def test_what_is_not_held_now_is_not_renewed(who: Identity, epoch: int, now_ms: 
 
 
 def test_a_lease_that_never_was_is_lost() -> None:
-    with pytest.raises(Problem, match="Epoch 3"):
+    with pytest.raises(Problem, match="epoch 3"):
         rules.require_held(None, ANNA, epoch=3, now_ms=START)
 
 

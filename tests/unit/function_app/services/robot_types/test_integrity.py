@@ -56,7 +56,7 @@ async def flip_each(name: str, home: Path, *, stride: int) -> tuple[int, int]:
                 await seals.check("anna", name, records.read(Row("p", "k", {**rest, **read}), TypeVersion))
         in_rows += 1
     for account, robot_type, version in (("bert", name, 1), ("anna", "other", 1), ("anna", name, 2)):
-        with pytest.raises(Problem, match="is not what was uploaded"):
+        with pytest.raises(Problem, match="differs from the upload"):
             await seals.check(account, robot_type, replace(good, version=version))
     return in_files, in_rows
 
