@@ -1,4 +1,4 @@
-"""Blink, now and then with one eye only."""
+"""Blink, sometimes with one eye only."""
 
 PARAMETERS = {
     "times": {"type": "integer", "minimum": 1, "maximum": 50, "default": 4, "description": "How often to blink"},
@@ -7,9 +7,16 @@ PARAMETERS = {
         "minimum": 0,
         "maximum": 50,
         "default": 4,
-        "description": "Every so many blinks only the left eye; 0: never",
+        "description": "Interval of blinks with the left eye only; 0: never",
     },
-    "pause_s": {"type": "number", "minimum": 0, "maximum": 20, "default": 1.5, "unit": "s", "description": "Between"},
+    "pause_s": {
+        "type": "number",
+        "minimum": 0,
+        "maximum": 20,
+        "default": 1.5,
+        "unit": "s",
+        "description": "Pause between blinks",
+    },
 }
 
 CLOSED_RAD, OPEN_RAD = -0.9, 0.0

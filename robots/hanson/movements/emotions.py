@@ -1,8 +1,21 @@
-"""Show the basic emotions one after the other, and name them where it can speak."""
+"""Show the basic emotions one by one, and name them if speech is available."""
 
 PARAMETERS = {
-    "strength": {"type": "number", "minimum": 0.1, "maximum": 1, "default": 1, "description": "Of each expression"},
-    "hold_s": {"type": "number", "minimum": 0, "maximum": 10, "default": 1.0, "unit": "s", "description": "Of each"},
+    "strength": {
+        "type": "number",
+        "minimum": 0.1,
+        "maximum": 1,
+        "default": 1,
+        "description": "Strength of each expression",
+    },
+    "hold_s": {
+        "type": "number",
+        "minimum": 0,
+        "maximum": 10,
+        "default": 1.0,
+        "unit": "s",
+        "description": "Duration of each expression",
+    },
 }
 
 EMOTIONS = ("happy", "surprised", "afraid", "angry", "disgusted", "sad")

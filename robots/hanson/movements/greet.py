@@ -6,7 +6,7 @@ PARAMETERS = {
         "minimum": 0,
         "maximum": 1,
         "default": 1,
-        "description": "Of the smile",
+        "description": "Strength of the smile",
     },
 }
 

@@ -1,18 +1,18 @@
-"""Look around as people do: the eyes go first, the neck follows, and the eyes come back to the middle."""
+"""Look around: the eyes move first, the neck follows, and the eyes return to the centre."""
 
 PARAMETERS = {
-    "rounds": {"type": "integer", "minimum": 1, "maximum": 10, "default": 1, "description": "How often"},
+    "rounds": {"type": "integer", "minimum": 1, "maximum": 10, "default": 1, "description": "Repetitions"},
     "pause_s": {
         "type": "number",
         "minimum": 0,
         "maximum": 10,
         "default": 0.4,
         "unit": "s",
-        "description": "At each place",
+        "description": "Pause at each position",
     },
 }
 
-PLACES_RAD = ((0.7, 0.15), (0.2, -0.2), (-0.7, 0.1), (0.0, 0.0))  # to its left, up
+PLACES_RAD = ((0.7, 0.15), (0.2, -0.2), (-0.7, 0.1), (0.0, 0.0))  # left, up
 
 rounds = min(10, max(1, int(parameters.get("rounds", 1))))
 pause_s = min(10.0, max(0.0, float(parameters.get("pause_s", 0.4))))

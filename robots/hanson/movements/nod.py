@@ -1,4 +1,4 @@
-"""Nod: the head goes down and up again, a few times."""
+"""Nod a few times."""
 
 PARAMETERS = {
     "times": {"type": "integer", "minimum": 1, "maximum": 20, "default": 3, "description": "How often to nod"},
@@ -16,7 +16,7 @@ speed = float(parameters.get("speed", 0.6))
 
 
 def pitch(motor_rad):
-    """Tilt the head forward: both motors of the upper gimbal by the same angle, in opposite senses."""
+    """Tilt the head forward: both motors of the upper gimbal by the same angle in opposite directions."""
     robot.move_joints({"Upper-Gimbal-L": motor_rad, "Upper-Gimbal-R": -motor_rad}, speed=speed)
 
 

@@ -1,7 +1,7 @@
 """Shake the head: no."""
 
 PARAMETERS = {
-    "times": {"type": "integer", "minimum": 1, "maximum": 20, "default": 2, "description": "How often, there and back"},
+    "times": {"type": "integer", "minimum": 1, "maximum": 20, "default": 2, "description": "Repetitions"},
     "speed": {
         "type": "number",
         "minimum": 0.05,

@@ -1,4 +1,4 @@
-"""Yawn: the mouth opens wide, the eyes close, the head leans back; then all of it comes home."""
+"""Yawn: open the mouth, close the eyes, lean the head back, and return home."""
 
 PARAMETERS = {
     "speed": {
@@ -6,7 +6,7 @@ PARAMETERS = {
         "minimum": 0.02,
         "maximum": 0.5,
         "default": 0.12,
-        "description": "Share of the joints' velocity limits: a yawn takes its time",
+        "description": "Share of the joints' velocity limits",
     },
     "hold_s": {
         "type": "number",
@@ -14,7 +14,7 @@ PARAMETERS = {
         "maximum": 10,
         "default": 1.0,
         "unit": "s",
-        "description": "At its widest",
+        "description": "Duration with open mouth",
     },
 }
 

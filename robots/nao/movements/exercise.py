@@ -8,7 +8,7 @@ LEGS = ("HipPitch", "KneePitch", "AnklePitch")
 
 
 def legs(hip, knee, ankle):
-    """Both legs alike, so that the feet stay where they are."""
+    """Move both legs equally, so that the feet stay in place."""
     return {side + name: value for side in "LR" for name, value in zip(LEGS, (hip, knee, ankle), strict=True)}
 
 

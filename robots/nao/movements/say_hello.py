@@ -1,8 +1,8 @@
 """Look up at the person in front, say hello with a wave, and bow the head."""
 
 PARAMETERS = {
-    "text": {"type": "string", "maxLength": 200, "default": "Hello, I am NAO.", "description": "What it says"},
-    "language": {"type": "string", "maxLength": 5, "default": "en", "description": "Of the text"},
+    "text": {"type": "string", "maxLength": 200, "default": "Hello, I am NAO.", "description": "Spoken text"},
+    "language": {"type": "string", "maxLength": 5, "default": "en", "description": "Language of the text"},
 }
 
 text = str(parameters.get("text", "Hello, I am NAO."))

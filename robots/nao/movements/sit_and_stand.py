@@ -1,4 +1,4 @@
-"""Sit down, rest, and stand up again. With a stool behind it sits on that, without one it squats."""
+"""Sit down on a stool (or squat without one), rest, and stand up again."""
 
 PARAMETERS = {
     "rest_s": {

@@ -1,4 +1,4 @@
-"""Walk a few steps ahead, then a square, and stand where the square began."""
+"""Walk a few steps forward, then a square."""
 
 PARAMETERS = {
     "side_m": {
@@ -7,13 +7,13 @@ PARAMETERS = {
         "maximum": 0.5,
         "default": 0.2,
         "unit": "m",
-        "description": "Of the square",
+        "description": "Side of the square",
     },
-    "left": {"type": "boolean", "default": True, "description": "Whether it turns left at the corners"},
+    "left": {"type": "boolean", "default": True, "description": "Turn left at the corners"},
 }
 
 SPEED_M_S, TURN_RAD_S = 0.1, 0.5
-SPEEDING_UP_S = 0.2  # what a drive loses, because it speeds up more slowly than it brakes
+SPEEDING_UP_S = 0.2  # lost by acceleration, which is slower than braking
 RIGHT_ANGLE_RAD = 1.5708
 
 side_m = min(0.5, max(0.1, float(parameters.get("side_m", 0.2))))

@@ -1,4 +1,4 @@
-"""Come forward until the sonars hear something near, look up, and go back a little."""
+"""Drive forward until the sonars detect an obstacle, look up, and drive back a little."""
 
 PARAMETERS = {
     "near_m": {
@@ -7,7 +7,7 @@ PARAMETERS = {
         "maximum": 2,
         "default": 0.5,
         "unit": "m",
-        "description": "How near is near",
+        "description": "Distance at which it stops",
     },
     "farthest_m": {
         "type": "number",
@@ -15,7 +15,7 @@ PARAMETERS = {
         "maximum": 3,
         "default": 1.5,
         "unit": "m",
-        "description": "It comes no farther than this",
+        "description": "Maximum driving distance",
     },
     "speed_m_s": {
         "type": "number",
@@ -23,7 +23,7 @@ PARAMETERS = {
         "maximum": 0.2,
         "default": 0.15,
         "unit": "m/s",
-        "description": "How fast",
+        "description": "Speed",
     },
 }
 
@@ -34,20 +34,22 @@ farthest_m = min(3.0, max(0.1, float(parameters.get("farthest_m", 1.5))))
 speed_m_s = min(0.2, max(0.05, float(parameters.get("speed_m_s", 0.15))))
 
 
-def heard():
-    """The nearer of what both sonars hear [m]."""
+def distance_m():
+    """The smaller distance of both sonars [m]."""
     sonar = robot.state()["streams"].get("sonar")
     if sonar is None or sonar["age_s"] > 1.0:
-        raise RobotError("the sonars tell nothing; it stays where it is")
+        raise RobotError("no sonar data; the movement ends")
     return min(sonar["values"]["distance_m.left"], sonar["values"]["distance_m.right"])
 
 
-gone_m = 0.0
-while heard() > near_m and gone_m < farthest_m:
+driven_m = 0.0
+while distance_m() > near_m and driven_m < farthest_m:
     robot.drive(forward_m_s=speed_m_s, duration_s=STEP_S)
-    gone_m += speed_m_s * STEP_S
-    progress(min(1.0, gone_m / farthest_m))
-print("stands", round(heard(), 2), "m before what it hears" if gone_m < farthest_m else "m from anything")
+    driven_m += speed_m_s * STEP_S
+    progress(min(1.0, driven_m / farthest_m))
+print(
+    "stopped", round(distance_m(), 2), "m before an obstacle" if driven_m < farthest_m else "m from the next obstacle"
+)
 robot.look([0.8, 0.0, 0.75], speed=0.4)
 wait(0.5)
 robot.home(speed=0.4)

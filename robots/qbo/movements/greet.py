@@ -1,8 +1,8 @@
 """Look up at the person in front, say hello, and nod."""
 
 PARAMETERS = {
-    "text": {"type": "string", "maxLength": 200, "default": "Hello, I am Qbo.", "description": "What it says"},
-    "language": {"type": "string", "maxLength": 5, "default": "en", "description": "Of the text"},
+    "text": {"type": "string", "maxLength": 200, "default": "Hello, I am Qbo.", "description": "Spoken text"},
+    "language": {"type": "string", "maxLength": 5, "default": "en", "description": "Language of the text"},
 }
 
 text = str(parameters.get("text", "Hello, I am Qbo."))

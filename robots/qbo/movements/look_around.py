@@ -1,7 +1,7 @@
-"""Look to both sides, up and down, and ahead again."""
+"""Look to both sides, up, down, and ahead."""
 
 PARAMETERS = {
-    "times": {"type": "integer", "minimum": 1, "maximum": 10, "default": 1, "description": "How often"},
+    "times": {"type": "integer", "minimum": 1, "maximum": 10, "default": 1, "description": "Repetitions"},
     "speed": {
         "type": "number",
         "minimum": 0.05,

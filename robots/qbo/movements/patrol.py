@@ -1,4 +1,4 @@
-"""Drive round a square, look to both sides at each corner, and come back to where it began."""
+"""Drive along a square and look to both sides at each corner."""
 
 import math
 
@@ -9,7 +9,7 @@ PARAMETERS = {
         "maximum": 2,
         "default": 0.5,
         "unit": "m",
-        "description": "Of the square",
+        "description": "Side of the square",
     },
     "speed_m_s": {
         "type": "number",
@@ -17,7 +17,7 @@ PARAMETERS = {
         "maximum": 0.3,
         "default": 0.2,
         "unit": "m/s",
-        "description": "How fast",
+        "description": "Speed",
     },
     "keep_m": {
         "type": "number",
@@ -25,7 +25,7 @@ PARAMETERS = {
         "maximum": 1,
         "default": 0.35,
         "unit": "m",
-        "description": "It stops this far from what its sonars hear",
+        "description": "Distance to obstacles at which it stops",
     },
 }
 
@@ -38,19 +38,19 @@ keep_m = min(1.0, max(0.15, float(parameters.get("keep_m", 0.35))))
 
 
 def room_ahead():
-    """The nearer of what both sonars hear [m]; none is heard of without them."""
+    """The smaller distance of both sonars [m]."""
     sonar = robot.state()["streams"].get("sonar")
     if sonar is None or sonar["age_s"] > 1.0:
-        raise RobotError("the sonars tell nothing; the patrol ends here")
+        raise RobotError("no sonar data; the patrol ends")
     return min(sonar["values"]["distance_m.left"], sonar["values"]["distance_m.right"])
 
 
 def along(way_m):
-    """Drive ahead in short steps, as long as there is room."""
+    """Drive forward in short steps until there is an obstacle."""
     steps = max(1, round(way_m / STEP_M))
     for _ in range(steps):
         if room_ahead() < keep_m + STEP_M:
-            print("something is in the way; turning here")
+            print("obstacle ahead; turning early")
             return
         robot.drive(forward_m_s=speed_m_s, duration_s=way_m / steps / speed_m_s)
 

@@ -1,9 +1,9 @@
-"""Turn once round on the spot, the head ahead of the body."""
+"""Turn on the spot, head first."""
 
 import math
 
 PARAMETERS = {
-    "turns": {"type": "number", "minimum": 0.25, "maximum": 3, "default": 1, "description": "How far round"},
+    "turns": {"type": "number", "minimum": 0.25, "maximum": 3, "default": 1, "description": "Number of turns"},
     "left": {"type": "boolean", "default": True, "description": "Counter-clockwise"},
     "turn_rad_s": {
         "type": "number",
@@ -11,7 +11,7 @@ PARAMETERS = {
         "maximum": 1.5,
         "default": 1.0,
         "unit": "rad/s",
-        "description": "How fast",
+        "description": "Speed",
     },
 }
 

@@ -3,14 +3,14 @@
 import math
 
 PARAMETERS = {
-    "who": {"type": "string", "default": "person", "description": "As the room's positions call them"},
+    "who": {"type": "string", "default": "person", "description": "Name in the room's positions"},
     "near_m": {
         "type": "number",
         "minimum": 0.7,
         "maximum": 2,
         "default": 0.9,
         "unit": "m",
-        "description": "It stops this far from them",
+        "description": "Distance at which it stops",
     },
     "tries": {
         "type": "integer",
@@ -21,10 +21,10 @@ PARAMETERS = {
     },
 }
 
-SIDES_RAD = (0.0, 0.7, -0.7, 1.4, -1.4)  # where to stand around them, from the side where it is
+SIDES_RAD = (0.0, 0.7, -0.7, 1.4, -1.4)  # candidate directions, relative to the robot's own side
 NEAR_M = 0.3  # tolerance for greeting a moving person
 TURN_RAD_S, STRAIGHT_RAD = 0.6, 0.1
-LOOK_S, PATIENCE_S = 0.3, 35.0  # it waits so long for them to come by
+LOOK_S, PATIENCE_S = 0.3, 35.0  # waiting time for a moving person
 OLD_S = 2.0
 
 who = str(parameters.get("who", "person"))
@@ -48,7 +48,7 @@ def apart():
 
 
 def near():
-    """Whether they are before it now, or come there while it waits."""
+    """Whether the person is, or comes, in front of the robot while it waits."""
     waited_s = 0.0
     while apart()[0] > near_m + NEAR_M:
         if waited_s >= PATIENCE_S:
@@ -59,7 +59,7 @@ def near():
 
 
 def approach():
-    """Go to a place before them, on whichever side there is room; whether there was any."""
+    """Drive to a free position near the person; returns whether there was one."""
     _, towards_rad, (x_m, y_m) = apart()
     for side_rad in SIDES_RAD:
         facing_rad = towards_rad + side_rad
@@ -73,7 +73,7 @@ def approach():
 
 
 def turn(angle_rad):
-    """Turn by so much, the shorter way round."""
+    """Turn by this angle in the shorter direction."""
     angle_rad = math.remainder(angle_rad, 2 * math.pi)
     if abs(angle_rad) > STRAIGHT_RAD:
         robot.drive(turn_rad_s=math.copysign(TURN_RAD_S, angle_rad), duration_s=abs(angle_rad) / TURN_RAD_S)
@@ -86,10 +86,10 @@ for attempt in range(tries):
         break
 left_m, facing_rad, _ = apart()
 if left_m <= near_m + NEAR_M:
-    print("stands", round(left_m, 2), "m before", who)
+    print("stopped", round(left_m, 2), "m before", who)
     robot.say("Hello!")
 else:
-    print("did not reach", who, "who keeps going;", round(left_m, 2), "m are left")
+    print("did not reach", who, "in time;", round(left_m, 2), "m remaining")
 turn(facing_rad - robot.state()["streams"]["odometry"]["values"]["yaw_rad"])
 robot.look([0.9, 0.0, 0.9], speed=0.4)
 robot.home(speed=0.4)

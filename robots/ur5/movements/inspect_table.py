@@ -1,14 +1,14 @@
 """Look along the table from one side to the other, nod at each stop, and go home."""
 
 PARAMETERS = {
-    "stops": {"type": "integer", "minimum": 2, "maximum": 9, "default": 3, "description": "Where it looks"},
+    "stops": {"type": "integer", "minimum": 2, "maximum": 9, "default": 3, "description": "Number of stops"},
     "pause_s": {
         "type": "number",
         "minimum": 0,
         "maximum": 10,
         "default": 0.5,
         "unit": "s",
-        "description": "At each stop",
+        "description": "Pause at each stop",
     },
     "speed": {
         "type": "number",

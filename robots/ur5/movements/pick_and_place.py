@@ -1,7 +1,7 @@
-"""Carry between the two trays, as with a gripper: over, down, up, across. It has no gripper yet."""
+"""Move between the two trays as with a gripper: over, down, up, across."""
 
 PARAMETERS = {
-    "times": {"type": "integer", "minimum": 1, "maximum": 20, "default": 2, "description": "How often, there and back"},
+    "times": {"type": "integer", "minimum": 1, "maximum": 20, "default": 2, "description": "Repetitions"},
     "speed": {
         "type": "number",
         "minimum": 0.05,
@@ -11,7 +11,7 @@ PARAMETERS = {
     },
 }
 
-# Taught over the trays of scene.xml, flange down, 200 mm and 60 mm above the table [rad].
+# Positions over the trays of scene.xml, flange down, 200 mm and 60 mm above the table [rad].
 OVER = {
     "orange": [0.267, -1.274, 1.849, -2.146, -1.571, 0.267],
     "green": [-0.660, -1.274, 1.849, -2.146, -1.571, -0.660],
@@ -26,7 +26,7 @@ speed = float(parameters.get("speed", 0.5))
 
 
 def visit(tray):
-    """Go down to a tray and up again, slowly near it."""
+    """Move down to a tray and up again, slowly near it."""
     robot.move_joints(OVER[tray], speed=speed)
     robot.move_joints(DOWN[tray], speed=speed / 2)
     wait(0.3)

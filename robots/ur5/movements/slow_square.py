@@ -10,7 +10,7 @@ PARAMETERS = {
         "maximum": 0.25,
         "default": 0.2,
         "unit": "m",
-        "description": "Of the square",
+        "description": "Side of the square",
     },
     "height_m": {
         "type": "number",
@@ -18,7 +18,7 @@ PARAMETERS = {
         "maximum": 0.4,
         "default": 0.25,
         "unit": "m",
-        "description": "Of the flange over the table",
+        "description": "Height of the flange above the table",
     },
     "speed": {
         "type": "number",
@@ -29,7 +29,7 @@ PARAMETERS = {
     },
 }
 
-# The arm's measures [m]: robots/ur5/README.md.
+# Dimensions of the arm [m]: robots/ur5/README.md.
 SHOULDER_HEIGHT, UPPER_ARM, FOREARM = 0.089159, 0.425, 0.39225
 LATERAL, WRIST_2, FLANGE = 0.10915, 0.09465, 0.0823
 CENTRE_X, CENTRE_Y = -0.45, 0.0

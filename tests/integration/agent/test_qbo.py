@@ -35,7 +35,7 @@ def test_it_comes_forward_until_its_sonars_say_near(harness: DeviceHarness) -> N
         harness.command(harness.script("parameters = {'near_m': 1.65, 'speed_m_s': 0.2}\n" + source), epoch=1)
     )
     assert ack.status is AckStatus.DONE, ack.reason
-    assert ack.output.startswith("stands 1.")
+    assert ack.output.startswith("stopped 1.")
     sonar = harness.heard(topics.TELE, Measurements, "sonar")
     nearest_m = min(float(told.values["distance_m.left"]) for told in sonar)
     assert 1.4 < nearest_m <= 1.65
