@@ -1,7 +1,7 @@
-"""The cloud: stateless functions over tables, blobs and a broker.
+"""The Telescope server: stateless functions over tables, blobs and a broker.
 
-A Functions host imports this package and looks for one ``FunctionApp``; it is made when asked for, so that nobody else
-pays for the import.
+A Functions host imports this package and looks for one ``FunctionApp``; it is created on first
+access, so that other programs do not pay for the import.
 """
 
 import gc

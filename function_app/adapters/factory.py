@@ -160,7 +160,7 @@ def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables,
 def access(
     settings: Settings, signing: RingKeys, tables: Tables, publish: Callable[[str, bytes], Awaitable[None]]
 ) -> BrokerAccess:
-    """What gives and takes the broker's rights. ``publish``: how the embedded broker is told."""
+    """Issues and revokes broker credentials. ``publish`` sends revocations to the embedded broker."""
     if settings.broker == "iot":
         from function_app.adapters.aws.broker_access import IotBrokerAccess  # noqa: PLC0415 (only where it is in use)
 
@@ -190,7 +190,7 @@ def _event_grid(settings: Settings, signing: RingKeys, tables: Tables) -> Broker
     assert grid.webhook is not None  # noqa: S101
     webhook = grid.webhook
     callers = EntraCallers(tenant=webhook.tenant, audience=webhook.audience, identity=webhook.caller)
-    # Its certificate is of an authority that every machine knows, whoever made ours.
+    # Its certificate has a public CA, independent of the CA of this installation.
     taker = SessionTakeover(host=settings.mqtt_host, port=settings.mqtt_port, tls=client_context(None))
     return EventGridBrokerAccess(keys=signing, tables=tables, take=taker, known=callers.knows)
 

@@ -78,7 +78,7 @@ class S3Blobs:
         """See ``Blobs``."""
         _check(content)
         place = self._place(name)
-        # S3 only writes whole objects. One after the other here; other instances are told by the ETag.
+        # S3 only writes whole objects. Local writers take turns; the ETag detects other instances.
         async with self._appending.setdefault(name, asyncio.Lock()):
             for attempt in range(TRIES):
                 if await self._append(place, _metadata(name), content):
@@ -185,7 +185,7 @@ class S3Blobs:
         return found["Body"], found["ETag"]
 
     async def _append(self, place: dict[str, str], metadata: dict[str, Any], content: bytes) -> bool:
-        """Write the object anew with more at its end; ``False``: somebody else has written it since it was read."""
+        """Write the object with data appended. ``False``: another process wrote it since it was read."""
         found = await self._read(place)
         if found is not None and not content:
             return True
@@ -226,7 +226,7 @@ def decode(key: str) -> str:
 
 
 def _whole(found: list[str], limit: int) -> bool:
-    """Whether the first ``limit`` names have been read, whatever the order among long ones will be."""
+    """Whether the first ``limit`` names have been read, for any order of the long names."""
     return len(found) >= limit and not names.same_head(found[limit - 1], found[-1])
 
 

@@ -81,13 +81,13 @@ class IotBrokerAccess:
         """What IoT Core's custom authoriser answers about a connection.
 
         Args:
-            username: The principal, and whatever IoT Core hangs on behind a question mark.
+            username: The principal, and what IoT Core appends after a question mark.
             password: The signed grant.
             client_id: As the client gives it.
             place: ``arn:aws:iot:<region>:<account>``.
 
         Raises:
-            StoreError: It is not known whether the grant was taken back: nobody is let in.
+            StoreError: The revocation state cannot be read; the client is not admitted.
         """
         grant = await self._rights.judge(username=username.partition("?")[0], password=password, client_id=client_id)
         return iot_policies.refusal() if grant is None else iot_policies.answer(grant, place=place, now_s=time.time())

@@ -52,7 +52,7 @@ class IotCertificates:
             await self._client.call("attach_thing_principal", thingName=agent, principal=made["certificateArn"])
             for name in self._policies(""):
                 await self._client.call("attach_policy", policyName=name, target=made["certificateArn"])
-            # Last: what a stop before it leaves lets nobody in.
+            # Last: an interrupted run leaves a certificate without access.
             await self._client.call("update_certificate", certificateId=made["certificateId"], newStatus="ACTIVE")
         except (Refused, StoreError) as error:
             raise self._said(error) from error

@@ -102,7 +102,7 @@ class Client:
         return await self._in_thread(lambda: self._call(operation, parameters))
 
     async def presign(self, operation: str, *, lifetime_s: int, **parameters: Any) -> str:
-        """An address at which whoever has it may do one of the SDK's operations.
+        """A presigned URL for one of the SDK's operations.
 
         Raises:
             StoreError: There are no credentials to sign it with.
@@ -115,7 +115,7 @@ class Client:
         return await self._in_thread(lambda: self._guarded(sign))
 
     async def close(self) -> None:
-        """Let go of connections and threads; a later call opens again."""
+        """Close connections and threads. A later call opens them again."""
         threads, self._threads = self._threads, None
         if threads is not None:
             await asyncio.to_thread(threads.shutdown)

@@ -10,7 +10,7 @@ from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import StoreError
 
 GIVE_UP_S = 8.0
-"""A caller waits no longer, whatever the SDK still tries."""
+"""Maximum time that a caller waits, including the SDK's retries."""
 
 
 class IotCommandBus:

@@ -1,7 +1,7 @@
 """A grant as AWS IoT Core reads it: policy documents, with which its custom authoriser answers.
 
 A ``*`` of a policy also matches slashes, which a ``+`` of MQTT does not. So each pattern with a ``+`` brings a denial
-of the same with one level more: whatever the star matched too much is denied.
+of the same with one level more: what the star matches in excess is denied.
 Limits (AWS IoT Core, custom authentication): 10 documents of 2,048 characters, a principal of 128 letters and digits.
 """
 

@@ -3,7 +3,7 @@
 512 characters have up to 2,048 bytes in UTF-8, and no encoding that keeps their order fits all of them into 1,024. So a
 name of up to ``HEAD`` characters, which is every name that Telescope makes, stays as it is; of a longer one the key has
 the head and a hash, and the whole name is written beside it. Keys then sort as names do, save among long names with one
-head: whoever lists reads such a group whole and sorts it by the names.
+head. A listing reads such a group completely and sorts it by name.
 """
 
 import hashlib

@@ -67,11 +67,11 @@ class SecretsManagerKeys(VaultKeys):
                 "create_secret",
                 Name=self._secret,
                 SecretString=text,
-                Description="Signing keys of Telescope: whoever reads them can order every robot",
+                Description="Signing keys of Telescope: a reader of this secret can command every robot",
                 **encrypted,
             )
         except Refused as error:
-            if error.code != _EXISTS:  # somebody else has made it
+            if error.code != _EXISTS:  # another process created it
                 raise self._client.unusable(error) from error
 
     async def _put(self, text: str) -> None:

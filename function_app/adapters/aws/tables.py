@@ -174,7 +174,7 @@ class DynamoTables:
 
         Raises:
             Refused: The row is not as the writer believed, or something is wrong.
-            StoreError: Somebody always stood in the way.
+            StoreError: Concurrent writes caused a conflict at every attempt.
         """
         for attempt in range(TRIES):
             try:
@@ -250,7 +250,7 @@ def _range(place: str, start: str, last: str | None) -> dict[str, Any]:
 
 
 def _whole(found: list[Row], limit: int) -> bool:
-    """Whether a page's rows and the one behind them have been read, whatever the order among long keys will be."""
+    """Whether a page's rows and the next one have been read, for any order of the long keys."""
     return len(found) > limit and not names.same_head(found[limit].key, found[-1].key)
 
 

@@ -90,7 +90,7 @@ class AzureBlobs:
         _check(content)
         written, metadata = _written(name), _metadata(name)
         block = secrets.token_hex(_BLOCK_BYTES)
-        # One after the other here; other instances are told by the ETag.
+        # Local writers take turns; the ETag detects other instances.
         async with self._appending.setdefault(name, asyncio.Lock()):
             for attempt in range(TRIES):
                 if await self._write(lambda to: _append(to.get_blob_client(written), block, content, metadata)):
@@ -142,7 +142,7 @@ class AzureBlobs:
         check_upload(length)
         metadata = {f"x-ms-meta-{key}": value for key, value in _metadata(name).items()}
         try:
-            await self._client.call(_make)  # nobody else would, before the upload
+            await self._client.call(_make)  # must exist before the upload
         except Refused as error:
             raise self._client.unusable(error) from error
         url = await self._presign(name, lifetime_s, permission="c")
@@ -227,7 +227,7 @@ def _make(container: "ContainerClient") -> None:
 
 
 def _append(blob: "BlobClient", block: str, content: bytes, metadata: dict[str, str]) -> bool:
-    """Add one block at the end; ``False``: somebody else has written the blob meanwhile.
+    """Append one block. ``False``: another process wrote the blob meanwhile.
 
     ``block`` is new with each append, and known again in the list: an answer may be lost and the SDK ask again.
     """

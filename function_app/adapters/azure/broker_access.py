@@ -2,7 +2,7 @@
 
 The namespace asks the webhook (``admit``) about each connection: whether, as whom, with what attributes of the client
 and until when. They come to exactly the grant (``topic_spaces``). A client's authentication name is its client id, so
-nobody takes over another's session, and there is one at a time.
+no client takes over another client's session, and there is one at a time.
 
 What was taken back is a row in the tables, which ``admit`` looks at. There is no call to end a connection of a client
 that the namespace knows from its webhook alone; but the same client that connects again takes its session over, and the
@@ -28,7 +28,7 @@ from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import StoreError, Tables
 
 CUTTER = "service:cutter"
-"""Who takes over a session to end it. What is signed for it is never given to anybody."""
+"""Client that takes over a session to end it. Its credentials never leave the server."""
 CUT_S = 60
 """So long its password is good."""
 CUTS_AT_ONCE = 16
@@ -98,7 +98,7 @@ class EventGridBrokerAccess:
             client_id: As the client gives it.
 
         Raises:
-            StoreError: It is not known whether the grant was taken back: nobody is let in.
+            StoreError: The revocation state cannot be read; the client is not admitted.
         """
         grant = await self._rights.judge(username=username, password=password, client_id=client_id)
         if grant is None:

@@ -100,7 +100,7 @@ class Client(Generic[Sdk]):
         return await asyncio.get_running_loop().run_in_executor(self._threads, self._call, operation)
 
     async def close(self) -> None:
-        """Let go of connections and threads; a later call opens again."""
+        """Close connections and threads. A later call opens them again."""
         threads, self._threads = self._threads, None
         if threads is not None:
             await asyncio.to_thread(threads.shutdown)

@@ -21,7 +21,7 @@ API_VERSION = "2025-08-01-preview"
 SCOPE = "https://eventgrid.azure.net/.default"
 ROLE = "EventGrid TopicSpaces Publisher"
 GIVE_UP_S = 8.0
-"""A caller waits no longer, whatever is still being tried."""
+"""Maximum time that a caller waits, including retries."""
 TRIES = 2
 """A connection that lay idle may turn out to be gone at the next message. A device drops doubles."""
 _TAKEN = frozenset({200, 202, 204})

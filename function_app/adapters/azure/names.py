@@ -5,7 +5,7 @@ promised beyond that of UTF-16, in which an emoji sorts before a ligature. So le
 themselves, and every other character is written as a sign that sorts where it does, and digits of base 64 (``_SIGNS``):
 a full stop is ``.-``, a slash ``.0``, an emoji ``}`` and three digits.
 
-512 characters of 21 bits have no room in the 512 of 16 that Azure's keys have, whatever the encoding. Of a name that
+512 characters of 21 bits have no room in the 512 of 16 that Azure's keys have, with any encoding. Of a name that
 comes out too long, which none is that Telescope makes, only the head is written, and a hash behind it; the whole is
 kept beside it. Such names sort as they should save among those with one head: ``in_order`` puts these right.
 """

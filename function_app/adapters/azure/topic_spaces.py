@@ -1,4 +1,4 @@
-"""Grants as an Event Grid namespace reads them: topic spaces, the same for everybody, and attributes of a client.
+"""Grants as an Event Grid namespace reads them: topic spaces, the same for all clients, and attributes of a client.
 
 A topic space holds templates of topics, with variables that stand for a client's attributes; a permission binding lets
 a client group say or hear one; a client is in a group by its attributes. So what one client may comes from its
@@ -138,7 +138,7 @@ def attributes(grant: Grant) -> dict[str, str]:
     """What a client is to have so that it may exactly what its grant says.
 
     Raises:
-        BrokerAccessError: There are none: it names more than there is room for, or what nobody is ever given here.
+        BrokerAccessError: The grant names too many topics, or topics that are never granted.
     """
     kind = grant.principal.partition(":")[0]
     families = next((families for known, families in _GROUPS.values() if known == kind), ())

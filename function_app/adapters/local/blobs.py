@@ -160,7 +160,7 @@ class FileBlobs:
 
     @staticmethod
     async def _fill(path: Path, content: AsyncIterator[bytes], most: int) -> int:
-        """Write what comes, but no more than ``most`` bytes of it; how many came."""
+        """Write at most ``most`` bytes of the content. Returns how many were received."""
         length = 0
         file = await asyncio.to_thread(path.open, "xb")
         try:

@@ -323,7 +323,7 @@ class _ControlLine:
         try:
             answers = msgspec.json.decode(payload, type=_Answers)
         except msgspec.MsgspecError:
-            return  # not an answer; whoever asked runs out of time and says so
+            return  # not a response; the caller times out and reports it
         question = answers.responses[0].question if answers.responses else ""
         if question in self._waiting:
             _settle(self._waiting[question], answers)

@@ -106,7 +106,7 @@ class FileCertificates:
                 x509.CertificateRevocationListBuilder()
                 .issuer_name(authority.subject)
                 .last_update(now)
-                .next_update(authority.not_valid_after_utc)  # one that had run out would shut everybody out
+                .next_update(authority.not_valid_after_utc)  # an expired list would reject every client
             )
             for entry in (entry for entries in ledger.values() for entry in entries if entry["revoked_at"]):
                 listed = listed.add_revoked_certificate(

@@ -14,7 +14,7 @@ _READY_S = 2.0
 
 
 class MqttCommandBus:
-    """``CommandBus`` over MQTT. Every instance hears all acks and hands on those that somebody here waits for."""
+    """``CommandBus`` over MQTT. Every instance receives all acks and uses those that a local call waits for."""
 
     def __init__(self, broker: Broker) -> None:
         self._connection = MqttConnection(
@@ -62,7 +62,7 @@ class MqttCommandBus:
         await self._connection.close()
 
     def _dispatch(self, message: MQTTMessage) -> None:
-        # By topic and id: an agent can only answer for its own devices, whatever id it writes into its ack.
+        # By topic and id: an agent can only acknowledge for its own devices, with any id in its ack.
         waiting = self._waiting.get(message.topic)
         if waiting is None:
             return

@@ -1,7 +1,7 @@
 """Passwords by argon2id.
 
 Its parameters are those of the OWASP Password Storage Cheat Sheet: 19 MiB, two passes, one lane. Each hash names its
-own: whoever signs in after these were raised has theirs made again.
+own. A sign-in after an increase of these creates a new hash.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ class Argon2Hashes:
 
     def __init__(self) -> None:
         self._made: PasswordHasher | None = None
-        self._nobodys = ""
+        self._dummy_hash = ""
         self._gate = asyncio.Semaphore(AT_ONCE)
 
     async def make(self, password: str) -> str:
@@ -35,11 +35,11 @@ class Argon2Hashes:
         """See ``PasswordHashes``."""
         from argon2.exceptions import InvalidHashError, VerificationError  # noqa: PLC0415 (only where it is in use)
 
-        if not self._nobodys:
-            self._nobodys = await self.make(secrets.token_urlsafe(32))
+        if not self._dummy_hash:
+            self._dummy_hash = await self.make(secrets.token_urlsafe(32))
         async with self._gate:
             try:
-                right = await asyncio.to_thread(self._hasher().verify, stored or self._nobodys, password)
+                right = await asyncio.to_thread(self._hasher().verify, stored or self._dummy_hash, password)
             except (VerificationError, InvalidHashError):
                 return False
         return right and bool(stored)

@@ -48,7 +48,7 @@ class FileKeys(RingKeys):
         self._changes_ms = 0
 
     def load(self) -> Ed25519PrivateKey:
-        """Read the keys, and make them when there are none. Sees to it that nobody else can.
+        """Read the keys, and make them when there are none. No other user of the machine can read them.
 
         Raises:
             StoreError: A file cannot be read or is not what it should be; the text names it.

@@ -43,7 +43,7 @@ def limit(cpu_s: int, wall_s: int, memory_mb: int) -> None:
         (resource.RLIMIT_NOFILE, 64),
     ):
         resource.setrlimit(kind, (most, most))
-    signal.alarm(wall_s)  # also where whoever started this is gone
+    signal.alarm(wall_s)  # also if the parent process has ended
 
 
 def confine(folder: str) -> None:
@@ -108,7 +108,7 @@ class Check:
         return spec.compile()
 
     def _do_without(self, spec: Any) -> None:
-        """Take out what needs files that are not there: they are told of; what else is wrong shall be told as well."""
+        """Remove elements whose files are missing. They are reported, and compilation finds further errors."""
         missing = set(self._task["missing"])
         if not missing:
             return
@@ -143,7 +143,7 @@ class Check:
             self.warnings.append(f"{file}: meshes are shown as boxes")
         for name in self._named(model, kinds.mjOBJ_ACTUATOR, model.nu):
             if name not in {*self._known(), *self._task["wheels"]}:
-                self.warnings.append(f"{file}: actuator '{name}' is not in robot.toml: nobody can move it")
+                self.warnings.append(f"{file}: actuator '{name}' is not in robot.toml, so it cannot be moved")
         if not scene.ncam:
             self.warnings.append(f"{self._task['scene']}: there is no camera")
 

@@ -36,7 +36,7 @@ RENEW_BEFORE_S = 30.0
 FROST_S = 3.0
 """So long without a turn of the loop, which has one each second at least, and the process was frozen."""
 DEAD_S = 1.5 * KEEP_ALIVE_S
-"""So long without a word from us, and the broker has let go of the connection (MQTT, 3.1.2.10)."""
+"""The broker closes the connection after this time without a packet (MQTT, 3.1.2.10)."""
 PROOF_TIMEOUT_S = 1.0
 """A connection that was frozen has this long to confirm a message."""
 MAX_FILTERS = 8
@@ -130,7 +130,7 @@ class MqttConnection:
         self._detect_freeze()
         generation = self.generation
         if self._unproven:
-            if qos == 0:  # which nobody confirms
+            if qos == 0:  # never confirmed
                 self._abandon(generation, "it was frozen")
             else:
                 try:
@@ -354,7 +354,7 @@ class MqttConnection:
         for waiting in (*self._waiting.values(), *self._subscribed.values()):
             if not waiting.done():
                 waiting.set_exception(BusUnavailable(f"the broker at {self._host}:{self._port} went away"))
-                waiting.exception()  # asked for here: whoever waits gets it too, nobody waiting is no fault
+                waiting.exception()  # retrieved here too: an exception without a waiting caller is no error
         self._waiting.clear()
         self._subscribed.clear()
         if client is not None:

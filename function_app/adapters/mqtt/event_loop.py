@@ -30,7 +30,7 @@ def prepare(client: mqtt.Client) -> None:
 
 
 def listen(client: mqtt.Client, *, every_s: float = 0.0) -> None:
-    """Read what comes, once it has connected.
+    """Read received packets, once connected.
 
     Args:
         client: It.
@@ -49,7 +49,7 @@ def listen(client: mqtt.Client, *, every_s: float = 0.0) -> None:
 
 
 class _Unhurried:
-    """Reads in rounds. To wake for each message would take the processor from those that somebody waits for.
+    """Reads periodically. Waking for each message would take processor time from commands and responses.
 
     Args:
         client: Connected.

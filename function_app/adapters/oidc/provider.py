@@ -96,7 +96,7 @@ class HttpOidcProvider:
         return self._subject(await self._verified(token), nonce)
 
     def _subject(self, claims: Mapping[str, Any], nonce: str) -> Subject:
-        """Whom a token is about that is seen to be the provider's."""
+        """The subject of a token whose signature is verified."""
         said = claims.get("nonce")
         if not isinstance(said, str) or not hmac.compare_digest(said.encode(), nonce.encode()):
             raise OidcError("the ID token is not of this sign-in: its nonce is another one")
@@ -112,7 +112,7 @@ class HttpOidcProvider:
             raise OidcError("the ID token is from the future; set this machine's clock")
         subject = claims["sub"]
         if not isinstance(subject, str) or not 0 < len(subject) <= _LONGEST_SUBJECT:
-            raise OidcError("the ID token names nobody (sub)")
+            raise OidcError("the ID token has no valid subject (sub)")
         return Subject(self._issuer, subject, _name(claims) or subject[:_LONGEST_NAME])
 
     async def _verified(self, token: str) -> dict[str, Any]:
@@ -140,7 +140,7 @@ class HttpOidcProvider:
         return claims
 
     async def _key(self, kid: object, algorithm: str) -> Any:
-        """The provider's key of this name. One that it has only just begun to use is fetched."""
+        """The provider's key with this id. An unknown id causes one fetch of the key set."""
         age_ms = self._clock.now_ms() - self._keys_ms
         found = self._among(kid, algorithm) if 0 <= age_ms < KEPT_MS else None
         if found is None and not 0 <= age_ms < AGAIN_MS:

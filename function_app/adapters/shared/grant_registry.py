@@ -1,7 +1,7 @@
 """Signed grants as passwords, where a cloud's broker asks us about each connection: what was issued, what taken back.
 
 The signature is in the password; in the tables is what was issued, so that it can be found to be cut, and what was
-taken back, which is looked at before anybody is let in.
+revoked, which is checked before a client is admitted.
 """
 
 import asyncio
@@ -78,7 +78,7 @@ class GrantRegistry:
             raise _said(error) from error
 
     async def signed(self, grant: Grant) -> str:
-        """A password that nobody has written down.
+        """A password that is not stored anywhere.
 
         Raises:
             StoreError: There is no key to be had.
@@ -105,7 +105,7 @@ class GrantRegistry:
         """The grant in a password that is good here and now, for this principal and client id.
 
         Raises:
-            StoreError: It is not known whether it was taken back: nobody is to be let in.
+            StoreError: The revocation state cannot be read; admit no client.
         """
         try:
             known = await self._keys.public(grants.signing_key_id(password))

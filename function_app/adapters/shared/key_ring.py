@@ -145,7 +145,7 @@ class Ring(Struct, frozen=True):
     def replaced(self, key: Ed25519PrivateKey, *, now_ms: int) -> "Ring":
         """With a new key instead of all that are still stored whole: they have leaked, and end at once.
 
-        Nothing tells devices of the new one: whoever has the old one could tell them of another just as well.
+        No statement announces the new key: a thief of the old key could sign such a statement too.
         """
         former = tuple(
             replace(each, leaked=each.leaked or bool(each.private), until_ms=_sooner(each.until_ms, now_ms))

@@ -4,8 +4,8 @@ Why a secret and no key of the vault's own: Azure's Key Vault has no Ed25519 amo
 P-521, RSA). Amazon's KMS has it since 2025, but signs at most 4,096 bytes, where an order with a script has 64 KB, and
 each order and token would wait for a call. The vault keeps the secret encrypted, says who may read it, and logs it.
 
-The functions only read. ``python -m function_app prepare`` makes the secret and ``rotate-keys`` changes it, by whoever
-deploys and with that person's rights; two of them at the same moment are told apart only as far as the vault can.
+The functions only read. ``python -m function_app prepare`` creates the secret and ``rotate-keys`` changes it, with the
+rights of the person who deploys. Two concurrent runs are detected only as far as the vault supports it.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ from function_app.ports.tables import StoreError
 LOOK_EVERY_MS = 60_000
 """How long a process goes on with what it has read: less than what devices are given to learn a key."""
 AGAIN_MS = 5_000
-"""A key that is not known has the vault asked again, but no more often: anybody can name one."""
+"""Minimum time between two reads for unknown keys: any client can send an unknown key id."""
 _log = logging.getLogger(__name__)
 
 
@@ -78,7 +78,7 @@ class VaultKeys(RingKeys):
 
     @abstractmethod
     async def _create(self, text: str) -> None:
-        """Make the secret; where somebody else has at the same moment, theirs may stay."""
+        """Create the secret. If another process creates it at the same time, either one may remain."""
 
     @abstractmethod
     async def _put(self, text: str) -> None:
@@ -110,7 +110,7 @@ class VaultKeys(RingKeys):
         before = await self._fetch()
         ring = change(self._parse(before))
         if await self._fetch() != before:
-            raise StoreError(f"{self._what} was changed by somebody else at this moment. Look at it, and try again.")
+            raise StoreError(f"{self._what} was changed by another process at the same time. Check it, and try again.")
         await self._put(ring.text)
         async with self._turn:
             self._read, self._read_ms = ring, self._now_ms()

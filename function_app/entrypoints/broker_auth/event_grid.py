@@ -2,7 +2,7 @@
 
 The namespace sends each CONNECT's client id, user name and password (base 64) with a token of its own identity. It is
 answered 200 with a decision, 401 where it is not the namespace that asks, 404 where another broker is in use. An error
-lets nobody in: the client is told that the server is unavailable.
+admits no client; the client receives "server unavailable".
 """
 
 import base64
@@ -41,7 +41,7 @@ async def admit(functions: Functions, authorization: str, body: bytes) -> tuple[
         body: As the namespace asks.
 
     Raises:
-        StoreError: It cannot be known; the namespace then lets nobody in.
+        StoreError: The state cannot be read; the namespace then admits no client.
     """
     access = functions.access
     if not isinstance(access, _Admits):

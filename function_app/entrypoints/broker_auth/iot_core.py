@@ -27,7 +27,7 @@ async def authorise(functions: Functions, event: Mapping[str, Any], function_arn
 
     Raises:
         ValueError: The functions use another broker.
-        StoreError: It cannot be known; IoT Core then lets nobody in.
+        StoreError: The state cannot be read; IoT Core then admits no client.
     """
     access = functions.access
     if not isinstance(access, _Admits):

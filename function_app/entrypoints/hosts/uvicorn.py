@@ -13,7 +13,7 @@ KEEP_ALIVE_S = 75
 
 
 class PortTaken(Exception):  # noqa: N818 (an answer for a terminal)
-    """Somebody listens there already."""
+    """Another program uses the address."""
 
 
 def serve(functions: Functions) -> None:

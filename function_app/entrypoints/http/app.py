@@ -45,7 +45,7 @@ from function_app.ports.tables import StoreError
 from function_app.services.identity.rate_limiter import RateLimiter
 
 _SECURE_FOR = b"max-age=31536000"
-"""A year: a browser that has once come by TLS comes no other way."""
+"""One year [s]: browsers that used TLS once use only TLS."""
 _log = logging.getLogger(__name__)
 _WRONG_METHOD = 405
 _TITLES = {404: "Nothing here", _WRONG_METHOD: "Not this method"}
@@ -124,7 +124,7 @@ def create_app(functions: Functions) -> FastAPI:
 
 
 def _by_name(url: str) -> bool:
-    """Whether browsers are to remember that this name speaks TLS; on ``localhost`` other programs have pages too."""
+    """Whether to send HSTS for this host. Not for ``localhost``, where other programs serve pages too."""
     parts = urlsplit(url)
     return parts.scheme == "https" and parts.hostname != "localhost"
 
@@ -170,7 +170,9 @@ async def _on_problem(_request: Request, error: Exception) -> Response:
 
 async def _on_store(_request: Request, error: Exception) -> Response:
     _log.error("%s", error)
-    return problem(store_unavailable("The tables cannot be used now; the log of this server says why."))
+    return problem(
+        store_unavailable("The tables are unavailable. The log of this server contains the reason. Try again later.")
+    )
 
 
 async def _on_validation(_request: Request, error: Exception) -> Response:
@@ -200,7 +202,7 @@ def _methods(request: Request) -> list[str]:
 
 
 class _Addresses:
-    """Counts what is asked from each address, before anything else is done for it."""
+    """Applies the rate limit per client address, before any other work."""
 
     def __init__(self, app: ASGIApp, *, limits: RateLimiter, proxies: int) -> None:
         self._app = app
@@ -221,7 +223,7 @@ class _Addresses:
 
 
 class _Headers:
-    """The headers of every answer, and an answer for what nobody has foreseen. Plain ASGI: it costs microseconds."""
+    """Adds headers to every response, and returns a 500 response for unhandled errors. Plain ASGI, for speed."""
 
     def __init__(self, app: ASGIApp, *, clock: Clock, websocket_url: str, secure: bool) -> None:
         self._app = app
@@ -246,12 +248,12 @@ class _Headers:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        begun = False
+        started = False
 
         async def sending(message: Message) -> None:
-            nonlocal begun
+            nonlocal started
             if message["type"] == "http.response.start":
-                begun = True
+                started = True
                 now = str(self._clock.now_ms()).encode()
                 message["headers"] = [*message["headers"], *self._fixed, (b"x-telescope-time-ms", now)]
             await send(message)
@@ -259,10 +261,10 @@ class _Headers:
         try:
             await self._app(scope, receive, sending)
         except ClientDisconnect:
-            return  # who left in the middle of a request waits for no answer
+            return  # the client disconnected during the request
         except Exception:
             _log.exception("%s %s", scope["method"], scope["path"])
-            if begun:
+            if started:
                 raise
-            detail = "Something went wrong here, and was written to the log. Try again."
+            detail = "The server failed and logged the error. Try again."
             await problem(Problem("internal", 500, "Internal error", detail))(scope, receive, sending)

@@ -1,4 +1,4 @@
-"""What an agent tells by another way than MQTT: seen to be its own, stored, and told to the broker's subscribers."""
+"""Messages that an agent sends without MQTT: checked, stored, and published to the broker's subscribers."""
 
 from collections.abc import Sequence
 
@@ -49,7 +49,7 @@ async def tell(
     passed = [
         (messages[place][0], *arrived)
         for place, arrived in taken.items()
-        if place not in refused and arrived.topic.kind != topics.LATE  # nobody looks at it as it comes
+        if place not in refused and arrived.topic.kind != topics.LATE  # late measurements have no live viewers
     ]
     await functions.relay.publish(passed)
     return [refused.get(place) for place in range(len(messages))]

@@ -28,7 +28,7 @@ async def ingest(functions: Functions, topic: str, payload: bytes) -> None:
 
 
 async def take_in(functions: Functions, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
-    """Store one message that came by whatever transport. Safe to repeat.
+    """Store one message of any transport. Safe to repeat.
 
     Raises:
         ProtocolError: It is not what its topic says.

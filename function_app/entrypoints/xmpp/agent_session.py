@@ -20,7 +20,7 @@ from function_app.services.telemetry.ingest import InboundMessage
 
 MOST_WAITING = 1000
 MOST_WAITING_BYTES = 4 * 1024 * 1024
-"""Messages of one agent that wait to be stored; what comes then is not confirmed, and told again."""
+"""Messages of one agent that wait for storage. Further messages are not acknowledged, so the agent resends them."""
 MOST_MEASURED = 100
 """Measurements that wait to be passed on: two seconds of one stream at 50 Hz. The oldest go."""
 AT_ONCE = 32
@@ -178,7 +178,7 @@ class AgentSession:
                         stanzas.receipt(self.jid, told.id) if why is None else stanzas.rejection(self.jid, told.id, why)
                     )
             return
-        # Not confirmed, and by this it will know: it greets somebody anew, and tells again what it must.
+        # Not acknowledged: the agent starts a new session and resends.
         self._line.send(stanzas.presence(to=self.jid, available=False))
 
     async def _stream(self) -> None:

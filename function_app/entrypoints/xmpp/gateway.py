@@ -1,7 +1,7 @@
 """Who speaks for the cloud over XMPP: knows who is there, and hands each stanza and order to whom it is about.
 
 An agent is served once it has greeted with its presence message; its newest greeting counts. What an agent tells it
-tells for itself: its name is that of its JID, which the server has seen to.
+publishes for itself: its name is that of its JID, which the XMPP server has verified.
 """
 
 import asyncio
@@ -68,7 +68,7 @@ class XmppGateway:
             if self._tasks:
                 await asyncio.wait(self._tasks, timeout=2.0)
 
-    # ------------------------------------------------------------ what comes
+    # ------------------------------------------------------------ received stanzas
 
     def message(self, stanza: Element) -> None:
         """See ``Listener``."""
@@ -92,7 +92,7 @@ class XmppGateway:
         elif served is not None and served.jid == jid:
             served.say(told)
         elif told.id:
-            # Whoever has not greeted is told as one whom nobody serves: by that it knows what to do.
+            # An agent without a session gets "unavailable", and then starts a session.
             self._line.send(stanzas.presence(to=jid, available=False))
 
     def presence(self, stanza: Element) -> None:
@@ -250,7 +250,7 @@ class XmppGateway:
                 self._dropped = 0
             try:
                 await self._functions.telemetry_ingest.ingest(batch)
-            except Exception as error:  # noqa: BLE001 (what comes next goes on)
+            except Exception as error:  # noqa: BLE001 (later messages are still processed)
                 _log.warning("%d measurements were not stored: %s", len(batch), error)
 
 
@@ -276,7 +276,7 @@ def _may_hear(agent: Agent, topic: str) -> bool:
 def _unfit(agent: Agent | None, told: Delivery) -> str | None:
     """Why an agent cannot be served."""
     if agent is None or not agent.claimed:
-        return "Nobody has claimed this agent."
+        return "This agent is not claimed. Claim it with its code first."
     if agent.transport != "xmpp":
         return f"This agent said at its enrolment that it speaks {agent.transport}. Enroll it for xmpp."
     if told.topic != topics.conn(agent.space or "", agent.id):

@@ -26,7 +26,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.LinkSignInRequest,
         responses={200: schemas.SignedIn},
         problems=(401, 403),
-        caller="nobody",
+        caller="anonymous",
     )
     async def sign_in(request: Request) -> Response:
         """Returns an access token for programs and sets a cookie for the console."""
@@ -41,7 +41,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.PasswordSignInRequest,
         responses={200: schemas.SignedIn},
         problems=(401, 403, 429),
-        caller="nobody",
+        caller="anonymous",
     )
     async def sign_in_by_password(request: Request) -> Response:
         """Like a one-time link. Failed attempts are counted per name and per client address."""
@@ -57,7 +57,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.AccountRequest,
         responses={201: schemas.SignedIn},
         problems=(403, 404, 409),
-        caller="nobody",
+        caller="anonymous",
     )
     async def create_account(request: Request) -> Response:
         """Creates the account, signs in and redeems the invitation.
@@ -68,7 +68,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         payload: schemas.AccountRequest = await read(request, schemas.AccountRequest)
         known = await functions.invitations.look(payload.invitation)
         if known.invitation.account:
-            raise forbidden("This invitation is for somebody who has an account. Sign in as the one it was made for.")
+            raise forbidden("This invitation is for an existing account. Sign in with that account to redeem it.")
         account = await functions.passwords.register(payload.name, payload.password)
         done = await functions.sessions.begin(account, "password", whence(request, settings))
         await functions.invitations.redeem(Identity(account.id, account.name, done.session), known)

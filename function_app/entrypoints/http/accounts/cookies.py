@@ -22,7 +22,7 @@ def clear_session(settings: Settings) -> str:
 
 
 def secure(settings: Settings) -> str:
-    """What a cookie says where the page is at ``https``."""
+    """The ``Secure`` attribute for cookies, if the console uses ``https``."""
     return "; Secure" if settings.public_url.startswith("https:") else ""
 
 
@@ -40,7 +40,7 @@ def signed_in(settings: Settings, done: SignedIn, status: int = 200) -> Response
 
 
 def whence(request: Request, settings: Settings) -> SignInOrigin:
-    """Whence somebody signs in."""
+    """Client address and user agent of a sign-in."""
     return SignInOrigin(client_address(request, settings.trusted_proxies), request.headers.get("user-agent", ""))
 
 

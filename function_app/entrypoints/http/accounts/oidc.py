@@ -30,7 +30,7 @@ def router(functions: Functions) -> Routes:
         "/auth/methods",
         summary="List sign-in methods",
         responses={200: schemas.SignInMethodsOut},
-        caller="nobody",
+        caller="anonymous",
     )
     async def sign_in_methods(_request: Request) -> Response:
         """For the sign-in page. A one-time link is always accepted."""
@@ -44,15 +44,15 @@ def router(functions: Functions) -> Routes:
         summary="Sign in with OpenID Connect",
         responses={303: None},
         problems=(404,),
-        caller="nobody",
+        caller="anonymous",
     )
     async def start_oidc_sign_in(_request: Request) -> Response:
         """Redirects the browser to the OpenID Connect provider (code flow with PKCE) and sets a cookie.
 
         The cookie is ``SameSite=Lax``, because the browser returns from another site. It is valid once.
         """
-        begun = await functions.oidc_sign_in.begin()
-        return _redirect(begun.address, _mark(settings, begun))
+        redirect = await functions.oidc_sign_in.begin()
+        return _redirect(redirect.address, _mark(settings, redirect))
 
     @routes.add(
         "POST",
@@ -61,7 +61,7 @@ def router(functions: Functions) -> Routes:
         body=schemas.OidcSignInRequest,
         responses={200: schemas.OidcSignInOut},
         problems=(403, 404),
-        caller="nobody",
+        caller="anonymous",
     )
     async def start_oidc_sign_in_with_invitation(request: Request) -> Response:
         """For an invited user without an account: the new account redeems the invitation.
@@ -71,9 +71,9 @@ def router(functions: Functions) -> Routes:
         """
         refuse_other_sites(request)
         payload: schemas.OidcSignInRequest = await read(request, schemas.OidcSignInRequest)
-        begun = await functions.oidc_sign_in.begin(payload.invitation)
-        headers = {"Set-Cookie": _mark(settings, begun), "Cache-Control": "no-store"}
-        return json_response(schemas.OidcSignInOut(url=begun.address), headers=headers)
+        redirect = await functions.oidc_sign_in.begin(payload.invitation)
+        headers = {"Set-Cookie": _mark(settings, redirect), "Cache-Control": "no-store"}
+        return json_response(schemas.OidcSignInOut(url=redirect.address), headers=headers)
 
     @routes.add(
         "GET",
@@ -81,7 +81,7 @@ def router(functions: Functions) -> Routes:
         summary="Finish the OpenID Connect sign-in",
         responses={303: None},
         problems=(404, 422),
-        caller="nobody",
+        caller="anonymous",
     )
     async def finish_oidc_sign_in(
         request: Request, state: Said = "", code: Said = "", iss: Said | None = None, error: Said = ""
@@ -97,15 +97,15 @@ def router(functions: Functions) -> Routes:
         except Problem as problem:
             if not problem.code.startswith("oidc-") or problem.code == "oidc-unknown":
                 raise
-            # The mark stays: another site may lead a browser here, and does not spoil what it has begun itself.
+            # The cookie stays: a request from another site must not end a sign-in that this browser started.
             return _redirect(f"{settings.public_url}{_FAILED}{problem.code}")
         return _redirect(f"{settings.public_url}/#/", set_session(settings, done))
 
     return routes
 
 
-def _mark(settings: Settings, begun: OidcRedirect) -> str:
-    mark = f"{COOKIE}={begun.secret}; Path={PREFIX}{_PATH}; Max-Age={BEGUN_S}; HttpOnly; SameSite=Lax"
+def _mark(settings: Settings, redirect: OidcRedirect) -> str:
+    mark = f"{COOKIE}={redirect.secret}; Path={PREFIX}{_PATH}; Max-Age={BEGUN_S}; HttpOnly; SameSite=Lax"
     return mark + secure(settings)
 
 

@@ -34,7 +34,7 @@ class PasswordRequest(Request, frozen=True, kw_only=True):
 
 
 class AccountRequest(Request, frozen=True, kw_only=True):
-    """An account to be made. ``name`` is what its owner signs in by, and others see."""
+    """A new account. ``name`` is the sign-in name, and visible to other accounts."""
 
     invitation: Annotated[str, Meta(min_length=1, max_length=200)]
     name: Annotated[str, Meta(pattern=r"^[^\s\x00-\x1f\x7f]([^\x00-\x1f\x7f]{0,58}[^\s\x00-\x1f\x7f])?$")]
@@ -53,14 +53,14 @@ class SignedIn(Response, frozen=True, kw_only=True):
 
 
 class OidcProviderOut(Response, frozen=True, kw_only=True):
-    """A provider to sign in at: its name, and the address that leads there."""
+    """An OpenID Connect provider: its name, and the URL that starts the sign-in."""
 
     name: str
     url: str
 
 
 class SignInMethodsOut(Response, frozen=True, kw_only=True):
-    """How one may sign in. ``oidc``: at an OpenID Connect provider, where there is one."""
+    """Available sign-in methods. ``oidc``: the OpenID Connect provider, if configured."""
 
     link: bool
     password: bool
@@ -68,13 +68,13 @@ class SignInMethodsOut(Response, frozen=True, kw_only=True):
 
 
 class OidcSignInRequest(Request, frozen=True, kw_only=True):
-    """The secret of an invitation, for who was invited and has no account yet."""
+    """The secret of an invitation, for a user without an account."""
 
     invitation: Annotated[str, Meta(min_length=1, max_length=200)]
 
 
 class OidcSignInOut(Response, frozen=True, kw_only=True):
-    """Where a browser goes on to sign in."""
+    """URL at which the browser continues the sign-in."""
 
     url: str
 
@@ -88,7 +88,7 @@ class AccessToken(Response, frozen=True, kw_only=True):
 
 
 class AccountOut(Response, frozen=True, kw_only=True):
-    """Who asks. ``csrf_token``: what a page shows with its cookie; ``null`` for who comes without one."""
+    """The signed-in account. ``csrf_token``: for requests with the cookie; ``null`` for a bearer token."""
 
     id: str
     name: str
@@ -97,7 +97,7 @@ class AccountOut(Response, frozen=True, kw_only=True):
 
 
 class SessionOut(Response, frozen=True, kw_only=True):
-    """A sign-in session. ``mine``: the one that asks."""
+    """A sign-in session. ``mine``: the session of this request."""
 
     id: str
     method: Literal["link", "password", "oidc"]
@@ -116,7 +116,7 @@ class SessionList(Response, frozen=True, kw_only=True):
 
 
 class SessionsEnded(Response, frozen=True, kw_only=True):
-    """How many were ended."""
+    """Number of ended sessions."""
 
     ended: int
 
@@ -128,7 +128,7 @@ class SpaceRequest(Request, frozen=True, kw_only=True):
 
 
 class SpaceOut(Response, frozen=True, kw_only=True):
-    """A space. ``role``: what the caller may do in it; agents can be claimed into one's own."""
+    """A space. ``role``: the caller's role. Only an owner can claim agents into it."""
 
     id: str
     name: str
@@ -147,7 +147,7 @@ Target = Annotated[str, Meta(pattern="^(space:)?[A-Za-z0-9_-]{1,64}$")]
 
 
 class ApiKeyRequest(Request, frozen=True, kw_only=True):
-    """A key to be made. ``only``: devices by id, spaces as ``space:<id>``; empty: all that the account may see."""
+    """A new key. ``only``: ids of devices, and ``space:<id>``; empty: everything that the account may see."""
 
     name: Annotated[str, Meta(min_length=1, max_length=60)]
     role: Literal["operator", "viewer"]
@@ -156,7 +156,7 @@ class ApiKeyRequest(Request, frozen=True, kw_only=True):
 
 
 class ApiKeyOut(Response, frozen=True, kw_only=True):
-    """A key without its secret. ``last_used_at`` is right to the hour."""
+    """A key without its secret. ``last_used_at`` has a resolution of one hour."""
 
     id: str
     name: str
@@ -169,7 +169,7 @@ class ApiKeyOut(Response, frozen=True, kw_only=True):
 
 
 class ApiKeyCreated(Response, frozen=True, kw_only=True):
-    """A new key; nobody is told ``token`` again."""
+    """A new key. ``token`` is returned only once."""
 
     api_key: ApiKeyOut
     token: str
@@ -183,7 +183,7 @@ class ApiKeyList(Response, frozen=True, kw_only=True):
 
 
 class AuditRecordOut(Response, frozen=True, kw_only=True):
-    """What somebody did, as it is recorded. ``hash`` covers it and the hash of the record before it.
+    """One audit record. ``hash`` covers it and the hash of the record before it.
 
     ``account``, ``session`` and ``key`` (an API key) identify the actor. All are empty if the cloud itself
     or an unknown caller acted.
@@ -203,7 +203,7 @@ class AuditRecordOut(Response, frozen=True, kw_only=True):
 
 
 class AuditList(Response, frozen=True, kw_only=True):
-    """Newest first. Where few of many records were asked for, a page may be short, or empty, and have a cursor."""
+    """Audit records, newest first. A filtered page may be short or empty and still have a cursor."""
 
     items: tuple[AuditRecordOut, ...]
     cursor: str | None

@@ -12,9 +12,9 @@ Why = Annotated[str, Meta(max_length=200)]
 
 
 class ControlRequestOut(Response, frozen=True, kw_only=True):
-    """Somebody asks for control. ``mine``: you ask; ``epoch``: of the lease that is asked for.
+    """A request for control. ``mine``: from the caller's session. ``epoch``: epoch of the requested lease.
 
-    ``ended``: the lease that it asked for has ended otherwise; look who has control now.
+    ``ended``: the requested lease ended in another way.
     """
 
     id: str
@@ -27,7 +27,7 @@ class ControlRequestOut(Response, frozen=True, kw_only=True):
 
 
 class LeaseOut(Response, frozen=True, kw_only=True):
-    """Who controls a device. ``reason``: why it was taken from somebody else; ``request``: the open one, if any."""
+    """The lease of a device. ``reason``: why control was taken over. ``request``: the open control request."""
 
     holder: str
     epoch: int
@@ -40,7 +40,7 @@ class LeaseOut(Response, frozen=True, kw_only=True):
 class LeaseRequest(Request, frozen=True, kw_only=True):
     """Without ``epoch``: take. With it: renew that epoch.
 
-    ``take_over``: take it even from somebody who holds it; only owners may, and say why in ``reason``.
+    ``take_over``: take control from its holder. Owners only; requires a ``reason``.
     """
 
     lease_ms: LeaseMs = 30_000
@@ -67,7 +67,7 @@ class LeaseStatus(Response, frozen=True, kw_only=True):
 
 
 class NewControlRequest(Request, frozen=True, kw_only=True):
-    """How long the holder has for an answer, and for how long control is wanted."""
+    """Time for the holder's response, and the requested duration of the lease [ms]."""
 
     within_ms: WithinMs = 30_000
     lease_ms: LeaseMs = 30_000
@@ -75,7 +75,7 @@ class NewControlRequest(Request, frozen=True, kw_only=True):
 
 
 class ControlRequestCreated(Response, frozen=True, kw_only=True):
-    """The caller's request. ``confirmed``: the device shows it to everybody who watches."""
+    """The caller's request. ``confirmed``: the device shows it to all viewers."""
 
     request: ControlRequestOut
     confirmed: bool
@@ -88,7 +88,7 @@ class AcceptControlRequest(Request, frozen=True, kw_only=True):
 
 
 class ControlRequestAccepted(Response, frozen=True, kw_only=True):
-    """The request, and the epoch that who asked has now. ``confirmed``: the device obeys it already."""
+    """The request, and the new epoch of the requester. ``confirmed``: the device has acknowledged it."""
 
     request: ControlRequestOut
     epoch: int
@@ -107,14 +107,14 @@ class ControlCredentialsRequest(Request, frozen=True, kw_only=True, tag_field="p
 
 
 class AgentCredentialsRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="agent"):
-    """To speak for an agent's own devices."""
+    """To publish for an agent's own devices."""
 
 
 MqttCredentialsRequest = ViewCredentialsRequest | ControlCredentialsRequest | AgentCredentialsRequest
 
 
 class TcpAddress(Response, frozen=True, kw_only=True):
-    """Where the broker takes MQTT. It wants certificates of agents that are newer than ``certificate_after_ms``."""
+    """Address of the broker for MQTT. It requires agent certificates issued after ``certificate_after_ms``."""
 
     host: str
     port: int
@@ -123,7 +123,7 @@ class TcpAddress(Response, frozen=True, kw_only=True):
 
 
 class MqttCredentialsOut(Response, frozen=True, kw_only=True):
-    """What to connect with, and the topics it is good for; for an agent also what is new of the cloud's keys."""
+    """Credentials, and the topics that they grant. For an agent also updates of the server's signing keys."""
 
     client_id: str
     username: str

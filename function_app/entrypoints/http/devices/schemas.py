@@ -9,7 +9,7 @@ from function_app.entrypoints.http.control.schemas import LeaseOut
 from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, Request, Response
 
 LABEL_PATTERN = r"^[^\x00-\x08\x0e-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x08\x0e-\x1f\x7f]*$"
-"""Something to read, and nothing that a terminal would obey."""
+"""Printable text without terminal control characters."""
 
 
 class DeviceOut(Response, frozen=True, kw_only=True):
@@ -39,13 +39,13 @@ class DeviceList(Response, frozen=True, kw_only=True):
 
 
 class RenameDeviceRequest(Request, frozen=True, kw_only=True):
-    """What a device is to be called, without the blanks around it; null: as its agent calls it."""
+    """The new label, without surrounding blanks; null: the label of the agent."""
 
     label: Annotated[str, Meta(min_length=1, max_length=80, pattern=LABEL_PATTERN)] | None
 
 
 class ViewerOut(Response, frozen=True, kw_only=True):
-    """Somebody who looks at a device. ``mine``: the caller's own account, in another sign-in."""
+    """A viewer of a device. ``mine``: the caller's own account, in another session."""
 
     name: str
     role: Literal["owner", "operator", "viewer"]
@@ -54,7 +54,7 @@ class ViewerOut(Response, frozen=True, kw_only=True):
 
 
 class ViewersOut(Response, frozen=True, kw_only=True):
-    """Who else looks at it now, the longest first. To be asked again within ``refresh_ms``."""
+    """Other current viewers, longest first. Repeat the request within ``refresh_ms``."""
 
     items: tuple[ViewerOut, ...]
     refresh_ms: int

@@ -1,7 +1,7 @@
-"""What an API key may ask for: this list, and nothing that is not on it. The API's description says the same of each.
+"""Operations that accept an API key. The OpenAPI document states it for each operation.
 
-A route that is new is for people until somebody thinks about it and adds it here. What is on the list looks its device
-up as anybody's request does, so role, shares and what the key is kept to hold there.
+A new operation rejects API keys until it is added here. Listed operations check role, shares and the key's device
+restriction like any other request.
 """
 
 from typing import Final
@@ -23,7 +23,7 @@ FOR_KEYS: Final = frozenset(
         "list_uploads",
         "get_upload",
         "mqtt_credentials",
-        # Control and actions. Not the reset of a Stop: that is for who has seen that everybody is clear.
+        # Control and actions. Not the reset of a Stop, which requires a person who has inspected the device.
         "get_lease",
         "take_lease",
         "release_lease",
@@ -40,7 +40,7 @@ FOR_KEYS: Final = frozenset(
         "stop_device",
         "stop_space",
         "stop_all",
-        # What can be asked of a robot; not anybody's scripts or models.
+        # What a robot can do. Not scripts or models.
         "list_robot_types",
         "get_robot_type",
         "list_movements",

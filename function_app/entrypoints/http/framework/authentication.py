@@ -51,9 +51,8 @@ class RequestAuthenticator:
     async def page(self, request: Request) -> tuple[Identity, str]:
         """The account that asks by a page's cookie, and the session's CSRF token.
 
-        A cookie travels with every request that a browser makes, whoever wrote the page: what changes something must
-        carry the token as well, which is in the cookie where no script can read it, and is told to our own page alone
-        (``accounts/me``: no other site's page is allowed to read that).
+        Browsers also send the cookie with requests that pages of other sites make. A changing request must therefore
+        carry the CSRF token. Only this site's page can read the token (``accounts/me``).
 
         Raises:
             Problem: ``unauthorized``; ``csrf-token``.
@@ -82,7 +81,7 @@ class RequestAuthenticator:
         return agent
 
     async def enrolling(self, request: Request, public_key: str) -> str:
-        """The id of an agent that may be new, once its token is seen to be signed by ``public_key``.
+        """The id of an agent that may be new, once its token is verified with ``public_key``.
 
         Raises:
             Problem: ``unauthorized``.
@@ -91,9 +90,9 @@ class RequestAuthenticator:
 
 
 def refuse_other_sites(request: Request) -> None:
-    """Refuse what another site's page has a browser send: nobody is signed in as somebody else behind their back.
+    """Reject requests from pages of other sites, so that they cannot sign a user in to another account.
 
-    Browsers say whose page asks (``Sec-Fetch-Site``), and programs say nothing.
+    Browsers send the origin of the page (``Sec-Fetch-Site``); programs do not.
 
     Raises:
         Problem: ``forbidden``.
@@ -103,7 +102,7 @@ def refuse_other_sites(request: Request) -> None:
 
 
 def is_stop(request: Request) -> bool:
-    """Whether somebody wants to stop something: nobody is asked to wait with that."""
+    """Whether the request orders a Stop. Rate limits do not apply to it."""
     return request.method == "POST" and _STOP.fullmatch(request.url.path) is not None
 
 

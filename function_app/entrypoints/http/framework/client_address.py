@@ -14,7 +14,7 @@ def client_address(request: Request, proxies: int) -> str:
     Args:
         request: Whose.
         proxies: How many proxies of one's own stand in front. Each adds to ``X-Forwarded-For`` whom it was asked by, so
-            the client is the one that the first of them added; what stands left of that anybody may have written.
+            the client is the one that the first of them added; what stands left of that is written by the client.
             A host that tells no address of the connection is a proxy itself.
     """
     peer = request.client.host if request.client is not None else ""

@@ -1,4 +1,4 @@
-"""Routes with their documentation: what is written here is what the OpenAPI document says."""
+"""Registration of routes with their OpenAPI documentation."""
 
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal
@@ -6,37 +6,37 @@ from typing import Annotated, Any, Literal
 import msgspec
 from fastapi import APIRouter, Query, Response
 
-from function_app.entrypoints.http.framework import schemas as contract
+from function_app.entrypoints.http.framework import schemas as common
 from function_app.entrypoints.http.framework.api_key_scopes import FOR_KEYS
 from function_app.entrypoints.http.framework.responses import JSON, PROBLEM_JSON
 
 Handler = Callable[..., Awaitable[Response]]
-Caller = Literal["nobody", "account", "page", "agent", "account or agent"]
+Caller = Literal["anonymous", "account", "page", "agent", "account or agent"]
 
 PREFIX = "/api/v1"
 VERSION = "0.1.0"
-Cursor = Annotated[str | None, Query(max_length=2000, description="Where the page before ended.")]
-Limit = Annotated[int, Query(ge=1, le=1000, description="At most so many in a page.")]
+Cursor = Annotated[str | None, Query(max_length=2000, description="Cursor of the previous page.")]
+Limit = Annotated[int, Query(ge=1, le=1000, description="Maximum number of items in a page.")]
 
 REF = "#/components/schemas/{name}"
 ACCOUNT_SCHEMES = ("accessToken", "sessionCookie")
 KEY_SCHEME = "apiKey"
 AGENT_SCHEME = "agentToken"
 _MEANINGS = {
-    200: "Done",
-    201: "Made",
-    202: "Under way",
-    204: "Done, nothing to say",
-    303: "Go on there, by GET",
-    207: "Partly refused; each item says how it went",
+    200: "OK",
+    201: "Created",
+    202: "Accepted; still in progress",
+    204: "Done; no content",
+    303: "Redirect with GET",
+    207: "Partly rejected; each item has its status",
     401: "Not signed in",
     403: "Not allowed",
-    404: "There is none",
-    409: "Not in this state",
+    404: "Not found",
+    409: "Conflict with the current state",
     413: "The body is too large",
-    422: "The request is not valid",
-    429: "Too many requests or tries; see Retry-After",
-    503: "The store or the broker cannot be used; see Retry-After",
+    422: "Invalid request",
+    429: "Too many requests or attempts; see Retry-After",
+    503: "The store or the broker is unavailable; see Retry-After",
 }
 
 
@@ -45,8 +45,8 @@ class Routes:
 
     def __init__(self, tag: str) -> None:
         self.router = APIRouter(prefix=PREFIX, tags=[tag])
-        self.kinds: list[Any] = [contract.Problem]
-        """Every struct that its routes have named."""
+        self.kinds: list[Any] = [common.Problem]
+        """All schemas of the routes."""
 
     def add(
         self,
@@ -67,17 +67,17 @@ class Routes:
             path: Below the API's prefix.
             summary: One line.
             responses: Status → struct of the body (``None``: no body; text: the media type of a file).
-            problems: Statuses of refusals beside 401, 413, 422, 429 and 503, which follow from the rest.
+            problems: Error statuses in addition to 401, 413, 422, 429 and 503, which follow from the other arguments.
             body: Struct of the request's body.
-            body_required: Whether it may be left out.
-            caller: Who may ask; ``page``: an account by its cookie alone. An API key stands for an account where the
+            body_required: Whether the body is required.
+            caller: Accepted authentication. ``page``: an account's cookie only. An API key acts for an account if the
                 handler's name is in ``FOR_KEYS``.
         """
         refusals = {*problems, 429, 503}
-        if caller != "nobody":
+        if caller != "anonymous":
             refusals.add(401)
-        if caller not in {"nobody", "agent"}:
-            refusals.add(403)  # for want of a role or of the page's token, or since an API key may not
+        if caller not in {"anonymous", "agent"}:
+            refusals.add(403)  # a missing role or CSRF token, or an operation that rejects API keys
         if body is not None:
             refusals |= {413, 422}
         documented: dict[int | str, dict[str, Any]] = {}
@@ -90,7 +90,7 @@ class Routes:
         for status in sorted(refusals):
             documented[status] = {
                 "description": _MEANINGS[status],
-                "content": {PROBLEM_JSON: {"schema": _reference(contract.Problem)}},
+                "content": {PROBLEM_JSON: {"schema": _reference(common.Problem)}},
             }
         extra: dict[str, Any] = {}
         if body is not None:
@@ -121,7 +121,7 @@ class Routes:
 
 
 def schemas(kinds: Iterable[Any]) -> dict[str, Any]:
-    """JSON Schemas of structs and of all that they hold."""
+    """JSON Schemas of structs and of their fields."""
     _, components = msgspec.json.schema_components(list(dict.fromkeys(kinds)), ref_template=REF)
     return components
 
@@ -133,7 +133,7 @@ def _reference(kind: Any) -> dict[str, Any]:
 
 
 def takes_keys(route: object) -> bool:
-    """Whether what is asked for by this route may be asked for with an API key: as its description says."""
+    """Whether the operation of this route accepts an API key."""
     extra = getattr(route, "openapi_extra", None) or {}
     return {KEY_SCHEME: []} in extra.get("security", [])
 

@@ -13,7 +13,7 @@ def router(functions: Functions) -> Routes:
     """The routes."""
     routes = Routes("health")
 
-    @routes.add("GET", "/health", summary="Check the server", responses={200: schemas.HealthOut}, caller="nobody")
+    @routes.add("GET", "/health", summary="Check the server", responses={200: schemas.HealthOut}, caller="anonymous")
     async def health(_request: Request) -> Response:
         """503 if the tables cannot be used. An unreachable broker is reported and recovers by itself."""
         found = await functions.health.check()

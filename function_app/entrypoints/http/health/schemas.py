@@ -49,7 +49,7 @@ class DiagnosticFieldOut(Response, frozen=True, kw_only=True):
     ``baseline`` is what is usual; values are usually from ``usual_low`` to ``usual_high``, null until that is known.
     ``slope_per_s`` is the trend of the last ten minutes; ``limit_in_s`` the time until it meets a limit, null: it
     does not. ``findings``: what is wrong now, of ``level``, ``trend``, ``change``, ``outlier``. ``advice``: what to do
-    then, by the robot type or the room; empty where nobody has listed the field.
+    then, by the robot type or the room; empty for unlisted fields.
     """
 
     stream: str

@@ -31,13 +31,13 @@ class AgentMessage(Request, frozen=True, kw_only=True):
 
 
 class MessagesRequest(Request, frozen=True, kw_only=True):
-    """Messages in the order in which they were said."""
+    """Messages in the order in which they were created."""
 
     messages: Annotated[tuple[AgentMessage, ...], Meta(min_length=1, max_length=500)]
 
 
 class MessageResult(Response, frozen=True, kw_only=True):
-    """``stored``, or why not: telling it again changes nothing."""
+    """``stored``, or ``rejected`` with a reason. Sending a rejected message again changes nothing."""
 
     status: Literal["stored", "rejected"]
     detail: str | None = None
@@ -55,7 +55,7 @@ XmppCredentialsRequest = ViewCredentialsRequest | AgentCredentialsRequest
 class XmppCredentialsOut(Response, frozen=True, kw_only=True):
     """Where to connect, as whom, and with whom to speak.
 
-    ``cloud`` is the bare JID of whoever speaks for the cloud.
+    ``cloud`` is the bare JID of the XMPP gateway.
     """
 
     jid: str
@@ -72,21 +72,21 @@ class XmppCredentialsOut(Response, frozen=True, kw_only=True):
 
 
 class XmppVerifyRequest(Request, frozen=True, kw_only=True):
-    """What somebody gave at a login."""
+    """User and password of a login attempt."""
 
     user: Annotated[str, Meta(min_length=1, max_length=64)]
     password: Annotated[str, Meta(min_length=1, max_length=4096)]
 
 
 class XmppContactOut(Response, frozen=True, kw_only=True):
-    """Somebody whom the user knows, and is known to."""
+    """A contact of the user, in both directions."""
 
     user: str
     name: str
 
 
 class XmppIdentityOut(Response, frozen=True, kw_only=True):
-    """Who it is, how long the connection may last, and whom they know."""
+    """The user, the maximum duration of the connection [s], and the contacts."""
 
     user: str
     name: str

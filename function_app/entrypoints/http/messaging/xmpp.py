@@ -63,7 +63,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.XmppVerifyRequest,
         responses={200: schemas.XmppIdentityOut},
         problems=(401, 409),
-        caller="nobody",
+        caller="anonymous",
     )
     async def xmpp_verify(request: Request) -> Response:
         """Called by the XMPP server. A caller without a valid password learns nothing."""

@@ -78,5 +78,5 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
 
 def _owner(account: str) -> Identity:
-    """In whose library it is looked. That the caller may is seen to before."""
+    """The account whose library is used. The caller has checked the access."""
     return Identity(account, "", "")

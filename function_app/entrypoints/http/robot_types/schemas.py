@@ -67,7 +67,7 @@ class RobotTypeList(Response, frozen=True, kw_only=True):
 class RobotTypeRequest(Request, frozen=True, kw_only=True):
     """``manifest`` is the text of a ``robot.toml``; ``files`` name → text of an ``.xml``, base64 of others.
 
-    Waits at most ``wait_ms`` for the verdict.
+    Waits at most ``wait_ms`` for the validation.
     """
 
     manifest: Annotated[str, Meta(min_length=1, max_length=MAX_MANIFEST)]
@@ -92,7 +92,7 @@ MAX_SCRIPTS = 20
 
 
 class RobotTypePreviewRequest(Request, frozen=True, kw_only=True):
-    """As to add a robot type. ``movements``: name → script; they are looked at, and not stored."""
+    """An upload to preview. ``movements``: name → script; they are checked, not stored."""
 
     manifest: Annotated[str, Meta(min_length=1, max_length=MAX_MANIFEST)]
     files: Annotated[dict[str, str], Meta(min_length=1, max_length=MAX_FILES)]
@@ -101,9 +101,9 @@ class RobotTypePreviewRequest(Request, frozen=True, kw_only=True):
 
 
 class RobotTypePreviewOut(Response, frozen=True, kw_only=True):
-    """An upload that is looked at before it is saved; nobody else sees it, and it goes by itself.
+    """A validated upload that is not saved yet. Only its account sees it, and it expires.
 
-    ``robot_type`` is as it would be; its ``upload`` says whether it is good.
+    ``robot_type`` is the result of saving it; its ``upload`` contains the validation result.
     """
 
     id: str
@@ -112,7 +112,7 @@ class RobotTypePreviewOut(Response, frozen=True, kw_only=True):
 
 
 class SaveRobotTypePreviewRequest(Request, frozen=True, kw_only=True):
-    """Waits at most ``wait_ms`` for the verdict."""
+    """Waits at most ``wait_ms`` for the validation."""
 
     wait_ms: WaitMs = 10_000
 
@@ -131,7 +131,7 @@ class SignatureOut(Response, frozen=True, kw_only=True):
 
 
 class MovementOut(Response, frozen=True, kw_only=True):
-    """One version of a movement. Without a ``parameters_schema`` a script takes whatever it is given."""
+    """One version of a movement. Without a ``parameters_schema`` a script accepts any parameters."""
 
     name: str
     description: str

@@ -12,7 +12,7 @@ ForS = Annotated[int, Meta(ge=10, le=10 * 366 * 86_400, description="How long it
 
 
 class ShareRequest(Request, frozen=True, kw_only=True):
-    """With which account (its name), as what, and for how long. Asked again, it is changed."""
+    """Account name, role and duration. A repeated request changes the share."""
 
     account: Name
     role: SharedRole
@@ -20,7 +20,7 @@ class ShareRequest(Request, frozen=True, kw_only=True):
 
 
 class ShareOut(Response, frozen=True, kw_only=True):
-    """One account's part. ``created_by``: who shared it."""
+    """One account's share. ``created_by``: name of the sharing account."""
 
     account: AccountRef
     role: SharedRole
@@ -48,9 +48,9 @@ Uses = Annotated[int, Meta(ge=1, le=50, description="How many accounts may redee
 
 
 class InvitationRequest(Request, frozen=True, kw_only=True):
-    """As what, and for how long, whoever brings the secret gets a part.
+    """Role and duration of the share that an account gets with the secret.
 
-    ``account``: who alone may redeem it, by name; null: whoever has the secret.
+    ``account``: name of the only account that may redeem it; null: any account with the secret.
     """
 
     role: SharedRole
@@ -61,7 +61,7 @@ class InvitationRequest(Request, frozen=True, kw_only=True):
 
 
 class TransferRequest(Request, frozen=True, kw_only=True):
-    """Until when it can be accepted, and by whom alone (an account's name); null: whoever has the secret."""
+    """Validity of the offer, and the only account that may accept it; null: any account with the secret."""
 
     expires_in_s: LinkS = 86_400
     account: Name | None = None
@@ -70,7 +70,7 @@ class TransferRequest(Request, frozen=True, kw_only=True):
 class InvitationOut(Response, frozen=True, kw_only=True):
     """An open invitation. ``role`` ``owner``: a transfer. ``share_s``: how long the part will last; null: no end.
 
-    ``account``: who alone may redeem it, in lists, which are the owner's; null: whoever has the secret.
+    ``account``: the only account that may redeem it, visible to the owner; null: any account with the secret.
     """
 
     id: str
@@ -86,7 +86,7 @@ class InvitationOut(Response, frozen=True, kw_only=True):
 
 
 class InvitationCreated(InvitationOut, frozen=True, kw_only=True):
-    """With its secret, which is told this once, and a link to the console that carries it."""
+    """An invitation with its secret, which is returned only once, and a console link that contains it."""
 
     secret: str
     link: str

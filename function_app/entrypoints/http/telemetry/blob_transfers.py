@@ -12,7 +12,7 @@ from function_app.ports.blobs import TransferRefused, Transfers
 
 PATH = "/blobs"
 _SHOWN = frozenset({"image/jpeg", "image/png", "image/webp"})
-"""What a browser may take for what it says it is: it comes from our own address, and anybody may have uploaded it."""
+"""Content types that a browser may display. All others are untrusted uploads from the server's own origin."""
 
 
 def router(transfers: Transfers | None) -> APIRouter:

@@ -56,7 +56,7 @@ class DataOut(Response, frozen=True, kw_only=True):
 
 
 class EventOut(Response, frozen=True, kw_only=True):
-    """A fact that happened. ``at`` is the clock of whoever tells it, ``received_at`` the cloud's."""
+    """An event. ``at`` is the time on its publisher's clock, ``received_at`` on the server's."""
 
     id: str
     kind: str
@@ -116,7 +116,7 @@ class LatencyBin(Response, frozen=True, kw_only=True):
 class LatencyOut(Response, frozen=True, kw_only=True):
     """One transport and path. Percentiles are within 1 % of the exact ones; null without samples in the span.
 
-    ``at_ms`` and ``ms`` are the newest samples as they came, of whatever span, at most 1,000, in time's order.
+    ``at_ms`` and ``ms`` are the newest raw samples, at most 1,000, oldest first. They may lie outside the span.
     """
 
     transport: Transport
@@ -184,7 +184,7 @@ class UploadStarted(Response, frozen=True, kw_only=True):
 
 
 class UploadOut(Response, frozen=True, kw_only=True):
-    """A registered capture. ``verified``: its content was seen to have the hash that was announced."""
+    """A completed capture. ``verified``: its content has the announced hash."""
 
     id: str
     stream: str
