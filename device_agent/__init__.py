@@ -1,1 +1,1 @@
-"""The program on a robot or a room PC: one identity, one broker connection, any number of devices."""
+"""The Telescope agent: the program on a robot or a room PC, with one identity and one broker connection."""

@@ -1,4 +1,4 @@
-"""Puts an agent together: the one place that picks drivers; ``links`` picks the transport."""
+"""Composition root: builds the agent from its configuration. The only place that selects drivers."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
@@ -36,13 +36,13 @@ from device_agent.sandbox.host import SandboxHost
 from device_agent.speech import Espeak
 from device_agent.transports import factory
 from device_agent.transports.http.client import CloudClient
-from device_agent.transports.http.latency_reports import HttpLatencies
+from device_agent.transports.http.latency_reports import LatencyReports
 from device_agent.transports.http.uploads import HttpUploads
 from device_agent.transports.pairing_monitor import PairingMonitor
 
 
 class RunningAgent:
-    """A running agent and what must be closed with it."""
+    """An agent and the resources to close with it."""
 
     def __init__(self, agent: Agent, journal: Journal, monitor: PairingMonitor, sandbox: Sandbox) -> None:
         self._agent = agent
@@ -52,33 +52,33 @@ class RunningAgent:
 
     @property
     def outdated(self) -> bool:
-        """Whether the agent was un-paired, or moved: whose it is is to be asked, and all of it built again."""
+        """Whether the agent was unpaired or moved to another space, and must be built again."""
         return self._monitor.outdated.is_set()
 
     def start(self) -> None:
-        """Start devices and link.
+        """Start sandbox, devices and link.
 
         Raises:
-            DriverError: A device is not there.
-            TransportError: The transport's configuration is unusable.
+            DriverError: A device is missing.
+            TransportError: The configuration of the transport is unusable.
         """
         self._sandbox.start()
         self._agent.start()
 
     def stop(self) -> None:
-        """Hold, say goodbye, close. May be called twice."""
+        """Hold, disconnect and close. Callable repeatedly."""
         self._agent.stop()
         self._sandbox.close()
         self._journal.close()
 
 
 def check_robot_type(folder: Path) -> None:
-    """Load all of a robot type in a folder, and connect its driver, a simulated one, for a moment.
+    """Load a robot type and connect its simulated driver once.
 
     Raises:
         ConfigError: The manifest is wrong.
-        GeometryError: The model cannot be used, or the home position has no room.
-        DriverError: The driver refuses it.
+        GeometryError: The model cannot be used, or the home position collides.
+        DriverError: The driver rejects the robot type.
     """
     kind = TYPES.load_from(folder)
     geometry.load(kind, folder)
@@ -88,12 +88,12 @@ def check_robot_type(folder: Path) -> None:
 
 
 def _folder(kind: RobotType) -> Path:
-    """Where its files are. What a room's manifest describes has none."""
+    """Folder of a robot type; types derived from a room's manifest have none."""
     return TYPES.folders().get(kind.type, ROBOTS / kind.type)
 
 
 def load_geometry(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
-    """The shape of a configured device in the scene or room that it stands in.
+    """Geometry of a device in its scene or room.
 
     Raises:
         GeometryError: The model cannot be used.
@@ -113,16 +113,16 @@ def load_geometry(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
 def create_driver(
     entry: DeviceEntry, kind: RobotType, *, trace: Path | None = None, faults: Path | None = None
 ) -> Driver:
-    """The driver of a configured device, not connected.
+    """Create the driver of a device, not connected.
 
     Args:
         entry: The device.
         kind: Its robot type.
-        trace: A folder for what really happened, where it is simulated.
-        faults: A folder for faults to put into simulated robots, ``{device}.toml`` each.
+        trace: Folder for the ground truth of simulated devices.
+        faults: Folder of injected faults of simulated robots, ``{device}.toml`` each.
 
     Raises:
-        DriverError: Unknown, or an option is.
+        DriverError: The driver or an option is unknown.
     """
     options: dict[str, object] = dict(entry.options)
     name = entry.driver or kind.driver
@@ -144,16 +144,16 @@ def create_room_device(
     *,
     faults: Path | None = None,
 ) -> RoomDevice | None:
-    """A configured device as a room's, not connected; ``None`` where it is a robot.
+    """Create a room device, not connected; ``None`` for a robot.
 
     Args:
-        entry: The device; its options stand before those of the room's manifest.
-        neighbours: The agent's room drivers by name, filled while they are made.
-        uploads: Where its captures go, if anywhere.
-        faults: A folder for faults to put into simulated devices, ``{device}.toml`` each.
+        entry: The device; its options override those of the room's manifest.
+        neighbours: The agent's room drivers by name, completed while they are created.
+        uploads: Destination of captures.
+        faults: Folder of injected faults of simulated devices, ``{device}.toml`` each.
 
     Raises:
-        ConfigError: The room is unknown, or its driver or an option.
+        ConfigError: The room, the driver or an option is unknown.
     """
     device = room_device_of(entry)
     if device is None:
@@ -184,10 +184,10 @@ def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundin
 def cloud_client(
     store: IdentityStore, configuration: AgentConfig, clock: CloudClock, *, create: bool = False
 ) -> CloudClient:
-    """The agent's view of the HTTP API.
+    """HTTP API client of the agent.
 
     Raises:
-        ConfigError: There is no identity.
+        ConfigError: The agent has no private key.
     """
     return CloudClient(
         configuration.server, store.private_key(create=create), clock, ca=store.certificate_authority(configuration.ca)
@@ -195,16 +195,16 @@ def cloud_client(
 
 
 def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
-    """An agent from its folder, ready to start.
+    """Build an agent, ready to start.
 
     Args:
-        store: Enrolled and claimed.
-        trace: A folder into which simulated devices write what really happened, ``{device}.ndjson`` each.
+        store: An enrolled and claimed agent.
+        trace: Folder for the ground truth of simulated devices, ``{device}.ndjson`` each.
 
     Raises:
-        ConfigError: Not enrolled, not claimed, or a file is wrong.
+        ConfigError: The agent is not enrolled or claimed, or a file is wrong.
         JournalError: The journal cannot be used.
-        DriverError: An unknown driver or option.
+        DriverError: A driver or option is unknown.
     """
     configuration = AgentConfig.load(store.folder)
     pairing = store.pairing()
@@ -235,9 +235,9 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
         now_ms=clock.now_ms,
         listen=room.topics(),
     )
-    latencies = HttpLatencies(pairing.agent, _carrier(configuration), wiring.open_api)
+    latencies = LatencyReports(pairing.agent, _carrier(configuration), wiring.open_api)
     transport = LatencyProbe(
-        factory.make(wiring), upload=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms())
+        factory.make(wiring), upload=latencies.send, at_ms=lambda: round(clock.now_ms() or wall_ms())
     )
     outbox = _outbox(store, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     sandbox = SandboxHost(allow_unconfined=configuration.allow_unconfined_scripts)
@@ -269,13 +269,13 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
 
 
 def _carrier(configuration: AgentConfig) -> str:
-    """What carries messages, as the cloud tells it apart."""
+    """Name of the transport in latency reports."""
     plain = configuration.transport == "http" and configuration.http.poll == "plain"
     return "http-poll" if plain else configuration.transport
 
 
 def _own_streams(configuration: AgentConfig) -> Iterator[tuple[str, str]]:
-    """Device and stream of all that the agent's own room devices measure: its scripts need not name them."""
+    """Streams of the agent's own room devices, which scripts may read without configuration."""
     for entry in configuration.devices:
         device = room_device_of(entry)
         for stream in () if device is None else device.streams:
@@ -307,7 +307,7 @@ def _outbox(
         store.outbox, own=own, max_bytes=round(buffer.max_mb * 1e6), max_age_ms=round(buffer.max_age_h * 3_600_000)
     )
     teller = own + configuration.devices[0].name
-    # Over the others a message is confirmed once it is stored.
+    # The other transports acknowledge a message once it is stored.
     settle_s = buffer.settle_s if configuration.transport == "mqtt" else 0.0
     return Outbox(
         shelf, publish=publish, device_topic=teller, is_quiet=quiet, keep_hz=buffer.measurements_hz, settle_s=settle_s

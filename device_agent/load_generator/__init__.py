@@ -1,1 +1,1 @@
-"""A fleet in one process, to try a server with: thousands of agents on the wire, none of them with physics."""
+"""Load generator: thousands of simulated agents without physics in one process."""

@@ -1,4 +1,4 @@
-"""Whose the agents of a swarm become: an account that redeems their claim codes, as a person does on the page."""
+"""The account that claims the simulated agents by their claim codes."""
 
 import threading
 import time
@@ -16,7 +16,7 @@ _UNAUTHORIZED, _BUSY, _SERVER_ERROR = 401, 429, 500
 
 
 class Account:
-    """Asks the HTTP API in the name of an account. Thread-safe: one question at a time.
+    """Client of the HTTP API for an account. Thread-safe; one request at a time.
 
     Args:
         server: Base address.
@@ -38,7 +38,7 @@ class Account:
         """Redeem a claim code.
 
         Raises:
-            LoadTestError: Refused, or nobody is signed in.
+            LoadTestError: The server rejects the claim, or there is no session.
             OSError: Not reached.
         """
         with self._lock:
@@ -46,7 +46,7 @@ class Account:
             self._ask("/agents/claim", {"code": code})
 
     def close(self) -> None:
-        """Sign out, where this has signed in."""
+        """Sign out, if this object has signed in."""
         with self._lock:
             if self._csrf:
                 self._post("/auth/sign-out", {})
@@ -57,7 +57,7 @@ class Account:
             return
         if not self._link:
             raise LoadTestError(
-                "its agents have to be claimed by somebody: give --sign-in with a link from `make link`, "
+                "an account must claim the agents: provide --sign-in with a link from `make link`, "
                 "or an access token in TELESCOPE_TOKEN"
             )
         link, self._link = self._link, ""
@@ -65,7 +65,7 @@ class Account:
         self._token, self._csrf = str(given["access_token"]), str(given["csrf_token"])
 
     def _ask(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
-        """The answer; where there are too many questions it is asked again when it may be."""
+        """The response; retries after a 429 response."""
         for _ in range(_TRIES):
             answer = self._post(path, body)
             if answer.status_code == _UNAUTHORIZED and self._csrf and path != "/auth/token":
@@ -77,10 +77,10 @@ class Account:
         try:
             found = answer.json()
         except ValueError as error:
-            raise LoadTestError(f"{self._base}{path} answered without JSON: is it a Telescope server?") from error
+            raise LoadTestError(f"{self._base}{path} responded without JSON: is it a Telescope server?") from error
         if not answer.ok or not isinstance(found, dict):
             detail = found.get("detail") if isinstance(found, dict) else None
-            raise LoadTestError(f"the server refuses {path}: {detail or answer.reason}")
+            raise LoadTestError(f"the server rejects {path}: {detail or answer.reason}")
         return found
 
     def _post(self, path: str, body: dict[str, Any]) -> requests.Response:

@@ -1,4 +1,4 @@
-"""One agent of a swarm: gets credentials, connects, stays, and comes back, as an agent on its own does."""
+"""One simulated agent: requests credentials, connects, and reconnects like a real agent."""
 
 import asyncio
 import time
@@ -69,11 +69,11 @@ class LoadAgent:
 
     @property
     def up(self) -> bool:
-        """Whether it is connected."""
+        """Whether the agent is connected."""
         return self._link is not None and self._link.up and not self._link.gone
 
     def tick(self, now_s: float) -> None:
-        """Measure and tell, where there is a link."""
+        """Publish telemetry if there is a link."""
         if self.up:
             self._robot.tick(now_s)
 
@@ -83,11 +83,11 @@ class LoadAgent:
             self._link.look()
 
     def stop(self) -> None:
-        """Have ``run`` say goodbye and return."""
+        """Make ``run`` disconnect and return."""
         self._stopping.set()
 
     async def run(self, after_s: float) -> None:
-        """Connect after so long, and stay connected until ``stop``."""
+        """Connect after a delay [s], and stay connected until ``stop``."""
         await self._pause(after_s)
         back_off = BackOff()
         while not self._stopping.is_set():
@@ -102,7 +102,7 @@ class LoadAgent:
 
     async def _connect_once(self) -> None:
         access = await asyncio.get_running_loop().run_in_executor(self._pool, self._access)
-        # The wall clock: it rises across runs too, and there is no journal to count in.
+        # The wall clock rises across runs; there is no journal to count sessions.
         self._session = max(self._session + 1, wall_ms())
         will = (topics.conn(self._pairing.space, self._pairing.agent), self._presence(online=False))
         link = Link(access, self._dialect, will=will, figures=self._figures, receive=self._receive)
@@ -131,7 +131,7 @@ class LoadAgent:
 
     def _access(self) -> BrokerAccess:
         given = responses.read(self._api.credentials(), responses.MqttCredentials)
-        if not self._plan.may_speak_to(given.tcp.host):
+        if not self._plan.may_connect_to(given.tcp.host):
             raise ValueError(
                 f"the server's broker is at {given.tcp.host}, which was not named; say --broker {given.tcp.host}"
             )

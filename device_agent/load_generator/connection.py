@@ -1,4 +1,4 @@
-"""One agent's connection to the broker, without a thread: paho does MQTT, the swarm's event loop does the waiting."""
+"""One agent's broker connection without a thread: paho handles MQTT, the shared event loop handles the socket."""
 
 import asyncio
 import contextlib
@@ -14,24 +14,24 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from device_agent.load_generator.metrics import Metrics
 from device_agent.transports.mqtt.transport import KEEP_ALIVE_S, BrokerAccess
 
-ANSWER_WITHIN_S = 10.0
-"""Longer than an agent on its own waits: many ask at once, and from one process."""
+CONNECT_TIMEOUT_S = 10.0
+"""Connection timeout [s]; longer than that of a real agent, since many agents connect at once."""
 _GOODBYE_S = 2.0
 
 
 class Dialect:
-    """The version of MQTT that the swarm speaks: 5, until a broker shows that it does not."""
+    """MQTT version of all agents: 5, or 3.1.1 once a broker has rejected version 5."""
 
     def __init__(self) -> None:
         self.version = MQTTProtocolVersion.MQTTv5
 
     def fall_back(self) -> None:
-        """Speak 3.1.1 from now on."""
+        """Use MQTT 3.1.1 from now on."""
         self.version = MQTTProtocolVersion.MQTTv311
 
 
-class OlderDialect(Exception):  # noqa: N818 (an answer, not a fault)
-    """The broker is there and speaks an older MQTT: the next connection does too."""
+class OlderDialect(Exception):  # noqa: N818 (a result, not an error)
+    """The broker supports only MQTT 3.1.1; the next connection uses it."""
 
 
 class Link:
@@ -77,14 +77,14 @@ class Link:
             OlderDialect: It is to be tried again at once.
         """
         access = self._access
-        # Resolving a name and a TLS handshake block: a thread of the pool does that, and nothing after it.
+        # Name resolution and TLS handshake block, so they run in a thread of the pool.
         await self._loop.run_in_executor(pool, self._client.connect, access.host, access.port, KEEP_ALIVE_S)
         self._socket = self._client.socket()
         if self._socket is None:
             raise OSError("the broker closed the connection at once")
         self._loop.add_reader(self._socket, self._read)
         self._flush()
-        await asyncio.wait({self._subscribed, self._gone}, timeout=ANSWER_WITHIN_S, return_when="FIRST_COMPLETED")
+        await asyncio.wait({self._subscribed, self._gone}, timeout=CONNECT_TIMEOUT_S, return_when="FIRST_COMPLETED")
         if self._older:
             raise OlderDialect
         if self._gone.done():
@@ -95,16 +95,16 @@ class Link:
         self.up = True
 
     async def stay(self, within_s: float) -> None:
-        """Return when the link has gone, or after so long."""
+        """Wait until the link is lost, at most this time [s]."""
         await asyncio.wait({self._gone}, timeout=within_s)
 
     @property
     def gone(self) -> bool:
-        """Whether it has ended by itself."""
+        """Whether the connection was lost."""
         return bool(self._gone.done())
 
     def publish(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> None:
-        """Send, as ``Transport.publish`` does."""
+        """Send a message; see ``Transport.publish``."""
         counts = self._figures.counts
         if not self.up or self._gone.done():
             counts.dropped += 1
@@ -120,12 +120,12 @@ class Link:
             self._sent[sent.mid] = time.monotonic()
 
     def look(self) -> None:
-        """Keep the connection alive; to be called about once a second."""
+        """Keep the connection alive; call about once per second."""
         if self.up and not self._gone.done():
             self._client.loop_misc()
 
     async def close(self, last: tuple[str, bytes] | None = None) -> None:
-        """End it, with last words."""
+        """Publish the offline presence and disconnect."""
         if self.up and not self._gone.done():
             if last is not None:
                 self.publish(last[0], last[1], qos=1, retain=True)
@@ -152,7 +152,7 @@ class Link:
             client.tls_set_context(access.tls)
         client.will_set(will[0], will[1], qos=1, retain=True)
         client.max_inflight_messages_set(100)
-        client.connect_timeout = ANSWER_WITHIN_S
+        client.connect_timeout = CONNECT_TIMEOUT_S
         client.on_socket_open = _no_delay
         client.on_socket_close = lambda *_: self._let_go()
         client.on_socket_register_write = lambda *_: self._to_flush()
@@ -165,12 +165,12 @@ class Link:
 
     def _read(self) -> None:
         self._client.loop_read()
-        pending = getattr(self._socket, "pending", None)  # TLS keeps what it has decrypted to itself
+        pending = getattr(self._socket, "pending", None)  # data that TLS has decrypted already
         while pending is not None and self._socket is not None and pending() > 0:
             self._client.loop_read()
 
     def _to_flush(self) -> None:
-        """Something is to be written: all of it at once, when what runs now has run."""
+        """Schedule one write for all pending data."""
         if self._socket is not None and not self._flushing:
             self._flushing = True
             self._loop.call_soon(self._flush)
@@ -232,6 +232,6 @@ class Link:
 
 
 def _no_delay(_client: mqtt.Client, _userdata: object, opened: Any) -> None:
-    """As ``transports.mqtt`` does: without this a small message can wait 40 ms."""
+    """Disable Nagle's algorithm: otherwise a small message may wait 40 ms."""
     with contextlib.suppress(OSError, AttributeError):
         opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

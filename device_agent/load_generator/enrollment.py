@@ -1,4 +1,4 @@
-"""Makes a swarm's agents known to the cloud: each with a key of its own, enrolled, and claimed by code."""
+"""Registers the simulated agents: each has its own key, is enrolled, and is claimed by code."""
 
 import base64
 import time
@@ -28,13 +28,13 @@ FILE = "keys.json"
 
 
 class Keys:
-    """The private keys of all agents of all runs, in one file that is nobody else's to read."""
+    """The private keys of all agents of all runs, in one file that only the user can read."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / FILE
 
     def first(self, count: int) -> list[Ed25519PrivateKey]:
-        """So many: those on file, and new ones that are put there.
+        """The requested number of keys: saved ones, and new ones, which are saved.
 
         Raises:
             LoadTestError: The file is not one of these.
@@ -60,11 +60,11 @@ class Keys:
                 for text in msgspec.json.decode(self._path.read_bytes(), type=list[str])
             ]
         except ValueError as error:
-            raise LoadTestError(f"{self._path} is no file of a swarm's keys; name another --home") from error
+            raise LoadTestError(f"{self._path} is not a key file of the load generator; use another --home") from error
 
 
 class Enrollment:
-    """Enrols and claims. Blocks: for the threads of a pool.
+    """Enrolls and claims agents. Blocks; runs in a thread pool.
 
     Args:
         plan: The run.
@@ -79,14 +79,14 @@ class Enrollment:
         self._account = Account(plan.cloud, sign_in=plan.sign_in, token=plan.token, ca=plan.ca)
 
     def api(self, key: Ed25519PrivateKey) -> CloudClient:
-        """One agent's view of the HTTP API."""
+        """HTTP API client of one agent."""
         return CloudClient(self._plan.cloud, key, self._clock, ca=self._plan.ca)
 
     def all(self, keys: list[Ed25519PrivateKey], pool: Executor, tell: Callable[[str], None]) -> list[Pairing]:
-        """Every agent, known and claimed.
+        """Pairings of all agents.
 
         Raises:
-            LoadTestError: Nobody claims them, or the server refuses that.
+            LoadTestError: There is no account, or the server rejects the claims.
             CloudError: The server refuses one.
             OSError: Not reached.
         """
@@ -107,18 +107,18 @@ class Enrollment:
     def _one(self, number: int, key: Ed25519PrivateKey) -> Pairing:
         api = self.api(key)
         device = {"name": DEVICE, "kind": self._kind.kind, "robot_type": self._kind.type, "label": f"Arm {number}"}
-        claim = _patiently(
+        claim = _with_retry(
             lambda: api.enroll(
-                name=f"swarm-{number:05d}", software=pairing_monitor.SOFTWARE, transport="mqtt", devices=[device]
+                name=f"load-{number:05d}", software=pairing_monitor.SOFTWARE, transport="mqtt", devices=[device]
             )
         )
         if claim.code is not None:
             self._account.claim(claim.code)
-        return pairing_monitor.pairing_of(responses.read(_patiently(api.enrollment), responses.Claimed))
+        return pairing_monitor.pairing_of(responses.read(_with_retry(api.enrollment), responses.Claimed))
 
 
-def _patiently(call: Callable[[], T]) -> T:
-    """Ask again while the server has too much to do.
+def _with_retry(call: Callable[[], T]) -> T:
+    """Retry while the server is overloaded.
 
     Raises:
         CloudError: It refuses, or still has.

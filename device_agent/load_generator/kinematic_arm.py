@@ -1,4 +1,4 @@
-"""An arm that is only figures: its joints turn at their speed to where they are asked, and stop at once."""
+"""A kinematic arm without dynamics: joints move at constant speed and stop at once."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ SPEED_RAD_S = 1.5
 
 
 def robot_type(name: str, joints: int, rate_hz: float) -> RobotType:
-    """The type of every arm of a swarm: so many joints, all alike."""
+    """Robot type of all simulated arms, with equal joints."""
     names = [f"joint_{number}" for number in range(1, joints + 1)]
     return RobotType(
         type=name,
@@ -23,7 +23,7 @@ def robot_type(name: str, joints: int, rate_hz: float) -> RobotType:
         description="Only figures: no mass, no shape.",
         model="",
         scene="",
-        driver="swarm",
+        driver="load-generator",
         period_ms=20,
         joints=tuple(
             Joint(
@@ -48,7 +48,7 @@ def robot_type(name: str, joints: int, rate_hz: float) -> RobotType:
 
 
 class Shape:
-    """What all arms of a swarm have in common.
+    """Properties that all simulated arms share.
 
     Attributes:
         kind: Their type.
@@ -63,7 +63,7 @@ class Shape:
 
 
 class Arm:
-    """One arm. Time is given to it; it has none of its own.
+    """One arm. Callers provide the time.
 
     Attributes:
         position_rad: Where it is, shape (n,).
@@ -84,21 +84,21 @@ class Arm:
 
     @property
     def arrived(self) -> bool:
-        """Whether it is where it was asked to be."""
+        """Whether the arm has reached its target."""
         return self.position_rad == self.target_rad
 
     def go(self, target_rad: Sequence[float], *, speed: float, until_s: float = math.inf) -> None:
-        """Turn towards here, shape (n,), with this share of the joints' speed, and no longer than until then [s]."""
+        """Move towards a target, shape (n,) [rad], with a share of the joint speed, until a time at most [s]."""
         self.target_rad = list(target_rad)
         self._speed = speed
         self._until_s = until_s
 
     def hold(self) -> None:
-        """Stay here."""
+        """Stop at once."""
         self.target_rad = list(self.position_rad)
 
     def advance(self, now_s: float) -> None:
-        """Be where the joints are by now."""
+        """Advance the joints to the current time."""
         moving_s = max(0.0, min(now_s, self._until_s) - self._at_s)
         passed_s = now_s - self._at_s
         self._at_s = now_s

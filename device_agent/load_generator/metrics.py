@@ -1,4 +1,4 @@
-"""What a swarm counts, and how it is told: a line now and then, and one object at the end."""
+"""Counters of a load test, printed regularly and as one object at the end."""
 
 import math
 import time
@@ -13,7 +13,7 @@ _MOST_SAMPLES = 200_000
 
 
 class Counts(Struct):
-    """What is counted from the beginning on.
+    """Counters since the start.
 
     Attributes:
         out: Messages handed to the broker; ``out_bytes``: their topics and payloads; ``heard``, ``heard_bytes``: come.
@@ -37,7 +37,7 @@ class Counts(Struct):
 
 
 class Metrics:
-    """All that is known of a run. Used by the event loop alone, but for ``trouble``.
+    """All metrics of a run. Only the event loop uses them, except for ``trouble``.
 
     Attributes:
         counts: So far.
@@ -61,16 +61,16 @@ class Metrics:
         self._steady: tuple[float, float, Counts] | None = None
 
     def up(self) -> None:
-        """A link has come."""
+        """Count an established link."""
         self.connected += 1
         self.most_connected = max(self.most_connected, self.connected)
 
     def trouble(self, text: str) -> None:
-        """Something went wrong with a link."""
+        """Count a link error."""
         self.troubles[text[:200]] += 1
 
     def steady(self) -> None:
-        """All are there that will be: what is told at the end as rates is counted from here."""
+        """Start the steady phase: final rates are counted from here."""
         self.lag_ms.clear()
         self.confirm_ms.clear()
         self._all_lag_ms.clear()
@@ -78,7 +78,7 @@ class Metrics:
         self._steady = (time.monotonic(), time.process_time(), _copy(self.counts))
 
     def line(self, memory_bytes: float) -> str:
-        """What has happened since the last line."""
+        """One line with changes since the previous one."""
         now_s = time.monotonic()
         passed_s = max(now_s - self._line_s, 1e-9)
         now, before = self.counts, self._before
@@ -98,7 +98,7 @@ class Metrics:
         return text
 
     def summary(self, memory_bytes: float) -> dict[str, Any]:
-        """All of it, for programs; rates are those since ``steady``."""
+        """All metrics, for programs; rates are since ``steady``."""
         self._gather()
         since_s, cpu_s, before = self._steady or (self._began_s, 0.0, Counts())
         passed_s = max(time.monotonic() - since_s, 1e-9)
@@ -129,7 +129,7 @@ class Metrics:
 
 
 def percentile(values: Sequence[float], percent: float) -> float | None:
-    """The smallest value that so many percent do not exceed; ``None`` where there is none."""
+    """The smallest value that the given percentage does not exceed, or ``None``."""
     if not values:
         return None
     return sorted(values)[max(0, math.ceil(percent / 100 * len(values)) - 1)]

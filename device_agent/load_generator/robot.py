@@ -1,4 +1,4 @@
-"""One robot of a swarm: the wire contract as an agent keeps it, over an arm that is only figures.
+"""One simulated robot: the wire contract of an agent, on a kinematic arm.
 
 Rights, Stop, one action at a time and positions' ranges are decided by the agent's own code (``runtime.authority``,
 ``lease``, ``envelope``, ``pins``). What is missing, and why nothing of this may ever move metal: no control loop, no
@@ -51,12 +51,12 @@ from device_agent.runtime.errors import Refused
 
 WATCHDOG_S = 0.3
 MAX_LOOP_AGE_S = 0.2
-"""Both as the agent's own, ``runtime.stream``; a test holds them to it."""
+"""Equal to those of ``runtime.control.setpoint_stream``; a test checks this."""
 STATE_EVERY_S = 30.0
 STATE_GAP_S = 1.0
 _FUTURE_MS = 2000
 _REMEMBERED = 64
-"""Commands whose answers are kept."""
+"""Number of commands whose acknowledgements are stored."""
 
 Say = Callable[..., None]
 """``say(topic, payload, qos=…, retain=…)``."""
@@ -64,14 +64,14 @@ Say = Callable[..., None]
 
 @dataclass(slots=True)
 class _Run:
-    """The action that runs."""
+    """The running action."""
 
     command: str
     tenure: Reservation
 
 
 class SwarmRobot:
-    """One device behind one agent. Not thread-safe: all of it runs in the swarm's event loop.
+    """One device of one agent. Not thread-safe: it runs in the event loop.
 
     Args:
         address: Space and agent.
@@ -114,10 +114,10 @@ class SwarmRobot:
         self._state_s = -STATE_EVERY_S
         self._shown: tuple[object, ...] = ()
 
-    # ------------------------------------------------------------ what it says
+    # ------------------------------------------------------------ outgoing
 
     def introduce(self, now_s: float) -> None:
-        """The link has come: say what it is and how."""
+        """Publish description and state, because the link is up."""
         kind = self._shape.kind
         self._retain(
             topics.DESC,
@@ -134,18 +134,18 @@ class SwarmRobot:
                 max_loop_age_ms=round(MAX_LOOP_AGE_S * 1000),
                 simulated=True,
                 limits=("position", "velocity"),
-                scripts_note="A robot of a swarm runs no scripts.",
+                scripts_note="Simulated robots of a load test run no scripts.",
             ),
         )
         self._show(now_s, at_once=True)
 
     def lost(self) -> None:
-        """The link is gone: what moves is held, and has to be taken again."""
+        """Hold and end the lease, because the link is lost."""
         if self._run is not None or not self._arm.arrived:
             self._authority.end(Refused("link_lost", "the device lost its link"))
 
     def tick(self, now_s: float) -> None:
-        """Be where it is by now, and tell it."""
+        """Advance the arm and publish telemetry."""
         self._catch_up(now_s)
         run = self._run
         if run is not None and self._arm.arrived:
@@ -172,7 +172,7 @@ class SwarmRobot:
         self._show(now_s)
 
     def _show(self, now_s: float, *, at_once: bool = False) -> None:
-        """Publish ``state``: on change at most once a second, and every 30 s."""
+        """Publish ``state`` on change, at most once per second, and every 30 s."""
         lease = self._authority.lease(now_s)
         asked = self._handover.current(lease, now_s)
         run = self._run.command if self._run is not None else ""
@@ -232,10 +232,10 @@ class SwarmRobot:
             self._answers.popitem(last=False)
         self._say(topics.device(*self._address, topics.ACK), payload, qos=1)
 
-    # ------------------------------------------------------------ what it hears
+    # ------------------------------------------------------------ incoming
 
     def receive(self, topic: str, payload: bytes, now_s: float) -> None:
-        """Take in one message; never raises."""
+        """Process one message; never raises."""
         self._catch_up(now_s)
         try:
             parsed = topics.parse(topic)
@@ -356,7 +356,7 @@ class SwarmRobot:
         if run is not None:
             self._ack(run.command, AckStatus.FAILED, reason=Reason(code=why.code, message=why.message))
 
-    # ------------------------------------------------------------ how it is
+    # ------------------------------------------------------------ condition
 
     def _positions(self) -> dict[str, float]:
         names = (joint.name for joint in self._shape.kind.joints)

@@ -1,4 +1,4 @@
-"""One run of a swarm, from the keys to the figures."""
+"""One load test, from enrollment to results."""
 
 import asyncio
 import resource
@@ -20,20 +20,20 @@ from device_agent.load_generator.options import LoadOptions, LoadTestError
 from device_agent.ports.clock import CloudClock
 
 _THREADS = 8
-"""For calls that block: HTTP, and the first steps of a connection."""
+"""Threads for blocking calls: HTTP and connection setup."""
 _SPARE_FILES = 64
 _AT_ONCE = 32
-"""So many robots measure before what has arrived is read."""
+"""Number of robots that publish before received data is read."""
 _LAG_EVERY_S = 0.05
 _LOOK_EVERY_S = 1.0
 _END_WITHIN_S = 10.0
 
 
 def run(plan: LoadOptions) -> int:
-    """Run the swarm to its end; the exit code: 0 when every agent was connected at once.
+    """Run the load test. Returns the exit code: 0 if all agents were connected at the same time.
 
     Raises:
-        LoadTestError: It cannot begin.
+        LoadTestError: The load test cannot start.
         CloudError: The server refuses an agent.
         OSError: The server is not reached, or a file cannot be written.
     """
@@ -42,7 +42,7 @@ def run(plan: LoadOptions) -> int:
     clock = CloudClock()
     kind = robot_type(plan.type, plan.joints, plan.rate_hz)
     register = Enrollment(plan, kind, clock)
-    with ThreadPoolExecutor(_THREADS, "swarm") as pool:
+    with ThreadPoolExecutor(_THREADS, "load-test") as pool:
         keys = Keys(plan.home).first(plan.count)
         pairings = register.all(keys, pool, _tell)
         figures = Metrics(plan.count)
@@ -64,7 +64,7 @@ def run(plan: LoadOptions) -> int:
 
 
 class _Crowd:
-    """All members at once."""
+    """All agents of one run."""
 
     def __init__(self, plan: LoadOptions, members: Sequence[LoadAgent], figures: Metrics, before_bytes: int) -> None:
         self._plan = plan
@@ -74,7 +74,7 @@ class _Crowd:
         self._ending = asyncio.Event()
 
     async def live(self) -> None:
-        """Connect, measure, and end by itself."""
+        """Connect, publish telemetry, and stop after the duration."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, self._ending.set)
@@ -109,7 +109,7 @@ class _Crowd:
             return
 
     async def _beat(self) -> None:
-        """Have each robot measure at its rate, one after another: evenly over each period.
+        """Publish the telemetry of all robots, evenly distributed over each period.
 
         Who comes more than a period late has missed it; what was missed is not made up for.
         """
@@ -136,7 +136,7 @@ class _Crowd:
                 await asyncio.sleep(0)
 
     async def _look(self) -> None:
-        """Keep all links alive."""
+        """Keep all connections alive."""
         while True:
             for first in range(0, len(self._members), _AT_ONCE):
                 for member in self._members[first : first + _AT_ONCE]:
@@ -144,7 +144,7 @@ class _Crowd:
                 await asyncio.sleep(_LOOK_EVERY_S * _AT_ONCE / max(len(self._members), _AT_ONCE))
 
     async def _lag(self) -> None:
-        """How late this loop comes to what is due."""
+        """Measure the delay of the event loop."""
         while True:
             began_s = time.monotonic()
             await asyncio.sleep(_LAG_EVERY_S)
@@ -168,10 +168,10 @@ def _write(plan: LoadOptions, found: dict[str, Any]) -> None:
 
 
 def _allow_files(wanted: int) -> None:
-    """See that so many sockets may be open.
+    """Raise the limit of open files for the required sockets.
 
     Raises:
-        LoadTestError: The system does not let them.
+        LoadTestError: The system limit is too low.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft >= wanted:
@@ -182,7 +182,7 @@ def _allow_files(wanted: int) -> None:
 
 
 def _memory_bytes() -> int:
-    """What this process has in memory now; where the system does not say, the most it has had."""
+    """Current memory of the process [bytes], or its maximum if the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except OSError:

@@ -1,1 +1,1 @@
-"""What the agent's runtime asks of the outside: drivers, transports, clocks."""
+"""Ports: interfaces of drivers, sensors, transports and services."""

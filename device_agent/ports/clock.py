@@ -1,10 +1,10 @@
-"""The agent's clocks: its own monotonic one, which decides, and an estimate of the cloud's, for ``ttl_ms``."""
+"""The agent's clocks: the monotonic clock for decisions, and an estimate of the cloud's clock for ``ttl_ms``."""
 
 import threading
 import time
 
 _DRIFT = 50e-6
-"""Assumed most by which two clocks drift apart, 50 ppm: an old estimate's error grows by it."""
+"""Assumed maximum drift between two clocks, 50 ppm; the error bound of an estimate grows by it."""
 
 
 def tick_ms() -> int:
@@ -13,15 +13,15 @@ def tick_ms() -> int:
 
 
 def wall_ms() -> int:
-    """The agent's wall clock [ms since 1970, UTC]; to show and to store, never to decide."""
+    """The agent's wall clock [ms since 1970, UTC]; for display and storage only."""
     return time.time_ns() // 1_000_000
 
 
 class CloudClock:
-    """The cloud's wall clock, as seen from the agent's monotonic clock. Thread-safe.
+    """The cloud's wall clock, estimated on the agent's monotonic clock. Thread-safe.
 
-    Each HTTP answer carries the server's time; half the round trip bounds the error, and the estimate with the
-    smallest bound wins. The agent's own wall clock is never asked, so setting it changes nothing.
+    Each HTTP response contains the server's time. Half the round trip bounds the error, and the estimate with the
+    smallest bound is used. Changes of the agent's own wall clock have no effect.
     """
 
     def __init__(self) -> None:
@@ -31,7 +31,7 @@ class CloudClock:
         self._measured_ms = 0
 
     def observe(self, *, server_ms: int, sent_tick_ms: float, received_tick_ms: float) -> None:
-        """Take in one exchange: request sent, answer received [own ticks], and the server's time in it."""
+        """Update the estimate with one exchange: times of request and response [own ticks], and the server's time."""
         error = max(0.5, (received_tick_ms - sent_tick_ms) / 2)
         offset = server_ms - (sent_tick_ms + received_tick_ms) / 2
         with self._lock:

@@ -1,4 +1,4 @@
-"""What a driver does for one device. This page is the implementer's manual."""
+"""Port: driver of one device. The implementer's manual."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ from device_agent.protocol import Pose, Twin
 
 
 class DriverError(Exception):
-    """The hardware or simulation cannot do what was asked. Its text is fit for an operator."""
+    """The hardware or simulation cannot execute the request. The message is shown to operators."""
 
 
 class Twist(NamedTuple):
-    """How a base moves over the floor, seen from itself."""
+    """Velocity of a base in its own frame."""
 
     forward_m_s: float = 0.0
     left_m_s: float = 0.0
@@ -21,7 +21,7 @@ class Twist(NamedTuple):
 
 
 REST = Twist()
-"""Not at all."""
+"""No motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +29,9 @@ class Observation:
     """All joints of a device at one moment, in the order of the robot type's ``joints``.
 
     Attributes:
-        position_rad: Measured, shape (n,) [rad].
-        velocity_rad_s: Measured, shape (n,) [rad/s].
-        effort_nm: Torque at the joint, shape (n,) [N m].
+        position_rad: Measured positions, shape (n,) [rad].
+        velocity_rad_s: Measured velocities, shape (n,) [rad/s].
+        effort_nm: Joint torques, shape (n,) [N m].
         frames: Pose of each of the type's ``frames`` in the robot's base frame.
     """
 
@@ -42,70 +42,70 @@ class Observation:
 
 
 class Driver(Protocol):
-    """Makes one kind of robot do what the agent asks.
+    """Executes the agent's requests on one kind of robot.
 
-    One thread calls it, the device's control loop, once per ``period_ms``: ``observe`` then ``send`` (see also
-    ``RunsInline``). Neither blocks longer than a fraction of the period. The constructor touches neither disk, network nor
+    One thread, the control loop, calls ``observe`` and ``send`` once per ``period_ms`` (see also ``RunsInline``).
+    Neither blocks for longer than a fraction of the period. The constructor accesses neither disk, network nor
     hardware.
     """
 
     @property
     def simulated(self) -> bool:
-        """Whether no real metal moves. Known before ``connect``."""
+        """Whether the device is simulated. Known before ``connect``."""
 
     def connect(self) -> None:
-        """Open the hardware or build the simulation; afterwards the device holds still where it is.
+        """Open the hardware or build the simulation; afterwards the device holds its position.
 
         Raises:
-            DriverError: It is not there, or does not answer; the text says what to check.
+            DriverError: The device is missing or does not respond; the message names what to check.
         """
 
     def twin(self) -> Twin | None:
-        """The drawing for live views, or ``None`` where the driver knows none. Called once, after ``connect``."""
+        """Model for live views, or ``None``. Called once, after ``connect``."""
 
     def observe(self) -> Observation:
         """The newest measurement.
 
         Raises:
-            DriverError: The device no longer answers. The agent then holds and raises a fault.
+            DriverError: The device does not respond. The agent then holds and raises a fault.
         """
 
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
-        """Command joint positions for the next period, shape (n,) [rad], already limited by the agent.
+        """Command joint positions for the next period, shape (n,) [rad], limited by the agent.
 
         Returns:
-            What was really applied, after the driver's own clamping, shape (n,) [rad].
+            The positions that were applied, after limits of the driver, shape (n,) [rad].
 
         Raises:
             DriverError: As for ``observe``.
         """
 
     def close(self) -> None:
-        """Let go. May be called twice, and without ``connect``."""
+        """Release the device. Callable repeatedly, and without ``connect``."""
 
 
 @runtime_checkable
 class RunsInline(Driver, Protocol):
-    """A driver whose ``observe``, ``send`` and ``drive`` only look into memory, as of a simulation beside it.
+    """A driver whose ``observe``, ``send`` and ``drive`` only access memory, such as a simulation in the same process.
 
-    They return within microseconds, and different threads may call them, one at a time: a Stop is then carried out by
-    the thread that brings it, and while the device rests a setpoint too. Another driver waits for its control loop.
+    They return within microseconds, and different threads may call them one at a time. The thread that receives a Stop
+    then applies it at once, and applies setpoints while the device rests. Other drivers wait for the control loop.
     """
 
     @property
     def prompt(self) -> bool:
-        """Whether that is so."""
+        """Whether this applies to the instance."""
 
 
 @runtime_checkable
 class MobileDriver(Driver, Protocol):
-    """A driver whose robot drives or walks: its robot type has a ``base``."""
+    """A driver of a mobile robot; its robot type has a ``base``."""
 
     def drive(self, twist: Twist) -> Twist:
-        """Command how the base moves for the next period, already limited by the agent. Called after each ``send``.
+        """Command the velocity of the base for the next period, limited by the agent. Called after each ``send``.
 
         Returns:
-            What was really applied, after the driver's own clamping.
+            The velocity that was applied, after limits of the driver.
 
         Raises:
             DriverError: As for ``observe``.
@@ -114,41 +114,41 @@ class MobileDriver(Driver, Protocol):
 
 @runtime_checkable
 class ReportsStreams(Protocol):
-    """A driver that measures more than joints: what its robot type's ``streams`` name besides ``joints``."""
+    """A driver that measures the robot type's ``streams`` besides ``joints``."""
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
-        """The newest values of one stream, by quantity with its unit, a dot and the part where there are several.
+        """The newest values of one stream, by quantity with unit, and a dot and the part if there are several.
 
-        Called at the stream's rate, from one thread that is not the control loop and may run beside it; also before
-        ``connect`` has succeeded, and while the device does not answer. What is not finite is left out.
+        Called at the stream's rate from one thread that may run beside the control loop, also before ``connect``
+        succeeds and while the device does not respond. Values that are not finite are omitted.
 
         Returns:
-            ``{"distance_m.left": 0.81}``; empty where there is nothing to tell just now.
+            ``{"distance_m.left": 0.81}``; empty if there is no measurement now.
 
         Raises:
-            DriverError: It cannot be measured now; it is asked again when the stream is next due.
+            DriverError: The stream cannot be measured now; the agent tries again when it is due.
         """
 
 
 @runtime_checkable
 class HasCameras(Protocol):
-    """A driver whose robot has cameras: what its robot type's ``cameras`` name."""
+    """A driver with the cameras of its robot type."""
 
     def frame(self, camera: str) -> Frame | None:
-        """A picture taken now; ``None`` where it has none at this moment.
+        """A frame taken now, or ``None`` if there is none.
 
-        Called at the camera's rate while somebody controls the robot, else once a second at most, from one thread that
-        is neither the control loop nor that of ``report``, and may run beside both; also before ``connect`` has
-        succeeded. A picture is at most 128 KB: small, and JPEG.
+        Called at the camera's rate while an operator has control, else at most once per second. The calling thread is
+        neither the control loop nor that of ``report``, and may run beside both, also before ``connect`` succeeds. A
+        frame is a JPEG of at most 128 KB.
 
         Raises:
-            DriverError: No such camera, or it failed; it is asked again when the next picture is due.
+            DriverError: The camera is unknown or failed; the agent tries again when the next frame is due.
         """
 
 
 @runtime_checkable
 class HasSpeaker(Driver, Protocol):
-    """A driver whose robot is heard by others when it speaks: of a simulated robot, by what listens in its room."""
+    """A driver whose robot is audible: simulated microphones in its room hear it."""
 
     def speaks(self, for_s: float) -> None:
-        """It speaks from now on for so long [s]. Never blocks; only for what listens, the words go elsewhere."""
+        """Emit speech sound from now on for ``for_s`` [s]. Never blocks; the text is published separately."""

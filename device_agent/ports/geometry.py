@@ -1,7 +1,7 @@
-"""What is known of a robot's shape, whoever moves it. This page is the implementer's manual.
+"""Port: shape of a robot. The implementer's manual.
 
-It comes from the robot type's model, not from the driver: the same checks hold for a simulation and for real metal. A
-robot type without a model has no geometry; then only what stands in its manifest limits it, and ``desc`` says so.
+Geometry comes from the robot type's model, not from the driver, so simulated and real robots have the same checks. A
+robot type without a model has no geometry; only its manifest limits it, and ``desc`` lists the missing limits.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,26 +12,25 @@ from device_agent.protocol import Pose
 
 
 class GeometryError(Exception):
-    """The model cannot be used, or has no answer. Its text is fit for an operator."""
+    """The model cannot be used, or there is no solution. The message is shown to operators."""
 
 
 class PlannerLostError(GeometryError):
-    """Whoever looks for ways has ended, or does not answer; asked again, another one does."""
+    """The planner ended or does not respond; the next request starts another."""
 
 
 def never() -> bool:
-    """It is always wanted."""
+    """Default of ``ended``: the plan is still needed."""
     return False
 
 
 @dataclass(frozen=True, slots=True)
 class Clearance:
-    """The tightest place of a robot.
+    """The smallest clearance of a robot.
 
     Attributes:
-        room_m: What is left until the tightest pair is as near as it may be; negative when it is nearer [m].
-        between: The two that are near each other: bodies of the robot, or things that stand still in its scene, or a
-            frame and a face of the workspace.
+        room_m: Distance minus the required clearance of the closest pair [m]; negative if violated.
+        between: The pair: bodies of the robot, fixed objects of its scene, or a frame and a face of the workspace.
         kind: ``clearance`` or ``workspace``.
     """
 
@@ -41,17 +40,17 @@ class Clearance:
 
     @property
     def text(self) -> str:
-        """As ``limited`` names it."""
+        """Text in ``limited``."""
         return f"{self.kind}: {self.between[0]} \u2013 {self.between[1]}"
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """How a way through joint space went.
+    """Result of checking a path through joint space.
 
     Attributes:
-        share: How much of it is clear, 0…1.
-        clearance: What ends it; ``None`` when all of it is clear.
+        share: Collision-free share of the path, 0…1.
+        clearance: What blocks it; ``None`` if the whole path is clear.
     """
 
     share: float
@@ -59,7 +58,7 @@ class Sweep:
 
 
 class RobotGeometry(Protocol):
-    """One robot's shape in the scene it stands in. Thread-safe; joint positions are in the robot type's order [rad]."""
+    """Shape of one robot in its scene. Thread-safe; joint positions are in the robot type's order [rad]."""
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -69,52 +68,52 @@ class RobotGeometry(Protocol):
         """Pose of each frame in the robot's base frame."""
 
     def clearance(self, position_rad: Sequence[float]) -> Clearance:
-        """The tightest place of the robot in one position: itself, what stands around it, its workspace.
+        """The smallest clearance in one position, to itself, to obstacles and to the workspace.
 
-        Quick enough for the control loop.
+        Fast enough for the control loop.
         """
 
     def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
-        """Go from one joint position straight to the next until something is nearer than it may be.
+        """Check straight joint-space segments until a clearance is violated.
 
-        From where something is too near already: until it comes nearer still, so that it can be left.
-
-        Quick enough for the control loop.
+        If the start already violates one, the check ends where the distance decreases further, so that the robot can
+        leave. Fast enough for the control loop.
 
         Args:
-            path_rad: At least two positions; each leg counts alike in ``Sweep.share``.
+            path_rad: At least two positions; each segment has the same weight in ``Sweep.share``.
         """
 
     def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
-        """The share of a straight way that seems clear, by a few places on it.
+        """Approximate clear share of a straight path, sampled at a few positions.
 
-        What is thin may be missed: this is for how fast to go there, ``sweep`` for whether.
+        It may miss thin obstacles: use it for speed limits, and ``sweep`` for collision checks.
         """
 
     def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
-        """A speed that no point of the robot exceeds, in whatever position, by the lever arms of its joints [m/s]."""
+        """Upper bound of the speed of all points of the robot in any position, by lever arms [m/s]."""
 
     def rates(
         self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
     ) -> tuple[float, ...]:
-        """Joint velocities that move a frame, shape (n,) [rad/s]; less where they would have to be very high.
+        """Joint velocities that move a frame, shape (n,) [rad/s]; reduced near singularities.
 
-        Quick enough for the control loop.
+        Fast enough for the control loop.
 
         Args:
             frame: One of ``frames``.
             twist: Linear x, y, z [m/s], then angular [rad/s].
-            position_rad: Where the joints are, shape (n,) [rad].
-            tool: Whether the twist is along the frame's own axes, not the base's.
+            position_rad: Joint positions, shape (n,) [rad].
+            tool: Whether the twist is along the frame's own axes instead of the base's.
         """
 
     def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
-        """Joint positions that bring a frame to a pose in the robot's base frame, near ``start_rad`` where possible.
+        """Joint positions that bring a frame to a pose in the robot's base frame, near ``start_rad`` if possible.
 
         May take tens of milliseconds: never call it from the control loop.
 
         Raises:
-            GeometryError: No such frame, or out of reach; the text says how near the robot can come.
+            GeometryError: The frame is unknown, or the pose is out of reach; the message contains the remaining
+                distance.
         """
 
     def plan(
@@ -126,19 +125,19 @@ class RobotGeometry(Protocol):
         within_s: float = 5.0,
         ended: Callable[[], bool] = never,
     ) -> tuple[tuple[float, ...], ...]:
-        """Positions from ``start_rad`` to ``goal_rad``, with a straight way between each and the next that is clear.
+        """Positions from ``start_rad`` to ``goal_rad``, connected by collision-free straight segments.
 
-        With more room than ``sweep`` asks for, where there is that much, so that the way may be rounded off. Joints of
-        limbs that need not move stay. May take seconds: never call it from the control loop.
+        Keeps more clearance than ``sweep`` requires if possible, so that corners may be blended. Joints of limbs that
+        need not move keep their position. May take seconds: never call it from the control loop.
 
         Args:
-            start_rad: Where the device is.
-            goal_rad: Where it shall be.
-            seed: The same seed finds the same way.
-            within_s: How long to look for one [s].
-            ended: Whether nobody wants it any more; asked all the time.
+            start_rad: Current position.
+            goal_rad: Target position.
+            seed: Equal seeds give equal plans.
+            within_s: Time limit [s].
+            ended: Whether the plan is no longer needed; polled continuously.
 
         Raises:
-            GeometryError: None was found in time, or there is no room at its end; the text says so.
-            PlannerLostError: Whoever looks for it has ended or does not answer.
+            GeometryError: No plan was found in time, or the goal violates a clearance.
+            PlannerLostError: The planner ended or does not respond.
         """

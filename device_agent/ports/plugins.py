@@ -1,7 +1,6 @@
-"""What is found by name: built-in parts, and those that other packages offer by an entry point.
+"""Loads built-in plug-ins, and plug-ins that other packages provide by entry points, by name.
 
-Built-in ones stand in a table of import paths and are imported when asked for, so that an agent needs only the
-libraries of what it uses.
+Built-in plug-ins are imported on demand, so that an agent needs only the libraries that it uses.
 """
 
 import importlib
@@ -18,10 +17,10 @@ class PlugIns(Generic[Factory]):
     """Factories of one kind, by name.
 
     Attributes:
-        what: What they make, for people.
-        group: The entry point group by which others add theirs; an entry point is a factory.
-        built_in: Name → module that has ``create``, the factory.
-        error: What is raised where there is none.
+        what: What they create, for messages.
+        group: Entry point group; an entry point is a factory.
+        built_in: Name → module with the factory ``create``.
+        error: Exception for unknown names.
     """
 
     what: str
@@ -34,10 +33,10 @@ class PlugIns(Generic[Factory]):
         return tuple(sorted({*self.built_in, *(point.name for point in entry_points(group=self.group))}))
 
     def load(self, name: str) -> Factory:
-        """The factory of this name. A built-in one wins over an entry point of the same name.
+        """The factory of this name. Built-in plug-ins take precedence.
 
         Raises:
-            Exception: ``error``: there is none, or a library that it needs is not installed.
+            Exception: ``error``: the name is unknown, or a required library is missing.
         """
         try:
             if name in self.built_in:
@@ -47,6 +46,6 @@ class PlugIns(Generic[Factory]):
                     return cast("Factory", point.load())
         except (ImportError, AttributeError) as error:
             raise self.error(
-                f"{self.what} '{name}' cannot be loaded: {error}; is the package that it needs installed?"
+                f"{self.what} '{name}' cannot be loaded: {error}; check that its package is installed"
             ) from error
         raise self.error(f"no {self.what} '{name}'; there are: {', '.join(self.names())}")

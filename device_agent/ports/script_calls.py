@@ -1,7 +1,7 @@
-"""What a script's process may say to the agent: one line of JSON a message, strict and bounded.
+"""Messages from a script process to the agent: one strict, bounded line of JSON each.
 
-The process is hostile until proven otherwise: ``parse`` is the only way in. It is pure, and what it lets pass is
-finite, of the right type, and no longer than the bounds below. Whether a value makes sense is asked of the robot.
+The process counts as hostile: ``parse`` is the only entry. It has no side effects and accepts only finite values of the
+right type within the bounds below. The robot's API checks the meaning of the values.
 """
 
 from typing import Annotated
@@ -12,45 +12,45 @@ from device_agent.protocol import RobotTask, codec
 from device_agent.protocol.commands import Speed
 
 MAX_LINE = 65_536
-"""Bytes of a line, with its end. A print of 8,000 characters, each written as six bytes or twelve, fits."""
+"""Maximum size of a line [bytes]; fits a print of 8,000 escaped characters."""
 _Name = Annotated[str, Meta(max_length=200)]
 _Text = Annotated[str, Meta(max_length=10_000)]
 
 
 class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind"):
-    """What is said; its ``kind`` says which."""
+    """Base of all messages; the tag ``kind`` names the message."""
 
 
 class Ready(_Message, frozen=True, kw_only=True, tag="ready"):
-    """The sandbox holds; the script may be sent."""
+    """The process is confined; the agent may send the script."""
 
 
 class Unfit(_Message, frozen=True, kw_only=True, tag="unfit"):
-    """the sandbox could not be set up; the process has ended."""
+    """The process could not be confined, and has ended."""
 
     reason: _Text
 
 
 class Output(_Message, frozen=True, kw_only=True, tag="output"):
-    """Something was printed."""
+    """Printed text."""
 
     text: _Text
 
 
 class Progress(_Message, frozen=True, kw_only=True, tag="progress"):
-    """So much is done."""
+    """Share of the work that is done."""
 
     share: Annotated[float, Meta(ge=0, le=1)]
 
 
 class Ended(_Message, frozen=True, kw_only=True, tag="ended"):
-    """The script has ended: well, or with an error that names its line."""
+    """The script has ended, successfully or with an error that names its line."""
 
     error: _Text = ""
 
 
 class Moment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One of the keyframes of ``robot.play``: when, and where the joints that it names are then."""
+    """One keyframe of ``robot.play``: time, and joint positions at that time."""
 
     time_s: float
     position_rad: Annotated[dict[str, float], Meta(max_length=128)] = {}
@@ -90,10 +90,10 @@ Message = Ready | Unfit | Output | Progress | Ended | Call
 
 
 def parse(line: bytes) -> Message:
-    """One message.
+    """Parse one message.
 
     Raises:
-        ProtocolError: It is none; the text says what is wrong with it.
+        ProtocolError: The line is not a valid message; the text names the mistake.
     """
     message: Message = codec.decode(line, Message)  # type: ignore[arg-type]
     return message

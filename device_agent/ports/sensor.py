@@ -1,8 +1,8 @@
-"""What a driver does for one room device: a sensor, or a thing to set. This page is the implementer's manual.
+"""Port: driver of one room device, a sensor or a settable device. The implementer's manual.
 
-A room device has streams (named values, read at a rate), cameras (pictures, read at a rate), captures (one raw
-picture or scan, for the blob store) and controls (something to set). Each driver has some of them; asked for what it
-has not, it raises ``SensorError`` and lists what there is. ``docs/guides/add-a-sensor.md`` makes one from nothing.
+A room device has streams (named values), cameras (frames), captures (raw data for the blob store) and controls
+(settable values). A driver raises ``SensorError`` with the known names if a name is unknown.
+``docs/guides/add-a-sensor.md`` shows an example.
 """
 
 from collections.abc import Mapping
@@ -22,12 +22,12 @@ Values = Mapping[str, float | bool]
 
 
 class SensorError(Exception):
-    """The device cannot do what was asked, or no longer answers. Its text is fit for an operator."""
+    """The device cannot execute the request, or does not respond. The message is shown to operators."""
 
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """Something raw, as a file: a PNG, a scan in JSON.
+    """Raw data as a file: a PNG, a scan in JSON.
 
     Attributes:
         media_type: ``image/png``, ``application/json``.
@@ -40,12 +40,13 @@ class Capture:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One picture of a camera, as JPEG.
+    """One camera frame.
 
     Attributes:
-        width: In pixels; ``height``: the same.
+        width: Width [pixels].
+        height: Height [pixels].
         content: The JPEG.
-        taken_s: ``time.monotonic()`` when it was taken [s].
+        taken_s: Time of exposure on ``time.monotonic()`` [s].
     """
 
     width: int
@@ -56,16 +57,16 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:
-    """One turn of a lidar, for perception in the same process. Arrays are the reader's own.
+    """One lidar scan, for perception in the same process. The reader owns the arrays.
 
     Attributes:
-        taken_s: ``time.monotonic()`` when it was taken [s].
-        position_m: Of the lidar in the room, shape (3,) [m].
-        rotation: Its axes in the room as columns, shape (3, 3): beams lie in its x-y plane.
-        angle_rad: Of each beam about its z axis from its x axis, shape (n,) [rad].
-        range_m: To what each beam met, shape (n,) [m]; ``inf`` where it met nothing within ``furthest_m``.
-        nearest_m: What is nearer is not seen [m].
-        furthest_m: Nor what is further [m].
+        taken_s: Time of measurement on ``time.monotonic()`` [s].
+        position_m: Position of the lidar in the room, shape (3,) [m].
+        rotation: Its axes in the room as columns, shape (3, 3); beams lie in its x-y plane.
+        angle_rad: Angle of each beam about the z axis from the x axis, shape (n,) [rad].
+        range_m: Measured range of each beam, shape (n,) [m]; ``inf`` for none within ``furthest_m``.
+        nearest_m: Minimum range [m].
+        furthest_m: Maximum range [m].
     """
 
     taken_s: float
@@ -79,17 +80,16 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Image:
-    """One picture, for perception in the same process. Arrays are the reader's own.
+    """One image, for perception in the same process. The reader owns the arrays.
 
     Attributes:
-        taken_s: ``time.monotonic()`` when it was taken [s].
-        position_m: Of the camera in the room, shape (3,) [m].
-        rotation: Its axes in the room as columns, shape (3, 3): x to the right of the picture, y up, and it looks
-            along its negative z.
-        fovy_rad: Angle of view from the lowest row to the highest [rad]; pixels are square.
-        rgb: Colours, shape (height, width, 3), first row at the top; ``None`` for a camera that has none.
-        depth_m: Distance along the line of sight's z, shape (height, width) [m]; ``inf`` where nothing is within reach;
-            ``None`` for a camera that measures none.
+        taken_s: Time of exposure on ``time.monotonic()`` [s].
+        position_m: Position of the camera in the room, shape (3,) [m].
+        rotation: Its axes in the room as columns, shape (3, 3): x to the right, y up, viewing direction -z.
+        fovy_rad: Vertical field of view [rad]; pixels are square.
+        rgb: Colours, shape (height, width, 3), top row first; ``None`` for a camera without colours.
+        depth_m: Depth along the viewing direction, shape (height, width) [m]; ``inf`` out of range; ``None`` for a
+            camera without depth.
     """
 
     taken_s: float
@@ -102,91 +102,90 @@ class Image:
 
 @runtime_checkable
 class RoomDriver(Protocol):
-    """Makes one room device measure and do what the agent asks.
+    """Driver of one room device.
 
-    The device's own thread calls ``connect``, ``read`` and ``frame``; ``capture`` and ``set`` come from the thread of
-    the action that runs, ``raw`` from whoever perceives: a driver locks where that matters. Each may take as long as
-    its sensor needs; other devices do not wait for it. The constructor touches neither disk, network nor hardware.
+    The device's own thread calls ``connect``, ``read`` and ``frame``; the thread of the running action calls
+    ``capture`` and ``set``; perception calls ``raw`` from its thread. Drivers synchronize where necessary. Calls may
+    take as long as the sensor needs. The constructor accesses neither disk, network nor hardware.
     """
 
     @property
     def simulated(self) -> bool:
-        """Whether it is no real sensor. Known before ``connect``."""
+        """Whether the sensor is simulated. Known before ``connect``."""
 
     def connect(self) -> None:
-        """Open it. May be called again after it failed.
+        """Open the device. May be called again after a failure.
 
         Raises:
-            SensorError: It is not there, or does not answer; the text says what to check.
+            SensorError: The device is missing or does not respond; the message names what to check.
         """
 
     def read(self, stream: str) -> Values:
-        """The newest measurement of one of its streams. Empty where it has nothing to say at this moment.
+        """The newest measurement of a stream; empty if there is none now.
 
         Raises:
-            SensorError: No such stream; or it no longer answers. The agent then raises a fault and connects again.
+            SensorError: The stream is unknown, or the device does not respond. The agent raises a fault and reconnects.
         """
 
     def capture(self, name: str) -> Capture:
-        """Something raw, taken now.
+        """Raw data, captured now.
 
         Raises:
-            SensorError: No such capture; or it failed.
+            SensorError: The capture is unknown or failed.
         """
 
     def set(self, control: str, value: float) -> float:
-        """Set one of its controls; ``value`` is finite and within the manifest's limits.
+        """Set a control; ``value`` is finite and within the manifest's limits.
 
         Returns:
-            What was really applied, after the driver's own clamping.
+            The applied value, after limits of the driver.
 
         Raises:
-            SensorError: No such control; or it failed.
+            SensorError: The control is unknown or failed.
         """
 
     def raw(self) -> Scan | Image | None:
-        """The newest scan or picture as arrays, at most a tenth of a second old; ``None`` where it takes none.
+        """The newest scan or image, at most 0.1 s old; ``None`` for other sensors.
 
         Raises:
-            SensorError: It no longer answers.
+            SensorError: The device does not respond.
         """
 
     def close(self) -> None:
-        """Let go. May be called twice, and without ``connect``."""
+        """Release the device. Callable repeatedly, and without ``connect``."""
 
 
 @runtime_checkable
 class Camera(RoomDriver, Protocol):
-    """A room driver with cameras: pictures for people, beside what ``raw`` gives."""
+    """A room driver with camera streams for viewers, besides ``raw``."""
 
     def frame(self, camera: str) -> Frame | None:
-        """A picture taken now; ``None`` where it has none at this moment.
+        """A frame taken now, or ``None`` if there is none.
 
         Raises:
-            SensorError: No such camera; or it failed.
+            SensorError: The camera is unknown or failed.
         """
 
 
 @runtime_checkable
 class Movable(RoomDriver, Protocol):
-    """A room driver with something that goes on moving after ``set``: a door, blinds, a camera that turns."""
+    """A room driver whose motion continues after ``set``: a door, blinds, a pan-tilt camera."""
 
     def hold(self) -> None:
-        """What moves stays where it is. Quick: called at Stop, at a hold of the room's and at a fault.
+        """Stop all motion. Fast; called at Stop, at a hold of the room and at a fault.
 
         Raises:
-            SensorError: It failed.
+            SensorError: The device failed.
         """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surroundings:
-    """What the driver of a room device may reach besides its own hardware.
+    """Environment of a room device's driver.
 
     Attributes:
-        neighbours: The agent's other room drivers by the device's name. Complete when ``connect`` is called; before
-            that it is still being filled.
-        world: The simulated world of the device's room; ``None`` where the room is real.
+        neighbours: Room drivers of the agent by device name; complete when ``connect`` is called.
+        world: Simulated world of the room; ``None`` for a real room.
     """
 
     neighbours: Mapping[str, RoomDriver]

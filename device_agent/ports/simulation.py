@@ -1,7 +1,7 @@
-"""The simulated room that several devices of one process share. Real rooms have none.
+"""Port: simulated room that several devices of one process share.
 
-Robots' drivers move in it, sensors look at it, and processes (a person who walks, air that warms) go on in it. It has
-one thread, and nobody else writes to its state.
+Drivers move robots in it, sensors observe it, and processes (a pedestrian, air temperature) advance it. It has one
+thread, which is the only writer of its state.
 """
 
 from collections.abc import Mapping
@@ -9,72 +9,71 @@ from typing import Any, Protocol
 
 
 class Process(Protocol):
-    """Something that goes on in a simulated room by itself."""
+    """A process that advances with the simulation."""
 
     def step(self, model: Any, data: Any, time_s: float) -> None:
-        """Go on until ``time_s``. Called in the world's thread before each group of steps (4 ms): be quick.
+        """Advance to ``time_s``. Called in the world's thread before each group of steps (4 ms); must be fast.
 
-        May write mocap poses, and the controls, positions and outer forces of its own actuators, joints and bodies, and
-        nothing else.
+        It may write mocap poses, and controls, positions and external forces of its own actuators, joints and bodies.
 
         Args:
-            model: ``MjModel``; of it only colours and lights may change.
+            model: ``MjModel``; only colours and lights may change.
             data: ``MjData``.
             time_s: Simulated time [s].
         """
 
 
 class SimulatedWorld(Protocol):
-    """What a room device may ask of the world it is in. Thread-safe."""
+    """Access of a room device to its world. Thread-safe."""
 
     @property
     def model(self) -> Any:
-        """The compiled ``MjModel``, after ``open``. Not to be written to."""
+        """The compiled ``MjModel``, after ``open``. Read-only."""
 
     @property
     def quantities(self) -> Mapping[str, float]:
-        """What has no place in MuJoCo's state, the newest of each, by name, as ``temperature_c``."""
+        """Newest values of quantities outside of MuJoCo's state, by name (``temperature_c``)."""
 
     @property
     def settings(self) -> Mapping[str, float]:
-        """What was ``set`` last, by name."""
+        """Values that were ``set`` last, by name."""
 
     def open(self) -> None:
-        """Take part; the first to do so starts real time.
+        """Join the world; the first call starts real time.
 
         Raises:
             DriverError: The model cannot be built.
         """
 
     def close(self) -> None:
-        """Leave; one call for each ``open``."""
+        """Leave the world; one call for each ``open``."""
 
     def add(self, process: Process) -> None:
-        """Have something go on in it, from the next group of steps."""
+        """Add a process, from the next group of steps."""
 
     def copy(self, into: Any) -> None:
-        """The state as it is now, all of one moment: positions, velocities, mocap poses, controls, time.
+        """Copy the current state: positions, velocities, mocap poses, controls and time of one moment.
 
-        Poses of bodies, geoms, sites, cameras and lights are computed; contacts and sensors are not. Costs the world's
-        thread nothing.
+        Computes poses of bodies, geoms, sites, cameras and lights, but no contacts and sensors. Does not delay the
+        world's thread.
 
         Args:
             into: An ``MjData`` of ``model`` that belongs to the caller.
         """
 
     def set(self, name: str, value: float) -> float:
-        """Set something of the room: the position of the model's own actuator of this name, and ``settings``.
+        """Set a value of the room: the position of the model's actuator of this name, and ``settings``.
 
         Args:
-            name: Of an actuator of the room's model, or one that a process reads: ``lamp``, ``thermostat``.
-            value: Finite, in the actuator's own unit.
+            name: Actuator of the room's model, or a setting of a process: ``lamp``, ``thermostat``.
+            value: Finite value in the actuator's unit.
 
         Returns:
-            What was applied, after the actuator's own range.
+            The applied value, within the actuator's range.
 
         Raises:
-            DriverError: Not finite.
+            DriverError: The value is not finite.
         """
 
     def sound(self, name: str, level_db: float, *, for_s: float) -> None:
-        """Let something be heard: a level a metre away, A-weighted [dB], from now on for some simulated time [s]."""
+        """Emit a sound for simulated ``for_s`` [s]; ``level_db``: A-weighted level at a distance of one metre [dB]."""

@@ -1,9 +1,9 @@
-"""What some robots can do besides moving joints and base: speak, show, stiffen. The implementer's manual.
+"""Port: skills of a driver besides moving joints and base. The implementer's manual.
 
-Most of it needs no driver: expressions, postures, behaviours and mouth shapes stand in the robot type's manifest, and
-the runtime moves the joints. A driver that also has ``perform`` goes first, for what both its ``performs`` and its
-robot type's ``capabilities`` name. It is called in the thread of the action, never in the control loop, and returns
-when the thing is done.
+Most skills need no driver: the manifest contains expressions, postures, behaviours and mouth shapes, and the runtime
+moves the joints. A driver with ``perform`` takes precedence for capabilities that both its ``performs`` and its robot
+type name. ``perform`` runs in the thread of the action, never in the control loop, and returns when the skill is
+complete.
 """
 
 from collections.abc import Collection
@@ -13,11 +13,11 @@ from device_agent.protocol import Express, LookAt, RunBehaviour, Say, SetStiffne
 
 SPEECH, STIFFNESS, GAZE, EXPRESSIONS, BEHAVIOURS = "speech", "stiffness", "gaze", "expressions", "behaviours"
 POSTURES = "postures"
-"""Capabilities that a manifest may name, each with the skill below."""
+"""Capabilities of manifests; each has a skill below."""
 
 
 class SkillError(Exception):
-    """It was not done. Its text is fit for an operator, and lists what there is where a name was unknown."""
+    """The skill failed. The message is shown to operators and lists the known names if a name was unknown."""
 
 
 Skill = Say | SetStiffness | LookAt | Express | RunBehaviour | TakePosture
@@ -25,20 +25,20 @@ Skill = Say | SetStiffness | LookAt | Express | RunBehaviour | TakePosture
 
 
 class Stage(Protocol):
-    """What a skill has while it lasts."""
+    """Context of a running skill."""
 
     @property
     def ended(self) -> bool:
-        """Whether the action has lost the device (Stop, lease, cancel, link): stop what goes on, and return."""
+        """Whether the action lost control (Stop, lease, cancellation, link): stop and return."""
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait [s], or until it has ended; whether it has."""
+        """Wait until the action has ended, at most ``timeout_s`` [s]. Returns whether it has."""
 
     def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
-        """Move and wait until there [rad]. The only way for a skill to move a joint: the agent's limits hold.
+        """Move to positions [rad] and wait. The only way for a skill to move joints: the agent's limits apply.
 
         Raises:
-            SkillError: The agent refused or interrupted it.
+            SkillError: The agent rejected or interrupted the motion.
         """
 
 
@@ -48,11 +48,11 @@ class Skills(Protocol):
 
     @property
     def performs(self) -> Collection[str]:
-        """The capabilities that ``perform`` is for."""
+        """Capabilities that ``perform`` executes."""
 
     def perform(self, skill: Skill, stage: Stage) -> None:
-        """Do it, to its end, or until ``stage`` has ended.
+        """Execute a skill to its end, or until ``stage`` has ended.
 
         Raises:
-            SkillError: It cannot.
+            SkillError: The skill failed.
         """

@@ -1,20 +1,20 @@
-"""What turns text into sound. This page is the implementer's manual."""
+"""Port: speech synthesizer. The implementer's manual."""
 
 from dataclasses import dataclass
 from typing import Protocol
 
 
 class SpeechError(Exception):
-    """Nothing can be spoken now. Its text is fit for an operator."""
+    """Synthesis failed. The message is shown to operators."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """One text as sound.
+    """Synthesized speech.
 
     Attributes:
-        wav: The file, whole.
-        duration_s: How long it is [s].
+        wav: The complete file.
+        duration_s: Duration [s].
     """
 
     wav: bytes
@@ -22,18 +22,18 @@ class Spoken:
 
 
 class Speech(Protocol):
-    """A speaker's voice. Thread-safe."""
+    """Speech synthesizer. Thread-safe."""
 
     def speak(self, text: str, language: str) -> Spoken | None:
-        """Make sound of a text. Called in the thread of an action; takes some tenths of a second.
+        """Synthesize a text. Called in the thread of an action; takes some tenths of a second.
 
         Args:
-            text: At most 2,000 characters, of whatever kind.
-            language: As ``en`` or ``sk``; empty, or one that it does not know: its own.
+            text: At most 2,000 arbitrary characters.
+            language: ``en``, ``sk`` …; the default voice if empty or unknown.
 
         Returns:
-            ``None`` where this machine has no voice: the text is all there is.
+            ``None`` if this machine has no synthesizer; speech is then text only.
 
         Raises:
-            SpeechError: It has one, and that failed.
+            SpeechError: Synthesis failed.
         """

@@ -1,7 +1,7 @@
-"""What carries messages between the agent and the cloud. This page is the implementer's manual.
+"""Port: message transport between agent and cloud. The implementer's manual.
 
-All transports carry the same topics and the same payloads; they differ in how. Safety never rests on a transport: it
-may lose, double, delay and reorder.
+All transports carry the same topics and payloads. Safety never depends on a transport: it may lose, duplicate, delay
+and reorder messages.
 """
 
 from collections.abc import Callable
@@ -14,17 +14,17 @@ LinkChanged = Callable[[bool], None]
 
 
 class TransportError(Exception):
-    """The transport cannot start. Its text says what to check."""
+    """The transport cannot start. The message names what to check."""
 
 
 class Transport(Protocol):
-    """One link of one agent. The constructor opens nothing."""
+    """The link of one agent. The constructor opens no connection."""
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
-        """Connect and stay connected: reconnects by itself with jittered back-off, for ever. Returns at once.
+        """Connect, and reconnect indefinitely with jittered backoff. Returns at once.
 
         Raises:
-            TransportError: Its configuration is unusable.
+            TransportError: The configuration is unusable.
         """
 
     def publish(
@@ -36,19 +36,19 @@ class Transport(Protocol):
         retain: bool = False,
         delivered: Callable[[], None] | None = None,
     ) -> bool:
-        """Send; thread-safe; never blocks.
+        """Send a message. Thread-safe; never blocks.
 
         Args:
-            topic: One of ``protocol.topics``.
-            payload: The message, encoded.
+            topic: Topic of ``protocol.topics``.
+            payload: The encoded message.
             qos: 0 or 1.
-            retain: Whether the broker keeps it for later subscribers.
-            delivered: With ``qos`` 1, called once the other side has confirmed the message; never if that is unknown.
+            retain: Whether the broker retains it for later subscribers.
+            delivered: With ``qos`` 1, called once the peer has acknowledged the message; never if that is unknown.
 
         Returns:
-            False when the message was dropped: the link is down or its queue full, or a picture of the same camera
-            still waits to be sent. Measurements are then lost on purpose, and the caller keeps what must not be.
+            False if the message was dropped: the link is down, its queue is full, or a frame of the same camera is
+            still queued. Measurements are dropped on purpose; the caller stores messages that must not be lost.
         """
 
     def stop(self) -> None:
-        """Say goodbye (presence offline), and disconnect within a second. May be called twice."""
+        """Publish the offline presence and disconnect within a second. Callable repeatedly."""

@@ -1,9 +1,9 @@
-"""What a script may use: ``robot``, ``room``, ``parameters``, ``wait``, ``progress``, ``print``, ``RobotError``.
+"""Names that a script can use: ``robot``, ``room``, ``parameters``, ``wait``, ``progress``, ``print``, ``RobotError``.
 
-Every call of ``robot`` blocks until it is done and raises ``RobotError``, with the reason, when it is not done: the
-robot cannot do this, a limit is in the way, somebody stopped it. SI units and radians.
+Each call of ``robot`` blocks until it is complete. It raises ``RobotError`` with the reason if it fails: the robot
+lacks the ability, a limit prevents it, or an operator stopped it. Units are SI and radians.
 
-A script's process has nothing else: no file, no network, no other process. It may import what ``modules`` names.
+The script process has no files, network or other processes. It may import the modules of ``importable_modules``.
 """
 
 import math
@@ -12,28 +12,28 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 Ask = Callable[..., Any]
-"""``ask(kind, **arguments)``: sends a call to the agent and gives its answer."""
+"""``ask(kind, **arguments)``: sends a call to the agent and returns its response."""
 Tell = Callable[..., None]
-"""``tell(kind, **arguments)``: sends what needs no answer."""
+"""``tell(kind, **arguments)``: sends a message without response."""
 
 OLD_S = 5.0
-"""A floor that was seen longer ago is not known any more [s]."""
+"""Older occupancy measurements are ignored [s]."""
 
-_DEEDS = ("posture", "behaviour", "express", "say", "drive", "go_to")
-"""What a keyframe may say to do where it is reached."""
+_SKILLS = ("posture", "behaviour", "express", "say", "drive", "go_to")
+"""Skills that a keyframe may contain."""
 
 
 class RobotError(Exception):
-    """The robot did not do what the script asked; says why. Ends the script unless it is caught."""
+    """The robot did not execute a call; the message names the reason. Ends the script unless caught."""
 
 
 class Robot:
-    """``robot``: the device that the script runs on. ``help(robot)`` is this page.
+    """``robot``: the device that the script runs on.
 
     Attributes:
         joints: Names of its joints, in the order of lists of positions.
-        frames: Names of the frames that ``move_to`` can bring somewhere.
-        can: Names of the calls that this robot has; any other raises ``RobotError``.
+        frames: Names of the frames that ``move_to`` can move.
+        can: Names of the calls that this robot supports; others raise ``RobotError``.
     """
 
     def __init__(self, ask: Ask, *, joints: Sequence[str], frames: Sequence[str], can: Sequence[str]) -> None:
@@ -45,45 +45,45 @@ class Robot:
     def move_joints(
         self, position_rad: Mapping[str, float] | Sequence[float], speed: float = 0.5, *, plan: bool = False
     ) -> None:
-        """Move joints and wait until they are there.
+        """Move joints and wait until they arrive.
 
         Args:
-            position_rad: Joint name → position [rad] (the others stay), or a list in the order of ``robot.joints``.
+            position_rad: Joint name → position [rad] (others keep theirs), or a list in the order of ``robot.joints``.
             speed: Share of each joint's velocity limit, above 0, up to 1.
-            plan: Look for a way around what is in between first.
+            plan: Plan a path around obstacles.
         """
         self._ask("move_joints", position_rad=self._by_name(position_rad), speed=float(speed), plan=bool(plan))
 
     def play(self, keyframes: Sequence[Mapping[str, Any]], speed: float = 1.0) -> None:
-        """Go through keyframes, each at its time: a joint passes where it goes on, and rests where it turns.
+        """Play keyframes at their times; joints pass through keyframes smoothly and rest where they reverse.
 
-        Goes to the first keyframe at half speed, and counts time from there. What the limits leave no time for comes
-        later, and the rest with it.
+        Moves to the first keyframe at half speed, and counts time from there. Keyframes that the limits do not allow in
+        time are delayed, with all later ones.
 
         Args:
-            keyframes: Dictionaries, in the order of ``time_s``. ``position_rad``: joint name → position [rad]; a joint
-                that is not named is on its way to where the next one names it. And what to do there while time stands
-                still, in this order: ``posture``, ``behaviour``, ``express``, ``say``: a name or a text; ``drive``,
-                ``go_to``: what they take, by name.
-            speed: 1: in the time of the keyframes; 0.5: in twice that time. Above 0, up to 2.
+            keyframes: Dictionaries in the order of ``time_s``. ``position_rad``: joint name → position [rad]; unnamed
+                joints move on to their next named position. Skills to execute at the keyframe, in this order:
+                ``posture``, ``behaviour``, ``express``, ``say``: a name or text; ``drive``, ``go_to``: their
+                arguments by name. Time pauses during skills.
+            speed: 1: times as given; 0.5: twice as long. Above 0, up to 2.
         """
-        begun_s, moments = 0.0, []
+        started_s, moments = 0.0, []
         for number, keyframe in enumerate(keyframes):
             places = self._by_name(keyframe.get("position_rad", {}))
             at_s = float(keyframe["time_s"])
             if not math.isfinite(at_s):
                 raise RobotError(f"the time of keyframe {number + 1} is not a finite number of seconds")
             if number == 0:
-                begun_s = at_s
+                started_s = at_s
                 if places:
                     self.move_joints(places, speed=min(0.5, 0.5 * float(speed)))
             else:
-                moments.append({"time_s": at_s - begun_s, "position_rad": places})
-            deeds = [name for name in _DEEDS if name in keyframe]
+                moments.append({"time_s": at_s - started_s, "position_rad": places})
+            deeds = [name for name in _SKILLS if name in keyframe]
             if moments and (deeds or number == len(keyframes) - 1):
                 first = number + 2 - len(moments)
                 self._ask("play", keyframes=moments, first=first, speed=float(speed))
-                begun_s, moments = at_s, []
+                started_s, moments = at_s, []
             for name in deeds:
                 how = keyframe[name]
                 getattr(self, name)(**how) if isinstance(how, Mapping) else getattr(self, name)(how)
@@ -99,16 +99,16 @@ class Robot:
         straight: bool = False,
         plan: bool = False,
     ) -> None:
-        """Bring a frame of the robot to a pose, and wait until it is there.
+        """Move a frame of the robot to a pose, and wait until it arrives.
 
         Args:
             position_m: x, y, z in the robot's base frame [m].
             quaternion: Orientation (w, x, y, z), or
-            rpy_rad: roll, pitch, yaw about the base's x, y, z [rad]. With neither the frame keeps its orientation.
-            frame: One of ``robot.frames``; the last of them, an arm's flange, when it is not named.
+            rpy_rad: roll, pitch, yaw about the base's x, y, z [rad]. Without either, the orientation is kept.
+            frame: One of ``robot.frames``; by default the last one, an arm's flange.
             speed: Share of each joint's velocity limit, above 0, up to 1.
-            straight: Bring it there on a straight line.
-            plan: Look for a way around what is in between first.
+            straight: Move on a straight line.
+            plan: Plan a path around obstacles.
         """
         if quaternion is not None and rpy_rad is not None:
             raise RobotError("give a quaternion or rpy_rad, not both")
@@ -124,13 +124,13 @@ class Robot:
         )
 
     def home(self, speed: float = 0.5) -> None:
-        """Move to the robot type's home position and wait until there."""
+        """Move to the home position of the robot type and wait until it arrives."""
         self._ask("home", speed=float(speed))
 
     def drive(
         self, forward_m_s: float = 0.0, left_m_s: float = 0.0, turn_rad_s: float = 0.0, *, duration_s: float = 1.0
     ) -> None:
-        """Drive the base at a velocity for a time, then stand. ``turn_rad_s`` is counter-clockwise."""
+        """Drive the base at a velocity for a time, then stop. ``turn_rad_s`` is counter-clockwise."""
         self._ask(
             "drive",
             forward_m_s=float(forward_m_s),
@@ -140,12 +140,12 @@ class Robot:
         )
 
     def go_to(self, x_m: float, y_m: float, yaw_rad: float | None = None) -> None:
-        """Go to a place in the room, around what stands there, and wait until there.
+        """Navigate to a position in the room around obstacles, and wait until it arrives.
 
         Args:
-            x_m: In the room's frame [m].
-            y_m: The same.
-            yaw_rad: How to stand there, counter-clockwise from the room's x axis; without it as it comes.
+            x_m: x in the room's frame [m].
+            y_m: y in the room's frame [m].
+            yaw_rad: Final heading, counter-clockwise from the room's x axis; any heading by default.
         """
         self._ask("go_to", x_m=float(x_m), y_m=float(y_m), yaw_rad=None if yaw_rad is None else float(yaw_rad))
 
@@ -154,11 +154,11 @@ class Robot:
         self._ask("look_at", position_m=_numbers(position_m, 3, "position_m"), speed=float(speed))
 
     def say(self, text: str, language: str = "") -> None:
-        """Speak and wait for the end; ``language`` as ``en`` or ``sk``, else the robot's own."""
+        """Speak and wait for the end; ``language``: ``en``, ``sk`` …, or the robot's default."""
         self._ask("say", text=str(text), language=str(language))
 
     def stiffness(self, value: float, joints: Sequence[str] = ()) -> None:
-        """How firmly joints hold, 0 (limp) to 1; all of them when none is named."""
+        """Set the holding strength of joints, 0 (limp) to 1; all joints if none is named."""
         self._ask("set_stiffness", value=float(value), joints=[str(name) for name in joints])
 
     def express(self, name: str, strength: float = 1.0) -> None:
@@ -166,18 +166,18 @@ class Robot:
         self._ask("express", name=str(name), strength=float(strength))
 
     def posture(self, name: str, speed: float = 0.5) -> None:
-        """Move to one of the robot type's postures and wait until there; ``speed`` as for ``move_joints``."""
+        """Move to a posture of the robot type and wait until it arrives; ``speed`` as for ``move_joints``."""
         self._ask("take_posture", name=str(name), speed=float(speed))
 
     def behaviour(self, name: str) -> None:
-        """Run a behaviour that the robot has of its own, and wait for its end."""
+        """Run a behaviour of the robot, and wait for its end."""
         self._ask("run_behaviour", name=str(name))
 
     def state(self) -> dict[str, Any]:
         """Measured ``position_rad``, ``velocity_rad_s``, ``effort_nm`` by joint name, ``frames`` by name, ``mode``.
 
-        A frame is x, y, z [m] and quaternion w, x, y, z in the robot's base frame. ``streams`` has what else the robot
-        measures, by stream: ``values`` by name and their age, ``age_s`` [s].
+        A frame is x, y, z [m] and quaternion w, x, y, z in the robot's base frame. ``streams`` contains the other
+        measurements by stream: ``values`` by name and their age, ``age_s`` [s].
         """
         state: dict[str, Any] = self._ask("state")
         return state
@@ -195,34 +195,34 @@ class Robot:
 
 
 class Room:
-    """``room``: what the other devices of the space have measured last."""
+    """``room``: newest measurements of other devices of the space."""
 
     def __init__(self, ask: Ask) -> None:
         self._ask = ask
 
     def latest(self, device: str, stream: str) -> dict[str, Any] | None:
-        """The newest measurement of a stream: ``values`` by name and ``age_s``, its age [s] since it was heard here.
+        """The newest measurement of a stream: ``values`` by name and ``age_s``, time since it arrived [s].
 
-        ``None`` when nothing has been heard. Decide by ``age_s`` whether it still counts.
+        ``None`` if none has arrived. Check ``age_s`` before using the values.
         """
-        found: dict[str, Any] | None = self._ask("latest", device=str(device), stream=str(stream))
-        return found
+        measurement: dict[str, Any] | None = self._ask("latest", device=str(device), stream=str(stream))
+        return measurement
 
     def taken(self, x_m: float, y_m: float, device: str = "perception") -> bool | None:
-        """Whether something stands at a place in the room, as its sensors saw it, in squares of about 0.2 m.
+        """Whether an obstacle is at a position in the room, in cells of about 0.2 m.
 
-        The robot that asks is seen as well. ``None`` where nobody knows: unseen, beyond the walls, or nothing was heard
-        for ``OLD_S``.
+        The calling robot counts as an obstacle too. ``None`` if unknown: not observed, outside of the room, or no
+        measurement for ``OLD_S``.
 
         Raises:
             RobotError: A number is not finite.
         """
         if not (math.isfinite(x_m) and math.isfinite(y_m)):
-            raise RobotError(f"a place in the room is two finite numbers, not {x_m}, {y_m}")
-        heard = self.latest(device, "occupancy")
-        if heard is None or heard["age_s"] > OLD_S:
+            raise RobotError(f"a position in the room consists of two finite numbers, not {x_m}, {y_m}")
+        occupancy = self.latest(device, "occupancy")
+        if occupancy is None or occupancy["age_s"] > OLD_S:
             return None
-        floor = heard["values"]
+        floor = occupancy["values"]
         column = math.floor((x_m - floor["lower_x_m"]) / floor["side_m"])
         row = math.floor((y_m - floor["lower_y_m"]) / floor["side_m"])
         if not (0 <= column < floor["columns"] and 0 <= row < floor["rows"]):
@@ -233,7 +233,7 @@ class Room:
 
 
 def names(tell: Tell, ask: Ask, flush: Callable[[], None], task: Mapping[str, Any]) -> dict[str, Any]:
-    """The names that a script finds."""
+    """The names that a script can use."""
 
     def wait(duration_s: float) -> None:
         """Wait [s]; the robot holds."""
@@ -241,7 +241,7 @@ def names(tell: Tell, ask: Ask, flush: Callable[[], None], task: Mapping[str, An
         time.sleep(duration_s)
 
     def progress(share: float) -> None:
-        """Say how much is done, 0 to 1."""
+        """Report the share of completed work, 0 to 1."""
         tell("progress", share=min(1.0, max(0.0, float(share))))
 
     return {

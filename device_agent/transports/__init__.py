@@ -1,1 +1,1 @@
-"""Ways between agent and cloud. All carry the same messages; ``ports.transport`` says what each must do."""
+"""Message transports: MQTT, HTTP polling and XMPP."""

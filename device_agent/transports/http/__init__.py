@@ -1,1 +1,1 @@
-"""The cloud's HTTP API as the agent uses it."""
+"""HTTP polling transport and the client of the HTTP API."""

@@ -1,4 +1,4 @@
-"""The calls of an agent: to become known, to get broker credentials, and, without a broker, to hear and to tell."""
+"""Client of the HTTP API for agents: enrollment, credentials, and messages for agents without a broker."""
 
 import time
 import uuid
@@ -21,19 +21,19 @@ _AUDIENCE = "telescope/api"
 _TOKEN_LIFE_S = 60
 _TIMEOUT_S = 10.0
 _CONNECT_S = 3.0
-ANSWER_WITHIN_S = 4.0
-"""What is asked and told all the time is answered within this, or never: the cloud gives a broker that is away 2 s."""
+RESPONSE_TIMEOUT_S = 4.0
+"""Timeout of polls and messages [s]; the cloud itself waits up to 2 s for an unavailable broker."""
 _NO_CONTENT = 204
 _SERVER_ERROR = 500
 _TOO_MANY = 429
 
 
 class CloudError(ValueError):
-    """The cloud said no, or something that is no answer. Its text is fit for a terminal.
+    """The cloud rejected a request, or its response is invalid. The message may be shown to users.
 
     Attributes:
-        code: The name of the refusal, as ``agent-unclaimed``; empty when it was no answer.
-        passing: Whether it may go better later: the server is busy or unwell.
+        code: Code of the problem, such as ``agent-unclaimed``; empty for an invalid response.
+        passing: Whether the problem may be temporary: the server is overloaded or failed.
     """
 
     def __init__(self, message: str, code: str = "", *, passing: bool = False) -> None:
@@ -43,7 +43,7 @@ class CloudError(ValueError):
 
 
 class Claim(msgspec.Struct, frozen=True, kw_only=True):
-    """What the agent waits for: a code to show, valid for ``expires_in_s`` [s]; no code once it is paired."""
+    """Result of an enrollment: a claim code, valid for ``expires_in_s`` [s]; no code once the agent is paired."""
 
     agent: str
     code: str | None = msgspec.field(default=None, name="claim_code")
@@ -52,7 +52,7 @@ class Claim(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class QueuedCommand:
-    """A command as it would have come on ``topic`` over MQTT, byte for byte."""
+    """A command and its MQTT topic; the payload equals that over MQTT, byte for byte."""
 
     command: str
     topic: str
@@ -60,13 +60,13 @@ class QueuedCommand:
 
 
 class CloudClient:
-    """One agent's view of the HTTP API. One call at a time; ``break_off`` at any.
+    """Client of one agent. One call at a time; ``abort`` at any time.
 
     Args:
-        server: Base address, ``http://host:port``.
-        key: The agent's own private key; it never leaves this machine.
-        clock: Learns the cloud's time from every answer.
-        ca: The authority that alone may speak for an ``https`` server; ``None``: those that the machine trusts.
+        server: URL of the server, ``http://host:port``.
+        key: The agent's private key; it is never sent.
+        clock: Updated with the cloud's time of each response.
+        ca: Pinned authority of an ``https`` server; ``None``: the authorities of the operating system.
     """
 
     def __init__(self, server: str, key: Ed25519PrivateKey, clock: CloudClock, *, ca: Path | None = None) -> None:
@@ -78,13 +78,13 @@ class CloudClient:
         self._http = Session()
 
     def enroll(self, *, name: str, software: str, transport: str, devices: list[dict[str, str]]) -> Claim:
-        """Make the agent, its devices, and how it is to be reached known. Safe to repeat.
+        """Register the agent, its devices and its transport. Idempotent.
 
         Raises:
-            CloudError: Refused.
-            OSError: Not reached.
+            CloudError: The cloud rejects the request.
+            OSError: The cloud cannot be reached.
         """
-        answer = self._call(
+        response = self._call(
             "POST",
             "/agents/enroll",
             json={
@@ -96,20 +96,20 @@ class CloudClient:
             },
         )
         try:
-            return msgspec.convert(answer, Claim)
+            return msgspec.convert(response, Claim)
         except msgspec.ValidationError as error:
-            raise CloudError(f"the cloud's answer to the enrolment cannot be used: {error}") from error
+            raise CloudError(f"the cloud's response to the enrollment is invalid: {error}") from error
 
     def enrollment(self, *, wait_s: float = 0.0, within_s: float = _TIMEOUT_S) -> dict[str, Any]:
-        """Whether somebody has claimed the agent: ``state``, ``space``, ``account``, ``keys``.
+        """State of the enrollment: ``state``, ``space``, ``account``, ``keys``.
 
         Args:
-            wait_s: How long the cloud may wait for it to happen before it answers [s].
-            within_s: How long after that an answer is waited for [s].
+            wait_s: Long poll: the cloud waits for a claim up to this time [s].
+            within_s: Additional timeout [s].
 
         Raises:
-            CloudError: Refused.
-            OSError: Not reached.
+            CloudError: The cloud rejects the request.
+            OSError: The cloud cannot be reached.
         """
         wait = {"wait_ms": round(wait_s * 1000)} if wait_s else {}
         return self._call("GET", "/agents/enrollment", params=wait, timeout=within_s + wait_s)
@@ -118,125 +118,127 @@ class CloudClient:
         """Short-lived broker credentials.
 
         Raises:
-            CloudError: Refused, so to an agent that was un-paired.
-            OSError: Not reached.
+            CloudError: The cloud rejects the request, for example because the agent was unpaired.
+            OSError: The cloud cannot be reached.
         """
         return self._call("POST", "/mqtt/credentials", json={"purpose": "agent"})
 
     def commands(self, agent: str, *, wait_s: float, limit: int, have: Collection[str]) -> list[QueuedCommand]:
-        """Commands that wait for an answer: Stop first, then the oldest first.
+        """Pending commands: Stop first, then the oldest.
 
         Args:
-            agent: The agent's own id.
-            wait_s: How long the cloud may wait for one [s].
-            limit: At most so many.
-            have: Ids of commands that are not to be given again.
+            agent: The agent's id.
+            wait_s: Long poll: the cloud waits for a command up to this time [s].
+            limit: Maximum number of commands.
+            have: Ids of received commands, which are not sent again.
 
         Raises:
-            CloudError: Refused.
-            TimeoutError: No answer in time.
-            OSError: Not reached.
+            CloudError: The cloud rejects the request.
+            TimeoutError: The cloud does not respond in time.
+            OSError: The cloud cannot be reached.
         """
         wait = {"wait_ms": round(wait_s * 1000)} if wait_s else {}
-        asked = {"limit": limit, "have": list(have), **wait}
-        answer = self._call("GET", f"/agents/{agent}/commands", params=asked, timeout=ANSWER_WITHIN_S + wait_s)
+        query = {"limit": limit, "have": list(have), **wait}
+        response = self._call("GET", f"/agents/{agent}/commands", params=query, timeout=RESPONSE_TIMEOUT_S + wait_s)
         try:
-            return [QueuedCommand(item["id"], item["topic"], item["payload"].encode()) for item in answer["items"]]
+            return [QueuedCommand(item["id"], item["topic"], item["payload"].encode()) for item in response["items"]]
         except (KeyError, TypeError, AttributeError) as error:
             raise CloudError(f"the cloud's commands lack {error}") from error
 
-    def tell(
-        self, agent: str, messages: Iterable[tuple[str, bytes]], *, within_s: float = ANSWER_WITHIN_S
+    def send(
+        self, agent: str, messages: Iterable[tuple[str, bytes]], *, within_s: float = RESPONSE_TIMEOUT_S
     ) -> list[str | None]:
-        """Tell messages, each a topic and JSON.
+        """Send messages: topics and JSON.
 
         Returns:
-            For each message ``None`` once the cloud has stored it, else why it never will.
+            For each message ``None`` if the cloud has stored it, otherwise why it is rejected for good.
 
         Raises:
-            CloudError: Refused altogether.
-            TimeoutError: No answer in time: they may be stored or not, and may be told again.
-            OSError: Not reached; as above.
+            CloudError: The cloud rejects the request.
+            TimeoutError: No response in time: the messages may have been stored, and may be sent again.
+            OSError: The cloud cannot be reached; as above.
         """
         parts = b",".join(b'{"topic":"%s","payload":%s}' % (topic.encode(), payload) for topic, payload in messages)
-        answer = self._call(
+        response = self._call(
             "POST",
             f"/agents/{agent}/messages",
             data=b'{"messages":[%s]}' % parts,
             timeout=within_s,
         )
         try:
-            return [None if result["status"] == "stored" else str(result["detail"]) for result in answer["results"]]
+            return [None if result["status"] == "stored" else str(result["detail"]) for result in response["results"]]
         except (KeyError, TypeError) as error:
-            raise CloudError(f"the cloud's answer lacks {error}") from error
+            raise CloudError(f"the cloud's response lacks {error}") from error
 
-    def break_off(self) -> None:
-        """End the call that is under way: it raises ``OSError``. From any thread."""
-        self._http.break_off()
+    def abort(self) -> None:
+        """Abort the running call, which raises ``OSError``. Callable from any thread."""
+        self._http.abort()
 
     def xmpp_credentials(self) -> dict[str, Any]:
         """Credentials for the XMPP server.
 
         Raises:
-            CloudError: Refused; an agent that was un-paired learns it here.
-            OSError: Not reached.
+            CloudError: The cloud rejects the request, for example because the agent was unpaired.
+            OSError: The cloud cannot be reached.
         """
         return self._call("POST", "/xmpp/credentials", json={"purpose": "agent"})
 
     def certificate(self, request: str) -> dict[str, Any]:
-        """A certificate for the broker, by a request (PKCS 10, PEM).
+        """A client certificate for a request (PKCS 10, PEM).
 
         Raises:
-            CloudError: Refused.
-            OSError: Not reached.
+            CloudError: The cloud rejects the request.
+            OSError: The cloud cannot be reached.
         """
         return self._call("POST", "/agents/certificate", json={"request": request})
 
     def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
-        """Any other call of an agent's, below ``/api/v1``.
+        """POST to a path below ``/api/v1``.
 
         Raises:
-            CloudError: Refused.
-            OSError: Not reached.
+            CloudError: The cloud rejects the request.
+            OSError: The cloud cannot be reached.
         """
         return self._call("POST", path, json=body)
 
     def _call(self, method: str, path: str, *, timeout: float = _TIMEOUT_S, **request: Any) -> dict[str, Any]:
         sent = tick_ms()
         try:
-            answer = self._http.request(
+            response = self._http.request(
                 method,
                 self._base + path,
                 auth=_Bearer(self._token()),
                 timeout=(min(_CONNECT_S, timeout), timeout),
                 allow_redirects=False,
-                verify=True if self.ca is None else str(self.ca),  # said each time: a variable would win over less
+                verify=True
+                if self.ca is None
+                else str(self.ca),  # passed per request: an environment variable would override the session's
                 **request,
             )
         except requests.Timeout as error:
-            raise TimeoutError(f"{self._base} does not answer") from error
+            raise TimeoutError(f"{self._base} does not respond") from error
         except requests.RequestException as error:
             raise OSError(f"{self._base} cannot be reached: {_cause(error)}") from error
         received = tick_ms()
-        server_ms = answer.headers.get("X-Telescope-Time-Ms", "")
-        # An answer that was held back (long poll) says little about the moment it was asked for.
+        server_ms = response.headers.get("X-Telescope-Time-Ms", "")
+        # The response to a long poll was delayed, so its time is not comparable.
         if server_ms.isdecimal() and "wait_ms" not in (request.get("params") or {}):
             self._clock.observe(server_ms=int(server_ms), sent_tick_ms=sent, received_tick_ms=received)
-        if answer.status_code == _NO_CONTENT:
+        if response.status_code == _NO_CONTENT:
             return {}
         try:
-            body = msgspec.json.decode(answer.content)  # unlike ``answer.json()`` it takes no NaN
+            body = msgspec.json.decode(response.content)  # unlike ``response.json()`` it rejects NaN
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             body = None
         if not isinstance(body, dict):
             raise CloudError(
-                f"{self._base}{path} answered {answer.status_code} without JSON: is it a Telescope server?",
-                passing=answer.status_code >= _SERVER_ERROR,
+                f"{self._base}{path} responded {response.status_code} without JSON: is it a Telescope server?",
+                passing=response.status_code >= _SERVER_ERROR,
             )
-        if not answer.ok:
+        if not response.ok:
             code = str(body.get("type", "")).rpartition("/")[2]
-            passing = answer.status_code >= _SERVER_ERROR or answer.status_code == _TOO_MANY
-            raise CloudError(str(body.get("detail") or body.get("title") or answer.reason), code, passing=passing)
+            passing = response.status_code >= _SERVER_ERROR or response.status_code == _TOO_MANY
+            raise CloudError(str(body.get("detail") or body.get("title") or response.reason), code, passing=passing)
         return body
 
     def _token(self) -> str:
@@ -248,7 +250,7 @@ class CloudClient:
 
 
 class _Bearer(AuthBase):
-    """The token of one request. As ``auth``, else a ``.netrc`` that names the server would win over it."""
+    """Token of one request, passed as ``auth`` so that a ``.netrc`` entry cannot replace it."""
 
     def __init__(self, token: str) -> None:
         self._token = token

@@ -1,17 +1,17 @@
-"""Tells the cloud how long messages of an agent took, as ``runtime.round_trips`` has measured it."""
+"""Sends latency samples of ``runtime.telemetry.latency_probe`` to the cloud."""
 
 from collections.abc import Callable, Sequence
 
 from device_agent.transports.http.client import CloudClient
 
 
-class HttpLatencies:
-    """The samples of one agent.
+class LatencyReports:
+    """Reports latency samples of one agent.
 
     Args:
-        agent: Its id.
-        transport: What carried the messages: ``mqtt``, ``http``, ``http-poll`` or ``xmpp``.
-        open_api: A view of the HTTP API, with which nobody else calls.
+        agent: Id of the agent.
+        transport: Transport of the messages: ``mqtt``, ``http``, ``http-poll`` or ``xmpp``.
+        open_api: Creates a client for exclusive use.
     """
 
     def __init__(self, agent: str, transport: str, open_api: Callable[[], CloudClient]) -> None:
@@ -20,12 +20,12 @@ class HttpLatencies:
         self._open_api = open_api
         self._api: CloudClient | None = None
 
-    def tell(self, device: str, samples: Sequence[tuple[int, float]]) -> None:
-        """Tell samples of a device: when [ms since 1970], and how long [ms].
+    def send(self, device: str, samples: Sequence[tuple[int, float]]) -> None:
+        """Send samples of a device: time [ms since 1970] and latency [ms].
 
         Raises:
-            CloudError: Refused.
-            OSError: Not reached.
+            CloudError: The cloud rejects the request.
+            OSError: The cloud cannot be reached.
         """
         api = self._api = self._api or self._open_api()
         api.post(

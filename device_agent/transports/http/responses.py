@@ -1,4 +1,4 @@
-"""What the cloud answers to an agent, each as a type: whatever else comes is told as such, never obeyed by half."""
+"""Typed responses of the cloud; invalid responses are rejected as a whole."""
 
 from typing import Annotated, Any, TypeVar
 
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class Address(Struct, frozen=True, kw_only=True):
-    """Where a broker takes MQTT. It may want a certificate of this agent, newer than ``certificate_after_ms``."""
+    """Address of an MQTT broker. It may require a client certificate newer than ``certificate_after_ms``."""
 
     host: str
     port: Port
@@ -25,7 +25,7 @@ class Address(Struct, frozen=True, kw_only=True):
 
 
 class MqttCredentials(Struct, frozen=True, kw_only=True):
-    """Broker credentials, good for ``lifetime_s`` from now [s]."""
+    """Broker credentials, valid for ``lifetime_s`` from now on [s]."""
 
     tcp: Address
     client_id: str
@@ -36,7 +36,7 @@ class MqttCredentials(Struct, frozen=True, kw_only=True):
 
 
 class XmppCredentials(Struct, frozen=True, kw_only=True):
-    """An XMPP login, good for ``lifetime_s`` from now [s]; ``cloud`` is who to speak with."""
+    """XMPP credentials, valid for ``lifetime_s`` from now on [s]; ``cloud`` is the JID of the cloud."""
 
     host: str
     port: Port
@@ -47,14 +47,14 @@ class XmppCredentials(Struct, frozen=True, kw_only=True):
 
 
 class Owner(Struct, frozen=True, kw_only=True):
-    """The account that an agent belongs to."""
+    """The account that owns an agent."""
 
     id: str
     name: str
 
 
 class Key(Struct, frozen=True, kw_only=True):
-    """One of the cloud's public keys; it counts until ``until_ms``, 0: for now without an end."""
+    """One of the cloud's public keys, valid until ``until_ms``; 0: no end yet."""
 
     id: str
     public: PublicKeyText
@@ -63,7 +63,7 @@ class Key(Struct, frozen=True, kw_only=True):
 
 
 class Claimed(Struct, frozen=True, kw_only=True):
-    """Whose the agent is, and which keys to pin."""
+    """Account and space of a claimed agent, and the keys to pin."""
 
     agent: Id
     space: Id
@@ -72,30 +72,30 @@ class Claimed(Struct, frozen=True, kw_only=True):
 
     @property
     def serial(self) -> int:
-        """The newest key's."""
+        """Serial number of the newest key."""
         return max((key.serial for key in self.keys), default=1)
 
 
 class Certificate(Struct, frozen=True, kw_only=True):
-    """A certificate of this agent's own, PEM."""
+    """A client certificate of this agent, PEM."""
 
     chain: str
 
 
 class News(Struct, frozen=True, kw_only=True):
-    """Of the cloud's keys: statements that lead to the newest, and which of them orders are signed with now."""
+    """Key rotations: statements that lead to the newest key, and the key that signs commands now."""
 
     key_statements: tuple[Statement, ...] = ()
     signing_key: str = ""
 
 
 def read(answer: dict[str, Any], kind: type[T]) -> T:
-    """The answer as ``kind``; what else is in it is passed over.
+    """Convert a response; unknown fields are ignored.
 
     Raises:
-        CloudError: It is not; the text says where.
+        CloudError: The response is invalid; the message names the field.
     """
     try:
         return msgspec.convert(answer, kind)
     except msgspec.ValidationError as error:
-        raise CloudError(f"the cloud's answer cannot be used: {error}") from error
+        raise CloudError(f"the cloud's response is invalid: {error}") from error

@@ -1,4 +1,4 @@
-"""What waits to be told over HTTP: gathered, so that one request carries what was said meanwhile."""
+"""Queue of messages to send over HTTP; combines messages into batches."""
 
 import threading
 import time
@@ -8,19 +8,19 @@ from dataclasses import dataclass
 
 from device_agent.protocol import topics
 
-MEASURED_EVERY_S = 0.25
-"""Measurements are gathered for so long: four requests a second carry them, whatever their rate."""
-_OVERDUE_S = 4 * MEASURED_EVERY_S
-_MOST_KEPT = 2000
-_MOST_MEASURED = 500
+MEASUREMENT_INTERVAL_S = 0.25
+"""Interval of batches of measurements [s]: at most four requests per second, independent of their rate."""
+_OVERDUE_S = 4 * MEASUREMENT_INTERVAL_S
+_MAX_URGENT = 2000
+_MAX_MEASUREMENTS = 500
 _BATCH = 200
 _BATCH_BYTES = 500_000
-"""Half of what the cloud takes in one request: JSON around the payloads needs room too."""
+"""Half of the cloud's maximum request size, to leave room for the envelope [bytes]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One message to be told. ``kept``: not to be dropped while the link is up."""
+    """One message to send. ``kept``: never dropped while the link is up."""
 
     topic: str
     payload: bytes
@@ -29,56 +29,56 @@ class Message:
 
     @property
     def is_ack(self) -> bool:
-        """Whether it answers a command."""
+        """Whether the message acknowledges a command."""
         return self.topic.endswith(f"/{topics.ACK}")
 
 
 class SendQueue:
-    """Two queues, each in order. Acks, state and events go first and at once; of measurements the newest win."""
+    """Two ordered queues. Acks, state and events are sent first and at once; of measurements the newest are kept."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._kept: deque[Message] = deque()
-        self._measured: deque[Message] = deque(maxlen=_MOST_MEASURED)
-        self._told_s = 0.0
+        self._measured: deque[Message] = deque(maxlen=_MAX_MEASUREMENTS)
+        self._sent_s = 0.0
         self._closed = False
 
     def put(self, message: Message) -> bool:
-        """Lay a message in; never blocks. Whether there was room: for a measurement there always is."""
+        """Add a message; never blocks. Returns whether there was room; measurements always have room."""
         with self._changed:
             if not message.kept:
                 self._measured.append(message)
-            elif len(self._kept) < _MOST_KEPT:
+            elif len(self._kept) < _MAX_URGENT:
                 self._kept.append(message)
             else:
                 return False
-            # Whoever waits for the first measurement of a batch wakes by itself when the batch is due.
+            # The sender wakes by itself when a batch of measurements is due.
             if message.kept or len(self._measured) == 1:
                 self._changed.notify()
         return True
 
     def put_back(self, batch: Sequence[Message]) -> None:
-        """What could not be told now, before all that came since."""
+        """Return messages that could not be sent, ahead of newer ones."""
         with self._changed:
             self._kept.extendleft(message for message in reversed(batch) if message.kept)
             for message in reversed(batch):
-                if not message.kept and len(self._measured) < _MOST_MEASURED:
+                if not message.kept and len(self._measured) < _MAX_MEASUREMENTS:
                     self._measured.appendleft(message)
 
     def clear(self) -> None:
-        """The link is lost: whoever needs a message delivered says it again."""
+        """Drop all messages, because the link is lost; senders repeat messages that must be delivered."""
         with self._changed:
             self._kept.clear()
             self._measured.clear()
 
     def close(self) -> None:
-        """Nobody needs to wait any more."""
+        """Wake and stop the sender."""
         with self._changed:
             self._closed = True
             self._changed.notify()
 
     def take(self, wait_s: float) -> list[Message]:
-        """The next batch, or nothing after ``wait_s`` or when the tray was closed."""
+        """The next batch; empty after ``wait_s`` [s], or once the queue is closed."""
         end_s = time.monotonic() + wait_s
         with self._changed:
             while not self._closed:
@@ -96,24 +96,24 @@ class SendQueue:
             return 0.0
         if len(self._measured) >= _BATCH:
             return 0.0
-        return self._told_s + MEASURED_EVERY_S if self._measured else float("inf")
+        return self._sent_s + MEASUREMENT_INTERVAL_S if self._measured else float("inf")
 
     def _batch(self, now_s: float) -> list[Message]:
-        """Alone what must be told, for its sender waits; with measurements when they have had to wait for long."""
+        """Urgent messages alone, since their senders wait; with measurements if those are overdue."""
         batch = _cut(self._kept, _BATCH, _BATCH_BYTES)
-        if not batch or now_s - self._told_s > _OVERDUE_S:
+        if not batch or now_s - self._sent_s > _OVERDUE_S:
             size = sum(len(message.payload) for message in batch)
             batch += _cut(self._measured, _BATCH - len(batch), _BATCH_BYTES - size)
-            self._told_s = now_s
+            self._sent_s = now_s
         return batch
 
 
-def _cut(waiting: deque[Message], most: int, most_bytes: int) -> list[Message]:
+def _cut(queue: deque[Message], max_count: int, max_bytes: int) -> list[Message]:
     batch: list[Message] = []
     size = 0
-    while waiting and len(batch) < most:
-        size += len(waiting[0].payload)
-        if batch and size > most_bytes:
+    while queue and len(batch) < max_count:
+        size += len(queue[0].payload)
+        if batch and size > max_bytes:
             break
-        batch.append(waiting.popleft())
+        batch.append(queue.popleft())
     return batch

@@ -1,4 +1,4 @@
-"""HTTP connections that another thread can break off: a long poll must not hold up whoever wants to end."""
+"""HTTP sessions whose running call another thread can abort, so that a long poll does not delay the shutdown."""
 
 import contextlib
 import socket
@@ -12,7 +12,7 @@ from urllib3.connectionpool import HTTPConnectionPool, HTTPSConnectionPool
 
 
 class Session(requests.Session):
-    """As ``requests.Session``. ``break_off`` may be called from any thread."""
+    """``requests.Session`` with ``abort``, which may be called from any thread."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -20,15 +20,15 @@ class Session(requests.Session):
         for scheme in ("http://", "https://"):
             self.mount(scheme, self._adapter)
 
-    def break_off(self) -> None:
-        """End the call that is under way, which raises as if the server had closed; harmless when there is none."""
+    def abort(self) -> None:
+        """Abort the running call, which raises as if the server had closed the connection; no effect without a call."""
         for connection in list(self._adapter.opened):
             with contextlib.suppress(OSError, AttributeError):
                 connection.sock.shutdown(socket.SHUT_RDWR)
 
 
 class _Adapter(HTTPAdapter):
-    """Remembers the connections that it has opened."""
+    """Records the connections that it opens."""
 
     def __init__(self) -> None:
         self.opened: weakref.WeakSet[Any] = weakref.WeakSet()
@@ -46,7 +46,7 @@ class _Adapter(HTTPAdapter):
 
 
 def _pools(opened: "weakref.WeakSet[Any]") -> dict[str, Any]:
-    """Connection pools by scheme whose connections note themselves in ``opened``."""
+    """Connection pools by scheme whose connections register themselves in ``opened``."""
 
     class Plain(HTTPConnection):
         def connect(self) -> None:

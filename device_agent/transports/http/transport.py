@@ -1,12 +1,11 @@
-"""The HTTP transport: one connection asks for commands, one tells what there is to say.
+"""HTTP transport: one connection polls for commands, another one sends messages.
 
-The link is up when the cloud knows that the agent is there and has answered a poll. It is lost when a connection is
-refused or cut and a fresh one is too, when a request gets no answer in time, or when polls are only answered with
-trouble for ``LOST_AFTER_S``. As telling never pauses longer than a heartbeat, a network that swallows everything is
-noticed within ``NOTICED_WITHIN_S`` while something moves.
+The link is up once the cloud has accepted the agent's presence and answered a poll. It is lost when a connection fails
+twice in a row, when a request times out, or when polls only return temporary errors for ``LOST_AFTER_S``. The sender
+sends heartbeats, so a network that drops all packets is detected within ``SILENCE_TIMEOUT_S`` during motion.
 
-Two threads: *poll* owns the link, hands on what comes, and alone says that the link has changed; *tell* empties the
-tray.
+The *poll* thread owns the link, forwards commands and alone reports changes of the link. The *send* thread empties the
+queue.
 """
 
 import contextlib
@@ -21,23 +20,23 @@ from device_agent.ports.transport import LinkChanged, Receive
 from device_agent.protocol import Ack, Presence, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.transports.backoff import BackOff
-from device_agent.transports.http.client import ANSWER_WITHIN_S, CloudClient, CloudError, QueuedCommand
+from device_agent.transports.http.client import RESPONSE_TIMEOUT_S, CloudClient, CloudError, QueuedCommand
 from device_agent.transports.http.send_queue import Message, SendQueue
 
 LONG_POLL_S = 25.0
-"""Below what proxies and hosts cut as idle."""
+"""Maximum duration of a long poll [s]; below idle timeouts of proxies and hosts."""
 LOST_AFTER_S = 5.0
 MOVING_HEARTBEAT_S = 1.0
 RESTING_HEARTBEAT_S = 10.0
-"""Without anything to tell the cloud is asked so often whether it is there; at rest a lost link does no harm."""
-NOTICED_WITHIN_S = MOVING_HEARTBEAT_S + ANSWER_WITHIN_S
+"""Heartbeat interval without other messages [s]; at rest a lost link is harmless."""
+SILENCE_TIMEOUT_S = MOVING_HEARTBEAT_S + RESPONSE_TIMEOUT_S
 _LIMIT = 32
-"""Commands in one answer, and ids that ``have`` may name: the most that the cloud takes."""
-_AGAIN_S = 5.0
-"""A command that nobody has answered for so long may be given again: the journal knows it."""
+"""Maximum number of commands per response, and of ids in ``have``."""
+_REDELIVERY_S = 5.0
+"""A command without acknowledgement for this time may be sent again [s]; the journal deduplicates it."""
 _BUSY_PAUSE_S = 0.2
-_BREAK_EVERY_S = 0.02
-_GOODBYE_S = 0.7
+_ABORT_INTERVAL_S = 0.02
+_DISCONNECT_S = 0.7
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
@@ -46,14 +45,14 @@ class HttpTransport:
     """``ports.transport.Transport`` over HTTP.
 
     Args:
-        open_api: The cloud's API, one for each thread.
-        check: Raises ``CloudError`` when this agent is no longer what it was built as, ``OSError`` without an answer.
-        presence_topic: Where presence goes; its other topics begin alike.
-        next_session: The next session number, rising across restarts.
+        open_api: Creates a client of the cloud's API, one per thread.
+        check: Raises ``CloudError`` if the agent's pairing is no longer valid, ``OSError`` without a response.
+        presence_topic: Topic of presence; the agent's other topics have the same prefix.
+        next_session: Next session number; it rises across restarts.
         software: Name and version, for presence.
-        quiet: Whether a short break would disturb nothing.
-        wait_s: How long the cloud may hold a poll back [s]; 0: plain polls.
-        pause_s: From the begin of one plain poll to the next [s].
+        quiet: Whether a short interruption is harmless now.
+        wait_s: Maximum duration of a long poll [s]; 0: plain polls.
+        pause_s: Interval of plain polls [s].
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class HttpTransport:
         pause_s: float = 0.0,
     ) -> None:
         self._poll_api = open_api()
-        self._tell_api = open_api()
+        self._send_api = open_api()
         self._check = check
         self._presence_topic = presence_topic
         self._agent = topics.parse(presence_topic).agent
@@ -79,23 +78,23 @@ class HttpTransport:
         self._quiet = quiet
         self._wait_s = wait_s
         self._pause_s = pause_s
-        self._tray = SendQueue()
+        self._queue = SendQueue()
         self._have: dict[str, float] = {}
         self._have_lock = threading.Lock()
         self._session = 0
-        self._said_online = False
+        self._announced_online = False
         self._up = False
         self._interrupt = threading.Event()
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
-        """See ``Transport.start``."""
+        """Implements ``Transport.start``."""
         self._receive = receive
         self._link_changed = link_changed
         self._threads = [
             threading.Thread(target=self._run, name="http-poll", daemon=True),
-            threading.Thread(target=self._tell, name="http-tell", daemon=True),
+            threading.Thread(target=self._send, name="http-send", daemon=True),
         ]
         for thread in self._threads:
             thread.start()
@@ -109,27 +108,27 @@ class HttpTransport:
         retain: bool = False,  # noqa: ARG002 (the cloud knows which classes are retained)
         delivered: Callable[[], None] | None = None,
     ) -> bool:
-        """See ``Transport.publish``. What is not JSON, as pictures, has no way here and is dropped."""
+        """Implements ``Transport.publish``. Payloads that are not JSON, such as camera frames, are dropped."""
         if not self._up or not payload.startswith(b"{"):
             return False
-        return self._tray.put(Message(topic, payload, kept=qos > 0, delivered=delivered))
+        return self._queue.put(Message(topic, payload, kept=qos > 0, delivered=delivered))
 
     def stop(self) -> None:
-        """See ``Transport.stop``."""
+        """Implements ``Transport.stop``."""
         self._stopping.set()
         self._interrupt.set()
-        self._tray.close()
+        self._queue.close()
         others = [thread for thread in self._threads if thread is not threading.current_thread()]
-        goodbye_s = time.monotonic() + _GOODBYE_S
-        while any(thread.is_alive() for thread in others) and time.monotonic() < goodbye_s + _GOODBYE_S:
-            # Again and again: a call may just be about to begin.
-            self._poll_api.break_off()
-            if time.monotonic() > goodbye_s:
-                self._tell_api.break_off()
+        deadline_s = time.monotonic() + _DISCONNECT_S
+        while any(thread.is_alive() for thread in others) and time.monotonic() < deadline_s + _DISCONNECT_S:
+            # Repeatedly: a call may be about to start.
+            self._poll_api.abort()
+            if time.monotonic() > deadline_s:
+                self._send_api.abort()
             for thread in others:
-                thread.join(_BREAK_EVERY_S)
+                thread.join(_ABORT_INTERVAL_S)
 
-    # ------------------------------------------------------------ the poll thread
+    # ------------------------------------------------------------ poll thread
 
     def _run(self) -> None:
         back_off = BackOff()
@@ -141,7 +140,7 @@ class HttpTransport:
             except (OSError, ValueError) as error:
                 if not self._interrupt.is_set():
                     _log.warning("no link: %s", error)
-            except Exception:  # noqa: BLE001 (whatever it was: a robot that has lost its link must keep trying)
+            except Exception:  # noqa: BLE001 (the transport must keep reconnecting after any error)
                 _log.exception("no link")
             finally:
                 self._disconnect()
@@ -149,89 +148,89 @@ class HttpTransport:
                 return
 
     def _connect(self) -> None:
-        """Say that the agent is there, and see that commands would come.
+        """Publish presence, and check that commands can be received.
 
         Raises:
-            CloudError: The cloud does not want it.
-            OSError: Not reached.
+            CloudError: The cloud rejects the agent.
+            OSError: The cloud cannot be reached.
         """
         self._interrupt.clear()
         if self._stopping.is_set():
             return
         self._check(self._poll_api)
         self._session = self._next_session()
-        self._said_online = True
-        (refused,) = self._poll_api.tell(self._agent, [(self._presence_topic, self._presence(online=True))])
-        if refused is not None:
-            raise CloudError(f"the cloud refuses this agent's presence: {refused}")
+        self._announced_online = True
+        (rejection,) = self._poll_api.send(self._agent, [(self._presence_topic, self._presence(online=True))])
+        if rejection is not None:
+            raise CloudError(f"the cloud rejects this agent's presence: {rejection}")
         with self._have_lock:
             self._have.clear()
-        letters = self._ask(wait_s=0.0)
+        commands = self._request_commands(wait_s=0.0)
         if self._stopping.is_set():
             return
         self._up = True
         self._link_changed(True)
-        self._hand_on(letters)
+        self._forward(commands)
 
     def _disconnect(self) -> None:
         was_up, self._up = self._up, False
         if not self._stopping.is_set():
-            self._said_online = False
-            self._tray.clear()
+            self._announced_online = False
+            self._queue.clear()
         if was_up:
             self._link_changed(False)
 
     def _poll(self) -> None:
-        """Ask until the link is lost.
+        """Poll until the link is lost.
 
         Raises:
-            CloudError, OSError: Why it is.
+            CloudError, OSError: Why the link is lost.
         """
         answered_s = time.monotonic()
         while not self._interrupt.wait(self._pause(answered_s)):
-            began_s = time.monotonic()
+            started_s = time.monotonic()
             try:
-                letters = self._twice(lambda: self._ask(wait_s=self._wait_s))
+                commands = self._with_retry(lambda: self._request_commands(wait_s=self._wait_s))
             except CloudError as error:
-                self._be_patient(error, began_s - answered_s)
+                self._wait_or_raise(error, started_s - answered_s)
                 continue
-            answered_s = time.monotonic() if self._wait_s else began_s
-            self._hand_on(letters)
+            answered_s = time.monotonic() if self._wait_s else started_s
+            self._forward(commands)
 
     def _pause(self, last_s: float) -> float:
-        """Until the next poll [s]."""
+        """Time until the next poll [s]."""
         return max(0.0, last_s + self._pause_s - time.monotonic())
 
-    def _ask(self, *, wait_s: float) -> list[QueuedCommand]:
-        long_ago_s = time.monotonic() - _AGAIN_S
+    def _request_commands(self, *, wait_s: float) -> list[QueuedCommand]:
+        expired_s = time.monotonic() - _REDELIVERY_S
         with self._have_lock:
-            for command in [command for command, came_s in self._have.items() if came_s < long_ago_s]:
+            for command in [command for command, came_s in self._have.items() if came_s < expired_s]:
                 del self._have[command]
             have = list(self._have)[:_LIMIT]
         return self._poll_api.commands(self._agent, wait_s=wait_s, limit=_LIMIT, have=have)
 
-    def _hand_on(self, letters: Sequence[QueuedCommand]) -> None:
-        for letter in letters:
+    def _forward(self, commands: Sequence[QueuedCommand]) -> None:
+        for command in commands:
             if self._interrupt.is_set():
                 return
-            if not letter.topic.startswith(self._own):
+            if not command.topic.startswith(self._own):
                 self._check(self._poll_api)
-                _log.warning("the cloud gives this agent a command for '%s'", letter.topic[:200])
+                _log.warning("the cloud sent this agent a command for '%s'", command.topic[:200])
                 continue
             with self._have_lock:
-                known = letter.command in self._have
-                self._have.setdefault(letter.command, time.monotonic())
-            if not known:
-                self._receive(letter.topic, letter.payload)
-        if letters and len(self._have) > _LIMIT:
-            # More than can be named: what is given again until the first are answered must not keep two machines busy.
+                duplicate = command.command in self._have
+                self._have.setdefault(command.command, time.monotonic())
+            if not duplicate:
+                self._receive(command.topic, command.payload)
+        if commands and len(self._have) > _LIMIT:
+            # `have` cannot list more: limit the load of redeliveries until the first are acknowledged.
             self._interrupt.wait(_BUSY_PAUSE_S)
 
-    def _be_patient(self, error: CloudError, since_s: float) -> None:
-        """Wait a little when the cloud may do better soon.
+    def _wait_or_raise(self, error: CloudError, since_s: float) -> None:
+        """Wait briefly after a temporary error.
 
         Raises:
-            CloudError: It will not, or has not for too long.
+            CloudError: The error is permanent, or has lasted for too long.
         """
         if not error.passing:
             self._check(self._poll_api)
@@ -240,11 +239,11 @@ class HttpTransport:
             raise error
         self._interrupt.wait(_BUSY_PAUSE_S)
 
-    def _twice(self, call: Callable[[], T]) -> T:
-        """Call again when the connection was closed: a server may do so with one that has waited.
+    def _with_retry(self, call: Callable[[], T]) -> T:
+        """Retry once on a closed connection: servers may close idle ones.
 
         Raises:
-            OSError: A fresh one does not work either, or there was no answer in time.
+            OSError: The retry failed too, or the request timed out.
         """
         try:
             return call()
@@ -255,70 +254,70 @@ class HttpTransport:
                 raise
             return call()
 
-    # ------------------------------------------------------------ the tell thread
+    # ------------------------------------------------------------ send thread
 
-    def _tell(self) -> None:
+    def _send(self) -> None:
         while not self._stopping.is_set():
-            batch = self._tray.take(RESTING_HEARTBEAT_S if self._quiet() else MOVING_HEARTBEAT_S)
+            batch = self._queue.take(RESTING_HEARTBEAT_S if self._quiet() else MOVING_HEARTBEAT_S)
             if self._stopping.is_set():
-                self._tray.put_back(batch)
+                self._queue.put_back(batch)
             elif self._interrupt.is_set() or not self._up:
-                # The link is lost: what was for it is nobody's. The poll thread may not have seen it yet.
+                # The link is lost: drop the batch. The poll thread may not have detected it yet.
                 if self._up:
-                    self._poll_api.break_off()
-                self._stopping.wait(_BREAK_EVERY_S)
+                    self._poll_api.abort()
+                self._stopping.wait(_ABORT_INTERVAL_S)
             else:
-                self._try_to_tell(batch)
-        self._say_goodbye()
+                self._try_send(batch)
+        self._publish_offline()
 
-    def _try_to_tell(self, batch: Sequence[Message]) -> None:
+    def _try_send(self, batch: Sequence[Message]) -> None:
         session = self._session
         try:
-            self._twice(lambda: self._tell_batch(batch))
+            self._with_retry(lambda: self._send_batch(batch))
         except (OSError, ValueError) as error:
             if session != self._session:
                 return
-            self._tray.put_back(batch)
+            self._queue.put_back(batch)
             if isinstance(error, CloudError) and error.passing:
                 self._interrupt.wait(_BUSY_PAUSE_S)
             elif not self._interrupt.is_set():
-                _log.warning("link given up: %s", error)
+                _log.warning("link lost: %s", error)
                 self._interrupt.set()
-                self._poll_api.break_off()
-        except Exception:  # noqa: BLE001 (whatever it was: there are other messages)
-            _log.exception("telling")
+                self._poll_api.abort()
+        except Exception:  # noqa: BLE001 (other messages must still be sent)
+            _log.exception("sending messages")
 
-    def _tell_batch(self, batch: Sequence[Message]) -> None:
-        """Tell all, or, when there is nothing to tell, ask whether all is well.
+    def _send_batch(self, batch: Sequence[Message]) -> None:
+        """Send a batch, or a heartbeat if it is empty.
 
         Raises:
-            CloudError: The cloud takes nothing now, or nothing of this agent any more.
-            OSError: Not reached.
+            CloudError: The cloud accepts nothing now, or nothing from this agent.
+            OSError: The cloud cannot be reached.
         """
         if not batch:
-            self._check(self._tell_api, within_s=ANSWER_WITHIN_S)
+            self._check(self._send_api, within_s=RESPONSE_TIMEOUT_S)
             return
         try:
-            results = self._tell_api.tell(self._agent, [(message.topic, message.payload) for message in batch])
+            results = self._send_api.send(self._agent, [(message.topic, message.payload) for message in batch])
         except CloudError as error:
             if error.passing:
                 raise
-            self._check(self._tell_api)
+            self._check(self._send_api)
             if len(batch) == 1:
-                _log.warning("the cloud refuses a message on %s: %s", batch[0].topic, error)
+                _log.warning("the cloud rejects a message on %s: %s", batch[0].topic, error)
                 return
-            # One of them is wrong: the others shall not suffer for it.
-            self._tell_batch(batch[: len(batch) // 2])
-            self._tell_batch(batch[len(batch) // 2 :])
+            # One of the messages is invalid: send the others.
+            self._send_batch(batch[: len(batch) // 2])
+            self._send_batch(batch[len(batch) // 2 :])
             return
-        self._take_results(batch, results)
+        self._process_results(batch, results)
         if any(results):
-            self._check(self._tell_api)
+            self._check(self._send_api)
 
-    def _take_results(self, batch: Sequence[Message], results: Sequence[str | None]) -> None:
-        for message, refused in zip(batch, results, strict=True):
-            if refused is not None:
-                _log.warning("the cloud refuses a message on %s: %s", message.topic, refused[:300])
+    def _process_results(self, batch: Sequence[Message], results: Sequence[str | None]) -> None:
+        for message, rejection in zip(batch, results, strict=True):
+            if rejection is not None:
+                _log.warning("the cloud rejects a message on %s: %s", message.topic, rejection[:300])
                 continue
             if message.is_ack:
                 self._forget(message.payload)
@@ -326,19 +325,19 @@ class HttpTransport:
                 message.delivered()
 
     def _forget(self, payload: bytes) -> None:
-        """The cloud knows that this command has come, and will not give it again."""
+        """Stop listing a command as received: the cloud knows from its acknowledgement."""
         with contextlib.suppress(ProtocolError), self._have_lock:
             self._have.pop(codec.decode(payload, Ack).id, None)
 
-    def _say_goodbye(self) -> None:
-        self._threads[0].join(_GOODBYE_S / 2)  # its presence must not come after ours
-        if not self._said_online:
+    def _publish_offline(self) -> None:
+        self._threads[0].join(_DISCONNECT_S / 2)  # its presence must not follow the offline presence
+        if not self._announced_online:
             return
-        batch = self._tray.take(0.0)
+        batch = self._queue.take(0.0)
         last = Message(self._presence_topic, self._presence(online=False), kept=True)
-        told = [(message.topic, message.payload) for message in (*batch, last)]
+        payloads = [(message.topic, message.payload) for message in (*batch, last)]
         with contextlib.suppress(OSError, ValueError):
-            self._take_results((*batch, last), self._tell_api.tell(self._agent, told, within_s=_GOODBYE_S))
+            self._process_results((*batch, last), self._send_api.send(self._agent, payloads, within_s=_DISCONNECT_S))
 
     def _presence(self, *, online: bool) -> bytes:
         return codec.encode(Presence(online=online, session=self._session, at_ms=wall_ms(), software=self._software))

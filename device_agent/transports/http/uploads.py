@@ -1,4 +1,4 @@
-"""``Uploads`` over HTTP: asks the functions for an address, sends the content there, and registers it."""
+"""Uploads over HTTP: requests an upload URL, sends the content there, and registers it."""
 
 import hashlib
 import threading
@@ -14,23 +14,23 @@ _WITHIN_S = 60.0
 
 
 class HttpUploads:
-    """The captures of one agent.
+    """Uploads of one agent.
 
     Args:
-        agent: Its id.
-        open_api: A view of the HTTP API, with which nobody else calls.
+        agent: Id of the agent.
+        open_api: Creates a client for exclusive use.
     """
 
     def __init__(self, agent: str, open_api: Callable[[], CloudClient]) -> None:
         self._agent = agent
         self._open_api = open_api
         self._api: CloudClient | None = None
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
 
     def store(self, device: str, *, stream: str, name: str, media_type: str, content: bytes, at_ms: int) -> str:
-        """See ``Uploads``."""
+        """Implements ``Uploads.store``."""
         path = f"/agents/{self._agent}/uploads"
-        announced = {
+        metadata = {
             "device": device,
             "stream": stream,
             "name": name,
@@ -39,41 +39,41 @@ class HttpUploads:
             "sha256": hashlib.sha256(content).hexdigest(),
             "at_ms": at_ms,
         }
-        with self._turn:
+        with self._lock:
             try:
                 api = self._api = self._api or self._open_api()
-                begun = api.post(path, announced)
-                upload = str(begun["id"])
-                url = urljoin(api.server, str(begun["url"]))
-                # The pinned authority speaks for the server alone, not for a cloud's store of blobs.
+                created = api.post(path, metadata)
+                upload = str(created["id"])
+                url = urljoin(api.server, str(created["url"]))
+                # The pinned authority applies to the server only, not to a blob store.
                 verify = str(api.ca) if api.ca is not None and url.startswith(api.server) else True
-                _send(str(begun["method"]), url, dict(begun["headers"]), content, verify)
+                _send(str(created["method"]), url, dict(created["headers"]), content, verify)
                 api.post(f"{path}/{upload}/complete", {"device": device})
             except (CloudError, OSError) as error:
                 raise UploadError(f"the capture could not be stored: {error}") from error
             except (KeyError, TypeError, ValueError) as error:
-                raise UploadError(f"the cloud's answer to an upload lacks {error}") from error
+                raise UploadError(f"the cloud's response to an upload lacks {error}") from error
         return upload
 
 
 def _send(method: str, url: str, headers: dict[str, str], content: bytes, verify: str | bool) -> None:
-    """What the address asks for. No token of ours goes with it, and no password of a ``.netrc`` either."""
+    """Send the content to the upload URL, without the agent's token and without ``.netrc`` credentials."""
     try:
-        answer = requests.request(
+        response = requests.request(
             method,
             url,
             data=content,
             headers=headers,
-            auth=_as_it_is,
+            auth=_no_auth,
             timeout=_WITHIN_S,
             allow_redirects=False,
             verify=verify,
         )
     except requests.RequestException as error:
         raise OSError(f"the blob store cannot be reached: {error}") from error
-    if not answer.ok:
-        raise UploadError(f"the blob store answered {answer.status_code}: {answer.text[:200]}")
+    if not response.ok:
+        raise UploadError(f"the blob store responded {response.status_code}: {response.text[:200]}")
 
 
-def _as_it_is(request: requests.PreparedRequest) -> requests.PreparedRequest:
+def _no_auth(request: requests.PreparedRequest) -> requests.PreparedRequest:
     return request

@@ -1,6 +1,6 @@
-"""One connection of paho's without a thread of its own: one of ours reads, and whoever has something to say writes.
+"""One paho connection without a thread of its own: the transport's thread reads, and every caller writes directly.
 
-A thread that wrote for all others would have to be woken for each message, and to wait for its turn.
+A separate writer thread would have to be woken for each message, and to wait for its turn.
 """
 
 import contextlib
@@ -22,16 +22,16 @@ Receive = Callable[[str, bytes], None]
 
 
 class Connection:
-    """Thread-safe but for ``open``, ``turn`` and ``close``, which are its one reader's.
+    """One MQTT connection. Thread-safe, except that one thread, the reader, calls ``open``, ``turn`` and ``close``.
 
-    Nothing is called back with its lock held: what a message brings is done by the reader once it has let go of it.
+    Callbacks run without the connection's lock, in the reader's thread.
 
     Args:
-        client: Not yet connected, with ``manual_ack``: a message is acknowledged after ``receive`` has returned.
-        receive: Called with topic and payload of each message that no broker had kept.
+        client: Client with ``manual_ack``, not connected. Messages are acknowledged after ``receive`` returns.
+        receive: Called with topic and payload of each message that is not retained.
 
     Attributes:
-        silent_s: How long it has listened in vain [s]; where nothing else is said, a ping is answered each keep-alive.
+        silent_s: Time without received data [s]. Without other traffic, pings are answered every keep-alive interval.
     """
 
     def __init__(self, client: mqtt.Client, receive: Receive) -> None:
@@ -41,22 +41,22 @@ class Connection:
         self._settling = False
         self._lock = threading.RLock()
         self._delivered: dict[int, Callable[[], None]] = {}
-        self._todo: deque[Callable[[], None]] = deque()
+        self._pending_calls: deque[Callable[[], None]] = deque()
         self._events = selectors.EVENT_READ
         self._selector = selectors.DefaultSelector()
-        self._alarm, self._bell = socket.socketpair()
-        for end in (self._alarm, self._bell):
+        self._wake_reader, self._wake_writer = socket.socketpair()
+        for end in (self._wake_reader, self._wake_writer):
             end.setblocking(False)
-        self._selector.register(self._alarm, selectors.EVENT_READ)
+        self._selector.register(self._wake_reader, selectors.EVENT_READ)
         client.on_socket_open = _no_delay
         client.on_message = self._on_message
         client.on_publish = self._on_publish
 
     def open(self, host: str, port: int, *, keep_alive_s: int) -> None:
-        """Connect, and say hello; the answer comes in a ``turn``.
+        """Connect and send CONNECT; a later ``turn`` reads the response.
 
         Raises:
-            OSError: There is nobody.
+            OSError: The broker cannot be reached.
         """
         self._client.connect(host, port, keepalive=keep_alive_s)
         sock: Any = self._client.socket()
@@ -67,14 +67,14 @@ class Connection:
     def publish(
         self, topic: str, payload: bytes, *, qos: int, retain: bool = False, delivered: Callable[[], None] | None = None
     ) -> mqtt.MQTTMessageInfo | None:
-        """Send a message, as far as the socket takes it now; ``None`` where there is no connection, or not for long.
+        """Send a message as far as the socket accepts it; returns ``None`` without a connection, or while it settles.
 
         Args:
-            topic: Where to.
-            payload: What.
+            topic: Topic.
+            payload: Payload.
             qos: 0 or 1.
-            retain: Whether the broker keeps it.
-            delivered: Called by the reader once the broker has confirmed it, with QoS 1.
+            retain: Whether the broker retains the message.
+            delivered: With QoS 1, called by the reader once the broker has acknowledged the message.
         """
         with self._lock:
             if self._settling:
@@ -82,7 +82,7 @@ class Connection:
             sent = self._client.publish(topic, payload, qos=qos, retain=retain)
             if sent.rc != mqtt.MQTT_ERR_SUCCESS:
                 return None
-            if delivered is not None:  # nobody can read the confirmation before this is written down
+            if delivered is not None:  # registered before the acknowledgement can be read
                 self._delivered[sent.mid] = delivered
             waits = self._client.want_write()
         if waits:
@@ -90,72 +90,72 @@ class Connection:
         return sent
 
     def settle(self, within_s: float) -> None:
-        """Give the broker a moment to confirm what was told; nothing more is."""
+        """Accept no more messages, and wait for acknowledgements of the broker."""
         with self._lock:
             self._settling = True
         until_s = time.monotonic() + within_s
         with contextlib.suppress(OSError, ValueError):
-            while (self._delivered or self._todo) and time.monotonic() < until_s:
+            while (self._delivered or self._pending_calls) and time.monotonic() < until_s:
                 self.turn(within_s / 10)
 
     def later(self, call: Callable[[], None]) -> None:
-        """Have the reader do something, after what has come before it."""
-        self._todo.append(call)
+        """Run a call in the reader's thread, after pending ones."""
+        self._pending_calls.append(call)
 
     def wake(self) -> None:
-        """Have the reader's ``turn`` look now."""
-        with contextlib.suppress(OSError):  # it is full: then the reader is called already; or all is over
-            self._bell.send(b"!")
+        """Wake the reader's ``turn``."""
+        with contextlib.suppress(OSError):  # full: the reader is already woken; or closed
+            self._wake_writer.send(b"!")
 
     def turn(self, within_s: float) -> None:
-        """Wait for something to read, or for room to write, and see to it.
+        """Wait until data can be read or written, and process it.
 
         Raises:
-            OSError, ValueError: The connection is gone.
+            OSError, ValueError: The connection is lost.
         """
         sock: Any = self._client.socket()
         if sock is None:
-            raise OSError("the connection is gone")
+            raise OSError("the connection is lost")
         events = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._client.want_write() else 0)
         if events != self._events:
             self._selector.modify(sock, events)
             self._events = events
-        # With TLS a message may have been decrypted with the one before it: then the socket has nothing more to tell.
+        # TLS may have decrypted several messages at once; the socket does not signal those.
         decrypted = isinstance(sock, ssl.SSLSocket) and sock.pending() > 0
-        began_s = time.monotonic()
+        started_s = time.monotonic()
         ready = {key.fileobj: for_ for key, for_ in self._selector.select(0 if decrypted else within_s)}
-        heard = decrypted or bool(ready.get(sock, 0) & selectors.EVENT_READ)
-        self.silent_s = 0.0 if heard else self.silent_s + time.monotonic() - began_s
-        if self._alarm in ready:
+        readable = decrypted or bool(ready.get(sock, 0) & selectors.EVENT_READ)
+        self.silent_s = 0.0 if readable else self.silent_s + time.monotonic() - started_s
+        if self._wake_reader in ready:
             with contextlib.suppress(BlockingIOError):
-                self._alarm.recv(4096)
+                self._wake_reader.recv(4096)
         with self._lock:
-            if heard:
+            if readable:
                 self._client.loop_read()
             if self._client.want_write():
                 self._client.loop_write()
             self._client.loop_misc()
-        while self._todo:
-            self._todo.popleft()()
+        while self._pending_calls:
+            self._pending_calls.popleft()()
 
     def close(self) -> bool:
-        """Say farewell, and let go; whether everything was confirmed that somebody waited to hear of."""
+        """Disconnect. Returns True if all tracked messages were acknowledged."""
         with self._lock:
             confirmed = not self._delivered
             self._delivered.clear()
             self._client.disconnect()
-            if (left := self._client.socket()) is not None:
-                left.close()
+            if (remaining := self._client.socket()) is not None:
+                remaining.close()
             self._selector.close()
-            self._alarm.close()
-            self._bell.close()
+            self._wake_reader.close()
+            self._wake_writer.close()
         return confirmed
 
     def _on_message(self, _client: mqtt.Client, _userdata: object, message: mqtt.MQTTMessage) -> None:
-        self._todo.append(partial(self._take, message))
+        self._pending_calls.append(partial(self._take, message))
 
     def _take(self, message: mqtt.MQTTMessage) -> None:
-        if not message.retain:  # an order that a broker kept is not an order of now
+        if not message.retain:  # a retained command is outdated
             self._receive(message.topic, bytes(message.payload))
         if message.qos:
             with self._lock:
@@ -165,10 +165,10 @@ class Connection:
         self, _client: mqtt.Client, _userdata: object, mid: int, code: ReasonCode, _properties: Properties | None
     ) -> None:
         if not code.is_failure and (delivered := self._delivered.pop(mid, None)) is not None:
-            self._todo.append(delivered)
+            self._pending_calls.append(delivered)
 
 
 def _no_delay(_client: mqtt.Client, _userdata: object, sock: Any) -> None:
-    """Without this a small message can wait 40 ms for the peer's delayed acknowledgement."""
+    """Without this option a small message may wait 40 ms for the peer's delayed acknowledgement."""
     with contextlib.suppress(OSError, AttributeError):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

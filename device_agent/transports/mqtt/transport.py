@@ -1,4 +1,4 @@
-"""The MQTT transport: one connection at a time, each made afresh with new credentials, session number and will."""
+"""MQTT transport: one connection at a time, each with new credentials, session number and will."""
 
 import contextlib
 import logging
@@ -21,32 +21,35 @@ from device_agent.transports.backoff import BackOff
 from device_agent.transports.mqtt.connection import Connection
 
 KEEP_ALIVE_S = 4
-"""At rest it costs one ping."""
-NOTICED_WITHIN_S = 1.5 * KEEP_ALIVE_S
-"""A broker that is silent for so long is gone: as long as brokers wait for a client (MQTT 5, 3.1.2.10)."""
+"""MQTT keep-alive interval [s]."""
+SILENCE_TIMEOUT_S = 1.5 * KEEP_ALIVE_S
+"""The agent treats the broker as disconnected after this time without traffic [s] (as in MQTT 5, 3.1.2.10)."""
 _CONNECT_TIMEOUT_S = 5.0
-_LOOK_EVERY_S = 0.25
-_FAREWELL_S = 0.5
-_UNNOTICED_S = 0.25
-"""A connection that makes room for the next one, with new credentials, is no loss of the link if that is up so soon:
-meanwhile no Stop arrives, and setpoints that stop coming are noticed after about as long."""
-_ASK_AGAIN_S = 5.0
+_POLL_S = 0.25
+_DISCONNECT_S = 0.5
+_MAX_INTERRUPTION_S = 0.25
+"""Maximum interruption by a reconnection with new credentials that is not reported as a lost link [s]. No Stop arrives
+meanwhile; the setpoint watchdog has about the same timeout."""
+_RENEWAL_RETRY_S = 5.0
 _REFRESH_AT = 0.8
-"""Credentials are renewed after this share of their life, at a quiet moment; at the last moment in any case."""
+"""Share of the credentials' lifetime after which they are renewed at a quiet moment."""
 _REFRESH_LATEST = 0.97
-_REFRESH_LAST_CALL = 0.99
-"""From here on a connection ends even where the cloud has given no credentials for the next one."""
-_MOST_QUEUED = 2000
-_MOST_FILTERS = 8
-"""In one SUBSCRIBE: AWS IoT Core takes no more."""
+_REFRESH_DEADLINE = 0.99
+"""Share of the lifetime after which the connection ends even without new credentials."""
+_MAX_QUEUED = 2000
+_MAX_FILTERS = 8
+"""Maximum number of filters per SUBSCRIBE; the limit of AWS IoT Core."""
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class BrokerAccess:
-    """Where and as whom to connect. ``subscribe`` are the filters to ask for; ``lifetime_s`` from now [s].
+    """Address and credentials of the broker.
 
-    ``tls``: how to check who the broker is; ``None`` where the cloud says that it speaks no TLS.
+    Attributes:
+        subscribe: Filters to subscribe to.
+        lifetime_s: Validity of the credentials from now on [s].
+        tls: TLS context; ``None`` for a connection without TLS.
     """
 
     host: str
@@ -63,12 +66,12 @@ class MqttTransport:
     """``ports.transport.Transport`` over MQTT.
 
     Args:
-        access: Asks the cloud for credentials; raises ``OSError`` or ``ValueError`` when it has none now.
-        presence_topic: Where presence and will go.
-        next_session: The next session number, rising across restarts.
+        access: Requests credentials; raises ``OSError`` or ``ValueError`` if none are available now.
+        presence_topic: Topic of presence and will.
+        next_session: Next session number; it rises across restarts.
         software: Name and version, for presence.
-        listen: Topics of other agents to hear as well, as far as the broker lets it. Without them the link is up, too.
-        quiet: Whether a short break would disturb nothing.
+        listen: Topics of other agents to subscribe to, as far as the broker allows. The link does not depend on them.
+        quiet: Whether a short interruption is harmless now.
     """
 
     def __init__(
@@ -92,15 +95,15 @@ class MqttTransport:
         self._up = False
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
-        self._pictures: dict[str, mqtt.MQTTMessageInfo] = {}
+        self._frames: dict[str, mqtt.MQTTMessageInfo] = {}
         self._session = 0
-        self._orders: int | None = None
-        self._gone = threading.Event()
-        self._break: threading.Timer | None = None
-        self._break_lock = threading.Lock()
+        self._command_subscription: int | None = None
+        self._lost = threading.Event()
+        self._interruption: threading.Timer | None = None
+        self._interruption_lock = threading.Lock()
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
-        """See ``Transport.start``."""
+        """Implements ``Transport.start``."""
         self._receive = receive
         self._link_changed = link_changed
         self._thread = threading.Thread(target=self._run, name="mqtt", daemon=True)
@@ -115,117 +118,117 @@ class MqttTransport:
         retain: bool = False,
         delivered: Callable[[], None] | None = None,
     ) -> bool:
-        """See ``Transport.publish``."""
+        """Implements ``Transport.publish``."""
         connection = self._connection
         if connection is None or not self._up:
             return False
-        picture = f"/{topics.CAM}/" in topic
-        if picture and (before := self._pictures.get(topic)) is not None and not before.is_published():
-            return False  # on a slow link pictures would wait in a queue, and all that is live behind them
+        frame = f"/{topics.CAM}/" in topic
+        if frame and (before := self._frames.get(topic)) is not None and not before.is_published():
+            return False  # on a slow link, queued frames would delay all live messages
         sent = connection.publish(topic, payload, qos=qos, retain=retain, delivered=delivered if qos else None)
         if sent is None:
             return False
-        if picture:
-            self._pictures[topic] = sent
+        if frame:
+            self._frames[topic] = sent
         return True
 
     def stop(self) -> None:
-        """See ``Transport.stop``."""
+        """Implements ``Transport.stop``."""
         self._stopping.set()
         if (connection := self._connection) is not None:
             connection.wake()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout=3)
 
-    # ------------------------------------------------------------ one connection after another
+    # ------------------------------------------------------------ connections
 
     def _run(self) -> None:
         back_off = BackOff()
-        following: BrokerAccess | None = None
+        next_access: BrokerAccess | None = None
         while not self._stopping.is_set():
             back_off.attempt()
-            version, access, following = self._version, following, None
+            version, access, next_access = self._version, next_access, None
             try:
-                following = self._connect_once(access or self._access())
+                next_access = self._connect_once(access or self._access())
             except (OSError, ValueError) as error:
                 _log.warning("no link: %s", error)
-            except Exception:  # noqa: BLE001 (whatever it was: a robot that has lost its link must keep trying)
+            except Exception:  # noqa: BLE001 (the transport must keep reconnecting after any error)
                 _log.exception("no link")
-            if following is not None:
+            if next_access is not None:
                 continue
-            self._break_lasts()
+            self._report_link_lost()
             if self._version is not version:
-                continue  # the broker is there, it only speaks an older MQTT
+                continue  # the broker is reachable, but supports only MQTT 3.1.1
             if self._stopping.wait(back_off.wait_s()):
                 break
-        self._break_lasts()
+        self._report_link_lost()
 
     def _connect_once(self, access: BrokerAccess) -> BrokerAccess | None:
-        """One connection, to its end; what the next one is to be made with at once, where that is why it has ended."""
-        following: BrokerAccess | None = None
+        """Run one connection until it ends. Returns new credentials if they are why it ended."""
+        next_access: BrokerAccess | None = None
         renewal = _Renewal(self._access)
         self._session = self._next_session()
-        self._pictures = {}
-        self._gone.clear()
+        self._frames = {}
+        self._lost.clear()
         connection = self._connection = Connection(self._new_client(access), self._receive)
         try:
             connection.open(access.host, access.port, keep_alive_s=KEEP_ALIVE_S)
-            began_s = time.monotonic()
-            while not self._gone.is_set() and not self._stopping.is_set():
-                connection.turn(_LOOK_EVERY_S)
-                if self._up and connection.silent_s > NOTICED_WITHIN_S:
-                    raise OSError(f"{access.host}:{access.port} has been silent for {NOTICED_WITHIN_S:g} s")
-                age_s = time.monotonic() - began_s
+            started_s = time.monotonic()
+            while not self._lost.is_set() and not self._stopping.is_set():
+                connection.turn(_POLL_S)
+                if self._up and connection.silent_s > SILENCE_TIMEOUT_S:
+                    raise OSError(f"{access.host}:{access.port} sent nothing for {SILENCE_TIMEOUT_S:g} s")
+                age_s = time.monotonic() - started_s
                 if not self._up and age_s > _CONNECT_TIMEOUT_S:
                     self._fall_back()
-                    raise OSError(f"{access.host}:{access.port} does not answer as an MQTT broker")
+                    raise OSError(f"{access.host}:{access.port} does not respond as an MQTT broker")
                 share = age_s / access.lifetime_s
                 if self._up and (share > _REFRESH_LATEST or (share > _REFRESH_AT and self._quiet())):
                     renewal.begin()
-                if renewal.found is not None or share > _REFRESH_LAST_CALL:
-                    following = renewal.found
+                if renewal.access is not None or share > _REFRESH_DEADLINE:
+                    next_access = renewal.access
                     break
         finally:
             was_up, self._up = self._up, False
-            if following is not None:
-                connection.settle(_UNNOTICED_S)
+            if next_access is not None:
+                connection.settle(_MAX_INTERRUPTION_S)
             if self._stopping.is_set() and was_up:
                 with contextlib.suppress(ValueError, RuntimeError, OSError):
-                    self._say_farewell(connection)
+                    self._publish_offline(connection)
             confirmed = connection.close()
             self._connection = None
-            if following is not None and confirmed:
-                self._begin_break()
+            if next_access is not None and confirmed:
+                self._start_interruption()
             elif was_up:
                 self._link_changed(False)
-        return following
+        return next_access
 
-    def _begin_break(self) -> None:
-        with self._break_lock:
-            self._break = threading.Timer(_UNNOTICED_S, self._break_lasts)
-            self._break.daemon = True
-            self._break.start()
+    def _start_interruption(self) -> None:
+        with self._interruption_lock:
+            self._interruption = threading.Timer(_MAX_INTERRUPTION_S, self._report_link_lost)
+            self._interruption.daemon = True
+            self._interruption.start()
 
-    def _break_lasts(self) -> None:
-        """The next connection is not up yet: the link is lost after all."""
-        with self._break_lock:
-            if self._break is not None:
-                self._break.cancel()
-                self._break = None
+    def _report_link_lost(self) -> None:
+        """Report the lost link: the next connection was not established in time."""
+        with self._interruption_lock:
+            if self._interruption is not None:
+                self._interruption.cancel()
+                self._interruption = None
                 self._link_changed(False)
 
-    def _came_up(self) -> None:
-        with self._break_lock:
-            if self._break is not None:
-                self._break.cancel()
-                self._break = None
+    def _report_link_up(self) -> None:
+        with self._interruption_lock:
+            if self._interruption is not None:
+                self._interruption.cancel()
+                self._interruption = None
             self._link_changed(True)
 
-    def _say_farewell(self, connection: Connection) -> None:
-        farewell = connection.publish(self._presence_topic, self._presence(online=False), qos=1, retain=True)
-        until_s = time.monotonic() + _FAREWELL_S
-        while farewell is not None and not farewell.is_published() and time.monotonic() < until_s:
-            connection.turn(_FAREWELL_S / 10)
+    def _publish_offline(self, connection: Connection) -> None:
+        offline = connection.publish(self._presence_topic, self._presence(online=False), qos=1, retain=True)
+        until_s = time.monotonic() + _DISCONNECT_S
+        while offline is not None and not offline.is_published() and time.monotonic() < until_s:
+            connection.turn(_DISCONNECT_S / 10)
 
     def _new_client(self, access: BrokerAccess) -> mqtt.Client:
         options: dict[str, Any] = {} if self._version is MQTTProtocolVersion.MQTTv5 else {"clean_session": True}
@@ -241,7 +244,7 @@ class MqttTransport:
         if access.tls is not None:
             client.tls_set_context(access.tls)
         client.will_set(self._presence_topic, self._presence(online=False), qos=1, retain=True)
-        client.max_queued_messages_set(_MOST_QUEUED)
+        client.max_queued_messages_set(_MAX_QUEUED)
         client.max_inflight_messages_set(100)
         client.connect_timeout = _CONNECT_TIMEOUT_S
         client.on_connect = self._on_connect
@@ -250,7 +253,7 @@ class MqttTransport:
         client.user_data_set(access)
         return client
 
-    # ------------------------------------------------------------ paho's callbacks, in a turn of the connection
+    # ------------------------------------------------------------ paho callbacks, in the reader's thread
 
     def _on_connect(
         self,
@@ -264,39 +267,39 @@ class MqttTransport:
             if "protocol" in str(code).lower() and self._version is MQTTProtocolVersion.MQTTv5:
                 self._fall_back()
             else:
-                _log.warning("the broker refused the connection: %s", code)
+                _log.warning("the broker rejected the connection: %s", code)
             client.disconnect()
             return
-        _, self._orders = client.subscribe([(pattern, 1) for pattern in access.subscribe])
+        _, self._command_subscription = client.subscribe([(pattern, 1) for pattern in access.subscribe])
 
     def _on_subscribe(
         self, client: mqtt.Client, _access: object, mid: int, codes: list[ReasonCode], _properties: Properties | None
     ) -> None:
-        if mid != self._orders:
+        if mid != self._command_subscription:
             if any(code.is_failure for code in codes):
-                _log.warning("the broker does not let this agent hear all that agent.toml names of the room")
+                _log.warning("the broker rejected subscriptions to room measurements of agent.toml")
             return
         if any(code.is_failure for code in codes):
-            _log.error("the broker refused a subscription; check the agent's rights")
+            _log.error("the broker rejected a subscription; check the agent's permissions")
             client.disconnect()
             return
         self._up = True
         client.publish(self._presence_topic, self._presence(online=True), qos=1, retain=True)
-        for first in range(0, len(self._listen), _MOST_FILTERS):
-            client.subscribe([(topic, 0) for topic in self._listen[first : first + _MOST_FILTERS]])
+        for first in range(0, len(self._listen), _MAX_FILTERS):
+            client.subscribe([(topic, 0) for topic in self._listen[first : first + _MAX_FILTERS]])
         if (connection := self._connection) is not None:
-            connection.later(self._came_up)
+            connection.later(self._report_link_up)
 
     def _on_disconnect(
         self, _client: mqtt.Client, _access: object, _flags: object, _code: ReasonCode, _properties: Properties | None
     ) -> None:
-        self._gone.set()
+        self._lost.set()
         if (connection := self._connection) is not None:
             connection.wake()
 
     def _fall_back(self) -> None:
         if self._version is MQTTProtocolVersion.MQTTv5:
-            _log.info("the broker does not speak MQTT 5; using 3.1.1")
+            _log.info("the broker does not support MQTT 5; using 3.1.1")
             self._version = MQTTProtocolVersion.MQTTv311
 
     def _presence(self, *, online: bool) -> bytes:
@@ -304,26 +307,26 @@ class MqttTransport:
 
 
 class _Renewal:
-    """Asks for the next credentials while the present connection goes on, again and again until it gets some."""
+    """Requests the next credentials while the current connection continues, until it succeeds."""
 
     def __init__(self, access: Callable[[], BrokerAccess]) -> None:
         self._access = access
         self._thread: threading.Thread | None = None
         self._next_s = float("-inf")
-        self.found: BrokerAccess | None = None
+        self.access: BrokerAccess | None = None
 
     def begin(self) -> None:
-        """Ask, unless that is being done, or was done in vain a moment ago."""
+        """Request credentials, unless a request is running or failed recently."""
         asking = self._thread is not None and self._thread.is_alive()
-        if self.found is None and not asking and time.monotonic() >= self._next_s:
-            self._next_s = time.monotonic() + _ASK_AGAIN_S
-            self._thread = threading.Thread(target=self._ask, name="mqtt-renewal", daemon=True)
+        if self.access is None and not asking and time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + _RENEWAL_RETRY_S
+            self._thread = threading.Thread(target=self._request, name="mqtt-renewal", daemon=True)
             self._thread.start()
 
-    def _ask(self) -> None:
+    def _request(self) -> None:
         try:
-            self.found = self._access()
+            self.access = self._access()
         except (OSError, ValueError) as error:
             _log.warning("no new credentials yet: %s", error)
-        except Exception:  # noqa: BLE001 (as above: the present ones still serve, and it is asked again)
+        except Exception:  # noqa: BLE001 (the current credentials remain valid; the request is repeated)
             _log.exception("no new credentials yet")

@@ -1,4 +1,4 @@
-"""XMPP through slixmpp: the agent is a user of an XMPP server, and speaks with the one user that is the cloud."""
+"""XMPP transport, on slixmpp."""
 
 from device_agent.transports.xmpp.transport import XmppAccess, XmppTransport
 

@@ -1,8 +1,8 @@
-"""The XMPP transport: one connection at a time, each made afresh with a new password; a thread with its event loop.
+"""XMPP transport: one connection at a time, each with a new password; one thread with its event loop.
 
-The cloud is a user with any number of places (resources): programs that speak for it. The agent sees by their presence
-which are there, chooses one, and greets it with its own presence message. Once that is confirmed the link is up. When
-that program or the server goes, the link is lost, and the next one that is there is greeted with a new session number.
+The cloud is a user with any number of resources, one per gateway process. The agent learns from presence which are
+online, chooses one, and sends it the agent's presence. Once that is acknowledged the link is up. When the gateway or
+the server goes offline, the link is lost, and the agent connects to the next gateway with a new session number.
 """
 
 import asyncio
@@ -23,30 +23,30 @@ from device_agent.protocol.xmpp import stanzas
 from device_agent.protocol.xmpp.stream import Login, Stream, StreamError
 
 _CONFIRM_S = 5.0
-_GOODBYE_S = 0.5
-_FIRST_BACK_OFF_S = 0.2
-_LONGEST_BACK_OFF_S = 15.0
+_DISCONNECT_S = 0.5
+_MIN_BACK_OFF_S = 0.2
+_MAX_BACK_OFF_S = 15.0
 _REFRESH_AT = 0.8
-"""Passwords are renewed after this share of their life, at a quiet moment; at the last moment in any case."""
+"""Share of the password's lifetime after which it is renewed at a quiet moment."""
 _REFRESH_LATEST = 0.97
-_LOOK_S = 0.25
-_MOST_UNSENT_BYTES = 128 * 1024
-"""More than this not yet taken by the kernel, and of each measurement only the newest is kept to be sent."""
-_UNSENT_LOOK_S = 0.02
-_MOST_QUEUED_BYTES = 4 * 1024 * 1024
-"""More than this, and nothing is taken any more."""
-NOTICED_WITHIN_S = stanzas.TIMEOUT_S + stanzas.PING_INTERVAL_S
+_POLL_S = 0.25
+_MAX_UNSENT_BYTES = 128 * 1024
+"""Above this size of the send buffer, only the newest measurement per topic is kept [bytes]."""
+_UNSENT_POLL_S = 0.02
+_MAX_QUEUED_BYTES = 4 * 1024 * 1024
+"""Maximum size of queued messages; more are rejected [bytes]."""
+SILENCE_TIMEOUT_S = stanzas.TIMEOUT_S + stanzas.PING_INTERVAL_S
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class XmppAccess:
-    """Where and as whom to connect, and with whom to speak.
+    """Credentials and peer of a connection.
 
     Attributes:
-        login: The agent's own JID and password.
-        cloud: The bare JID of the cloud.
-        lifetime_s: Of the password, from now [s].
+        login: The agent's JID and password.
+        cloud: Bare JID of the cloud.
+        lifetime_s: Validity of the password from now on [s].
     """
 
     login: Login
@@ -58,12 +58,12 @@ class XmppTransport:
     """``ports.transport.Transport`` over XMPP.
 
     Args:
-        access: Asks the cloud for a password; raises ``OSError`` or ``ValueError`` when it has none now.
-        presence_topic: Where presence goes.
-        next_session: The next session number, rising across restarts.
+        access: Requests a password; raises ``OSError`` or ``ValueError`` if none is available now.
+        presence_topic: Topic of presence.
+        next_session: Next session number; it rises across restarts.
         software: Name and version, for presence.
-        listen: Topics of the space's other agents to hear as well.
-        quiet: Whether a short break of the link would disturb nothing.
+        listen: Topics of other agents of the space to subscribe to.
+        quiet: Whether a short interruption is harmless now.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class XmppTransport:
         self._link: _Link | None = None
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
-        """See ``Transport.start``."""
+        """Implements ``Transport.start``."""
         self._receive = receive
         self._link_changed = link_changed
         self._thread = threading.Thread(target=self._run, name="xmpp", daemon=True)
@@ -99,17 +99,17 @@ class XmppTransport:
         payload: bytes,
         *,
         qos: int,
-        retain: bool = False,  # noqa: ARG002 (who speaks for the cloud knows what is kept)
+        retain: bool = False,  # noqa: ARG002 (the gateway knows which classes are retained)
         delivered: Callable[[], None] | None = None,
     ) -> bool:
-        """See ``Transport.publish``. What is not JSON, as pictures, has no way here and is dropped."""
+        """Implements ``Transport.publish``. Payloads that are not JSON, such as camera frames, are dropped."""
         if not payload.startswith(b"{"):
             return False
         link = self._link
         return link is not None and link.publish(topic, payload, qos=qos, delivered=delivered)
 
     def stop(self) -> None:
-        """See ``Transport.stop``."""
+        """Implements ``Transport.stop``."""
         self._stopping.set()
         link = self._link
         if link is not None:
@@ -117,25 +117,25 @@ class XmppTransport:
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout=3)
 
-    # ------------------------------------------------------------ one connection after another
+    # ------------------------------------------------------------ connections
 
     def _run(self) -> None:
-        back_off_s = _FIRST_BACK_OFF_S
+        back_off_s = _MIN_BACK_OFF_S
         while not self._stopping.is_set():
-            began_s = time.monotonic()
+            started_s = time.monotonic()
             try:
                 access = self._access()
                 asyncio.run(self._connect_once(access))
             except (OSError, ValueError) as error:
                 _log.warning("no link: %s", error)
-            except Exception:  # noqa: BLE001 (whatever it was: a robot that has lost its link must keep trying)
+            except Exception:  # noqa: BLE001 (the transport must keep reconnecting after any error)
                 _log.exception("no link")
-            if time.monotonic() - began_s > _LONGEST_BACK_OFF_S:
-                back_off_s = _FIRST_BACK_OFF_S
-            # Full jitter: agents that lost one server together do not come back together.
-            if self._stopping.wait(random.uniform(_FIRST_BACK_OFF_S / 2, back_off_s)):  # noqa: S311 (not a secret)
+            if time.monotonic() - started_s > _MAX_BACK_OFF_S:
+                back_off_s = _MIN_BACK_OFF_S
+            # Full jitter: agents that lost one server together must not reconnect together.
+            if self._stopping.wait(random.uniform(_MIN_BACK_OFF_S / 2, back_off_s)):  # noqa: S311 (not a secret)
                 return
-            back_off_s = min(2 * back_off_s, _LONGEST_BACK_OFF_S)
+            back_off_s = min(2 * back_off_s, _MAX_BACK_OFF_S)
 
     async def _connect_once(self, access: XmppAccess) -> None:
         link = self._link = _Link(access, self._receive)
@@ -143,13 +143,15 @@ class XmppTransport:
         try:
             await link.stream.open()
             staying = asyncio.create_task(link.stream.stay())
-            began_s = time.monotonic()
-            while not self._stopping.is_set() and not self._to_renew(time.monotonic() - began_s, access.lifetime_s):
+            started_s = time.monotonic()
+            while not self._stopping.is_set() and not self._renewal_due(
+                time.monotonic() - started_s, access.lifetime_s
+            ):
                 if staying.done():
                     staying.result()
-                if link.peer is None and await self._greet(link):
+                if link.peer is None and await self._announce(link):
                     self._link_changed(True)
-                await link.something(_LOOK_S)
+                await link.wait_for_change(_POLL_S)
                 if link.left:
                     link.left = False
                     self._link_changed(False)
@@ -157,7 +159,7 @@ class XmppTransport:
             was_up, link.up = link.up, False
             if was_up and (self._stopping.is_set() or staying is None or not staying.done()):
                 with contextlib.suppress(StreamError):
-                    await link.tell(self._presence_topic, self._presence(link, online=False), _GOODBYE_S)
+                    await link.send(self._presence_topic, self._presence(link, online=False), _DISCONNECT_S)
             self._link = None
             if staying is not None:
                 staying.cancel()
@@ -166,21 +168,21 @@ class XmppTransport:
             if was_up or link.left:
                 self._link_changed(False)
 
-    def _to_renew(self, age_s: float, lifetime_s: float) -> bool:
+    def _renewal_due(self, age_s: float, lifetime_s: float) -> bool:
         share = age_s / lifetime_s
         return share > _REFRESH_LATEST or (share > _REFRESH_AT and self._quiet())
 
-    async def _greet(self, link: "_Link") -> bool:
-        """Choose one of those that speak for the cloud, and say to it that we are there; whether it has heard.
+    async def _announce(self, link: "_Link") -> bool:
+        """Choose a gateway and send presence to it. Returns whether the link is up.
 
         Raises:
-            StreamError: It says no, or nothing.
+            StreamError: The gateway rejects the agent or does not respond.
         """
         if not link.present:
             return False
-        link.peer = random.choice(sorted(link.present))  # noqa: S311 (spreads agents, hides nothing)
+        link.peer = random.choice(sorted(link.present))  # noqa: S311 (load distribution)
         link.session = self._next_session()
-        await link.tell(self._presence_topic, self._presence(link, online=True), _CONFIRM_S, listen=self._listen)
+        await link.send(self._presence_topic, self._presence(link, online=True), _CONFIRM_S, listen=self._listen)
         link.up = link.peer is not None
         link.left = False
         return link.up
@@ -190,14 +192,14 @@ class XmppTransport:
 
 
 class _Link:
-    """One connection. Everything but ``publish`` and ``wake`` runs in its event loop.
+    """One connection. All methods but ``publish`` and ``wake`` run in its event loop.
 
     Attributes:
-        present: JIDs of those that speak for the cloud now.
-        peer: The one that we have chosen.
-        up: Whether it has heard our greeting.
-        left: Whether it has gone since.
-        session: Number of the greeting.
+        present: JIDs of the gateways that are online.
+        peer: The chosen gateway.
+        up: Whether it has acknowledged the agent's presence.
+        left: Whether the gateway went offline offline since.
+        session: Session number.
     """
 
     def __init__(self, access: XmppAccess, receive: Receive) -> None:
@@ -216,17 +218,17 @@ class _Link:
         self._number = 0
         self._newest: dict[str, str] = {}
         self._delivered: dict[str, Callable[[], None]] = {}
-        self._answers: dict[str, asyncio.Future[str]] = {}
+        self._responses: dict[str, asyncio.Future[str]] = {}
 
-    # ------------------------------------------------------------ out
+    # ------------------------------------------------------------ outgoing
 
     def publish(self, topic: str, payload: bytes, *, qos: int, delivered: Callable[[], None] | None) -> bool:
-        """From any thread: have a message written."""
+        """Send a message, from any thread."""
         peer = self.peer
         if not self.up or peer is None:
             return False
         with self._lock:
-            if self._queued_bytes + len(payload) > _MOST_QUEUED_BYTES:
+            if self._queued_bytes + len(payload) > _MAX_QUEUED_BYTES:
                 return False
             self._queued_bytes += len(payload)
             self._number += 1
@@ -236,41 +238,41 @@ class _Link:
             if qos:
                 self._loop.call_soon_threadsafe(self._write, stanza, len(payload), number, delivered)
             else:
-                self._loop.call_soon_threadsafe(self._measure, topic, stanza, len(payload))
-        except RuntimeError:  # the loop has ended meanwhile
+                self._loop.call_soon_threadsafe(self._write_newest, topic, stanza, len(payload))
+        except RuntimeError:  # the loop has ended
             return False
         return True
 
-    async def tell(self, topic: str, payload: bytes, within_s: float, *, listen: tuple[str, ...] = ()) -> None:
-        """Send a message of our own, and wait until it is confirmed.
+    async def send(self, topic: str, payload: bytes, within_s: float, *, listen: tuple[str, ...] = ()) -> None:
+        """Send a message and wait for its receipt.
 
         Raises:
-            StreamError: It was refused, or not confirmed in time.
+            StreamError: The message was rejected, or not acknowledged in time.
         """
         if self.peer is None:
             return
         with self._lock:
             self._number += 1
             number = str(self._number)
-        answer = self._answers[number] = self._loop.create_future()
+        response = self._responses[number] = self._loop.create_future()
         self.stream.send(stanzas.message(self.peer, topic, payload, receipt=number, listen=listen))
         try:
             async with asyncio.timeout(within_s):
-                why = await answer
+                reason = await response
         except TimeoutError as error:
-            raise StreamError("whoever speaks for the cloud over XMPP does not answer") from error
+            raise StreamError("the cloud's XMPP gateway does not respond") from error
         finally:
-            del self._answers[number]
-        if why:
-            raise StreamError(f"whoever speaks for the cloud over XMPP refuses this agent: {why}")
+            del self._responses[number]
+        if reason:
+            raise StreamError(f"the cloud's XMPP gateway rejects this agent: {reason}")
 
     def wake(self) -> None:
-        """From any thread: look again at once."""
+        """Wake the event loop, from any thread."""
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._changed.set)
 
-    async def something(self, within_s: float) -> None:
-        """Wait until something has changed, but no longer than this."""
+    async def wait_for_change(self, within_s: float) -> None:
+        """Wait for a change, at most ``within_s`` [s]."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within_s):
                 await self._changed.wait()
@@ -283,60 +285,60 @@ class _Link:
             self._delivered[number] = delivered
         self.stream.send(stanza)
 
-    def _measure(self, topic: str, stanza: str, size: int) -> None:
+    def _write_newest(self, topic: str, stanza: str, size: int) -> None:
         with self._lock:
             self._queued_bytes -= size
-        if not self._newest and self.stream.unsent_bytes <= _MOST_UNSENT_BYTES:
+        if not self._newest and self.stream.unsent_bytes <= _MAX_UNSENT_BYTES:
             self.stream.send(stanza)
             return
         if not self._newest:
-            self._loop.call_later(_UNSENT_LOOK_S, self._send_newest)
+            self._loop.call_later(_UNSENT_POLL_S, self._send_newest)
         self._newest[topic] = stanza
 
     def _send_newest(self) -> None:
-        if self.stream.unsent_bytes > _MOST_UNSENT_BYTES:
-            self._loop.call_later(_UNSENT_LOOK_S, self._send_newest)
+        if self.stream.unsent_bytes > _MAX_UNSENT_BYTES:
+            self._loop.call_later(_UNSENT_POLL_S, self._send_newest)
             return
         newest, self._newest = self._newest, {}
         for stanza in newest.values():
             self.stream.send(stanza)
 
-    # ------------------------------------------------------------ in
+    # ------------------------------------------------------------ incoming
 
     def _on_message(self, stanza: Element) -> None:
         sender = stanza.get("from", "")
-        if (refused := stanzas.parse_rejection(stanza)) is not None:
-            self._came_back(refused)
+        if (rejection := stanzas.parse_rejection(stanza)) is not None:
+            self._on_rejection(rejection)
             return
         if sender.partition("/")[0] != self._access.cloud:
-            _log.warning("a message of %s was dropped: only the cloud may speak to an agent", sender[:200])
+            _log.warning("a message from %s was dropped: agents accept messages of the cloud only", sender[:200])
             return
         if (number := stanzas.receipt_id(stanza)) is not None:
             self._settle(number)
             return
         try:
-            told = stanzas.parse(stanza)
+            delivery = stanzas.parse(stanza)
         except ProtocolError as error:
             _log.warning("a message was dropped: %s", error)
             return
-        if told is not None:
-            self._receive(told.topic, told.payload)
+        if delivery is not None:
+            self._receive(delivery.topic, delivery.payload)
 
-    def _settle(self, number: str, why: str = "") -> None:
-        """A message was confirmed, or will never be taken: to tell it again would change nothing."""
-        answer = self._answers.get(number)
-        if answer is not None and not answer.done():
-            answer.set_result(why)
+    def _settle(self, number: str, reason: str = "") -> None:
+        """Complete a message that was acknowledged or rejected for good; sending it again would change nothing."""
+        response = self._responses.get(number)
+        if response is not None and not response.done():
+            response.set_result(reason)
         delivered = self._delivered.pop(number, None)
         if delivered is not None:
             delivered()
 
-    def _came_back(self, refused: stanzas.Rejection) -> None:
-        if refused.id not in self._answers:
-            _log.warning("a message came back: %s", refused.reason)
-        if not refused.final:
-            self._delivered.pop(refused.id, None)
-        self._settle(refused.id, refused.reason)
+    def _on_rejection(self, rejection: stanzas.Rejection) -> None:
+        if rejection.id not in self._responses:
+            _log.warning("a message was returned: %s", rejection.reason)
+        if not rejection.final:
+            self._delivered.pop(rejection.id, None)
+        self._settle(rejection.id, rejection.reason)
 
     def _on_presence(self, stanza: Element) -> None:
         sender = stanza.get("from", "")
@@ -350,6 +352,6 @@ class _Link:
                 self.peer = None
                 self.left, self.up = self.up or self.left, False
                 self._delivered.clear()
-                for number in list(self._answers):
-                    self._settle(number, "it has gone")
+                for number in list(self._responses):
+                    self._settle(number, "the gateway went offline")
         self._changed.set()

@@ -5,7 +5,7 @@ import time
 import pytest
 
 from device_agent.protocol import topics
-from device_agent.transports.mqtt.transport import NOTICED_WITHIN_S
+from device_agent.transports.mqtt.transport import SILENCE_TIMEOUT_S
 from tests.contract.transports.agent_suite import FAR, AgentSuite, Resident
 from tests.contract.transports.suite import Spoken, TransportSuite
 from tests.harness.cloud.cloud_processes import Link
@@ -34,11 +34,11 @@ class _OverMqtt(TransportSuite):
 
 
 class TestAmqtt(_OverMqtt):
-    spoken = Spoken(endpoint="broker", notices_s=NOTICED_WITHIN_S)
+    spoken = Spoken(endpoint="broker", notices_s=SILENCE_TIMEOUT_S)
 
 
 class TestMosquitto(_OverMqtt):
-    spoken = Spoken(endpoint="broker", notices_s=NOTICED_WITHIN_S, broker="mosquitto")
+    spoken = Spoken(endpoint="broker", notices_s=SILENCE_TIMEOUT_S, broker="mosquitto")
 
 
 class _AgentOverMqtt(AgentSuite):
@@ -46,7 +46,7 @@ class _AgentOverMqtt(AgentSuite):
         self, resident: Resident, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         transport = "device_agent.transports.mqtt.transport"
-        monkeypatch.setattr(f"{transport}._UNNOTICED_S", PATIENCE_S)  # however slow this machine is
+        monkeypatch.setattr(f"{transport}._MAX_INTERRUPTION_S", PATIENCE_S)  # however slow this machine is
         action = resident.move(FAR, speed=0.5, epoch=resident.take())
         with monkeypatch.context() as patch:
             patch.setattr(f"{transport}._REFRESH_AT", 0.0)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from device_agent.transports.xmpp.transport import NOTICED_WITHIN_S
+from device_agent.transports.xmpp.transport import SILENCE_TIMEOUT_S
 from tests.contract.transports.agent_suite import AgentSuite
 from tests.contract.transports.suite import Spoken, TransportSuite
 from tests.harness.cloud.cloud_processes import Ground
@@ -18,7 +18,7 @@ def xmpp_ground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
 
 
 class TestXmpp(TransportSuite):
-    spoken = Spoken(configuration={"transport": "xmpp"}, endpoint="xmpp", notices_s=NOTICED_WITHIN_S)
+    spoken = Spoken(configuration={"transport": "xmpp"}, endpoint="xmpp", notices_s=SILENCE_TIMEOUT_S)
 
     @pytest.fixture
     def ground(self, xmpp_ground: Ground) -> Ground:

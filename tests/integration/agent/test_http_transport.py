@@ -177,7 +177,7 @@ def test_a_command_is_named_until_its_answer_is_stored(server: Server, agent: Ag
 def test_a_command_that_nobody_answers_is_given_again(
     server: Server, agent: Agent, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(http, "_AGAIN_S", 0.2)
+    monkeypatch.setattr(http, "_REDELIVERY_S", 0.2)
     server.waiting = ["one"]
     agent.start()
     wait_until(lambda: len(agent.received) >= 2, "it to come again: the journal knows it")

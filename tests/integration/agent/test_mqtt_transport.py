@@ -186,7 +186,7 @@ def test_nothing_more_is_told_by_a_connection_that_waits_for_what_was(broker: Ru
 
 @pytest.mark.usefixtures("renewing")
 def test_without_new_credentials_the_old_ones_serve_on(broker: RunningBroker, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("device_agent.transports.mqtt.transport._ASK_AGAIN_S", 0.1)
+    monkeypatch.setattr("device_agent.transports.mqtt.transport._RENEWAL_RETRY_S", 0.1)
     still: list[bool] = []
     link = Link(broker, quiet=lambda: bool(still))
     link.up()
@@ -205,7 +205,7 @@ def test_who_was_too_busy_to_listen_does_not_take_the_broker_for_silent(
     broker: RunningBroker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("device_agent.transports.mqtt.transport.KEEP_ALIVE_S", 2)
-    monkeypatch.setattr("device_agent.transports.mqtt.transport.NOTICED_WITHIN_S", 3.0)
+    monkeypatch.setattr("device_agent.transports.mqtt.transport.SILENCE_TIMEOUT_S", 3.0)
     link = Link(broker)
     link.received = Tedious()
     link.up()

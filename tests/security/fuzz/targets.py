@@ -167,7 +167,7 @@ def _answer(data: bytes) -> None:
         api.enrollment,
         api.credentials,
         lambda: api.commands("a", wait_s=0, limit=1, have=()),
-        lambda: api.tell("a", [("t", b"{}")]),
+        lambda: api.send("a", [("t", b"{}")]),
     )
     try:
         found = asked[data[1] % len(asked)]()

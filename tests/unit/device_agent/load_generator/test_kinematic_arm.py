@@ -11,7 +11,7 @@ from device_agent.runtime.control import setpoint_stream
 
 @pytest.fixture
 def arm() -> Arm:
-    return Arm(Shape(robot_type("swarm-arm", 3, 5.0)), 0.0)
+    return Arm(Shape(robot_type("load-test-arm", 3, 5.0)), 0.0)
 
 
 def test_joints_turn_at_their_share_of_the_speed_and_stop_where_they_were_asked_to_be(arm: Arm) -> None:

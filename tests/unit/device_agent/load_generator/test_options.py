@@ -39,12 +39,12 @@ def test_what_cannot_be_run_is_refused_by_the_name_of_its_option(changes: dict[s
 
 
 def test_only_hosts_that_were_named_are_spoken_to() -> None:
-    assert PLAN.may_speak_to("telescope.example")
-    assert not PLAN.may_speak_to("broker.example")
-    assert not PLAN.may_speak_to("127.0.0.1")
-    assert replace(PLAN, broker="broker.example").may_speak_to("broker.example")
-    assert not PLAN.may_speak_to("")
-    assert replace(PLAN, cloud="http://localhost:8080").may_speak_to("127.0.0.1")
+    assert PLAN.may_connect_to("telescope.example")
+    assert not PLAN.may_connect_to("broker.example")
+    assert not PLAN.may_connect_to("127.0.0.1")
+    assert replace(PLAN, broker="broker.example").may_connect_to("broker.example")
+    assert not PLAN.may_connect_to("")
+    assert replace(PLAN, cloud="http://localhost:8080").may_connect_to("127.0.0.1")
 
 
 def test_the_next_run_has_the_same_keys_and_nobody_else_may_read_them(tmp_path: Path) -> None:

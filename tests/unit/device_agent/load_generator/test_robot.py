@@ -51,7 +51,7 @@ class Bench:
         self.cloud_ms: float | None = float(wall_ms())
         self.robot = SwarmRobot(
             (SPACE, AGENT),
-            Shape(robot_type("swarm-arm", 2, rate_hz)),
+            Shape(robot_type("load-test-arm", 2, rate_hz)),
             pins=pinned_keys_of(self.key),
             cloud_ms=lambda: self.cloud_ms,
             say=self.say,

@@ -5,7 +5,7 @@ import random
 import pytest
 
 from device_agent.transports import backoff
-from device_agent.transports.backoff import FIRST_S, LONGEST_S, BackOff
+from device_agent.transports.backoff import MIN_S, MAX_S, BackOff
 
 
 class Clock:
@@ -31,12 +31,12 @@ def waits(back: BackOff, clock: Clock, count: int, *, each_s: float) -> list[flo
     return found
 
 
-@pytest.mark.parametrize("each_s", [0.0, LONGEST_S - 0.1])
+@pytest.mark.parametrize("each_s", [0.0, MAX_S - 0.1])
 def test_it_waits_up_to_twice_as_long_each_time_and_never_longer_than_the_bound(clock: Clock, each_s: float) -> None:
-    longest = FIRST_S
+    longest = MIN_S
     for wait_s in waits(BackOff(), clock, 50, each_s=each_s):
-        assert FIRST_S / 2 <= wait_s <= longest
-        longest = min(2 * longest, LONGEST_S)
+        assert MIN_S / 2 <= wait_s <= longest
+        longest = min(2 * longest, MAX_S)
 
 
 def test_links_that_break_at_once_make_few_attempts(clock: Clock) -> None:
@@ -52,10 +52,10 @@ def test_links_that_break_at_once_make_few_attempts(clock: Clock) -> None:
 def test_a_link_that_held_lets_the_next_attempt_follow_soon(clock: Clock) -> None:
     back = BackOff()
     waits(back, clock, 20, each_s=0.0)
-    assert waits(back, clock, 1, each_s=LONGEST_S + 0.1)[0] <= FIRST_S
+    assert waits(back, clock, 1, each_s=MAX_S + 0.1)[0] <= MIN_S
 
 
 def test_agents_that_lost_one_broker_come_back_apart(clock: Clock) -> None:
     last = [waits(BackOff(), clock, 8, each_s=0.0)[-1] for _ in range(200)]
-    assert max(last) - min(last) > LONGEST_S / 2
-    assert sum(wait_s < LONGEST_S / 4 for wait_s in last) < 120
+    assert max(last) - min(last) > MAX_S / 2
+    assert sum(wait_s < MAX_S / 4 for wait_s in last) < 120

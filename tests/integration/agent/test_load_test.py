@@ -62,7 +62,7 @@ def test_twenty_agents_are_claimed_come_on_line_obey_and_leave(kind: BrokerKind,
         with command(*plan, *timing, "--json", str(figures), **who) as swarm:
             wait_until(lambda: sum(each["online"] for each in devices(ground)) == COUNT, "all on line", 120)
             one = devices(ground)[0]
-            assert one["robot_type"] == "swarm-arm"
+            assert one["robot_type"] == "load-test-arm"
             obeys(ground, one["id"])
             swarm.terminate()
             said, _ = swarm.communicate(timeout=60)
