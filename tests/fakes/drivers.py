@@ -1,4 +1,4 @@
-"""Robots that are nothing but their figures, for tests of what is decided about any robot."""
+"""Robot types and drivers without physics."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -52,7 +52,7 @@ def robot_type(base: Base | None = None, joints: Sequence[Joint] | None = None, 
 
 
 class FakeDriver:
-    """Is where it was told to be."""
+    """A driver whose joints are at the commanded positions."""
 
     simulated = True
 

@@ -1,9 +1,9 @@
-"""Handovers of control over a bad network, as many as wanted, all from one seed.
+"""Simulated handovers of control over an unreliable network, reproducible from one seed.
 
-The robot is the real controller with the real lease gate. The cloud, the operators and the network are played: grants,
-renewals, releases and setpoints are lost, doubled, delayed and overtake one another; operators go on after they have
-lost control; somebody keeps old grants and sends them again; the robot restarts with what its journal has. What must
-never happen is judged by a witness who sees all that reaches the robot and knows nothing of how the gate decides.
+The robot is the real controller with the real lease gate. Cloud, operators and network are simulated: grants, renewals,
+releases and setpoints are lost, duplicated, delayed and reordered. Operators continue after they have lost control. Old
+grants are replayed. The robot restarts with the content of its journal. A witness that sees every received message, but
+does not know the gate's rules, checks the result.
 """
 
 import heapq
@@ -19,19 +19,19 @@ from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S, joint, robot_type
 
 HANDOVERS = 50
-"""In one history, of one robot."""
+"""Handovers in one history of one robot."""
 _TYPE = robot_type(joints=[joint("elbow")])
 MakeGate = Callable[[int, int], LeaseGate]
 
 
 def real_gate(epoch: int, burned: int) -> LeaseGate:
-    """The one that ships."""
+    """The gate of the product."""
     return LeaseGate(epoch=epoch, burned=burned)
 
 
 @dataclass(order=True, slots=True)
 class Message:
-    """Something on its way to the robot."""
+    """A message in transit to the robot."""
 
     arrives_s: float
     number: int
@@ -43,7 +43,7 @@ class Message:
 
 @dataclass(slots=True)
 class Witness:
-    """Knows what has reached the robot, and so whose word counts."""
+    """Decides from the received messages which epochs are valid."""
 
     newest: int = 0
     expires_s: dict[int, float] = field(default_factory=dict)
@@ -58,16 +58,16 @@ class Witness:
         self.newest = max(self.newest, epoch)
 
     def ordered(self, epoch: int) -> None:
-        """Some other signed order arrived."""
+        """Another signed command arrived."""
         self.newest = max(self.newest, epoch)
 
     def all_ended(self) -> None:
-        """A Stop, or a restart: no lease of before counts."""
+        """A Stop or restart ends all previous leases."""
         self.ended.update(self.expires_s)
         self.ended.add(self.newest)
 
     def stale(self, epoch: int, now_s: float, *, needs_lease: bool) -> bool:
-        """Whether to obey an order of this epoch now is to obey somebody who has control no more, or never had it."""
+        """Whether a command of this epoch is from a caller without control."""
         if epoch < self.newest or epoch in self.ended:
             return True
         return needs_lease and self.expires_s.get(epoch, -1.0) < now_s
@@ -75,21 +75,21 @@ class Witness:
 
 @dataclass(slots=True)
 class Tally:
-    """What came of it."""
+    """Counts of a run."""
 
     handovers: int = 0
     delivered: int = 0
-    obeyed: int = 0
+    applied: int = 0
     stale: int = 0
 
 
 class History:
-    """One robot, and everybody who wants it.
+    """One robot and its operators.
 
     Args:
-        seed: All chance comes from it.
+        seed: Seed of the random numbers.
         gate: Makes the lease gate.
-        journal_first: Whether an epoch is written down before it is obeyed.
+        journal_first: Whether an epoch is journalled before it is applied.
     """
 
     def __init__(self, seed: int, gate: MakeGate = real_gate, *, journal_first: bool = True) -> None:
@@ -105,7 +105,7 @@ class History:
         self.tally = Tally()
 
     def run(self, handovers: int = HANDOVERS) -> Tally:
-        """Play it to the end."""
+        """Run the history to its end."""
         self._plan(handovers)
         while self._queue:
             message = heapq.heappop(self._queue)
@@ -128,7 +128,7 @@ class History:
             self._send("grant", now_s, epoch, lease_s)
             if chance.random() < 0.5:
                 self._send("grant", now_s + lease_s * 0.6, epoch, lease_s)
-            # Whoever has lost control may not know it for long.
+            # A former holder may continue for a while.
             for sequence in range(1, 5):
                 self._send("setpoint", now_s + chance.uniform(0.0, 2.5), epoch, sequence=sequence)
             what = chance.random()
@@ -162,14 +162,14 @@ class History:
         controller.start_at([0.0])
         return controller
 
-    def _signed(self, epoch: int, obey: Callable[[], None]) -> None:
-        """As the office does: an epoch stands in the journal before it is obeyed. It may be killed at any moment."""
+    def _signed(self, epoch: int, apply: Callable[[], None]) -> None:
+        """Journal the epoch before applying it, as the command processor does; a crash may happen at any moment."""
         if self._journal_first:
             self._saved = max(self._saved, epoch)
         when = self._random.random()
         if when > 0.01:
             with suppress(Refused):
-                obey()
+                apply()
         if when < 0.02:
             self._restart_now()
         self._saved = max(self._saved, self._robot.epochs[0])
@@ -191,7 +191,7 @@ class History:
         def act() -> None:
             reservation = self._robot.reserve(epoch=message.epoch, on_revoked=lambda _: None)
             self._robot.end_reservation(reservation)
-            self._judge(stale=stale)
+            self._count(stale=stale)
 
         self._signed(message.epoch, act)
 
@@ -210,7 +210,7 @@ class History:
         except Refused:
             return
         if self._robot.update(now_s).mode is Mode.STREAMING:
-            self._judge(stale=self._witness.stale(message.epoch, now_s, needs_lease=True))
+            self._count(stale=self._witness.stale(message.epoch, now_s, needs_lease=True))
 
     def _stop(self, _message: Message) -> None:
         self._witness.all_ended()
@@ -230,15 +230,15 @@ class History:
         self._witness.all_ended()
         self._robot = self._started()
 
-    def _judge(self, *, stale: bool) -> None:
-        self.tally.obeyed += 1
+    def _count(self, *, stale: bool) -> None:
+        self.tally.applied += 1
         self.tally.stale += stale
 
 
-# ------------------------------------------------------------ gates that must be caught
+# ------------------------------------------------------------ mutants
 
 
-class _Whatever(int):
+class _AnyEpoch(int):
     """An epoch that equals every other."""
 
     __slots__ = ()
@@ -253,28 +253,28 @@ class _Whatever(int):
 
 
 class NoCheck(LeaseGate):
-    """Obeys everybody who ever had control."""
+    """A gate that accepts every holder, past or present."""
 
     def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
-        """Take in any."""
+        """Accept every grant."""
         self.epoch, self.burned = epoch, 0
-        self._lease = Lease(holder, _Whatever(epoch), now_s + lease_s, reason)
+        self._lease = Lease(holder, _AnyEpoch(epoch), now_s + lease_s, reason)
 
     def fence(self, epoch: int) -> None:
-        """Refuse none."""
+        """Reject nothing."""
         self.burned = min(self.burned, epoch - 1)
 
     def current(self, now_s: float) -> Lease | None:  # noqa: ARG002
-        """For ever."""
+        """Never expire."""
         return self._lease
 
     def expire(self, now_s: float) -> bool:  # noqa: ARG002
-        """Never."""
+        """Never expire."""
         return False
 
 
 class _Unexpired(int):
-    """An epoch that equals every one whose lease has not run out."""
+    """An epoch that equals every one whose lease has not expired."""
 
     live: frozenset[int]
 
@@ -288,29 +288,29 @@ class _Unexpired(int):
 
 
 class ExpiryOnly(LeaseGate):
-    """Obeys everybody whose lease has not run out, as if clocks were all that is needed."""
+    """A gate that only checks the expiry of leases."""
 
     def __init__(self, *, epoch: int = 0, burned: int = 0) -> None:
         super().__init__(epoch=epoch, burned=burned)
         self._until_s: dict[int, float] = {}
 
     def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
-        """Take in any."""
+        """Accept every grant."""
         self._until_s[epoch] = now_s + lease_s
         self.epoch, self.burned = max(self.epoch, epoch), 0
         self._lease = Lease(holder, epoch, max(self._until_s.values()), reason)
 
     def fence(self, epoch: int) -> None:
-        """Refuse none."""
+        """Reject nothing."""
         self.burned = min(self.burned, epoch - 1)
 
     def current(self, now_s: float) -> Lease | None:
-        """The lease of whoever asks, if it has not run out."""
+        """A lease that equals all unexpired ones."""
         if self._lease is None:
             return None
-        asked = _Unexpired(self._lease.epoch)
-        asked.live = frozenset(epoch for epoch, until_s in self._until_s.items() if now_s < until_s)
-        return Lease(self._lease.holder, asked, self._lease.expires_s)
+        epoch = _Unexpired(self._lease.epoch)
+        epoch.live = frozenset(one for one, until_s in self._until_s.items() if now_s < until_s)
+        return Lease(self._lease.holder, epoch, self._lease.expires_s)
 
 
 def no_check(epoch: int, burned: int) -> LeaseGate:
@@ -323,13 +323,13 @@ def expiry_only(epoch: int, burned: int) -> LeaseGate:
     return ExpiryOnly(epoch=epoch, burned=burned)
 
 
-def play(handovers: int, *, seed: int = 0, gate: MakeGate = real_gate, journal_first: bool = True) -> Tally:
-    """As many handovers as asked, in histories of fifty; history ``n`` has the seed ``seed + n``."""
+def simulate(handovers: int, *, seed: int = 0, gate: MakeGate = real_gate, journal_first: bool = True) -> Tally:
+    """Run this many handovers, in histories of fifty; history ``n`` has the seed ``seed + n``."""
     total = Tally()
     for history in range(max(1, handovers // HANDOVERS)):
         tally = History(seed + history, gate, journal_first=journal_first).run()
         total.handovers += tally.handovers
         total.delivered += tally.delivered
-        total.obeyed += tally.obeyed
+        total.applied += tally.applied
         total.stale += tally.stale
     return total

@@ -1,4 +1,4 @@
-"""Somebody at the page of the arm: takes control, drags, and what the simulation's own record says of it."""
+"""An operator at the page of the arm, and the simulation's record of the motion."""
 
 import contextlib
 import itertools
@@ -57,7 +57,7 @@ def take(page: Page) -> None:
         assert time.monotonic() < deadline_s, state.text_content()
         button = page.get_by_test_id("take-control")
         if button.count():
-            with contextlib.suppress(Error):  # it goes as soon as somebody has control
+            with contextlib.suppress(Error):  # it disappears when an operator has control
                 button.click(timeout=1_000)
         page.wait_for_timeout(300)
     expect(page.get_by_test_id("slider-elbow")).to_be_enabled()

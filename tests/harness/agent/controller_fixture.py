@@ -1,4 +1,4 @@
-"""A controller, an operator and a clock, and what may come between them; no thread, no wait."""
+"""A controller with an operator and a clock; without threads and delays."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -112,7 +112,7 @@ def interruptions() -> dict[str, object]:
 
 
 class Wall:
-    """An elbow, one metre long, before a wall; whoever is beyond it may only come back."""
+    """An elbow, one metre long, before a wall; beyond the wall it may only return."""
 
     frames: tuple[str, ...] = ()
 

@@ -44,7 +44,7 @@ _HEARD = (topics.STATE, topics.ACK, topics.EVENT)
 class _Api:
     """What the agent asks the functions for, from a file."""
 
-    server = "http://nobody.invalid"
+    server = "http://server.invalid"
     ca = None
 
     def __init__(self, store: IdentityStore, clock: CloudClock) -> None:
@@ -76,7 +76,7 @@ class OwnAgent:
         self.store.private_key(create=True)
         keys = {signing.key_id(self.key.public_key()): signing.public_text(self.key.public_key())}
         self.store.save_pairing(Pairing(agent=AGENT, space=SPACE, account="ann", keys=keys))
-        (folder / "agent.toml").write_text(f'server = "http://nobody.invalid"\nname = "arm"\n{toml}')
+        (folder / "agent.toml").write_text(f'server = "http://server.invalid"\nname = "arm"\n{toml}')
         self.process: subprocess.Popen[bytes] | None = None
         self.heard: list[tuple[str, bytes]] = []
         self.use(broker)

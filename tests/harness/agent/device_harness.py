@@ -1,4 +1,4 @@
-"""A whole device with a toy driver and a broker that is a list: commands in, acks out."""
+"""A whole device with a fake driver and broker: commands in, acks out."""
 
 import hashlib
 import time
@@ -44,7 +44,7 @@ OWNER = "accountaaaaaaaaa"
 
 
 class DeviceHarness:
-    """A device, the cloud's key, and everything the device has said."""
+    """A device, the cloud's key, and all messages of the device."""
 
     def __init__(
         self,
@@ -68,8 +68,8 @@ class DeviceHarness:
         self.clock = CloudClock()
         self.clock.observe(server_ms=wall_ms(), sent_tick_ms=tick_ms(), received_tick_ms=tick_ms())
         self.number = 0
-        shelf = OutboxStore(folder / "outbox.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
-        self.outbox = Outbox(shelf, publish=self.publish, device_topic="ts/v1/s/a/arm")
+        store = OutboxStore(folder / "outbox.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
+        self.outbox = Outbox(store, publish=self.publish, device_topic="ts/v1/s/a/arm")
         self.outbox.link_changed(True)
         self.outbox.start()
         self.device = Device(

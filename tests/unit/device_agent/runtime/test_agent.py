@@ -1,4 +1,4 @@
-"""An agent with a device and a link that are toys: who hears what, and when."""
+"""Agent: routing of messages and link changes."""
 
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,8 @@ class Whole:
         self.harness = harness
         self.link = ToyLink(harness)
         self.room = ReadingCache(space="s", agent="a", own=["arm"], named=[("other-pir", "presence")])
-        shelf = OutboxStore(folder / "whole.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
-        self.outbox = Outbox(shelf, publish=harness.publish, device_topic="ts/v1/s/a/arm")
+        store = OutboxStore(folder / "whole.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
+        self.outbox = Outbox(store, publish=harness.publish, device_topic="ts/v1/s/a/arm")
         self.agent = Agent(
             {"arm": harness.device}, self.link, outbox=self.outbox, readings=self.room, address=("s", "a")
         )

@@ -1,4 +1,4 @@
-"""A whole device with a toy driver and a broker that is a list: commands in, acks out."""
+"""A whole device with a fake driver and broker: commands in, acks out."""
 
 import threading
 import time
@@ -170,7 +170,7 @@ def test_a_second_action_is_refused_while_one_runs_and_the_first_can_be_cancelle
     eventually(lambda: [ack for ack in harness.acks(first) if ack.status is AckStatus.STARTED])
     assert harness.end_code(harness.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1)) == "busy"
     eventually(lambda: [ack for ack in harness.acks(first) if "hello" in ack.output])
-    assert harness.end(harness.command(CancelAction(action="nobody"))).status is AckStatus.FAILED
+    assert harness.end(harness.command(CancelAction(action="unknown"))).status is AckStatus.FAILED
     assert harness.end(harness.command(CancelAction(action=first))).status is AckStatus.DONE
     cancelled = harness.end(first)
     assert cancelled.status is AckStatus.CANCELLED

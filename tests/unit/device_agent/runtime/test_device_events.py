@@ -1,4 +1,4 @@
-"""Every change of authority at a device and every refusal leaves an event."""
+"""Events of a device: changes of authority and rejections."""
 
 import sqlite3
 import time

@@ -1,4 +1,4 @@
-"""A device in trouble with its own code or its driver: it holds, says so, and leaves nothing without an end."""
+"""A device with failing code, driver or disk: it holds, reports the error and ends every command."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""What the agent knows of its space: the newest readings of what it was told to listen to, by its own clock."""
+"""Reading cache: subscriptions, ages and restarts of senders."""
 
 import pytest
 

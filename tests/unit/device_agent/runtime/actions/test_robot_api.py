@@ -1,4 +1,4 @@
-"""Every call of a script's API, from the script in its sandbox to a toy robot that can do all of it."""
+"""Every call of the script API, from the sandboxed script to a fake robot."""
 
 import math
 import threading
@@ -50,7 +50,7 @@ from tests.harness.agent.sandbox import LACK, NoSandbox
 
 
 class AbleDriver(FakeDriver):
-    """Does at once whatever it is asked, and remembers it."""
+    """A driver that executes and records every skill at once."""
 
     performs = ("speech", "stiffness", "gaze", "expressions", "behaviours", "postures")
 
@@ -214,9 +214,9 @@ def test_a_straight_motion_reaches_the_pose_or_reports_why_not(harness: DeviceHa
 
 def test_keyframes_are_played_in_time_and_delays_are_reported(harness: DeviceHarness) -> None:
     keyframes = "{'time_s': 0, 'position_rad': {'elbow': 0.1}}, {'time_s': %s, 'position_rad': {'elbow': 0.3}}"
-    begun_s = time.monotonic()
+    start_s = time.monotonic()
     play(harness, f"robot.play([{keyframes % 0.8}])")
-    assert time.monotonic() - begun_s >= 0.8
+    assert time.monotonic() - start_s >= 0.8
     assert harness.driver.position[1] == pytest.approx(0.3, abs=1e-3)
     ack = harness.end(harness.command(harness.script(f"robot.play([{keyframes % 0.001}])"), epoch=1))
     assert ack.result["limited"] == ["keyframes: later"]
@@ -293,7 +293,7 @@ def test_a_cancel_ends_a_skill(harness: DeviceHarness, name: str) -> None:
 
 
 def test_a_script_times_out(harness: DeviceHarness) -> None:
-    order = msgspec.structs.replace(harness.script("print('begun')\nwait(600)"), timeout_ms=300)
+    order = msgspec.structs.replace(harness.script("print('started')\nwait(600)"), timeout_ms=300)
     ack = harness.end(harness.command(order, epoch=1))
     assert ack.reason is not None
     assert (ack.status, ack.reason.code) == (AckStatus.FAILED, "too_long")
@@ -326,10 +326,10 @@ def test_a_script_of_another_account_runs_behind_bubblewrap(harness: DeviceHarne
 
 
 def test_a_result_contains_the_limits(harness: DeviceHarness) -> None:
-    harness.device._controller.restrict("room", 0.2, "somebody is near")
+    harness.device._controller.restrict("room", 0.2, "a person is near")
     ack = harness.end(harness.command(MoveJoints(position_rad={"elbow": 0.05}, speed=1.0), epoch=1))
     assert ack.status is AckStatus.DONE
-    assert ack.result["limited"] == ["interlock: somebody is near"]
+    assert ack.result["limited"] == ["interlock: a person is near"]
 
 
 @pytest.mark.parametrize("how", ["unavailable", "unconfined"])

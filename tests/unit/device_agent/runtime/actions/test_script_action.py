@@ -1,4 +1,4 @@
-"""Movement scripts in the real sandbox, with a robot that only takes notes."""
+"""Script actions: calls, errors, kills and limits of the sandboxed process."""
 
 import contextlib
 import hashlib
@@ -43,7 +43,7 @@ class Notes:
 
 
 def nothing() -> None:
-    """Nobody needs to know that the process is dead."""
+    """Ignore the exit of the process."""
 
 
 class Told:
@@ -58,7 +58,7 @@ class Told:
 
 
 class FakeProcess:
-    """A process that says what it is told to."""
+    """A process with preset messages."""
 
     def __init__(self, *, dies: bool = True) -> None:
         self.link, self.theirs = socket.socketpair()

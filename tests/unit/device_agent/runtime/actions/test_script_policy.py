@@ -1,4 +1,4 @@
-"""Which scripts a device runs at all."""
+"""Script policy: signatures, versions and authors."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a robot shows: by its manifest through the controller, with words that everybody can read and hear."""
+"""Skills: speech, behaviours and stiffness by manifest and by driver."""
 
 import threading
 import time
@@ -39,7 +39,7 @@ WAIT_S = 0.3
 
 
 class Servos(FakeDriver):
-    """Holds as firmly as it is told; what is limp hangs where somebody puts it."""
+    """A driver with stiffness; a compliant joint stays where the test moves it."""
 
     performs = ("stiffness",)
 
@@ -68,8 +68,8 @@ class Servos(FakeDriver):
         self.stiffness = skill.value
 
 
-class Voice:
-    """A machine's voice that takes 0.2 s for whatever it says."""
+class FakeSpeech:
+    """Speech synthesis with a fixed duration of 0.2 s."""
 
     def __init__(self, *, broken: bool = False) -> None:
         self.broken = broken
@@ -77,7 +77,7 @@ class Voice:
 
     def speak(self, text: str, language: str) -> Spoken | None:
         if self.broken:
-            raise SpeechError("no voice today")
+            raise SpeechError("no speech today")
         self.said.append((text, language))
         return Spoken(b"RIFF", 0.2)
 
@@ -170,13 +170,13 @@ def test_speech_is_published_as_text_and_moves_the_mouth(harness: DeviceHarness)
 
 @pytest.mark.parametrize(("how", "upload"), [("", "u1"), ("fails", None), ("hangs", None)])
 def test_synthesized_audio_is_uploaded_and_named_if_in_time(tmp_path: Path, how: str, upload: str | None) -> None:
-    voice, store = Voice(), Store(how)
-    harness = make(tmp_path, speech=voice, uploads=store)
+    speech, store = FakeSpeech(), Store(how)
+    harness = make(tmp_path, speech=speech, uploads=store)
     ends(harness, Say(text="hello"))
     (event,) = eventually(lambda: said(harness))
     assert event.data.get("upload") == upload
     assert event.data["duration_s"] == 0.2
-    assert voice.said == [("hello", "")]
+    assert speech.said == [("hello", "")]
     if upload:
         wanted = {"device": "arm", "stream": "speech", "media_type": "audio/wav", "content": b"RIFF"}
         assert wanted.items() <= store.kept[0].items()
@@ -185,14 +185,14 @@ def test_synthesized_audio_is_uploaded_and_named_if_in_time(tmp_path: Path, how:
 
 
 def test_failed_synthesis_leaves_the_text(tmp_path: Path) -> None:
-    harness = make(tmp_path, speech=Voice(broken=True), kind=msgspec.structs.replace(actor(), visemes={}))
+    harness = make(tmp_path, speech=FakeSpeech(broken=True), kind=msgspec.structs.replace(actor(), visemes={}))
     ends(harness, Say(text="hi"))
     assert [event.message for event in eventually(lambda: said(harness))] == ["hi"]
     harness.stop()
 
 
 def test_synthesis_without_storage_still_speaks(tmp_path: Path) -> None:
-    harness = make(tmp_path, speech=Voice())
+    harness = make(tmp_path, speech=FakeSpeech())
     ends(harness, Say(text="hi"))
     assert [event.message for event in eventually(lambda: said(harness))] == ["hi"]
     harness.stop()
@@ -233,9 +233,9 @@ def test_the_driver_receives_the_speech_duration() -> None:
 
 
 def test_a_behaviour_moves_and_speaks_in_its_time(harness: DeviceHarness) -> None:
-    begun_s = time.monotonic()
+    start_s = time.monotonic()
     ends(harness, RunBehaviour(name="bow"))
-    assert time.monotonic() - begun_s >= 0.6
+    assert time.monotonic() - start_s >= 0.6
     assert [event.message for event in eventually(lambda: said(harness))] == ["Good day"]
     assert harness.driver.position == pytest.approx([0.0, 0.0], abs=1e-3)
 
@@ -253,7 +253,7 @@ def test_stop_ends_a_behaviour_before_its_next_line(harness: DeviceHarness) -> N
 
 
 class Speaking(Servos):
-    """A robot that has a voice of its own."""
+    """A driver that speaks itself."""
 
     performs = ("speech",)
 
@@ -341,7 +341,7 @@ class Late:
 
     def __init__(self) -> None:
         self.ended = threading.Event()
-        self.reservation: Any = type("Tenure", (), {"why": None})()
+        self.reservation: Any = type("Reservation", (), {"why": None})()
 
 
 class Restless:

@@ -1,4 +1,4 @@
-"""Who asks for control, as the device shows it: until the answer, its time, or the end of the lease."""
+"""Pending control requests."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The room slows or holds a robot, and every doubt does."""
+"""Interlocks: presence, silence and changes."""
 
 from typing import Any
 
@@ -120,7 +120,7 @@ def test_presence_and_silence_slow_and_absence_clears() -> None:
     harness = DeviceHarness(rule(equals=True, action="slow", speed=0.25))
     harness.measure(present=False)
     assert harness.step() == [(NAME,)]
-    assert harness.told == [], "nothing changed for anybody"
+    assert harness.told == [], "nothing changed"
     harness.measure(present=True)
     assert harness.step() == [(NAME, 0.25, "present = true")]
     harness.measure(present=False)

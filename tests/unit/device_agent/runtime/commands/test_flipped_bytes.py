@@ -1,4 +1,4 @@
-"""Whatever bit of an order is another, the device obeys it not: of a lease, and of a movement."""
+"""Commands and movements with a flipped bit are rejected."""
 
 import msgspec
 import pytest
@@ -15,7 +15,7 @@ KEY = signing.generate()
 PINS = pinned_keys_of(KEY)
 
 
-def envelope(request: Request) -> bytes:
+def limits(request: Request) -> bytes:
     order = Command(
         id="a-arm-1",
         space="s",
@@ -36,7 +36,7 @@ def envelope(request: Request) -> bytes:
     ids=["lease", "movement"],
 )
 def test_a_command_with_a_flipped_bit_is_rejected(request_: Request) -> None:
-    good = envelope(request_)
+    good = limits(request_)
     codec.decode(signing.verify(good, PINS), Command)
     for place in range(len(good)):
         for bit in (0x01, 0x20, 0x80):

@@ -1,4 +1,4 @@
-"""Which of the cloud's keys an agent obeys, and how it follows to new ones."""
+"""Pinned keys: rotation, expiry and rejection."""
 
 from pathlib import Path
 

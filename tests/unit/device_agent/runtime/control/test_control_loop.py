@@ -1,4 +1,4 @@
-"""A setpoint for a device at rest does not wait for the next period, and telemetry tells of it when it is applied."""
+"""Control loop: early periods, Stop and telemetry rate."""
 
 import threading
 import time
@@ -32,30 +32,30 @@ LONG_MS = 600_000
 """No test waits for a period of this length: it is longer than any patience."""
 
 
-class Desk:
+class LoopFixture:
     """A toy arm whose control loop runs, and its operator."""
 
     def __init__(self, driver: FakeDriver | None = None, *, period_ms: int = LONG_MS) -> None:
         kind = robot_type(period_ms=period_ms)
         self.driver = driver or FakeDriver()
         self.controller = Controller(kind, LeaseGate())
-        self.told: list[JointTelemetry] = []
+        self.published: list[JointTelemetry] = []
         self.loop = ControlLoop(
             kind,
             self.driver,
             self.controller,
             name="arm",
-            publish=self.told.append,
+            publish=self.published.append,
             check_interlocks=lambda _now_s: None,
         )
         self._sequence = 0
 
     def start(self) -> None:
         self.loop.start()
-        wait_until(lambda: len(self.told) == 1, "the first period")
+        wait_until(lambda: len(self.published) == 1, "the first period")
         self.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=time.monotonic())
 
-    def ask(self, elbow_rad: float) -> None:
+    def send_setpoint(self, elbow_rad: float) -> None:
         self._sequence += 1
         target = JointTarget(position_rad={"elbow": elbow_rad})
         setpoint = Setpoint(epoch=1, sequence=self._sequence, echo_tick_ms=5, sent_ms=0.0, target=target)
@@ -64,28 +64,28 @@ class Desk:
 
 
 @pytest.fixture
-def desk() -> Iterator[Desk]:
-    desk = Desk()
-    desk.start()
-    yield desk
-    desk.loop.stop()
+def setup() -> Iterator[LoopFixture]:
+    setup = LoopFixture()
+    setup.start()
+    yield setup
+    setup.loop.stop()
 
 
-def test_a_device_at_rest_follows_a_setpoint_at_once(desk: Desk) -> None:
-    desk.ask(0.5)
-    wait_until(lambda: desk.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
-    wait_until(lambda: desk.told[-1].setpoint_sequence == 1, "telemetry of it")
+def test_a_device_at_rest_follows_a_setpoint_at_once(setup: LoopFixture) -> None:
+    setup.send_setpoint(0.5)
+    wait_until(lambda: setup.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
+    wait_until(lambda: setup.published[-1].setpoint_sequence == 1, "telemetry of it")
 
 
-def test_a_flood_of_setpoints_adds_one_period(desk: Desk) -> None:
-    desk.ask(0.5)
-    wait_until(lambda: desk.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
-    desk.ask(0.7)
+def test_a_flood_of_setpoints_adds_one_period(setup: LoopFixture) -> None:
+    setup.send_setpoint(0.5)
+    wait_until(lambda: setup.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
+    setup.send_setpoint(0.7)
     time.sleep(SILENCE_S)
-    assert desk.driver.position[1] == pytest.approx(0.5)
+    assert setup.driver.position[1] == pytest.approx(0.5)
 
 
-class PromptDriver(FakeDriver):
+class InlineDriver(FakeDriver):
     """Its loop's thread is not needed: ``threads`` are those that have commanded it."""
 
     prompt = True
@@ -100,60 +100,60 @@ class PromptDriver(FakeDriver):
 
 
 def test_an_inline_driver_is_commanded_by_the_callers_thread() -> None:
-    desk = Desk(PromptDriver())
-    desk.start()
+    setup = LoopFixture(InlineDriver())
+    setup.start()
     try:
-        desk.ask(0.5)
-        assert desk.driver.position[1] == pytest.approx(0.5)
-        assert desk.told[-1].setpoint_sequence == 1
-        desk.ask(0.7)  # the second waits for its period, which here takes ten minutes
-        assert desk.driver.position[1] == pytest.approx(0.5)
-        assert isinstance(desk.driver, PromptDriver)
-        assert desk.driver.threads[1:] == [threading.current_thread().name]
+        setup.send_setpoint(0.5)
+        assert setup.driver.position[1] == pytest.approx(0.5)
+        assert setup.published[-1].setpoint_sequence == 1
+        setup.send_setpoint(0.7)  # the second waits for its period, which here takes ten minutes
+        assert setup.driver.position[1] == pytest.approx(0.5)
+        assert isinstance(setup.driver, InlineDriver)
+        assert setup.driver.threads[1:] == [threading.current_thread().name]
     finally:
-        desk.loop.stop()
-    desk.loop._out_of_turn = False
-    desk.ask(0.9)
-    assert len(desk.driver.threads) == 2, "who has stopped commands nothing more"
+        setup.loop.stop()
+    setup.loop._out_of_turn = False
+    setup.send_setpoint(0.9)
+    assert len(setup.driver.threads) == 2, "who has stopped commands nothing more"
 
 
 def test_a_full_period_follows_an_early_one() -> None:
-    driver = PromptDriver()
-    desk = Desk(driver, period_ms=300)
-    desk.start()
+    driver = InlineDriver()
+    setup = LoopFixture(driver, period_ms=300)
+    setup.start()
     try:
         before = len(driver.threads)
         wait_until(lambda: len(driver.threads) > before, "a period")
-        desk.loop._out_of_turn = False
-        desk.ask(0.5)
+        setup.loop._out_of_turn = False
+        setup.send_setpoint(0.5)
         asked_s, commanded = time.monotonic(), len(driver.threads)
         wait_until(lambda: len(driver.threads) > commanded, "the next period")
         assert time.monotonic() - asked_s >= 0.29
     finally:
-        desk.loop.stop()
+        setup.loop.stop()
 
 
 def test_a_blocked_period_does_not_prevent_stop() -> None:
-    desk = Desk()
-    desk.start()
-    with desk.loop._period_lock:
-        desk.loop.stop()
-    assert desk.loop._stopping.is_set()
+    setup = LoopFixture()
+    setup.start()
+    with setup.loop._period_lock:
+        setup.loop.stop()
+    assert setup.loop._stopping.is_set()
 
 
 def test_concurrent_wakes_run_one_period() -> None:
     """The other finds out when it has the turn, not before; so does the loop's own thread."""
-    driver = PromptDriver()
-    desk = Desk(driver)
-    desk.start()
-    real = desk.loop._period_lock
+    driver = InlineDriver()
+    setup = LoopFixture(driver)
+    setup.start()
+    real = setup.loop._period_lock
 
     class Turn:
-        """Whoever takes it finds that somebody else was quicker."""
+        """A lock after whose acquisition another thread has just run a period."""
 
         def acquire(self, **how: Any) -> bool:
             taken = real.acquire(**how)
-            desk.loop._out_of_turn = True
+            setup.loop._out_of_turn = True
             return taken
 
         def release(self) -> None:
@@ -166,37 +166,37 @@ def test_concurrent_wakes_run_one_period() -> None:
             self.release()
 
     try:
-        wait_until(lambda: desk.loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
-        desk.loop._period_lock = Turn()  # type: ignore[assignment]
+        wait_until(lambda: setup.loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
+        setup.loop._period_lock = Turn()  # type: ignore[assignment]
         commanded = len(driver.threads)
-        desk.ask(0.5)
+        setup.send_setpoint(0.5)
         time.sleep(SILENCE_S)
         assert len(driver.threads) == commanded
     finally:
-        desk.loop._period_lock = real
-        desk.loop.stop()
+        setup.loop._period_lock = real
+        setup.loop.stop()
 
 
 def test_an_error_in_an_early_period_is_a_fault_until_the_driver_responds() -> None:
-    desk = Desk(PromptDriver(), period_ms=8)
-    desk.start()
+    setup = LoopFixture(InlineDriver(), period_ms=8)
+    setup.start()
     try:
-        with desk.loop._period_lock:  # its loop's thread waits meanwhile
-            desk.driver.broken = True
-            desk.controller.update(time.monotonic())
-        wait_until(lambda: desk.controller.fault is not None, "the fault")
-        desk.driver.broken = False
-        wait_until(lambda: desk.controller.fault is None, "the driver's return")
+        with setup.loop._period_lock:  # its loop's thread waits meanwhile
+            setup.driver.broken = True
+            setup.controller.update(time.monotonic())
+        wait_until(lambda: setup.controller.fault is not None, "the fault")
+        setup.driver.broken = False
+        wait_until(lambda: setup.controller.fault is None, "the driver's return")
     finally:
-        desk.loop.stop()
-    desk = Desk(PromptDriver())
-    desk.start()
+        setup.loop.stop()
+    setup = LoopFixture(InlineDriver())
+    setup.start()
     try:
-        desk.driver.refuses = True
-        desk.ask(0.5)
-        wait_until(lambda: desk.controller.fault == "no", "the fault")
+        setup.driver.refuses = True
+        setup.send_setpoint(0.5)
+        wait_until(lambda: setup.controller.fault == "no", "the fault")
     finally:
-        desk.loop.stop()
+        setup.loop.stop()
 
 
 def plainly(harness: DeviceHarness) -> None:
@@ -208,7 +208,7 @@ def signed(harness: DeviceHarness) -> None:
 
 
 @pytest.mark.parametrize("stop", [plainly, signed])
-@pytest.mark.parametrize("driver", [FakeDriver, PromptDriver])
+@pytest.mark.parametrize("driver", [FakeDriver, InlineDriver])
 def test_a_stop_at_rest_does_not_wait_for_a_period(
     tmp_path: Path, driver: type[FakeDriver], stop: Callable[[DeviceHarness], object]
 ) -> None:
@@ -225,101 +225,101 @@ def test_a_stop_at_rest_does_not_wait_for_a_period(
 
 
 def test_in_motion_periods_keep_their_length() -> None:
-    desk = Desk(PromptDriver(), period_ms=8)
-    desk.controller.start_at((0.0, 0.0))
+    setup = LoopFixture(InlineDriver(), period_ms=8)
+    setup.controller.start_at((0.0, 0.0))
     now_s = time.monotonic()
-    desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
-    desk.ask(0.5)
-    assert desk.loop._wait()
-    desk.controller.update(now_s)
-    assert desk.controller.moving
-    desk.ask(0.6)
-    assert not desk.loop._wait()
-    assert desk.driver.position[1] == 0.0, "no period has been run"
+    setup.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
+    setup.send_setpoint(0.5)
+    assert setup.loop._wait()
+    setup.controller.update(now_s)
+    assert setup.controller.moving
+    setup.send_setpoint(0.6)
+    assert not setup.loop._wait()
+    assert setup.driver.position[1] == 0.0, "no period has been run"
 
 
-def moving(period_ms: int, periods: int = 20) -> Desk:
-    """A desk whose arm moves and whose loop's thread is held back, as between two periods."""
-    desk = Desk(PromptDriver(), period_ms=period_ms)
-    desk.controller.start_at((0.0, 0.0))
-    desk.loop._thread = threading.current_thread()
+def moving(period_ms: int, periods: int = 20) -> LoopFixture:
+    """A setup whose arm moves and whose loop's thread is held back, as between two periods."""
+    setup = LoopFixture(InlineDriver(), period_ms=period_ms)
+    setup.controller.start_at((0.0, 0.0))
+    setup.loop._thread = threading.current_thread()
     now_s = time.monotonic()
-    desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
-    desk.loop._out_of_turn = True
-    desk.ask(2.5)
+    setup.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
+    setup.loop._out_of_turn = True
+    setup.send_setpoint(2.5)
     for _ in range(periods):
-        desk.loop._run_period(early=False)
-    assert desk.controller.mode is Mode.STREAMING
-    assert desk.controller.moving
-    return desk
+        setup.loop._run_period(early=False)
+    assert setup.controller.mode is Mode.STREAMING
+    assert setup.controller.moving
+    return setup
 
 
 def test_a_stop_in_motion_brakes_at_once_for_the_elapsed_time() -> None:
-    desk = moving(period_ms=4)
-    assert isinstance(desk.driver, PromptDriver)
-    before_rad, speed_rad_s = desk.driver.position[1], desk.controller._state.motion.velocity_rad_s[1]
-    commanded = len(desk.driver.threads)
-    desk.loop._next_s = time.monotonic() + 0.004 - 0.001  # a quarter of the period has passed, or more
-    desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    desk.loop.wake()
-    assert desk.controller.mode is Mode.STOPPED
-    assert len(desk.driver.threads) == commanded + 1
-    assert 0 < desk.driver.position[1] - before_rad <= speed_rad_s * 0.004 + 1e-9
-    assert desk.controller.moving, "it brakes, it does not jump"
-    assert desk.loop._next_s > time.monotonic() - 1
-    desk.loop.wake()
-    assert len(desk.driver.threads) == commanded + 1, "only once: then periods keep their length again"
+    setup = moving(period_ms=4)
+    assert isinstance(setup.driver, InlineDriver)
+    before_rad, speed_rad_s = setup.driver.position[1], setup.controller._state.motion.velocity_rad_s[1]
+    commanded = len(setup.driver.threads)
+    setup.loop._next_s = time.monotonic() + 0.004 - 0.001  # a quarter of the period has passed, or more
+    setup.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    setup.loop.wake()
+    assert setup.controller.mode is Mode.STOPPED
+    assert len(setup.driver.threads) == commanded + 1
+    assert 0 < setup.driver.position[1] - before_rad <= speed_rad_s * 0.004 + 1e-9
+    assert setup.controller.moving, "it brakes, it does not jump"
+    assert setup.loop._next_s > time.monotonic() - 1
+    setup.loop.wake()
+    assert len(setup.driver.threads) == commanded + 1, "only once: then periods keep their length again"
 
 
 def test_a_stop_after_an_early_period_does_not_wait() -> None:
-    desk = moving(period_ms=4)
-    desk.loop._out_of_turn = True
-    desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    desk.loop.wake()
-    assert desk.controller.mode is Mode.STOPPED
+    setup = moving(period_ms=4)
+    setup.loop._out_of_turn = True
+    setup.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    setup.loop.wake()
+    assert setup.controller.mode is Mode.STOPPED
 
 
 def test_the_elapsed_time_is_bounded() -> None:
-    desk = moving(period_ms=4)
-    desk.loop._next_s = 10.0
-    assert [desk.loop._passed_s(now_s) for now_s in (9.0, 9.996, 9.998, 10.0, 11.0)] == pytest.approx(
+    setup = moving(period_ms=4)
+    setup.loop._next_s = 10.0
+    assert [setup.loop._passed_s(now_s) for now_s in (9.0, 9.996, 9.998, 10.0, 11.0)] == pytest.approx(
         [0.0001, 0.0001, 0.002, 0.004, 0.004]
     )
 
 
 def test_a_stop_waits_for_the_running_period() -> None:
-    desk = moving(period_ms=100, periods=3)
-    desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    desk.loop._period_lock.acquire()
-    threading.Timer(0.05, desk.loop._period_lock.release).start()
-    desk.loop.wake()
-    assert desk.controller.mode is Mode.STOPPED
+    setup = moving(period_ms=100, periods=3)
+    setup.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    setup.loop._period_lock.acquire()
+    threading.Timer(0.05, setup.loop._period_lock.release).start()
+    setup.loop.wake()
+    assert setup.controller.mode is Mode.STOPPED
 
 
 def test_telemetry_follows_setpoints_within_its_rate_limit() -> None:
-    desk = Desk()
-    desk.controller.start_at((0.0, 0.0))
-    seen, tick = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ()), desk.controller.update(0.0)
+    setup = LoopFixture()
+    setup.controller.start_at((0.0, 0.0))
+    seen, tick = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ()), setup.controller.update(0.0)
 
     def told(now_s: float, sequence: int) -> bool:
-        before = len(desk.told)
-        desk.loop._publish_telemetry(now_s, seen, replace(tick, setpoint_sequence=sequence), (0.0, 0.0))
-        return len(desk.told) > before
+        before = len(setup.published)
+        setup.loop._publish_telemetry(now_s, seen, replace(tick, setpoint_sequence=sequence), (0.0, 0.0))
+        return len(setup.published) > before
 
     asked = ((0.0, 0), (0.03, 0), (0.03, 1), (0.04, 2), (0.045, 3), (0.0501, 3))
     assert [told(now_s, sequence) for now_s, sequence in asked] == [True, False, True, True, False, True]
 
 
 def test_telemetry_is_in_step_with_setpoints_or_at_33_hz() -> None:
-    desk = Desk()
-    desk.controller.start_at((0.0, 0.0))
+    setup = LoopFixture()
+    setup.controller.start_at((0.0, 0.0))
     seen = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
-    tick = replace(desk.controller.update(0.0), mode=Mode.STREAMING)
+    tick = replace(setup.controller.update(0.0), mode=Mode.STREAMING)
     for period in range(1001):
         now_s = period / 1000
-        desk.loop._publish_telemetry(now_s, seen, replace(tick, setpoint_sequence=period // 25), (0.0, 0.0))
-    assert [each.setpoint_sequence for each in desk.told] == list(range(41))
-    desk.told.clear()
+        setup.loop._publish_telemetry(now_s, seen, replace(tick, setpoint_sequence=period // 25), (0.0, 0.0))
+    assert [each.setpoint_sequence for each in setup.published] == list(range(41))
+    setup.published.clear()
     for period in range(1001, 2002):
-        desk.loop._publish_telemetry(period / 1000, seen, replace(tick, setpoint_sequence=40), (0.0, 0.0))
-    assert 32 <= len(desk.told) <= 34
+        setup.loop._publish_telemetry(period / 1000, seen, replace(tick, setpoint_sequence=40), (0.0, 0.0))
+    assert 32 <= len(setup.published) <= 34

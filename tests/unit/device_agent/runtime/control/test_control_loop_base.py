@@ -1,4 +1,4 @@
-"""The control loop of a robot that drives: its driver is told how at every period, or the device does not start."""
+"""Control loop of a mobile robot."""
 
 import threading
 

@@ -1,4 +1,4 @@
-"""The controller, tick by tick: what moves, what holds, who is obeyed."""
+"""Controller: setpoints, leases, Stop and actions, period by period."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Driving: for a time, inside limits, braked by whatever brakes the joints."""
+"""Driving: duration, limits and braking."""
 
 import math
 from itertools import pairwise
@@ -71,9 +71,9 @@ def test_a_restriction_slows_a_drive() -> None:
     fixture = ControllerFixture(base=BASE)
     drive = driving(fixture)
     twists(fixture, 1.0)
-    fixture.controller.restrict("zone", 0.5, "somebody is near")
+    fixture.controller.restrict("zone", 0.5, "a person is near")
     assert twists(fixture, 0.8)[-1] == pytest.approx(Twist(0.2, 0.0, -0.25))
-    assert drive.limited == ("interlock: somebody is near",)
+    assert drive.limited == ("interlock: a person is near",)
 
 
 def test_drive_and_joint_goals_replace_each_other() -> None:

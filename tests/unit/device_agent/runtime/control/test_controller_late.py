@@ -1,4 +1,4 @@
-"""A machine that is busy: the control loop is called late. A hold takes no longer, and nothing jumps."""
+"""Late control loops and late setpoints."""
 
 import pytest
 
@@ -19,14 +19,14 @@ def fixture() -> ControllerFixture:
 
 def rest_after(fixture: ControllerFixture, *gaps_s: float) -> float:
     """Time to rest after the last setpoint, with these times between one call of the loop and the next."""
-    began_s = fixture.now_s
+    start_s = fixture.now_s
     for count in range(200):
         before = fixture.elbow
         fixture.now_s += gaps_s[count % len(gaps_s)]
         fixture.elbow = fixture.controller.update(fixture.now_s).position_rad[1]
         assert abs(fixture.elbow - before) <= FASTEST_RAD_S * PERIOD_S, "a jump"
         if not fixture.controller.moving:
-            return fixture.now_s - began_s
+            return fixture.now_s - start_s
     pytest.fail("it never came to rest")
 
 

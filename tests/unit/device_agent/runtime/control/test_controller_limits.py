@@ -1,4 +1,4 @@
-"""Limits for every source: nothing comes nearer than it may, and whoever is too near can still leave."""
+"""Limits for every source of motion."""
 
 import math
 from collections.abc import Sequence
@@ -142,15 +142,15 @@ def test_without_geometry_loop_age_alone_limits_the_speed() -> None:
 
 
 def test_one_late_setpoint_does_not_limit_the_speed() -> None:
-    pace = LatencyLimiter(None, watchdog_s=0.3, max_age_s=0.2)
-    assert pace.age_s == 0.0
+    limiter = LatencyLimiter(None, watchdog_s=0.3, max_age_s=0.2)
+    assert limiter.age_s == 0.0
     for _ in range(50):
-        pace.add_age(0.03)
-    pace.add_age(0.19)
-    assert pace.age_s < 0.07
-    assert pace.joint_share() == 1.0
-    pace.reset()
-    assert pace.age_s == 0.0
+        limiter.add_age(0.03)
+    limiter.add_age(0.19)
+    assert limiter.age_s < 0.07
+    assert limiter.joint_share() == 1.0
+    limiter.reset()
+    assert limiter.age_s == 0.0
 
 
 def test_changes_by_the_driver_are_reported() -> None:
@@ -249,6 +249,6 @@ def test_limits_are_listed_by_available_model() -> None:
 
 
 def test_a_path_without_motion_is_not_checked() -> None:
-    envelope = MotionLimits(robot_type(), Wall(-1.0))
-    assert envelope.find_obstacle([[0.0, 0.0], [0.0, 0.0]]) is None
-    assert envelope.find_obstacle([[0.0, 0.0], [0.0, 0.1]]) is not None
+    limits = MotionLimits(robot_type(), Wall(-1.0))
+    assert limits.find_obstacle([[0.0, 0.0], [0.0, 0.0]]) is None
+    assert limits.find_obstacle([[0.0, 0.0], [0.0, 0.1]]) is not None

@@ -1,4 +1,4 @@
-"""The controller under chance: whatever comes in whatever order, limits hold and nobody moves it without authority."""
+"""Random runs of the controller: limits hold, and nothing moves without authority."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Board(Wall):
 
 
 class Post(Board):
-    """A post: whoever reaches out far enough, in its direction, touches it."""
+    """A post that the arm can touch."""
 
     def clearance(self, position_rad: Sequence[float]) -> Clearance:
         shoulder, elbow = position_rad
@@ -69,7 +69,7 @@ class Post(Board):
 
 
 class Chance:
-    """One seeded life of a controller, watched at every tick by somebody who only knows what was asked and answered."""
+    """One seeded run of a controller, checked in each period against requests and responses only."""
 
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)  # noqa: S311
@@ -123,7 +123,7 @@ class Chance:
         self.sequence = 0
 
     def likely(self) -> bool:
-        """Mostly somebody clears the way first; sometimes they just try."""
+        """Usually clear all restrictions first."""
         if self.random.random() < 0.2:
             return False
         if self.controller.latch is not None:
@@ -224,7 +224,7 @@ class Chance:
     def restrict(self) -> None:
         speed, source = self.random.choice((0.0, 0.2, 0.7, 0.7, math.nan)), self.random.choice("ab")
         moved = self.controller.moving or self.reservation is not None
-        self.controller.restrict(source, speed, "somebody is near")
+        self.controller.restrict(source, speed, "a person is near")
         self.restrictions[source] = speed if speed > 0 else 0.0
         if self.speed() <= 0:
             assert self.reservation is None, "the action was not told"

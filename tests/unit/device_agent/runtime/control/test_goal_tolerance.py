@@ -1,4 +1,4 @@
-"""A move is done when the joints are there, not when they were told to be; what does not come says so."""
+"""Goal tolerance: measured joints must arrive."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ Servo = Callable[[Sequence[float]], Sequence[float]]
 
 
 class Loaded(ControllerFixture):
-    """A fixture whose joints are measured: each time where a servo has them, by where they are told to be."""
+    """A fixture with measured joints, computed from the commands by a servo model."""
 
     def __init__(self, servo: Servo) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ def test_the_end_of_a_trajectory_is_checked() -> None:
 
     fixture = Loaded(lambda told: (told[0], told[1] - 0.12))
     way = MotionPlanner(robot_type(), Open(9.0)).plan([0.0, 0.0], [0.0, 1.0], speed=1.0, ended=lambda: False)
-    passage = fixture.controller.start_trajectory(fixture.reservation, way)
-    fixture.go(passage)
-    assert passage.why is not None
-    assert "elbow is 0.12 rad short" in passage.why.message
+    goal = fixture.controller.start_trajectory(fixture.reservation, way)
+    fixture.go(goal)
+    assert goal.why is not None
+    assert "elbow is 0.12 rad short" in goal.why.message

@@ -1,4 +1,4 @@
-"""Setpoints for a frame and for a base: while they are fresh, inside every limit, and nothing goes on after them."""
+"""Setpoints for a frame and for a base."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Motion by itself: what it does when asked for what cannot be."""
+"""Joint motion: special cases of the generator."""
 
 import msgspec
 import pytest

@@ -1,4 +1,4 @@
-"""Keyframes and speech as one way: on time where limits allow it, later where they do not, never beyond its places."""
+"""Behaviour trajectories: keyframes, speech and visemes."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""Joints that hang together: no commanded position ever leaves the range that another joint leaves it."""
+"""Joint couplings: no command leaves the range that depends on another joint."""
 
 import math
 from collections.abc import Mapping
@@ -207,7 +207,7 @@ def test_a_joint_outside_its_range_returns_and_never_moves_further_out() -> None
 
 
 def test_a_command_beyond_the_range_is_clamped_to_its_edge() -> None:
-    """The last word, for whatever comes to the motors by a way of its own."""
+    """Commands from any source are clamped."""
     couplings = Couplings(head())
     position = [2.0, 0.3, 0.0, 0.0]
     couplings.clamp_to_range(position, [0.0, 0.3, 0.0, 0.0])
@@ -234,12 +234,12 @@ def test_a_joint_that_cannot_return_stays() -> None:
     ],
 )
 def test_a_trajectory_that_violates_couplings_is_rejected(places: list[list[float]], says: str) -> None:
-    envelope = MotionLimits(head(), None)
+    limits = MotionLimits(head(), None)
     if says:
         with pytest.raises(Refused, match=says):
-            envelope.check_trajectory(np.array(places))
+            limits.check_trajectory(np.array(places))
     else:
-        envelope.check_trajectory(np.array(places))
+        limits.check_trajectory(np.array(places))
 
 
 def test_compliant_joints_track_the_measurement() -> None:

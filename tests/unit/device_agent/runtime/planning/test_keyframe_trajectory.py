@@ -1,4 +1,4 @@
-"""Keyframes as one way: on time where limits allow it, later where not, never back, and never beyond a place."""
+"""Keyframe trajectories: times, limits and agreement with the preview."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Ways around things: found, gone along in physics without a touch, and refused clearly where there are none."""
+"""Motion planning around obstacles and on straight lines."""
 
 import math
 from pathlib import Path
@@ -69,10 +69,10 @@ def check_around(scene: Path, shape: MujocoGeometry, seed: int) -> float:
     """Plan with this seed, go, and give how far the flange then is from where it should be [m]."""
     physics, routes = Physics(scene, shape), MotionPlanner(KIND, shape, seed=seed)
     way = routes.plan(HOME, BEYOND, speed=1.0, ended=lambda: False)
-    passage = physics.controller.start_trajectory(physics.reservation, way)
+    goal = physics.controller.start_trajectory(physics.reservation, way)
     physics.run(way.duration_s + 1.5)
-    assert passage.result is GoalResult.REACHED, passage.why
-    assert passage.limited == ()
+    assert goal.result is GoalResult.REACHED, goal.why
+    assert goal.limited == ()
     assert physics.touched == 0
     return math.dist(physics.flange_m(), shape.poses(BEYOND)["flange"][:3])
 

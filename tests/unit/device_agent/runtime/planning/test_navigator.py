@@ -1,4 +1,4 @@
-"""Going to a place in the room: around what stands there, and never without knowing where the robot is."""
+"""Navigation: localization, path search and driving to a goal."""
 
 import math
 import threading
@@ -13,7 +13,7 @@ from device_agent.protocol import GoTo, StopLatch
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.planning import navigator as errand_module
+from device_agent.runtime.planning import navigator as navigator_module
 from device_agent.runtime.planning.grid_search import find_path
 from device_agent.runtime.planning.localization import Pose2D, PoseEstimator
 from device_agent.runtime.planning.navigator import BLOCKED_TIMEOUT_S, START_TIMEOUT_S, UPDATE_PERIOD_S, Navigator
@@ -36,11 +36,11 @@ def room(*walls: tuple[float, float, float, float]) -> OccupancyGrid:
     return grid
 
 
-def go(errand: Navigator, grid: OccupancyGrid, place: Pose2D, *, seconds: float = 60.0) -> list[Pose2D]:
+def go(navigator: Navigator, grid: OccupancyGrid, place: Pose2D, *, seconds: float = 60.0) -> list[Pose2D]:
     """Where an ideal base comes."""
     places = [place]
     for _ in range(round(seconds / UPDATE_PERIOD_S)):
-        twist = errand.compute_twist(places[-1], grid)
+        twist = navigator.compute_twist(places[-1], grid)
         if twist is None:
             return places
         assert all(abs(part) <= most + 1e-9 for part, most in zip(twist, LIMITS, strict=True))
@@ -58,8 +58,8 @@ def go(errand: Navigator, grid: OccupancyGrid, place: Pose2D, *, seconds: float 
 
 def test_the_robot_avoids_a_wall_and_reaches_the_heading() -> None:
     grid = room((-0.1, -2.0, 0.1, 0.8))
-    errand = Navigator((1.2, -1.0), 1.5, limits=LIMITS, radius_m=0.25)
-    places = go(errand, grid, Pose2D(-1.2, -1.0, 2.0))
+    navigator = Navigator((1.2, -1.0), 1.5, limits=LIMITS, radius_m=0.25)
+    places = go(navigator, grid, Pose2D(-1.2, -1.0, 2.0))
     assert math.dist((places[-1].x_m, places[-1].y_m), (1.2, -1.0)) <= 0.08
     assert places[-1].yaw_rad == pytest.approx(1.5, abs=0.05)
     taken = grid.blocked(0.15)
@@ -116,12 +116,12 @@ def test_a_path_leads_between_obstacles() -> None:
 
 
 def test_an_occupied_goal_has_a_short_timeout_before_the_start() -> None:
-    errand = Navigator((1.0, 0.0), None, limits=LIMITS, radius_m=0.25)
+    navigator = Navigator((1.0, 0.0), None, limits=LIMITS, radius_m=0.25)
     taken = Refused("taken", "")
-    assert errand.timeout_s(taken) == START_TIMEOUT_S
-    assert errand.timeout_s(Refused("out_of_room", "")) == 0
-    errand.compute_twist(Pose2D(0.0, 0.0, 0.0), room())
-    assert errand.timeout_s(taken) == BLOCKED_TIMEOUT_S
+    assert navigator.timeout_s(taken) == START_TIMEOUT_S
+    assert navigator.timeout_s(Refused("out_of_room", "")) == 0
+    navigator.compute_twist(Pose2D(0.0, 0.0, 0.0), room())
+    assert navigator.timeout_s(taken) == BLOCKED_TIMEOUT_S
 
 
 def test_room_positions_correct_the_odometry() -> None:
@@ -156,15 +156,15 @@ def test_a_robot_without_a_position_does_not_drive(seen: Reading | None) -> None
 
 
 def test_at_the_goal_the_robot_only_turns() -> None:
-    errand = Navigator((0.0, 0.0), 1.0, limits=LIMITS, radius_m=0.25)
-    twist = errand.compute_twist(Pose2D(0.01, 0.0, 0.0), room())
+    navigator = Navigator((0.0, 0.0), 1.0, limits=LIMITS, radius_m=0.25)
+    twist = navigator.compute_twist(Pose2D(0.01, 0.0, 0.0), room())
     assert twist is not None
     assert (twist.forward_m_s, twist.left_m_s) == (REST.forward_m_s, REST.left_m_s)
     assert twist.turn_rad_s > 0
 
 
 class Toy:
-    """A base that goes as it is told, in a thread of its own."""
+    """A base that follows commands in its own thread."""
 
     def __init__(self, ground: OccupancyGrid | None) -> None:
         self.fixture = ControllerFixture(base=BASE)
@@ -212,8 +212,8 @@ def test_go_to_reaches_the_goal_and_rests() -> None:
 
 
 def test_go_to_without_a_map_or_after_the_timeout_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(errand_module, "BLOCKED_TIMEOUT_S", 0.15)
-    monkeypatch.setattr(errand_module, "START_TIMEOUT_S", 0.15)
+    monkeypatch.setattr(navigator_module, "BLOCKED_TIMEOUT_S", 0.15)
+    monkeypatch.setattr(navigator_module, "START_TIMEOUT_S", 0.15)
     shut = room((0.5, -2, 0.7, 2))
     for ground, x_m, code in ((None, 1.0, "no_ground"), (shut, 0.6, "taken"), (room(), 9.0, "out_of_room")):
         toy = Toy(ground)

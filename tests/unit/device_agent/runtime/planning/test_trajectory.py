@@ -1,4 +1,4 @@
-"""Ways: inside every limit, gone along to their end, and never left, not even to brake."""
+"""Trajectories: limits, following, braking on the path."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -70,10 +70,10 @@ def test_a_single_segment_is_straight_and_nearly_time_optimal() -> None:
     fixture = ControllerFixture()
     reservation = fixture.reserve()
     move = fixture.controller.start_joint_goal(reservation, {"shoulder": 2.0, "elbow": 1.0}, speed=1.0)
-    began_s = fixture.now_s
+    start_s = fixture.now_s
     while not move.finished.is_set():
         fixture.run(PERIOD_S)
-    assert found.duration_s <= 1.3 * (fixture.now_s - began_s)
+    assert found.duration_s <= 1.3 * (fixture.now_s - start_s)
 
 
 def test_corners_are_blended_as_widely_as_obstacles_allow() -> None:
@@ -93,9 +93,9 @@ def test_corners_are_blended_as_widely_as_obstacles_allow() -> None:
 def test_a_trajectory_is_followed_to_rest() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
     reservation = fixture.reserve()
-    passage = fixture.controller.start_trajectory(reservation, found)
+    goal = fixture.controller.start_trajectory(reservation, found)
     gone = ride(fixture, found.duration_s + 0.1)
-    assert passage.result is GoalResult.REACHED
+    assert goal.result is GoalResult.REACHED
     assert gone[: len(found.position_rad) - 1] == pytest.approx(found.position_rad[1:], abs=1e-6)
     assert fixture.controller.commanded_rad == pytest.approx([1.2, 1.0], abs=1e-9)
     assert not fixture.controller.moving
@@ -121,12 +121,12 @@ def test_every_revocation_brakes_on_the_path(cause: str, after_s: float) -> None
     fixture, found = ControllerFixture(), along(CORNER)
     fixture.take(1, lease_s=5.0)
     reservation = fixture.reserve()
-    passage = fixture.controller.start_trajectory(reservation, found)
+    goal = fixture.controller.start_trajectory(reservation, found)
     before = ride(fixture, after_s)
     assert before[-1] != pytest.approx(before[-2], abs=1e-6)
     interruptions()[cause](fixture)  # type: ignore[operator]
     gone = ride(fixture, 0.3)
-    assert passage.result is GoalResult.INTERRUPTED
+    assert goal.result is GoalResult.INTERRUPTED
     assert not fixture.controller.moving
     assert gone[-1] == pytest.approx(gone[-2], abs=1e-6)
     check_on(found, gone)
@@ -136,16 +136,16 @@ def test_every_revocation_brakes_on_the_path(cause: str, after_s: float) -> None
 def test_a_restriction_slows_a_trajectory_within_the_limits() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
     reservation = fixture.reserve()
-    passage = fixture.controller.start_trajectory(reservation, found)
+    goal = fixture.controller.start_trajectory(reservation, found)
     gone = [ride(fixture, 0.4)]
-    fixture.controller.restrict("room", 0.3, "somebody is near")
+    fixture.controller.restrict("room", 0.3, "a person is near")
     gone.append(ride(fixture, 1.5))
     slow = np.max(np.abs(np.diff(gone[-1][-40:], axis=0))) / PERIOD_S
     assert slow <= 0.3 * 3.0 + 1e-6
     fixture.controller.lift("room")
     gone.append(ride(fixture, 3.0))
-    assert passage.result is GoalResult.REACHED
-    assert any("somebody is near" in one for one in passage.limited)
+    assert goal.result is GoalResult.REACHED
+    assert any("a person is near" in one for one in goal.limited)
     whole = np.concatenate(gone)
     check_on(found, whole)
     assert slopes(whole)[1] <= 8.0 * 1.05
@@ -154,10 +154,10 @@ def test_a_restriction_slows_a_trajectory_within_the_limits() -> None:
 def test_an_obstacle_on_the_trajectory_holds_the_device_before_it() -> None:
     fixture, found = ControllerFixture(geometry=Wall(0.5)), along(CORNER)
     reservation = fixture.reserve()
-    passage = fixture.controller.start_trajectory(reservation, found)
+    goal = fixture.controller.start_trajectory(reservation, found)
     gone = ride(fixture, 3.0)
-    assert passage.why is not None
-    assert passage.why.code == "no_room"
+    assert goal.why is not None
+    assert goal.why.code == "no_room"
     assert np.max(gone[:, 1]) <= 0.5 + 1e-6
     check_on(found, gone)
 
@@ -178,10 +178,10 @@ def test_a_late_control_loop_catches_up_braking_on_a_trajectory() -> None:
 def test_a_new_goal_waits_until_the_trajectory_has_braked() -> None:
     fixture, found = ControllerFixture(), along(CORNER)
     reservation = fixture.reserve()
-    passage = fixture.controller.start_trajectory(reservation, found)
+    goal = fixture.controller.start_trajectory(reservation, found)
     ride(fixture, 0.5)
     move = fixture.controller.start_joint_goal(reservation, {"shoulder": 0.0, "elbow": 0.0}, speed=1.0)
-    assert passage.result is GoalResult.INTERRUPTED
+    assert goal.result is GoalResult.INTERRUPTED
     gone = ride(fixture, 3.0)
     assert move.result is GoalResult.REACHED
     assert slopes(gone)[1] <= 20.5

@@ -1,4 +1,4 @@
-"""A whole room device with a toy sensor and a broker that is a list: what it measures, and what may be done with it."""
+"""Room devices: streams, cameras, actions, Stop and faults."""
 
 import math
 import threading
@@ -363,7 +363,7 @@ def test_a_missing_sensor_at_start_is_a_fault(tmp_path: Path) -> None:
 
     def absent(self: FakeSensor) -> None:
         if not started.is_set():
-            raise SensorError("nobody at home")
+            raise SensorError("not connected")
         original(self)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -371,7 +371,7 @@ def test_a_missing_sensor_at_start_is_a_fault(tmp_path: Path) -> None:
         harness = RoomBench(tmp_path)
         try:
             harness.device.link_changed(True)
-            assert shown(harness, lambda state: state.faults).faults[0].message == "nobody at home"
+            assert shown(harness, lambda state: state.faults).faults[0].message == "not connected"
             started.set()
             grows(harness.measured)
         finally:
@@ -416,7 +416,7 @@ def test_the_driver_is_closed_once_on_repeated_stops(tmp_path: Path) -> None:
 
 
 class ToyThermometer:
-    """Has nothing that moves, and is read by nobody."""
+    """A sensor without moving parts."""
 
     simulated = False
 

@@ -1,24 +1,24 @@
-"""Streams and cameras of a room device that give nothing, or the same for ever, though no error is raised."""
+"""Stream watchdog: silent and stuck sources."""
 
 from device_agent.protocol.manifests.room import Watch
 from device_agent.runtime.room.stream_watchdog import StreamWatchdog
 
 
 class Bedside:
-    """A vigil over one stream, read once a second of a clock that is set by hand."""
+    """A watchdog of one stream that is read once a second on a manual clock."""
 
     def __init__(self, *watches: Watch, rate_hz: float = 1.0) -> None:
         self.now_s, self.rate_hz = 100.0, rate_hz
-        self.vigil = StreamWatchdog(watches, lambda _: self.rate_hz, lambda: self.now_s)
-        self.vigil.reset()
+        self.watchdog = StreamWatchdog(watches, lambda _: self.rate_hz, lambda: self.now_s)
+        self.watchdog.reset()
 
     def pass_s(self, seconds: int, *contents: object) -> list[str]:
         """Seconds go by, in which it gives these in turn, or nothing; the codes of what is wrong then."""
         for second in range(seconds):
             self.now_s += 1.0
             if contents:
-                self.vigil.record("air", contents[second % len(contents)])
-        return [fault.code for fault in self.vigil.faults()]
+                self.watchdog.record("air", contents[second % len(contents)])
+        return [fault.code for fault in self.watchdog.faults()]
 
 
 def test_a_source_with_readings_has_no_fault() -> None:
@@ -33,15 +33,15 @@ def test_a_source_without_readings_is_silent_until_the_next_one() -> None:
 
 
 def test_there_is_no_fault_before_the_first_reset() -> None:
-    vigil = StreamWatchdog((Watch(source="air", silent_s=5.0),), lambda _: 1.0, lambda: 100.0)
-    vigil.record("air", {"x": 1.0})
-    assert vigil.faults() == ()
+    watchdog = StreamWatchdog((Watch(source="air", silent_s=5.0),), lambda _: 1.0, lambda: 100.0)
+    watchdog.record("air", {"x": 1.0})
+    assert watchdog.faults() == ()
 
 
 def test_a_reset_restarts_the_timeout() -> None:
     bed = Bedside(Watch(source="air", silent_s=5.0))
     assert bed.pass_s(60) == ["silent.air"]
-    bed.vigil.reset()
+    bed.watchdog.reset()
     assert bed.pass_s(5) == []
 
 
@@ -74,7 +74,7 @@ def test_a_source_without_limits_has_no_faults() -> None:
 def test_a_continuing_fault_keeps_its_time_and_gives_advice() -> None:
     bed = Bedside(Watch(source="air", silent_s=5.0, stuck_s=20.0))
     bed.pass_s(10)
-    (first,) = bed.vigil.faults()
+    (first,) = bed.watchdog.faults()
     bed.pass_s(100)
-    assert bed.vigil.faults() == (first,)
+    assert bed.watchdog.faults() == (first,)
     assert "'air' has sent nothing for 5 s. Check that the device has power" in first.message

@@ -1,4 +1,4 @@
-"""What is kept on disk stays in order, within its bound, and what had to go is counted."""
+"""Outbox store: order, bounds and counts of dropped messages."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -18,42 +18,42 @@ def make(path: Path, *, own: str = OWN, max_bytes: int = 10**6, max_age_ms: int 
 
 
 @pytest.fixture
-def shelf(tmp_path: Path) -> Iterator[OutboxStore]:
-    shelf = make(tmp_path / "outbox.db")
-    shelf.open()
-    yield shelf
-    shelf.close()
+def store(tmp_path: Path) -> Iterator[OutboxStore]:
+    store = make(tmp_path / "outbox.db")
+    store.open()
+    yield store
+    store.close()
 
 
 def item(number: int, topic: str = LATE, *, at_ms: int = NOW_MS, size: int = 1) -> OutboxItem:
     return OutboxItem(topic, str(number).encode().ljust(size), at_ms, late="/late/" in topic)
 
 
-def numbers(shelf: OutboxStore, *, late: bool = True, last: int = 0, limit: int = 100_000) -> list[int]:
-    return [int(found.payload) for _, found in shelf.after(last, late=late, limit=limit)]
+def numbers(store: OutboxStore, *, late: bool = True, last: int = 0, limit: int = 100_000) -> list[int]:
+    return [int(found.payload) for _, found in store.after(last, late=late, limit=limit)]
 
 
-def dropped(shelf: OutboxStore) -> list[DroppedCount]:
+def dropped(store: OutboxStore) -> list[DroppedCount]:
     told: list[DroppedCount] = []
 
     def event(what: DroppedCount) -> OutboxItem:
         told.append(what)
         return OutboxItem(what.device + "/event", b"0", NOW_MS, late=False)
 
-    shelf.store_dropped_events(event)
+    store.store_dropped_events(event)
     return told
 
 
-def test_items_are_returned_oldest_first_in_pages(shelf: OutboxStore) -> None:
-    shelf.put([item(1), item(2, EVENT), item(3)], now_ms=NOW_MS)
-    shelf.put([item(4)], now_ms=NOW_MS)
-    assert numbers(shelf) == [1, 3, 4]
-    assert numbers(shelf, late=False) == [2]
-    (first, found), (second, _) = shelf.after(0, late=True, limit=2)
+def test_items_are_returned_oldest_first_in_pages(store: OutboxStore) -> None:
+    store.put([item(1), item(2, EVENT), item(3)], now_ms=NOW_MS)
+    store.put([item(4)], now_ms=NOW_MS)
+    assert numbers(store) == [1, 3, 4]
+    assert numbers(store, late=False) == [2]
+    (first, found), (second, _) = store.after(0, late=True, limit=2)
     assert found == item(1)
-    assert numbers(shelf, last=second) == [4]
-    shelf.remove([first, 999])
-    assert numbers(shelf) == [3, 4]
+    assert numbers(store, last=second) == [4]
+    store.remove([first, 999])
+    assert numbers(store) == [3, 4]
 
 
 def test_a_restart_keeps_items_except_those_of_another_space(tmp_path: Path) -> None:
@@ -74,75 +74,75 @@ def test_a_restart_keeps_items_except_those_of_another_space(tmp_path: Path) -> 
 
 
 def test_beyond_the_bound_oldest_measurements_then_events_are_dropped_and_counted(tmp_path: Path) -> None:
-    shelf = make(tmp_path / "db", max_bytes=200_000)
-    shelf.open()
+    store = make(tmp_path / "db", max_bytes=200_000)
+    store.open()
     for number in range(300):
-        shelf.put([item(number, EVENT, size=200), item(number, size=1000)], now_ms=NOW_MS)
-        assert shelf._bytes <= 200_000
-    assert numbers(shelf, late=False) == list(range(300)), "no event goes while there are measurements"
-    left = numbers(shelf)
+        store.put([item(number, EVENT, size=200), item(number, size=1000)], now_ms=NOW_MS)
+        assert store._bytes <= 200_000
+    assert numbers(store, late=False) == list(range(300)), "no event goes while there are measurements"
+    left = numbers(store)
     assert left == list(range(300 - len(left), 300)), "the oldest went"
-    (told,) = dropped(shelf)
+    (told,) = dropped(store)
     assert told == DroppedCount(OWN + "arm", measurements=300 - len(left), events=0)
     for number in range(300, 2000):
-        shelf.put([item(number, EVENT, size=200)], now_ms=NOW_MS)
-    events = numbers(shelf, late=False)
+        store.put([item(number, EVENT, size=200)], now_ms=NOW_MS)
+    events = numbers(store, late=False)
     assert events[-1] == 1999
-    assert numbers(shelf) == []
-    (told,) = dropped(shelf)
+    assert numbers(store) == []
+    (told,) = dropped(store)
     assert told.events + len(events) == 2001, "all that are not there, and the one that told, are counted"
-    shelf.close()
+    store.close()
 
 
 def test_the_stored_size_is_always_correct(tmp_path: Path) -> None:
-    shelf = make(tmp_path / "db", max_bytes=50_000)
-    shelf.open()
+    store = make(tmp_path / "db", max_bytes=50_000)
+    store.open()
     for number in range(200):
-        shelf.put([item(number, size=number), item(number, EVENT)], now_ms=NOW_MS + number)
-        shelf.remove([number // 2, number // 3])
+        store.put([item(number, size=number), item(number, EVENT)], now_ms=NOW_MS + number)
+        store.remove([number // 2, number // 3])
         if number % 50 == 0:
-            shelf.store_dropped_events(lambda what: OutboxItem(what.device + "/event", b"0", NOW_MS, late=False))
-    kept = shelf._bytes
-    shelf.close()
+            store.store_dropped_events(lambda what: OutboxItem(what.device + "/event", b"0", NOW_MS, late=False))
+    kept = store._bytes
+    store.close()
     again = make(tmp_path / "db")
     again.open()
     assert again._bytes == kept
     again.close()
 
 
-def test_old_measurements_are_dropped_and_counted(shelf: OutboxStore) -> None:
-    shelf.put([item(1), item(2, at_ms=NOW_MS + 3_000_000), item(3, EVENT)], now_ms=NOW_MS)
-    shelf.enforce_bounds(now_ms=NOW_MS + 3_700_000)
-    assert (numbers(shelf), numbers(shelf, late=False)) == ([2], [3])
-    shelf.enforce_bounds(now_ms=NOW_MS + 31 * 24 * 3_600_000)
-    assert numbers(shelf, late=False) == [3], "what happened stays worth telling"
-    assert dropped(shelf) == [DroppedCount(OWN + "arm", measurements=2, events=0)]
-    assert dropped(shelf) == [], "told once"
+def test_old_measurements_are_dropped_and_counted(store: OutboxStore) -> None:
+    store.put([item(1), item(2, at_ms=NOW_MS + 3_000_000), item(3, EVENT)], now_ms=NOW_MS)
+    store.enforce_bounds(now_ms=NOW_MS + 3_700_000)
+    assert (numbers(store), numbers(store, late=False)) == ([2], [3])
+    store.enforce_bounds(now_ms=NOW_MS + 31 * 24 * 3_600_000)
+    assert numbers(store, late=False) == [3], "what happened stays worth telling"
+    assert dropped(store) == [DroppedCount(OWN + "arm", measurements=2, events=0)]
+    assert dropped(store) == [], "told once"
 
 
-def test_unacknowledged_items_are_dropped_and_counted(shelf: OutboxStore) -> None:
-    shelf.put([item(1), item(2)], now_ms=NOW_MS)
-    shelf.drop([number for number, _ in shelf.after(0, late=True, limit=1)])
-    assert numbers(shelf) == [2]
-    assert dropped(shelf)[0].measurements == 1
+def test_unacknowledged_items_are_dropped_and_counted(store: OutboxStore) -> None:
+    store.put([item(1), item(2)], now_ms=NOW_MS)
+    store.drop([number for number, _ in store.after(0, late=True, limit=1)])
+    assert numbers(store) == [2]
+    assert dropped(store)[0].measurements == 1
 
 
-def test_drop_events_are_stored_atomically(shelf: OutboxStore) -> None:
-    shelf.count({(OWN + "arm", True): 2, (OWN + "arm", False): 1, (OWN + "leg", True): 5})
-    shelf.count({(OWN + "arm", True): 2})
-    assert dropped(shelf) == [DroppedCount(OWN + "arm", 4, 1), DroppedCount(OWN + "leg", 5, 0)]
-    assert [found.topic for _, found in shelf.after(0, late=False, limit=9)] == [OWN + "arm/event", OWN + "leg/event"]
+def test_drop_events_are_stored_atomically(store: OutboxStore) -> None:
+    store.count({(OWN + "arm", True): 2, (OWN + "arm", False): 1, (OWN + "leg", True): 5})
+    store.count({(OWN + "arm", True): 2})
+    assert dropped(store) == [DroppedCount(OWN + "arm", 4, 1), DroppedCount(OWN + "leg", 5, 0)]
+    assert [found.topic for _, found in store.after(0, late=False, limit=9)] == [OWN + "arm/event", OWN + "leg/event"]
 
 
 def test_a_damaged_file_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "outbox.db"
     path.write_bytes(b"no database" * 1000)
-    shelf = make(path)
-    shelf.open()
-    shelf.put([item(1)], now_ms=NOW_MS)
-    assert numbers(shelf) == [1]
+    store = make(path)
+    store.open()
+    store.put([item(1)], now_ms=NOW_MS)
+    assert numbers(store) == [1]
     assert path.with_suffix(".damaged").exists()
-    shelf.close()
+    store.close()
 
 
 def test_an_unusable_file_raises(tmp_path: Path) -> None:
@@ -154,17 +154,17 @@ def test_an_unusable_file_raises(tmp_path: Path) -> None:
             call()
 
 
-def test_a_full_disk_changes_nothing_and_raises(tmp_path: Path, shelf: OutboxStore) -> None:
-    shelf.put([item(1)], now_ms=NOW_MS)
-    before = shelf._bytes
-    shelf._connection().execute("PRAGMA max_page_count = 1")
+def test_a_full_disk_changes_nothing_and_raises(tmp_path: Path, store: OutboxStore) -> None:
+    store.put([item(1)], now_ms=NOW_MS)
+    before = store._bytes
+    store._connection().execute("PRAGMA max_page_count = 1")
     with pytest.raises(OutboxStoreError, match="is the disk full"):
-        shelf.put([item(2), item(3, size=500_000)], now_ms=NOW_MS)
-    assert (numbers(shelf), shelf._bytes) == ([1], before)
-    shelf._connection().execute("PRAGMA max_page_count = 100000")
-    shelf.put([item(4)], now_ms=NOW_MS)
-    assert numbers(shelf) == [1, 4]
+        store.put([item(2), item(3, size=500_000)], now_ms=NOW_MS)
+    assert (numbers(store), store._bytes) == ([1], before)
+    store._connection().execute("PRAGMA max_page_count = 100000")
+    store.put([item(4)], now_ms=NOW_MS)
+    assert numbers(store) == [1, 4]
     with sqlite3.connect(tmp_path / "outbox.db") as other:
         other.execute("DROP TABLE items")
     with pytest.raises(OutboxStoreError, match="cannot be read"):
-        shelf.after(0, late=True, limit=1)
+        store.after(0, late=True, limit=1)

@@ -1,4 +1,4 @@
-"""What a robot sees: told at its rate, beside what moves it, whatever goes wrong with it."""
+"""Camera streaming: rates, control, link and errors."""
 
 import logging
 import threading
@@ -23,7 +23,7 @@ JPEG = b"\xff\xd8 a picture"
 
 
 class Seeing(FakeDriver):
-    """Sees what it is told to."""
+    """A driver with preset pictures."""
 
     def __init__(self, see: Callable[[], bytes | None]) -> None:
         super().__init__()
@@ -112,9 +112,9 @@ def paced(pictures: list[CameraFrame], count: int) -> float:
     """How long it takes from the first to the last of so many more pictures [s]."""
     first = len(pictures)
     eventually(lambda: len(pictures) > first)
-    began_s = time.monotonic()
+    start_s = time.monotonic()
     eventually(lambda: len(pictures) > first + count)
-    return time.monotonic() - began_s
+    return time.monotonic() - start_s
 
 
 def test_frames_are_slow_without_control_and_live_during_control() -> None:
@@ -142,10 +142,10 @@ def test_frames_stay_live_for_a_while_after_control_ends() -> None:
     eventually(lambda: told)
     controlled.clear()
     seen = len(told)
-    began_s = time.monotonic()
+    start_s = time.monotonic()
     eventually(lambda: len(told) > seen + 20)
     filmer.stop()
-    assert time.monotonic() - began_s < 15
+    assert time.monotonic() - start_s < 15
 
 
 def test_without_a_link_there_are_no_frames() -> None:

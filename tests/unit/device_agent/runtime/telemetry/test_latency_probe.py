@@ -1,4 +1,4 @@
-"""How long messages take: only what is confirmed, little at a time, and nothing that waits for a link."""
+"""Latency probe: samples from acknowledged messages."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +15,7 @@ NOW_MS = 1_800_000_000_000
 
 
 class Link:
-    """Confirms when it is told to."""
+    """A transport that acknowledges on request."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, Callable[[], None] | None]] = []

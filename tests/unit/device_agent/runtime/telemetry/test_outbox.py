@@ -1,4 +1,4 @@
-"""Events are never lost and measurements rarely, nobody waits for the disk, and live messages wait for nothing kept."""
+"""Outbox: no event is lost, callers never wait, and live messages have priority."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -19,7 +19,7 @@ LATE = ARM + "/late/joints"
 
 
 class Link:
-    """A transport that takes what it is told to take, and confirms when it is told to."""
+    """A transport whose acceptance and acknowledgements the test controls."""
 
     def __init__(self) -> None:
         self.takes = True
@@ -63,9 +63,9 @@ class DeviceHarness:
 
     def renew(self) -> None:
         """As after a restart."""
-        self.shelf = OutboxStore(self.path, own="ts/v1/s/a/", **self.limits)
+        self.store = OutboxStore(self.path, own="ts/v1/s/a/", **self.limits)
         self.outbox = Outbox(
-            self.shelf, publish=self.link.publish, device_topic=ARM, is_quiet=lambda: not self.moves, keep_hz=1.0
+            self.store, publish=self.link.publish, device_topic=ARM, is_quiet=lambda: not self.moves, keep_hz=1.0
         )
 
     def rounds(self, count: int = 1, step_s: float = 0.25) -> None:
@@ -82,14 +82,14 @@ class DeviceHarness:
             self.outbox.add_measurement(LATE, str(number).encode(), at_ms=number, sent=sent, now_s=self.now_s)
 
     def kept(self, *, late: bool = True) -> list[str]:
-        return [found.payload.decode() for _, found in self.shelf.after(0, late=late, limit=10**6)]
+        return [found.payload.decode() for _, found in self.store.after(0, late=late, limit=10**6)]
 
 
 @pytest.fixture
 def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
     harness = DeviceHarness(tmp_path)
     yield harness
-    harness.shelf.close()
+    harness.store.close()
 
 
 def test_an_event_is_stored_before_it_is_sent_and_deleted_after_the_ack(harness: DeviceHarness) -> None:
@@ -128,7 +128,7 @@ def test_stored_messages_are_sent_after_a_restart(harness: DeviceHarness) -> Non
     harness.event("before")
     harness.measure(0, 3, sent=False)
     harness.rounds()
-    harness.shelf.close()
+    harness.store.close()
     harness.renew()
     harness.outbox.link_changed(True)
     harness.rounds(4)
@@ -184,7 +184,7 @@ def test_sending_starts_after_the_settle_time(tmp_path: Path) -> None:
     harness.event("live")
     harness.rounds()
     assert harness.link.payloads(topics.EVENT) == [b"held", b"live"], "from then on at once"
-    harness.shelf.close()
+    harness.store.close()
 
 
 def test_messages_in_flight_are_limited(harness: DeviceHarness) -> None:
@@ -232,7 +232,7 @@ def test_dropped_messages_are_reported_after_reconnection(tmp_path: Path) -> Non
     (told,) = harness.link.events(EventKind.BUFFER_DROPPED)
     assert told.data == {"measurements": 2000 - left, "events": 0}
     assert (told.device, told.severity) == ("arm", "warning")
-    harness.shelf.close()
+    harness.store.close()
 
 
 def test_a_stuck_thread_uses_bounded_memory_and_counts_drops(
@@ -253,14 +253,14 @@ class TestFullDisk:
     @pytest.fixture
     def full(self, harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
         """While its only entry is true, nothing can be put on disk."""
-        put, full = harness.shelf.put, [True]
+        put, full = harness.store.put, [True]
 
         def fail(items: Any, **options: Any) -> None:
             if full[0]:
                 raise OutboxStoreError("outbox.db cannot be written: is the disk full?")
             put(items, **options)
 
-        monkeypatch.setattr(harness.shelf, "put", fail)
+        monkeypatch.setattr(harness.store, "put", fail)
         return full
 
     def test_events_go_out_from_memory_and_it_is_said(self, harness: DeviceHarness, full: list[bool]) -> None:
@@ -327,7 +327,7 @@ def test_an_unusable_folder_does_not_stop_the_outbox(tmp_path: Path) -> None:
     harness.link.takes = False
     harness.rounds()
     assert harness.kept(late=False) == ["again"]
-    harness.shelf.close()
+    harness.store.close()
 
 
 def test_read_errors_are_reported_and_unexpected_errors_do_not_stop_the_thread(
@@ -342,12 +342,12 @@ def test_read_errors_are_reported_and_unexpected_errors_do_not_stop_the_thread(
         return after
 
     with monkeypatch.context() as patch:
-        patch.setattr(harness.shelf, "after", fail(OutboxStoreError("outbox.db cannot be read")))
+        patch.setattr(harness.store, "after", fail(OutboxStoreError("outbox.db cannot be read")))
         harness.event("one")
         harness.rounds()
     assert "cannot be read" in caplog.text
     with monkeypatch.context() as patch:
-        patch.setattr(harness.shelf, "after", fail(RuntimeError("a mistake")))
+        patch.setattr(harness.store, "after", fail(RuntimeError("a mistake")))
         harness.rounds()
     assert "a mistake" in caplog.text
     harness.rounds(int(4 * module._SAVE_RETRY_S) + 1)
@@ -369,8 +369,8 @@ def test_the_thread_sends_at_once_and_drains_before_it_stops(tmp_path: Path) -> 
     later.join()
     assert harness.link.payloads(topics.EVENT) == [b"held", b"goodbye"]
     harness.renew()
-    harness.shelf.open()
+    harness.store.open()
     harness.event("x")
     harness.rounds()
     assert harness.kept(late=False)[-1] == "x"
-    harness.shelf.close()
+    harness.store.close()

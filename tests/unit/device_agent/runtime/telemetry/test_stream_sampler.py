@@ -1,4 +1,4 @@
-"""What a driver measures besides joints: told at its rate, beside the control loop, whatever goes wrong with it."""
+"""Stream sampling: rates, values, errors and use in scripts and interlocks."""
 
 import logging
 import math
@@ -25,7 +25,7 @@ Answer = Callable[[], Mapping[str, float | bool]]
 
 
 class Gauge(FakeDriver):
-    """Measures what it is told to."""
+    """A driver with preset measurements."""
 
     def __init__(self, **answers: Answer) -> None:
         super().__init__()
