@@ -95,7 +95,7 @@ class Conversation:
         self.leave()
 
     def knock(self) -> None:
-        """As nobody, and as somebody who only says so."""
+        """Without credentials, and with invalid ones."""
         ask = self.site.ask
         ask("GET", f"{API}/health")
         ask("GET", f"{API}/devices")
@@ -273,7 +273,7 @@ class Conversation:
         body = {"devices": [*self.robot.devices, "aaaaaaaaaa-arm"], "request": MOVE}
         answer = self.anna.post("/actions", body)
         assert answer.status_code == 207, answer.text
-        self.site.silent = True  # which of the devices is told first is nobody's promise
+        self.site.silent = True  # the order of the devices is not specified
         self.robot.step()
         self.site.silent = False
         for device in self.robot.devices:
@@ -337,7 +337,7 @@ class Conversation:
         return url.replace(PUBLIC_URL, self.host.url)
 
     def accounts(self) -> None:
-        """A password, and a key for a program of somebody else's."""
+        """A password, and an API key."""
         ask, good = self.site.ask, "grüß 🤖 correct horse"
         ask("GET", f"{API}/auth/methods")
         ask("GET", f"{API}/auth/oidc/start")

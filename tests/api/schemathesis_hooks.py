@@ -69,7 +69,7 @@ def _token(whose: str) -> str:
 
 @schemathesis.auth(refresh_interval=None)
 class Caller:
-    """A token of whoever the operation is for."""
+    """A token that the operation accepts."""
 
     def get(self, case: _Case, _context: object) -> str:
         operation = case.operation.definition.raw

@@ -212,7 +212,7 @@ async def test_an_append_that_never_arrived_is_made_once(blobs: Blobs, through: 
 
 
 def meanwhile(writing: Coroutine[Any, Any, None]) -> Callable[[], None]:
-    """Somebody else's writing, before a request arrives."""
+    """A concurrent write, before a request arrives."""
     loop = asyncio.get_running_loop()
     return lambda: asyncio.run_coroutine_threadsafe(writing, loop).result()
 
@@ -291,7 +291,7 @@ async def test_an_answer_that_ends_in_the_middle_is_an_error(blobs: Blobs, throu
     assert await through.get("a") == bytes(100_000)
 
 
-async def test_an_address_where_nobody_answers_is_named(opened: Open) -> None:
+async def test_an_unreachable_address_is_named(opened: Open) -> None:
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         address = f"http://{HOST}:{taken.getsockname()[1]}"

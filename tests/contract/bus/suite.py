@@ -27,8 +27,8 @@ class Stage:
 
     Attributes:
         heard: All that has arrived so far, in order of arrival.
-        kept: What somebody who comes later would be given on a topic, or ``None``.
-        away: Another bus of the same kind, to where nobody listens.
+        kept: The retained message of a topic, or ``None``.
+        away: Another bus of the same kind, to an address without a broker.
     """
 
     bus: CommandBus
@@ -91,7 +91,7 @@ class BusContract:
         assert [heard.payload for heard in await stage.until(2)] == [b"here", b""]
         assert not await asyncio.to_thread(stage.kept, topic)
 
-    async def test_where_nobody_answers_it_says_so_in_a_sentence_and_in_time(self, stage: Stage) -> None:
+    async def test_an_unreachable_broker_is_reported_in_time(self, stage: Stage) -> None:
         began = time.monotonic()
         with pytest.raises(BusUnavailable) as caught:
             await stage.away.publish(stage.topic, b"x")

@@ -92,7 +92,7 @@ class TestIot(BusContract):
         await stage.bus.publish(stage.topic, b"x")
         assert await stage.bus.status() == "ok"
 
-    async def test_a_slow_answer_holds_up_nobody_else_and_is_given_up(
+    async def test_a_slow_response_delays_no_other_call_and_times_out(
         self, stage: Stage, wire: Wire, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         await stage.bus.publish(stage.topic, b"x")

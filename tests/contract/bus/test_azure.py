@@ -1,4 +1,4 @@
-"""The command bus over Event Grid. Nobody emulates its HTTP publish: a server here checks what Microsoft documents.
+"""The command bus over Event Grid. No emulator exists for its HTTP publish: a server here checks what Microsoft documents.
 
 That is what this shows, and no more: the request is the documented one, over TLS, with a token of the host's identity
 for the documented audience; and each documented answer is read as what it means.
@@ -205,7 +205,7 @@ class TestEventGrid(BusContract):
         assert "\n" not in str(caught.value)
         await bus.close()
 
-    async def test_a_slow_answer_holds_up_nobody_else_and_is_given_up(
+    async def test_a_slow_response_delays_no_other_call_and_times_out(
         self, stage: Stage, namespace: Namespace, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         await stage.bus.publish(stage.topic, b"x")

@@ -172,9 +172,7 @@ async def test_a_write_whose_answer_was_lost_is_no_conflict(tables: Tables, thro
     assert wire.operations == ["PutItem", "PutItem", "GetItem"]
 
 
-async def test_a_lost_write_that_somebody_else_did_first_is_a_conflict(
-    tables: Tables, through: Tables, wire: Wire
-) -> None:
+async def test_a_lost_write_after_another_write_is_a_conflict(tables: Tables, through: Tables, wire: Wire) -> None:
     row = await tables.create("T", Row("p", "k", {"n": 1}))
     wire.spoil("lose request")
     with pytest.raises(Conflict):
@@ -271,13 +269,13 @@ async def test_too_much_to_do_is_tried_a_few_times(through: Tables, wire: Wire) 
     assert len(wire.asked) == ATTEMPTS
 
 
-async def test_an_address_where_nobody_answers_is_named(opened: Open) -> None:
+async def test_an_unreachable_address_is_named(opened: Open) -> None:
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         address = f"http://{HOST}:{taken.getsockname()[1]}"
-        nobody = opened(at=address)
+        unreachable = opened(at=address)
         with pytest.raises(StoreError, match=f"at {address} cannot be reached.*Check TELESCOPE_AWS_ENDPOINT and"):
-            await nobody.create("T", Row("p", "k"))
+            await unreachable.create("T", Row("p", "k"))
 
 
 async def test_missing_credentials_are_said_to_be(opened: Open, monkeypatch: pytest.MonkeyPatch) -> None:

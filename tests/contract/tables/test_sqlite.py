@@ -15,7 +15,7 @@ from function_app.ports.tables import Conflict, Row, StoreError, Tables
 from tests.contract.tables.suite import Again, TablesSuite
 
 _FORK = multiprocessing.get_context("fork")
-_NOBODY = 65_534
+_UNPRIVILEGED_UID = 65_534
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ async def test_a_place_that_cannot_be_a_file_is_named(tmp_path: Path, what: str)
     assert str(path) in str(caught.value)
 
 
-async def test_a_file_that_somebody_holds_locked_is_said_to_be_and_is_good_afterwards(
+async def test_a_locked_file_is_reported_and_usable_afterwards(
     tables: Tables, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(adapter, "BUSY_TIMEOUT_MS", 100)
@@ -127,7 +127,7 @@ async def test_a_file_that_somebody_holds_locked_is_said_to_be_and_is_good_after
 
 @pytest.fixture
 def foreign() -> Iterator[Path]:
-    """A folder that everybody may enter and only root, or nobody at all, may write."""
+    """A folder that all users may enter and that only root, or no user, may write."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         folder.chmod(0o555)
@@ -143,10 +143,10 @@ def test_a_folder_that_may_not_be_written_is_said_to_be(foreign: Path, kept: boo
         sqlite3.connect(path).close()
         path.chmod(0o444)
         foreign.chmod(0o555)
-    assert _as_nobody(path).startswith(f"StoreError: the tables in {path} cannot be used: ")
+    assert _as_unprivileged(path).startswith(f"StoreError: the tables in {path} cannot be used: ")
 
 
-def _as_nobody(path: Path) -> str:
+def _as_unprivileged(path: Path) -> str:
     """What a process without rights gets; root may write everywhere."""
     here, there = _FORK.Pipe()
     child = _FORK.Process(target=_try, args=(path, there))
@@ -159,8 +159,8 @@ def _as_nobody(path: Path) -> str:
 def _try(path: Path, there: "multiprocessing.connection.Connection") -> None:
     if os.getuid() == 0:
         os.setgroups([])
-        os.setgid(_NOBODY)
-        os.setuid(_NOBODY)
+        os.setgid(_UNPRIVILEGED_UID)
+        os.setuid(_UNPRIVILEGED_UID)
     try:
         SqliteTables(path)._run("INSERT INTO rows VALUES ('T','p','k','e','{}')")
         there.send("written")

@@ -1,6 +1,6 @@
 """The messages between the Functions host and its worker, as far as the worker looks at them.
 
-In production they are protobuf's; the worker takes them from whoever starts it. These check what protobuf would: one
+In production they are protobuf's; the worker takes them from its host. These check what protobuf would: one
 value in ``TypedData``, text in text fields.
 """
 

@@ -19,7 +19,7 @@ async def main() -> None:
     while line := await asyncio.to_thread(sys.stdin.readline):
         try:
             await _do(functions, json.loads(line))
-        except Exception as error:  # noqa: BLE001 (the test is told)
+        except Exception as error:  # noqa: BLE001 (the test gets it)
             answer = f"{type(error).__name__}: {error}"
         else:
             answer = ""

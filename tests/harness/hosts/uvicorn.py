@@ -12,7 +12,7 @@ from tests.harness.network.brokers import wait_until
 
 @contextlib.contextmanager
 def start_uvicorn(environment: Mapping[str, str]) -> Iterator[Host]:
-    """The server on a free port, and a worker that is told each step."""
+    """The server on a free port, and a worker that runs on request."""
     port = _free_port()
     given = environment_of({"TELESCOPE_HOST": LOOPBACK, **environment, "TELESCOPE_PORT": str(port)})
     with (

@@ -36,7 +36,7 @@ def start_emulator(kind: StoreKind) -> Iterator[str]:
 
 
 def empty_store(kind: StoreKind, emulator: str) -> dict[str, str]:
-    """The environment of a store with nothing in it; the local one is in whatever ``TELESCOPE_HOME`` is."""
+    """The environment of a store with nothing in it; the local one is in ``TELESCOPE_HOME``."""
     name = f"test{secrets.token_hex(8)}"
     if kind == "azure":
         return {

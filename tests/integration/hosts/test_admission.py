@@ -83,7 +83,7 @@ def test_who_has_credentials_is_let_in_with_exactly_its_topics(there: There, acc
     assert set(answer["attributes"].values()) == {"account", account}
 
 
-def test_nobody_else_is(there: There, account: str) -> None:
+def test_other_clients_are_rejected(there: There, account: str) -> None:
     wanted = grant(account)
     good = there.broker.issue(wanted)
     forged = grants.issue(wanted, signing.generate())
@@ -110,13 +110,15 @@ def test_nobody_else_is(there: There, account: str) -> None:
 def test_only_the_namespace_is_answered(there: There, account: str) -> None:
     wanted = grant(account)
     good = connect_of(there.broker.issue(wanted), wanted.client_id)
-    assert ask(there, good, caller="somebody") == (401, {})
+    assert ask(there, good, caller="other") == (401, {})
     assert there.cloud.run(admit(there.cloud.functions, "", json.dumps(good).encode())) == (401, {})
     assert there.cloud.run(admit(there.cloud.functions, f"Basic {CALLER}", json.dumps(good).encode())) == (401, {})
     assert ask(there, b" " * 65_537) == (401, {})
 
 
-def test_what_cannot_be_known_lets_nobody_in(there: There, account: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_client_is_admitted_if_the_grant_cannot_be_read(
+    there: There, account: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def away(*_: Any) -> None:
         raise StoreError("the tables are away")
 
@@ -174,7 +176,7 @@ def test_who_comes_to_cut_may_say_and_hear_nothing(there: There, account: str) -
     assert answer["decision"] == "deny"
 
 
-def test_a_connection_ends_with_its_grant_whatever_the_namespace_does(there: There, account: str) -> None:
+def test_a_connection_ends_with_its_grant(there: There, account: str) -> None:
     (mine, _), (renewed, _) = enter(there, grant(account)), enter(there, grant(account, "x"))
     there.broker.issue(replace_end(grant(account, "x"), 5_000))
     with mine, renewed:
@@ -200,13 +202,13 @@ def test_who_was_being_let_in_at_the_moment_of_a_revocation_is_cut_soon_after(th
     with slow, new:
         assert slow.connected.is_set()
         there.broker.expire()
-        assert not slow.disconnected.is_set(), "it is looked for later, when nobody can be on the way in any more"
+        assert not slow.disconnected.is_set(), "it is found later, when no client can still be connecting"
         there.broker.run(there.broker.access.expire(time.time() + SETTLE_S + 1))
         assert slow.disconnected.wait(PATIENCE_S)
         assert not new.disconnected.is_set(), "credentials issued afterwards work"
 
 
-def test_a_namespace_that_is_away_is_one_clear_error_and_nobody_is_let_in(there: There, account: str) -> None:
+def test_an_unreachable_namespace_is_one_clear_error_and_admits_no_client(there: There, account: str) -> None:
     access: Any = there.cloud.functions.access
     take, access._take = access._take, SessionTakeover(host=HOST, port=1, tls=None)
     client, credentials = enter(there, grant(account))
@@ -222,14 +224,14 @@ def test_a_namespace_that_is_away_is_one_clear_error_and_nobody_is_let_in(there:
         assert client.disconnected.wait(PATIENCE_S)
 
 
-def test_what_nobody_is_given_here_is_not_signed(there: There) -> None:
+def test_topics_that_are_never_granted_are_not_signed(there: There) -> None:
     with pytest.raises(BrokerAccessError, match="topic spaces"):
         there.broker.issue(grants.gateway_grant(client_id="s", token_id="t", lifetime_s=60))
     with pytest.raises(BrokerAccessError, match="no connection"):
         there.cloud.functions.access.service_credentials()
 
 
-def test_nobody_takes_over_the_session_of_another(there: There, account: str) -> None:
+def test_no_client_takes_over_the_session_of_another(there: There, account: str) -> None:
     mine, _ = enter(there, agent_grant(account, f"agent{account}", token_id=new_id(), lifetime_s=60))
     thief = there.broker.issue(grant(account))
     with mine, there.broker.connect(mine.client_id, thief) as other:

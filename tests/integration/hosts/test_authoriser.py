@@ -122,7 +122,7 @@ def test_who_has_credentials_is_let_in_with_exactly_its_topics(cloud: Cloud) -> 
     assert "ctl" not in text
 
 
-def test_nobody_else_is(cloud: Cloud) -> None:
+def test_other_clients_are_rejected(cloud: Cloud) -> None:
     username, password = issue(cloud, grant())
     forged = grants.issue(grant(), signing.generate())
     over = grants.issue(grant(lifetime_s=-1), cloud.run(cloud.functions.keys.current()))

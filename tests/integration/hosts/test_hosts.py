@@ -61,7 +61,7 @@ def test_bodies_come_and_go_whole(there: Reached) -> None:
     "path",
     ["/devices/%ff", "/devices/a%2Fb", "/devices/a+b%20c", "/devices/gr%C3%BC%C3%9F", "/devices/%25", "/devices/a;b=c"],
 )
-def test_an_odd_path_is_nobodys(there: Reached, path: str) -> None:
+def test_an_odd_path_is_not_found(there: Reached, path: str) -> None:
     with there.sign_in("anna") as anna:
         answer = anna.get(path)
     assert answer.status_code in {404, 422}, answer.text

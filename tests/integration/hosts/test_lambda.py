@@ -42,7 +42,7 @@ def test_of_a_batch_only_what_was_not_stored_stays_in_the_queue(host: Lambda, tm
         assert broken.invoke(batch) == {"batchItemFailures": [{"itemIdentifier": "1"}]}
 
 
-def test_an_event_that_nobody_knows_is_an_error_and_the_instance_goes_on(host: Lambda) -> None:
+def test_an_unknown_event_is_an_error_and_the_instance_continues(host: Lambda) -> None:
     with pytest.raises(HostFailed, match="for none of the functions"):
         host.invoke({"what": 1})
     host.tick()

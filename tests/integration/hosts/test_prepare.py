@@ -1,4 +1,4 @@
-"""Amazon's table and bucket are made when somebody says so, and missed with a sentence that says how."""
+"""``prepare`` creates the table and the bucket; without them the error message names it."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Beyond this machine nothing is said in the clear, and to nobody whom a trusted certificate does not name."""
+"""Connections beyond this machine use TLS, and only with a server that a trusted certificate names."""
 
 import asyncio
 import datetime as dt
@@ -60,7 +60,7 @@ def _far_away(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def refusal(port: int, trusted: Path | None, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Why a login is refused. The functions are nowhere, so whoever gets as far as the password is refused for it."""
+    """Why a login is refused. The functions are nowhere, so a login that reaches the password check is rejected there."""
     if trusted is not None:
         monkeypatch.setattr(ssl, "create_default_context", _trusting(trusted))
 
@@ -99,9 +99,7 @@ def test_with_a_trusted_certificate_the_password_is_asked_for_under_tls(
     assert auth is True
 
 
-def test_a_certificate_that_nobody_trusts_is_refused(
-    server: tuple[Prosody, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_untrusted_certificate_is_rejected(server: tuple[Prosody, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     assert "certificate" in refusal(server[0].port, None, monkeypatch)
 
 
@@ -131,4 +129,4 @@ def _trusting(pem: Path) -> Any:
 
 
 def _nothing(_: Any) -> None:
-    """Nobody listens."""
+    """No program listens."""

@@ -81,7 +81,7 @@ WRONG = [
     ("TELESCOPE_HOST", "a b"),
     ("TELESCOPE_MQTT_HOST", ""),
     ("TELESCOPE_HOME", ""),
-    ("TELESCOPE_HOME", "~nobody-of-this-name/x"),
+    ("TELESCOPE_HOME", "~no-such-user/x"),
     ("TELESCOPE_ROBOTS", ""),
     ("TELESCOPE_CONSOLE", ""),
 ]

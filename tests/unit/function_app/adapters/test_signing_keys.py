@@ -78,7 +78,7 @@ def test_of_many_who_rotate_at_once_one_does(tmp_path: Path) -> None:
     def rotate(_: int) -> bool:
         try:
             asyncio.run(FileKeys(tmp_path).rotate())
-        except Exception as error:  # noqa: BLE001 (whatever it is, it is counted)
+        except Exception as error:  # noqa: BLE001 (any error is counted)
             return type(error).__name__ != "RotationRefused"
         return True
 

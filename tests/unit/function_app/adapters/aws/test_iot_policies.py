@@ -83,7 +83,7 @@ LEVEL = st.sampled_from(["space", "other", "agentaaaaa", "arm", "state", "cmd", 
 
 
 @given(st.lists(LEVEL, min_size=1, max_size=6))
-def test_whatever_is_published_the_policy_allows_no_more_than_the_grant(levels: list[str]) -> None:
+def test_the_policy_allows_no_topic_outside_the_grant(levels: list[str]) -> None:
     topic = "/".join(["ts", "v1", *levels])
     if may(AGENT, "Publish", "topic", topic):
         assert AGENT.may_publish(topic)

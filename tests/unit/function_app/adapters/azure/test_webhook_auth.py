@@ -104,7 +104,7 @@ def test_the_namespaces_identity_is_known_by_tokens_of_both_versions(
     ],
     ids=str,
 )
-def test_nobody_else_is(entra: Entra, keys: tuple[SigningKey, SigningKey], changed: dict[str, Any]) -> None:
+def test_other_callers_are_rejected(entra: Entra, keys: tuple[SigningKey, SigningKey], changed: dict[str, Any]) -> None:
     assert not asyncio.run(known(entra).knows(token(keys[0], entra, **changed)))
 
 

@@ -175,7 +175,7 @@ class TestErrors:
         problem(answer, 405, "http")
         assert set(answer.headers["allow"].split(", ")) == allowed
 
-    def test_a_fault_nobody_foresaw_is_a_problem_without_its_inside(
+    def test_an_unhandled_error_is_a_problem_without_internals(
         self, cloud: Cloud, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         async def broken() -> None:

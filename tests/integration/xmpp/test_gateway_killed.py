@@ -1,4 +1,4 @@
-"""Whoever is killed and comes back: nothing runs twice, and nothing that was promised is lost."""
+"""Killed and restarted programs: no command runs twice, and no accepted message is lost."""
 
 from device_agent.protocol import AckStatus, MoveJoints, StopDevice
 from tests.harness.cloud.cloud import Person
@@ -31,7 +31,7 @@ def test_of_two_who_speak_one_may_go_and_no_agent_is_served_twice(
             each.__exit__()
 
 
-def test_a_stop_while_nobody_speaks_is_brought_later(site: XmppSite, anna: Person, robot: XmppRobot) -> None:
+def test_a_stop_without_a_gateway_is_delivered_later(site: XmppSite, anna: Person, robot: XmppRobot) -> None:
     site.speaking.pop().end()
     wait_until(lambda: robot.changes[-1] is False, "the loss: the cloud is not there")
     wait_until(lambda: not anna.get(f"/devices/{robot.device}").json()["online"], "offline")

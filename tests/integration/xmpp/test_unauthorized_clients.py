@@ -1,4 +1,4 @@
-"""Whoever has no right, or another tenant's, gets nowhere; and nothing that anybody sends ends the one who speaks."""
+"""Clients without rights, or of another tenant, reach nothing, and no stanza ends the gateway."""
 
 import contextlib
 import json
@@ -28,7 +28,7 @@ def as_agent(site: XmppSite, robot: XmppRobot) -> Iterator[XmppClient]:
     """A client with an agent's own password, that can say what it likes."""
     with site.client(robot.id, password_of(robot)) as client:
         assert client.opened, client.trouble
-        wait_until(lambda: client.there(jids.CLOUD), "whoever speaks for the cloud")
+        wait_until(lambda: client.there(jids.CLOUD), "the gateway")
         yield client
 
 
@@ -47,7 +47,7 @@ def unheard(site: XmppSite, anna: Person) -> Iterator[XmppRobot]:
 
 
 class TestLogin:
-    def test_nobody_logs_in_with_somebody_elses_password_or_another_token(
+    def test_a_login_with_a_foreign_password_or_token_is_rejected(
         self, site: XmppSite, anna: Person, unheard: XmppRobot
     ) -> None:
         mine = password_of(unheard)
@@ -65,7 +65,7 @@ class TestLogin:
                 (anna.account, anna.token),
                 (jids.CLOUD, mine),
                 (jids.CLOUD, hers),
-                ("somebody", hers),
+                ("unknown-user", hers),
             ]
             for user, password in wrong:
                 with site.client(user, password) as client:
@@ -120,7 +120,7 @@ class TestLogin:
 
 
 class TestTenants:
-    def test_nobody_but_the_cloud_is_spoken_to(self, site: XmppSite, anna: Person, unheard: XmppRobot) -> None:
+    def test_clients_can_reach_only_the_cloud(self, site: XmppSite, anna: Person, unheard: XmppRobot) -> None:
         bert = site.cloud.sign_in("bert")
         with site.robot() as other, contextlib.ExitStack() as stack:
             other.pair(bert)
@@ -130,7 +130,7 @@ class TestTenants:
             his = stack.enter_context(site.person(bert))
             users = {mine: unheard.id, hers: anna.account, its: other.id, his: bert.account}
             for sender, own in users.items():
-                for user in (*users.values(), "cloud" if sender in (hers, his) else "nobody"):
+                for user in (*users.values(), "cloud" if sender in (hers, his) else "unknown-user"):
                     for to in (f"{user}@{DOMAIN}", f"{user}@{DOMAIN}/test", f"{user}@elsewhere.example"):
                         if own == user and to.endswith((DOMAIN, "/test")):
                             continue
