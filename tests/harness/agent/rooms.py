@@ -2,16 +2,18 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from device_agent import sensors
-from device_agent.drivers.mujoco import World
 from device_agent.ports.sensor import RoomDriver, Surroundings
 from device_agent.ports.simulation import Process
 from device_agent.protocol.manifests import robot_type, room
 from device_agent.protocol.manifests.room import Room, RoomDeviceManifest
 from device_agent.simulation import world_registry
 from tests.harness.paths import ROOT
+
+if TYPE_CHECKING:
+    from device_agent.drivers.mujoco import World
 
 ROBOTS = Path(ROOT) / "robots"
 LAB = ROBOTS / "rooms" / "lab"
