@@ -203,7 +203,7 @@ def check(lab: Laboratory, x_m: float, y_m: float, yaw_rad: float) -> None:
 
 
 def test_qbo_drives_around_another_robot(lab: Laboratory) -> None:
-    with pytest.raises(Refused, match="nearest place to go to is x_m") as refused:
+    with pytest.raises(Refused, match="nearest reachable place is x_m") as refused:
         lab.robot.execute(GoTo(x_m=1.5, y_m=2.0))  # the arm's table stands there
     assert refused.value.code == "taken"
     check(lab, 0.6, -0.35, 1.0)  # straight there stands the NAO
