@@ -7,6 +7,8 @@ import pytest
 
 from tests.harness.stores.emulators import StoreKind, start_emulator
 
+pytest_plugins = ["tests.fixtures.cloud"]
+
 Emulators = Callable[[StoreKind], str]
 
 

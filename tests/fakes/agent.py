@@ -24,7 +24,6 @@ from device_agent.protocol import (
 from device_agent.protocol.security import signing
 from function_app.domain.common.ids import agent_id
 from function_app.entrypoints.http.framework.routing import PREFIX
-from function_app.ports.broker_access import Credentials
 from tests.harness.network.brokers import Client, Message
 
 if TYPE_CHECKING:
@@ -123,7 +122,7 @@ class Robot:
         """Connect with credentials from the API, hear what is addressed to it, and say that it is there."""
         issued = self.ask("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
         self.session += 1
-        self.link = _Link(self, issued).open()
+        self.link = self.cloud.connect(issued, on_message=self.obey)
         assert self.link.connected.is_set(), f"refused: {self.link.answer}"
         assert self.link.subscribe(*issued["subscribe"]) == [1] * len(issued["subscribe"])
         self.say_presence(online=True)
@@ -192,20 +191,6 @@ class Robot:
     def __exit__(self, *_: object) -> None:
         if self.link is not None:
             self.link.close()
-
-
-class _Link(Client):
-    """The toy robot's connection: hands each message on at once."""
-
-    def __init__(self, robot: Robot, issued: dict[str, Any]) -> None:
-        super().__init__(
-            issued["client_id"], Credentials(issued["username"], issued["password"]), port=issued["tcp"]["port"]
-        )
-        self._robot = robot
-
-    def _on_message(self, *arguments: Any) -> None:
-        super()._on_message(*arguments)
-        self._robot.obey(self.messages.queue[-1])
 
 
 def replace_ack(ack: Ack, changes: dict[str, Any]) -> Ack:

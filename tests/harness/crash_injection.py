@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from function_app.adapters.local.tables import SqliteTables
-from function_app.ports.tables import Page, Row, Write
+from function_app.ports.tables import Page, Row, Tables, Write
 from tests.harness.cloud.cloud import Cloud, Person
 
 
@@ -33,7 +32,7 @@ class Knife:
 class CutTables:
     """Real tables of a process that the knife ends: after that it neither reads nor writes."""
 
-    def __init__(self, inner: SqliteTables, knife: Knife) -> None:
+    def __init__(self, inner: Tables, knife: Knife) -> None:
         self._inner = inner
         self._knife = knife
 

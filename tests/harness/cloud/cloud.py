@@ -10,22 +10,26 @@ with Cloud(settings(home, broker)) as cloud:
 import asyncio
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 import httpx
+from fastapi import FastAPI
 
 from function_app import bootstrap
 from function_app.domain.identity.accounts import Identity
 from function_app.entrypoints.http import create_app
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
+from function_app.ports.broker_access import Credentials
+from function_app.ports.tables import Tables
 from function_app.services.identity.authenticator import ACCESS_S, SESSION_S
 from function_app.settings import RateLimits, Settings
 from tests.fakes.agent import Robot
-from tests.harness.network.brokers import PATIENCE_S, RunningBroker, wait_until
+from tests.fakes.clock import MovingClock
+from tests.harness.cloud.memory import Memory, SharedApp
+from tests.harness.network.brokers import PATIENCE_S, Client, Message, RunningBroker, wait_until
 
 BASE = "http://telescope.test"
 API = "/api/v1"
@@ -37,35 +41,67 @@ TOKEN_MS = ACCESS_S * 1000
 T = TypeVar("T")
 
 
-class MovingClock:
-    """The machine's clock, which a test can put forward."""
-
-    def __init__(self) -> None:
-        self.ahead_ms = 0
-
-    def now_ms(self) -> int:
-        return time.time_ns() // 1_000_000 + self.ahead_ms
-
-    def advance(self, seconds: float) -> None:
-        self.ahead_ms += round(seconds * 1000)
-
-
 class Cloud:
-    """One instance of the functions on an event loop of its own, with the ingest beside it."""
+    """One instance of the functions, with the ingest beside it.
 
-    def __init__(self, settings: Settings, *, clock: MovingClock | None = None) -> None:
-        self.clock = clock or MovingClock()
-        self.loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self.loop.run_forever)
-        self._thread.start()
-        self.functions = bootstrap.build(settings, clock=self.clock)
-        self.app = create_app(self.functions)
+    With ``memory`` it runs over fakes in the thread of the test: a call returns once all that it caused is stored.
+    Without, it runs over the adapters that the settings choose, on an event loop in a thread of its own.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        clock: MovingClock | None = None,
+        memory: Memory | None = None,
+        tables: Tables | None = None,
+    ) -> None:
+        self.memory = memory
+        self.clock = clock or (MovingClock() if memory is None else memory.clock)
         self._feeds: list[asyncio.Future[None]] = []
         self._clients: list[httpx.AsyncClient] = []
+        if memory is None:
+            self.loop: asyncio.AbstractEventLoop = asyncio.new_event_loop()
+            self._thread = threading.Thread(target=self.loop.run_forever)
+            self._thread.start()
+            self.functions = bootstrap.build(settings, clock=self.clock)
+            self.app: FastAPI | SharedApp = create_app(self.functions)
+        else:
+            self.loop = memory.loop
+            self.functions = bootstrap.build(settings, clock=self.clock, adapters=memory.adapters(settings, tables))
+            self.app = SharedApp(self.functions)
 
     def run(self, call: Coroutine[Any, Any, T]) -> T:
-        """Run something on the functions' own loop."""
-        return asyncio.run_coroutine_threadsafe(call, self.loop).result(4 * PATIENCE_S)
+        """Run a coroutine on the event loop of the functions."""
+        if self.memory is None:
+            return asyncio.run_coroutine_threadsafe(call, self.loop).result(4 * PATIENCE_S)
+        self.memory.clock.advance(0.001)
+        result = self.loop.run_until_complete(call)
+        self.settle()
+        return result
+
+    def begin(self, call: Coroutine[Any, Any, T]) -> Callable[[], T]:
+        """Run a coroutine without waiting for its end; call what this returns for the result."""
+        if self.memory is None:
+            future = asyncio.run_coroutine_threadsafe(call, self.loop)
+            return lambda: future.result(4 * PATIENCE_S)
+        task = self.loop.create_task(call)
+        self.settle()
+        return lambda: self.run(_result(task))
+
+    def settle(self) -> None:
+        """In memory: run what is ready, until everything that was published is stored."""
+        if self.memory is not None:
+            self.memory.settle()
+
+    def connect(self, issued: dict[str, Any], *, on_message: Callable[[Message], None] | None = None) -> Client:
+        """A connection to the broker with credentials that the API has issued."""
+        credentials = Credentials(issued["username"], issued["password"])
+        if self.memory is None:
+            client = Client(issued["client_id"], credentials, port=issued["tcp"]["port"], on_message=on_message)
+            return client.open()
+        connection = self.memory.broker.connect(issued["client_id"], credentials, on_message=on_message)
+        return cast("Client", connection)
 
     def client(self, *, address: str = "127.0.0.1", **options: Any) -> httpx.AsyncClient:
         """A new HTTP client with a cookie jar of its own, that asks from ``address``."""
@@ -119,7 +155,10 @@ class Cloud:
     def _listen(self, feed: Any, handle: Callable[..., Coroutine[Any, Any, None]]) -> None:
         async def start() -> None:
             self._feeds.append(asyncio.ensure_future(feed.run(handle)))
-            assert await feed._connection.ready(PATIENCE_S), feed._connection.trouble
+            if self.memory is None:
+                assert await feed._connection.ready(PATIENCE_S), feed._connection.trouble
+            else:
+                await asyncio.sleep(0)
 
         self.run(start())
 
@@ -140,10 +179,16 @@ class Cloud:
             await self.functions.close()
 
         self.run(end())
+        if self.memory is not None:
+            return
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join()
         self.loop.run_until_complete(self.loop.shutdown_default_executor())
         self.loop.close()
+
+
+async def _result(task: asyncio.Task[T]) -> T:
+    return await task
 
 
 class Person:
@@ -175,8 +220,7 @@ class Person:
         """Ask without waiting; call what this gives for the answer."""
         self._stay()
         call = self._client.request(method, API + path, **options)
-        future = asyncio.run_coroutine_threadsafe(call, self.cloud.loop)
-        return lambda: future.result(4 * PATIENCE_S)
+        return self.cloud.begin(call)
 
     def get(self, path: str, **options: Any) -> httpx.Response:
         return self.ask("GET", path, **options)
@@ -211,7 +255,7 @@ def settings(home: Path, broker: RunningBroker | None = None, **changes: Any) ->
     Requests are counted only where a test asks for it: all of a test's people share one address.
     """
     unlimited = RateLimits(address=0, account=0, key=0, agent=0)
-    known = Settings(home=home, public_url=BASE, mqtt_port=1, **{"rate_limits": unlimited, **changes})
+    known = Settings(**{"home": home, "public_url": BASE, "mqtt_port": 1, "rate_limits": unlimited, **changes})
     if broker is None:
         return known
     return replace(

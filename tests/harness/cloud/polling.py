@@ -13,7 +13,8 @@ import httpx
 
 from device_agent.protocol import AckStatus, codec, topics
 from tests.fakes.agent import Robot
-from tests.harness.cloud.cloud import API, MovingClock
+from tests.fakes.clock import MovingClock
+from tests.harness.cloud.cloud import API
 from tests.harness.network.brokers import PATIENCE_S, Message
 
 

@@ -9,7 +9,8 @@ import httpx
 from device_agent.protocol.security import signing
 from function_app import bootstrap, settings
 from tests.fakes.agent import Robot
-from tests.harness.cloud.cloud import API, Cloud, MovingClock
+from tests.fakes.clock import MovingClock
+from tests.harness.cloud.cloud import API, Cloud
 from tests.harness.hosts.host import PATIENCE_S, Host
 
 

@@ -78,6 +78,7 @@ class Client:
         keep_alive_s: int = 60,
         will: Message | None = None,
         tls: ssl.SSLContext | None = None,
+        on_message: Callable[[Message], None] | None = None,
     ) -> None:
         self.client_id = client_id
         self.messages: queue.Queue[Message] = queue.Queue()
@@ -86,6 +87,7 @@ class Client:
         self.connected = threading.Event()
         self.disconnected = threading.Event()
         self._port = port
+        self._handle = on_message
         self._keep_alive_s = keep_alive_s
         self._acknowledged: set[int] = set()
         self._granted: dict[int, list[int]] = {}
@@ -176,7 +178,10 @@ class Client:
         self.disconnected.set()
 
     def _on_message(self, _: Any, __: Any, message: paho.MQTTMessage) -> None:
-        self.messages.put(Message(message.topic, bytes(message.payload), message.qos, message.retain))
+        received = Message(message.topic, bytes(message.payload), message.qos, message.retain)
+        self.messages.put(received)
+        if self._handle is not None:
+            self._handle(received)
 
     def _on_subscribe(self, _: Any, __: Any, mid: int, codes: Any, ___: Any) -> None:
         self._granted[mid] = [code.value for code in codes]

@@ -12,7 +12,8 @@ from function_app.domain.common.rate_limit import Rate, request
 from function_app.services.identity import rate_limiter
 from function_app.services.identity.rate_limiter import BURST_S, RateLimiter
 from function_app.settings import RateLimits
-from tests.harness.cloud.cloud import API, Cloud, MovingClock, problem, settings
+from tests.fakes.clock import MovingClock
+from tests.harness.cloud.cloud import API, Cloud, problem, settings
 
 RATE = Rate(per_s=10, burst=30)
 

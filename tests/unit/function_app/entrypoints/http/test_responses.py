@@ -16,7 +16,8 @@ from starlette.types import Scope
 
 from function_app.domain.common.problems import Problem
 from function_app.entrypoints.http.framework.responses import MAX_BODY
-from tests.harness.cloud.cloud import API, Cloud, MovingClock, Person, problem
+from tests.fakes.clock import MovingClock
+from tests.harness.cloud.cloud import API, Cloud, Person, problem
 from tests.harness.cloud.cloud import settings as cloud_settings
 
 SIGN_IN = f"{API}/auth/sign-in"

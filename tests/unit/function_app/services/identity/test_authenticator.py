@@ -9,7 +9,7 @@ from function_app import bootstrap, settings
 from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
 from function_app.services.identity.authenticator import API, RECHECK_MS
-from tests.harness.cloud.cloud import MovingClock
+from tests.fakes.clock import MovingClock
 
 
 def test_what_would_be_checked_again_anyway_is_not_kept(tmp_path: Path) -> None:

@@ -1,0 +1,121 @@
+"""Blobs in memory."""
+
+import asyncio
+import secrets
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import NamedTuple
+from urllib.parse import quote
+
+from function_app.ports.blobs import (
+    MAX_BYTES,
+    MAX_NAME_LENGTH,
+    Download,
+    TransferRefused,
+    Upload,
+    check_upload,
+)
+
+
+class _Address(NamedTuple):
+    name: str
+    upload: bool
+    content_type: str
+    expires_s: float
+    length: int = 0
+
+
+class MemoryBlobs:
+    """``Blobs`` and ``Transfers`` in memory. ``shared`` opens another instance over the blobs of the first."""
+
+    def __init__(
+        self, shared: "MemoryBlobs | None" = None, *, url: str = "", now_s: Callable[[], float] = time.time
+    ) -> None:
+        self.contents: dict[str, bytes] = {} if shared is None else shared.contents
+        self._addresses: dict[str, _Address] = {} if shared is None else shared._addresses
+        self.url = url
+        self._now_s = now_s
+
+    async def put(self, name: str, content: bytes) -> None:
+        self._check(name, len(content))
+        await asyncio.sleep(0)
+        self.contents[name] = bytes(content)
+
+    async def get(self, name: str) -> bytes | None:
+        self._check(name)
+        await asyncio.sleep(0)
+        return self.contents.get(name)
+
+    async def append(self, name: str, content: bytes) -> None:
+        self._check(name, len(self.contents.get(name, b"")) + len(content))
+        self.contents[name] = self.contents.get(name, b"") + content
+
+    async def delete(self, name: str) -> None:
+        self._check(name)
+        self.contents.pop(name, None)
+
+    async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
+        return tuple(sorted(name for name in self.contents if name.startswith(prefix))[:limit])
+
+    async def size(self, name: str) -> int | None:
+        content = await self.get(name)
+        return None if content is None else len(content)
+
+    async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
+        check_upload(length)
+        self._check(name)
+        url = self._sign(_Address(name, True, content_type, self._now_s() + lifetime_s, length))
+        return Upload("PUT", url, {"Content-Length": str(length), "Content-Type": content_type})
+
+    async def presign_download(self, name: str, *, content_type: str, lifetime_s: int) -> str:
+        self._check(name)
+        return self._sign(_Address(name, False, content_type, self._now_s() + lifetime_s))
+
+    async def receive(self, token: str, headers: Mapping[str, str], content: AsyncIterator[bytes]) -> None:
+        address = self._address(token, upload=True)
+        if headers.get("content-length", str(address.length)) != str(address.length):
+            raise TransferRefused(403, f"The address is for exactly {address.length} bytes.")
+        if headers.get("content-type") != address.content_type:
+            raise TransferRefused(403, f"The address is for content of the type {address.content_type}.")
+        if address.name in self.contents:
+            raise TransferRefused(409, "A blob with this name exists.")
+        received = b"".join([part async for part in content])
+        if len(received) != address.length:
+            raise TransferRefused(400, f"The body must have {address.length} bytes.")
+        self.contents[address.name] = received
+
+    async def send(self, token: str) -> Download:
+        address = self._address(token, upload=False)
+        if address.name not in self.contents:
+            raise TransferRefused(404, "There is nothing at this address any more.")
+        content = self.contents[address.name]
+        return Download(_parts(content), len(content), address.content_type)
+
+    async def close(self) -> None:
+        """Nothing is open."""
+
+    def _sign(self, address: _Address) -> str:
+        token = f"{secrets.token_hex(16)}.{quote(address.name, safe='').replace('%', '_')}"
+        self._addresses[token] = address
+        return f"{self.url}/{token}"
+
+    def _address(self, token: str, *, upload: bool) -> _Address:
+        address = self._addresses.get(token)
+        if address is None or address.upload != upload or address.expires_s <= self._now_s():
+            raise TransferRefused(403, "The address is not one of ours, or has expired. Ask for a new one.")
+        return address
+
+    @staticmethod
+    def _check(name: str, size: int = 0) -> None:
+        if not 1 <= len(name) <= MAX_NAME_LENGTH or not _is_text(name):
+            raise ValueError(f"a blob's name is Unicode text of 1 to {MAX_NAME_LENGTH} characters")
+        if size > MAX_BYTES:
+            raise ValueError(f"a blob has at most {MAX_BYTES} bytes, not {size}")
+
+
+def _is_text(name: str) -> bool:
+    return name.encode(errors="replace").decode() == name
+
+
+async def _parts(content: bytes) -> AsyncIterator[bytes]:
+    yield content

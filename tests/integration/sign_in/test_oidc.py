@@ -1,0 +1,457 @@
+"""Signing in elsewhere: at a real OpenID Connect provider; and what a lying one, or somebody in between, gets by."""
+
+import asyncio
+import contextlib
+import json
+import re
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import httpx
+import jwt
+import pytest
+
+from function_app.adapters.oidc.provider import HttpOidcProvider
+from function_app.domain.audit.hash_chain import CLOUD
+from function_app.ports.oidc_provider import OidcError, Subject
+from function_app.services.storage import records
+from function_app.settings import OidcClient
+from tests.fakes.clock import MovingClock
+from tests.harness.cloud.cloud import API, BASE, Cloud, Person, problem, settings
+from tests.harness.cloud.oidc_provider import (
+    CLIENT_ID,
+    CLIENT_SECRET,
+    REDIRECT,
+    Liar,
+    SigningKey,
+    new_key,
+    sign_in_there,
+    start_liar,
+    start_provider,
+)
+
+START, CALLBACK = f"{API}/auth/oidc/start", f"{API}/auth/oidc/callback"
+NONCE = "of this sign-in"
+STARTED_S = int(time.time())
+
+
+@pytest.fixture(scope="module")
+def key() -> SigningKey:
+    return new_key()
+
+
+@pytest.fixture(scope="module")
+def provider(key: SigningKey) -> Iterator[str]:
+    with start_provider([key]) as address:
+        yield address
+
+
+def opened(home: Path, issuer: str, *, anyone: bool = True) -> Cloud:
+    client = OidcClient(
+        issuer=issuer, client_id=CLIENT_ID, client_secret=CLIENT_SECRET, name="The lab's", anyone=anyone
+    )
+    return Cloud(replace(settings(home), public_url=BASE, oidc=client), clock=MovingClock())
+
+
+@pytest.fixture
+def here(home: Path, provider: str) -> Iterator[Cloud]:
+    """The functions, at which one may sign in at the real provider."""
+    with opened(home, provider) as cloud:
+        yield cloud
+
+
+@pytest.fixture
+def closed(home: Path, provider: str) -> Iterator[Cloud]:
+    """The same, where a newcomer has to be invited."""
+    with opened(home, provider, anyone=False) as cloud:
+        yield cloud
+
+
+class Browser:
+    """Somebody's, at our page and at the provider's."""
+
+    def __init__(self, cloud: Cloud) -> None:
+        self.cloud = cloud
+        self.page = cloud.client()
+
+    def start(self) -> str:
+        answer = self.cloud.run(self.page.get(START))
+        assert answer.status_code == 303, answer.text
+        assert answer.headers["cache-control"] == "no-store"
+        return answer.headers["location"]
+
+    def start_with(self, invitation: str) -> str:
+        answer = self.cloud.run(self.page.post(START, json={"invitation": invitation}))
+        assert answer.status_code == 200, answer.text
+        assert answer.headers["cache-control"] == "no-store"
+        assert invitation not in answer.text + str(answer.headers)
+        return str(answer.json()["url"])
+
+    def back(self, place: httpx.URL) -> httpx.Response:
+        return self.cloud.run(self.page.get(place.raw_path.decode()))
+
+    def sign_in(self, name: str) -> httpx.Response:
+        return self.back(sign_in_there(self.start(), name))
+
+    def me(self) -> httpx.Response:
+        return self.cloud.run(self.page.get(f"{API}/accounts/me"))
+
+
+def failed(answer: httpx.Response, why: str) -> None:
+    """It leads to the page that says why, and to no session."""
+    assert (answer.status_code, answer.headers["location"]) == (303, f"{BASE}/#sign-in-failed=oidc-{why}")
+    assert "set-cookie" not in answer.headers
+
+
+def test_somebody_signs_in_and_is_the_same_account_the_next_time(here: Cloud) -> None:
+    local = here.sign_in("Name of anna")
+    browser, again, other = Browser(here), Browser(here), Browser(here)
+    answer = browser.sign_in("anna")
+    assert (answer.status_code, answer.headers["location"]) == (303, f"{BASE}/#/")
+    assert "HttpOnly; SameSite=Strict" in answer.headers["set-cookie"]
+    me = browser.me().json()
+    assert me["name"] == "Name of anna"
+    assert me["id"] != local.account, "nobody is somebody by name"
+    assert me["csrf_token"]
+    assert len(here.run(browser.page.get(f"{API}/spaces")).json()["items"]) == 1
+    (session,) = here.run(browser.page.get(f"{API}/accounts/me/sessions")).json()["items"]
+    assert (session["method"], session["mine"]) == ("oidc", True)
+    again.sign_in("anna")
+    assert again.me().json()["id"] == me["id"]
+    other.sign_in("bert")
+    assert other.me().json()["id"] not in {me["id"], local.account}
+    headers = {"X-CSRF-Token": me["csrf_token"]}
+    body = {"password": "correct horse battery"}
+    problem(
+        here.run(browser.page.put(f"{API}/accounts/me/password", json=body, headers=headers)),
+        409,
+        "password-not-managed-here",
+    )
+
+
+class TestWhoMayCome:
+    """A provider knows people whom nobody here has asked in."""
+
+    @staticmethod
+    def invite(owner: Person, **more: Any) -> str:
+        space = owner.get("/spaces").json()["items"][0]["id"]
+        answer = owner.post(f"/spaces/{space}/invitations", {"role": "viewer", **more})
+        assert answer.status_code == 201, answer.text
+        return str(answer.json()["secret"])
+
+    @staticmethod
+    def accounts(cloud: Cloud) -> set[str]:
+        with sqlite3.connect(cloud.functions.settings.home / "tables.sqlite") as tables:
+            return {row for (row,) in tables.execute("SELECT part FROM rows WHERE tab = ?", (records.ACCOUNTS,))}
+
+    def test_a_stranger_gets_no_account_and_leaves_nothing(self, closed: Cloud) -> None:
+        closed.sign_in("anna")
+        before = self.accounts(closed)
+        browser = Browser(closed)
+        failed(browser.sign_in("mallory"), "uninvited")
+        assert browser.me().status_code == 401
+        assert self.accounts(closed) == before
+        refused = closed.run(closed.functions.tables.query(records.AUDIT, CLOUD, first="record:", last="record;")).rows
+        assert "oidc-uninvited" in {row.data["data"].get("code") for row in refused}
+
+    def test_who_was_invited_has_an_account_and_what_was_offered_and_comes_again(self, closed: Cloud) -> None:
+        owner = closed.sign_in("anna")
+        secret = self.invite(owner)
+        browser = Browser(closed)
+        answer = browser.back(sign_in_there(browser.start_with(secret), "bert"))
+        assert answer.headers["location"] == f"{BASE}/#/"
+        me = browser.me().json()
+        assert me["name"] == "Name of bert"
+        roles = {each["role"] for each in closed.run(browser.page.get(f"{API}/spaces")).json()["items"]}
+        assert roles == {"owner", "viewer"}
+        again = Browser(closed)
+        again.sign_in("bert")
+        assert again.me().json()["id"] == me["id"]
+        # It had one use.
+        other = Browser(closed)
+        problem(closed.run(other.page.post(START, json={"invitation": secret})), 404, "invitation-unknown")
+        failed(other.sign_in("mallory"), "uninvited")
+
+    def test_an_invitation_that_ends_meanwhile_lets_nobody_in(self, closed: Cloud) -> None:
+        owner = closed.sign_in("anna")
+        browser = Browser(closed)
+        place = sign_in_there(browser.start_with(self.invite(owner, expires_in_s=300)), "bert")
+        closed.clock.advance(301)
+        failed(browser.back(place), "uninvited")
+
+    def test_an_invitation_for_somebody_with_an_account_lets_nobody_else_in(self, closed: Cloud) -> None:
+        owner, _ = closed.sign_in("anna"), closed.sign_in("carl")
+        browser = Browser(closed)
+        place = sign_in_there(browser.start_with(self.invite(owner, account="carl")), "bert")
+        failed(browser.back(place), "uninvited")
+
+    def test_another_sites_page_begins_nothing_with_an_invitation(self, closed: Cloud) -> None:
+        secret = self.invite(closed.sign_in("anna"))
+        headers = {"Sec-Fetch-Site": "cross-site"}
+        problem(closed.ask("POST", START, json={"invitation": secret}, headers=headers), 403, "forbidden")
+
+    def test_where_anyone_may_come_a_stranger_has_an_empty_account(self, here: Cloud) -> None:
+        browser = Browser(here)
+        assert browser.sign_in("stranger").headers["location"] == f"{BASE}/#/"
+        assert here.run(browser.page.get(f"{API}/devices")).json()["items"] == []
+
+
+def test_the_browser_is_sent_with_what_makes_the_way_back_its_own(here: Cloud, provider: str) -> None:
+    answer = here.ask("GET", START)
+    asked = {name: value for name, (value,) in parse_qs(urlsplit(answer.headers["location"]).query).items()}
+    assert answer.headers["location"].startswith(f"{provider}/auth?")
+    assert (asked["response_type"], asked["code_challenge_method"], asked["redirect_uri"]) == ("code", "S256", REDIRECT)
+    assert len({asked["state"], asked["nonce"], asked["code_challenge"]}) == 3
+    cookie = answer.headers["set-cookie"]
+    assert "Path=/api/v1/auth/oidc; Max-Age=600; HttpOnly; SameSite=Lax" in cookie
+    assert asked["state"] not in cookie
+
+
+def test_the_page_is_told_how_one_may_sign_in(here: Cloud, cloud: Cloud) -> None:
+    elsewhere = {"name": "The lab's", "url": START}
+    assert here.ask("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "oidc": elsewhere}
+    assert cloud.ask("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "oidc": None}
+    for path in (START, f"{CALLBACK}?code=x&state=y"):
+        problem(cloud.ask("GET", path), 404, "oidc-unknown")
+
+
+def test_a_way_back_is_good_once_and_in_the_browser_that_began(here: Cloud) -> None:
+    anna, mallory = Browser(here), Browser(here)
+    place = sign_in_there(anna.start(), "anna")
+    failed(mallory.back(place), "expired")
+    mallory.start()
+    failed(mallory.back(place), "expired")
+    failed(anna.back(place.copy_set_param("state", "x" * 43)), "expired")
+    failed(anna.back(place.copy_remove_param("state")), "expired")
+    assert anna.me().status_code == 401
+    assert anna.back(place).headers["location"] == f"{BASE}/#/"
+    failed(anna.back(place), "expired")
+    assert anna.me().status_code == 200
+
+
+def test_somebody_elses_code_signs_nobody_in(here: Cloud) -> None:
+    """The verifier is not theirs, so the provider refuses it: to nobody, and not to whom it was given afterwards."""
+    anna, mallory = Browser(here), Browser(here)
+    stolen = sign_in_there(anna.start(), "anna").params["code"]
+    own = sign_in_there(mallory.start(), "mallory")
+    failed(mallory.back(own.copy_set_param("code", stolen)), "rejected")
+    assert mallory.me().status_code == 401
+
+
+def test_a_code_is_used_once(here: Cloud) -> None:
+    anna = Browser(here)
+    first = sign_in_there(anna.start(), "anna")
+    anna.back(first)
+    second = sign_in_there(anna.start(), "anna")
+    failed(anna.back(second.copy_set_param("code", first.params["code"])), "rejected")
+
+
+def test_a_way_back_from_another_provider_is_refused(here: Cloud) -> None:
+    for change in (
+        lambda url: url.copy_set_param("iss", "https://evil.example"),
+        lambda url: url.copy_remove_param("iss"),
+    ):
+        browser = Browser(here)
+        failed(browser.back(change(sign_in_there(browser.start(), "anna"))), "rejected")
+        assert browser.me().status_code == 401
+
+
+def test_who_takes_too_long_begins_again(here: Cloud) -> None:
+    browser = Browser(here)
+    place = sign_in_there(browser.start(), "anna")
+    here.clock.advance(601)
+    failed(browser.back(place), "expired")
+
+
+def test_whom_the_provider_refuses_is_told(here: Cloud) -> None:
+    browser = Browser(here)
+    state = parse_qs(urlsplit(browser.start()).query)["state"][0]
+    failed(browser.back(httpx.URL(f"{REDIRECT}?error=access_denied&state={state}")), "rejected")
+
+
+def test_a_provider_with_new_keys_is_believed_at_once(home: Path, key: SigningKey) -> None:
+    with contextlib.ExitStack() as stack:
+        first = stack.enter_context(contextlib.ExitStack())
+        issuer = first.enter_context(start_provider([key]))
+        cloud = stack.enter_context(opened(home, issuer))
+        Browser(cloud).sign_in("anna")
+        first.close()
+        failed_start = cloud.ask("GET", START)
+        assert failed_start.status_code == 303, "what is known of a provider is kept for a while"
+        stack.enter_context(start_provider([new_key("two"), key], port=urlsplit(issuer).port or 0))
+        cloud.clock.advance(11)
+        browser = Browser(cloud)
+        assert browser.sign_in("anna").headers["location"] == f"{BASE}/#/"
+        assert browser.me().status_code == 200
+
+
+def test_a_provider_that_is_away_is_no_fault_of_the_caller(home: Path) -> None:
+    with opened(home, "http://127.0.0.1:1") as cloud:
+        answer = cloud.ask("GET", START)
+        problem(answer, 503, "oidc-unavailable")
+        assert answer.headers["retry-after"] == "30"
+
+
+# ------------------------------------------------------------ a provider that lies
+
+Change = Callable[[dict[str, Any]], object]
+
+
+@pytest.fixture(scope="module")
+def strange() -> SigningKey:
+    """A key that the provider does not show, under the name of one that it does."""
+    return new_key()
+
+
+@pytest.fixture
+def liar(key: SigningKey) -> Iterator[Liar]:
+    with start_liar() as liar:
+        liar.keys = [key.shown()]
+        yield liar
+
+
+def client(liar: Liar, *, secret: str = CLIENT_SECRET, clock: MovingClock | None = None) -> HttpOidcProvider:
+    return HttpOidcProvider(issuer=liar.issuer, client_id=CLIENT_ID, client_secret=secret, clock=clock or MovingClock())
+
+
+def claims(liar: Liar, **changes: Any) -> dict[str, Any]:
+    now = int(time.time())
+    good = {"iss": liar.issuer, "sub": "anna", "aud": CLIENT_ID, "iat": now, "exp": now + 300, "nonce": NONCE}
+    return {name: value for name, value in {**good, **changes}.items() if value is not None}
+
+
+def signed(said: dict[str, Any], key: SigningKey, **header: Any) -> str:
+    return jwt.encode(said, key.private, "RS256", headers={"kid": key.name, **header})
+
+
+def redeem(asked: HttpOidcProvider, issuer: str | None = None) -> Subject:
+    return asyncio.run(asked.redeem(code="c", verifier="v", nonce=NONCE, redirect=REDIRECT, issuer=issuer))
+
+
+def test_an_honest_token_is_believed(liar: Liar, key: SigningKey) -> None:
+    liar.token = signed(claims(liar), key)
+    assert redeem(client(liar)) == Subject(liar.issuer, "anna", "anna")
+    liar.token = signed(claims(liar, aud=[CLIENT_ID, "other"], azp=CLIENT_ID, name=" A\u0000nna\n"), key)
+    assert redeem(client(liar), liar.issuer).name == "Anna"
+    assert parse_qs(liar.asked[0]) == {
+        "grant_type": ["authorization_code"], "code": ["c"], "redirect_uri": [REDIRECT], "code_verifier": ["v"],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"nonce": "of another one"}, {"nonce": None}, {"nonce": 1},
+        {"aud": "other"}, {"aud": ["other"]}, {"aud": [CLIENT_ID, "other"]}, {"aud": None},
+        {"aud": [CLIENT_ID, "other"], "azp": "other"},
+        {"iss": "https://evil.example"}, {"iss": None},
+        {"exp": STARTED_S - 60}, {"exp": None}, {"exp": "soon"}, {"exp": float("inf")}, {"exp": float("nan")},
+        {"iat": STARTED_S + 3600}, {"nbf": STARTED_S + 3600},
+        {"sub": None}, {"sub": ""}, {"sub": "x" * 256},
+    ],
+    # Named alike however late a process looks: tests that run side by side must have the same names in each.
+    ids=lambda changes: re.sub(r"\d{10}", "another time", json.dumps(changes)),
+)  # fmt: skip
+def test_a_token_of_other_claims_is_not(liar: Liar, key: SigningKey, changes: dict[str, Any]) -> None:
+    liar.token = signed(claims(liar, **changes), key)
+    with pytest.raises(OidcError):
+        redeem(client(liar))
+
+
+def test_a_token_that_others_signed_is_not(liar: Liar, key: SigningKey, strange: SigningKey) -> None:
+    said = claims(liar)
+    good = signed(said, key)
+    head, body, tail = good.split(".")
+    for token in (
+        signed(said, strange),
+        signed(said, strange, kid="two"),
+        signed(said, strange, jwk=strange.shown(), jku="http://127.0.0.1:1/keys"),
+        jwt.encode(said, "", "none", headers={"kid": key.name}),
+        jwt.encode(said, CLIENT_SECRET, "HS256", headers={"kid": key.name}),
+        jwt.encode(said, str(key.shown()["n"]), "HS512", headers={"kid": key.name}),
+        f"{head}.{body}.",
+        f"{head}.{body[:-4]}AAAA.{tail}",
+        f"{head}.{body}.{tail[:-8]}AAAAAAAA",
+        "nonsense",
+        "",
+        None,
+        1,
+    ):
+        liar.token = token
+        with pytest.raises(OidcError):
+            redeem(client(liar))
+    liar.token = good
+    assert redeem(client(liar)).id == "anna"
+
+
+def test_a_key_for_something_else_is_none(liar: Liar, key: SigningKey) -> None:
+    liar.token = signed(claims(liar), key)
+    for shown in ({**key.shown(), "use": "enc"}, {**key.shown(), "alg": "PS256"}, {"kid": "one", "kty": "oct"}, "x",
+                  {**key.shown(), "n": "!"}, {**key.shown(), "n": 1}, {**key.shown(), "e": None}):  # fmt: skip
+        liar.keys = [shown]
+        with pytest.raises(OidcError):
+            redeem(client(liar))
+
+
+def test_an_unknown_key_has_the_keys_fetched_but_not_for_ever(liar: Liar, key: SigningKey, strange: SigningKey) -> None:
+    clock = MovingClock()
+    asked = client(liar, clock=clock)
+    liar.token = signed(claims(liar), key)
+    redeem(asked)
+    liar.token = signed(claims(liar), strange, kid="two")
+    for _ in range(5):
+        with pytest.raises(OidcError):
+            redeem(asked)
+    assert liar.fetched.count("/keys") == 1
+    clock.advance(11)
+    liar.keys.append({**strange.shown(), "kid": "two"})
+    assert redeem(asked).id == "anna"
+    liar.keys = [{**strange.shown(), "kid": "two"}]
+    liar.token = signed(claims(liar), key)
+    assert redeem(asked).id == "anna", "a key is kept for an hour"
+    clock.advance(3_600)
+    liar.token = signed(claims(liar, exp=int(time.time()) + 7_200), key)
+    with pytest.raises(OidcError, match="does not show"):
+        redeem(asked)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"issuer": "https://evil.example"}, {"issuer": None},
+        {"token_endpoint": "http://192.0.2.1/token"}, {"jwks_uri": "file:///etc/passwd"}, {"jwks_uri": None},
+        {"authorization_endpoint": "javascript:alert(1)"}, {"code_challenge_methods_supported": ["plain"]},
+    ],
+    ids=json.dumps,
+)  # fmt: skip
+def test_a_provider_that_is_not_what_it_should_be_is_not_used(liar: Liar, changes: dict[str, Any]) -> None:
+    liar.document |= changes
+    with pytest.raises(OidcError):
+        asyncio.run(client(liar).address(state="s", nonce="n", challenge="c", redirect=REDIRECT))
+    assert liar.asked == []
+
+
+def test_a_client_without_a_secret_says_who_it_is(liar: Liar, key: SigningKey) -> None:
+    liar.token = signed(claims(liar), key)
+    redeem(client(liar, secret=""))
+    liar.document["token_endpoint_auth_methods_supported"] = ["client_secret_post"]
+    redeem(client(liar))
+    public, posted = (parse_qs(form) for form in liar.asked)
+    assert public["client_id"] == posted["client_id"] == [CLIENT_ID]
+    assert "client_secret" not in public
+    assert posted["client_secret"] == [CLIENT_SECRET]
+
+
+def test_a_refusal_and_too_long_an_answer_are_told_apart_from_a_token(liar: Liar, key: SigningKey) -> None:
+    liar.token = signed(claims(liar), key)
+    liar.status = 400
+    with pytest.raises(OidcError, match="answered 400"):
+        redeem(client(liar))
+    liar.status, liar.token = 200, "x" * 300_000
+    with pytest.raises(OidcError, match="more than"):
+        redeem(client(liar))

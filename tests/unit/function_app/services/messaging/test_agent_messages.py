@@ -1,0 +1,240 @@
+"""What an agent tells over HTTP is taken in as what it says over MQTT, and nobody else may tell it."""
+
+import json
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from device_agent.protocol import AckStatus, Event, Measurements, Mode, State, codec, topics
+from function_app.entrypoints.ingest.router import ingest
+from tests.fakes.broker import MemoryBroker, MemoryConnection
+from tests.fixtures.cloud import OpenCloud
+from tests.harness.cloud.cloud import Cloud, Person, problem
+from tests.harness.cloud.polling import PollingRobot
+
+
+@pytest.fixture
+def anna(cloud: Cloud) -> Person:
+    return cloud.sign_in("anna")
+
+
+@pytest.fixture
+def robot(cloud: Cloud, anna: Person) -> Iterator[PollingRobot]:
+    """Paired, and not yet asking."""
+    with PollingRobot(cloud) as robot:
+        robot.pair(anna)
+        yield robot
+
+
+def state(tick_ms: int = 1) -> bytes:
+    return codec.encode(State(device="arm", at_ms=1, tick_ms=tick_ms, mode=Mode.IDLE, epoch=0))
+
+
+class TestTelling:
+    def test_each_message_has_its_own_result(self, anna: Person, robot: PollingRobot, cloud: Cloud) -> None:
+        other = cloud.robot()
+        other.pair(cloud.sign_in("bert"))
+        own = f"ts/v1/{robot.space}/{robot.id}"
+        good = [(robot.topic(topics.STATE), state(7)), (f"{own}/conn", b'{"online":true,"session":3,"at_ms":1}')]
+        foreign = [
+            other.topic(topics.STATE),
+            f"ts/v1/{other.space}/{robot.id}/arm/state",
+            f"ts/v1/{robot.space}/{other.id}/arm/state",
+            f"{own}/leg/state",
+            f"{own}/arm/cmd",
+            f"{own}/arm/stop",
+            f"{own}/arm/ctl/1",
+            f"{own}/arm/cam/wrist",
+            f"{own}/arm/tele",
+            f"{own}/+/state",
+            "$CONTROL/telescope/v1",
+            "x",
+        ]
+        bad = [
+            (robot.topic(topics.STATE), b"[]"),
+            (robot.topic(topics.STATE), b'{"device":"arm"}'),
+            (
+                robot.topic(topics.EVENT),
+                b'{"id":"e","device":"arm","at_ms":1,"kind":"","severity":"odd","message":""}',
+            ),
+            (robot.topic(topics.ACK), codec.encode(robot.ack(f"{other.device}-{'0' * 20}", AckStatus.DONE))),
+            (robot.topic(topics.ACK), codec.encode(robot.ack("x", AckStatus.DONE))),
+            (robot.topic(topics.TELE) + "/heat", b'{"values":1}'),
+        ]
+        answer = robot.tell_raw(*good, *((topic, state(8)) for topic in foreign), *bad)
+        assert answer.status_code == 200, answer.text
+        results = answer.json()["results"]
+        assert [result["status"] for result in results] == ["stored"] * 2 + ["rejected"] * (len(foreign) + len(bad))
+        assert all(result["detail"].endswith(".") for result in results[2:])
+        assert anna.get(f"/devices/{robot.device}").json()["state"]["tick_ms"] == 7
+
+    def test_told_twice_is_told_once(self, anna: Person, robot: PollingRobot) -> None:
+        robot.fetch()
+        action = anna.start(robot.device).json()["id"]
+        acks = [
+            (robot.topic(topics.ACK), codec.encode(robot.ack(action, status)))
+            for status in (AckStatus.RECEIVED, AckStatus.STARTED, AckStatus.DONE)
+        ]
+        event = Event(id="e1", device="arm", at_ms=1, kind="bump", severity="info", message="")
+        said = [*acks, (robot.topic(topics.EVENT), codec.encode(event)), (robot.topic(topics.STATE), state())]
+        for _ in range(2):
+            assert {result["status"] for result in robot.tell_raw(*said).json()["results"]} == {"stored"}
+            assert anna.action(action)["status"] == "done"
+        assert len(anna.get(f"/devices/{robot.device}/events").json()["items"]) == 1
+
+    def test_telemetry_reaches_the_series(self, cloud: Cloud, anna: Person, robot: PollingRobot) -> None:
+        now_ms = cloud.clock.now_ms()
+        topic = robot.topic(topics.TELE) + "/heat"
+        samples = (
+            Measurements(tick_ms=n, at_ms=now_ms - 1000 + n, sequence=n, values={"t_c": 20.0 + n}) for n in range(50)
+        )
+        measured = [(topic, codec.encode(sample)) for sample in samples]
+        assert robot.tell_raw(*measured).json()["results"] == [{"status": "stored", "detail": None}] * 50
+        streams = anna.get(f"/devices/{robot.device}/data").json()["items"]
+        assert [stream["name"] for stream in streams] == ["heat"]
+
+    def test_the_brokers_subscribers_hear_it_too_and_its_echo_changes_nothing(
+        self, cloud: Cloud, broker: MemoryBroker, anna: Person, robot: PollingRobot
+    ) -> None:
+        issued = anna.post("/mqtt/credentials", {"purpose": "view"}).json()
+        from function_app.ports.broker_access import Credentials
+
+        def page(number: int) -> MemoryConnection:
+            again = anna.post("/mqtt/credentials", {"purpose": "view"}).json() if number else issued
+            login = Credentials(again["username"], again["password"])
+            client = broker.connect(again["client_id"], login)
+            client.subscribe(robot.topic(topics.STATE), robot.topic(topics.TELE) + "/+", robot.topic(topics.EVENT))
+            return client
+
+        event = codec.encode(Event(id="e1", device="arm", at_ms=1, kind="bump", severity="info", message=""))
+        heat = codec.encode(Measurements(tick_ms=1, at_ms=cloud.clock.now_ms(), sequence=1, values={"t_c": 20.0}))
+        said = [(robot.topic(topics.STATE), state(n)) for n in (1, 2, 3)]
+        said += [(robot.topic(topics.TELE) + "/heat", heat), (robot.topic(topics.EVENT), event)]
+        with page(0) as ear:
+            robot.tell_raw(*said, (f"ts/v1/{robot.space}/{robot.id}/arm/cmd", b"{}"))
+            heard = [ear.receive() for _ in said]
+            assert sorted((message.topic, message.payload) for message in heard) == sorted(said)
+            ticks = [message.payload for message in heard if message.topic.endswith("/state")]
+            assert ticks == [state(1), state(2), state(3)]
+        with page(1) as late:
+            kept = late.receive()
+            assert (kept.payload, kept.retain) == (state(3), True)
+        cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), state(2)))
+        assert anna.get(f"/devices/{robot.device}").json()["state"]["tick_ms"] == 3
+
+    def test_a_broker_that_is_away_costs_little(self, open_cloud: OpenCloud) -> None:
+        cloud = open_cloud()
+        with PollingRobot(cloud) as robot:
+            robot.pair(cloud.sign_in("anna"))
+            began = time.monotonic()
+            for number in range(50):
+                assert robot.tell_raw((robot.topic(topics.STATE), state(number))).status_code == 200
+            assert time.monotonic() - began < 15, "the broker is asked once in a while, not each time"
+
+
+class TestWhoMayAsk:
+    def test_only_the_agent_itself(self, cloud: Cloud, anna: Person, robot: PollingRobot) -> None:
+        message = {"messages": [{"topic": "t", "payload": {}}]}
+        other = PollingRobot(cloud)
+        other.pair(cloud.sign_in("bert"))
+        for path, body in (("commands", None), ("messages", message)):
+            method = "GET" if body is None else "POST"
+            where = f"/agents/{robot.id}/{path}"
+            missing = f"/agents/zzzzzzzzzz/{path}"
+            foreign = problem(other.ask(method, where, json=body), 404, "agent-unknown")
+            assert (
+                foreign["detail"].replace(robot.id, "zzzzzzzzzz")
+                == problem(other.ask(method, missing, json=body), 404, "agent-unknown")["detail"]
+            )
+            problem(anna.ask(method, where, json=body), 401, "unauthorized")
+            problem(cloud.ask(method, f"/api/v1{where}", json=body), 401, "unauthorized")
+
+    def test_nobody_before_it_is_claimed(self, cloud: Cloud) -> None:
+        robot = PollingRobot(cloud)
+        robot.enroll()
+        problem(robot.poll(), 409, "agent-unclaimed")
+        problem(robot.tell(("t", {})), 409, "agent-unclaimed")
+
+    @pytest.mark.parametrize(
+        "query",
+        [{"wait_ms": -1}, {"wait_ms": 30_001}, {"wait_ms": "x"}, {"limit": 0}, {"limit": 33}, {"have": ["x"] * 33}],
+    )
+    def test_what_is_asked_for_has_limits(self, robot: PollingRobot, query: dict[str, Any]) -> None:
+        problem(robot.poll(**query), 422, "invalid")
+
+    def test_what_is_told_has_limits(self, robot: PollingRobot) -> None:
+        problem(robot.tell(), 422, "invalid")
+        problem(robot.tell(*[("t", 1)] * 501), 422, "invalid")
+        problem(robot.tell_raw((robot.topic(topics.STATE), b'"' + b"x" * 1_000_000 + b'"')), 413, "too-large")
+        problem(robot.tell_raw((robot.topic(topics.STATE), b"[" * 10_000 + b"]" * 10_000)), 422, "invalid")
+        (result,) = robot.tell_raw((robot.topic(topics.STATE), b'"' + b"x" * 140_000 + b'"')).json()["results"]
+        assert result["status"] == "rejected"
+
+    def test_a_new_owner_gets_nothing_of_the_old_ones(self, cloud: Cloud, anna: Person, robot: PollingRobot) -> None:
+        robot.fetch()
+        anna.start(robot.device, ttl_ms=600_000, timeout_ms=600_000)
+        anna.post(f"/devices/{robot.device}/stop")
+        assert len(robot.fetch()) == 2
+        assert anna.delete(f"/agents/{robot.id}").status_code == 204
+        problem(robot.poll(), 409, "agent-unclaimed")
+        for owner in (cloud.sign_in("bert"), anna):
+            robot.pair(owner)
+            assert robot.fetch() == []
+            assert owner.delete(f"/agents/{robot.id}").status_code == 204
+
+
+ODD = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(min_value=-(10**40), max_value=10**40)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(st.characters(categories=None), max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=4),
+    max_leaves=8,
+)
+SAID: list[dict[str, Any]] = [
+    {"online": True, "session": 1, "at_ms": 1, "software": ""},
+    {"device": "arm", "at_ms": 1, "tick_ms": 1, "mode": "idle", "epoch": 0, "faults": []},
+    {"id": "e", "device": "arm", "at_ms": 1, "kind": "k", "severity": "info", "message": "", "data": {}},
+    {"device": "arm", "kind": "arm", "robot_type": "ur5", "label": "", "joints": [], "streams": []},
+    {"id": "", "status": "done", "sequence": 1, "at_ms": 1, "tick_ms": 1, "output": "", "result": {}},
+    {"tick_ms": 1, "at_ms": 1, "sequence": 1, "values": {"t_c": 1.0}},
+]
+"""One message of each class, of which a part is replaced by something odd."""
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_whatever_is_told_is_stored_or_refused(
+    cloud: Cloud, anna: Person, robot: PollingRobot, data: st.DataObject
+) -> None:
+    kinds = [
+        "conn",
+        "arm/state",
+        "arm/event",
+        "arm/desc",
+        "arm/ack",
+        "arm/tele/heat",
+        "arm/tele/joints",
+        "arm/desc/twin",
+    ]
+    messages = []
+    for _ in range(data.draw(st.integers(1, 4))):
+        said = dict(data.draw(st.sampled_from(SAID)))
+        for name in data.draw(st.lists(st.sampled_from(sorted(said)), max_size=2, unique=True)):
+            said[name] = data.draw(ODD)
+        if said.get("id") == "":
+            said["id"] = f"{robot.device}-{'0' * 20}"
+        topic = f"ts/v1/{robot.space}/{robot.id}/{data.draw(st.sampled_from(kinds))}"
+        messages.append((topic, json.dumps(said).encode()))
+    answer = robot.tell_raw(*messages)
+    assert answer.status_code in {200, 422}, answer.text
+    if answer.status_code == 200:
+        assert len(answer.json()["results"]) == len(messages)
+    assert anna.get(f"/devices/{robot.device}").status_code == 200
+    assert anna.get(f"/devices/{robot.device}/data").status_code == 200
+    cloud.sweep()

@@ -1,0 +1,83 @@
+"""Claim codes that are guessed at and redeemed by many."""
+
+import asyncio
+import random
+
+import pytest
+
+from function_app.domain.common.ids import new_claim_code
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
+from function_app.services.storage import records
+from tests.harness.cloud.cloud import Cloud
+from tests.harness.processes import show_code
+
+LIVE = 20
+"""Codes that are shown at the same time."""
+
+
+def guess(cloud: Cloud, guesses: int) -> None:
+    """As many accounts as one likes, each with its five tries: what protects is that there are 2.56·10¹⁰ codes."""
+    chance = random.Random(1)  # noqa: S311 (chance with a seed)
+    functions = cloud.functions
+
+    async def work() -> int:
+        shown = [await show_code(functions) for _ in range(LIVE)]
+        accounts = [(await functions.sign_in.account(f"a{number}")).id for number in range(20)]
+        claimed, answers = 0, set[str]()
+        for number in range(guesses):
+            if number % 100 == 0:
+                for account in accounts:
+                    row = await functions.tables.get(records.ATTEMPTS, account, "claim")
+                    if row is not None:
+                        await functions.tables.delete(records.ATTEMPTS, row)
+            who = Identity(accounts[number // 5 % 20], "x", f"s{chance.randrange(9)}")
+            try:
+                await functions.claim.claim(who, new_claim_code(), None)
+                claimed += 1
+            except Problem as problem:
+                answers.add(problem.code)
+        for agent, _ in shown:
+            row = await functions.tables.get(records.AGENTS, agent, "agent")
+            assert row is not None
+            claimed += row.data["account"] is not None
+        assert answers == {"claim-code-unknown"}
+        return claimed
+
+    assert cloud.run(work()) == 0
+
+
+def test_guessed_claim_codes_claim_nothing(cloud: Cloud) -> None:
+    guess(cloud, 1_000)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3_600)
+def test_a_hundred_thousand_guessed_claim_codes_claim_nothing(cloud: Cloud) -> None:
+    guess(cloud, 100_000)
+
+
+def test_of_a_hundred_who_redeem_one_code_at_once_one_wins(cloud: Cloud) -> None:
+    functions = cloud.functions
+
+    async def work() -> list[str]:
+        agent, code = await show_code(functions)
+        accounts = [(await functions.sign_in.account(f"a{number}")).id for number in range(100)]
+
+        async def one(account: str) -> str:
+            try:
+                await functions.claim.claim(Identity(account, "x", "s"), code, None)
+            except Problem as problem:
+                return problem.code
+            return account
+
+        found = await asyncio.gather(*(one(account) for account in accounts))
+        row = await functions.tables.get(records.AGENTS, agent, "agent")
+        assert row is not None
+        assert [each for each in found if each in accounts] == [row.data["account"]]
+        replayed = await one(accounts[0])
+        return [each for each in (*found, replayed) if each not in accounts]
+
+    refusals = cloud.run(work())
+    assert len(refusals) == 100
+    assert set(refusals) <= {"claim-code-unknown", "busy"}

@@ -1,0 +1,227 @@
+"""What is left when an agent is un-paired or moved, or loses a device: nothing that runs, shows or holds."""
+
+import secrets
+from typing import Any
+
+import pytest
+
+from device_agent.protocol import Description, Mode, MoveJoints, State, topics
+from function_app.services.maintenance.scheduler import ORPHAN_MS
+from function_app.services.pairing.offboarding import LOOK_MS
+from function_app.services.storage import records
+from function_app.services.storage.reminders import SHARDS
+from tests.fakes.agent import Robot
+from tests.fakes.broker import MemoryBroker
+from tests.fixtures.cloud import Mortal
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.crash_injection import elsewhere
+from tests.harness.network.brokers import wait_until
+
+Pair = tuple[Person, Robot]
+
+
+def furnish(anna: Person, robot: Robot, name: str = "arm") -> tuple[str, str]:
+    """Have a device run an action, with another one behind it, and say all that is retained."""
+    device = f"{robot.id}-{name}"
+    state = State(device=name, at_ms=1, tick_ms=1, mode=Mode.IDLE, epoch=0)
+    robot.say(robot.topic(topics.STATE, name), state, retain=True)
+    robot.say(
+        robot.topic(topics.DESC, name), Description(device=name, kind="arm", robot_type="ur5", label=""), retain=True
+    )
+    robot.say(topics.device(robot.space, robot.id, name, topics.DESC, topics.TWIN), {"x": 1}, retain=True)
+    wait_until(lambda: anna.get(f"/devices/{device}").json()["state"] is not None, "the state")
+    running = anna.start(device, wait_ms=10_000).json()["id"]
+    waiting = anna.start(device, policy="queue").json()
+    assert waiting["status"] == "queued"
+    return running, waiting["id"]
+
+
+def retained(cloud: Cloud, broker: MemoryBroker, space: str, agent: str, *names: str) -> set[str]:
+    """Topics of an agent's on which the broker keeps something."""
+    wanted = [topics.conn(space, agent)]
+    for name in names:
+        wanted += [f"{topics.ROOT}/{space}/{agent}/{name}/{kind}" for kind in ("state", "desc", "desc/twin")]
+    client_id = f"look-{secrets.token_hex(4)}"
+    grant = broker.grant(client_id, publish=(f"look/{client_id}",), subscribe=(*wanted, "look/#"))
+    credentials = cloud.run(cloud.functions.access.issue(grant))
+    with broker.connect(client_id, credentials) as client:
+        client.subscribe("look/#", *wanted)
+        client.publish_acknowledged(f"look/{client_id}", b"end")  # comes after what is retained
+        found = set()
+        while (message := client.receive()).topic != f"look/{client_id}":
+            found.add(message.topic)
+        return found
+
+
+def ends(cloud: Cloud, *actions: str) -> set[tuple[str, str]]:
+    """How they ended, whoever may see them."""
+    found = [cloud.run(cloud.functions.start_action._action_store.get(action)) for action in actions]
+    return {(each.action.status.value, (each.action.reason or {}).get("code", "")) for each in found if each}
+
+
+def rest(cloud: Cloud, robot: Robot) -> dict[str, Any]:
+    """What the tables still mean to do about an agent."""
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
+    pages = [cloud.run(cloud.functions.tables.query(records.PENDING, str(shard))) for shard in range(SHARDS)]
+    notes = [note.key for page in pages for note in page.rows if ":leave:" in note.key or ":queue:" in note.key]
+    assert row is not None
+    return {"leaving": list(row.data["leaving"]), "notes": notes}
+
+
+def pass_time(cloud: Cloud) -> None:
+    for seconds in (1, LOOK_MS / 1000, 1, ORPHAN_MS / 1000 + 1, 1):
+        cloud.clock.advance(seconds)
+        cloud.sweep()
+
+
+def test_unpairing_ends_what_runs_and_waits_and_clears_what_the_broker_keeps(
+    cloud: Cloud, pair: Pair, broker: MemoryBroker
+) -> None:
+    anna, robot = pair
+    running, waiting = furnish(anna, robot)
+    space = robot.space
+    assert len(retained(cloud, broker, space, robot.id, "arm")) == 4
+    assert anna.delete(f"/agents/{robot.id}").status_code == 204
+    assert ends(cloud, running, waiting) == {("failed", "unpaired")}
+    assert retained(cloud, broker, space, robot.id, "arm") == set()
+    assert [command.id for command in robot.heard(MoveJoints)] == [running]
+    pass_time(cloud)
+    assert rest(cloud, robot) == {"leaving": [], "notes": []}
+    for table, partition in ((records.MEMBERS, anna.account), (records.DESCRIPTIONS, robot.id)):
+        assert cloud.run(cloud.functions.tables.query(table, partition)).rows == ()
+
+
+def test_nothing_of_what_an_agent_said_under_one_owner_shows_to_the_next(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    furnish(anna, robot)
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, f"state:{robot.names[0]}"))
+    assert anna.delete(f"/agents/{robot.id}").status_code == 204
+    assert row is not None
+    cloud.run(cloud.functions.tables.create(records.AGENTS, row))  # as if it had come late
+    bert = cloud.sign_in("bert")
+    robot.pair(bert)
+    found = bert.get(f"/devices/{robot.device}").json()
+    assert (found["state"], found["online"], found["last_seen_at"]) == (None, False, None)
+
+
+@pytest.mark.parametrize("after", range(1, 24, 2))
+def test_whoever_unpairs_killed_after_any_write_leaves_the_rest_to_the_timer(
+    cloud: Cloud, pair: Pair, mortal: Mortal, broker: MemoryBroker, after: int
+) -> None:
+    anna, robot = pair
+    running, waiting = furnish(anna, robot)
+    space = robot.space
+    process, knife = mortal(cloud.clock)
+    there = elsewhere(process, anna)
+    assert there.get("/accounts/me").status_code == 200
+    knife.left = after
+    there.delete(f"/agents/{robot.id}")
+    if anna.get(f"/devices/{robot.device}").status_code == 200:
+        assert after == 1, "only before the write that decides"
+        assert anna.delete(f"/agents/{robot.id}").status_code == 204
+    bert = cloud.sign_in("bert")
+    robot.pair(bert)
+    robot.connect()
+    wait_until(lambda: bert.get(f"/devices/{robot.device}").json()["online"], "the robot to be online")
+    epoch = bert.take(robot.device, lease_ms=600_000).json()["epoch"]
+    mine = bert.start(robot.device, epoch=epoch, timeout_ms=600_000, wait_ms=10_000).json()
+    assert mine["status"] == "started"
+    pass_time(cloud)
+    assert ends(cloud, running, waiting) == {("failed", "unpaired")}
+    assert retained(cloud, broker, space, robot.id, "arm") == set()
+    assert rest(cloud, robot) == {"leaving": [], "notes": []}
+    assert bert.get(f"/devices/{robot.device}/lease").json()["lease"]["epoch"] == epoch
+    assert bert.action(mine["id"])["status"] == "started"
+    assert [item["id"] for item in bert.get("/devices").json()["items"]] == [robot.device]
+    assert anna.get("/agents").json()["items"] == []
+
+
+def test_what_the_broker_could_not_be_told_it_is_told_when_it_is_back(
+    cloud: Cloud, pair: Pair, broker: MemoryBroker
+) -> None:
+    anna, robot = pair
+    running, waiting = furnish(anna, robot)
+    broker.reachable = False
+    assert anna.delete(f"/agents/{robot.id}").status_code == 204
+    broker.reachable = True
+    assert ends(cloud, running, waiting) == {("failed", "unpaired")}
+    assert len(retained(cloud, broker, robot.space, robot.id, "arm")) == 4
+    assert robot.link is not None
+    assert not robot.link.disconnected.is_set()
+    pass_time(cloud)
+    wait_until(robot.link.disconnected.is_set, "the cut")
+    assert retained(cloud, broker, robot.space, robot.id, "arm") == set()
+    assert rest(cloud, robot) == {"leaving": [], "notes": []}
+
+
+class TestMoving:
+    def test_it_keeps_the_history_and_ends_what_runs(self, cloud: Cloud, pair: Pair, broker: MemoryBroker) -> None:
+        anna, robot = pair
+        running, waiting = furnish(anna, robot)
+        before, epoch = robot.space, anna.action(running)["epoch"]
+        space = anna.post("/spaces", {"name": "Attic"}).json()["id"]
+        answer = anna.put(f"/agents/{robot.id}/space", {"space": space})
+        assert (answer.status_code, answer.json()["space"]) == (200, space)
+        assert robot.link is not None
+        wait_until(robot.link.disconnected.is_set, "the cut")
+        assert {(anna.action(each)["status"], anna.action(each)["reason"]["code"]) for each in (running, waiting)} == {
+            ("failed", "moved")
+        }
+        assert retained(cloud, broker, before, robot.id, "arm") == set()
+        robot.space = robot.enrollment()["space"]
+        robot.connect()
+        wait_until(lambda: anna.get(f"/devices/{robot.device}").json()["online"], "the robot to be online")
+        assert anna.get(f"/devices/{robot.device}").json()["topic"] == f"ts/v1/{space}/{robot.device.replace('-', '/')}"
+        started = anna.start(robot.device, wait_ms=10_000).json()
+        assert (started["status"], started["epoch"] > epoch) == ("started", True)
+        listed = [item["id"] for item in anna.get(f"/devices/{robot.device}/actions").json()["items"]]
+        assert listed == [started["id"], waiting, running]
+        pass_time(cloud)
+        assert rest(cloud, robot) == {"leaving": [], "notes": []}
+
+    def test_only_into_a_space_of_ones_own_and_only_ones_own_agent(self, cloud: Cloud, pair: Pair) -> None:
+        anna, robot = pair
+        bert = cloud.sign_in("bert")
+        (foreign,) = bert.get("/spaces").json()["items"]
+        problem(anna.put(f"/agents/{robot.id}/space", {"space": foreign["id"]}), 404, "space-unknown")
+        problem(bert.put(f"/agents/{robot.id}/space", {"space": foreign["id"]}), 404, "agent-unknown")
+        problem(anna.put("/agents/nobody/space", {"space": robot.space}), 404, "agent-unknown")
+
+    def test_to_where_it_is_changes_nothing(self, pair: Pair) -> None:
+        anna, robot = pair
+        action = anna.start(robot.device, wait_ms=10_000).json()["id"]
+        assert anna.put(f"/agents/{robot.id}/space", {"space": robot.space}).status_code == 200
+        assert anna.action(action)["status"] == "started"
+
+    def test_the_first_space_stays_the_one_that_is_taken_where_none_is_named(self, cloud: Cloud) -> None:
+        anna = cloud.sign_in("anna")
+        (first,) = anna.get("/spaces").json()["items"]
+        made = [anna.post("/spaces", {"name": f"s{number}"}).json() for number in range(8)]
+        spaces = anna.get("/spaces").json()["items"]
+        assert spaces[0] == first
+        assert {space["id"] for space in spaces[1:]} == {space["id"] for space in made}
+        robot = cloud.robot()
+        robot.pair(anna)
+        assert robot.space == first["id"]
+        problem(anna.post("/spaces", {"name": ""}), 422, "invalid")
+
+    def test_an_account_has_a_hundred_spaces_at_most(self, cloud: Cloud) -> None:
+        anna = cloud.sign_in("anna")
+        assert [anna.post("/spaces", {"name": "s"}).status_code for _ in range(99)] == [201] * 99
+        problem(anna.post("/spaces", {"name": "s"}), 409, "too-many-spaces")
+
+
+def test_a_device_that_is_no_longer_named_ends_and_the_others_go_on(cloud: Cloud, broker: MemoryBroker) -> None:
+    with paired(cloud, "anna", "left", "right") as (anna, robot):
+        running, waiting = furnish(anna, robot, "left")
+        other, _ = furnish(anna, robot, "right")
+        devices = [device for device in robot.introduction()["devices"] if device["name"] == "right"]
+        assert robot.enroll(devices=devices).status_code == 200
+        assert ends(cloud, running, waiting) == {("failed", "removed")}
+        problem(anna.get(f"/actions/{running}"), 404, "action-unknown")
+        assert retained(cloud, broker, robot.space, robot.id, "left") == {topics.conn(robot.space, robot.id)}
+        assert anna.action(other)["status"] == "started"
+        assert robot.link is not None
+        assert not robot.link.disconnected.is_set()
+        pass_time(cloud)
+        assert rest(cloud, robot)["leaving"] == []

@@ -1,0 +1,259 @@
+"""What is no longer needed goes, when its time has come and not before; what was renewed stays."""
+
+from typing import Any
+
+import pytest
+
+from device_agent.protocol import AckStatus, Event, topics
+from function_app.ports.tables import Row
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS, NOTES, ROWS, SHARDS, Retention
+from function_app.services.telemetry.event_log import KEEP_EVENTS_MS
+from tests.fakes.agent import Robot
+from tests.fixtures.cloud import OpenCloud
+from tests.harness.cloud.cloud import Cloud, Person
+from tests.harness.network.brokers import wait_until
+
+Pair = tuple[Person, Robot]
+NOW_MS = 1_800_000_000_000
+
+
+@pytest.fixture
+def alone(open_cloud: OpenCloud) -> Cloud:
+    """The functions where no broker is needed."""
+    return open_cloud()
+
+
+def put(cloud: Cloud, *keys: str, **data: Any) -> None:
+    for key in keys:
+        cloud.run(cloud.functions.tables.create("Things", Row("p", key, data)))
+
+
+def left(cloud: Cloud, table: str = "Things", partition: str = "p") -> list[str]:
+    keys: list[str] = []
+    cursor: str | None = None
+    while True:
+        page = cloud.run(cloud.functions.tables.query(table, partition, limit=1000, cursor=cursor))
+        keys += [row.key for row in page.rows]
+        cursor = page.cursor
+        if cursor is None:
+            return keys
+
+
+def notes(cloud: Cloud, table: str = "") -> list[str]:
+    """Notes, or those about rows of one table: the silence of a robot is remembered too."""
+    pages = [cloud.run(cloud.functions.tables.query(records.FORGET, str(shard), limit=1000)) for shard in range(SHARDS)]
+    return [row.key for page in pages for row in page.rows if table in {"", row.data.get("table")}]
+
+
+def run(cloud: Cloud, now_ms: int) -> None:
+    cloud.run(cloud.functions.retention.delete_due(now_ms))
+
+
+class TestRows:
+    def test_a_range_goes_at_its_time_and_its_neighbours_stay(self, alone: Cloud) -> None:
+        put(alone, "a", "b", "b1", "c")
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="b", last="c", due_ms=NOW_MS))
+        run(alone, NOW_MS - 1)
+        assert left(alone) == ["a", "b", "b1", "c"]
+        run(alone, NOW_MS)
+        assert left(alone) == ["a", "c"]
+        assert notes(alone) == []
+
+    def test_one_row_is_that_row_alone(self, alone: Cloud) -> None:
+        put(alone, "b", "b1")
+        alone.run(alone.functions.retention.delete_row_at("Things", "p", "b", due_ms=NOW_MS))
+        run(alone, NOW_MS)
+        assert left(alone) == ["b1"]
+
+    def test_without_a_last_key_it_is_the_rest_of_the_partition(self, alone: Cloud) -> None:
+        put(alone, "a", "b", "zzz")
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="b", last=None, due_ms=NOW_MS))
+        run(alone, NOW_MS)
+        assert left(alone) == ["a"]
+
+    def test_a_row_that_was_renewed_stays_until_its_own_time(self, alone: Cloud) -> None:
+        put(alone, "old", expires_ms=NOW_MS)
+        put(alone, "renewed", expires_ms=NOW_MS + 1)
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="", last=None, due_ms=NOW_MS))
+        run(alone, NOW_MS)
+        assert left(alone) == ["renewed"]
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="", last=None, due_ms=NOW_MS + 1))
+        run(alone, NOW_MS + 1)
+        assert left(alone) == []
+
+    def test_the_same_note_twice_is_one(self, alone: Cloud) -> None:
+        for _ in range(2):
+            alone.run(alone.functions.retention.delete_row_at("Things", "p", "b", due_ms=NOW_MS))
+        assert len(notes(alone)) == 1
+
+    def test_many_rows_go_in_several_rounds_also_behind_many_that_stay(self, alone: Cloud) -> None:
+        put(alone, *(f"a{number:04d}" for number in range(ROWS)), expires_ms=NOW_MS + 1)
+        put(alone, *(f"b{number:04d}" for number in range(ROWS + 1)))
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="", last=None, due_ms=NOW_MS))
+        for looked in (0, ROWS, 2 * ROWS):
+            assert len(left(alone)) == 2 * ROWS + 1 - max(0, looked - ROWS)
+            assert len(notes(alone)) == 1
+            run(alone, NOW_MS)
+        assert len(left(alone)) == ROWS
+        assert notes(alone) == []
+
+    def test_many_notes_go_in_several_rounds(self, alone: Cloud) -> None:
+        for number in range(2 * SHARDS * NOTES):
+            alone.run(alone.functions.retention.delete_row_at("Things", "p", str(number), due_ms=NOW_MS))
+        run(alone, NOW_MS)
+        assert 0 < len(notes(alone)) < 2 * SHARDS * NOTES
+        for _ in range(4):
+            run(alone, NOW_MS)
+        assert notes(alone) == []
+
+    def test_large_rows_go_too(self, alone: Cloud) -> None:
+        put(alone, *(f"{number:02d}" for number in range(20)), text="x" * 200_000)
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="", last=None, due_ms=NOW_MS))
+        run(alone, NOW_MS)
+        assert left(alone) == []
+
+    def test_a_row_that_somebody_changes_meanwhile_is_looked_at_again(self, alone: Cloud) -> None:
+        put(alone, "a", "b")
+        tables, inner = alone.functions.tables, alone.functions.tables.batch
+
+        class Changing:
+            """The same tables, where a row is renewed between reading and deleting it."""
+
+            def __getattr__(self, name: str) -> Any:
+                return getattr(tables, name)
+
+            async def batch(self, *arguments: Any) -> Any:
+                row = await tables.get("Things", "p", "a")
+                assert row is not None
+                await tables.replace("Things", Row("p", "a", {"expires_ms": NOW_MS + 1}, row.etag))
+                return await inner(*arguments)
+
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="", last=None, due_ms=NOW_MS))
+        alone.run(Retention(tables=Changing(), blobs=alone.functions.blobs).delete_due(NOW_MS))
+        assert left(alone) == ["a", "b"]
+        assert len(notes(alone)) == 1
+        run(alone, NOW_MS)
+        assert left(alone) == ["a"]
+        assert notes(alone) == []
+
+
+def test_a_blob_goes_at_its_time_and_one_that_is_gone_is_no_trouble(alone: Cloud) -> None:
+    blobs = alone.functions.blobs
+    alone.run(blobs.put("a/b", b"content"))
+    alone.run(alone.functions.retention.delete_blob_at("a/b", due_ms=NOW_MS))
+    alone.run(alone.functions.retention.delete_blob_at("never/there", due_ms=NOW_MS))
+    run(alone, NOW_MS - 1)
+    assert alone.run(blobs.get("a/b")) == b"content"
+    run(alone, NOW_MS)
+    assert alone.run(blobs.get("a/b")) is None
+    assert notes(alone) == []
+
+
+def test_an_action_is_kept_for_30_days_after_its_end_and_its_key_for_one(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    action = anna.start(robot.device, once="k", wait_ms=10_000).json()["id"]
+    robot.report(action, AckStatus.DONE)
+    assert anna.action(action, wait_ms=10_000)["status"] == "done"
+    cloud.clock.advance(2)
+    cloud.sweep()
+    cloud.clock.advance(24 * 3600)
+    cloud.sweep()
+    anna = cloud.sign_in("anna")
+    assert [item["id"] for item in anna.get(f"/devices/{robot.device}/actions").json()["items"]] == [action]
+    assert [key for key in left(cloud, records.CONTROL, robot.device) if key.startswith("once:")] == []
+    cloud.clock.advance(29 * 24 * 3600)
+    cloud.sweep()
+    assert [key for key in left(cloud, records.CONTROL, robot.device) if key.startswith("action:")] == []
+    assert [key for key in left(cloud, records.CONTROL, robot.device) if key.startswith("now:")] != []
+    assert notes(cloud, records.CONTROL) == []
+
+
+def test_an_agents_clock_decides_nothing_about_how_long_its_actions_are_kept(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    robot.reports = lambda command: (robot.ack(command.id, AckStatus.DONE, at_ms=8_000_000_000_000),)
+    anna.start(robot.device, wait_ms=10_000, wait_for="done")
+    cloud.clock.advance(2)
+    cloud.sweep()
+    cloud.clock.advance(30 * 24 * 3600 + 300)
+    cloud.sweep()
+    assert [key for key in left(cloud, records.CONTROL, robot.device) if key.startswith("action:")] == []
+
+
+def test_events_are_kept_for_90_days_with_one_note_a_day(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+
+    def events() -> int:
+        return len(anna.get(f"/devices/{robot.device}/events").json()["items"])
+
+    now_ms = cloud.clock.now_ms()
+    before = len(notes(cloud))
+    for number in range(5):
+        event = Event(id=f"e{number}", device="arm", kind="door", severity="info", at_ms=now_ms, message="open")
+        robot.say(robot.topic(topics.EVENT), event)
+    wait_until(lambda: events() == 5, "the events")
+    assert len(notes(cloud)) - before <= 2, "two, where midnight falls between"
+    run(cloud, now_ms + KEEP_EVENTS_MS - DAY_MS)
+    assert events() == 5
+    run(cloud, now_ms + KEEP_EVENTS_MS + 2 * DAY_MS)
+    assert events() == 0
+    assert notes(cloud) == []
+
+
+def test_a_signed_out_session_is_remembered_as_long_as_its_token_could_be_used(alone: Cloud) -> None:
+    anna = alone.sign_in("anna")
+    assert anna.post("/auth/sign-out").status_code == 204
+    alone.clock.advance(12 * 3600 - 5)
+    alone.sweep()
+    assert any(key.startswith("signed-out:") for key in left(alone, records.ACCOUNTS, anna.account))
+    alone.clock.advance(10)
+    alone.sweep()
+    assert not any(key.startswith("signed-out:") for key in left(alone, records.ACCOUNTS, anna.account))
+
+
+def test_wrong_tries_are_forgotten_when_they_no_longer_count(alone: Cloud) -> None:
+    anna = alone.sign_in("anna")
+    for _ in range(3):
+        anna.post("/agents/claim", {"code": "BCDF-GHJK"})
+    assert len(left(alone, records.ATTEMPTS, anna.account)) == 1
+    alone.clock.advance(601)
+    alone.sweep()
+    assert left(alone, records.ATTEMPTS, anna.account) == []
+    assert notes(alone, records.ATTEMPTS) == []
+
+
+def test_an_agent_that_nobody_claims_is_forgotten_after_a_week_and_no_other(cloud: Cloud) -> None:
+    lost, waiting, claimed, given_back = (cloud.robot() for _ in range(4))
+    anna = cloud.sign_in("anna")
+    claimed.pair(anna)
+    given_back.pair(anna)
+    assert anna.delete(f"/agents/{given_back.id}").status_code == 204
+    for robot in (lost, waiting, given_back):
+        robot.enroll()
+    for _ in range(9):
+        cloud.clock.advance(24 * 3600)
+        assert waiting.enroll().status_code == 201
+        cloud.sweep()
+    for _ in range(3):
+        cloud.sweep()
+    found = [len(left(cloud, records.AGENTS, robot.id)) for robot in (lost, waiting, claimed, given_back)]
+    assert found == [0, 1, 1, 0]
+    cloud.clock.advance(100 * 24 * 3600)
+    for _ in range(5):
+        cloud.sweep()
+    anna = cloud.sign_in("anna")
+    assert [item["id"] for item in anna.get("/agents").json()["items"]] == [claimed.id]
+    assert left(cloud, records.AGENTS, waiting.id) == []
+    given_back.pair(anna)
+    assert len(anna.get("/agents").json()["items"]) == 2
+
+
+def test_an_agent_that_is_claimed_while_it_is_about_to_be_forgotten_stays(alone: Cloud) -> None:
+    robot, anna = alone.robot(), alone.sign_in("anna")
+    robot.enroll()
+    alone.clock.advance(9 * 24 * 3600)
+    anna = alone.sign_in("anna")
+    robot.pair(anna)
+    for _ in range(3):
+        alone.sweep()
+    assert [item["id"] for item in anna.get("/agents").json()["items"]] == [robot.id]

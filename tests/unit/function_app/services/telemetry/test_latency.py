@@ -1,0 +1,242 @@
+"""The latency store: each batch counts once, percentiles are the samples' own, what is another's stays theirs."""
+
+import math
+import random
+from typing import Any
+
+import pytest
+
+from device_agent.protocol import Ack, AckStatus, codec, topics
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.telemetry.histogram import ERROR
+from function_app.entrypoints.ingest.router import ingest
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS
+from function_app.services.telemetry.latency import HOUR_MS, KEEP_HOURS_MS
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.network.brokers import wait_until
+
+Pair = tuple[Person, Robot]
+Samples = list[tuple[int, float]]
+
+
+def body(samples: Samples, **changes: Any) -> dict[str, Any]:
+    found = [{"at_ms": at_ms, "ms": ms} for at_ms, ms in samples]
+    return {"transport": "mqtt", "path": "operator-device", "samples": found, **changes}
+
+
+def drawn(cloud: Cloud, count: int, *, seed: int = 1, over_ms: int = 60_000) -> Samples:
+    chance = random.Random(seed)  # noqa: S311 (repeatable samples)
+    now_ms = cloud.clock.now_ms()
+    moments = sorted(now_ms - chance.randrange(over_ms) for _ in range(count))
+    return sorted((at_ms, round(chance.lognormvariate(3.5, 0.6), 3)) for at_ms in moments)
+
+
+def known(who: Person, device: str, **query: Any) -> list[dict[str, Any]]:
+    answer = who.get(f"/devices/{device}/latency", params=query)
+    assert answer.status_code == 200, answer.text
+    items: list[dict[str, Any]] = answer.json()["items"]
+    return items
+
+
+def test_percentiles_bins_and_newest_samples_are_those_of_the_samples(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    samples = drawn(cloud, 1700)
+    for part in (samples[:600], samples[600:1100], samples[1100:]):
+        assert anna.post(f"/devices/{robot.device}/latency", body(part)).status_code == 204
+    (found,) = known(anna, robot.device)
+    times = sorted(ms for _, ms in samples)
+    assert found["count"] == len(times)
+    assert found["mean_ms"] == pytest.approx(math.fsum(times) / len(times))
+    assert (found["min_ms"], found["max_ms"]) == (times[0], times[-1])
+    for percent in (50, 90, 95, 99):
+        exact = times[math.ceil(percent / 100 * len(times)) - 1]
+        assert found[f"p{percent}_ms"] == pytest.approx(exact, rel=ERROR * 1.000001), percent
+    for one in found["bins"]:
+        assert one["count"] == sum(one["above_ms"] < ms <= one["up_to_ms"] for ms in times)
+    assert list(zip(found["at_ms"], found["ms"], strict=True)) == samples[-1000:]
+    (few,) = known(anna, robot.device, samples=5)
+    assert few["ms"] == found["ms"][-5:]
+    (none,) = known(anna, robot.device, samples=0)
+    assert none["ms"] == []
+
+
+def test_transports_and_paths_stand_side_by_side(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    now_ms = cloud.clock.now_ms()
+    anna.post(f"/devices/{robot.device}/latency", body([(now_ms, 20.0)]))
+    anna.post(f"/devices/{robot.device}/latency", body([(now_ms, 300.0)], transport="http-poll"))
+    mine = {"device": "arm", **body([(now_ms, 8.0)], path="device-cloud")}
+    assert robot.ask("POST", f"/agents/{robot.id}/latency", json=mine).status_code == 204
+    found = {(item["transport"], item["path"]): item["p50_ms"] for item in known(anna, robot.device)}
+    assert found == {
+        ("http-poll", "operator-device"): pytest.approx(300, rel=ERROR),
+        ("mqtt", "device-cloud"): pytest.approx(8, rel=ERROR),
+        ("mqtt", "operator-device"): pytest.approx(20, rel=ERROR),
+    }
+    assert len(known(anna, robot.device, transport="mqtt")) == 2
+    assert len(known(anna, robot.device, path="operator-device")) == 2
+    assert len(known(anna, robot.device, transport="mqtt", path="device-cloud")) == 1
+    assert known(anna, robot.device, transport="xmpp") == []
+
+
+def test_a_span_holds_its_own_hours_and_long_spans_are_summed_from_days(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    now_ms = cloud.clock.now_ms()
+    spread = [(now_ms - hour * HOUR_MS, 10.0 + hour) for hour in range(165)]
+    assert anna.post(f"/devices/{robot.device}/latency", body(spread)).status_code == 204
+    (whole,) = known(anna, robot.device, **{"from": now_ms - 8 * DAY_MS, "to": now_ms + HOUR_MS})
+    assert (whole["count"], whole["min_ms"], whole["max_ms"]) == (165, 10.0, 174.0)
+    (some,) = known(anna, robot.device, **{"from": now_ms - 4 * HOUR_MS, "to": now_ms})
+    assert some["count"] == 5
+    (days,) = known(anna, robot.device, **{"from": now_ms - 300 * DAY_MS, "to": now_ms})
+    assert days["count"] == 165
+    (before,) = known(anna, robot.device, **{"from": now_ms - 30 * DAY_MS, "to": now_ms - 20 * DAY_MS})
+    assert (before["count"], before["p50_ms"], before["bins"]) == (0, None, [])
+
+
+def test_a_batch_counts_once_however_often_it_comes(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    path = f"/devices/{robot.device}/latency"
+    samples = drawn(cloud, 50)
+    calls = [anna.begin("POST", path, json=body(samples)) for _ in range(6)]
+    assert {finish().status_code for finish in calls} == {204}
+    assert known(anna, robot.device)[0]["count"] == 50
+    key = {"Idempotency-Key": "k"}
+    other = drawn(cloud, 7, seed=2)
+    for _ in range(3):
+        assert anna.post(path, body(other), headers=key).status_code == 204
+    assert known(anna, robot.device)[0]["count"] == 57
+    problem(anna.post(path, body(drawn(cloud, 7, seed=3)), headers=key), 422, "idempotency-key-reused")
+
+
+def test_many_senders_at_once_lose_nothing(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    waiting = [
+        anna.begin("POST", f"/devices/{robot.device}/latency", json=body(drawn(cloud, 20, seed=seed)))
+        for seed in range(8)
+    ]
+    codes = [wait().status_code for wait in waiting]
+    (found,) = known(anna, robot.device)
+    assert set(codes) <= {204, 503}
+    assert found["count"] == 20 * codes.count(204) == len(found["ms"])
+
+
+def test_what_cannot_be_is_refused(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    path = f"/devices/{robot.device}/latency"
+    now_ms = cloud.clock.now_ms()
+    wrong: list[dict[str, Any]] = [
+        body([]),
+        body([(now_ms, -1.0)]),
+        body([(now_ms, 1e9)]),
+        body([(now_ms - 9 * DAY_MS, 1.0)]),
+        body([(now_ms + DAY_MS, 1.0)]),
+        body([(now_ms, 1.0)], transport="pigeon"),
+        body([(now_ms, 1.0)], path="there"),
+        body([(now_ms, 1.0)], more=1),
+        body([(now_ms, 1.0)] * 1001),
+    ]
+    for one in wrong:
+        problem(anna.post(path, one), 422, "invalid")
+    for query in ({"from": 5, "to": 5}, {"from": 0}, {"from": "x"}, {"samples": 1001}, {"transport": "pigeon"}):
+        problem(anna.get(path, params=query), 422, "invalid")
+    assert known(anna, robot.device) == []
+
+
+def test_nobody_sees_or_adds_to_what_is_not_theirs(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    samples = body([(cloud.clock.now_ms(), 5.0)])
+    with paired(cloud, "bert") as (bert, other):
+        problem(bert.post(f"/devices/{robot.device}/latency", samples), 404, "device-unknown")
+        problem(bert.get(f"/devices/{robot.device}/latency"), 404, "device-unknown")
+        mine = {"device": "arm", **samples}
+        problem(other.ask("POST", f"/agents/{robot.id}/latency", json=mine), 404, "agent-unknown")
+        problem(robot.ask("POST", f"/agents/{robot.id}/latency", json={**mine, "device": "leg"}), 404, "device-unknown")
+    assert cloud.ask("GET", f"/api/v1/devices/{robot.device}/latency").status_code == 401
+    anna.post(f"/devices/{robot.device}/latency", samples)
+    anna.delete(f"/agents/{robot.id}")
+    problem(robot.ask("POST", f"/agents/{robot.id}/latency", json={"device": "arm", **samples}), 404, "agent-unknown")
+    clara = cloud.sign_in("clara")
+    robot.pair(clara)
+    assert known(clara, robot.device) == [], "an earlier owner's samples are not hers"
+
+
+def test_a_stop_between_two_parts_of_a_batch_is_made_good_by_sending_it_again(
+    cloud: Cloud, pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    anna, robot = pair
+    now_ms = cloud.clock.now_ms()
+    spread = body([(now_ms - hour * HOUR_MS, 10.0) for hour in range(100)])
+    real = cloud.functions.tables.batch
+    calls = 0
+
+    async def once(table: str, writes: Any) -> Any:
+        nonlocal calls
+        calls += table == records.LATENCY
+        if table == records.LATENCY and calls > 1:
+            raise RuntimeError("killed")
+        return await real(table, writes)
+
+    monkeypatch.setattr(cloud.functions.tables, "batch", once)
+    assert anna.post(f"/devices/{robot.device}/latency", spread).status_code == 500
+    monkeypatch.undo()
+    assert anna.post(f"/devices/{robot.device}/latency", spread).status_code == 204
+    (found,) = known(anna, robot.device, **{"from": now_ms - 7 * DAY_MS})
+    assert found["count"] == 100
+
+
+def test_hours_are_forgotten_after_their_time_and_days_stay(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    now_ms = cloud.clock.now_ms()
+    spread = body([(now_ms - hour * HOUR_MS, 10.0) for hour in range(30)])
+    assert anna.post(f"/devices/{robot.device}/latency", spread).status_code == 204
+
+    def kinds() -> set[str]:
+        view = cloud.run(cloud.functions.devices.view(_identity(anna), robot.device))
+        partition = f"{robot.device}/{view.device.pairing}"
+        page = cloud.run(cloud.functions.tables.query(records.LATENCY, partition, limit=1000))
+        return {row.key.partition(":")[0] for row in page.rows}
+
+    assert kinds() == {"day", "hour", "once", "recent"}
+    cloud.clock.advance(11 * 86_400)
+    cloud.sweep()
+    assert kinds() == {"day", "hour", "recent"}
+    cloud.clock.advance((KEEP_HOURS_MS - 9 * DAY_MS) / 1000)
+    cloud.sweep()
+    assert kinds() == {"day", "recent"}
+
+
+def _identity(who: Person) -> Identity:
+    return Identity(who.account, who.name, who.session)
+
+
+def test_the_cloud_counts_what_the_end_of_an_action_tells_once(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    clock = cloud.clock
+
+    def late(_: object) -> list[Ack]:
+        """An agent whose clock is ten years ahead, and which takes 250 ms of it to begin."""
+        ahead_ms = 10 * 365 * DAY_MS
+        now_ms = clock.now_ms() + ahead_ms
+        times = ((AckStatus.RECEIVED, 0), (AckStatus.ACCEPTED, 100), (AckStatus.STARTED, 250))
+        return [robot.ack(robot.commands[-1].id, status, at_ms=now_ms + ms) for status, ms in times]
+
+    robot.reports = late
+    for number in range(3):
+        action = anna.start(robot.device, wait_ms=10_000).json()["id"]
+        done = robot.report(action, AckStatus.DONE)
+        wait_until(lambda: len(_ms(anna, robot, "received-started")) > number, "its times")  # noqa: B023 (at once)
+        robot.say(robot.topic(topics.ACK), done)
+    cloud.run(ingest(cloud.functions, robot.topic(topics.ACK), codec.encode(done)))
+    assert _ms(anna, robot, "received-started") == [250.0] * 3
+    answered, started = (_ms(anna, robot, path) for path in ("command-answered", "command-started"))
+    assert len(answered) == len(started) == 3
+    for first, second in zip(answered, started, strict=True):
+        assert 0 <= first <= second < 60_000, "by the cloud's clock, whatever the agent's says"
+
+
+def _ms(who: Person, robot: Robot, path: str) -> list[float]:
+    found = known(who, robot.device, path=path)
+    return found[0]["ms"] if found else []
