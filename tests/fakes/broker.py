@@ -208,10 +208,10 @@ class MemoryConnection:
 
     def receive(self, timeout_s: float = 0) -> Message:
         del timeout_s
-        assert not self.messages.empty(), f"{self.client_id} heard nothing"
+        assert not self.messages.empty(), f"{self.client_id} received nothing"
         return self.messages.get_nowait()
 
-    def heard(self) -> list[Message]:
+    def pending(self) -> list[Message]:
         """The messages that were not received yet."""
         return [self.messages.get_nowait() for _ in range(self.messages.qsize())]
 

@@ -76,8 +76,8 @@ class TestMemoryBrokerAccess:
         other.subscribe(f"{SPACE}/#")
         viewer.publish(f"{SPACE}/agent/arm/ctl/1", b"setpoint")
         viewer.publish(f"{SPACE}/agent/arm/cmd", b"forbidden")
-        assert [message.payload for message in other.heard()] == [b"setpoint"]
-        assert viewer.heard() == []
+        assert [message.payload for message in other.pending()] == [b"setpoint"]
+        assert viewer.pending() == []
 
     async def test_wrong_credentials_and_a_foreign_client_id_are_refused(self, broker: MemoryBroker) -> None:
         credentials = (await self.connect(broker))._credentials
@@ -89,7 +89,7 @@ class TestMemoryBrokerAccess:
         broker.publish(STATE, b"new", retain=True)
         viewer = await self.connect(broker)
         viewer.subscribe(f"{SPACE}/+/+/state")
-        assert [(message.payload, message.retain) for message in viewer.heard()] == [(b"new", True)]
+        assert [(message.payload, message.retain) for message in viewer.pending()] == [(b"new", True)]
 
     async def test_a_second_connection_with_a_client_id_replaces_the_first(self, broker: MemoryBroker) -> None:
         first, second = await self.connect(broker), await self.connect(broker)

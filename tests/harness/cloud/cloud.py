@@ -13,10 +13,9 @@ import threading
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Self, TypeVar, cast
 
 import httpx
-from fastapi import FastAPI
 
 from function_app import bootstrap
 from function_app.domain.identity.accounts import Identity
@@ -30,6 +29,9 @@ from tests.fakes.agent import Robot
 from tests.fakes.clock import MovingClock
 from tests.harness.cloud.memory import Memory, SharedApp
 from tests.harness.network.brokers import PATIENCE_S, Client, Message, RunningBroker, wait_until
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 BASE = "http://telescope.test"
 API = "/api/v1"
