@@ -1,4 +1,4 @@
-"""Every movement, played in its robot's own scene."""
+"""Every movement runs in its robot's scene within the limits."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ STEPS = 4  # of 2 ms: one control period
 
 
 class PlayedRobot:
-    """The script's ``robot``: follows minimum-jerk lines between joint positions and watches what happens."""
+    """The script's ``robot``: follows minimum-jerk lines and records contacts and speeds."""
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
@@ -70,7 +70,7 @@ class PlayedRobot:
         return float(base.xpos[0]), float(base.xpos[1]), math.atan2(base.xmat[3], base.xmat[0])
 
     def go_to(self, x_m: float, y_m: float, yaw_rad: float | None = None) -> None:
-        """Straight there: nothing stands in its scene. ``test_errands.py`` goes around things."""
+        """Drives straight; ``test_navigation.py`` covers obstacles."""
         x, y, yaw = self.place()
         towards = math.atan2(y_m - y, x_m - x)
         self._turn(towards - yaw)

@@ -1,4 +1,4 @@
-"""Qbo in its scene, driven by its driver, step by step: how well it drives, and what it notices."""
+"""Driving and distance sensors of Qbo in its scene."""
 
 import math
 from collections.abc import Iterator
@@ -19,8 +19,8 @@ from tests.harness.paths import ROBOTS
 FOLDER = ROBOTS / "qbo"
 
 
-class Track:
-    """The robot in its scene, stepped by hand, its twist shaped as the agent shapes it."""
+class DrivenQbo:
+    """The manually stepped robot, with the agent's twist limits."""
 
     def __init__(self) -> None:
         self.type = robot_type.load(FOLDER)
@@ -61,43 +61,43 @@ class Track:
 
     @property
     def speed(self) -> tuple[float, float]:
-        """Over the floor [m/s], of turning [rad/s]."""
+        """Linear [m/s] and angular [rad/s] speed."""
         velocity = self.world.snapshot().qvel[:6]
         return float(np.linalg.norm(velocity[:2])), float(velocity[5])
 
-    def told(self) -> dict[str, Any]:
+    def odometry(self) -> dict[str, Any]:
         return dict(self.driver.report("odometry"))
 
 
 @pytest.fixture
-def track() -> Track:
-    return Track()
+def qbo() -> DrivenQbo:
+    return DrivenQbo()
 
 
-def test_it_drives_straight(track: Track) -> None:
-    track.go(Twist(0.3), 5.0)
-    track.rest()
-    x, y, yaw = track.truth
+def test_it_drives_straight(qbo: DrivenQbo) -> None:
+    qbo.go(Twist(0.3), 5.0)
+    qbo.rest()
+    x, y, yaw = qbo.truth
     assert x == pytest.approx(0.3 * 5.0, abs=0.1)
     assert abs(y) < 0.005
     assert abs(yaw) < 0.005
-    told = track.told()
-    assert told["x_m"] == pytest.approx(x, abs=0.01)
-    assert told["y_m"] == pytest.approx(y, abs=0.005)
-    assert told["forward_m_s"] == pytest.approx(0.0, abs=0.002)
+    values = qbo.odometry()
+    assert values["x_m"] == pytest.approx(x, abs=0.01)
+    assert values["y_m"] == pytest.approx(y, abs=0.005)
+    assert values["forward_m_s"] == pytest.approx(0.0, abs=0.002)
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_it_turns_on_the_spot(track: Track, side: int) -> None:
-    track.go(Twist(0.0, 0.0, side * 1.0), 3.0)
-    track.rest()
-    x, y, yaw = track.truth
+def test_it_turns_on_the_spot(qbo: DrivenQbo, side: int) -> None:
+    qbo.go(Twist(0.0, 0.0, side * 1.0), 3.0)
+    qbo.rest()
+    x, y, yaw = qbo.truth
     assert math.hypot(x, y) < 0.005
     assert side * yaw == pytest.approx(3.0, abs=0.25)
-    assert track.told()["yaw_rad"] == pytest.approx(yaw, abs=0.03)
+    assert qbo.odometry()["yaw_rad"] == pytest.approx(yaw, abs=0.03)
 
 
-def test_odometry_follows_a_long_way_and_drifts_a_little(track: Track) -> None:
+def test_odometry_follows_a_long_way_and_drifts_a_little(qbo: DrivenQbo) -> None:
     for twist in (
         Twist(0.3),
         Twist(0.0, 0.0, 0.8),
@@ -105,123 +105,123 @@ def test_odometry_follows_a_long_way_and_drifts_a_little(track: Track) -> None:
         Twist(-0.2, 0.0, 0.3),
         Twist(0.25, 0.0, -0.7),
     ):
-        track.go(twist, 3.0)
-    track.rest()
-    x, y, yaw = track.truth
-    told = track.told()
-    off_m = math.hypot(told["x_m"] - x, told["y_m"] - y)
-    assert 0 < off_m < 0.05, "wheels slip: it is not the truth, and near to it"
-    assert abs(math.remainder(told["yaw_rad"] - yaw, 2 * math.pi)) < 0.08
+        qbo.go(twist, 3.0)
+    qbo.rest()
+    x, y, yaw = qbo.truth
+    values = qbo.odometry()
+    off_m = math.hypot(values["x_m"] - x, values["y_m"] - y)
+    assert 0 < off_m < 0.05, "small error by wheel slip"
+    assert abs(math.remainder(values["yaw_rad"] - yaw, 2 * math.pi)) < 0.08
 
 
-def test_odometry_includes_wheel_slip(track: Track) -> None:
-    """Odometry is what wheels say: held in the air it goes on."""
-    track.world._data.qpos[2] = 0.5
-    track.world.model.opt.gravity[2] = 0.0
-    before = track.truth
-    track.go(Twist(0.3), 1.0)
-    assert track.truth[0] == pytest.approx(before[0], abs=0.02)
-    assert track.told()["x_m"] > 0.15
+def test_odometry_includes_wheel_slip(qbo: DrivenQbo) -> None:
+    """Odometry integrates wheel rotation, even if the robot is lifted."""
+    qbo.world._data.qpos[2] = 0.5
+    qbo.world.model.opt.gravity[2] = 0.0
+    before = qbo.truth
+    qbo.go(Twist(0.3), 1.0)
+    assert qbo.truth[0] == pytest.approx(before[0], abs=0.02)
+    assert qbo.odometry()["x_m"] > 0.15
 
 
 @pytest.mark.parametrize("twist", [Twist(0.3), Twist(-0.3), Twist(0.0, 0.0, 1.5), Twist(0.2, 0.0, -1.0)])
-def test_it_stops_within_its_braking_limits(track: Track, twist: Twist) -> None:
-    track.go(twist, 2.0)
-    linear, angular = track.speed
+def test_it_stops_within_its_braking_limits(qbo: DrivenQbo, twist: Twist) -> None:
+    qbo.go(twist, 2.0)
+    linear, angular = qbo.speed
     assert max(linear / 0.3, abs(angular) / 1.5) > 0.6
-    place = track.truth
+    place = qbo.truth
     periods = 0
-    while track.motion.moving:
-        track.motion.brake()
-        track.period()
+    while qbo.motion.moving:
+        qbo.motion.brake()
+        qbo.period()
         periods += 1
-    assert periods * track.type.period_ms <= 180, "0.15 s at full speed, and the generator's ramps"
+    assert periods * qbo.type.period_ms <= 180, "0.15 s at full speed, plus ramps"
     for _ in range(2):
-        track.period()
-    linear, angular = track.speed
+        qbo.period()
+    linear, angular = qbo.speed
     assert linear < 0.03
     assert abs(angular) < 0.05
-    assert math.dist(place[:2], track.truth[:2]) < 0.04
+    assert math.dist(place[:2], qbo.truth[:2]) < 0.04
 
 
-def test_it_never_tips_over(track: Track) -> None:
-    chance = np.random.default_rng(4)
+def test_it_never_tips_over(qbo: DrivenQbo) -> None:
+    random = np.random.default_rng(4)
     upright = 1.0
     for _ in range(40):
-        track.go(Twist(chance.uniform(-0.3, 0.3), 0.0, chance.uniform(-1.5, 1.5)), 0.25)
-        if chance.random() < 0.3:
-            track.rest(0.2)
-        w, i, j, k = track.world.snapshot().body_quaternion[track.driver._base].tolist()
+        qbo.go(Twist(random.uniform(-0.3, 0.3), 0.0, random.uniform(-1.5, 1.5)), 0.25)
+        if random.random() < 0.3:
+            qbo.rest(0.2)
+        w, i, j, k = qbo.world.snapshot().body_quaternion[qbo.driver._base].tolist()
         assert math.isclose(math.hypot(w, i, j, k), 1.0, abs_tol=1e-6)
         upright = min(upright, 1 - 2 * (i * i + j * j))
     assert upright > math.cos(0.06)
-    assert not track.world._data.warning.number.any()
+    assert not qbo.world._data.warning.number.any()
 
 
-def test_sideways_motion_is_ignored_and_fast_curves_keep_their_radius(track: Track) -> None:
-    assert track.driver.drive(Twist(0.1, 0.2, 0.0)) == Twist(0.1, 0.0, 0.0)
-    fast = track.driver.drive(Twist(2.0, 0.0, 4.0))
+def test_sideways_motion_is_ignored_and_fast_curves_keep_their_radius(qbo: DrivenQbo) -> None:
+    assert qbo.driver.drive(Twist(0.1, 0.2, 0.0)) == Twist(0.1, 0.0, 0.0)
+    fast = qbo.driver.drive(Twist(2.0, 0.0, 4.0))
     assert fast.turn_rad_s / fast.forward_m_s == pytest.approx(2.0)
     assert fast.forward_m_s < 0.5
     with pytest.raises(DriverError, match="not finite"):
-        track.driver.drive(Twist(math.nan))
-    track.driver.drive(REST)
+        qbo.driver.drive(Twist(math.nan))
+    qbo.driver.drive(REST)
 
 
-def test_wheels_stop_without_commands(track: Track) -> None:
-    """As when the control loop has found a fault and waits: nothing is commanded any more, and it was going."""
-    track.go(Twist(0.3), 2.0)
-    place = track.truth
-    assert track.speed[0] > 0.25
-    track.world.step(500)
-    assert track.speed[0] < 0.01
-    assert 0.3 * 0.25 < track.truth[0] - place[0] < 0.3 * 0.3 + 0.3**2 / 2 / 2.0 + 0.02
-    track.world.step(500)
-    assert track.speed[0] < 0.002
-    track.motion.start()
-    track.go(Twist(0.3), 2.0)
-    assert track.speed[0] > 0.25, "who drives again is obeyed"
+def test_wheels_stop_without_commands(qbo: DrivenQbo) -> None:
+    """Commands end during motion, as after a fault of the control loop."""
+    qbo.go(Twist(0.3), 2.0)
+    place = qbo.truth
+    assert qbo.speed[0] > 0.25
+    qbo.world.step(500)
+    assert qbo.speed[0] < 0.01
+    assert 0.3 * 0.25 < qbo.truth[0] - place[0] < 0.3 * 0.3 + 0.3**2 / 2 / 2.0 + 0.02
+    qbo.world.step(500)
+    assert qbo.speed[0] < 0.002
+    qbo.motion.start()
+    qbo.go(Twist(0.3), 2.0)
+    assert qbo.speed[0] > 0.25, "new commands are executed"
 
 
-def test_sonars_measure_an_approaching_wall(track: Track) -> None:
-    """The wall's face is at x = 2.0 m; the sonars sit 0.156 m before the axle."""
-    heard = [track.driver.report("sonar")]
-    while track.truth[0] < 1.0:
-        track.go(Twist(0.3), 0.4)
-        heard.append(track.driver.report("sonar"))
-    track.rest()
-    heard.append(track.driver.report("sonar"))
-    room_m = 2.0 - 0.156 - track.truth[0]
+def test_sonars_measure_an_approaching_wall(qbo: DrivenQbo) -> None:
+    """The wall is at x = 2.0 m, the sonars 0.156 m in front of the axle."""
+    readings = [qbo.driver.report("sonar")]
+    while qbo.truth[0] < 1.0:
+        qbo.go(Twist(0.3), 0.4)
+        readings.append(qbo.driver.report("sonar"))
+    qbo.rest()
+    readings.append(qbo.driver.report("sonar"))
+    room_m = 2.0 - 0.156 - qbo.truth[0]
     for part in ("left", "right"):
-        told = [float(values[f"distance_m.{part}"]) for values in heard]
-        assert told[0] == pytest.approx(2.0 - 0.156, abs=0.05)
-        assert told == sorted(told, reverse=True)
-        assert told[-1] == pytest.approx(room_m, abs=0.05)
-        assert (told[-1] * 100) == pytest.approx(round(told[-1] * 100), abs=1e-6), "steps of 10 mm"
+        values = [float(values[f"distance_m.{part}"]) for values in readings]
+        assert values[0] == pytest.approx(2.0 - 0.156, abs=0.05)
+        assert values == sorted(values, reverse=True)
+        assert values[-1] == pytest.approx(room_m, abs=0.05)
+        assert (values[-1] * 100) == pytest.approx(round(values[-1] * 100), abs=1e-6), "resolution of 10 mm"
 
 
-def test_distance_sensors_report_their_range_without_an_echo(track: Track) -> None:
-    model, data = track.world.model, track.world._data
+def test_distance_sensors_report_their_range_without_an_echo(qbo: DrivenQbo) -> None:
+    model, data = qbo.world.model, qbo.world._data
     data.qpos[:2] = (0.0, 0.0)
-    data.qpos[3:7] = (math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4))  # to the left: no wall
-    track.world.step(2)
-    values = track.driver.report("sonar")
+    data.qpos[3:7] = (math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4))  # no wall to the left
+    qbo.world.step(2)
+    values = qbo.driver.report("sonar")
     assert values["distance_m.left"] == values["distance_m.right"] == 4.0
     assert values["distance_m.front"] == pytest.approx(0.04, abs=0.005)
-    data.qpos[2] += 1.0  # as over the edge of a stair
-    track.world.step(2)
-    assert track.driver.report("sonar")["distance_m.front"] == 0.3
+    data.qpos[2] += 1.0  # like the edge of a stair
+    qbo.world.step(2)
+    assert qbo.driver.report("sonar")["distance_m.front"] == 0.3
     assert model.nq == len(data.qpos)
 
 
 def test_odometry_starts_at_the_true_pose() -> None:
-    track = Track()
-    track.world._data.qpos[:7] = (0.7, -0.4, 0.0, math.cos(0.5), 0.0, 0.0, math.sin(0.5))
-    track.world.step(2)
-    track.driver._resolve(track.world.model)
-    track.driver.observe()
-    told = track.told()
-    assert (told["x_m"], told["y_m"], told["yaw_rad"]) == pytest.approx((0.7, -0.4, 1.0), abs=0.01)
+    qbo = DrivenQbo()
+    qbo.world._data.qpos[:7] = (0.7, -0.4, 0.0, math.cos(0.5), 0.0, 0.0, math.sin(0.5))
+    qbo.world.step(2)
+    qbo.driver._resolve(qbo.world.model)
+    qbo.driver.observe()
+    values = qbo.odometry()
+    assert (values["x_m"], values["y_m"], values["yaw_rad"]) == pytest.approx((0.7, -0.4, 1.0), abs=0.01)
 
 
 @pytest.fixture

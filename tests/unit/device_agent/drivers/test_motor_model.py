@@ -33,7 +33,7 @@ STILL = np.zeros(6)
 BATTERY = Battery(capacity_wh=50.0, full_v=25.0, empty_v=20.0, idle_w=25.0)
 
 
-class Life:
+class SimulatedMotors:
     """A motor model in simulated time."""
 
     def __init__(self, battery: Battery | None = None, *, share: float = 0.0) -> None:
@@ -42,7 +42,7 @@ class Life:
         self.time_s = 0.0
         self.health.observe(0.0, MOST * share, STILL)
 
-    def live(self, duration_s: float, *, step_s: float = 1.0) -> dict[str, Any]:
+    def advance(self, duration_s: float, *, step_s: float = 1.0) -> dict[str, Any]:
         for _ in range(round(duration_s / step_s)):
             self.time_s += step_s
             self.health.observe(self.time_s, MOST * self.share, STILL)
@@ -50,7 +50,7 @@ class Life:
 
 
 def test_a_resting_joint_keeps_its_temperature() -> None:
-    values = Life().live(3600)
+    values = SimulatedMotors().advance(3600)
     assert set(values) == {f"{what}.{name}" for what in ("temperature_c", "load") for name in NAMES}
     for name in NAMES:
         assert values[f"temperature_c.{name}"] == pytest.approx(AMBIENT_C + IDLE_RISE_C, abs=0.5)
@@ -58,85 +58,85 @@ def test_a_resting_joint_keeps_its_temperature() -> None:
 
 
 def test_a_loaded_joint_warms_with_the_square_of_its_torque() -> None:
-    life = Life(share=0.5)
-    first = life.live(WARMING_S)["temperature_c.elbow"]
-    last = life.live(10 * WARMING_S)["temperature_c.elbow"]
+    motors = SimulatedMotors(share=0.5)
+    first = motors.advance(WARMING_S)["temperature_c.elbow"]
+    last = motors.advance(10 * WARMING_S)["temperature_c.elbow"]
     rise_c = FULL_RISE_C * 0.25
     assert first == pytest.approx(AMBIENT_C + IDLE_RISE_C + 0.632 * rise_c, abs=1.0)
     assert last == pytest.approx(AMBIENT_C + IDLE_RISE_C + rise_c, abs=1.0)
-    assert life.live(1)["load.elbow"] == pytest.approx(0.5, abs=0.01)
+    assert motors.advance(1)["load.elbow"] == pytest.approx(0.5, abs=0.01)
 
 
 def test_the_thermal_model_is_independent_of_the_step() -> None:
-    coarse, fine = Life(share=0.4), Life(share=0.4)
-    assert coarse.live(600)["temperature_c.elbow"] == pytest.approx(
-        fine.live(600, step_s=0.05)["temperature_c.elbow"], abs=0.5
+    coarse, fine = SimulatedMotors(share=0.4), SimulatedMotors(share=0.4)
+    assert coarse.advance(600)["temperature_c.elbow"] == pytest.approx(
+        fine.advance(600, step_s=0.05)["temperature_c.elbow"], abs=0.5
     )
 
 
 def test_a_stopped_world_does_not_heat_motors() -> None:
-    life = Life(share=1.0)
-    life.time_s += 86_400
-    assert life.live(1)["temperature_c.elbow"] < AMBIENT_C + IDLE_RISE_C + 1
+    motors = SimulatedMotors(share=1.0)
+    motors.time_s += 86_400
+    assert motors.advance(1)["temperature_c.elbow"] < AMBIENT_C + IDLE_RISE_C + 1
 
 
 def test_an_overheating_joint_cools_after_the_fault() -> None:
-    life = Life()
-    life.health.inject(InjectedFaults(overheating={"elbow": 2.0}))
-    values = life.live(1200)
+    motors = SimulatedMotors()
+    motors.health.inject(InjectedFaults(overheating={"elbow": 2.0}))
+    values = motors.advance(1200)
     assert values["temperature_c.elbow"] == pytest.approx(
         AMBIENT_C + IDLE_RISE_C + 40 + IDLE_RISE_C * 1200 / WARMING_S, abs=1
     )
     assert values["temperature_c.wrist_1"] == pytest.approx(AMBIENT_C + IDLE_RISE_C, abs=0.5)
-    life.health.inject(NO_FAULTS)
-    assert life.live(10 * WARMING_S)["temperature_c.elbow"] == pytest.approx(AMBIENT_C + IDLE_RISE_C, abs=0.5)
+    motors.health.inject(NO_FAULTS)
+    assert motors.advance(10 * WARMING_S)["temperature_c.elbow"] == pytest.approx(AMBIENT_C + IDLE_RISE_C, abs=0.5)
 
 
 def test_a_battery_discharges_and_recharges() -> None:
-    life = Life(BATTERY)
-    half = life.live(3600)
+    motors = SimulatedMotors(BATTERY)
+    half = motors.advance(3600)
     assert half["battery_percent"] == pytest.approx(50.0, abs=0.5)
     assert half["battery_v"] == pytest.approx(22.5, abs=0.1)
     assert half["charging"] is False
     emptiest, charged = 100.0, False
     for _ in range(200):
-        values = life.live(60)
+        values = motors.advance(60)
         emptiest = min(emptiest, values["battery_percent"])
         charged = charged or values["charging"]
     assert charged
     assert PLUGGED_IN_PERCENT - 1 < emptiest <= PLUGGED_IN_PERCENT + 0.5
-    assert life.live(7200 - 7000)["battery_percent"] > emptiest
+    assert motors.advance(7200 - 7000)["battery_percent"] > emptiest
 
 
 def test_load_discharges_the_battery_faster() -> None:
-    idle, busy = Life(BATTERY), Life(BATTERY, share=0.1)
-    assert busy.live(60)["battery_percent"] < idle.live(60)["battery_percent"] - 0.2
+    idle, busy = SimulatedMotors(BATTERY), SimulatedMotors(BATTERY, share=0.1)
+    assert busy.advance(60)["battery_percent"] < idle.advance(60)["battery_percent"] - 0.2
 
 
 def test_battery_charge_and_charger_can_be_injected() -> None:
-    life = Life(BATTERY)
-    life.health.inject(InjectedFaults(battery_percent=4.0, charging=False))
-    assert life.live(10)["battery_percent"] < 4.0
-    assert life.live(7200)["battery_percent"] == 0.0
-    life.health.inject(InjectedFaults(charging=True))
-    assert life.live(720)["battery_percent"] == pytest.approx(10.0, abs=0.5)
+    motors = SimulatedMotors(BATTERY)
+    motors.health.inject(InjectedFaults(battery_percent=4.0, charging=False))
+    assert motors.advance(10)["battery_percent"] < 4.0
+    assert motors.advance(7200)["battery_percent"] == 0.0
+    motors.health.inject(InjectedFaults(charging=True))
+    assert motors.advance(720)["battery_percent"] == pytest.approx(10.0, abs=0.5)
 
 
 def test_a_motor_at_its_limit_without_motion_has_stalled() -> None:
-    health = Life().health
+    health = SimulatedMotors().health
     behind = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
     effort = np.where(behind > 0, MOST, 0.0)
     assert [name for _ in range(4) for name in health.stalled(0.1, behind, effort, STILL)] == []
     assert health.stalled(0.1, behind, effort, STILL) == ["elbow"]
     health.clear()
     assert health.stalled(0.1, behind, effort, STILL) == []
-    for innocent in (
+    for state in (
         (np.zeros(6), effort, STILL),  # in position under load
         (behind, effort * 0.5, STILL),  # below its limit
         (behind, effort, np.full(6, 0.1)),  # in motion
     ):
         health.clear()
-        assert [name for _ in range(30) for name in health.stalled(0.1, *innocent)] == []
+        assert [name for _ in range(30) for name in health.stalled(0.1, *state)] == []
 
 
 # ------------------------------------------------------------ the file
@@ -151,7 +151,7 @@ def test_a_fault_file_is_parsed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ('stuck = ["nose"]', "no joint 'nose'; valid joints: shoulder_pan, shoulder_lift"),
         ("broken = true", "unknown field `broken`; valid fields: overheating, weak, stuck"),
@@ -160,28 +160,28 @@ def test_a_fault_file_is_parsed() -> None:
         ("overheating = { elbow = nan }", "> 0"),
     ],
 )
-def test_an_invalid_fault_file_is_rejected_with_valid_names(text: str, says: str) -> None:
-    with pytest.raises(ProtocolError, match="valid") as refused:
+def test_an_invalid_fault_file_is_rejected_with_valid_names(text: str, message: str) -> None:
+    with pytest.raises(ProtocolError, match="valid") as raised:
         read(text, NAMES)
-    assert says in str(refused.value)
+    assert message in str(raised.value)
 
 
 def test_the_fault_file_may_appear_change_and_disappear(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "arm.toml"
-    bed = FaultInjector(path, NAMES)
-    assert bed.poll() is None
+    injector = FaultInjector(path, NAMES)
+    assert injector.poll() is None
     path.write_text('stuck = ["elbow"]')
-    assert bed.poll() == InjectedFaults(stuck=("elbow",))
-    assert bed.poll() is None
+    assert injector.poll() == InjectedFaults(stuck=("elbow",))
+    assert injector.poll() is None
     with caplog.at_level(logging.WARNING):
         path.write_text('stuck = ["nose"]  # no such joint')
-        assert bed.poll() is None
-        assert bed.poll() is None
+        assert injector.poll() is None
+        assert injector.poll() is None
     assert caplog.text.count("no joint 'nose'") == 1
     path.unlink()
-    assert bed.poll() == NO_FAULTS
+    assert injector.poll() == NO_FAULTS
     path.mkdir()
-    assert bed.poll() is None
+    assert injector.poll() is None
     assert FaultInjector(None, NAMES).poll() is None
 
 
@@ -215,20 +215,20 @@ def test_a_stuck_joint_is_an_error_until_reconnect(arm: MujocoDriver, faults: Pa
     target = [home[0], home[1], home[2] - 0.4, *home[3:]]
     faults.write_text('stuck = ["elbow"]')
     arm.report("health")
-    said: list[str] = []
+    messages: list[str] = []
 
     def failed() -> bool:
         try:
             arm.observe()
         except DriverError as error:
-            said.append(str(error))
-        return bool(said)
+            messages.append(str(error))
+        return bool(messages)
 
     hold(arm, target, failed)
-    assert said[0].startswith("elbow does not move at full motor effort")
+    assert messages[0].startswith("elbow does not move at full motor effort")
     arm.connect()  # as the control loop does
-    seen = arm.observe()
-    assert seen.position_rad[2] == pytest.approx(home[2], abs=0.05)
+    observation = arm.observe()
+    assert observation.position_rad[2] == pytest.approx(home[2], abs=0.05)
     faults.unlink()
     arm.report("health")
     hold(arm, target, lambda: abs(arm.observe().position_rad[2] - target[2]) < 0.01)

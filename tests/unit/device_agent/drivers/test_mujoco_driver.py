@@ -71,7 +71,7 @@ def test_a_frame_may_be_a_body():
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"frames": ("flanch",)}, r"no site or body 'flanch'; it has: .*forearm"),
         (
@@ -80,9 +80,9 @@ def test_a_frame_may_be_a_body():
         ),
     ],
 )
-def test_missing_names_are_reported_with_the_valid_ones(change: dict[str, object], says: str):
+def test_missing_names_are_reported_with_the_valid_ones(change: dict[str, object], message: str):
     driver = alone(msgspec.structs.replace(TYPE, **change))
-    with pytest.raises(DriverError, match=says):
+    with pytest.raises(DriverError, match=message):
         driver.connect()
     with pytest.raises(DriverError, match="not connected"):
         driver.observe()

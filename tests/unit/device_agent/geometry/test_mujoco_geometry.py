@@ -31,12 +31,12 @@ def shape() -> MujocoGeometry:
     return MujocoGeometry(KIND, UR5 / KIND.scene)
 
 
-def places(count: int, seed: int) -> Any:
+def positions(count: int, seed: int) -> Any:
     return np.random.default_rng(seed).uniform(LOWER, UPPER, (count, len(LOWER)))
 
 
 def free(shape: MujocoGeometry, count: int, seed: int) -> list[Any]:
-    found = [place for place in places(20 * count, seed) if shape.clearance(place.tolist()).room_m > 0]
+    found = [position for position in positions(20 * count, seed) if shape.clearance(position.tolist()).room_m > 0]
     assert len(found) >= count
     return found[:count]
 
@@ -49,13 +49,13 @@ def test_contacts_have_no_clearance(shape: MujocoGeometry) -> None:
     model = mujoco.MjModel.from_xml_path(str(UR5 / KIND.scene))
     data = mujoco.MjData(model)
     touching = 0
-    for place in places(400, 1):
-        data.qpos[:] = place
+    for position in positions(400, 1):
+        data.qpos[:] = position
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         if any(data.contact[index].dist < 0 for index in range(data.ncon)):
             touching += 1
-            assert shape.clearance(place.tolist()).room_m < 0
+            assert shape.clearance(position.tolist()).room_m < 0
     assert touching > 50
 
 
@@ -72,7 +72,7 @@ def test_sweeps_agree_with_sampling(shape: MujocoGeometry) -> None:
             blocked += 1
             assert swept.clearance.room_m < 0
             beyond = [start + part * (end - start) for part in np.linspace(share, 1, 60)]
-            assert min(shape.clearance(place.tolist()).room_m for place in beyond) < 0
+            assert min(shape.clearance(position.tolist()).room_m for position in beyond) < 0
         else:
             assert share == 1.0
     assert 20 < blocked < 100
@@ -121,8 +121,8 @@ def test_no_point_is_faster_than_the_bound(shape: MujocoGeometry) -> None:
     random = np.random.default_rng(5)
     solid = [g for g in range(model.ngeom) if model.geom_contype[g] and model.geom_bodyid[g]]
 
-    def corners(place: Any) -> Any:
-        data.qpos[:] = place
+    def corners(position: Any) -> Any:
+        data.qpos[:] = position
         mujoco.mj_kinematics(model, data)
         signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         return np.concatenate(
@@ -134,10 +134,10 @@ def test_no_point_is_faster_than_the_bound(shape: MujocoGeometry) -> None:
         )
 
     tightest = math.inf
-    for place in places(200, 4):
-        velocity = random.uniform(-1, 1, len(place)) * random.integers(0, 2, len(place))
+    for position in positions(200, 4):
+        velocity = random.uniform(-1, 1, len(position)) * random.integers(0, 2, len(position))
         step = 1e-5
-        speed = np.linalg.norm(corners(place + step * velocity) - corners(place), axis=1).max() / step
+        speed = np.linalg.norm(corners(position + step * velocity) - corners(position), axis=1).max() / step
         bound = shape.speed_m_s(velocity.tolist())
         assert speed <= bound + 1e-6
         tightest = min(tightest, bound - speed)
@@ -167,10 +167,10 @@ def test_the_workspace_keeps_frames_inside(shape: MujocoGeometry) -> None:
 def test_poses_are_those_of_the_model(shape: MujocoGeometry) -> None:
     model = mujoco.MjModel.from_xml_path(str(UR5 / KIND.scene))
     data = mujoco.MjData(model)
-    for place in places(20, 6):
-        data.qpos[:] = place
+    for position in positions(20, 6):
+        data.qpos[:] = position
         mujoco.mj_kinematics(model, data)
-        poses: dict[str, Any] = dict(shape.poses(place.tolist()))
+        poses: dict[str, Any] = dict(shape.poses(position.tolist()))
         assert set(poses) == set(shape.frames) == set(KIND.frames)
         for name, pose in poses.items():
             assert pose[:3] == pytest.approx(data.site(name).xpos, abs=1e-9)
@@ -181,11 +181,11 @@ def test_poses_are_those_of_the_model(shape: MujocoGeometry) -> None:
 
 
 def test_inverse_kinematics_finds_reachable_poses(shape: MujocoGeometry) -> None:
-    for place in free(shape, 12, 7):
-        wanted = shape.poses(place.tolist())["flange"]
-        found = shape.solve("flange", wanted, HOME)
-        assert shape.poses(found)["flange"][:3] == pytest.approx(wanted[:3], abs=2e-4)
-        assert abs(np.dot(shape.poses(found)["flange"][3:], wanted[3:])) == pytest.approx(1.0, abs=1e-6)
+    for position in free(shape, 12, 7):
+        target = shape.poses(position.tolist())["flange"]
+        found = shape.solve("flange", target, HOME)
+        assert shape.poses(found)["flange"][:3] == pytest.approx(target[:3], abs=2e-4)
+        assert abs(np.dot(shape.poses(found)["flange"][3:], target[3:])) == pytest.approx(1.0, abs=1e-6)
         assert all(np.array(found) >= LOWER) and all(np.array(found) <= UPPER)  # noqa: PT018
         assert shape.clearance(found).room_m >= 0
 
@@ -207,7 +207,7 @@ def test_solutions_are_near_the_start(shape: MujocoGeometry) -> None:
 
 
 @pytest.mark.parametrize(
-    ("frame", "pose", "says"),
+    ("frame", "pose", "message"),
     [
         ("hand", (0.3, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0), "available frames: shoulder_pan"),
         ("flange", (2.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0), "found no joint position for flange: the closest one is"),
@@ -216,8 +216,8 @@ def test_solutions_are_near_the_start(shape: MujocoGeometry) -> None:
         ("flange", (0.3, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0), "quaternion"),
     ],
 )
-def test_unreachable_poses_are_rejected(shape: MujocoGeometry, frame: str, pose: Any, says: str) -> None:
-    with pytest.raises(GeometryError, match=says):
+def test_unreachable_poses_are_rejected(shape: MujocoGeometry, frame: str, pose: Any, message: str) -> None:
+    with pytest.raises(GeometryError, match=message):
         shape.solve(frame, pose, HOME)
 
 
@@ -263,10 +263,10 @@ def broken() -> dict[str, tuple[RobotType, str, str]]:
 
 @pytest.mark.parametrize("case", broken())
 def test_a_mismatched_model_is_rejected(case: str) -> None:
-    kind, scene, says = broken()[case]
+    kind, scene, message = broken()[case]
     if case == "no joint":
         kind = msgspec.structs.replace(kind, home_rad={"knee": 0.0})
-    with pytest.raises(GeometryError, match=says):
+    with pytest.raises(GeometryError, match=message):
         MujocoGeometry(kind, UR5 / scene)
 
 
@@ -357,8 +357,11 @@ def test_poses_in_a_room_are_relative_to_the_base(shape: MujocoGeometry, tmp_pat
 def test_room_objects_are_transformed_by_the_base_pose(tmp_path: Path, yaw_rad: float):
     # At the flange's distance from the base.
     x, y = -0.36, -0.36
-    place = (2.0 + x * math.cos(yaw_rad) - y * math.sin(yaw_rad), -1.0 + x * math.sin(yaw_rad) + y * math.cos(yaw_rad))
-    post = f'<geom name="post" type="cylinder" size="0.05 0.6" pos="{place[0]} {place[1]} 1.3"/>'
+    position = (
+        2.0 + x * math.cos(yaw_rad) - y * math.sin(yaw_rad),
+        -1.0 + x * math.sin(yaw_rad) + y * math.cos(yaw_rad),
+    )
+    post = f'<geom name="post" type="cylinder" size="0.05 0.6" pos="{position[0]} {position[1]} 1.3"/>'
     there = base_pose(room_with(tmp_path, post), yaw_rad=yaw_rad)
     towards = [HOME[0] + 1.0, *HOME[1:]]
     swept = there.sweep([HOME, towards])

@@ -1,4 +1,4 @@
-"""The perception device: looks with its neighbours, and tells what the room knows."""
+"""The perception driver."""
 
 import json
 import math
@@ -33,8 +33,8 @@ upper_m = [0.0, 2.5, 2.7]
 """
 
 
-class Eye:
-    """A neighbour: a sensor of the playground, whose clock is the real one."""
+class FakeSensor:
+    """A sensor of the playground with the real clock."""
 
     simulated = True
 
@@ -84,14 +84,18 @@ def folder(tmp_path):
 
 
 @pytest.fixture
-def eyes():
+def neighbours():
     ground = Playground(1)
-    return {"lidar": Eye(ground, "scan"), "depth": Eye(ground, "depth"), "light": Eye(ground, "scan")}
+    return {
+        "lidar": FakeSensor(ground, "scan"),
+        "depth": FakeSensor(ground, "depth"),
+        "light": FakeSensor(ground, "scan"),
+    }
 
 
 @pytest.fixture
-def driver(folder, eyes):
-    made = create(device(survey="survey.npz", light="light"), folder, Surroundings(neighbours=eyes))
+def driver(folder, neighbours):
+    made = create(device(survey="survey.npz", light="light"), folder, Surroundings(neighbours=neighbours))
     made.connect()
     yield made
     made.close()
@@ -105,8 +109,8 @@ def until(driver, stream, holds, patience_s=60):
     return found
 
 
-def test_streams_report_positions(driver, eyes):
-    ground = eyes["lidar"].ground
+def test_streams_report_positions(driver, neighbours):
+    ground = neighbours["lidar"].ground
     found = until(driver, "positions", lambda found: {"x_m.person", "x_m.nao", "x_m.qbo"} <= set(found))
     for name, one in ground.walkers.items():
         assert math.dist((found[f"x_m.{name}"], found[f"y_m.{name}"]), (one.x_m, one.y_m)) < 0.2
@@ -144,28 +148,28 @@ def test_unknown_names_are_rejected_with_the_valid_ones(driver):
         driver.set("smell", 1.0)
 
 
-def test_it_fails_only_if_all_sensors_fail(driver, eyes, monkeypatch):
+def test_it_fails_only_if_all_sensors_fail(driver, neighbours, monkeypatch):
     until(driver, "positions", lambda found: "x_m.qbo" in found)
-    eyes["depth"].broken = True
+    neighbours["depth"].broken = True
     driver.read("positions")
     monkeypatch.setattr("device_agent.sensors.perception.driver.SILENT_S", 0.2)
-    eyes["lidar"].broken = True
-    assert "the lens is dirty" in told(driver, blind=True)
-    eyes["lidar"].broken = False
-    assert not told(driver, blind=False)
+    neighbours["lidar"].broken = True
+    assert "the lens is dirty" in error_text(driver, blind=True)
+    neighbours["lidar"].broken = False
+    assert not error_text(driver, blind=False)
 
 
-def told(driver, *, blind, patience_s=60):
-    """What it says when it sees nothing; empty when it sees. Waits until that is so."""
+def error_text(driver, *, blind, patience_s=60):
+    """Wait until reading fails (``blind``) or succeeds; returns the error message."""
     deadline = time.monotonic() + patience_s
     while True:
         try:
             driver.read("positions")
-            says = ""
+            message = ""
         except SensorError as error:
-            says = str(error)
-        if bool(says) == blind:
-            return says
+            message = str(error)
+        if bool(message) == blind:
+            return message
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
@@ -186,26 +190,26 @@ def test_a_survey_can_be_captured(driver, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("more", "says"),
+    ("more", "message"),
     [
         ({"lenses": []}, "lenses.*lidars, cameras"),
         ({"look_hz": 0}, "look_hz"),
         ({"kinds": [{"name": "x", "lowest_m": 2, "highest_m": 1, "radius_m": 0}]}, "heights must increase"),
     ],
 )
-def test_invalid_options_are_rejected(folder, eyes, more, says):
-    with pytest.raises(SensorError, match=says):
-        PerceptionDriver(device(**more), folder, eyes)
+def test_invalid_options_are_rejected(folder, neighbours, more, message):
+    with pytest.raises(SensorError, match=message):
+        PerceptionDriver(device(**more), folder, neighbours)
 
 
 @pytest.mark.parametrize(
-    ("more", "says"),
+    ("more", "message"),
     [
         ({"lidars": ["radar"]}, "'radar'; this agent's devices: depth, lidar, light"),
         ({"survey": "none.npz"}, "capture 'survey'"),
         ({"mounts": [{"name": "x", "lowest_m": 0, "highest_m": 1, "radius_m": 0, "reach_m": 1}]}, "the room has: arm"),
     ],
 )
-def test_connect_reports_mismatches_with_the_room(folder, eyes, more, says):
-    with pytest.raises(SensorError, match=says):
-        PerceptionDriver(device(**more), folder, eyes).connect()
+def test_connect_reports_mismatches_with_the_room(folder, neighbours, more, message):
+    with pytest.raises(SensorError, match=message):
+        PerceptionDriver(device(**more), folder, neighbours).connect()

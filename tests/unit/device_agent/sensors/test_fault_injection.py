@@ -1,4 +1,4 @@
-"""Faults put into simulated room devices: by a file, while they run, and gone with it."""
+"""Injected faults of simulated room devices."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,8 +25,8 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "faults.toml"
 
 
-class Ward:
-    """Connects devices of the laboratory, each with the file."""
+class DeviceConnector:
+    """Connects devices of the laboratory with the fault file."""
 
     def __init__(self, world: StillWorld, file: Path) -> None:
         self._world, self._file = world, file
@@ -46,14 +46,14 @@ class Ward:
 
 
 @pytest.fixture
-def ward(world: StillWorld, file: Path) -> Iterator[Ward]:
-    ward = Ward(world, file)
-    yield ward
-    ward.close()
+def connect(world: StillWorld, file: Path) -> Iterator[DeviceConnector]:
+    connect = DeviceConnector(world, file)
+    yield connect
+    connect.close()
 
 
-def test_a_device_without_fault_file_is_unchanged(ward: Ward) -> None:
-    co2, camera, door = ward("co2"), ward("camera"), ward("door")
+def test_a_device_without_fault_file_is_unchanged(connect: DeviceConnector) -> None:
+    co2, camera, door = connect("co2"), connect("camera"), connect("door")
     assert 500 < co2.read("co2")["co2_ppm"] < 800
     assert not isinstance(co2, Camera)
     assert isinstance(camera, Camera)
@@ -63,8 +63,8 @@ def test_a_device_without_fault_file_is_unchanged(ward: Ward) -> None:
     door.hold()
 
 
-def test_a_stuck_meter_repeats_its_value_until_the_file_is_removed(ward: Ward, file: Path) -> None:
-    co2 = ward("co2")
+def test_a_stuck_meter_repeats_its_value_until_the_file_is_removed(connect: DeviceConnector, file: Path) -> None:
+    co2 = connect("co2")
     last = co2.read("co2")
     file.write_text('stuck = ["co2"]')
     assert [co2.read("co2") for _ in range(20)] == [last] * 20
@@ -72,20 +72,20 @@ def test_a_stuck_meter_repeats_its_value_until_the_file_is_removed(ward: Ward, f
     assert len({co2.read("co2")["co2_ppm"] for _ in range(20)}) > 3
 
 
-def test_a_silent_stream_returns_nothing_but_rejects_unknown_names(ward: Ward, file: Path) -> None:
-    pir = ward("pir")
+def test_a_silent_stream_returns_nothing_but_rejects_unknown_names(connect: DeviceConnector, file: Path) -> None:
+    pir = connect("pir")
     file.write_text('silent = ["motion"]')
     assert pir.read("motion") == {}
     with pytest.raises(SensorError, match="motion"):
         pir.read("nonsense")
 
 
-def test_a_value_drifts_per_minute(ward: Ward, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_value_drifts_per_minute(connect: DeviceConnector, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [1000.0]
     clock = type("Clock", (), {"monotonic": staticmethod(lambda: now_s[0])})
     monkeypatch.setattr(fault_injection, "time", clock)
     monkeypatch.setattr(scalar_sensors, "time", clock)
-    co2 = ward("co2")
+    co2 = connect("co2")
     before = np.mean([co2.read("co2")["co2_ppm"] for _ in range(50)])
     file.write_text("drift = { co2_ppm = 50.0 }")
     co2.read("co2")
@@ -94,8 +94,8 @@ def test_a_value_drifts_per_minute(ward: Ward, file: Path, monkeypatch: pytest.M
     assert after - before == pytest.approx(500.0, abs=15.0)
 
 
-def test_an_unreachable_device_fails_but_receives_hold(ward: Ward, file: Path) -> None:
-    door = ward("door")
+def test_an_unreachable_device_fails_but_receives_hold(connect: DeviceConnector, file: Path) -> None:
+    door = connect("door")
     file.write_text("unreachable = true")
     for call in (lambda: door.read("settings"), lambda: door.set("opening", 0.5), door.connect, door.raw):
         with pytest.raises(SensorError, match="'door' does not respond; check its power"):
@@ -104,17 +104,17 @@ def test_an_unreachable_device_fails_but_receives_hold(ward: Ward, file: Path) -
     door.hold()
 
 
-def test_a_stuck_camera_repeats_its_frame_and_a_silent_one_has_none(ward: Ward, file: Path) -> None:
-    camera = ward("camera")
+def test_a_stuck_camera_repeats_its_frame_and_a_silent_one_has_none(connect: DeviceConnector, file: Path) -> None:
+    camera = connect("camera")
     assert isinstance(camera, Camera)
     moving = {frame.content for frame in (camera.frame("colour") for _ in range(3)) if frame is not None}
-    assert len(moving) == 3, "grain"
+    assert len(moving) == 3, "noise"
     seen = camera.raw()
     assert isinstance(seen, Image)
     file.write_text('stuck = ["colour"]')
     frames = [camera.frame("colour") for _ in range(3)]
     assert len({frame.content for frame in frames if frame is not None}) == 1
-    assert len({frame.taken_s for frame in frames if frame is not None}) == 3, "it says that each is new"
+    assert len({frame.taken_s for frame in frames if frame is not None}) == 3, "timestamps are current"
     again = camera.raw()
     assert isinstance(again, Image)
     assert again.rgb is seen.rgb
@@ -125,17 +125,17 @@ def test_a_stuck_camera_repeats_its_frame_and_a_silent_one_has_none(ward: Ward, 
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ('stuck = ["nose"]', "no stream or camera 'nose'; valid names: co2, image"),
         ("broken = true", "unknown field `broken`; valid fields: unreachable, silent, stuck, drift"),
         ("silent = [", "valid fields: unreachable"),
     ],
 )
-def test_an_invalid_fault_file_is_rejected_with_valid_names(text: str, says: str) -> None:
-    with pytest.raises(ProtocolError) as refused:
+def test_an_invalid_fault_file_is_rejected_with_valid_names(text: str, message: str) -> None:
+    with pytest.raises(ProtocolError) as raised:
         read(text, ["co2", "image"])
-    assert says in str(refused.value)
+    assert message in str(raised.value)
     assert read("", []) == NO_FAULTS == InjectedFaults()
 
 

@@ -1,4 +1,4 @@
-"""In the simulated laboratory sensors tell what people, doors and robots do; each with the errors of its kind."""
+"""Simulated sensors in the laboratory, with realistic errors."""
 
 import math
 from collections.abc import Callable
@@ -19,26 +19,26 @@ from device_agent.sensors.mujoco.noise import NOISE, NoiseParameters, SensorNois
 from tests.harness.agent.rooms import LAB, StillWorld
 
 ROUND_S = 45.0
-"""Longer than the person's way round the room."""
+"""Longer than one round of the person."""
 LEG_M = 0.35
 
 
 @pytest.fixture(autouse=True)
 def present(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everything that looks sees the present: time is driven by hand."""
+    """No cached views: time is manual."""
     monkeypatch.setattr(shared_view, "OLDEST_S", -1.0)
     monkeypatch.setattr(cameras, "FRESH_S", -1.0)
 
 
 @pytest.fixture
 def world() -> StillWorld:
-    """The laboratory without its robots, which take most of the time."""
+    """The laboratory without robots, which is faster."""
     return StillWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
 
 
 @pytest.fixture
 def lab() -> StillWorld:
-    """With them."""
+    """The laboratory with robots."""
     return StillWorld()
 
 
@@ -69,11 +69,11 @@ def until(world: StillWorld, wanted: Callable[[], bool], step_s: float = 0.25) -
         if wanted():
             return
         world.go_on(step_s)
-    pytest.fail("not within a round of the person")
+    pytest.fail("not within one round of the person")
 
 
-def met_by(scan: Scan) -> np.ndarray:
-    """Where in the room the beams met something, shape (m, 2) [m]."""
+def hits_of(scan: Scan) -> np.ndarray:
+    """End points of the beams that hit something, shape (m, 2) [m]."""
     seen = np.isfinite(scan.range_m)
     beams = np.stack((np.cos(scan.angle_rad), np.sin(scan.angle_rad), np.zeros_like(scan.angle_rad)), axis=1)
     points: np.ndarray = scan.position_m + (beams * np.where(seen, scan.range_m, 0)[:, None]) @ scan.rotation.T
@@ -85,15 +85,15 @@ def met_by(scan: Scan) -> np.ndarray:
 
 def test_the_motion_detector_only_detects_motion(world: StillWorld) -> None:
     pir = connected(world, "pir")
-    told: list[tuple[bool, float]] = []
+    readings: list[tuple[bool, float]] = []
     for _ in range(round(ROUND_S / 0.25)):
         before = world.place("person")
         world.go_on(0.25)
-        told.append((bool(pir.read("motion")["present"]), math.dist(before, world.place("person")) / 0.25))
-    assert {present for present, _ in told} == {True, False}
-    rose = [speed for (before, _), (after, speed) in pairwise(told) if after and not before]
-    assert rose, "it never woke"
-    assert min(rose) > 0.1, "false detection"
+        readings.append((bool(pir.read("motion")["present"]), math.dist(before, world.place("person")) / 0.25))
+    assert {present for present, _ in readings} == {True, False}
+    speeds = [speed for (before, _), (after, speed) in pairwise(readings) if after and not before]
+    assert speeds, "no detection"
+    assert min(speeds) > 0.1, "false detection"
 
 
 def test_the_motion_detector_ignores_cold_and_hidden_bodies(world: StillWorld) -> None:
@@ -116,7 +116,7 @@ def test_the_lidar_measures_the_persons_legs(world: StillWorld) -> None:
         now = scan(lidar)
         x, y, _ = world.place("person")
         nearer = np.isfinite(now.range_m) & (now.range_m < empty - 0.25)
-        points = met_by(now)[nearer[np.isfinite(now.range_m)]]
+        points = hits_of(now)[nearer[np.isfinite(now.range_m)]]
         distance_m = np.hypot(*(points - (x, y)).T)
         seen += bool((distance_m < LEG_M).any())
     assert seen > 25, f"the person was met in {seen} of 40 scans"
@@ -143,12 +143,12 @@ def test_cameras_show_a_moving_robot(lab: StillWorld) -> None:
         lab.world.command("test", np.array(arm), now + np.array([1.2, 0.4, -0.6, 0, 0, 0]), ramp_s=1.0)
         lab.go_on(2.0)
         after = image(camera)
-        assert difference(before, after) > noise + 20, "the picture is the same"
+        assert difference(before, after) > noise + 20, "the image has not changed"
         camera.close()
 
 
 def difference(one: Image, other: Image) -> int:
-    """How many pixels changed by more than grain."""
+    """Number of pixels that changed by more than noise."""
     assert one.rgb is not None
     assert other.rgb is not None
     return int((np.abs(one.rgb.astype(int) - other.rgb.astype(int)).max(axis=2) > 25).sum())
@@ -160,7 +160,7 @@ def test_the_depth_camera_measures_the_person(world: StillWorld) -> None:
     def seen() -> bool:
         now = image(depth)
         assert now.depth_m is not None
-        row_column, z = onto(now, np.array(world.place("person")))
+        row_column, z = project(now, np.array(world.place("person")))
         height, width = now.depth_m.shape
         row, column = row_column
         if not (5 <= row < height - 5 and 5 <= column < width - 5 and 0.5 < z < 7):
@@ -172,8 +172,8 @@ def test_the_depth_camera_measures_the_person(world: StillWorld) -> None:
     depth.close()
 
 
-def onto(image: Image, point: np.ndarray) -> tuple[tuple[int, int], float]:
-    """Row and column of a point of the room in a picture, and how far along the line of sight it is [m]."""
+def project(image: Image, point: np.ndarray) -> tuple[tuple[int, int], float]:
+    """Row and column of a point in an image, and its depth [m]."""
     pixels = image.depth_m if image.depth_m is not None else image.rgb
     assert pixels is not None
     height, width = pixels.shape[:2]
@@ -198,7 +198,7 @@ def test_the_door_contact_follows_the_door_and_the_door_its_control(world: Still
     assert door.set("opening", 0.5) == pytest.approx(0.5)
     world.go_on(0.6)
     assert contact.read("contact") == {"open": True}
-    assert 0.05 < door.read("settings")["opening"] < 0.45, "a door takes its time"
+    assert 0.05 < door.read("settings")["opening"] < 0.45, "the door moves at limited speed"
     world.go_on(4.0)
     assert door.read("settings")["opening"] == pytest.approx(0.5, abs=0.05)
     door.set("opening", 0.0)
@@ -239,38 +239,38 @@ def test_the_lamp_changes_the_light_meter(world: StillWorld) -> None:
     until(world, lambda: meter.read("light")["light_lux"] > dark + 100, step_s=0.02)
 
 
-# ---------------------------------------------------------------- errors of sensors
+# ---------------------------------------------------------------- noise
 
 
 def test_noise_is_reproducible_by_seed() -> None:
     errors = NoiseParameters(offset=2.0, jitter=0.5)
-    told = [[SensorNoise(errors, generator("one", seed)).read(20.0, 0.0) for _ in range(3)] for seed in (1, 1, 2)]
-    assert told[0] == told[1] != told[2]
-    offsets = [np.mean([probe.read(0.0, each) for each in range(200)]) for probe in probes(errors, 300)]
+    readings = [[SensorNoise(errors, generator("one", seed)).read(20.0, 0.0) for _ in range(3)] for seed in (1, 1, 2)]
+    assert readings[0] == readings[1] != readings[2]
+    offsets = [np.mean([sensor.read(0.0, each) for each in range(200)]) for sensor in sensors_of(errors, 300)]
     assert np.std(offsets) == pytest.approx(2.0, rel=0.15)
 
 
-def probes(errors: NoiseParameters, count: int) -> list[SensorNoise]:
+def sensors_of(errors: NoiseParameters, count: int) -> list[SensorNoise]:
     return [SensorNoise(errors, generator("many", seed)) for seed in range(count)]
 
 
 def test_readings_lag_behind_a_step() -> None:
-    probe = SensorNoise(NoiseParameters(lag_s=10.0), generator("slow", 0))
-    assert probe.read(0.0, 0.0) == 0
-    assert probe.read(1.0, 10.0) == pytest.approx(1 - math.exp(-1))
-    assert probe.read(1.0, 100.0) == pytest.approx(1, abs=1e-3)
+    sensor = SensorNoise(NoiseParameters(lag_s=10.0), generator("slow", 0))
+    assert sensor.read(0.0, 0.0) == 0
+    assert sensor.read(1.0, 10.0) == pytest.approx(1 - math.exp(-1))
+    assert sensor.read(1.0, 100.0) == pytest.approx(1, abs=1e-3)
 
 
 @pytest.mark.parametrize("quantity", NOISE)
 def test_readings_respect_minimum_and_resolution(quantity: str) -> None:
     errors = NOISE[quantity]
-    for probe in probes(errors, 20):
-        told = probe.read(0.3, 0.0)
-        assert told >= errors.least
-        assert told / errors.step == pytest.approx(round(told / errors.step), abs=1e-3)
+    for sensor in sensors_of(errors, 20):
+        readings = sensor.read(0.3, 0.0)
+        assert readings >= errors.least
+        assert readings / errors.step == pytest.approx(round(readings / errors.step), abs=1e-3)
 
 
-# ---------------------------------------------------------------- what cannot be made
+# ---------------------------------------------------------------- invalid configuration
 
 
 def test_an_unknown_driver_is_rejected() -> None:
@@ -280,7 +280,7 @@ def test_an_unknown_driver_is_rejected() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"kind": "telescope"}, "no kind 'telescope'; it has: camera, .*thermostat"),
         ({"options": {"colour": "red"}}, "no option 'colour'; it has: .*joint"),
@@ -288,8 +288,8 @@ def test_an_unknown_driver_is_rejected() -> None:
         ({"options": {"seed": True}}, "option 'seed' .* is True, of the wrong type"),
     ],
 )
-def test_an_invalid_entry_is_rejected(world: StillWorld, changes: dict[str, object], said: str) -> None:
-    with pytest.raises(SensorError, match=said):
+def test_an_invalid_entry_is_rejected(world: StillWorld, changes: dict[str, object], message: str) -> None:
+    with pytest.raises(SensorError, match=message):
         world.driver(changed(world.entry("door_contact"), **changes))
 
 
