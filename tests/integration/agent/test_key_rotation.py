@@ -57,7 +57,7 @@ def learned(keys: FileKeys) -> None:
 def test_a_live_agent_goes_on_and_the_old_key_ends(ground: Ground, resident: Resident) -> None:
     keys = FileKeys(ground.home / "keys")
     old = keys.load()
-    pins: Any = resident.device._office._keys
+    pins: Any = resident.device._commands._keys
     assert ground.anna.put(MOVEMENT, {"source": SOURCE}).status_code == 201
     work(ground, resident)
 
@@ -85,7 +85,7 @@ def test_a_live_agent_goes_on_and_the_old_key_ends(ground: Ground, resident: Res
 
 def refusals(resident: Resident) -> dict[str, int]:
     """How many commands the device has refused, and why."""
-    found: dict[str, int] = dict(resident.device.voice.refusals)
+    found: dict[str, int] = dict(resident.device.publisher.rejections)
     return found
 
 
