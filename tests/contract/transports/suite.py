@@ -115,7 +115,7 @@ class TransportSuite:
         wait_until(lambda: _sequences(link)[-1:] == [2999], "the newest measurement: it wins over older ones")
         assert _sequences(link) == sorted(set(_sequences(link)))
 
-    def test_many_threads_may_publish_and_whoever_hears_of_a_delivery_too(self, link: Link) -> None:
+    def test_many_threads_and_delivery_callbacks_may_publish(self, link: Link) -> None:
         link.start().up()
         confirmed: list[str] = []
 
@@ -226,7 +226,7 @@ class TransportSuite:
         assert link.changes == [True, False]
         assert not link.transport.publish(link.topic(topics.ACK), b"{}", qos=1)
         wait_until(lambda: link.presences()[-1:] == [(False, link.sessions)], "the goodbye, of the same session")
-        assert link.heard(topics.ACK) == [last], "what was said before the end is told"
+        assert link.heard(topics.ACK) == [last], "messages before the stop are delivered"
         wait_until(lambda: not link.threads(), f"the end of {link.threads()}")
         assert took_s < STOPS_WITHIN_S
         link.transport.stop()
@@ -248,7 +248,7 @@ class TransportSuite:
 
     @staticmethod
     def _say_something_until(link: Link, enough: Any) -> None:
-        """As an agent does all the time: what it says is where some transports learn that it is nobody's any more."""
+        """As agents do: some transports detect only on sending that the pairing is invalid."""
 
         def say() -> bool:
             link.transport.publish(link.topic(topics.TELE, "load"), codec.encode(_measured(1)), qos=0)
@@ -289,7 +289,7 @@ def _sequences(link: Link) -> list[int]:
 
 
 def _odd(payload: bytes) -> bytes:
-    """The same JSON, written as nobody would."""
+    """The same JSON in an unusual notation."""
     return json.dumps(json.loads(payload), indent=1, ensure_ascii=True).replace("\n", " \t\r\n").encode()
 
 

@@ -174,7 +174,7 @@ def test_a_command_is_named_until_its_answer_is_stored(server: Server, agent: Ag
     assert agent.received == ["one"]
 
 
-def test_a_command_that_nobody_answers_is_given_again(
+def test_an_unacknowledged_command_is_delivered_again(
     server: Server, agent: Agent, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(http, "_REDELIVERY_S", 0.2)
@@ -260,7 +260,7 @@ def test_what_is_refused_for_ever_is_not_confirmed_and_makes_it_ask_whose_it_is(
     wait_until(lambda: agent.changes == [True, False], "the end of the link")
 
 
-def test_without_anything_to_tell_it_still_notices_that_it_is_nobodys(server: Server) -> None:
+def test_heartbeats_detect_an_invalid_pairing(server: Server) -> None:
     agent = Agent(server, quiet=lambda: False)
     agent.start()
     agent.belongs = False
@@ -277,7 +277,7 @@ def test_pictures_and_what_is_no_json_find_no_way(agent: Agent) -> None:
 def test_a_file_of_passwords_does_not_win_over_the_agents_own_token(
     server: Server, agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "netrc").write_text("machine 127.0.0.1 login somebody password else\n")
+    (tmp_path / "netrc").write_text("machine 127.0.0.1 login other password else\n")
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
     agent.start()
     assert server.headers

@@ -40,7 +40,7 @@ def devices(ground: Ground) -> list[dict[str, Any]]:
 
 
 def obeys(ground: Ground, device: str) -> None:
-    """One of them does what every robot does: moves when it is asked, stops when it is told, and says so."""
+    """A simulated robot moves, stops, and reports both."""
     move = {"request": {"kind": "move_joints", "position_rad": {"joint_1": 0.2}}, "wait_for": "done", "wait_ms": 20_000}
     done = ground.anna.post(f"/devices/{device}/actions", move).json()
     assert done["status"] == "done", done
@@ -75,7 +75,7 @@ def test_twenty_agents_are_claimed_come_on_line_obey_and_leave(kind: BrokerKind,
         assert told["counts"]["lost_links"] == 0
         wait_until(lambda: not any(each["online"] for each in devices(ground)), "all to have said goodbye")
 
-        # The next run is the same robots: nobody needs to claim anything.
+        # The next run reuses the agents, so no claim is necessary.
         again = command(*plan, "--rate-hz", "2", "--seconds", "4", "--spread-s", "1")
         said, _ = again.communicate(timeout=120)
         assert again.returncode == 0, said

@@ -1,4 +1,4 @@
-"""The agent's own program, as a service runs it: as nobody in particular, told to end, examined while it works."""
+"""The agent's program as a service: unprivileged user, termination by signal, ``doctor`` while it runs."""
 
 import atexit
 import contextlib
@@ -25,7 +25,7 @@ from tests.harness.cloud.cloud_processes import Ground, start_ground
 from tests.harness.network.brokers import wait_until
 from tests.harness.paths import ROOT
 
-NOBODY = 65_534
+USER = 65_534
 PATIENCE_S = 60.0
 MINE = "/robot-types/ur5/movements/mine"
 MOVE = {"kind": "move_joints", "position_rad": {"shoulder_pan": 0.1}, "speed": 1.0}
@@ -44,16 +44,16 @@ def folder() -> Iterator[Path]:
     """A place that an unprivileged user can reach, and owns."""
     made = Path(tempfile.mkdtemp(prefix="telescope-"))
     if os.geteuid() == 0:
-        os.chown(made, NOBODY, NOBODY)
+        os.chown(made, USER, USER)
     yield made
     shutil.rmtree(made)
 
 
 def unprivileged(*arguments: str) -> list[str]:
-    """This command, by somebody who may do nothing special."""
+    """The command, run by an unprivileged user."""
     if os.geteuid() != 0:
         return [sys.executable, *arguments]
-    drop = ["setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", "--no-new-privs"]
+    drop = ["setpriv", f"--reuid={USER}", f"--regid={USER}", "--clear-groups", "--no-new-privs"]
     return [*drop, str(_reachable_python()), *arguments]
 
 
@@ -150,7 +150,7 @@ class Manager:
         self._socket.close()
 
 
-def test_it_works_as_nobody_and_ends_when_told(ground: Ground, folder: Path) -> None:
+def test_it_runs_unprivileged_and_ends_on_a_signal(ground: Ground, folder: Path) -> None:
     device = claimed(ground, folder, "--transport", "http")
     manager = Manager(folder / "notify")
     run = unprivileged("-m", "device_agent", "run", "--home", str(folder / "agent"))
@@ -206,7 +206,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.parametrize("platform", ["win32", pytest.param("darwin", marks=pytest.mark.long)])
-def test_where_there_is_no_jail_it_runs_without_scripts(ground: Ground, folder: Path, platform: str) -> None:
+def test_without_a_sandbox_it_runs_without_scripts(ground: Ground, folder: Path, platform: str) -> None:
     device = claimed(ground, folder, "--transport", "http" if platform == "win32" else "mqtt")
     source = ELSEWHERE.replace("PLATFORM", repr(platform))
     run = unprivileged("-c", source, "run", "--home", str(folder / "agent"))

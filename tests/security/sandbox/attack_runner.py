@@ -15,7 +15,7 @@ from tests.security.sandbox.attack_host import Result
 from tests.security.sandbox.attacks import ATTACKS, PRELUDE
 
 REPOSITORY = ROOT
-NOBODY = 65534
+UNPRIVILEGED = 65534
 
 
 class AttackRunner:
@@ -23,7 +23,7 @@ class AttackRunner:
 
     def __init__(self, *, root: bool, layers: Sequence[str] = LAYERS) -> None:
         self._results: dict[str, Result] = {}
-        command = [] if root == (os.geteuid() == 0) else as_nobody()
+        command = [] if root == (os.geteuid() == 0) else as_unprivileged_user()
         self._process = subprocess.Popen(
             [*command, sys.executable, "-m", "tests.security.sandbox.attack_host", ",".join(layers)],
             stdin=subprocess.PIPE,
@@ -69,15 +69,15 @@ def inside(source: str) -> str:
     return PRELUDE + source
 
 
-def as_nobody() -> list[str]:
-    """The command that runs another as nobody, where root started this.
+def as_unprivileged_user() -> list[str]:
+    """The prefix that runs a command as an unprivileged user, if root started the tests.
 
-    Nobody may not pass through root's own folder; where Python or this repository is in there, a view is made in which
-    nothing of it is but these.
+    That user cannot access root's folder. If Python or this repository is inside, the command runs in a mount namespace
+    in which only these are visible.
     """
     needed = [Path(sys.prefix).resolve(), Path(sys.base_prefix), Path(sys.prefix), REPOSITORY]
     closed = {folder for path in needed for folder in path.parents if not folder.stat().st_mode & 0o001}
-    user = ["setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", "--inh-caps=-all"]
+    user = ["setpriv", f"--reuid={UNPRIVILEGED}", f"--regid={UNPRIVILEGED}", "--clear-groups", "--inh-caps=-all"]
     if not closed:
         return user
     view = ["bwrap", "--dev-bind", "/", "/"]

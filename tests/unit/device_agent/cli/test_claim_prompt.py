@@ -1,4 +1,4 @@
-"""What an agent that is nobody's shows: its code, a link, and the link as a picture for a phone's camera."""
+"""The claim prompt shows code, link, and QR code if the terminal can display it."""
 
 import io
 
@@ -32,31 +32,27 @@ def columns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
 
 
-def test_the_code_stands_in_its_line_and_in_a_link() -> None:
+def test_code_and_link_are_printed() -> None:
     assert shown(io.StringIO()) == ["claim code BCDF-GHJK  (valid for 300 s)", f"or open    {LINK}"]
 
 
-def test_a_terminal_is_shown_a_picture_too() -> None:
+def test_a_terminal_also_shows_the_qr_code() -> None:
     assert len(shown(Terminal())) == 2 + len(claim_prompt.qr_lines(LINK))
 
 
-@pytest.mark.parametrize("out", [io.StringIO, Ascii])
-def test_what_cannot_show_it_is_spared_it(out: type[io.StringIO]) -> None:
-    assert len(shown(out())) == 2
+@pytest.mark.parametrize(
+    ("out", "qr", "columns"), [(io.StringIO, True, 80), (Ascii, True, 80), (Terminal, False, 80), (Terminal, True, 20)]
+)
+def test_the_qr_code_is_omitted_if_unwanted_or_not_displayable(
+    out: type[io.StringIO], qr: bool, columns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    assert len(shown(out(), qr=qr)) == 2
 
 
-def test_who_does_not_want_it_is_spared_it() -> None:
-    assert len(shown(Terminal(), qr=False)) == 2
-
-
-def test_a_narrow_terminal_has_the_link_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "20")
-    assert len(shown(Terminal())) == 2
-
-
-def test_the_picture_has_every_module_of_the_code() -> None:
+def test_the_qr_code_is_complete() -> None:
     upper, lower = {"█": (0, 0), "▀": (0, 1), "▄": (1, 0), " ": (1, 1)}, claim_prompt.qr_lines(LINK)
-    drawn = [[upper[mark][half] for mark in line] for line in lower for half in (0, 1)]
-    wanted = [list(row) for row in segno.make(LINK, error="m", micro=False).matrix_iter(border=2)]
-    assert drawn[: len(wanted)] == wanted
-    assert all(not any(row) for row in drawn[len(wanted) :]), "what is over is light"
+    modules = [[upper[mark][half] for mark in line] for line in lower for half in (0, 1)]
+    expected = [list(row) for row in segno.make(LINK, error="m", micro=False).matrix_iter(border=2)]
+    assert modules[: len(expected)] == expected
+    assert all(not any(row) for row in modules[len(expected) :]), "padding is light"

@@ -1,4 +1,4 @@
-"""An arm that is only figures: never faster, never further, and at rest when nobody says more."""
+"""The kinematic arm respects speed and target, and stops without further commands."""
 
 import math
 
@@ -14,7 +14,7 @@ def arm() -> Arm:
     return Arm(Shape(robot_type("load-test-arm", 3, 5.0)), 0.0)
 
 
-def test_joints_turn_at_their_share_of_the_speed_and_stop_where_they_were_asked_to_be(arm: Arm) -> None:
+def test_joints_move_at_the_given_speed_and_stop_at_the_target(arm: Arm) -> None:
     arm.go([1.5, -0.3, 0.0], speed=0.5)
     arm.advance(1.0)
     assert arm.position_rad == pytest.approx([0.5 * SPEED_RAD_S, -0.3, 0.0])
@@ -26,7 +26,7 @@ def test_joints_turn_at_their_share_of_the_speed_and_stop_where_they_were_asked_
     assert arm.velocity_rad_s == [0.0] * 3
 
 
-def test_whoever_says_nothing_more_stops_it_at_the_given_moment_however_late_one_looks(arm: Arm) -> None:
+def test_motion_ends_at_the_given_time_independent_of_the_update_interval(arm: Arm) -> None:
     arm.go([3.0, 0.0, 0.0], speed=1.0, until_s=0.3)
     arm.advance(10.0)
     assert arm.position_rad[0] == pytest.approx(0.3 * SPEED_RAD_S)
@@ -34,12 +34,12 @@ def test_whoever_says_nothing_more_stops_it_at_the_given_moment_however_late_one
     assert arm.velocity_rad_s == [0.0] * 3
 
 
-def test_a_clock_that_stands_moves_nothing(arm: Arm) -> None:
+def test_no_motion_without_elapsed_time(arm: Arm) -> None:
     arm.go([3.0, 0.0, 0.0], speed=1.0)
     arm.advance(0.0)
     assert arm.position_rad == [0.0] * 3
     assert not math.isnan(arm.velocity_rad_s[0])
 
 
-def test_watchdog_and_loop_age_are_those_of_every_agent() -> None:
+def test_timeouts_equal_those_of_a_real_agent() -> None:
     assert (robot.WATCHDOG_S, robot.MAX_LOOP_AGE_S) == (setpoint_stream.WATCHDOG_S, setpoint_stream.MAX_LOOP_AGE_S)

@@ -1,4 +1,4 @@
-"""What a swarm may be, whom it may speak to, what it keeps, and how its figures are made."""
+"""Options, allowed hosts, key files and metrics of a load test."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from device_agent.load_generator.enrollment import FILE, Keys
 from device_agent.load_generator.metrics import Metrics, percentile
 from device_agent.load_generator.options import LoadOptions, LoadTestError
 
-PLAN = LoadOptions(cloud="https://telescope.example:8443")
+OPTIONS = LoadOptions(cloud="https://telescope.example:8443")
 
 
 @pytest.mark.parametrize(
@@ -32,22 +32,22 @@ PLAN = LoadOptions(cloud="https://telescope.example:8443")
         {"spread_s": 61.0},
     ],
 )
-def test_what_cannot_be_run_is_refused_by_the_name_of_its_option(changes: dict[str, Any]) -> None:
-    PLAN.check()
+def test_invalid_options_are_named(changes: dict[str, Any]) -> None:
+    OPTIONS.check()
     with pytest.raises(LoadTestError, match="--"):
-        replace(PLAN, **changes).check()
+        replace(OPTIONS, **changes).check()
 
 
-def test_only_hosts_that_were_named_are_spoken_to() -> None:
-    assert PLAN.may_connect_to("telescope.example")
-    assert not PLAN.may_connect_to("broker.example")
-    assert not PLAN.may_connect_to("127.0.0.1")
-    assert replace(PLAN, broker="broker.example").may_connect_to("broker.example")
-    assert not PLAN.may_connect_to("")
-    assert replace(PLAN, cloud="http://localhost:8080").may_connect_to("127.0.0.1")
+def test_only_named_hosts_are_contacted() -> None:
+    assert OPTIONS.may_connect_to("telescope.example")
+    assert not OPTIONS.may_connect_to("broker.example")
+    assert not OPTIONS.may_connect_to("127.0.0.1")
+    assert replace(OPTIONS, broker="broker.example").may_connect_to("broker.example")
+    assert not OPTIONS.may_connect_to("")
+    assert replace(OPTIONS, cloud="http://localhost:8080").may_connect_to("127.0.0.1")
 
 
-def test_the_next_run_has_the_same_keys_and_nobody_else_may_read_them(tmp_path: Path) -> None:
+def test_keys_are_reused_and_private(tmp_path: Path) -> None:
     def public(count: int) -> list[bytes]:
         keys = Keys(tmp_path / "home").first(count)
         return [key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw) for key in keys]
@@ -62,33 +62,33 @@ def test_the_next_run_has_the_same_keys_and_nobody_else_may_read_them(tmp_path: 
         public(1)
 
 
-def test_percentiles_are_values_that_were_seen() -> None:
+def test_percentiles_are_observed_values() -> None:
     assert percentile([], 99) is None
     assert percentile([3.0], 99) == 3.0
     assert percentile([float(number) for number in range(1, 201)], 99) == 198.0
     assert percentile([2.0, 1.0], 50) == 1.0
 
 
-def test_rates_are_those_since_all_were_there_and_a_line_those_since_the_last() -> None:
-    figures = Metrics(2)
-    figures.up()
-    figures.counts.out = 1000
-    figures.lag_ms.append(500.0)
-    figures.steady()
-    figures.counts.out, figures.counts.out_bytes, figures.counts.missed = 1090, 9000, 10
-    figures.counts.asked, figures.counts.confirmed = 3, 2
-    figures.lag_ms += [1.0, 2.0]
-    line = figures.line(4000)
+def test_summary_counts_since_the_steady_phase_and_lines_since_the_previous_one() -> None:
+    metrics = Metrics(2)
+    metrics.up()
+    metrics.counts.out = 1000
+    metrics.lag_ms.append(500.0)
+    metrics.steady()
+    metrics.counts.out, metrics.counts.out_bytes, metrics.counts.missed = 1090, 9000, 10
+    metrics.counts.asked, metrics.counts.confirmed = 3, 2
+    metrics.lag_ms += [1.0, 2.0]
+    line = metrics.line(4000)
     assert "1 of 2 connected" in line
     assert "lag p99 2.0 ms" in line
     assert "missed 10" in line
     assert "2 kB an agent" in line
-    figures.trouble("no way there")
-    assert "trouble: no way there (1 times)" in figures.line(4000)
-    told = figures.summary(4000)
-    assert told["out_bytes_per_message"] == 100.0
-    assert told["missed_share"] == pytest.approx(0.1)
-    assert told["unconfirmed"] == 1
-    assert told["lag_ms"] == {"p50": 1.0, "p99": 2.0, "p100": 2.0, "count": 2}
-    assert told["confirm_ms"]["p99"] is None
-    assert told["troubles"] == {"no way there": 1}
+    metrics.trouble("no way there")
+    assert "trouble: no way there (1 times)" in metrics.line(4000)
+    summary = metrics.summary(4000)
+    assert summary["out_bytes_per_message"] == 100.0
+    assert summary["missed_share"] == pytest.approx(0.1)
+    assert summary["unconfirmed"] == 1
+    assert summary["lag_ms"] == {"p50": 1.0, "p99": 2.0, "p100": 2.0, "count": 2}
+    assert summary["confirm_ms"]["p99"] is None
+    assert summary["troubles"] == {"no way there": 1}

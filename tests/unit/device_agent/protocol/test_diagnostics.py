@@ -1,4 +1,4 @@
-"""What a manifest says about measurements is checked when it is read."""
+"""Diagnostics of manifests are validated."""
 
 import pytest
 
@@ -13,7 +13,7 @@ def given(lines: str) -> str:
     return f'{UR5.read_text(encoding="utf-8")}\n[[diagnostics]]\nfields = "x"\nlabel = "X"\n{lines}\n'
 
 
-def test_limits_that_rise_are_read() -> None:
+def test_ascending_limits_are_accepted() -> None:
     known = robot_type.parse(given("low = -1\nwarning_high = 2\nhigh = 3\nchecks = ['level']"))
     last = known.diagnostics[-1]
     assert (last.low, last.warning_low, last.warning_high, last.high) == (-1.0, None, 2.0, 3.0)
@@ -34,12 +34,12 @@ def test_limits_that_rise_are_read() -> None:
         "fields = ''",
     ],
 )
-def test_what_contradicts_itself_is_refused(lines: str) -> None:
+def test_contradictions_are_rejected(lines: str) -> None:
     with pytest.raises(ProtocolError):
         robot_type.parse(given(lines))
 
 
-def test_a_ur5_says_what_its_joints_may_be() -> None:
+def test_diagnostics_of_the_ur5_have_advice() -> None:
     known = robot_type.load(UR5.parent)
     assert {one.stream for one in known.diagnostics} == {"health", "joints"}
     assert all(one.advice for one in known.diagnostics)

@@ -81,7 +81,7 @@ def test_a_receipt_and_a_refusal_name_their_message() -> None:
 
 
 @pytest.mark.parametrize("jid", ["x@other/r", "lab", "@lab", "x@lab.org/r", "lab/x@lab", ""])
-def test_a_foreign_address_is_nobody(jid: str) -> None:
+def test_foreign_addresses_are_ignored(jid: str) -> None:
     assert stanzas.user_at(jid, "lab") is None
 
 

@@ -10,7 +10,7 @@ FILTER_LEVEL = st.sampled_from(["ts", "v1", "a", "b", "+", "#", "$SYS", ""])
 
 
 def mqtt_match(pattern: list[str], topic: list[str]) -> bool:
-    """MQTT 3.1.1 §4.7, written down once more as recursion over levels."""
+    """MQTT 3.1.1 §4.7, as an independent recursive implementation."""
     if topic and topic[0].startswith("$") and pattern and pattern[0] in {"+", "#"}:
         return False
 
@@ -25,7 +25,7 @@ def mqtt_match(pattern: list[str], topic: list[str]) -> bool:
 
 
 @given(st.lists(FILTER_LEVEL, min_size=1, max_size=5), st.lists(LEVEL, min_size=1, max_size=5))
-def test_a_filter_covers_a_topic_as_mqtt_says(pattern: list[str], topic: list[str]) -> None:
+def test_filters_match_as_in_mqtt(pattern: list[str], topic: list[str]) -> None:
     if "#" in pattern[:-1]:
         return
     assert topics.matches("/".join(pattern), "/".join(topic)) == mqtt_match(pattern, topic)
@@ -36,7 +36,7 @@ def test_a_filter_covers_a_topic_as_mqtt_says(pattern: list[str], topic: list[st
     st.lists(FILTER_LEVEL, min_size=1, max_size=4),
     st.lists(LEVEL, min_size=1, max_size=5),
 )
-def test_a_covered_filter_never_reaches_further_than_what_covers_it(
+def test_a_covered_filter_matches_no_more_than_its_cover(
     granted: list[str], asked: list[str], topic: list[str]
 ) -> None:
     if "#" in granted[:-1] or "#" in asked[:-1]:
@@ -62,12 +62,12 @@ def test_a_covered_filter_never_reaches_further_than_what_covers_it(
         "/ts/v1/s/a/conn",
     ],
 )
-def test_what_is_no_topic_is_refused(topic: str) -> None:
+def test_invalid_topics_are_rejected(topic: str) -> None:
     with pytest.raises(ProtocolError):
         topics.parse(topic)
 
 
-def test_topics_written_are_topics_read() -> None:
+def test_topics_are_parsed() -> None:
     assert topics.parse(topics.conn("s", "a")) == ("s", "a", "", "conn", "")
     assert topics.parse(topics.device("s", "a", "d", topics.CTL, "5")) == ("s", "a", "d", "ctl", "5")
     assert topics.parse(topics.device("s", "a", "d", topics.DESC)) == ("s", "a", "d", "desc", "")

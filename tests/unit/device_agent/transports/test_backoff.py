@@ -1,11 +1,11 @@
-"""Attempts to connect become rare while nothing holds, and differ from agent to agent."""
+"""Connection attempts become rare while links fail, and differ between agents."""
 
 import random
 
 import pytest
 
 from device_agent.transports import backoff
-from device_agent.transports.backoff import MIN_S, MAX_S, BackOff
+from device_agent.transports.backoff import MAX_S, MIN_S, BackOff
 
 
 class Clock:
@@ -23,23 +23,23 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def waits(back: BackOff, clock: Clock, count: int, *, each_s: float) -> list[float]:
-    found = []
+    delays = []
     for _ in range(count):
         back.attempt()
         clock.now_s += each_s
-        found.append(back.wait_s())
-    return found
+        delays.append(back.wait_s())
+    return delays
 
 
 @pytest.mark.parametrize("each_s", [0.0, MAX_S - 0.1])
-def test_it_waits_up_to_twice_as_long_each_time_and_never_longer_than_the_bound(clock: Clock, each_s: float) -> None:
+def test_delays_double_up_to_the_maximum(clock: Clock, each_s: float) -> None:
     longest = MIN_S
     for wait_s in waits(BackOff(), clock, 50, each_s=each_s):
         assert MIN_S / 2 <= wait_s <= longest
         longest = min(2 * longest, MAX_S)
 
 
-def test_links_that_break_at_once_make_few_attempts(clock: Clock) -> None:
+def test_unstable_links_cause_few_attempts(clock: Clock) -> None:
     random.seed(4)
     back, attempts = BackOff(), 0
     while clock.now_s < 600:
@@ -49,13 +49,13 @@ def test_links_that_break_at_once_make_few_attempts(clock: Clock) -> None:
     assert attempts < 150
 
 
-def test_a_link_that_held_lets_the_next_attempt_follow_soon(clock: Clock) -> None:
+def test_a_stable_link_resets_the_delay(clock: Clock) -> None:
     back = BackOff()
     waits(back, clock, 20, each_s=0.0)
     assert waits(back, clock, 1, each_s=MAX_S + 0.1)[0] <= MIN_S
 
 
-def test_agents_that_lost_one_broker_come_back_apart(clock: Clock) -> None:
+def test_delays_of_agents_are_spread(clock: Clock) -> None:
     last = [waits(BackOff(), clock, 8, each_s=0.0)[-1] for _ in range(200)]
     assert max(last) - min(last) > MAX_S / 2
     assert sum(wait_s < MAX_S / 4 for wait_s in last) < 120
