@@ -45,7 +45,7 @@ def refusal() -> dict[str, Any]:
     """What it answers about every other: nothing is said of why."""
     return {
         "isAuthenticated": False,
-        "principalId": "nobody",
+        "principalId": "denied",
         "disconnectAfterInSeconds": MIN_REFRESH_S,
         "refreshAfterInSeconds": MIN_REFRESH_S,
         "policyDocuments": [],

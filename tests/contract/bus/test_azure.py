@@ -1,4 +1,4 @@
-"""The command bus over Event Grid. No emulator exists for its HTTP publish: a server here checks what Microsoft documents.
+"""The command bus over Event Grid. A local server checks the HTTP publish against the documentation of Microsoft.
 
 That is what this shows, and no more: the request is the documented one, over TLS, with a token of the host's identity
 for the documented audience; and each documented answer is read as what it means.

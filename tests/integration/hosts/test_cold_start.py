@@ -63,7 +63,7 @@ def test_the_cold_import_stays_near_fastapis_own(code: str, there: str, byte_cod
 def test_no_entry_loads_what_only_some_stores_or_other_programs_need() -> None:
     heavy = ("boto3", "botocore", "azure.data", "azure.storage", "azure.identity", "numpy", "jsonschema", "uvicorn")
     code = (
-        "import sys, function_app.bootstrap, function_app.entrypoints.hosts.aws; import function_app; function_app.app\n"
+        "import sys, function_app.bootstrap, function_app.entrypoints.hosts.aws, function_app; function_app.app\n"
         f"found = [name for name in {heavy} if name in sys.modules]\n"
         "sys.exit(', '.join(found) or 0)"
     )

@@ -60,7 +60,7 @@ def _far_away(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def refusal(port: int, trusted: Path | None, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Why a login is refused. The functions are nowhere, so a login that reaches the password check is rejected there."""
+    """Why a login is rejected. No server runs, so a login that reaches the password check is rejected there."""
     if trusted is not None:
         monkeypatch.setattr(ssl, "create_default_context", _trusting(trusted))
 
