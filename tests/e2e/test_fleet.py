@@ -35,7 +35,7 @@ def pans(page: Page) -> list[str]:
 
 def shows_nothing_of_who_says_nothing(page: Page, machine: Machine, silent: str, arm: str) -> None:
     page.goto(f"{machine.url}/#/operate/{silent},{arm}")
-    station = page.locator(f"[data-testid=station][data-device={silent}]")
+    station = page.locator(f"[data-testid=robot-panel][data-device='{silent}']")
     expect(station).to_be_visible(timeout=PATIENCE_MS)
     wait_until(lambda: len(pans(page)) == 1 and pans(page)[0] != "", "the other's joints")
     expect(station.get_by_test_id("view-3d")).to_have_attribute("data-frames", "0")

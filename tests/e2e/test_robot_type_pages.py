@@ -119,8 +119,8 @@ def test_a_robot_type_is_mended_seen_saved_and_deleted(
 ) -> None:
     with pages(drawing_browser, machine) as (page,):
         page.get_by_role("link", name="Robot types").click()
-        expect(page.locator("[data-testid=type-row][data-type=ur5]")).to_be_visible()
-        expect(page.locator("[data-type=ur5]")).to_contain_text("1 device")
+        expect(page.locator("[data-testid=type-row][data-type='ur5']")).to_be_visible()
+        expect(page.locator("[data-type='ur5']")).to_contain_text("1 device")
         page.get_by_test_id("add-robot-type").click()
         assert_good_page(page, "robot-type-add")
         is_refused(page)
@@ -130,7 +130,7 @@ def test_a_robot_type_is_mended_seen_saved_and_deleted(
         is_deleted(page, machine)
 
         # A type that comes with the installation has its picture too.
-        page.locator("[data-type=ur5] a").click()
+        page.locator("[data-type='ur5'] a").click()
         view = page.get_by_test_id("model-view")
         wait_until(lambda: frames(view) > 0, "a picture")
         expect(page.get_by_test_id("delete-type")).to_have_count(0)
@@ -197,21 +197,21 @@ def is_saved(page: Page, machine: Machine) -> None:
     expect(page.get_by_test_id("joint-table").locator("tbody tr")).to_have_count(2)
     assert_good_page(page, "robot-type")
     page.get_by_role("link", name="Robot types", exact=True).click()
-    expect(page.locator("[data-type=reacher] [data-testid=type-state]")).to_have_attribute("data-state", "ready")
+    expect(page.locator("[data-type='reacher'] [data-testid=type-state]")).to_have_attribute("data-state", "ready")
     assert_good_page(page, "robot-types")
 
 
 def is_deleted(page: Page, machine: Machine) -> None:
     """While something of it is in use it stays; then it goes."""
-    page.locator("[data-type=reacher] a").click()
+    page.locator("[data-type='reacher'] a").click()
     page.get_by_test_id("delete-type").click()
     page.get_by_test_id("confirm-yes").click()
     expect(page.get_by_role("alert").filter(has_text="'reacher' is used by movement bow")).to_be_visible()
     with machine.api() as api:
         assert api.http.delete("/robot-types/reacher/movements/bow").is_success
     page.get_by_test_id("confirm-yes").click()
-    expect(page.locator("[data-type=ur5]")).to_be_visible()
-    expect(page.locator("[data-type=reacher]")).to_have_count(0)
+    expect(page.locator("[data-type='ur5']")).to_be_visible()
+    expect(page.locator("[data-type='reacher']")).to_have_count(0)
 
 
 def enrolment(machine: Machine) -> str:

@@ -1,7 +1,8 @@
 /** The lease's life on a clock that the test turns, with the server's answers in the test's hands. */
+import type { Device, GrantedLease, Lease } from "../src/shared/api/types";
 import { signal } from "@preact/signals-core";
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
-import { Api, type Device, type GrantedLease, type Lease } from "../src/shared/api/client";
+import { Api } from "../src/shared/api/client";
 import { ApiError } from "../src/shared/api/http";
 import { Control, LEASE_MS } from "../src/features/control/model/lease";
 import { DeviceStore } from "../src/features/devices/model/device-store";

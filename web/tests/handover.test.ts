@@ -1,7 +1,8 @@
 /** Control from hand to hand, as each of the two pages lives it, with the server's answers in the test's hands. */
+import type { ControlRequestInfo, Device, GrantedLease, Lease, Watcher } from "../src/shared/api/types";
 import { signal } from "@preact/signals-core";
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
-import { Api, type ControlRequestInfo, type Device, type GrantedLease, type Lease, type Watcher } from "../src/shared/api/client";
+import { Api } from "../src/shared/api/client";
 import { Control, LEASE_MS } from "../src/features/control/model/lease";
 import { DeviceStore } from "../src/features/devices/model/device-store";
 import { ApiError } from "../src/shared/api/http";

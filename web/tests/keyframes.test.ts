@@ -1,20 +1,8 @@
+import { plan } from "../src/features/keyframes/model/plan";
+import { type Problem, placeOf, problems, stretchAll } from "../src/features/keyframes/model/problems";
 import { readFileSync } from "node:fs";
 import { describe, expect, test } from "vitest";
-import {
-  addAfter,
-  duplicate,
-  plan,
-  placeOf,
-  problems,
-  remove,
-  setPosition,
-  setTime,
-  stretchAll,
-  normalize,
-  type Keyframe,
-  type Movement,
-  type Problem,
-} from "../src/features/keyframes/model/keyframes";
+import { addAfter, duplicate, remove, setPosition, setTime, normalize, type Keyframe, type Movement } from "../src/features/keyframes/model/keyframes";
 import { readMovement, readScript, writeScript } from "../src/features/keyframes/model/script-codec";
 import { Recorder, trimmedGaps, keyframesOf, trim, type Sample } from "../src/features/keyframes/model/recording";
 import { UndoHistory } from "../src/shared/lib/undo-history";

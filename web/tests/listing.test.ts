@@ -1,6 +1,6 @@
+import type { Device } from "../src/shared/api/types";
 import { signal } from "@preact/signals-core";
 import { describe, expect, it } from "vitest";
-import type { Device } from "../src/shared/api/client";
 import type { DeviceStore } from "../src/features/devices/model/device-store";
 import { matchesFilter, type DeviceFilter } from "../src/features/devices/model/filter";
 

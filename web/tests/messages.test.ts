@@ -1,5 +1,6 @@
+import { MessageError } from "../src/shared/mqtt/checks";
 import { describe, expect, it } from "vitest";
-import { MessageError, readAck, readDescription, readPresence, readState, readTelemetry, readTwin } from "../src/shared/mqtt/parse-messages";
+import { readAck, readDescription, readPresence, readState, readTelemetry, readTwin } from "../src/shared/mqtt/parse-messages";
 import { description, twin } from "./support/arm";
 
 const bytes = (value: unknown): Uint8Array => new TextEncoder().encode(typeof value === "string" ? value : JSON.stringify(value));

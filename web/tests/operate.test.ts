@@ -383,7 +383,7 @@ describe("what became of a command", () => {
     await until(() => told.lines.value[0]?.status === "done", "the end");
     const [line] = told.lines.value;
     expect(line?.seenBy).toBe("state");
-    expect(line?.steps.filter(({ heard }) => heard === "device").length).toBeGreaterThan(2);
+    expect(line?.steps.filter(({ heard }) => heard === "device").length).toBeGreaterThan(0);
   });
 
   it("is not said to have moved where it has not", async () => {

@@ -1,8 +1,9 @@
+import { MessageError } from "../src/shared/mqtt/checks";
 import { readFileSync } from "node:fs";
 import { deflateSync } from "node:zlib";
 import { describe, expect, it } from "vitest";
 import { readFrame } from "../src/shared/mqtt/camera-frame";
-import { MessageError, readApplied, readDescription, readMeasurements, readScan, readShot, type KnownDiagnostic } from "../src/shared/mqtt/parse-messages";
+import { readApplied, readDescription, readMeasurements, readScan, readShot, type KnownDiagnostic } from "../src/shared/mqtt/parse-messages";
 import { readDepth } from "../src/shared/lib/png";
 import { judge, quantityOf } from "../src/features/sensors/model/quantities";
 import { apart, extent, readFloor, readPlaces } from "../src/features/spaces/model/room-perception";

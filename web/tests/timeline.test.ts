@@ -1,7 +1,8 @@
 /** The page's reckoning of keyframes is the robot's own. */
+import { plan, poseAt } from "../src/features/keyframes/model/plan";
 import { readFileSync } from "node:fs";
 import { expect, test } from "vitest";
-import { poseAt, plan, type Movement, type Robot } from "../src/features/keyframes/model/keyframes";
+import { type Movement, type Robot } from "../src/features/keyframes/model/keyframes";
 import { Curve, fitted, moments, type Stay } from "../src/features/keyframes/model/timeline-layout";
 import { head } from "./support/robots";
 

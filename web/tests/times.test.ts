@@ -1,8 +1,9 @@
 /** Times: what is drawn, what it comes to, what is saved; and the papers' figures. */
+import type { Action, LatencyBatch } from "../src/shared/api/types";
 import { LatencyApi, type Sample, type StoredLatency } from "../src/shared/api/latency";
 import { signal } from "@preact/signals-core";
 import { describe, expect, it } from "vitest";
-import { Api, type Action, type LatencyBatch } from "../src/shared/api/client";
+import { Api } from "../src/shared/api/client";
 import type { DeviceStore } from "../src/features/devices/model/device-store";
 import { ApiError, Http } from "../src/shared/api/http";
 import type { Link } from "../src/shared/mqtt/mqtt-link";

@@ -1,6 +1,7 @@
+import type { Account } from "../shared/api/types";
 import { effect, useSignalEffect } from "@preact/signals";
 import { useEffect, useState } from "preact/hooks";
-import type { Account, Api } from "../shared/api/client";
+import type { Api } from "../shared/api/client";
 import { ApiError } from "../shared/api/http";
 import { Fleet } from "../features/devices/model/device-list";
 import type { FollowedInvitation } from "../features/sharing/model/invitation-link";

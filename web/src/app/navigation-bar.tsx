@@ -1,5 +1,5 @@
 /** The bar above every page: the parts of the console, the account, the way out. */
-import type { Account } from "../shared/api/client";
+import type { Account } from "../shared/api/types";
 import type { Session } from "../features/account/model/session";
 import { texts } from "./texts";
 import { PAGES, ROWS } from "./page-registry";

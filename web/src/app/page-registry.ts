@@ -3,8 +3,9 @@
  * is opened. Routing, navigation and loading go by this table alone. All pages are for who is signed in: to anybody
  * else the app shows the sign-in, whatever the address.
  */
+import type { Account } from "../shared/api/types";
 import type { ComponentType } from "preact";
-import type { Account, Api } from "../shared/api/client";
+import type { Api } from "../shared/api/client";
 import type { Fleet } from "../features/devices/model/device-list";
 import type { FollowedInvitation } from "../features/sharing/model/invitation-link";
 import type { FollowedCode } from "../features/pairing/model/claim-code";
@@ -60,7 +61,7 @@ export const PAGES = {
   multiRobot: {
     title: ({ ids }: At): string => texts.pages.multiRobot(ids.split(",").length),
     part: "devices",
-    load: async (): Loaded => (await import("../features/steering/multi-robot-page")).MultiRobotPage,
+    load: async (): Loaded => (await import("../features/steering/multi-robot/page")).MultiRobotPage,
   },
   space: {
     title: ({ id }: At, fleet: Fleet): string => fleet.spaceName(id),

@@ -2,6 +2,7 @@
  * As much of the cloud as the console's core needs, for its tests: the HTTP API's shapes, and a real MQTT broker over a
  * real WebSocket with exact rights for each connection. The full system is tested from the project's own test suite.
  */
+import type { Action, Device, GrantedLease, Lease } from "../../src/shared/api/types";
 import { randomUUID } from "node:crypto";
 import { createReadStream, existsSync } from "node:fs";
 import { createServer, type IncomingMessage, type ServerResponse } from "node:http";
@@ -9,7 +10,6 @@ import type { AddressInfo } from "node:net";
 import { extname, join } from "node:path";
 import { Aedes, type AedesPublishPacket, type Client } from "aedes";
 import { createWebSocketStream, WebSocketServer } from "ws";
-import type { Action, Device, GrantedLease, Lease } from "../../src/shared/api/client";
 import type { Presence, Setpoint, Stop } from "../../src/shared/mqtt/protocol.generated";
 import { matches } from "../../src/shared/mqtt/topics";
 import { Arm, description } from "./arm";

@@ -1,9 +1,10 @@
+import type { Space } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
 import { MAY } from "../sharing";
 import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
 import { useEffect, useRef, useState } from "preact/hooks";
-import type { Api, Space } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { ApiKey, ApiKeyMade, SharedRole } from "../../shared/api/sharing";
 import { common } from "../../shared/i18n/common";

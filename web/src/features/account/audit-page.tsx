@@ -1,6 +1,7 @@
+import type { Space } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
 import { useEffect, useMemo, useState } from "preact/hooks";
-import type { Api, Space } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { accountIdsOf, AuditReader, ALL_ENTRIES } from "./model/audit-log";
 import type { ApiKey, AuditQuery, AuditRecord } from "../../shared/api/sharing";
 import { common } from "../../shared/i18n/common";

@@ -1,7 +1,8 @@
+import type { SignInMethods } from "../../shared/api/types";
 import { JoinForm } from "../sharing";
 import type { FollowedInvitation } from "../sharing/model";
 import { useEffect, useState } from "preact/hooks";
-import type { Api, SignInMethods } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import { signInToken, type Session } from "./model/session";
 import { texts } from "./texts";

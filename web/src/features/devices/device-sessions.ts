@@ -1,6 +1,7 @@
 /** The devices that are operated on a page, from its opening to its end. */
+import type { Account } from "../../shared/api/types";
 import { useEffect, useState } from "preact/hooks";
-import type { Account, Api } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
 import { DeviceSession } from "./model/device-session";

@@ -1,8 +1,9 @@
 /** The frame of a page about one device beside its own: who it is, its control, its Stop, and its other pages. */
+import type { Account } from "../../shared/api/types";
 import { ControlBar, StopBanner } from "../control";
 import { LastSeenAge, ReachChip } from "./reach-chip";
 import type { ComponentChildren } from "preact";
-import type { Account, Api } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
 import type { DeviceSession } from "./model/device-session";

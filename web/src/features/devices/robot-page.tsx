@@ -1,3 +1,4 @@
+import type { Account } from "../../shared/api/types";
 import { ActionCards, RunStatusPanel } from "../actions";
 import { CommandTraceCard, ControlBar, StopBanner } from "../control";
 import { HealthChip } from "../health";
@@ -10,7 +11,7 @@ import { JointPoseTable, TelemetryPlot, TwinView } from "../twin";
 import { LastSeenAge, ReachChip } from "./reach-chip";
 import type { ComponentChildren } from "preact";
 import { useRef } from "preact/hooks";
-import type { Account, Api } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
 import type { DeviceSession } from "./model/device-session";

@@ -1,4 +1,5 @@
 /** How devices are: all of them, those of a space, or one. */
+import type { Account } from "../../shared/api/types";
 import { DevicePageFrame, LastSeenAge, ReachChip } from "../devices";
 import type { DeviceStore, Fleet } from "../devices/model";
 import { Age } from "../../shared/ui/age";
@@ -6,7 +7,7 @@ import { Choice } from "../../shared/ui/choice";
 import { RANK, type HealthLine, type HealthState } from "../../shared/api/health";
 import { useComputed } from "@preact/signals";
 import { useState } from "preact/hooks";
-import type { Account, Api } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { healthNow, reportedFaults } from "./model/health";
 import { onThisClock } from "../../shared/lib/clock";
 import { common } from "../../shared/i18n/common";

@@ -1,8 +1,9 @@
 /** The keyframe editor of one device: the same for an arm, a humanoid, a base and a head. */
+import type { Account } from "../../shared/api/types";
 import { ControlBar, StopBanner } from "../control";
 import { ReachChip, useDeviceSessions } from "../devices";
 import type { DeviceStore, Fleet } from "../devices/model";
-import type { Account, Api } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { deviceAddress, deviceListAddress, keyframesAddress } from "../../shared/routing/routes";

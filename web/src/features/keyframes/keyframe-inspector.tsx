@@ -1,20 +1,11 @@
 /** The keyframe that is chosen: its time, where its joints are, and what is done there. */
+import { supports } from "./model/problems";
 import { JointSlider } from "../steering";
 import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
 import type { Editor } from "./model/editor";
-import {
-  supports,
-  setAction,
-  setPose,
-  setPosition,
-  setTime,
-  type ActionKind,
-  type KeyframeActions,
-  type Keyframe,
-  type Positions,
-} from "./model/keyframes";
+import { setAction, setPose, setPosition, setTime, type ActionKind, type KeyframeActions, type Keyframe, type Positions } from "./model/keyframes";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
 import { texts } from "./texts";
 

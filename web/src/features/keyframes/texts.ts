@@ -1,4 +1,5 @@
-import type { ActionKind, Problem } from "./model/keyframes";
+import type { Problem } from "./model/problems";
+import type { ActionKind } from "./model/keyframes";
 import { format } from "../../shared/i18n/format";
 
 export const texts = {

@@ -1,8 +1,9 @@
 /** Keyframes in time: markers that are dragged or moved by keys, and the preview's playhead above them. */
+import { stretchAll } from "./model/problems";
 import { Card } from "../../shared/ui/card";
 import { useRef } from "preact/hooks";
 import type { Editor } from "./model/editor";
-import { ACTION_KINDS, setTime, SHORTEST_S, stretchAll, type Keyframe, type Positions } from "./model/keyframes";
+import { ACTION_KINDS, setTime, SHORTEST_S, type Keyframe, type Positions } from "./model/keyframes";
 import { texts } from "./texts";
 
 interface TimelineProps {

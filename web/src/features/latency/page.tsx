@@ -1,11 +1,12 @@
 /** How long things take: of all devices, or of one, where it can be measured here and now. */
+import type { Account } from "../../shared/api/types";
 import { DevicePageFrame } from "../devices";
 import type { DeviceSession, DeviceStore, Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
 import { PATHS, type Path, type StoredLatency, TRANSPORTS, type Transport } from "../../shared/api/latency";
 import { useMemo, useState } from "preact/hooks";
-import type { Account, Api } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { serverNow } from "../../shared/lib/clock";
 import { LatencyProbe } from "./model/probe";
 import { publishedFor, SOURCES, type Published } from "./model/published-figures";

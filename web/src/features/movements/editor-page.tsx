@@ -1,4 +1,5 @@
 /** One movement: its script, what is wrong with it, its versions, and running it. */
+import type { Account } from "../../shared/api/types";
 import { useDeviceSessions } from "../devices";
 import type { DeviceSession, Fleet } from "../devices/model";
 import { readScript } from "../keyframes/model";
@@ -6,7 +7,7 @@ import { Age } from "../../shared/ui/age";
 import { Card } from "../../shared/ui/card";
 import { useSignalEffect } from "@preact/signals";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
-import type { Account, Api } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { now } from "../../shared/lib/clock";
 import { sentence } from "../../shared/api/http";
 import { storedDraft } from "../../shared/lib/local-storage";

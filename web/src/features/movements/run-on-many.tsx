@@ -1,4 +1,5 @@
 /** One movement on many robots at once: who takes part, and what becomes of each. */
+import type { Account } from "../../shared/api/types";
 import { RunSteps } from "../actions";
 import { ended } from "../actions/model";
 import { StopBanner } from "../control";
@@ -6,7 +7,7 @@ import { actionUnavailableReason, ReachChip } from "../devices";
 import type { DeviceSession, DeviceStore, Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { useEffect, useState } from "preact/hooks";
-import type { Account, Api } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { ApiError } from "../../shared/api/http";
 import { newId } from "../../shared/lib/ids";
 import type { ObjectSchema, Parameters } from "../../shared/api/movement-library";

@@ -1,9 +1,10 @@
 /** Pairing an agent: by the code it shows or the link it prints, into a space; and then naming what has come. */
+import type { Device, Space } from "../../shared/api/types";
 import { LastSeenAge, ReachChip, RenameDevice } from "../devices";
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
-import type { Api, Device, Space } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { ApiError, sentence } from "../../shared/api/http";
 import { readCode, type FollowedCode } from "./model/claim-code";
 import { common } from "../../shared/i18n/common";

@@ -1,8 +1,9 @@
 /** One robot type: what every robot of it has in common. */
+import type { Device } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { useCallback } from "preact/hooks";
-import type { Api, Device } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { degrees } from "../../shared/lib/angles";
 import { readFindings } from "./model/parse-findings";
 import { ApiError } from "../../shared/api/http";

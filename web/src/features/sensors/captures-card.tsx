@@ -1,9 +1,9 @@
+import type { Upload } from "../../shared/api/types";
 import { unavailableReason } from "../devices";
 import type { DeviceStore } from "../devices/model";
 import { Age } from "../../shared/ui/age";
 import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
-import type { Upload } from "../../shared/api/client";
 import { onThisClock } from "../../shared/lib/clock";
 import type { RoomDeviceAction } from "./model/room-device-action";
 import { common } from "../../shared/i18n/common";

@@ -1,7 +1,8 @@
+import type { Account } from "../../shared/api/types";
 import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
-import type { Account, Api } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { ApiError, sentence } from "../../shared/api/http";
 import type { Invitation, Person, Role, Share, SharedRole, Target } from "../../shared/api/sharing";
 import { secondsLeft, ShareList } from "./model/shares";

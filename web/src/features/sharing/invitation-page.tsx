@@ -1,7 +1,8 @@
+import type { Account, Space } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
-import type { Account, Api, Space } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { ApiError, sentence } from "../../shared/api/http";
 import type { FollowedInvitation } from "./model/invitation-link";
 import type { Invitation } from "../../shared/api/sharing";

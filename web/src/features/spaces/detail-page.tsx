@@ -1,8 +1,9 @@
+import type { Account, Space } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
 import { PageExplainer } from "../help";
 import { AccessList } from "../sharing";
 import { useEffect, useState } from "preact/hooks";
-import type { Account, Api, Space } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";

@@ -1,29 +1,31 @@
 /** The floor of a room as its perception knows it: what is taken, who is where, and what hangs where. */
 import type { DeviceStore, Fleet } from "../devices/model";
-import { shown } from "../sensors";
-import { quantityOf } from "../sensors/model";
 import { Age } from "../../shared/ui/age";
 import { Card } from "../../shared/ui/card";
 import { effect } from "@preact/signals";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
-import { degrees } from "../../shared/lib/angles";
 import { clock, now } from "../../shared/lib/clock";
 import { apart, extent, readFloor, readPlaces, type Extent, type Floor, type Place } from "./model/room-perception";
-import { common } from "../../shared/i18n/common";
-import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { canvasBox } from "../../shared/ui/hidpi-canvas";
 import { useFloorPlanLabels } from "./floor-plan-labels";
 import { deviceAddress } from "../../shared/routing/routes";
-import { colour, onColourChange } from "../../shared/ui/canvas-theme";
+import { onColourChange } from "../../shared/ui/canvas-theme";
 import "./floor-plan.css";
+import { Legend, Who, HungList } from "./floor-plan-tables";
+import { paint } from "./floor-plan-canvas";
 
 const POSITIONS = "positions";
+
 const OCCUPANCY = "occupancy";
-const RANGE = "range";
+
+export const RANGE = "range";
+
 const TRAIL_MS = 30_000;
+
 /** Whom no sensor has seen for this long is drawn as one whose place is old [s]. */
 const UNSEEN_S = 2;
+
 const PIN_PX = 24;
 
 interface PlanProps {
@@ -33,7 +35,7 @@ interface PlanProps {
   agent: string;
 }
 
-interface Hung {
+export interface Hung {
   device: DeviceStore;
   position: readonly [number, number, number];
   number: number;
@@ -121,11 +123,11 @@ function hungOf(devices: readonly DeviceStore[]): Hung[] {
     .map((one, index) => ({ ...one, number: index + 1 }));
 }
 
-function deviceOf(place: Place, devices: readonly DeviceStore[]): DeviceStore | null {
+export function deviceOf(place: Place, devices: readonly DeviceStore[]): DeviceStore | null {
   return devices.find(({ info }) => info.value.name === place.name) ?? null;
 }
 
-function nameOf(place: Place, devices: readonly DeviceStore[]): string {
+export function nameOf(place: Place, devices: readonly DeviceStore[]): string {
   return deviceOf(place, devices)?.info.value.label ?? texts.plan.person(place.name);
 }
 
@@ -145,7 +147,7 @@ interface DrawingProps {
   onPick?: (xM: number, yM: number) => void;
 }
 
-type Trail = { at: number; x: number; y: number }[];
+export type Trail = { at: number; x: number; y: number }[];
 
 export function Drawing({ extent: room, floor, places, hung, devices, trails, old, receivedAt, target, onPick }: DrawingProps) {
   const canvas = useRef<HTMLCanvasElement>(null);
@@ -310,178 +312,4 @@ function useTrails(perception: DeviceStore | null): { readonly current: Readonly
     });
   }, [perception]);
   return trails;
-}
-
-function paint(
-  context: CanvasRenderingContext2D,
-  width: number,
-  height: number,
-  room: Extent,
-  floor: Floor | null,
-  trails: ReadonlyMap<string, Trail>,
-): void {
-  const scale = width / (room.highX - room.lowX);
-  const x = (m: number): number => (m - room.lowX) * scale;
-  const y = (m: number): number => height - (m - room.lowY) * scale;
-  if (floor !== null) paintFloor(context, floor, x, y, scale);
-  paintMetres(context, room, x, y, width, height);
-  context.lineWidth = 2;
-  context.lineJoin = "round";
-  [...trails.keys()].sort().forEach((name, index) => {
-    const trail = trails.get(name) ?? [];
-    context.strokeStyle = colour(`--series-${(index % 8) + 1}`);
-    context.globalAlpha = 0.45;
-    context.beginPath();
-    for (const point of trail) context.lineTo(x(point.x), y(point.y));
-    context.stroke();
-  });
-  context.globalAlpha = 1;
-}
-
-function paintFloor(
-  context: CanvasRenderingContext2D,
-  floor: Floor,
-  x: (m: number) => number,
-  y: (m: number) => number,
-  scale: number,
-): void {
-  const fills = { free: colour("--surface"), taken: colour("--plan-taken"), unknown: colour("--plan-unknown") };
-  const side = floor.sideM * scale;
-  for (let row = 0; row < floor.rows; row += 1) {
-    for (let column = 0; column < floor.columns; column += 1) {
-      context.fillStyle = fills[floor.cell(column, row)];
-      const [left, top] = [x(floor.lowerXM + column * floor.sideM), y(floor.lowerYM + (row + 1) * floor.sideM)];
-      // A little more than its square: no line of the ground shines through between two.
-      context.fillRect(left, top, side + 0.6, side + 0.6);
-    }
-  }
-}
-
-function paintMetres(
-  context: CanvasRenderingContext2D,
-  room: Extent,
-  x: (m: number) => number,
-  y: (m: number) => number,
-  width: number,
-  height: number,
-): void {
-  context.strokeStyle = colour("--quiet");
-  context.globalAlpha = 0.18;
-  context.lineWidth = 1;
-  context.beginPath();
-  for (let m = Math.ceil(room.lowX); m <= room.highX; m += 1) {
-    context.moveTo(x(m), 0);
-    context.lineTo(x(m), height);
-  }
-  for (let m = Math.ceil(room.lowY); m <= room.highY; m += 1) {
-    context.moveTo(0, y(m));
-    context.lineTo(width, y(m));
-  }
-  context.stroke();
-  context.globalAlpha = 1;
-}
-
-function Legend() {
-  return (
-    <ul class="plan-key quiet small">
-      <li class="key-taken">{texts.plan.key.taken}</li>
-      <li class="key-unknown">{texts.plan.key.unknown}</li>
-      <li class="key-metre">{texts.plan.metre}</li>
-    </ul>
-  );
-}
-
-interface WhoProps {
-  places: readonly Place[];
-  devices: readonly DeviceStore[];
-  receivedAt: number;
-  old: boolean;
-}
-
-function Who({ places, devices, receivedAt, old }: WhoProps) {
-  const metres = (m: number): string => m.toFixed(2);
-  const since = Math.max(0, clock.value - receivedAt);
-  const { column } = texts.plan;
-  return (
-    <div class="scroll" tabIndex={0} role="region" aria-label={texts.plan.who}>
-      <table class={old ? "old" : ""}>
-        <thead>
-          <tr>
-            {[column.name, column.place, column.heading, column.seen].map((name) => (
-              <th key={name} scope="col">
-                {name}
-              </th>
-            ))}
-          </tr>
-        </thead>
-        <tbody>
-          {places.map((place, index) => {
-            const device = deviceOf(place, devices);
-            const label = nameOf(place, devices);
-            return (
-              <tr key={place.name}>
-                <th scope="row">
-                  <span class={`swatch series-${(index % 8) + 1}`} aria-hidden="true">
-                    {texts.plan.letter(index)}
-                  </span>
-                  {device === null ? label : <a href={deviceAddress(device.id)}>{label}</a>}
-                </th>
-                <td>{texts.plan.place(metres(place.xM), metres(place.yM))}</td>
-                <td>{place.yawRad === null ? format.unknown : format.wholeDegrees(degrees(place.yawRad))}</td>
-                <td>{format.age(place.ageS * 1000 + since)}</td>
-              </tr>
-            );
-          })}
-        </tbody>
-      </table>
-    </div>
-  );
-}
-
-/** The numbers of the plan, with what each of them says now. */
-function HungList({ hung }: { hung: readonly Hung[] }) {
-  return (
-    <>
-      <h3>{texts.plan.sensors}</h3>
-      <ol class="hung">
-        {hung.map(({ device, number }) => (
-          <li key={device.id}>
-            <span class="pin-number" aria-hidden="true">
-              {number}
-            </span>
-            <a href={deviceAddress(device.id)}>{device.info.value.label}</a>
-            <Says device={device} />
-          </li>
-        ))}
-      </ol>
-    </>
-  );
-}
-
-/** What it measures: of a lidar the nearest thing, of others the first two values. */
-function Says({ device }: { device: DeviceStore }) {
-  const description = device.description.value;
-  const stream = description?.streams[0]?.name;
-  if (description === null || stream === undefined) return null;
-  const newest = device.measured(stream).value;
-  const values = Object.entries(newest?.message.values ?? {});
-  if (newest === null || values.length === 0) return <span class="quiet">{format.unknown}</span>;
-  const late = device.late(stream);
-  const said = (field: string, value: number | boolean): string => {
-    if (typeof value === "boolean") return (common.booleanState[field] ?? common.yesNo)[value ? 0 : 1];
-    const quantity = quantityOf(description, stream, field);
-    return `${shown(quantity, value)} ${quantity.unit}`;
-  };
-  const [first, second] = stream === RANGE ? [[...values].sort(([, a], [, b]) => Number(a) - Number(b))[0]] : values;
-  return (
-    <span class={late ? "old" : "value"}>
-      {[first, second].flatMap((one) => (one === undefined ? [] : [said(...one)])).join(", ")}
-      {late && (
-        <span class="small">
-          {" "}
-          <Age at={newest.receivedAt} />
-        </span>
-      )}
-    </span>
-  );
 }

@@ -1,7 +1,8 @@
+import type { Space } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { useEffect, useState } from "preact/hooks";
-import type { Api, Space } from "../../shared/api/client";
+import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";

@@ -1,5 +1,5 @@
 /** Movements of the robot types: what is in the library, saving, checking, and running one on many robots. */
-import type { Action } from "./client";
+import type { Action } from "./types";
 import { ApiError, type Http } from "./http";
 
 /** What an operator may set: a small part of JSON Schema, with units. */

@@ -2,7 +2,7 @@
  * Grey pictures of 16 bits, as depth cameras capture them: a browser's own decoder would keep 8 of them.
  * Reads what ISO/IEC 15948 allows of that kind, but for interlacing.
  */
-import { MessageError } from "../mqtt/parse-messages";
+import { MessageError } from "../mqtt/checks";
 
 /** Distances by pixel, row by row from the top [m]; 0 where nothing was within reach. */
 export interface DepthPicture {

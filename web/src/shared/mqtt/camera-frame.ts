@@ -1,5 +1,5 @@
 /** Pictures of `cam/{name}`: a header of 20 bytes, then the JPEG, as device_agent/protocol/camera_frames.py has them. */
-import { MessageError } from "./parse-messages";
+import { MessageError } from "./checks";
 
 export interface CameraFrame {
   /** Counts up from one start of the agent to the next. */

@@ -2,9 +2,9 @@
  * One connection to the broker that keeps itself alive: it fetches its own short-lived credentials, moves to new ones
  * before they run out without losing a message, and comes back after a loss with new ones.
  */
+import type { Credentials } from "../api/types";
 import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import type { MqttClient } from "mqtt";
-import type { Credentials } from "../api/client";
 import { ApiError, sentence } from "../api/http";
 import { now } from "../lib/clock";
 import { matches } from "./topics";

@@ -2,6 +2,7 @@
  * Reads what arrives from the broker: JSON of the contract's types, every number finite, every list of the length it
  * must have. Unknown fields pass, so that this page still reads a newer robot. Nothing unchecked is ever drawn.
  */
+import { MAX_JOINTS, type Check, MessageError } from "./checks";
 import type { Pose, Quaternion, Vector3 } from "../lib/vectors";
 import type {
   Ack,
@@ -32,100 +33,20 @@ import type {
   Stream,
   TwinJoint,
 } from "./protocol.generated";
-
-/** A message that is not what the contract says; the text names the field. */
-export class MessageError extends Error {
-  override name = "MessageError";
-}
+import { place, fail, number, count, text, flag, anything, oneOf, list, byName, numbers, optional, nullable, object } from "./checks";
 
 /** Largest message of the contract [bytes]. */
 const MAX_BYTES = 128 * 1024;
-const MAX_JOINTS = 128;
+
+
 const MAX_BODIES = 512;
 
-/**
- * Checks one value; `at` is where it stands and `key` its place there, for the error's text. They are put together only
- * for what is wrong: of ten robots two hundred messages come a second, each with a hundred numbers.
- */
-export type Check<T> = (value: unknown, at: string, key?: string | number) => T;
-
-function place(at: string, key?: string | number): string {
-  if (key === undefined) return at;
-  return typeof key === "number" ? `${at}[${key}]` : `${at}.${key}`;
-}
-
-function fail(at: string, wanted: string, key?: string | number): never {
-  throw new MessageError(`${place(at, key)} is not ${wanted}`);
-}
-
-const number: Check<number> = (value, at, key) =>
-  typeof value === "number" && Number.isFinite(value) ? value : fail(at, "a finite number", key);
-
-const count: Check<number> = (value, at, key) =>
-  Number.isSafeInteger(value) && (value as number) >= 0 ? (value as number) : fail(at, "a whole number from 0", key);
-
-const text: Check<string> = (value, at, key) => (typeof value === "string" ? value : fail(at, "text", key));
-
-const flag: Check<boolean> = (value, at, key) => (typeof value === "boolean" ? value : fail(at, "true or false", key));
-
-const anything: Check<Record<string, unknown>> = (value, at, key) =>
-  typeof value === "object" && value !== null && !Array.isArray(value)
-    ? (value as Record<string, unknown>)
-    : fail(at, "an object", key);
-
-function oneOf<const T extends string>(...names: T[]): Check<T> {
-  return (value, at, key) => {
-    const found = names.find((name) => name === value);
-    return found ?? fail(at, `one of ${names.join(", ")}`, key);
-  };
-}
-
-function list<T>(item: Check<T>, longest: number): Check<T[]> {
-  return (value, at, key) => {
-    if (!Array.isArray(value) || value.length > longest) fail(at, `a list of at most ${longest}`, key);
-    const here = place(at, key);
-    return value.map((entry, index) => item(entry, here, index));
-  };
-}
-
-/** Numbers by name, of which none is taken for a part of what every object has. */
-const byName: Check<Record<string, number>> = (value, at, key) => {
-  const entries = Object.entries(anything(value, at, key));
-  if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} numbers`, key);
-  const here = place(at, key);
-  return Object.fromEntries(entries.map(([name, entry]) => [name, number(entry, here, name)]));
-};
-
-function numbers<T extends number[]>(length: T["length"]): Check<T> {
-  return (value, at, key) => {
-    if (!Array.isArray(value) || value.length !== length) fail(at, `${length} numbers`, key);
-    const here = place(at, key);
-    return value.map((entry, index) => number(entry, here, index)) as T;
-  };
-}
-
-function optional<T>(check: Check<T>, otherwise: T): Check<T> {
-  return (value, at, key) => (value === undefined ? otherwise : check(value, at, key));
-}
-
-function nullable<T>(check: Check<T>): Check<T | null> {
-  return (value, at, key) => (value === undefined || value === null ? null : check(value, at, key));
-}
-
-type Fields<T> = { [K in keyof T]-?: Check<T[K]> };
-
-function object<T extends object>(fields: Fields<T>): Check<T> {
-  const entries = Object.entries<Check<unknown>>(fields as Record<string, Check<unknown>>);
-  return (value, at, key) => {
-    const given = anything(value, at, key);
-    const here = place(at, key);
-    return Object.fromEntries(entries.map(([name, check]) => [name, check(given[name], here, name)])) as T;
-  };
-}
-
 const vector3 = numbers<Vector3>(3);
+
 const quaternion = numbers<Quaternion>(4);
+
 const pose = numbers<Pose>(7);
+
 const mode = oneOf<Mode>("idle", "streaming", "action", "holding", "stopped", "fault");
 
 const presence = object<Required<Presence>>({
@@ -147,6 +68,7 @@ const joint = object<Joint>({
 });
 
 const mimicJoint = object<Required<MimicJoint>>({ joint: text, mimics: text, multiplier: optional(number, 1) });
+
 const positionDependentLimit = object<PositionDependentLimit>({ joint: text, depends_on: text, table: list(vector3, 200) });
 
 const stream = object<Stream>({ name: text, rate_hz: number });
@@ -332,18 +254,25 @@ function read<T>(payload: Uint8Array, check: Check<T>, name: string): T {
 }
 
 export type KnownDiagnostic = Required<Diagnostic>;
+
 export type KnownDescription = Required<Omit<Description, "diagnostics" | "mimic_joints">> & {
   diagnostics: KnownDiagnostic[];
   mimic_joints: Required<MimicJoint>[];
 };
+
 export type KnownBody = Required<Body>;
+
 export interface KnownTwin {
   device: string;
   bodies: KnownBody[];
 }
+
 export type KnownState = Required<State>;
+
 export type KnownTelemetry = Required<JointTelemetry>;
+
 export type KnownAck = Required<Ack>;
+
 export type KnownEvent = Required<Event>;
 
 /** `conn`. Throws `MessageError`. */

@@ -1,6 +1,7 @@
 /** Who is signed in. The token of a sign-in link is used once and kept nowhere. */
+import type { Account } from "../../../shared/api/types";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Account, Api } from "../../../shared/api/client";
+import type { Api } from "../../../shared/api/client";
 import { ApiError, sentence } from "../../../shared/api/http";
 
 export type SessionState =

@@ -2,9 +2,10 @@
  * What a device is asked to do, each request followed from the click to its end: by the acks of the device, and by
  * asking the cloud. Robots and room devices alike.
  */
+import type { Action, ActionCallOptions, ActionStatus } from "../../../shared/api/types";
 import type { DeviceStore } from "../../devices/model";
 import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Action, ActionCallOptions, ActionStatus, Api } from "../../../shared/api/client";
+import type { Api } from "../../../shared/api/client";
 import { now } from "../../../shared/lib/clock";
 import { ApiError, sentence } from "../../../shared/api/http";
 import { newId } from "../../../shared/lib/ids";

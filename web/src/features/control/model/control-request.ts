@@ -1,7 +1,8 @@
 /** Asking whoever has control of a device for it, until there is an answer; and what it comes to. */
+import type { ControlRequestInfo } from "../../../shared/api/types";
 import type { DeviceStore } from "../../devices/model";
 import { effect, signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Api, ControlRequestInfo } from "../../../shared/api/client";
+import type { Api } from "../../../shared/api/client";
 import { now, onThisClock } from "../../../shared/lib/clock";
 import { ApiError, sentence } from "../../../shared/api/http";
 

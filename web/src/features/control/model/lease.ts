@@ -1,9 +1,10 @@
 /** Control of one device from this page: the lease, its renewal, its loss, and the stream of setpoints it allows. */
+import type { GrantedLease } from "../../../shared/api/types";
 import type { DeviceStore, OpenRequestHere } from "../../devices/model";
 import { RoundTrip } from "../../latency/model";
 import { SetpointStreamer } from "../../steering/model";
 import { batch, computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Api, GrantedLease } from "../../../shared/api/client";
+import type { Api } from "../../../shared/api/client";
 import { ControlRequest } from "./control-request";
 import { ApiError, sentence } from "../../../shared/api/http";
 import { now } from "../../../shared/lib/clock";

@@ -1,6 +1,7 @@
 /** Says that this page looks at a device for as long as it can be seen, and hears who else does. */
+import type { Watcher } from "../../../shared/api/types";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Api, Watcher } from "../../../shared/api/client";
+import type { Api } from "../../../shared/api/client";
 
 const AGAIN_MS = 10_000;
 /** What the server says itself is taken within these bounds [ms]. */

@@ -1,6 +1,7 @@
 /** All devices that this account may see. */
+import type { Device } from "../../../shared/api/types";
 import { effect, signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Api, Device } from "../../../shared/api/client";
+import type { Api } from "../../../shared/api/client";
 import { sentence } from "../../../shared/api/http";
 import { DeviceStore } from "./device-store";
 import { MqttLink, type Link } from "../../../shared/mqtt/mqtt-link";

@@ -1,27 +1,13 @@
 /** One device as the page knows it: only what it or the cloud has said, with the time at which it was heard. */
+import type { Device, Lease } from "../../../shared/api/types";
+import { MessageError } from "../../../shared/mqtt/checks";
 import { RecentTelemetry } from "../../twin/model";
 import { computed, signal, type ReadonlySignal, type Signal } from "@preact/signals-core";
-import type { Api, Device, Lease } from "../../../shared/api/client";
+import type { Api } from "../../../shared/api/client";
 import { ApiError } from "../../../shared/api/http";
 import { clock, now, onThisClock } from "../../../shared/lib/clock";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
-import {
-  MessageError,
-  readAck,
-  readDescription,
-  readEvent,
-  readMeasurements,
-  readPresence,
-  readState,
-  readTelemetry,
-  readTwin,
-  type KnownAck,
-  type KnownDescription,
-  type KnownEvent,
-  type KnownState,
-  type KnownTelemetry,
-  type KnownTwin,
-} from "../../../shared/mqtt/parse-messages";
+import { readAck, readDescription, readEvent, readMeasurements, readPresence, readState, readTelemetry, readTwin, type KnownAck, type KnownDescription, type KnownEvent, type KnownState, type KnownTelemetry, type KnownTwin } from "../../../shared/mqtt/parse-messages";
 import { readFrame, type CameraFrame } from "../../../shared/mqtt/camera-frame";
 import type { Measurements, Presence } from "../../../shared/mqtt/protocol.generated";
 import { deviceTopics, type DeviceTopics } from "../../../shared/mqtt/topics";

@@ -1,5 +1,5 @@
 /** Which devices a list shows: by what was typed, by what they are, by whether they need somebody to look. */
-import type { Device } from "../../../shared/api/client";
+import type { Device } from "../../../shared/api/types";
 import type { DeviceStore } from "./device-store";
 
 export type KindFilter = "all" | "robots" | "sensors";

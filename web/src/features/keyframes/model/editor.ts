@@ -1,17 +1,8 @@
 /** One movement that is being edited: its changes, what is chosen, the preview, and the draft that outlives the page. */
+import { plan, poseAt } from "./plan";
+import { problems } from "./problems";
 import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
-import {
-  addAfter,
-  duplicate,
-  plan,
-  poseAt,
-  poseOf,
-  problems,
-  remove,
-  type Movement,
-  type Positions,
-  type Robot,
-} from "./keyframes";
+import { addAfter, duplicate, poseOf, remove, type Movement, type Positions, type Robot } from "./keyframes";
 import { readMovement } from "./script-codec";
 import { UndoHistory } from "../../../shared/lib/undo-history";
 

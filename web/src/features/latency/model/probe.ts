@@ -1,8 +1,9 @@
 /** Measuring here and now, by requests that move nothing: one after the other, each on this page's clock alone. */
+import type { LatencyBatch } from "../../../shared/api/types";
 import type { DeviceStore } from "../../devices/model";
 import type { Sample } from "../../../shared/api/latency";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Api, LatencyBatch } from "../../../shared/api/client";
+import type { Api } from "../../../shared/api/client";
 import { now, serverNow } from "../../../shared/lib/clock";
 import { sentence } from "../../../shared/api/http";
 import { newId } from "../../../shared/lib/ids";

@@ -1,6 +1,7 @@
 /** Times that this page has measured, on their way to the cloud: in batches, seldom, and none twice. */
+import type { LatencyBatch } from "../../../shared/api/types";
 import { effect } from "@preact/signals-core";
-import type { Api, LatencyBatch } from "../../../shared/api/client";
+import type { Api } from "../../../shared/api/client";
 import { now } from "../../../shared/lib/clock";
 import { ApiError } from "../../../shared/api/http";
 import { newId } from "../../../shared/lib/ids";

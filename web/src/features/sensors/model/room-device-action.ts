@@ -1,9 +1,10 @@
 /** What this page asks of one room device: one thing at a time, and what became of it. */
+import type { Upload } from "../../../shared/api/types";
 import type { ActionOptions, ActionRunner, Run } from "../../actions/model";
 import type { DeviceStore } from "../../devices/model";
 import type { Values } from "../../spaces/model";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Api, Upload } from "../../../shared/api/client";
+import type { Api } from "../../../shared/api/client";
 import { sentence } from "../../../shared/api/http";
 import { now } from "../../../shared/lib/clock";
 import { readApplied, readShot } from "../../../shared/mqtt/parse-messages";

@@ -1,5 +1,5 @@
 /** What one field has measured: what the cloud has stored of it, and what this page has heard since. */
-import type { Series } from "../../../shared/api/client";
+import type { Series } from "../../../shared/api/types";
 
 export interface Sample {
   /** On the agent's wall clock [ms since 1970]. */

@@ -1,8 +1,8 @@
 /** Which robots are ticked in the list, to be operated on one page. */
-import type { DeviceStore } from "../devices/model";
+import type { DeviceStore } from "../../devices/model";
 import { signal } from "@preact/signals";
-import { texts } from "./texts";
-import { multiRobotAddress } from "../../shared/routing/routes";
+import { texts } from "../texts";
+import { multiRobotAddress } from "../../../shared/routing/routes";
 
 const ticked = signal<readonly string[]>([]);
 

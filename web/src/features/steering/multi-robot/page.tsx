@@ -1,15 +1,16 @@
 /** Several robots on one page, each with its own control; one key and one button stop them all. */
-import { ControlBar, StopBanner } from "../control";
-import { LastSeenAge, ReachChip, useDeviceSessions } from "../devices";
-import type { DeviceSession, DeviceStore, Fleet } from "../devices/model";
-import { TwinView } from "../twin";
+import type { Account } from "../../../shared/api/types";
+import { ControlBar, StopBanner } from "../../control";
+import { LastSeenAge, ReachChip, useDeviceSessions } from "../../devices";
+import type { DeviceSession, DeviceStore, Fleet } from "../../devices/model";
+import { TwinView } from "../../twin";
 import { useMemo, useState } from "preact/hooks";
-import type { Account, Api } from "../../shared/api/client";
-import { common } from "../../shared/i18n/common";
-import { format } from "../../shared/i18n/format";
-import { texts } from "./texts";
-import { deviceAddress, deviceListAddress } from "../../shared/routing/routes";
-import { SteeringCard } from "./steering-card";
+import type { Api } from "../../../shared/api/client";
+import { common } from "../../../shared/i18n/common";
+import { format } from "../../../shared/i18n/format";
+import { texts } from "../texts";
+import { deviceAddress, deviceListAddress } from "../../../shared/routing/routes";
+import { SteeringCard } from "../steering-card";
 import "./multi-robot.css";
 
 interface TogetherPageProps {

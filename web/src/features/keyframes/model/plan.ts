@@ -1,0 +1,134 @@
+/** The timed joint positions of a movement. */
+import { clamp } from "../../../shared/lib/angles";
+import type { KnownDescription } from "../../../shared/mqtt/parse-messages";
+import type { Joint } from "../../../shared/mqtt/protocol.generated";
+import { at, Curve, curveOf, fitted, moments, type Stay } from "./timeline-layout";
+import { type Positions, type Keyframe, type Movement, type Robot, DEED_S, hasAction } from "./keyframes";
+
+// ---------------------------------------------------------------- how it is played
+
+/** One joint in one piece of the movement: from where it rests to where it rests again. */
+interface Track {
+  joint: Joint;
+  stays: Stay[];
+}
+
+interface Piece {
+  /** Indices of the keyframes where it begins and ends. */
+  first: number;
+  last: number;
+  gaps: number[];
+  tracks: Track[];
+}
+
+export function pieces(keyframes: readonly Keyframe[], robot: Robot): Piece[] {
+  const found: Piece[] = [];
+  const rests = new Map<string, number>();
+  const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));
+  for (const joint of robot.joints) {
+    // Where a joint is before it is named first nobody knows; it is drawn where it is named first.
+    const named = keyframes.find(({ position_rad }) => joint.name in position_rad);
+    const place = named?.position_rad[joint.name];
+    if (place !== undefined && !followers.has(joint.name)) rests.set(joint.name, place);
+  }
+  for (let first = 0; first < keyframes.length - 1; ) {
+    let last = first + 1;
+    while (last < keyframes.length - 1 && !hasAction(keyframes[last] ?? {})) last += 1;
+    const stretch = keyframes.slice(first, last + 1);
+    const gaps = stretch.slice(1).map(({ time_s }, index) => Math.max(time_s - (stretch[index]?.time_s ?? 0), 1e-3));
+    const tracks = robot.joints.flatMap((joint) => {
+      const rest = rests.get(joint.name);
+      if (rest === undefined) return [];
+      const stays: Stay[] = [{ number: 0, place: rest }];
+      stretch.slice(1).forEach(({ position_rad }, index) => {
+        const place = position_rad[joint.name];
+        if (place !== undefined) stays.push({ number: index + 1, place });
+      });
+      rests.set(joint.name, stays.at(-1)?.place ?? rest);
+      return [{ joint, stays }];
+    });
+    found.push({ first, last, gaps, tracks });
+    first = last;
+  }
+  return found;
+}
+
+/** What the robot will do, and when. */
+export interface Plan {
+  /** Where time would be at each keyframe if the robot played it now [s]: later than asked where that is too fast. */
+  reached_s: number[];
+  duration_s: number;
+  /** Where joints are at a time of `reached_s` [rad]. */
+  at: (time: number) => Positions;
+  /** That time on the scale of the keyframes' own times [s]. */
+  asked: (time: number) => number;
+  /** The other way round. */
+  played: (asked: number) => number;
+}
+
+export function plan({ keyframes }: Movement, robot: Robot): Plan {
+  const reached = [0];
+  /** The two scales side by side: where something is done one of them stands still. */
+  const scale: [played: number, asked: number][] = [[0, 0]];
+  const parts: { begin: number; end: number; curves: [string, Curve][] }[] = [];
+  let begin = hasAction(keyframes[0] ?? {}) ? DEED_S : 0;
+  for (const piece of pieces(keyframes, robot)) {
+    const times = moments(fitted(piece.gaps, piece.tracks));
+    parts.push({
+      begin,
+      end: begin + (times.at(-1) ?? 0),
+      curves: piece.tracks.map(({ joint, stays }) => [joint.name, curveOf(stays, times)]),
+    });
+    scale.push([begin, keyframes[piece.first]?.time_s ?? 0]);
+    times.slice(1).forEach((time, index) => {
+      reached.push(begin + time);
+      scale.push([begin + time, keyframes[piece.first + 1 + index]?.time_s ?? 0]);
+    });
+    begin += (times.at(-1) ?? 0) + (hasAction(keyframes[piece.last] ?? {}) ? DEED_S : 0);
+  }
+  const only = poseAt(keyframes[0]?.position_rad ?? {}, robot);
+  const played = scale.map(([one]) => one);
+  const asked = scale.map(([, one]) => one);
+  return {
+    reached_s: reached,
+    duration_s: begin,
+    at: (time) => {
+      const part = parts.find(({ end }) => time <= end) ?? parts.at(-1);
+      if (part === undefined) return only;
+      return poseAt(Object.fromEntries(part.curves.map(([name, curve]) => [name, curve.at(time - part.begin)])), robot);
+    },
+    asked: (time) => between(time, played, asked),
+    played: (time) => between(time, asked, played),
+  };
+}
+
+/** A value on one scale from that on another; beyond their ends that of the ends. */
+export function between(value: number, from: readonly number[], to: readonly number[]): number {
+  const end = from.findIndex((one) => one > value);
+  if (end === 0) return at(to, 0);
+  if (end < 0) return at(to, to.length - 1);
+  const share = (value - at(from, end - 1)) / (at(from, end) - at(from, end - 1));
+  return at(to, end - 1) + share * (at(to, end) - at(to, end - 1));
+}
+
+/** Joints that hang together as they do: the range that narrows, and those that one motor moves. */
+export function poseAt(positions: Positions, robot: Robot): Positions {
+  const all: Record<string, number> = { ...positions };
+  for (const { joint, depends_on, table } of robot.position_dependent_limits) {
+    const [place, where] = [all[joint], all[depends_on]];
+    if (place === undefined || where === undefined) continue;
+    const [lower, upper] = room(table, where);
+    all[joint] = clamp(place, lower, upper);
+  }
+  for (const { joint, mimics, multiplier } of robot.mimic_joints) {
+    const leads = all[mimics];
+    if (leads !== undefined) all[joint] = leads * multiplier;
+  }
+  return all;
+}
+
+/** The range that is left where the other joint is. */
+export function room(table: KnownDescription["position_dependent_limits"][number]["table"], where: number): [number, number] {
+  const by = table.map((row) => row[0]);
+  return [1, 2].map((column) => between(where, by, table.map((row) => row[column] ?? NaN))) as [number, number];
+}

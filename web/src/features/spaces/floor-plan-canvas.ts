@@ -1,0 +1,72 @@
+import { type Extent, type Floor } from "./model/room-perception";
+import { colour } from "../../shared/ui/canvas-theme";
+import type { Trail } from "./floor-plan";
+
+export function paint(
+  context: CanvasRenderingContext2D,
+  width: number,
+  height: number,
+  room: Extent,
+  floor: Floor | null,
+  trails: ReadonlyMap<string, Trail>,
+): void {
+  const scale = width / (room.highX - room.lowX);
+  const x = (m: number): number => (m - room.lowX) * scale;
+  const y = (m: number): number => height - (m - room.lowY) * scale;
+  if (floor !== null) paintFloor(context, floor, x, y, scale);
+  paintMetres(context, room, x, y, width, height);
+  context.lineWidth = 2;
+  context.lineJoin = "round";
+  [...trails.keys()].sort().forEach((name, index) => {
+    const trail = trails.get(name) ?? [];
+    context.strokeStyle = colour(`--series-${(index % 8) + 1}`);
+    context.globalAlpha = 0.45;
+    context.beginPath();
+    for (const point of trail) context.lineTo(x(point.x), y(point.y));
+    context.stroke();
+  });
+  context.globalAlpha = 1;
+}
+
+function paintFloor(
+  context: CanvasRenderingContext2D,
+  floor: Floor,
+  x: (m: number) => number,
+  y: (m: number) => number,
+  scale: number,
+): void {
+  const fills = { free: colour("--surface"), taken: colour("--plan-taken"), unknown: colour("--plan-unknown") };
+  const side = floor.sideM * scale;
+  for (let row = 0; row < floor.rows; row += 1) {
+    for (let column = 0; column < floor.columns; column += 1) {
+      context.fillStyle = fills[floor.cell(column, row)];
+      const [left, top] = [x(floor.lowerXM + column * floor.sideM), y(floor.lowerYM + (row + 1) * floor.sideM)];
+      // A little more than its square: no line of the ground shines through between two.
+      context.fillRect(left, top, side + 0.6, side + 0.6);
+    }
+  }
+}
+
+function paintMetres(
+  context: CanvasRenderingContext2D,
+  room: Extent,
+  x: (m: number) => number,
+  y: (m: number) => number,
+  width: number,
+  height: number,
+): void {
+  context.strokeStyle = colour("--quiet");
+  context.globalAlpha = 0.18;
+  context.lineWidth = 1;
+  context.beginPath();
+  for (let m = Math.ceil(room.lowX); m <= room.highX; m += 1) {
+    context.moveTo(x(m), 0);
+    context.lineTo(x(m), height);
+  }
+  for (let m = Math.ceil(room.lowY); m <= room.highY; m += 1) {
+    context.moveTo(0, y(m));
+    context.lineTo(width, y(m));
+  }
+  context.stroke();
+  context.globalAlpha = 1;
+}

@@ -1,0 +1,149 @@
+/** Responses and parameters of the HTTP API. */
+import type { AckStatus, Reason } from "../mqtt/protocol.generated";
+import type {
+  Person,
+  Role
+} from "./sharing";
+
+export interface Account {
+  id: string;
+  name: string;
+  session: string;
+}
+
+/** How one may sign in here; `oidc`: at an OpenID Connect provider. */
+export interface SignInMethods {
+  password: boolean;
+  oidc: { name: string; url: string } | null;
+}
+
+export interface SignInSession {
+  id: string;
+  method: "link" | "password" | "oidc";
+  created_at: string;
+  address: string;
+  program: string;
+  mine: boolean;
+}
+
+/** Somebody asks for control. `ended`: the lease that it asked for has ended otherwise. */
+export interface ControlRequestInfo {
+  id: string;
+  requester: string;
+  epoch: number;
+  mine: boolean;
+  requested_at: string;
+  expires_at: string;
+  outcome: "open" | "accepted" | "rejected" | "withdrawn" | "expired" | "ended";
+}
+
+export interface Lease {
+  holder: string;
+  epoch: number;
+  expires_at: string;
+  mine: boolean;
+  /** Why it was taken from somebody else. */
+  reason?: string;
+  /** The open one. */
+  request?: ControlRequestInfo | null;
+}
+
+/** Somebody else who looks at a device. `mine`: this very account, signed in elsewhere. */
+export interface Watcher {
+  name: string;
+  role: Role;
+  mine: boolean;
+  since: string;
+}
+
+export interface Device {
+  id: string;
+  name: string;
+  label: string;
+  kind: string;
+  robot_type: string;
+  agent: string;
+  space: string;
+  /** What this account may do with it. A viewer watches, and changes nothing. */
+  role: Role;
+  owner: Person;
+  topic: string;
+  online: boolean;
+  last_seen_at: string | null;
+  lease: Lease | null;
+}
+
+export interface GrantedLease {
+  epoch: number;
+  holder: string;
+  expires_at: string;
+  lease_ms: number;
+  confirmed: boolean;
+}
+
+export type ActionStatus = AckStatus | "queued" | "created" | "published";
+
+export interface Action {
+  id: string;
+  device: string;
+  status: ActionStatus;
+  epoch: number;
+  caller: string;
+  reason: Reason | null;
+  progress: number | null;
+  output: string;
+  result: Record<string, unknown>;
+}
+
+/** Times of one kind, each measured on this page's clock alone. */
+export interface LatencyBatch {
+  transport: "websocket" | "http";
+  path: "operator-device" | "operator-cloud";
+  samples: readonly { at_ms: number; ms: number }[];
+}
+
+/** A captured file. */
+export interface Upload {
+  id: string;
+  stream: string;
+  name: string;
+  at: string;
+  content_type: string;
+  length: number;
+  verified: boolean;
+}
+
+/** A stretch of a stream: of `raw` samples `mean` is the value itself, and there are no others. */
+export interface Series {
+  resolution: string;
+  span_ms: number;
+  at_ms: number[];
+  fields: Record<string, { mean: (number | null)[]; min: (number | null)[]; max: (number | null)[]; last: (number | null)[] }>;
+}
+
+export interface Credentials {
+  client_id: string;
+  username: string;
+  password: string;
+  lifetime_s: number;
+  publish: string[];
+  subscribe: string[];
+  websocket_url: string;
+}
+
+export type Purpose = { purpose: "view" } | { purpose: "control"; device: string; epoch: number };
+
+export interface Space {
+  id: string;
+  name: string;
+  role: Role;
+  owner: Person;
+}
+
+export interface ActionCallOptions {
+  /** Epoch of the lease held here; `null`: the cloud takes a lease for the duration of the action. */
+  epoch: number | null;
+  waitFor?: "started" | "done";
+  /** The device ends the action after this time [ms]. */
+  timeoutMs?: number;
+}

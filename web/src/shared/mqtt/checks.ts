@@ -1,0 +1,87 @@
+/** Checks of untrusted JSON values. A failed check throws MessageError with the path of the value. */
+export const MAX_JOINTS = 128;
+
+/** A message that is not what the contract says; the text names the field. */
+export class MessageError extends Error {
+  override name = "MessageError";
+}
+
+/**
+ * Checks one value; `at` is where it stands and `key` its place there, for the error's text. They are put together only
+ * for what is wrong: of ten robots two hundred messages come a second, each with a hundred numbers.
+ */
+export type Check<T> = (value: unknown, at: string, key?: string | number) => T;
+
+export function place(at: string, key?: string | number): string {
+  if (key === undefined) return at;
+  return typeof key === "number" ? `${at}[${key}]` : `${at}.${key}`;
+}
+
+export function fail(at: string, wanted: string, key?: string | number): never {
+  throw new MessageError(`${place(at, key)} is not ${wanted}`);
+}
+
+export const number: Check<number> = (value, at, key) =>
+  typeof value === "number" && Number.isFinite(value) ? value : fail(at, "a finite number", key);
+
+export const count: Check<number> = (value, at, key) =>
+  Number.isSafeInteger(value) && (value as number) >= 0 ? (value as number) : fail(at, "a whole number from 0", key);
+
+export const text: Check<string> = (value, at, key) => (typeof value === "string" ? value : fail(at, "text", key));
+
+export const flag: Check<boolean> = (value, at, key) => (typeof value === "boolean" ? value : fail(at, "true or false", key));
+
+export const anything: Check<Record<string, unknown>> = (value, at, key) =>
+  typeof value === "object" && value !== null && !Array.isArray(value)
+    ? (value as Record<string, unknown>)
+    : fail(at, "an object", key);
+
+export function oneOf<const T extends string>(...names: T[]): Check<T> {
+  return (value, at, key) => {
+    const found = names.find((name) => name === value);
+    return found ?? fail(at, `one of ${names.join(", ")}`, key);
+  };
+}
+
+export function list<T>(item: Check<T>, longest: number): Check<T[]> {
+  return (value, at, key) => {
+    if (!Array.isArray(value) || value.length > longest) fail(at, `a list of at most ${longest}`, key);
+    const here = place(at, key);
+    return value.map((entry, index) => item(entry, here, index));
+  };
+}
+
+/** Numbers by name, of which none is taken for a part of what every object has. */
+export const byName: Check<Record<string, number>> = (value, at, key) => {
+  const entries = Object.entries(anything(value, at, key));
+  if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} numbers`, key);
+  const here = place(at, key);
+  return Object.fromEntries(entries.map(([name, entry]) => [name, number(entry, here, name)]));
+};
+
+export function numbers<T extends number[]>(length: T["length"]): Check<T> {
+  return (value, at, key) => {
+    if (!Array.isArray(value) || value.length !== length) fail(at, `${length} numbers`, key);
+    const here = place(at, key);
+    return value.map((entry, index) => number(entry, here, index)) as T;
+  };
+}
+
+export function optional<T>(check: Check<T>, otherwise: T): Check<T> {
+  return (value, at, key) => (value === undefined ? otherwise : check(value, at, key));
+}
+
+export function nullable<T>(check: Check<T>): Check<T | null> {
+  return (value, at, key) => (value === undefined || value === null ? null : check(value, at, key));
+}
+
+type Fields<T> = { [K in keyof T]-?: Check<T[K]> };
+
+export function object<T extends object>(fields: Fields<T>): Check<T> {
+  const entries = Object.entries<Check<unknown>>(fields as Record<string, Check<unknown>>);
+  return (value, at, key) => {
+    const given = anything(value, at, key);
+    const here = place(at, key);
+    return Object.fromEntries(entries.map(([name, check]) => [name, check(given[name], here, name)])) as T;
+  };
+}
