@@ -1,4 +1,4 @@
-"""Who may do what, by ownership, by shares and by what a key allows: every combination."""
+"""Permissions by ownership, shares and API keys, in all combinations."""
 
 import itertools
 
@@ -25,12 +25,12 @@ def share(on: str, role: Role, **more: object) -> Share:
     return Share(on=on, role=role, **{**fields, **more})  # type: ignore[arg-type]
 
 
-def role(*shares: Share, who: Identity = BERT, agent: Agent = AGENT, now_ms: int = NOW_MS) -> Role | None:
-    found = access.permissions(who, agent, "arm", shares, now_ms)
-    return None if found is None else found.role
+def role(*shares: Share, caller: Identity = BERT, agent: Agent = AGENT, now_ms: int = NOW_MS) -> Role | None:
+    result = access.permissions(caller, agent, "arm", shares, now_ms)
+    return None if result is None else result.role
 
 
-def test_the_owner_needs_no_share_and_nobody_else_has_a_part_without_one() -> None:
+def test_only_the_owner_has_access_without_a_share() -> None:
     assert access.permissions(Identity("anna", "anna", "s"), AGENT, "arm", (), NOW_MS) == OWNER_PERMISSIONS
     assert role() is None
 
@@ -38,11 +38,11 @@ def test_the_owner_needs_no_share_and_nobody_else_has_a_part_without_one() -> No
 @pytest.mark.parametrize(
     ("of_device", "of_space"), list(itertools.product((None, Role.VIEWER, Role.OPERATOR), repeat=2))
 )
-def test_the_higher_of_both_shares_counts(of_device: Role | None, of_space: Role | None) -> None:
+def test_the_highest_share_counts(of_device: Role | None, of_space: Role | None) -> None:
     shares = [share(on, each) for on, each in ((DEVICE, of_device), (SPACE, of_space)) if each is not None]
-    found = access.permissions(BERT, AGENT, "arm", shares, NOW_MS)
-    assert RANK[found.role if found else None] == max(RANK[of_device], RANK[of_space])
-    assert (found.space if found else None) == of_space
+    result = access.permissions(BERT, AGENT, "arm", shares, NOW_MS)
+    assert RANK[result.role if result else None] == max(RANK[of_device], RANK[of_space])
+    assert (result.space if result else None) == of_space
 
 
 @pytest.mark.parametrize(
@@ -59,17 +59,17 @@ def test_the_higher_of_both_shares_counts(of_device: Role | None, of_space: Role
         share("space:attic", Role.OPERATOR, pairing="p1"),
     ],
 )
-def test_what_is_over_of_another_or_for_another_counts_for_nothing(dead: Share) -> None:
+def test_expired_and_foreign_shares_are_ignored(dead: Share) -> None:
     assert role(dead) is None
 
 
-def test_a_share_counts_until_the_very_moment_of_its_end() -> None:
+def test_a_share_is_valid_until_its_expiry() -> None:
     lasting = share(DEVICE, Role.OPERATOR, expires_ms=NOW_MS)
     assert role(lasting, now_ms=NOW_MS - 1) is Role.OPERATOR
     assert role(lasting, share(SPACE, Role.VIEWER)) is Role.VIEWER
 
 
-def test_the_end_that_is_told_is_that_of_the_role_that_counts() -> None:
+def test_the_expiry_is_that_of_the_effective_role() -> None:
     shares = [share(DEVICE, Role.OPERATOR, expires_ms=5_000), share(SPACE, Role.VIEWER, expires_ms=9_000)]
     assert access.permissions(BERT, AGENT, "arm", shares, NOW_MS) == Permissions(Role.OPERATOR, 5_000, Role.VIEWER)
     equal = [share(DEVICE, Role.VIEWER, expires_ms=5_000), share(SPACE, Role.VIEWER)]
@@ -88,19 +88,19 @@ def test_the_end_that_is_told_is_that_of_the_role_that_counts() -> None:
         (Role.OWNER, ("aaaaaaaaaa-leg", "space:attic"), None),
     ],
 )
-def test_a_key_caps_the_role_and_keeps_to_its_devices(most: Role, only: tuple[str, ...], expected: Role | None) -> None:
-    who = Identity("bert", "app", "k", key="k", most=most, only=only)
-    assert role(share(SPACE, Role.OPERATOR), who=who) is expected
+def test_a_key_limits_role_and_devices(most: Role, only: tuple[str, ...], expected: Role | None) -> None:
+    caller = Identity("bert", "app", "k", key="k", most=most, only=only)
+    assert role(share(SPACE, Role.OPERATOR), caller=caller) is expected
 
 
-def test_a_key_for_one_device_has_no_part_in_the_space_around_it() -> None:
-    who = Identity("anna", "app", "k", key="k", only=("aaaaaaaaaa-arm",))
-    assert access.permissions(who, AGENT, "arm", (), NOW_MS) == Permissions(Role.OWNER, NEVER_MS, None)
+def test_a_key_for_one_device_has_no_role_in_its_space() -> None:
+    caller = Identity("anna", "app", "k", key="k", only=("aaaaaaaaaa-arm",))
+    assert access.permissions(caller, AGENT, "arm", (), NOW_MS) == Permissions(Role.OWNER, NEVER_MS, None)
 
 
-def test_an_agent_that_nobody_has_claimed_has_no_roles() -> None:
-    nobodys = Agent("aaaaaaaaaa", "lab", "", "", (SPEC,), 0)
-    assert role(share(DEVICE, Role.OPERATOR), share("space:", Role.OPERATOR), agent=nobodys) is None
+def test_an_unclaimed_agent_has_no_roles() -> None:
+    unclaimed = Agent("aaaaaaaaaa", "lab", "", "", (SPEC,), 0)
+    assert role(share(DEVICE, Role.OPERATOR), share("space:", Role.OPERATOR), agent=unclaimed) is None
 
 
 def test_ownership_cannot_be_shared() -> None:
