@@ -45,29 +45,12 @@ def test_ids_do_not_repeat() -> None:
     assert all(re.fullmatch("[a-z2-7]{16}", ids.new_id()) for _ in range(100))
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "-",
-        AGENT,
-        f"{AGENT}-",
-        "-arm",
-        "short-arm",
-        f"{AGENT}x-arm",
-        f"{AGENT}-a/b",
-        f"{AGENT}-a b",
-        f"{AGENT}-ärm",
-        f"{AGENT}-" + "x" * 33,
-        "äbcdefgh23-arm",
-        "abcdefgh2٣-arm",
-        f"{AGENT}-arm\n",
-        f"{AGENT}-\x00",
-    ],
-)
-def test_invalid_device_ids_are_rejected(text: str) -> None:
-    assert ids.split_device(text) is None
-    assert ids.split_command(f"{text}-{'0' * 20}") is None
+@pytest.mark.parametrize("agent", ["", AGENT[:-1], f"{AGENT}x", "äbcdefgh23", "abcdefgh2٣", AGENT])
+@pytest.mark.parametrize("name", ["", "a/b", "a b", "ärm", "x" * 33, "arm\n", "\x00"])
+def test_invalid_device_ids_are_rejected(agent: str, name: str) -> None:
+    for text in (f"{agent}-{name}", agent, "-arm", "short-arm"):
+        assert ids.split_device(text) is None
+        assert ids.split_command(f"{text}-{'0' * 20}") is None
 
 
 @pytest.mark.parametrize("suffix", ["", "0" * 19, "0" * 21, "0" * 19 + "/", "0" * 19 + " "])

@@ -1,4 +1,4 @@
-"""How often somebody may ask, by the rule and by HTTP."""
+"""Rate limits: the algorithm, and its use by the HTTP API."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +42,7 @@ def test_after_the_wait_that_is_told_it_is_let_through() -> None:
     assert request(RATE, arrival_ms, now_ms + wait_ms)[1] == 0
 
 
-def test_a_clock_that_jumps_back_locks_nobody_out_for_long() -> None:
+def test_a_clock_that_jumps_back_delays_one_request_only() -> None:
     arrival_ms, _ = request(RATE, 0.0, 2e12)
     _, wait_ms = request(RATE, arrival_ms, 1e12)
     assert wait_ms <= 100
@@ -84,7 +84,7 @@ def test_too_many_requests_of_an_account_wait_but_stop_never_does(tmp_path: Path
         assert anna.get("/accounts/me").status_code == 200
 
 
-def test_an_address_is_counted_before_anybody_is_known_and_agents_each_for_itself(tmp_path: Path) -> None:
+def test_addresses_are_counted_before_authentication(tmp_path: Path) -> None:
     with Cloud(replace(settings(tmp_path), rate_limits=RateLimits(address=1, agent=1, account=0, key=0))) as cloud:
         here, there = cloud.client(address="192.0.2.1"), cloud.client(address="192.0.2.2")
         for _ in range(BURST_S):

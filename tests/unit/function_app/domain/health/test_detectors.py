@@ -1,4 +1,4 @@
-"""Detectors: as early as promised, silent about the healthy, equal to ``river`` where it has the same."""
+"""Detectors report early, stay silent on healthy data, and match ``river``."""
 
 import json
 import math
@@ -60,7 +60,7 @@ def steady(level: float, count: int, *, start_ms: int = 1_700_000_000_000, noise
 
 
 class TestEarly:
-    """What goes wrong is told before it is wrong."""
+    """Faults are reported before damage."""
 
     @pytest.mark.parametrize("seed", range(3))
     @pytest.mark.parametrize(("per_minute_c", "before_min"), [(0.2, 40), (0.5, 35), (1.0, 20), (2.0, 10)])
@@ -124,7 +124,7 @@ class TestEarly:
 
 
 class TestSilent:
-    """What is well is not told."""
+    """Healthy data are not reported."""
 
     @pytest.mark.parametrize("seed", range(2))
     @pytest.mark.parametrize(("rise_c", "settle_s"), [(0.0, 600.0), (5.0, 600.0), (10.0, 600.0), (15.0, 900.0)])
@@ -141,7 +141,7 @@ class TestSilent:
         assert life(windows(truth, hours=240, seed=1))[1] == []
 
     @pytest.mark.parametrize("noise", [0.01, 1.0, 50.0])
-    def test_noise_alone_is_nothing_whatever_its_size(self, noise: float) -> None:
+    def test_noise_of_any_size_is_not_reported(self, noise: float) -> None:
         assert life(steady(100.0, 8_640, noise=noise), NOTHING)[1] == []
 
     @pytest.mark.parametrize("level", [0.0, 35.0, -1e12, 1e12, 1e300, 5e-324])
@@ -190,7 +190,7 @@ class TestSilent:
 
 
 class TestAgainstRiver:
-    """The same algorithms from another hand."""
+    """Comparison with the implementations of river."""
 
     @pytest.mark.parametrize(("delta", "threshold"), [(0.005, 50.0), (0.5, 15.0), (2.0, 60.0)])
     @pytest.mark.parametrize("seed", range(4))
@@ -291,7 +291,7 @@ def test_the_room_to_the_nearest_limit() -> None:
 
 
 class TestTrend:
-    """Where the last minutes lead."""
+    """Extrapolation of the last minutes."""
 
     def test_what_comes_to_rest_below_the_limit_never_meets_it(self) -> None:
         minutes = [35 + 25 * -math.expm1(-number / 15) for number in range(20)]
@@ -308,14 +308,14 @@ class TestTrend:
         assert found.limit_in_s == pytest.approx(meets_s, rel=0.1)
 
     def test_only_what_has_lasted_is_proven(self) -> None:
-        begun = trend(
+        recent = trend(
             [34.5 + 0.05 * number for number in range(10)] + [35.0 + number for number in range(1, 11)], JOINT
         )
         lasting = trend([35.0 + number for number in range(20)], JOINT)
-        assert begun is not None
+        assert recent is not None
         assert lasting is not None
-        assert begun.limit_in_s == pytest.approx(35 * 60)
-        assert (begun.proven, lasting.proven) == (False, True)
+        assert recent.limit_in_s == pytest.approx(35 * 60)
+        assert (recent.proven, lasting.proven) == (False, True)
 
     def test_too_few_minutes_and_noise_lead_nowhere(self) -> None:
         assert trend([35.0] * 9, JOINT) is None

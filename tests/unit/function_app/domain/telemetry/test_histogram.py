@@ -1,4 +1,4 @@
-"""Quantiles within the promised error, and the whole equal to its parts, whatever the parts."""
+"""Quantiles stay within the documented error; merging equals recording all samples."""
 
 import math
 import random
@@ -67,7 +67,7 @@ def test_bins_hold_every_sample_and_the_mean_has_no_error() -> None:
     assert histogram.mean_ms == pytest.approx(sum(values) / len(values))
 
 
-def test_nothing_is_nothing() -> None:
+def test_an_empty_histogram() -> None:
     assert merge([]) == of([]) == Histogram()
     assert Histogram().mean_ms == 0
     with pytest.raises(ValueError, match="no samples"):
@@ -75,6 +75,6 @@ def test_nothing_is_nothing() -> None:
 
 
 @pytest.mark.parametrize("value", [-0.1, LONGEST_MS * 2, math.inf, math.nan])
-def test_what_is_no_time_is_refused(value: float) -> None:
+def test_invalid_times_are_rejected(value: float) -> None:
     with pytest.raises(ValueError, match="a time is"):
         of([1.0, value])

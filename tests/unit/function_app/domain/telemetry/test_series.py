@@ -45,14 +45,14 @@ def truth(rows: list[tuple[int, dict[str, float]]]) -> dict[int, dict[str, float
 
 
 @given(ROWS)
-def test_of_samples_at_one_time_the_first_counts(rows: list[tuple[int, dict[str, float]]]) -> None:
+def test_the_first_sample_of_a_time_counts(rows: list[tuple[int, dict[str, float]]]) -> None:
     samples = series.from_rows(rows)
     assert rows_of(samples) == truth(rows)
     assert list(samples.at_ms) == sorted(set(samples.at_ms))
 
 
 @given(ROWS)
-def test_what_is_packed_comes_out_as_it_was(rows: list[tuple[int, dict[str, float]]]) -> None:
+def test_unpacking_reverses_packing(rows: list[tuple[int, dict[str, float]]]) -> None:
     samples = series.from_rows(rows)
     packed = json.loads(json.dumps(series.pack(samples)))
     assert rows_of(series.unpack(packed)) == rows_of(samples)
@@ -80,7 +80,7 @@ def test_windows_hold_every_sample_once(rows: list[tuple[int, dict[str, float]]]
 
 
 @given(ROWS, st.randoms(use_true_random=False))
-def test_a_bucket_is_what_its_samples_are_in_whatever_order_they_came(
+def test_a_bucket_does_not_depend_on_the_sample_order(
     rows: list[tuple[int, dict[str, float]]], chance: random.Random
 ) -> None:
     samples = series.from_rows(rows)
@@ -102,7 +102,7 @@ def test_a_bucket_is_what_its_samples_are_in_whatever_order_they_came(
 
 
 @pytest.mark.parametrize("fields", [1, 2, 18, 128, 256])
-def test_a_full_window_fits_into_a_row_however_badly_it_compresses(fields: int) -> None:
+def test_a_full_incompressible_window_fits_into_a_row(fields: int) -> None:
     chance = random.Random(5)  # noqa: S311 (the same noise each time)
     times = sorted(chance.sample(range(WINDOW_MS), 9_000))
     names = [f"{'x' * 76}{number:03d}" for number in range(fields)]
@@ -136,7 +136,7 @@ def test_the_finest_buckets_that_fit_are_chosen(hours: int, points: int, level: 
     assert series.finest_level(first_ms, NOW_MS, points=points, now_ms=NOW_MS, keep=RetentionPolicy()).name == level
 
 
-def test_buckets_that_are_forgotten_already_are_not_chosen() -> None:
+def test_deleted_levels_are_not_chosen() -> None:
     first_ms = NOW_MS - 20 * DAY.span_ms
     last_ms = first_ms + 600_000
     assert series.finest_level(first_ms, last_ms, points=500, now_ms=first_ms, keep=RetentionPolicy()) == FINEST

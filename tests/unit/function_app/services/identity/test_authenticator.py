@@ -1,4 +1,4 @@
-"""A process remembers tokens for as long as that saves it anything: many sign-ins must not fill its memory."""
+"""The token cache is bounded: expired checks are removed."""
 
 import asyncio
 from pathlib import Path
@@ -12,7 +12,7 @@ from function_app.services.identity.authenticator import API, RECHECK_MS
 from tests.fakes.clock import MovingClock
 
 
-def test_what_would_be_checked_again_anyway_is_not_kept(tmp_path: Path) -> None:
+def test_tokens_due_for_a_check_are_not_cached(tmp_path: Path) -> None:
     asyncio.run(_kept(tmp_path))
 
 

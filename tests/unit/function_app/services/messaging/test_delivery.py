@@ -1,4 +1,4 @@
-"""Waiting for a device's answer ends when its time is over, whatever else happens in that moment."""
+"""Waiting for an ack ends at its time limit, also during concurrent mailbox changes."""
 
 import asyncio
 import math
@@ -48,6 +48,6 @@ async def confirmed(folder: Path, wait_ms: int) -> bool:
         await tables.close()
 
 
-def test_a_wait_ends_in_the_moment_in_which_something_else_happens(tmp_path: Path) -> None:
+def test_a_wait_ends_at_its_limit_during_a_concurrent_change(tmp_path: Path) -> None:
     assert asyncio.run(confirmed(tmp_path, 0)) is False
     assert asyncio.run(confirmed(tmp_path, 30)) is False

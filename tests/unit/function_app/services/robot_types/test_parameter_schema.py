@@ -1,4 +1,4 @@
-"""Which schemas a movement may have, and which parameters fit them."""
+"""Valid parameter schemas, and the parameters that they accept."""
 
 import json
 from collections.abc import Callable
@@ -45,7 +45,7 @@ JSON = st.recursive(
 
 
 def outcome(call: Callable[[], Any]) -> tuple[Any, Problem | None]:
-    """What it gives, or how it refuses."""
+    """The result, or the problem."""
     try:
         return call(), None
     except Problem as problem:
@@ -53,9 +53,7 @@ def outcome(call: Callable[[], Any]) -> tuple[Any, Problem | None]:
 
 
 @given(SCHEMAS, st.dictionaries(st.text(min_size=1, max_size=3), JSON, max_size=4))
-def test_what_passes_fits_the_schema_as_any_other_validator_reads_it(
-    properties: dict[str, Any], asked: dict[str, Any]
-) -> None:
+def test_accepted_parameters_are_valid_for_other_validators(properties: dict[str, Any], asked: dict[str, Any]) -> None:
     schema = parameter_schema.plain(parameter_schema.of_properties(properties))
     jsonschema.Draft202012Validator.check_schema(schema)
     filled, refused = outcome(lambda: parameter_schema.fit(schema, asked))
@@ -97,7 +95,7 @@ def test_any_json_is_a_schema_or_is_refused(given_: Any) -> None:
         (1, "object"),
     ],
 )
-def test_a_schema_that_cannot_be_used_is_refused_in_words_that_help(schema: Any, words: str) -> None:
+def test_invalid_schemas_are_rejected_with_the_reason(schema: Any, words: str) -> None:
     with pytest.raises(Problem) as refused:
         parameter_schema.of_properties({"a": schema})
     assert refused.value.code == "schema-invalid"
@@ -166,7 +164,7 @@ def test_parameters_have_a_size_defaults_included(schema: str | None, spare: int
         "dict(a=1)",
     ],
 )
-def test_what_a_script_computes_is_no_schema(value: str) -> None:
+def test_computed_schemas_are_rejected(value: str) -> None:
     with pytest.raises(Problem) as refused:
         read_script(f"\nPARAMETERS = {value}\n")
     assert refused.value.code == "movement-invalid"

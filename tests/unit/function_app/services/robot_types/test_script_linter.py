@@ -1,4 +1,4 @@
-"""What is wrong with a script is found without running it, and where; what is right is left alone."""
+"""The linter finds errors with their place without running the script."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def marks(source: str, kind: robot_type.RobotType = UR5) -> tuple[LintMessage, .
 @pytest.mark.parametrize(
     "path", sorted(ROBOTS.glob("*/movements/*.py")), ids=lambda path: f"{path.parts[-3]}/{path.stem}"
 )
-def test_nothing_is_wrong_with_what_comes_with_the_robots(path: Path) -> None:
+def test_shipped_movements_have_no_messages(path: Path) -> None:
     checked = check_script(path.read_text(), robot_type.load(path.parents[1]))
     assert checked.marks == ()
     assert checked.script is not None
@@ -31,7 +31,7 @@ def test_nothing_is_wrong_with_what_comes_with_the_robots(path: Path) -> None:
     ("source", "severity", "where", "said"),
     [
         ("robot.home()\nwait(\n", "error", (2, 4), "never closed"),
-        ("PARAMETERS = {'speed': 1 + len('x')}\n", "error", (1, 0), "plain dictionary"),
+        ("PARAMETERS = {'speed': 1 + len('x')}\n", "error", (1, 0), "literal dictionary"),
         ("PARAMETERS = {'speed': {'type': 'colour'}}\n", "error", (1, 0), "speed"),
         ("robot.hom()\n", "warning", (1, 0), "there are move_joints"),
         ("robot.move_joints({'elbow': 1, 'elbw': 1})\n", "warning", (1, 31), "no joint 'elbw'"),
@@ -46,7 +46,7 @@ def test_nothing_is_wrong_with_what_comes_with_the_robots(path: Path) -> None:
         ("'ü'; wiat(1)\n", "warning", (1, 5), "no 'wiat'"),
     ],
 )
-def test_what_is_wrong_is_marked_at_its_place(source: str, severity: str, where: tuple[int, int], said: str) -> None:
+def test_errors_are_reported_at_their_place(source: str, severity: str, where: tuple[int, int], said: str) -> None:
     (mark,) = marks(source)
     assert (mark.severity, (mark.line, mark.column)) == (severity, where), mark
     assert said in mark.message
@@ -66,7 +66,7 @@ def test_what_is_wrong_is_marked_at_its_place(source: str, severity: str, where:
         "def f():\n    global later\n    later = 1\nprint(later)\nimport numpy.linalg as la\nprint(la)\n",
     ],
 )
-def test_what_may_be_right_is_not_marked(source: str) -> None:
+def test_possibly_valid_code_has_no_message(source: str) -> None:
     assert marks(source) == ()
 
 
@@ -82,10 +82,10 @@ def test_a_wrong_indent_is_marked_in_its_line() -> None:
 
 
 @pytest.mark.parametrize("source", ["", "(" * 30_000, "a." * 30_000 + "b", "x" * 100_000, "x\x00"])
-def test_whatever_it_is_there_is_an_answer(source: str) -> None:
+def test_every_input_has_a_result(source: str) -> None:
     checked = check_script(source, UR5)
     assert checked.script is not None or checked.marks[0].severity == "error"
 
 
-def test_the_document_is_what_scripts_are_given() -> None:
+def test_the_document_equals_the_script_api() -> None:
     assert script_api() == document()
