@@ -120,7 +120,6 @@ class Client:
         return self
 
     def subscribe(self, *filters: str, qos: int = 1) -> list[int]:
-        """Subscribe; returns the codes of the SUBACK."""
         _, mid = self.paho.subscribe([(each, qos) for each in filters])
         assert mid is not None
         wait_until(lambda: mid in self._granted or self.disconnected.is_set(), "a SUBACK")
@@ -131,7 +130,6 @@ class Client:
         return self.paho.publish(topic, payload, qos, retain).mid
 
     def publish_acknowledged(self, topic: str, payload: bytes | str = b"", *, retain: bool = False) -> None:
-        """Publish at QoS 1 and wait for the acknowledgement."""
         mid = self.publish(topic, payload, retain=retain)
         wait_until(lambda: mid in self._acknowledged, f"a PUBACK for {topic}")
 
@@ -145,7 +143,6 @@ class Client:
             raise AssertionError(f"{self.client_id} received nothing in {timeout_s} s") from None
 
     def pending(self) -> list[Message]:
-        """All pending messages."""
         messages = []
         with contextlib.suppress(queue.Empty):
             while True:
@@ -248,7 +245,6 @@ class RunningBroker:
         raise AssertionError(f"{client_id} could not connect in {lifetime_s} s")
 
     def expire(self) -> None:
-        """Run the functions' expiry timer."""
         self.run(self.access.expire(time.time()))
 
     def connect(self, client_id: str, credentials: Credentials | None, **options: Any) -> Client:
@@ -282,7 +278,6 @@ class RunningBroker:
         return self.process.wait(PATIENCE_S)
 
     def kill(self) -> None:
-        """Kill the broker."""
         self.process.kill()
         self.process.wait(PATIENCE_S)
 
