@@ -70,7 +70,7 @@ class Resident:
         self.lost_s: list[float] = []
         driver: Any = self.device._driver
         controller: Any = self.device._controller
-        send, lost = driver.send, controller.lost
+        send, lost = driver.send, controller.interrupt
 
         def noting_send(position_rad: Sequence[float], *more: Any) -> Any:
             self.sent.append((time.monotonic(), tuple(position_rad)))
@@ -88,7 +88,7 @@ class Resident:
             changed(up)
             self.links.append(up)
 
-        driver.send, controller.lost, agent._link_changed = noting_send, noting_lost, noting_change
+        driver.send, controller.interrupt, agent._link_changed = noting_send, noting_lost, noting_change
         self.cell.start()
         self.online()
 
