@@ -168,7 +168,7 @@ def test_it_runs_unprivileged_and_ends_on_a_signal(ground: Ground, folder: Path)
         assert code == 0, said
         assert said["user"].startswith("ok")
         assert said["scripts"].startswith(("ok", "warning"))
-        assert "not disturbed" in said["link"]
+        assert "not tested" in said["link"]
 
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 0
