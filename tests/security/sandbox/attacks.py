@@ -15,16 +15,13 @@ def call(name, *arguments):
     kinds = {int: c_long, bytes: c_char_p}
     given = [kinds.get(type(each), lambda known: known)(each) for each in arguments]
     return libc.syscall(c_long(P["numbers"][name]), *given)
-def breach(what=""):
-    print("BREACH", what, flush=True)
+def breach(what=""): print("BREACH", what, flush=True)
 def worked(result):
-    if result >= 0:
-        breach(result)
+    if result >= 0: breach(result)
 def tries(what, *arguments):
     try:
         result = what(*arguments)
-    except OSError:
-        return None
+    except OSError: return None
     breach(result)
     return result
 AT_FDCWD = -100
@@ -38,9 +35,7 @@ FILES = {
     "reads_the_agents_key_by_openat2": """
         how = (c_uint64 * 3)(0, 0, 0)
         worked(call('openat2', AT_FDCWD, P['key'].encode(), byref(how), 24))""",
-    "reads_the_agents_key_through_a_path_descriptor": """
-        place = call('openat', AT_FDCWD, P['home'].encode(), 0o10200000, 0)
-        worked(place)""",
+    "reads_the_agents_key_by_a_path_descriptor": "worked(call('openat', AT_FDCWD, P['home'].encode(), 0o10200000, 0))",
     "reads_the_passwords": "tries(lambda: open('/etc/passwd').read())",
     "reads_the_shadow_passwords": "worked(call('openat', AT_FDCWD, b'/etc/shadow', 0, 0))",
     "reads_the_agents_environment": """
@@ -394,10 +389,7 @@ LIES = {
 }
 
 GROUPS = {
-    "files": FILES,
-    "network": NETWORK,
-    "processes": PROCESSES,
-    "privileges": PRIVILEGES,
+    "files": FILES, "network": NETWORK, "processes": PROCESSES, "privileges": PRIVILEGES,  # fmt: skip
     "kernel": KERNEL,
     "descriptors": DESCRIPTORS,
     "code": CODE,
