@@ -389,11 +389,11 @@ LIES = {
 }
 
 GROUPS = {
-    "files": FILES, "network": NETWORK, "processes": PROCESSES, "privileges": PRIVILEGES,  # fmt: skip
+    "files": FILES, "network": NETWORK, "processes": PROCESSES, "privileges": PRIVILEGES,
     "kernel": KERNEL,
     "descriptors": DESCRIPTORS,
     "code": CODE,
     "exhaustion": EXHAUSTION,
     "lies": LIES,
-}
+}  # fmt: skip
 ATTACKS = {name: PRELUDE + dedent(source) for group in GROUPS.values() for name, source in group.items()}
