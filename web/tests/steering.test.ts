@@ -1,6 +1,6 @@
 import { describe, expect, it } from "vitest";
 import { DEAD_ZONE, readPad, type Pad } from "../src/features/steering/model/gamepad-mapping";
-import { HeldInputs } from "../src/features/steering/model/held-inputs";
+import { PressedInputs } from "../src/features/steering/model/pressed-inputs";
 import { DRIVE_KEYS, JOG_KEYS, jointOfKey } from "../src/features/steering/model/keymap";
 import type { KnownDescription } from "../src/shared/mqtt/parse-messages";
 import { direction, driveOf, jogOf, pushed, restOf, sumOf, steeringModesOf } from "../src/features/steering/model/steerable-parts";
@@ -42,9 +42,9 @@ describe("the ways to steer", () => {
 });
 
 describe("what is held", () => {
-  const made = (): [HeldInputs<number>, (readonly number[])[]] => {
+  const made = (): [PressedInputs<number>, (readonly number[])[]] => {
     const told: (readonly number[])[] = [];
-    return [new HeldInputs<number>((parts) => told.push(parts)), told];
+    return [new PressedInputs<number>((parts) => told.push(parts)), told];
   };
 
   it("is the sum of all that is pressed, and nothing when the last is let go", () => {

@@ -7,10 +7,10 @@ import { JOG_KEYS } from "./model/keymap";
 import { direction, jogOf, sumOf, type Direction } from "./model/steerable-parts";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { useGamepadInputs } from "./use-gamepad";
-import { useHeldInputs } from "./use-held-inputs";
-import { HoldButton } from "./hold-button";
-import { useHeldKeys } from "./keyboard-help";
+import { useGamepadInputs } from "./inputs/use-gamepad";
+import { usePressedInputs } from "./inputs/use-pressed-inputs";
+import { HoldButton } from "./inputs/hold-button";
+import { useHeldKeys } from "./inputs/keyboard-help";
 import type { PanelProps } from "./panel-props";
 import { NumberWithUnit } from "../../shared/ui/number-with-unit";
 
@@ -33,7 +33,7 @@ export function CartesianPanel({ device, streamer, active, pad }: PanelProps) {
   const [angular, setAngular] = useState(ANGULAR_DEG_S.first);
   const frame = picked !== null && frames.includes(picked) ? picked : (frames.at(-1) ?? "");
   const speed = { linear_m_s: linear / 1000, angular_rad_s: radians(angular) };
-  const held = useHeldInputs<Direction>(streamer, (parts) => jogOf(sumOf(parts), speed, frame, axes === "tool"));
+  const held = usePressedInputs<Direction>(streamer, (parts) => jogOf(sumOf(parts), speed, frame, axes === "tool"));
   useHeldKeys(active && streamer !== null, held, JOG_KEYS);
   useGamepadInputs(pad, held, ({ left, right, lift, cross }): Direction => ({
     along: [left[1], -left[0], lift],

@@ -7,13 +7,13 @@ import { AT_REST, driveOf, pushed, type Push } from "./model/steerable-parts";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { useGamepadInputs } from "./use-gamepad";
-import { useHeldInputs } from "./use-held-inputs";
-import { HoldButton } from "./hold-button";
-import { useHeldKeys } from "./keyboard-help";
+import { useGamepadInputs } from "./inputs/use-gamepad";
+import { usePressedInputs } from "./inputs/use-pressed-inputs";
+import { HoldButton } from "./inputs/hold-button";
+import { useHeldKeys } from "./inputs/keyboard-help";
 import type { PanelProps } from "./panel-props";
 import { NumberWithUnit } from "../../shared/ui/number-with-unit";
-import { VirtualStick } from "./virtual-stick";
+import { VirtualStick } from "./inputs/virtual-stick";
 
 const PERCENT = { least: 5, most: 100, step: 5, first: 50 };
 
@@ -21,7 +21,7 @@ const PERCENT = { least: 5, most: 100, step: 5, first: 50 };
 export function DrivePanel({ device, streamer, active, pad }: PanelProps) {
   const limits = device.description.value?.base ?? { forward_m_s: 0, left_m_s: 0, turn_rad_s: 0 };
   const [percent, setPercent] = useState(PERCENT.first);
-  const held = useHeldInputs<Push>(streamer, (parts) => driveOf(pushed(parts), limits, percent / 100));
+  const held = usePressedInputs<Push>(streamer, (parts) => driveOf(pushed(parts), limits, percent / 100));
   useHeldKeys(active && streamer !== null, held, DRIVE_KEYS);
   useGamepadInputs(pad, held, ({ left, right }) => ({ forward: left[1], turn: -left[0], left: -right[0] }));
   const aside = limits.left_m_s > 0;

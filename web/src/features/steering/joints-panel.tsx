@@ -2,16 +2,16 @@ import type { DeviceStore } from "../devices/model";
 import { effect, type ReadonlySignal, useComputed, useSignalEffect } from "@preact/signals";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { clamp, radians } from "../../shared/lib/angles";
-import { HeldInputs } from "./model/held-inputs";
+import { PressedInputs } from "./model/pressed-inputs";
 import { JOINT_KEYS, jointOfKey } from "./model/keymap";
 import type { KnownTelemetry } from "../../shared/mqtt/parse-messages";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
 import { texts } from "./texts";
 import { useFrameSignal } from "../../shared/hooks/use-frame-signal";
-import { useGamepadInputs } from "./use-gamepad";
+import { useGamepadInputs } from "./inputs/use-gamepad";
 import { JointSlider } from "./joint-slider";
-import { useHeldKeys, useKey } from "./keyboard-help";
+import { useHeldKeys, useKey } from "./inputs/keyboard-help";
 import type { PanelProps } from "./panel-props";
 
 /** How fast a held key moves the target [rad/s], and how far ahead of the joint at most [rad]. */
@@ -114,7 +114,7 @@ function useTurning({ device, streamer, active, pad }: PanelProps, chosen: numbe
   const amount = useRef(0);
   const held = useMemo(
     () =>
-      new HeldInputs<number>((parts) => {
+      new PressedInputs<number>((parts) => {
         amount.current = clamp(
           parts.reduce((sum, part) => sum + part, 0),
           -1,

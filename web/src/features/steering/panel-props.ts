@@ -1,6 +1,6 @@
 import type { DeviceStore } from "../devices/model";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
-import type { PadWatch } from "./use-gamepad";
+import type { PadWatch } from "./inputs/use-gamepad";
 
 /** What each way of steering gets. */
 export interface PanelProps {

@@ -7,10 +7,10 @@ import { steeringModesOf, type SteeringMode } from "./model/steerable-parts";
 import { texts } from "./texts";
 import { BlockedNotice, blockedReason } from "./blocked-notice";
 import { DrivePanel } from "./drive-panel";
-import { useGamepad, type PadNews } from "./use-gamepad";
+import { useGamepad, type PadNews } from "./inputs/use-gamepad";
 import { CartesianPanel } from "./cartesian-panel";
 import { JointsPanel } from "./joints-panel";
-import { KeyboardHelp, useKey } from "./keyboard-help";
+import { KeyboardHelp, useKey } from "./inputs/keyboard-help";
 import type { PanelProps } from "./panel-props";
 import "./steering.css";
 

@@ -2,7 +2,10 @@
  * Reads what arrives from the broker: JSON of the contract's types, every number finite, every list of the length it
  * must have. Unknown fields pass, so that this page still reads a newer robot. Nothing unchecked is ever drawn.
  */
-import { MAX_JOINTS, type Check, MessageError } from "./checks";
+import {
+  MAX_JOINTS, MessageError, anything, byName, count, fail, flag, list, nullable, number, numbers, object, oneOf, optional, place, text,
+  type Check,
+} from "./checks";
 import type { Pose, Quaternion, Vector3 } from "../lib/vectors";
 import type {
   Ack,
@@ -33,7 +36,6 @@ import type {
   Stream,
   TwinJoint,
 } from "./protocol.generated";
-import { place, fail, number, count, text, flag, anything, oneOf, list, byName, numbers, optional, nullable, object } from "./checks";
 
 /** Largest message of the contract [bytes]. */
 const MAX_BYTES = 128 * 1024;

@@ -2,7 +2,7 @@
  * What hands hold at one moment, on pads, sticks, keys and gamepads, each under a name of its own. Whatever ends a
  * stream spends what is held then: it counts for nothing until it has been let go and is pressed anew.
  */
-export class HeldInputs<T> {
+export class PressedInputs<T> {
   readonly #parts = new Map<string, T>();
   readonly #spent = new Set<string>();
   readonly #tell: (parts: readonly T[]) => void;

@@ -1,8 +1,8 @@
 /** Looks at the gamepads of this computer. A browser tells of none until a button of it has been pressed. */
 import { useSignal, useSignalEffect, type ReadonlySignal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
-import { readPad, type PadReading } from "./model/gamepad-mapping";
-import type { HeldInputs } from "./model/held-inputs";
+import { readPad, type PadReading } from "../model/gamepad-mapping";
+import type { PressedInputs } from "../model/pressed-inputs";
 
 /** Not with the page's frames: those wait where drawing is slow, and a button that was let go must not [ms]. */
 const LOOK_EVERY_MS = 20;
@@ -50,7 +50,7 @@ export function useGamepad(active: boolean, onStop: () => void): PadWatch {
 }
 
 /** Hold what a gamepad's sticks say while its dead-man button is held; `null` from `part`: nothing for this panel. */
-export function useGamepadInputs<T>(watch: PadWatch, held: HeldInputs<T>, part: (reading: PadReading) => T): void {
+export function useGamepadInputs<T>(watch: PadWatch, held: PressedInputs<T>, part: (reading: PadReading) => T): void {
   const was = useRef(false);
   const newest = useRef(part);
   newest.current = part;

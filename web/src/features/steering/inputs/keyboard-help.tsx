@@ -1,9 +1,9 @@
 /** The keys that move a robot: what they are, and who hears them. */
 import { signal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
-import type { HeldInputs } from "./model/held-inputs";
-import type { SteeringMode } from "./model/steerable-parts";
-import { texts } from "./texts";
+import type { PressedInputs } from "../model/pressed-inputs";
+import type { SteeringMode } from "../model/steerable-parts";
+import { texts } from "../texts";
 
 const STORED = "telescope-keys";
 /** Whether keys move a robot from anywhere on the page; else only while the focus is on its controls. */
@@ -38,7 +38,7 @@ export function useKey(active: boolean, onKey: (event: KeyboardEvent) => boolean
 }
 
 /** Hold what a key stands for while it is down. A key that comes up is heard wherever the focus has gone. */
-export function useHeldKeys<T>(active: boolean, held: HeldInputs<T>, map: Readonly<Record<string, T>>): void {
+export function useHeldKeys<T>(active: boolean, held: PressedInputs<T>, map: Readonly<Record<string, T>>): void {
   useKey(active, (event) => {
     const part = map[event.code];
     if (part === undefined) return false;

@@ -1,9 +1,9 @@
 import type { ComponentChildren } from "preact";
 import { useEffect } from "preact/hooks";
-import type { HeldInputs } from "./model/held-inputs";
+import type { PressedInputs } from "../model/pressed-inputs";
 
 interface HoldButtonProps<T> {
-  held: HeldInputs<T>;
+  held: PressedInputs<T>;
   name: string;
   part: T;
   label: string;

@@ -1,21 +1,21 @@
 /** Ties what hands hold to a stream: one let-go, whatever kind, ends it. */
 import { effect } from "@preact/signals";
 import { useEffect, useMemo, useRef } from "preact/hooks";
-import { HeldInputs } from "./model/held-inputs";
-import type { SetpointStreamer } from "./model/setpoint-streamer";
-import type { Velocity } from "./model/steerable-parts";
+import { PressedInputs } from "../model/pressed-inputs";
+import type { SetpointStreamer } from "../model/setpoint-streamer";
+import type { Velocity } from "../model/steerable-parts";
 
 /**
  * What is held of a panel, as the velocity that `asked` makes of it.
  *
  * @param streamer There while this page may move the robot.
  */
-export function useHeldInputs<T>(streamer: SetpointStreamer | null, asked: (parts: readonly T[]) => Velocity): HeldInputs<T> {
+export function usePressedInputs<T>(streamer: SetpointStreamer | null, asked: (parts: readonly T[]) => Velocity): PressedInputs<T> {
   const newest = useRef({ streamer, asked });
   newest.current = { streamer, asked };
   const held = useMemo(
     () =>
-      new HeldInputs<T>((parts) => {
+      new PressedInputs<T>((parts) => {
         const { streamer: to, asked: ask } = newest.current;
         if (parts.length === 0) to?.letGo();
         else to?.hold(ask(parts));

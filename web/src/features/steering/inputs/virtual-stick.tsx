@@ -1,15 +1,15 @@
 import { useEffect, useState } from "preact/hooks";
-import { clamp } from "../../shared/lib/angles";
-import type { HeldInputs } from "./model/held-inputs";
-import type { Push } from "./model/steerable-parts";
-import { texts } from "./texts";
+import { clamp } from "../../../shared/lib/angles";
+import type { PressedInputs } from "../model/pressed-inputs";
+import type { Push } from "../model/steerable-parts";
+import { texts } from "../texts";
 
 /** Nearer to the middle than this is the middle. */
 const MIDDLE = 0.1;
 const NAME = "stick";
 
 interface StickProps {
-  held: HeldInputs<Push>;
+  held: PressedInputs<Push>;
   disabled: boolean;
 }
 
