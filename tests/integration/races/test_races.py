@@ -132,7 +132,7 @@ def see_exactly_one_winner(place: Place, rounds: int) -> None:
 
 @pytest.mark.parametrize(("place", "rounds"), [("local", 250), ("azure", 6), ("aws", 5)], indirect=["place"])
 def test_of_eight_processes_exactly_one_gets_it(place: Place, rounds: int) -> None:
-    """At moto one request after the other is answered (``tests/harness/stores/aws.py``): the processes still interleave."""
+    """The processes interleave, although moto answers requests one by one (``tests/harness/stores/aws.py``)."""
     see_exactly_one_winner(place, rounds)
 
 

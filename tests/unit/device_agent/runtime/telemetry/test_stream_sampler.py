@@ -17,7 +17,7 @@ from device_agent.protocol import Measurements, Stream, codec, topics
 from device_agent.runtime.telemetry.stream_sampler import StreamSampler
 from tests.fakes.drivers import FakeDriver, robot_type
 from tests.harness.agent.device_harness import DeviceHarness, eventually
-from tests.unit.device_agent.runtime.actions.test_robot_api import play
+from tests.unit.device_agent.runtime.actions.robot_api_fixture import play
 
 WITHIN_S = 60.0
 JOINTS, SONAR, HEALTH = (Stream(name=name, rate_hz=100.0) for name in ("joints", "sonar", "health"))

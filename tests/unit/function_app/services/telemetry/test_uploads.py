@@ -74,7 +74,8 @@ def test_a_capture_is_uploaded_registered_found_and_deleted(cloud: Cloud, pair: 
 
     done = complete(anna, robot, begun["id"]).json()
     assert complete(anna, robot, begun["id"]).json() == done
-    assert {name: done[name] for name in ("stream", "name", "length", "content_type", "sha256", "verified", "created_by")} == {
+    names = ("stream", "name", "length", "content_type", "sha256", "verified", "created_by")
+    assert {name: done[name] for name in names} == {
         "stream": "camera", "name": "Küche 1.png", "length": len(PICTURE), "content_type": "image/png",
         "sha256": digest, "verified": True, "created_by": "account:anna",
     }  # fmt: skip

@@ -1,0 +1,130 @@
+"""A recording script API, a fake sandbox, and functions that run script actions on them."""
+
+import hashlib
+import socket
+from typing import Any
+
+from device_agent import protocol
+from device_agent.ports import script_calls
+from device_agent.ports.sandbox import Limits, SandboxError, SandboxStatus
+from device_agent.protocol import RunMovement
+from device_agent.runtime.actions.script_action import ScriptAction, ScriptSandbox
+from device_agent.runtime.errors import Refused
+from tests.harness.agent.sandbox import warm_sandbox
+
+
+class RecordingApi:
+    joints = ("shoulder", "elbow")
+    frames = ("tool",)
+    calls = ("move_joints", "home", "state")
+
+    def __init__(self) -> None:
+        self.received: list[Any] = []
+
+    def execute(self, call: script_calls.Call) -> Any:
+        match call:
+            case protocol.MoveJoints(position_rad=position_rad, speed=speed):
+                if "knee" in position_rad:
+                    raise Refused("unknown_joint", "no joint 'knee'")
+                self.received.append((position_rad, speed))
+            case script_calls.AskState():
+                return {"position_rad": {"shoulder": 0.1, "elbow": 0.2}, "mode": "action"}
+            case _:
+                self.received.append(call)
+        return None
+
+
+def ignore_exit() -> None:
+    """Ignore the exit of the process."""
+
+
+class RecordedOutput:
+    def __init__(self) -> None:
+        self.printed = ""
+        self.progress: list[float] = []
+
+    def __call__(self, text: str, share: float | None) -> None:
+        self.printed += text
+        if share is not None:
+            self.progress.append(share)
+
+
+class FakeProcess:
+    """A process with preset messages."""
+
+    def __init__(self, *, exits: bool = True) -> None:
+        self.link, self.theirs = socket.socketpair()
+        self.exits = exits
+        self.killed = False
+
+    def send(self, *lines: bytes) -> None:
+        self.theirs.sendall(b"".join(line + b"\n" for line in lines))
+
+    def kill(self) -> None:
+        self.killed = True
+
+    def wait(self, timeout_s: float) -> bool:
+        del timeout_s
+        return self.exits
+
+    def ending(self) -> str:
+        return "it crashed"
+
+    def close(self) -> None:
+        self.link.close()
+        self.theirs.close()
+
+
+class FakeSandbox:
+    def __init__(self, process: FakeProcess | None) -> None:
+        self.process = process
+
+    def start(self) -> None:
+        pass
+
+    def status(self) -> SandboxStatus:
+        return SandboxStatus("sandboxed")
+
+    def refusal(self, *, untrusted: bool) -> str | None:
+        del untrusted
+        return None
+
+    def open(self, limits: Limits, *, untrusted: bool) -> FakeProcess:
+        del limits, untrusted
+        if self.process is None:
+            raise SandboxError("no process can be started for the script")
+        return self.process
+
+    def close(self) -> None:
+        pass
+
+
+def run_movement(source: str, parameters: dict[str, Any] | None = None) -> RunMovement:
+    digest = hashlib.sha256(source.encode()).hexdigest()
+    return RunMovement(
+        robot_type="toy", name="wave", version=1, sha256=digest, source=source, parameters=parameters or {}
+    )
+
+
+def run(source: str, parameters: dict[str, Any] | None = None) -> tuple[RecordingApi, RecordedOutput]:
+    api, output = RecordingApi(), RecordedOutput()
+    ScriptAction(
+        run_movement(source, parameters),
+        api,
+        output,
+        sandbox=ScriptSandbox(warm_sandbox(), untrusted=False),
+        on_exit=ignore_exit,
+    ).run()
+    return api, output
+
+
+def run_fake(process: FakeProcess) -> RecordedOutput:
+    output = RecordedOutput()
+    ScriptAction(
+        run_movement(""),
+        RecordingApi(),
+        output,
+        sandbox=ScriptSandbox(FakeSandbox(process), untrusted=False),
+        on_exit=ignore_exit,
+    ).run()
+    return output
