@@ -1,6 +1,7 @@
-"""What tests of several folders share."""
+"""Fixtures that tests of several folders share."""
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -9,12 +10,22 @@ from tests.harness.stores.emulators import StoreKind, start_emulator
 
 pytest_plugins = ["tests.fixtures.cloud"]
 
+
+@pytest.fixture(autouse=True)
+def _restore_umask() -> Iterator[None]:
+    """Restores the umask, which ``main`` of the agent sets when a test calls it in this process."""
+    previous = os.umask(0o022)
+    os.umask(previous)
+    yield
+    os.umask(previous)
+
+
 Emulators = Callable[[StoreKind], str]
 
 
 @pytest.fixture(scope="session")
 def emulators() -> Iterator[Emulators]:
-    """The address of what stands in for a cloud's store, started when the first test needs it."""
+    """Starts the emulator of a cloud store on first use and returns its address."""
     running: dict[StoreKind, str] = {}
     with contextlib.ExitStack() as stack:
 
