@@ -22,7 +22,7 @@ from tests.fakes.head_driver import RANGES, head
 
 START = (0.0, 0.0, 0.0, 0.0)
 SHARED = Path(__file__).with_name("timelines.json")
-"""Movements with what becomes of them, also for the page's own reckoning (``web/tests/timeline.test.ts``)."""
+"""Movements and their expected trajectories, shared with ``web/tests/features/keyframes/timeline-layout.test.ts``."""
 
 
 def frame(time_s: float, **position_rad: float) -> Moment:

@@ -1,0 +1,20 @@
+import { readFileSync } from "node:fs";
+import { describe, expect, it } from "vitest";
+
+const read = (name: string): string => readFileSync(new URL(`../../${name}`, import.meta.url), "utf8");
+
+describe("the project", () => {
+  it("has a lock file without addresses, so that any registry serves it (`npm run lock` takes them out)", () => {
+    expect(read("package-lock.json")).not.toContain("http");
+  });
+
+  it("pins every dependency to one version", () => {
+    const { dependencies, devDependencies } = JSON.parse(read("package.json")) as Record<string, Record<string, string>>;
+    for (const version of Object.values({ ...dependencies, ...devDependencies })) expect(version).toMatch(/^\d+\.\d+\.\d+$/);
+  });
+
+  it("has a page without script or style of its own, as the policy demands", () => {
+    const page = read("index.html");
+    expect(page).not.toMatch(/<style|style=|<script(?![^>]*\ssrc=)|\son\w+=/);
+  });
+});

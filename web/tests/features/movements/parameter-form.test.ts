@@ -1,0 +1,99 @@
+import { describe, expect, test } from "vitest";
+import { storedDraft, storedParameters } from "../../../src/shared/lib/local-storage";
+import type { ObjectSchema } from "../../../src/shared/api/movement-library";
+import { fieldsOf, fill, read } from "../../../src/features/movements/model/parameter-form";
+
+const SCHEMA: ObjectSchema = {
+  type: "object",
+  properties: {
+    times: { type: "integer", minimum: 1, maximum: 20, default: 3 },
+    angle_rad: { type: "number", minimum: -Math.PI / 2, maximum: Math.PI / 2, default: 0.5, unit: "rad" },
+    word: { type: "string", minLength: 2, maxLength: 4 },
+    colour: { type: "string", enum: ["red", "green"], default: "green" },
+    loud: { type: "boolean", default: true },
+    place_m: { type: "array", items: { type: "number" }, minItems: 2, maxItems: 3, unit: "m" },
+    more: { type: "object", additionalProperties: true },
+    share: { type: "number", exclusiveMinimum: 0, exclusiveMaximum: 1, default: 0.5 },
+  },
+  required: ["word"],
+};
+const fields = fieldsOf(SCHEMA);
+const good = { ...fill(fields), word: "hey" };
+
+describe("a form for parameters", () => {
+  test("begins with the defaults, angles in degrees", () => {
+    expect(fill(fields)).toEqual({
+      times: "3", angle_rad: "28.65", word: "", colour: "green", loud: "true", place_m: "", more: "", share: "0.5",
+    });
+    expect(fields.map(({ kind }) => kind)).toEqual(["integer", "number", "text", "choice", "yes-no", "list", "json", "number"]);
+    expect(fields[1]).toMatchObject({ title: "Angle", unit: "°", least: -90, most: 90 });
+  });
+
+  test("gives values in the units of the script, and leaves out what is empty and need not be there", () => {
+    const { values, wrong } = read(fields, { ...good, angle_rad: "90", place_m: "1.5, -2" });
+    expect(wrong).toEqual({});
+    expect(values).toEqual({
+      times: 3, angle_rad: Math.PI / 2, word: "hey", colour: "green", loud: true, place_m: [1.5, -2], share: 0.5,
+    });
+  });
+
+  test.each([
+    ["times", "", undefined],
+    ["times", "2.5", "whole"],
+    ["times", "x", "number"],
+    ["times", "0", "least"],
+    ["times", "21", "most"],
+    ["angle_rad", "90.5", "most"],
+    ["word", "", "missing"],
+    ["word", "a", "shorter"],
+    ["word", "abcde", "longer"],
+    ["place_m", "1", "fewer"],
+    ["place_m", "1 2 3 4", "more"],
+    ["place_m", "1 b", "number"],
+    ["more", "{", "json"],
+    ["share", "0", "above"],
+    ["share", "1", "below"],
+    ["share", "Infinity", "number"],
+  ])("%s = '%s' is %s", (name, text, kind) => {
+    expect(read(fields, { ...good, [name]: text }).wrong[name]?.kind).toBe(kind);
+  });
+
+  test("shows what was used last, unless it does not fit any more", () => {
+    const shown = fill(fields, { times: 7, angle_rad: 9, colour: "blue", loud: false, place_m: [1, 2], word: "x" });
+    expect(shown).toMatchObject({ times: "7", angle_rad: "28.65", colour: "green", loud: "false", place_m: "1 2", word: "" });
+  });
+
+  test("without a schema has no fields", () => {
+    expect(fieldsOf(null)).toEqual([]);
+  });
+});
+
+describe("what the browser keeps", () => {
+  const store = (): Storage => {
+    const known = new Map<string, string>();
+    return {
+      getItem: (key: string) => known.get(key) ?? null,
+      setItem: (key: string, value: string) => void known.set(key, value),
+      removeItem: (key: string) => void known.delete(key),
+    } as Storage;
+  };
+
+  test("is found again by the same account and movement only", () => {
+    const there = store();
+    expect(storedDraft(there, "ann", "ur5", "wave").write({ source: "x", basedOn: 2, at: 1 })).toBe(true);
+    expect(storedDraft(there, "ann", "ur5", "wave").read()).toEqual({ source: "x", basedOn: 2, at: 1 });
+    expect(storedDraft(there, "bob", "ur5", "wave").read()).toBeNull();
+    expect(storedParameters(there, "ann", "ur5", "wave").read()).toBeNull();
+    storedDraft(there, "ann", "ur5", "wave").drop();
+    expect(storedDraft(there, "ann", "ur5", "wave").read()).toBeNull();
+  });
+
+  test("is nothing where it was written by something else, or storage is refused", () => {
+    const there = store();
+    there.setItem("telescope.draft.ann.ur5.wave", "{");
+    expect(storedDraft(there, "ann", "ur5", "wave").read()).toBeNull();
+    there.setItem("telescope.draft.ann.ur5.wave", '{"source": 1}');
+    expect(storedDraft(there, "ann", "ur5", "wave").read()).toBeNull();
+    expect(storedDraft(null, "ann", "ur5", "wave").write({ source: "x", basedOn: 0, at: 1 })).toBe(false);
+  });
+});

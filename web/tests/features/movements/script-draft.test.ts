@@ -1,0 +1,137 @@
+import { beforeEach, describe, expect, test } from "vitest";
+import { ApiError, type Http } from "../../../src/shared/api/http";
+import { StoredValue, storedDraft, type Draft } from "../../../src/shared/lib/local-storage";
+import { Library, type MovementSource } from "../../../src/shared/api/movement-library";
+import { ScriptDraft } from "../../../src/features/movements/model/script-draft";
+import { failureMark, placed } from "../../../src/features/movements/model/text-offsets";
+
+/** The movements of one account, as the back end keeps them. */
+class Shelf {
+  versions: string[] = [];
+  broken = false;
+
+  readonly library = new Library({
+    call: (method: string, path: string, options?: { body: { source: string; based_on: number } }) => {
+      if (this.broken) return Promise.reject(new ApiError(0, "unreachable", "The server cannot be reached."));
+      const version = this.versions.length;
+      if (method === "GET") {
+        if (version === 0) return Promise.reject(new ApiError(404, "movement-unknown", "There is none."));
+        return Promise.resolve({ version, source: this.versions.at(-1) });
+      }
+      const body = options?.body ?? { source: "", based_on: 0 };
+      if (body.source.includes("(((")) return Promise.reject(new ApiError(422, "movement-invalid", "Line 1: no."));
+      if (body.based_on !== version) return Promise.reject(new ApiError(409, "movement-changed", path, { version }));
+      this.versions.push(body.source);
+      return Promise.resolve({ version: version + 1 } as MovementSource);
+    },
+  } as unknown as Http);
+}
+
+let shelf: Shelf;
+let known: Map<string, string>;
+
+function kept(): StoredValue<Draft> {
+  return storedDraft(
+    {
+      getItem: (key) => known.get(key) ?? null,
+      setItem: (key, value) => void known.set(key, value),
+      removeItem: (key) => void known.delete(key),
+    },
+    "ann",
+    "ur5",
+    "wave",
+  );
+}
+
+async function open(): Promise<ScriptDraft> {
+  const manuscript = new ScriptDraft(shelf.library, "ur5", "wave", kept(), "template");
+  await manuscript.load();
+  return manuscript;
+}
+
+beforeEach(() => {
+  shelf = new Shelf();
+  known = new Map();
+});
+
+describe("a script that is written", () => {
+  test("begins with the template, and is saved as the first version", async () => {
+    const script = await open();
+    expect([script.text.value, script.changed.value]).toEqual(["template", true]);
+    script.edit("robot.home()");
+    expect(await script.save()).toBe(true);
+    expect([shelf.versions, script.base.value?.version, script.changed.value]).toEqual([["robot.home()"], 1, false]);
+    expect(kept().read()).toBeNull();
+  });
+
+  test("is there again after a reload, and can be discarded", async () => {
+    shelf.versions = ["saved"];
+    (await open()).edit("unsaved");
+    const again = await open();
+    expect(again.text.value).toBe("unsaved");
+    expect(again.restored.value).not.toBeNull();
+    expect(again.discard()).toBe("unsaved");
+    expect([again.text.value, again.restored.value]).toEqual(["saved", null]);
+    expect((await open()).text.value).toBe("saved");
+  });
+
+  test("stays when it is refused or the server is away", async () => {
+    const script = await open();
+    script.edit("(((");
+    expect(await script.save()).toBe(false);
+    expect([script.text.value, script.why.value]).toEqual(["(((", "Line 1: no."]);
+    shelf.broken = true;
+    script.edit("good");
+    expect(await script.save()).toBe(false);
+    expect(script.text.value).toBe("good");
+    shelf.broken = false;
+    expect(await script.save()).toBe(true);
+    expect(script.why.value).toBe("");
+  });
+
+  test("is not saved over what another tab has saved, and both can be had", async () => {
+    shelf.versions = ["one"];
+    const [mine, other] = [await open(), await open()];
+    other.edit("theirs");
+    await other.save();
+    mine.edit("mine");
+    expect(await mine.save()).toBe(false);
+    expect(mine.conflict.value?.theirs).toMatchObject({ version: 2, source: "theirs" });
+    expect(mine.text.value).toBe("mine");
+    expect(await mine.saveOver()).toBe(true);
+    expect(shelf.versions).toEqual(["one", "theirs", "mine"]);
+    other.edit("more");
+    expect(await other.save()).toBe(false);
+    expect(other.takeTheirs()).toBe("more");
+    expect([other.text.value, other.changed.value, other.conflict.value]).toEqual(["mine", false, null]);
+  });
+
+  test("kept from an older version is a conflict too", async () => {
+    shelf.versions = ["one"];
+    (await open()).edit("mine");
+    shelf.versions.push("two");
+    const again = await open();
+    expect(again.text.value).toBe("mine");
+    expect(await again.save()).toBe(false);
+    expect(again.conflict.value?.theirs?.source).toBe("two");
+  });
+});
+
+describe("places in a text", () => {
+  const mark = { severity: "error", message: "x" } as const;
+
+  test("are counted in characters by the server, and in units of UTF-16 here", () => {
+    const text = "a = 1\r\n'🤖'; b\nc";
+    expect(placed(text.replace("\r", ""), { ...mark, line: 2, column: 5, end_line: 2, end_column: 6 })).toMatchObject({ from: 12, to: 13 });
+  });
+
+  test("are never outside of it, nor empty", () => {
+    expect(placed("ab", { ...mark, line: 9, column: 9, end_line: 1, end_column: 0 })).toMatchObject({ from: 2, to: 2 });
+    expect(placed("ab\ncd", { ...mark, line: 1, column: 0, end_line: 1, end_column: 0 })).toMatchObject({ from: 0, to: 1 });
+  });
+
+  test("are found in what a run has failed with", () => {
+    expect(failureMark("line 3: RobotError: no way")).toMatchObject({ line: 3, message: "RobotError: no way" });
+    expect(failureMark("somebody pressed Stop")).toBeNull();
+  });
+});

@@ -1,0 +1,188 @@
+import { describe, expect, it } from "vitest";
+import { readFinding, readFindings } from "../../../src/features/robot-types/model/parse-findings";
+import { ApiError } from "../../../src/shared/api/http";
+import type { Look, RobotType, RobotTypes, TypeFolder, TypeModel } from "../../../src/shared/api/robot-types";
+import { UploadDraft } from "../../../src/features/robot-types/model/upload-draft";
+import { selectFiles, packFiles } from "../../../src/features/robot-types/model/upload-files";
+
+const bytes = (text: string): Uint8Array => new TextEncoder().encode(text);
+const folder = (...names: string[]): Map<string, Uint8Array> => new Map(names.map((name) => [name, bytes(name)]));
+
+describe("a folder", () => {
+  it("is what lies beside its manifest, wherever that is", () => {
+    const { files, left } = selectFiles(
+      folder("my/robots/lever/robot.toml", "my/robots/lever/lever.xml", "my/robots/lever/movements/up.py",
+        "my/robots/lever/meshes/hand.stl", "my/robots/lever/README.md", "my/notes.txt", "__MACOSX/lever/robot.toml",
+        "my/robots/lever/.DS_Store", "my/robots/lever/"),
+    );
+    expect([...files.keys()].sort()).toEqual(["lever.xml", "meshes/hand.stl", "movements/up.py", "robot.toml"]);
+    expect(left).toEqual(["my/robots/lever/README.md", "my/notes.txt"]);
+  });
+
+  it("without a manifest keeps its files, without the folder around them all", () => {
+    expect([...selectFiles(folder("lever/lever.xml", "lever/scene.xml")).files.keys()]).toEqual(["lever.xml", "scene.xml"]);
+    expect([...selectFiles(folder("movements/up.py")).files.keys()]).toEqual(["movements/up.py"]);
+  });
+
+  it("is sent as text where it is text, else as base64", () => {
+    const large = new Uint8Array(100_000).map((_, index) => index % 256);
+    const packed = packFiles(new Map([...folder("robot.toml", "lever.xml", "movements/up.py"), ["hand.stl", large]]));
+    expect(packed?.manifest).toBe("robot.toml");
+    expect(packed?.files["lever.xml"]).toBe("lever.xml");
+    expect(packed?.movements).toEqual({ up: "movements/up.py" });
+    expect(Buffer.from(packed?.files["hand.stl"] ?? "", "base64")).toEqual(Buffer.from(large));
+    expect(packFiles(folder("lever.xml"))).toBeNull();
+  });
+});
+
+describe("a finding", () => {
+  it.each([
+    ["lever.xml: the range of joint 'shoulder' is -0.5000 to 0.5000 rad; the manifest's must lie within (…).", "range", null, "shoulder"],
+    ["lever.xml: 'hand.stl' is not among the files (line 2).", "missing", 2, "hand.stl"],
+    ["scene.xml: mismatched tag: line 3, column 15.", "torn", 3, ""],
+    ["lever.xml: XML parse error 14: Error=XML_ERROR_MISMATCHED_ELEMENT ErrorID=14 (0xe) Line number=1: XMLElement name=body.", "torn", 1, ""],
+    ["lever.xml: XML Error: invalid keyword: 'boxx' Element 'geom', line 4.", "word", 4, "boxx"],
+    ["lever.xml: XML Error: Schema violation: unrecognized element Element 'sight', line 8.", "element", 8, "sight"],
+    ["lever.xml: no joint 'shoulder'; the model has: hip.", "unnamed", null, "shoulder"],
+    ["robot.toml: Expected '=' after a key in a key/value pair (at line 5, column 8).", "manifest", 5, "="],
+    ["robot.toml: model is 'no.xml'; it must be one of the .xml files: lever.xml.", "field", null, "no.xml"],
+    ["movements/up.py: Line 1: '(' was never closed.", "script", 1, "("],
+    ["The model takes MuJoCo more than 15 s. Simplify it.", "heavy", null, ""],
+    ["something new", "other", null, ""],
+  ])("is told apart: %s", (error, kind, line, about) => {
+    const found = readFinding(error);
+    expect([found.kind, found.line, found.about]).toEqual([kind, line, about]);
+    expect(found.file === "" || error.startsWith(found.file)).toBe(true);
+    expect(found.said.toLowerCase()).not.toContain("line number=1:".repeat(2));
+  });
+
+  it("says the range that the model allows", () => {
+    expect(readFinding("a.xml: the range of joint 'j' is -0.5000 to 0.5000 rad; x").range_rad).toEqual([-0.5, 0.5]);
+  });
+
+  it("stands with others of its file, by line", () => {
+    const found = readFindings(["b.xml: x: line 9", "a.xml: y", "b.xml: z: line 2", "all"]);
+    expect(found.map(({ file, line }) => `${file}:${line ?? ""}`)).toEqual([":", "a.xml:", "b.xml:2", "b.xml:9"]);
+  });
+});
+
+/** A cloud whose checker says what it is told to. */
+class Checker {
+  asked: TypeFolder[] = [];
+  dropped: string[] = [];
+  put: string[] = [];
+  errors: string[] = [];
+  open = 1;
+  fail: Error | null = null;
+  #made = 0;
+
+  #type(state: "checking" | "ready" | "rejected"): RobotType {
+    const upload = { version: 1, state, errors: state === "rejected" ? this.errors : [], warnings: [], uploaded_at: "" };
+    return { type: "lever", upload } as unknown as RobotType;
+  }
+
+  look(folder: TypeFolder): Promise<Look> {
+    if (this.fail !== null) return Promise.reject(this.fail);
+    this.asked.push(folder);
+    this.#made += 1;
+    return Promise.resolve({ id: `look${this.#made}`, expires_at: "", robot_type: this.#type("checking") });
+  }
+
+  lookAgain(id: string): Promise<Look> {
+    this.open -= 1;
+    const state = this.open > 0 ? "checking" : this.errors.length > 0 ? "rejected" : "ready";
+    return Promise.resolve({ id, expires_at: "", robot_type: this.#type(state) });
+  }
+
+  lookModel(): Promise<TypeModel> {
+    return Promise.resolve({ twin: { device: "lever", bodies: [] }, actuators: [], cameras: [] });
+  }
+
+  save(): Promise<RobotType> {
+    return Promise.resolve(this.#type("ready"));
+  }
+
+  putMovement(_: string, name: string): Promise<unknown> {
+    this.put.push(name);
+    return name === "bad" ? Promise.reject(new ApiError(422, "movement-invalid", "Line 1: no.")) : Promise.resolve({});
+  }
+
+  drop(id: string): Promise<void> {
+    this.dropped.push(id);
+    return Promise.resolve();
+  }
+}
+
+describe("a draft", () => {
+  const made = (): [UploadDraft, Checker] => {
+    const checker = new Checker();
+    return [new UploadDraft(checker as unknown as RobotTypes), checker];
+  };
+  const whole = folder("lever/robot.toml", "lever/lever.xml", "lever/movements/up.py", "lever/movements/bad.py");
+
+  it("is checked as soon as files come, looked at, and saved with its movements", async () => {
+    const [draft, checker] = made();
+    await draft.add(whole);
+    expect(draft.step.value).toBe("good");
+    expect(draft.model.value?.twin.device).toBe("lever");
+    expect(Object.keys(checker.asked[0]?.movements ?? {})).toEqual(["up", "bad"]);
+    await draft.save();
+    expect(draft.step.value).toBe("saved");
+    expect(draft.movements.value).toEqual([
+      { name: "up", why: "" },
+      { name: "bad", why: "Line 1: no." },
+    ]);
+    expect(checker.dropped).toEqual([]);
+  });
+
+  it("keeps its files when it is refused, and is checked again with the one that is exchanged", async () => {
+    const [draft, checker] = made();
+    checker.errors = ["lever.xml: mismatched tag: line 3, column 1."];
+    await draft.add(whole);
+    expect([draft.step.value, draft.errors.value.length]).toEqual(["wrong", 1]);
+    checker.errors = [];
+    checker.open = 1;
+    await draft.replace("lever.xml", bytes("<mujoco/>"));
+    expect([draft.step.value, draft.files.value.size]).toEqual(["good", 4]);
+    expect(checker.asked[1]?.files["lever.xml"]).toBe("<mujoco/>");
+    expect(checker.dropped).toEqual(["look1"]);
+  });
+
+  it("says what the server refuses unseen, and whether it was reached at all", async () => {
+    const [draft, checker] = made();
+    checker.fail = new ApiError(422, "manifest-invalid", "no", { errors: ["robot.toml: a.", "lever.xml: b."] });
+    await draft.add(whole);
+    expect([draft.step.value, draft.errors.value.map(({ file }) => file)]).toEqual(["wrong", ["lever.xml", "robot.toml"]]);
+    checker.fail = new ApiError(0, "unreachable", "The server cannot be reached.");
+    await draft.check();
+    expect([draft.step.value, draft.trouble.value, draft.errors.value]).toEqual(["unsent", "The server cannot be reached.", []]);
+    checker.fail = new ApiError(409, "robot-type-built-in", "'ur5' comes with the installation.");
+    await draft.check();
+    expect([draft.step.value, draft.errors.value[0]?.file]).toEqual(["wrong", "robot.toml"]);
+    expect(draft.files.value.size).toBe(4);
+  });
+
+  it("sends nothing without a manifest, nor what is too large", async () => {
+    const [draft, checker] = made();
+    await draft.add(folder("lever.xml"));
+    expect([draft.step.value, draft.fault.value]).toEqual(["wrong", "no-manifest"]);
+    await draft.add(new Map([["robot.toml", bytes("x")], ["a.stl", new Uint8Array(7_000_000)]]));
+    expect(draft.fault.value).toBe("too-large");
+    await draft.clear();
+    expect([draft.step.value, draft.fault.value, checker.asked.length]).toEqual(["empty", null, 0]);
+  });
+
+  it("forgets what was under way when a file is exchanged meanwhile", async () => {
+    const [draft, checker] = made();
+    checker.open = 1000;
+    const first = draft.add(whole);
+    await new Promise((resolve) => setTimeout(resolve, 10));
+    expect(draft.step.value).toBe("checking");
+    checker.open = 1;
+    await Promise.all([first, draft.remove("movements/bad.py")]);
+    expect([draft.step.value, draft.files.value.size, draft.look.value?.id]).toEqual(["good", 3, "look2"]);
+    expect(checker.dropped).toEqual(["look1"]);
+    draft.dispose();
+    expect(checker.dropped).toEqual(["look1", "look2"]);
+  });
+});
