@@ -1,3 +1,5 @@
+"""Products and browsers of the end-to-end tests."""
+
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,20 +12,21 @@ from tests.harness.browser.browser import FLAT, chromium
 from tests.harness.browser.product import Machine, start_machine
 
 LABORATORY = {
-    "test_acts",
     "test_health_pages",
     "test_keyframes",
+    "test_robot_actions",
     "test_room_devices",
     "test_room_pages",
     "test_steering",
 }
+"""Test files that use the product with all devices of the laboratory."""
 OWN = {"test_fleet", "test_make_up", "test_sign_in", "test_tls", "test_xmpp"}
-"""Files that need the laboratory, and those that start what they need; the others share one arm."""
+"""Test files that start their own product. All other files share a product with one arm."""
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
-    """Where several workers share the tests, those of one product stay together, so that it is started once."""
+    """Run all tests of one product in the same xdist worker, so that the product starts once."""
     from xdist.scheduler import LoadScopeScheduling  # type: ignore[import-untyped]
 
     class ByProduct(LoadScopeScheduling):  # type: ignore[misc]
@@ -36,7 +39,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
 
 @pytest.fixture(scope="session")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
-    """The product, started once for all tests that leave it as they found it."""
+    """The product with one arm. Tests share it and must restore its state."""
     with start_machine(tmp_path_factory.mktemp("machine")) as machine:
         assert machine.process.poll() is None, "".join(machine.lines)
         yield machine
@@ -44,7 +47,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
 
 @pytest.fixture(scope="session")
 def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
-    """The product with all that is in its laboratory, started once for all tests that leave it as they found it."""
+    """The product with all devices of the laboratory. Tests share it and must restore its state."""
     with start_machine(tmp_path_factory.mktemp("laboratory"), TELESCOPE_ROOM="lab") as machine:
         assert machine.process.poll() is None, "".join(machine.lines)
         yield machine
@@ -58,7 +61,7 @@ def playwright() -> Iterator[Playwright]:
 
 @pytest.fixture(scope="package")
 def browser(playwright: Playwright, request: pytest.FixtureRequest) -> Iterator[Browser]:
-    """One for all tests, each with contexts of its own. It draws nothing in three dimensions but for pictures."""
+    """A shared browser; each test opens its own context. 3D rendering is off unless pictures are requested."""
     if os.environ.get("TELESCOPE_PICTURES"):
         yield request.getfixturevalue("drawing_browser")
         return
@@ -68,6 +71,6 @@ def browser(playwright: Playwright, request: pytest.FixtureRequest) -> Iterator[
 
 @pytest.fixture(scope="package")
 def drawing_browser(playwright: Playwright) -> Iterator[Browser]:
-    """One for all tests of what is drawn in three dimensions."""
+    """A shared browser with 3D rendering."""
     with chromium(playwright) as browser:
         yield browser

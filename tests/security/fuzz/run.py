@@ -1,4 +1,4 @@
-"""``python -m tests.security.fuzz.run FOLDER TARGET,TARGET``: run targets under atheris, each in a fork of this process.
+"""``python -m tests.security.fuzz.run FOLDER TARGET,TARGET``: run each target under atheris in a fork of this process.
 
 What libFuzzer says of each goes into the folder: ``TARGET`` from its examples on, ``TARGET-empty`` of an empty input
 alone. Its own options may follow (``-max_total_time=60``, ``-runs=1000``, ``-seed=1``).

@@ -23,14 +23,14 @@ PAGES = sorted(
 GENERATED = {DOCS / "reference" / "messages.md", DOCS / "reference" / "openapi.md"}
 """Pages that ``make docs`` creates."""
 EXECUTED = {
-    "README.md": "tests/e2e/test_readme.py",
-    "docs/guides/use-the-api.md": "tests/e2e/test_readme.py",
+    "README.md": "tests/e2e/product/test_readme.py",
+    "docs/guides/use-the-api.md": "tests/e2e/product/test_readme.py",
     "docs/guides/add-a-robot.md": "tests/integration/docs/test_guides.py",
     "docs/guides/install-an-agent.md": "tests/integration/docs/test_guides.py",
     "docs/guides/operate-a-site.md": "tests/integration/docs/test_guides.py",
     "docs/guides/security-on-a-site.md": "tests/integration/docs/test_guides.py",
     "docs/guides/add-a-sensor.md": "tests/unit/device_agent/sensors/test_add_a_sensor.py",
-    "docs/reference/scripts.md": "tests/e2e/test_readme.py",
+    "docs/reference/scripts.md": "tests/e2e/product/test_readme.py",
     "docs/reference/room-and-perception.md": "tests/unit/docs/test_pages.py",
     "docs/reference/configuration.md": "tests/unit/docs/test_pages.py",
 }
