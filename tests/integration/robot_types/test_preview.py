@@ -159,7 +159,7 @@ class TestFindings:
         upload = found["robot_type"]["upload"]
         assert upload["state"] == "ready"
         assert upload["warnings"] == [
-            "lever.xml: actuator 'idle' is not in robot.toml: nobody can move it.",
+            "lever.xml: actuator 'idle' is not in robot.toml, so it cannot be moved.",
             "scene.xml: there is no camera.",
         ]
 

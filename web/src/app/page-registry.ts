@@ -1,7 +1,7 @@
 /**
  * Every page there is: its address, what it is called, where it stands in the navigation, and the code that comes when it
- * is opened. Routing, navigation and loading go by this table alone. All pages are for who is signed in: to anybody
- * else the app shows the sign-in, whatever the address.
+ * is opened. Routing, navigation and loading go by this table alone. All pages require a signed-in account:
+ * without one, the app shows the sign-in page for every address.
  */
 import type { Account } from "../shared/api/types";
 import type { ComponentType } from "preact";

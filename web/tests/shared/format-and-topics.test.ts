@@ -4,16 +4,16 @@ import { deviceTopics, matches } from "../../src/shared/mqtt/topics";
 import { format } from "../../src/shared/i18n/format";
 
 describe("formats and topics", () => {
-  it("degrees and radians undo each other", () => {
+  it("converts between degrees and radians", () => {
     expect(degrees(radians(12.5))).toBeCloseTo(12.5);
   });
 
-  it("a value that rounds to nought has no sign", () => {
+  it("shows no sign for a value that rounds to zero", () => {
     expect(format.degrees(-0.04)).toBe("0.0°");
     expect(format.degrees(-0.06)).toBe("-0.1°");
   });
 
-  it("ages are told in the largest fitting unit", () => {
+  it("ages use the largest fitting unit", () => {
     expect([0, 59_000, 61_000, 3_700_000, 200_000_000].map(format.age)).toEqual([
       "just now",
       "59 s ago",

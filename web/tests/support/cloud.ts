@@ -309,7 +309,7 @@ export class Cloud {
     const leaseMs = Number(body["lease_ms"]);
     const renewal = body["epoch"] !== undefined;
     if (renewal && (this.lease === null || this.lease.epoch !== body["epoch"])) {
-      return problem(409, "lease-lost", "Control has gone to somebody else.");
+      return problem(409, "lease-lost", "Another operator has control.");
     }
     if (!renewal && this.lease !== null && !this.lease.mine) {
       return problem(409, "lease-held", `${this.lease.holder} has control.`);

@@ -19,7 +19,7 @@ const ID_SHOWN = 8;
 export function entryText(record: AuditRecord, names: Names): string {
   const { event, data } = record;
   const message = data["message"];
-  // What is told of control over a device says so itself.
+  // Control entries carry their own text.
   if (typeof message === "string") return message;
   const who = whoDid(record);
   const on = thing(record.target, names);
@@ -81,7 +81,7 @@ export function entryText(record: AuditRecord, names: Names): string {
 
 function whoDid({ actor, account }: AuditRecord): string {
   if (actor !== "") return actor;
-  return account === "" ? texts.audit.cloud : texts.audit.somebody;
+  return account === "" ? texts.audit.cloud : texts.audit.unknownAccount;
 }
 
 function thing(on: string, names: Names): string {

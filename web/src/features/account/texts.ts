@@ -114,7 +114,7 @@ export const texts = {
     outcome: { done: "", rejected: "rejected", failed: "failed", unknown: "interrupted" } satisfies Record<Outcome, string>,
     unknownExplained: "The operation was interrupted before its outcome was recorded. Check the affected device or account.",
     byKey: "with an API key",
-    somebody: "Unknown account",
+    unknownAccount: "Unknown account",
     cloud: "Server",
     anAccount: (id: string): string => `a deleted account (${id})`,
     key: { number: "Number", account: "Account", session: "Session", key: "API key", on: "Device", hash: "Hash" },

@@ -1,4 +1,4 @@
-/** Fields of the cards that ask a robot for something. What is typed stays, whatever becomes of the request. */
+/** Form fields of the action cards. Input stays after the request, including after a failure. */
 import { useId } from "preact/hooks";
 import { format } from "../../shared/i18n/format";
 

@@ -1,4 +1,4 @@
-/** What the device does now at somebody's request: how far it is, its end, the way back. Always in sight. */
+/** The device's current action: progress, result and undo. Always visible. */
 import type { Control } from "../control/model";
 import { actionUnavailableReason } from "../devices";
 import type { DeviceStore } from "../devices/model";

@@ -58,7 +58,7 @@ export function ControlBar({ device, control, stop, watching }: ControlBarProps)
   );
 }
 
-/** Whether somebody has control whom this page would have to ask. */
+/** Whether another operator has control, so that this page must request it. */
 function anothers(device: DeviceStore, control: Control): boolean {
   const holder = device.holder.value;
   const { kind } = control.state.value;
@@ -82,7 +82,7 @@ function HoldButton({ device, control }: { device: DeviceStore; control: Control
     );
   }
   const asking = control.asking.state.value.kind;
-  // Where asking fails nobody may hold it any more, though the robot has not said so: then it can be taken.
+  // After a failed request the lease may have ended before the robot reports it: offer to take control.
   if (anothers(device, control) && !watches && asking !== "failed") return <RequestControlButton control={control} />;
   const resumable = device.holder.value?.mine === true;
   return (

@@ -47,7 +47,7 @@ export function PendingRequest({ control }: { control: Control }) {
       {state.kind === "open" && (
         <>
           <span>
-            {texts.handover.asked(state.of || texts.handover.somebody)} {!state.shown && texts.handover.notShown}
+            {texts.handover.asked(state.of || texts.handover.operator)} {!state.shown && texts.handover.notShown}
           </span>
           <Left until={state.until} as={texts.handover.left} />
         </>
@@ -61,7 +61,7 @@ export function PendingRequest({ control }: { control: Control }) {
 
 function became(state: Extract<ControlRequestState, { kind: "over" | "failed" }>): string {
   if (state.kind === "failed") return texts.handover.failed(state.why);
-  return texts.handover.over[state.how](state.of || texts.handover.somebody);
+  return texts.handover.over[state.how](state.of || texts.handover.operator);
 }
 
 function Read({ text, control, wrong = false }: { text: string; control: Control; wrong?: boolean }) {
@@ -127,7 +127,7 @@ interface TakeOverProps {
   onClose: () => void;
 }
 
-/** Not to be undone, and somebody is in the middle of something: it wants a reason, which they read. */
+/** Takeover interrupts the current operator and cannot be undone, so it requires a reason, which that operator sees. */
 export function TakeOverForm({ device, control, onClose }: TakeOverProps) {
   const id = useId();
   const [reason, setReason] = useState("");

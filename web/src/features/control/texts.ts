@@ -32,7 +32,7 @@ export const texts = {
     left: (s: number): string => `${s} s to respond`,
     leftFor: (s: number): string => `${s} s left`,
     withdraw: "Withdraw request",
-    somebody: "the operator",
+    operator: "the operator",
     wants: (by: string): string => `${by} requests control.`,
     accept: (by: string): string => `Hand over to ${by}`,
     keep: "Keep control",

@@ -16,7 +16,7 @@ export function actionUnavailableReason(device: DeviceStore, control: Control): 
   const no = unavailableReason(device);
   if (no !== "") return no;
   const mode = device.live.value ? device.mode.value : undefined;
-  // First of all: an action that nobody had control for brings a lease of its own, and that says nothing here.
+  // Check this first: an action that runs without an operator has its own lease, which does not matter here.
   if (mode === "action") return texts.unavailable.busy;
   const holder = device.holder.value;
   if (holder !== null && !holder.mine && control.epoch === null) return texts.unavailable.held(holder.name);

@@ -126,6 +126,6 @@ function nameOf(action: { name?: string; kind: string }): string {
 
 function Holder({ device }: { device: DeviceStore }) {
   const holder = device.holder.value;
-  if (holder === null) return <>{texts.list.nobody}</>;
+  if (holder === null) return <>{texts.list.noOperator}</>;
   return <>{holder.mine ? texts.list.you : holder.name}</>;
 }

@@ -36,7 +36,7 @@ export function useDeviceSessions(
       if (document.visibilityState !== "hidden") return;
       for (const { control } of made) control.hidden();
     };
-    // The keys that are let go now are heard by nobody here.
+    // While the page has no focus it receives no keyup events.
     const blur = (): void => {
       for (const { control } of made) control.streamer.value?.letGo();
     };

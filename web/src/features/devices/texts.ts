@@ -17,7 +17,7 @@ export const texts = {
     heard: "Last seen",
     doing: "Activity",
     control: "Controlled by",
-    nobody: "–",
+    noOperator: "–",
     you: "you",
     faults: (count: number): string => (count === 1 ? "1 fault" : `${count} faults`),
     running: (name: string): string => `Running: ${name}`,

@@ -5,7 +5,7 @@ import { robotTypesAddress } from "../../shared/routing/routes";
 import { AgentCommands } from "./agent-commands";
 import { PageExplainer } from "./page-explainer";
 
-/** Comes with every installation, and is simulated unless somebody names a real one. */
+/** Included in every installation. Simulated unless the configuration names a real robot. */
 const EXAMPLE = { name: "arm", type: "ur5" };
 
 export function FirstSteps() {

@@ -1,4 +1,4 @@
-/** Recording what the robot does, whoever moves it; its ends are trimmed, and it becomes keyframes. */
+/** Records the robot's motion from any source, trims both ends and converts it to keyframes. */
 import type { DeviceStore } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { effect } from "@preact/signals";

@@ -8,7 +8,7 @@ interface LatencyProps {
   control: Control;
 }
 
-/** The round trip of what is streamed, and how fresh what comes back is. */
+/** The round-trip time of streamed setpoints, and the age of the telemetry. */
 export function LiveLatency({ device, control }: LatencyProps) {
   const figures = control.roundTrip.figures.value;
   const telemetry = device.telemetry.value;

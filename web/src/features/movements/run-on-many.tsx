@@ -24,7 +24,7 @@ export function robotsOf(fleet: Fleet, robotType: string, account: string): { ow
   return { own: all.filter(mine), others: all.filter((device) => !mine(device)) };
 }
 
-/** Always in sight while robots are chosen: whatever runs, one button stops all of it, and so does one key. */
+/** Always visible while robots are selected: one button, or one key, stops all of them. */
 export function RunOnManyBar({ sessions }: { sessions: readonly DeviceSession[] }) {
   const running = sessions.filter(({ actions }) => isRunning(actions.run.value));
   return (

@@ -75,7 +75,7 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
   const into = async (): Promise<string | null> => {
     if (space !== NEW) return space === "" ? null : space;
     const made = await api.makeSpace(name.trim());
-    // It is there now, whatever becomes of the rest: another try goes into it, and makes no second one.
+    // The space exists now, even if pairing fails: a retry uses it and does not create a second one.
     setSpaces([...(spaces ?? []), made]);
     setSpace(made.id);
     return made.id;
@@ -193,7 +193,7 @@ interface PairedProps {
   onAnother: () => void;
 }
 
-/** What has come, to be named: before it is paired nobody can know what stands behind a code. */
+/** Names the paired devices. They are unknown until the code is claimed. */
 function Paired({ api, fleet, devices, onAnother }: PairedProps) {
   const heading = useRef<HTMLHeadingElement>(null);
   useEffect(() => heading.current?.focus(), []);

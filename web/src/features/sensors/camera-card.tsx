@@ -36,7 +36,7 @@ interface CameraCardProps {
   aside?: ComponentChildren;
 }
 
-/** Pictures as they come, on a canvas. The broker sends them only while somebody watches. */
+/** Draws camera frames on a canvas. The page subscribes only while the card is visible. */
 export function CameraCard({ device, name, roomAction, title, aside }: CameraCardProps) {
   const canvas = useRef<HTMLCanvasElement>(null);
   const [running, setRunning] = useState(false);

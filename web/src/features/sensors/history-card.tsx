@@ -167,7 +167,7 @@ export function HistoryCard({ recording, quantity, spanMs, binary, old, marks }:
   );
 }
 
-/** What a screen reader is told of the cursor. */
+/** Updates the cursor's description for screen readers. */
 function tellPlace(element: HTMLElement, columns: Columns, cursor: number | null, quantity: Quantity): void {
   const at = nearest(columns, cursor ?? Infinity);
   element.setAttribute("aria-valuemin", "0");

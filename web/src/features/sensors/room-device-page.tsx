@@ -1,4 +1,4 @@
-/** The page of a room device: a card for each thing that it has, whatever kind of device it is. */
+/** The page of a room device: one card for each capability in its description. */
 import { EventLog } from "../devices";
 import type { DeviceSession, Fleet } from "../devices/model";
 import { FloorPlan } from "../spaces";

@@ -19,7 +19,7 @@ import { spaceAddress } from "../../shared/routing/routes";
 import { TransferPanel } from "./transfer-panel";
 import "./sharing.css";
 
-/** While a link is out somebody may use it at any moment. */
+/** An open invitation can be redeemed at any time, so the list is polled at this interval [ms]. */
 const LOOK_AGAIN_MS = 5_000;
 const LASTS = ["keep", "never", "hour", "workday", "day", "week", "month", "date"] as const;
 

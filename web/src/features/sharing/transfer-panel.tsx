@@ -16,7 +16,7 @@ import { LinkOnce } from "../../shared/ui/link-once";
 import { usePolling } from "../../shared/hooks/use-polling";
 import "./sharing.css";
 
-/** While an offer is out somebody may accept it at any moment. */
+/** An open offer can be accepted at any time, so it is polled at this interval [ms]. */
 const LOOK_AGAIN_MS = 5_000;
 const VALID = ["hour", "day", "week", "month"] as const;
 const TO = [

@@ -141,7 +141,7 @@ interface DrawingProps {
   trails: DeviceStore | null;
   old: boolean;
   receivedAt: number | null;
-  /** Where somebody wants to go. */
+  /** The requested goal. */
   target?: { xM: number; yM: number; yawRad: number | null } | null;
   /** Called with the place that was pointed at; nothing on the plan is a link then. */
   onPick?: (xM: number, yM: number) => void;

@@ -29,7 +29,6 @@ export const texts = {
     seen: (age: string): string => `seen ${age}`,
     unseen: (s: number): string => `last seen ${Math.round(s)} s ago`,
     who: "Robots and people",
-    nobody: "No robots or people detected.",
     column: { name: "Name", place: "Position (m)", heading: "Heading", seen: "Last seen" },
     sensors: "Room devices",
     place: (x: string, y: string): string => `${x}, ${y}`,

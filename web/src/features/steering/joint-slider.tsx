@@ -7,7 +7,7 @@ import { texts } from "./texts";
 
 interface JointRowProps {
   joint: Joint;
-  /** Where it is to be [rad]; `undefined`: nobody knows. */
+  /** Target position [rad]; `undefined`: unknown. */
   targetRad: number | undefined;
   /** Where it is measured [rad]; `undefined`: it is not. */
   measuredRad: number | undefined;

@@ -112,7 +112,7 @@ function poseText([x, y, z, qw, qx, qy, qz]: Pose, form: Form): [string, string]
   return [position, columns(rollPitchYaw(unit([qw, qx, qy, qz])).map(degrees), 1)];
 }
 
-/** Numbers side by side, each as wide as the others whatever its sign. */
+/** Numbers side by side, each with the same width regardless of sign. */
 function columns(values: readonly number[], digits: number): string {
   return values.map((value) => (Math.abs(value) < 0.5 / 10 ** digits ? 0 : value).toFixed(digits).padStart(digits + 5)).join(" ");
 }

@@ -53,7 +53,7 @@ const GHOST_OPACITY = 0.28;
 
 type Robot = Object3D[];
 
-/** Builds the view inside `canvas`. `onFrame` is told of every drawn frame. Throws `NoWebglError`. */
+/** Builds the view inside `canvas`. `onFrame` is called after every drawn frame. Throws `NoWebglError`. */
 export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame: () => void): LiveScene {
   const renderer = createRenderer(canvas);
   const scene = new Scene();
@@ -75,7 +75,7 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
     drawn = wanted;
     onFrame();
   });
-  // What is scrolled away waits, but for the first picture: nobody is to scroll to an empty one.
+  // A view outside the viewport does not draw, except its first frame, so that scrolling never shows an empty view.
   const drawSoon = (): void => {
     if (inSight || drawn === null) turn.ask();
   };

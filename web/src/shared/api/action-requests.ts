@@ -1,4 +1,4 @@
-/** All that a device can be asked to do: one union, whoever asks. Which of it a device takes, its description says. */
+/** The union of all action requests. A device's description lists those it accepts. */
 import type {
   CaptureRaw,
   CollectData,

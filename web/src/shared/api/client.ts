@@ -192,7 +192,7 @@ export class Api {
     await this.#http.call("DELETE", `/devices/${device}/lease?epoch=${epoch}`, { keepalive: leaving });
   }
 
-  /** Take control from whoever has it, who reads the reason. For owners. */
+  /** Takes control from the current operator, who sees the reason. For owners. */
   takeOver(device: string, leaseMs: number, reason: string): Promise<GrantedLease> {
     const waitMs = 1000;
     const body = { lease_ms: leaseMs, wait_ms: waitMs, take_over: true, reason };

@@ -33,7 +33,7 @@ export interface StoredLatency {
   p50_ms: number | null;
   p95_ms: number | null;
   p99_ms: number | null;
-  /** The newest samples as they came, of whatever span. */
+  /** The newest raw samples, independent of the requested period. */
   at_ms: number[];
   ms: number[];
 }

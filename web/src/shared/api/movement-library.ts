@@ -33,7 +33,7 @@ export interface Movement {
   sha256: string;
   updated_at: string;
   built_in: boolean;
-  /** `null`: it takes whatever it is given. */
+  /** `null`: accepts any parameters. */
   parameters_schema: ObjectSchema | null;
 }
 

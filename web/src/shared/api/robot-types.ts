@@ -39,7 +39,7 @@ export interface RobotType {
   upload: TypeUpload | null;
 }
 
-/** An upload that is not saved: nobody else sees it, and it goes by itself. */
+/** A temporary upload for checking. Only its owner sees it; it expires. */
 export interface Look {
   id: string;
   expires_at: string;

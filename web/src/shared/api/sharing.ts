@@ -35,11 +35,11 @@ export interface Invitation {
   /** How long the part lasts from when it is taken [s]; `null`: until it is ended. */
   share_s: number | null;
   expires_at: string;
-  /** Who alone may redeem it, in the owner's lists; `null`: whoever has the secret. */
+  /** The only account that may redeem it, shown to the owner; `null`: any account with the secret. */
   account: Person | null;
 }
 
-/** The secret, and the link that carries it, are told this once. */
+/** The secret and its link are returned only in this response. */
 export interface InvitationMade extends Invitation {
   secret: string;
   link: string;

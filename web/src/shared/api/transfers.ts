@@ -21,7 +21,7 @@ export class Transfers {
     return this.#http.all(at(of));
   }
 
-  /** `account`: who alone may accept it, by name; `null`: whoever has the link. */
+  /** `account`: the name of the only account that may accept it; `null`: any account with the link. */
   offer(of: Whole, account: string | null, forS: number): Promise<InvitationMade> {
     return this.#http.call("POST", at(of), { body: { account, expires_in_s: forS } });
   }

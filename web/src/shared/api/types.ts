@@ -42,7 +42,7 @@ export interface Lease {
   epoch: number;
   expires_at: string;
   mine: boolean;
-  /** Why it was taken from somebody else. */
+  /** The reason for taking it from another operator. */
   reason?: string;
   /** The open one. */
   request?: ControlRequestInfo | null;

@@ -1,6 +1,6 @@
 /**
- * Views that cost time to draw take turns, however many there are on the page: as many in a frame as nobody feels, one
- * at least, and all of them together only a part of the page's time. Sliders and setpoints go first.
+ * Schedules expensive views in turn. Each frame draws at least one view and stays within a time budget, so that sliders
+ * and setpoints keep priority.
  */
 import { now } from "../lib/clock";
 

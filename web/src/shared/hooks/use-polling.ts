@@ -1,4 +1,4 @@
-/** What the cloud has to be asked for again and again, while somebody looks. */
+/** Polls the cloud while the page is visible. */
 import { useCallback, useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../api/http";
 

@@ -18,7 +18,7 @@ interface FoldableProps {
   name: string;
   type: string;
   title: string;
-  /** Open on a phone too, as long as nobody has chosen otherwise. */
+  /** Open on a phone too, unless the user has collapsed it. */
   always?: boolean;
   children: ComponentChildren;
 }

@@ -1,4 +1,4 @@
-/** A canvas that is as sharp as the screen, whatever its box: drawn now, and again when the box changes. */
+/** Keeps a canvas at device resolution: draws now, and again when its size changes. */
 export function canvasBox(
   canvas: HTMLCanvasElement,
   draw: (context: CanvasRenderingContext2D, width: number, height: number) => void,

@@ -6,7 +6,7 @@ import { DEVICE, problem } from "../../support/cloud";
 import { api, cloud } from "../../support/console";
 
 describe("a session", () => {
-  it("begins with a link and ends at sign-out", async () => {
+  it("starts with a sign-in link and ends at sign-out", async () => {
     const session = new Session(api);
     await session.start("good");
     expect(session.state.value).toMatchObject({ kind: "in", account: { name: "Demo" } });
@@ -14,7 +14,7 @@ describe("a session", () => {
     expect(session.state.value).toEqual({ kind: "out", why: "" });
   });
 
-  it("begins with a name and a password, or says what is wrong with them", async () => {
+  it("signs in with a name and a password, or rejects them", async () => {
     const session = new Session(api);
     await expect(session.enter("demo", "wrong")).rejects.toMatchObject({ status: 401 });
     expect(session.state.value.kind).not.toBe("in");
@@ -22,7 +22,7 @@ describe("a session", () => {
     expect(session.state.value).toMatchObject({ kind: "in", account: { name: "Demo" } });
   });
 
-  it("says what went wrong elsewhere to who is not signed in, and to nobody else", async () => {
+  it("shows an external sign-in error only while signed out", async () => {
     const session = new Session(api);
     await session.start(null, "Not there.");
     expect(session.state.value.kind).toBe("in");
@@ -31,7 +31,7 @@ describe("a session", () => {
     expect(session.state.value).toEqual({ kind: "out", why: "Not there." });
   });
 
-  it("says why a link did not work, and nothing at a first visit", async () => {
+  it("reports why a sign-in link failed, and shows no error on a first visit", async () => {
     const session = new Session(api);
     await session.start("used");
     expect(session.state.value).toMatchObject({ kind: "out", why: expect.stringContaining("used before") as string });
@@ -40,13 +40,13 @@ describe("a session", () => {
     expect(session.state.value).toEqual({ kind: "out", why: "" });
   });
 
-  it("shows the session's token with what it changes, and with nothing else", () => {
+  it("sends the CSRF token with changing requests only", () => {
     const [call] = cloud.callsTo("POST", "/mqtt/credentials");
     expect(call?.headers["x-csrf-token"]).toBe("of-this-session");
     expect(cloud.callsTo("GET", "/devices")[0]?.headers["x-csrf-token"]).toBeUndefined();
   });
 
-  it("takes the token of the session that another tab has begun, once", async () => {
+  it("retries once with the CSRF token of a session that another tab started", async () => {
     cloud.csrf = "of-another-session";
     expect((await api.stop(DEVICE, "test")).confirmed).toBe(false);
     expect(cloud.callsTo("POST", `/devices/${DEVICE}/stop`)).toHaveLength(2);
@@ -55,7 +55,7 @@ describe("a session", () => {
     expect(cloud.callsTo("POST", `/devices/${DEVICE}/stop`)).toHaveLength(4);
   });
 
-  it("tells a server that is away from one that refuses", async () => {
+  it("distinguishes an unreachable server from a rejection", async () => {
     const away = new Api("http://127.0.0.1:9/api/v1");
     await expect(away.me()).rejects.toMatchObject({ status: 0, code: "unreachable" });
     await expect(api.claim("BCDF-GHJK")).rejects.toMatchObject({ status: 404, code: "claim-code-unknown" });

@@ -27,11 +27,11 @@ class Wire implements Link {
   }
 
   ping(): Promise<never> {
-    return Promise.reject(new Error("nobody asks for this here"));
+    return Promise.reject(new Error("unexpected call"));
   }
 
   renew(): void {
-    throw new Error("nobody asks for this here");
+    throw new Error("unexpected call");
   }
 
   close(): void {
@@ -175,7 +175,7 @@ describe("who asks for control", () => {
     expect(control.epoch).toBe(6);
   });
 
-  it.each(["rejected", "expired", "ended"] as const)("is told when it was %s, and moves nothing", async (how) => {
+  it.each(["rejected", "expired", "ended"] as const)("reports that the request was %s, and sends no motion", async (how) => {
     await control.asking.ask();
     desk.outcome = how;
     await vi.advanceTimersByTimeAsync(1_000);
@@ -205,7 +205,7 @@ describe("who asks for control", () => {
     expect(control.asking.state.value).toMatchObject({ kind: "over", how: "expired" });
   });
 
-  it("is told why asking failed", async () => {
+  it("reports why the request failed", async () => {
     desk.trouble = new ApiError(409, "lease-requested", "Eve asks already.");
     await control.asking.ask();
     expect(control.asking.state.value).toEqual({ kind: "failed", why: "Eve asks already." });
@@ -268,7 +268,7 @@ describe("who has control", () => {
     expect(control.answered.value).toEqual({ kind: "kept", from: "Bob" });
   });
 
-  it("keeps it and is told where the answer came too late", async () => {
+  it("keeps control and reports a response that was too late", async () => {
     desk.trouble = new ApiError(409, "control-request-closed", "It was not answered in time.");
     await control.answer(true);
     expect(control.epoch).toBe(5);

@@ -33,7 +33,7 @@ class Wire implements Link {
   }
 
   renew(): void {
-    throw new Error("nobody asks for this here");
+    throw new Error("unexpected call");
   }
 
   close(): void {
@@ -202,7 +202,7 @@ describe("control of a device", () => {
     expect(desk.released).toEqual([5]);
   });
 
-  it("is not taken when somebody holds it, and the page says who", async () => {
+  it("does not take a lease that another operator holds, and names that operator", async () => {
     desk.taking = () => Promise.reject(new ApiError(409, "lease-held", "Ann has control."));
     await control.take();
     expect(control.state.value).toEqual({ kind: "refused", why: "Ann has control." });

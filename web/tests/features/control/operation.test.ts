@@ -24,8 +24,8 @@ async function takeControl(): Promise<Control> {
   return control;
 }
 
-describe("an operator", () => {
-  it("moves the arm: it goes where the target is, and only that joint", async () => {
+describe("control", () => {
+  it("moves only the commanded joint to its target", async () => {
     const control = await takeControl();
     const before = { ...arm().positions };
     control.streamer.value?.setTarget("elbow", 1.2);
@@ -36,7 +36,7 @@ describe("an operator", () => {
     expect(control.roundTrip.figures.value?.samples).toBeGreaterThan(0);
   });
 
-  it("cannot take what another holds", async () => {
+  it("is not granted while another operator has it", async () => {
     cloud.lease = { holder: "Ann", epoch: 4, expires_at: "2030-01-01T00:00:00.000Z", mine: false, session: "s2" };
     const control = new Control(api, device);
     await control.take();
@@ -44,7 +44,7 @@ describe("an operator", () => {
     await until(() => device.lease.value?.holder === "Ann", "the holder");
   });
 
-  it("gives control back, and the connection for setpoints closes with it", async () => {
+  it("closes the setpoint connection on release", async () => {
     const control = await takeControl();
     expect(cloud.connections).toBe(2);
     await control.release();
@@ -52,7 +52,7 @@ describe("an operator", () => {
     await until(() => cloud.connections === 1, "the end of the connection");
   });
 
-  it("keeps control while the connection for setpoints is cut, and comes back", async () => {
+  it("continues after the setpoint connection is lost and restored", async () => {
     const control = await takeControl();
     cloud.cutAll();
     await until(() => control.linkStatus.value?.state === "down", "the loss");
@@ -63,7 +63,7 @@ describe("an operator", () => {
 });
 
 describe("stop", () => {
-  it("goes out by both ways and is confirmed by the robot", async () => {
+  it("is sent over MQTT and HTTP and confirmed by the robot", async () => {
     const stop = stopSwitch();
     stop.press("test");
     expect(stop.state.value.kind).toBe("sending");
@@ -72,7 +72,7 @@ describe("stop", () => {
     await until(() => cloud.callsTo("POST", `/devices/${DEVICE}/stop`).length === 1, "the call");
   });
 
-  it("is repeated until the robot says that it has stopped, and the page says so meanwhile", async () => {
+  it("is republished, with a warning, until the robot confirms it", async () => {
     arm().deaf = true;
     const stop = stopSwitch();
     stop.press();
@@ -85,7 +85,7 @@ describe("stop", () => {
     expect(arm().stops).toBe(count);
   });
 
-  it("reaches the cloud while the broker is away", async () => {
+  it("reaches the cloud while the broker is offline", async () => {
     cloud.brokerDown = true;
     cloud.cutAll();
     await until(() => !fleet.link.up.value, "the loss");
@@ -98,7 +98,7 @@ describe("stop", () => {
     await until(() => stop.state.value.kind === "clear", "the robot's own word");
   });
 
-  it("is not for who only watches: nothing goes out, and the page says so", async () => {
+  it("is not sent for a viewer, and the page shows why", async () => {
     cloud.role = "viewer";
     await fleet.refresh();
     const stop = stopSwitch();
@@ -110,7 +110,7 @@ describe("stop", () => {
     expect(arm().stop).toBeNull();
   });
 
-  it("stays latched until it is reset, and then nothing resumes", async () => {
+  it("stays latched until it is reset, and no motion resumes", async () => {
     const control = await takeControl();
     const stop = stopSwitch();
     control.streamer.value?.setTarget("shoulder_pan", 3);
@@ -129,7 +129,7 @@ describe("stop", () => {
 });
 
 describe("a movement", () => {
-  it("is followed from the click to its end, with what it printed", async () => {
+  it("is tracked from the click to its end, with its output", async () => {
     const actions = new ActionRunner(api, device);
     ends.push(() => actions.dispose());
     await actions.start({ kind: "run_movement", name: "wave" }, null);
@@ -149,14 +149,14 @@ describe("a movement", () => {
     await until(() => actions.run.value?.status === "cancelled", "the end");
   });
 
-  it("says why it was refused", async () => {
+  it("reports why it was rejected", async () => {
     cloud.instead.set(`POST /devices/${DEVICE}/actions`, () => problem(409, "device-busy", "The arm is running home."));
     const actions = new ActionRunner(api, device);
     await actions.start({ kind: "run_movement", name: "wave" }, null);
     expect(actions.run.value).toMatchObject({ status: "refused", why: "The arm is running home." });
   });
 
-  it("runs under the lease that the page holds, and once for one click", async () => {
+  it("runs under the page's lease, and once per click", async () => {
     const control = await takeControl();
     const actions = new ActionRunner(api, device);
     ends.push(() => actions.dispose());
@@ -167,14 +167,14 @@ describe("a movement", () => {
   });
 });
 
-describe("what became of a command", () => {
+describe("a command trace", () => {
   function evidence(control: Control, actions: ActionRunner): CommandTrace {
     const made = new CommandTrace(device, control, actions);
     ends.push(() => made.dispose(), () => actions.dispose());
     return made;
   }
 
-  it("is one line for a stream, from its first setpoint to where it was to go", async () => {
+  it("has one line for a stream, from its first setpoint to its target", async () => {
     const control = await takeControl();
     const told = evidence(control, new ActionRunner(api, device));
     control.streamer.value?.setTarget("elbow", 1.2);
@@ -187,7 +187,7 @@ describe("what became of a command", () => {
     expect(times).toEqual(times.toSorted((a, b) => a - b));
   });
 
-  it("is heard from the robot, and seen by its own word where nothing moves", async () => {
+  it("contains the robot's acks, and its state where nothing moves", async () => {
     const control = await takeControl();
     const actions = new ActionRunner(api, device);
     const told = evidence(control, actions);
@@ -199,7 +199,7 @@ describe("what became of a command", () => {
     expect(line?.steps.filter(({ heard }) => heard === "device").length).toBeGreaterThan(0);
   });
 
-  it("is not said to have moved where it has not", async () => {
+  it("does not report motion that did not occur", async () => {
     const control = await takeControl();
     const actions = new ActionRunner(api, device);
     const told = evidence(control, actions);
@@ -210,8 +210,8 @@ describe("what became of a command", () => {
   });
 });
 
-describe("what undoes a request", () => {
-  it("goes back to where every joint was at the click, around what is in between", async () => {
+describe("the undo request", () => {
+  it("returns every joint to its position at the click, with collision avoidance", async () => {
     cloud.tell(`${TOPIC}/desc`, { ...description, actions: ["move_joints", "take_posture", "say"] }, { qos: 1, retain: true });
     await until(() => device.description.value?.actions.includes("move_joints") === true, "what it takes");
     const actions = new ActionRunner(api, device);

@@ -2,15 +2,15 @@ import { describe, expect, it } from "vitest";
 import { TOPIC, arm, cloud, device, fleet } from "../../support/console";
 import { until } from "../../support/until";
 
-describe("what is known of a device", () => {
-  it("turns stale when it falls silent, and live again when it speaks", async () => {
+describe("a device", () => {
+  it("becomes stale without messages, and online again with the next message", async () => {
     arm().mute = true;
     await until(() => device.reach.value === "stale", "stale");
     arm().mute = false;
     await until(() => device.reach.value === "online", "online");
   });
 
-  it("is offline at the agent's word, unless that is older news", async () => {
+  it("is offline when the agent reports it, unless the message is from an older session", async () => {
     const conn = "ts/v1/lab/agent00001/conn";
     cloud.tell(conn, { online: true, session: 9, at_ms: Date.now() }, { qos: 1, retain: true });
     cloud.tell(conn, { online: false, session: 8, at_ms: Date.now() }, { qos: 1, retain: true });
@@ -22,7 +22,7 @@ describe("what is known of a device", () => {
     await until(() => device.reach.value === "offline", "offline");
   });
 
-  it("is unknown while this page has no connection", async () => {
+  it("has unknown reachability while this page has no connection", async () => {
     cloud.brokerDown = true;
     cloud.cutAll();
     await until(() => device.reach.value === "unknown", "unknown");
@@ -30,7 +30,7 @@ describe("what is known of a device", () => {
     await until(() => device.reach.value === "online", "online");
   });
 
-  it("does not change by a message that cannot be read", async () => {
+  it("keeps its state after an unreadable message", async () => {
     const before = device.state.value;
     cloud.tell(`${TOPIC}/state`, "{\"mode\":", { qos: 1, retain: false });
     await until(() => device.trouble.value !== null, "the complaint");
@@ -40,7 +40,7 @@ describe("what is known of a device", () => {
     expect(device.state.value?.epoch).toBe(3);
   });
 
-  it("refuses telemetry for another number of joints", async () => {
+  it("rejects telemetry with a different number of joints", async () => {
     arm().mute = true; // Its next good message would end the complaint.
     const telemetry = { tick_ms: 9e9, at_ms: 9e14, sequence: 1, mode: "idle" };
     const lists = { position_rad: [7], velocity_rad_s: [0], effort_nm: [0], commanded_rad: [7] };
@@ -51,17 +51,17 @@ describe("what is known of a device", () => {
 });
 
 describe("the fleet", () => {
-  it("knows spaces by their names, and by their ids until it does", async () => {
+  it("names spaces by id until their names are loaded", async () => {
     await until(() => fleet.spaceName("lab") === "Laboratory", "the name");
     expect(fleet.spaceName("elsewhere")).toBe("elsewhere");
   });
 });
 
-describe("who has control", () => {
+describe("the lease holder", () => {
   const lease = (epoch: number, inMs: number): void =>
     device.setLease({ holder: "Cloud", epoch, expires_at: new Date(Date.now() + inMs).toISOString(), mine: false });
 
-  it("is told by the robot, unless the cloud knows of a newer lease or the robot is not heard", async () => {
+  it("is reported by the robot, unless the cloud has a newer lease or the robot is silent", async () => {
     arm().grant(3, "Ann");
     await until(() => device.holder.value?.name === "Ann", "the robot's word");
     lease(2, 60_000);
@@ -71,7 +71,7 @@ describe("who has control", () => {
     lease(4, -5_000);
     expect(device.holder.value?.name).toBe("Ann");
     arm().grant(3, null);
-    await until(() => device.holder.value === null, "nobody");
+    await until(() => device.holder.value === null, "no holder");
     lease(2, 60_000);
     expect(device.holder.value).toBeNull();
     arm().mute = true;
@@ -79,8 +79,8 @@ describe("who has control", () => {
   });
 });
 
-describe("what is retained", () => {
-  it("is read anew only when it has changed, so that nothing drawn from it is built again", async () => {
+describe("retained messages", () => {
+  it("keeps the same objects after a reconnect without changes", async () => {
     await until(() => device.twin.value !== null, "the model");
     const { description, twin } = { description: device.description.value, twin: device.twin.value };
     cloud.cutAll();

@@ -102,7 +102,7 @@ describe("a watched field", () => {
     expect(found.shown(Math.PI)).toBeCloseTo(180);
   });
 
-  it("that nobody has listed is named by its field, without limits", () => {
+  it("that is not listed is named by its field, without limits", () => {
     const found = watchedQuantity(watched({ field: "battery_v", label: "battery_v", unit: "", advice: "", high: null, warning_high: null }), null);
     expect(found).toMatchObject({ label: "Battery", unit: "V", judged: null });
   });

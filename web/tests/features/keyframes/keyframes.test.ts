@@ -185,7 +185,7 @@ describe("the script", () => {
     ["a line more", (source: string) => `${source}robot.home()\n`],
     ["another speed", (source: string) => source.replace('"default": 1', '"default": 2')],
     ["a number that is computed", (source: string) => source.replace("0.5", "1 / 2")],
-    ["a key that nobody knows", (source: string) => source.replace('"express"', '"shout"')],
+    ["an unknown key", (source: string) => source.replace('"express"', '"shout"')],
     ["an infinite time", (source: string) => source.replace("1.5", "1e999")],
     ["no keyframe", (source: string) => source.replace(/ {4}\{"time_s.*\n/gu, "")],
     ["no end", (source: string) => source.replace("\n]\n", "\n")],
@@ -193,7 +193,7 @@ describe("the script", () => {
     expect(readScript(change(writeScript(made)))).toEqual({ kind: "changed" });
   });
 
-  test("of somebody else was never keyframes", () => {
+  test("written by hand is not read as keyframes", () => {
     expect(readScript('"""Wave."""\nrobot.home()\n')).toEqual({ kind: "other" });
   });
 

@@ -5,7 +5,7 @@ import { DEVICE, problem } from "../../support/cloud";
 import { api, cloud, ends } from "../../support/console";
 
 describe("latency samples", () => {
-  it("go to the cloud in one batch, and once: what did not arrive goes again with the same key", async () => {
+  it("are sent in one batch; a failed batch is sent again with the same idempotency key", async () => {
     const path = `/devices/${DEVICE}/latency`;
     cloud.instead.set(`POST ${path}`, () => problem(503, "busy", "Later."));
     const roundTrip = new RoundTrip();

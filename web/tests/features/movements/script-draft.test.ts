@@ -132,6 +132,6 @@ describe("places in a text", () => {
 
   test("are found in what a run has failed with", () => {
     expect(failureMark("line 3: RobotError: no way")).toMatchObject({ line: 3, message: "RobotError: no way" });
-    expect(failureMark("somebody pressed Stop")).toBeNull();
+    expect(failureMark("the operator pressed Stop")).toBeNull();
   });
 });

@@ -49,7 +49,7 @@ describe("a finding", () => {
     ["movements/up.py: Line 1: '(' was never closed.", "script", 1, "("],
     ["The model takes MuJoCo more than 15 s. Simplify it.", "heavy", null, ""],
     ["something new", "other", null, ""],
-  ])("is told apart: %s", (error, kind, line, about) => {
+  ])("is classified: %s", (error, kind, line, about) => {
     const found = readFinding(error);
     expect([found.kind, found.line, found.about]).toEqual([kind, line, about]);
     expect(found.file === "" || error.startsWith(found.file)).toBe(true);
@@ -66,7 +66,7 @@ describe("a finding", () => {
   });
 });
 
-/** A cloud whose checker says what it is told to. */
+/** A cloud whose checker returns the prepared results. */
 class Checker {
   asked: TypeFolder[] = [];
   dropped: string[] = [];

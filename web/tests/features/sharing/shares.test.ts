@@ -175,7 +175,7 @@ describe("a followed invitation", () => {
   });
 });
 
-describe("the fleet of somebody whose share ends", () => {
+describe("the device list when a share ends", () => {
   it("asks what may be seen when the connection is cut, long before the next turn", async () => {
     const fleet = new Fleet(api);
     try {

@@ -56,7 +56,7 @@ describe("names on a plan", () => {
     expect(endY).toBeLessThanOrEqual((placed?.top ?? 0) + 18.01);
   });
 
-  it("are told elsewhere where there is no room at all", () => {
+  it("are listed separately if no position is free", () => {
     expect(placeLabels([named(180, 100, 400)], [], ROOM)).toEqual([null]);
   });
 

@@ -34,7 +34,7 @@ function message(position: readonly number[], rest: Partial<KnownTelemetry> = {}
   };
 }
 
-/** A robot that is measured every 20 ms and goes where it is told at 1 rad/s, unless `held`. */
+/** A robot that publishes telemetry every 20 ms and moves to its setpoint at 1 rad/s, unless `held`. */
 class Bench {
   readonly sent: Setpoint[] = [];
   latest: { message: KnownTelemetry; receivedAt: number } | null = null;
@@ -155,7 +155,7 @@ describe("a stream of setpoints", () => {
     bench.streamer.setTarget("a", 99);
     expect(bench.streamer.targets.value["a"]).toBe(2);
     bench.streamer.setTarget("a", NaN);
-    bench.streamer.setTarget("nobody", 1);
+    bench.streamer.setTarget("unknown", 1);
     expect(bench.streamer.targets.value).toEqual({ a: 2, b: 0.25 });
   });
 

@@ -102,7 +102,7 @@ describe("a gamepad", () => {
     expect(readPad(pad([0, 0, 0, 0], { 6: 0.5, 1: 1, 12: 1, 14: 1 }))).toMatchObject({ stop: true, lift: -0.5, cross: [-1, 1] });
   });
 
-  it("is not read where nobody knows which button is which", () => {
+  it("is not read if its button layout is unknown", () => {
     expect(readPad(pad([0, 0, 0, 0], {}, { mapping: "" }))).toBeNull();
     expect(readPad(pad([], {}, { connected: false }))).toBeNull();
     expect(readPad(null)).toBeNull();

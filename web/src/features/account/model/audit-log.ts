@@ -40,7 +40,7 @@ export class AuditReader {
     return this.older();
   }
 
-  /** Read on. What was read stays, whatever goes wrong. */
+  /** Reads the next page. Entries already read stay after an error. */
   async older(): Promise<void> {
     const asked = ++this.#asked;
     this.#busy.value = true;

@@ -14,8 +14,8 @@ import { undoRequestOf } from "./undo-request";
 import type { AnyRequest } from "../../../shared/api/action-requests";
 
 /**
- * `sent`: asked for, and no answer yet. `refused`: the cloud said no. `unanswered`: it could not be reached, so nobody
- * here knows whether it was asked of the device.
+ * `sent`: requested, no response yet. `refused`: rejected by the cloud. `unanswered`: the cloud was unreachable, so it
+ * is unknown whether the device received the request.
  */
 export type RunStatus =
   | "sent"
@@ -79,7 +79,7 @@ const POLL_MS = 10_000;
 const RETRY_MS = 2_000;
 /** Asked again with the same key after a broken call, but never later than this: nothing may move by surprise [ms]. */
 const AGAIN_WITHIN_MS = 2_000;
-/** The lease that the cloud took for a run is nobody's so long after its end: asked anew, the page says so too [ms]. */
+/** The cloud releases the lease of a run this long after the run ends; the page then reads the holder again [ms]. */
 const LEASE_AFTER_MS = 1_000;
 
 function rank(status: ActionStatus): RunStatus {
@@ -121,7 +121,7 @@ export class ActionRunner {
     return this.#begin(request, asking).reached(asking.waitFor ?? "done");
   }
 
-  /** End our newest run, or the action `other` that somebody else started. Why it could not be, or nothing. */
+  /** Cancels the newest run of this page, or action `other` of another caller. Returns the error, or "". */
   async cancel(other: string | null): Promise<string> {
     const newest = this.#pursuits.value[0];
     const id = other ?? newest?.run.value.id;
@@ -265,7 +265,7 @@ class Pursuit {
     this.#advance(rank(ack.status), { why: ack.reason?.message ?? run.why, ...told }, "device", at);
   }
 
-  /** The status never goes back and the first end stays; a step that is told late still finds its place. */
+  /** The status never moves backwards and the first terminal status stays; a late step is inserted in order. */
   #advance(status: RunStatus, rest: Partial<Run>, heard: Channel, at: number): void {
     const run = this.#run.value;
     const forward = RANK[status] > RANK[run.status];

@@ -14,7 +14,7 @@ const JOINTS: ReadonlySet<AnyRequest["kind"]> = new Set([
   "run_movement",
 ]);
 
-/** `null`: nothing undoes it, or nobody knows where the device is. */
+/** The request that reverses `request`; `null`: it is not reversible, or the device's pose is unknown. */
 export function undoRequestOf(device: DeviceStore, request: AnyRequest): AnyRequest | null {
   if (request.kind === "set_stiffness") return stiffnessBefore(device, request.joints ?? []);
   const { telemetry, description } = { telemetry: device.telemetry.value, description: device.description.value };

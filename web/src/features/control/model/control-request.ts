@@ -1,4 +1,4 @@
-/** Asking whoever has control of a device for it, until there is an answer; and what it comes to. */
+/** A request for control, sent to the current operator of a device, and its outcome. */
 import type { ControlRequestInfo } from "../../../shared/api/types";
 import type { DeviceStore } from "../../devices/model";
 import { effect, signal, type ReadonlySignal } from "@preact/signals-core";
@@ -33,7 +33,7 @@ export class ControlRequest {
 
   readonly state: ReadonlySignal<ControlRequestState> = this.#state;
 
-  /** `accepted` is told the epoch that was handed to this session. */
+  /** `accepted` is called with the epoch that was handed over to this session. */
   constructor(api: Api, device: DeviceStore, accepted: (epoch: number) => void) {
     this.#api = api;
     this.#device = device;

@@ -49,9 +49,9 @@ export class Control {
   #handingTo: string | null = null;
   readonly #answer = signal<AnswerState>({ kind: "none" });
 
-  /** Asking somebody else for it. */
+  /** This session's request for control from another operator. */
   readonly asking: ControlRequest;
-  /** Answering somebody who asks for it. */
+  /** The response to another operator's request. */
   readonly answered: ReadonlySignal<AnswerState> = this.#answer;
   readonly state: ReadonlySignal<ControlState> = this.#state;
   /** There while the lease is held. */
@@ -84,7 +84,7 @@ export class Control {
     await this.#begin(() => this.#api.takeLease(this.#device.id, LEASE_MS));
   }
 
-  /** Take it from whoever has it, who reads why. For owners. */
+  /** Takes control from the current operator, who sees the reason. For owners. */
   async takeOver(reason: string): Promise<void> {
     this.asking.clear();
     await this.#begin(() => this.#api.takeOver(this.#device.id, LEASE_MS, reason));
@@ -189,7 +189,7 @@ export class Control {
     ];
   }
 
-  /** What the robot says of the lease: a higher epoch, or none after ours, ends it at once, whatever our clock says. */
+  /** Applies the robot's reported epoch: a higher epoch, or none after ours, ends the lease regardless of the local clock. */
   #hear(epoch: number): void {
     const latest = this.#device.telemetry.value;
     const state = this.#device.state.value;

@@ -12,7 +12,7 @@ import type { Stop } from "../../../shared/mqtt/protocol.generated";
 export const REPEAT_MS = 200;
 /** No word from the robot for this long: the page must say so, loudly [ms]. */
 export const DOUBT_MS = 1_000;
-/** Publishing goes on this long at most; somebody must have gone to the robot by then [ms]. */
+/** Stop is republished for at most this long; after it, an operator must be at the robot [ms]. */
 export const GIVE_UP_MS = 60_000;
 
 export type StopState =
@@ -76,7 +76,7 @@ export class StopSwitch {
   /** Latch Stop. May be pressed again at any time. */
   press(reason = "Stop pressed on the console"): void {
     if (this.#device.info.value.role === "viewer") {
-      this.#problem.value = "You may watch this device, not stop it. Ask its owner, or whoever stands there.";
+      this.#problem.value = "You can watch this device, but not stop it. Ask its owner or an operator at the robot.";
       return;
     }
     this.#stateAtPress = this.#device.state.value;

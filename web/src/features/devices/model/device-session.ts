@@ -16,7 +16,7 @@ export class DeviceSession {
   readonly watchers: Watchers;
   readonly #unwatch: () => void;
 
-  /** `by`: who is told to have pressed Stop. */
+  /** `by`: the name that is reported as the caller of Stop. */
   constructor(api: Api, link: Link, device: DeviceStore, by: string) {
     this.device = device;
     this.#unwatch = device.watchClosely();

@@ -125,8 +125,8 @@ export class DeviceStore {
   });
 
   /**
-   * Who has control; `null`: nobody. The device obeys the lease it knows, so its word counts before the cloud's, unless
-   * the cloud knows a newer one.
+   * The lease holder; `null`: none. The device enforces the lease it knows, so its report takes precedence over the
+   * cloud's, unless the cloud has a newer epoch.
    */
   readonly holder = computed<{ name: string; mine: boolean } | null>(() => {
     const lease = this.#lease.value;

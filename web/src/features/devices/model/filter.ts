@@ -1,4 +1,4 @@
-/** Which devices a list shows: by what was typed, by what they are, by whether they need somebody to look. */
+/** Filters a device list by text, by device kind and by "needs attention". */
 import type { Device } from "../../../shared/api/types";
 import type { DeviceStore } from "./device-store";
 

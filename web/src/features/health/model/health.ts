@@ -37,7 +37,7 @@ export function reportedFaults(device: DeviceStore): readonly ReportedFault[] | 
   return device.live.value ? (device.state.value?.faults ?? null) : null;
 }
 
-/** Open faults, by whoever knows of them: what the device says now and what the cloud has found. */
+/** Number of open faults: those the device reports now and those the cloud has detected. */
 export function openCount(stored: readonly Pick<Fault, "source" | "code">[] | null, told: readonly ReportedFault[] | null): number {
   if (stored === null) return told?.length ?? 0;
   if (told === null) return stored.length;

@@ -52,7 +52,7 @@ export class Editor {
     this.chosen = computed(() => Math.min(this.#chosen.value, history.now.value.keyframes.length - 1));
     this.changed = computed(() => JSON.stringify(history.now.value) !== JSON.stringify(this.#saved.value));
     this.pose = computed(() => this.plan.value.at(this.#at.value));
-    // What nobody has touched yet is no draft.
+    // An unedited movement is not stored as a draft.
     this.#forget = effect(() => keep(this.changed.value && (draft !== null || this.canUndo.value) ? this.movement.value : null));
   }
 
@@ -146,7 +146,7 @@ export class Editor {
   }
 }
 
-/** A movement of one keyframe: the robot as it is, or, where nobody knows that, with every joint at 0 or next to it. */
+/** A movement of one keyframe: the measured pose, or, if unknown, every joint at 0 or at the limit nearest to 0. */
 export function begun(robot: Robot, measured: Positions | null): Movement {
   const positions = measured ?? poseAt(Object.fromEntries(robot.joints.map(({ name }) => [name, 0])), robot);
   return { description: "", keyframes: [{ time_s: 0, position_rad: poseOf(positions, robot) }] };

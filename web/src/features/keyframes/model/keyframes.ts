@@ -63,7 +63,7 @@ export const LONGEST_TEXT = 500;
 
 const STEP_RAD = 1e-4;
 
-/** How long the preview stays where something is done [s]: how long that takes, nobody knows before. */
+/** Time the preview spends on a step of unknown duration, such as speech [s]. */
 export const DEED_S = 0.8;
 
 export const SAME_RAD = 1e-6;

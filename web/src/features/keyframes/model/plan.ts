@@ -26,7 +26,7 @@ export function pieces(keyframes: readonly Keyframe[], robot: Robot): Piece[] {
   const rests = new Map<string, number>();
   const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));
   for (const joint of robot.joints) {
-    // Where a joint is before it is named first nobody knows; it is drawn where it is named first.
+    // A joint's position before its first keyframe is unknown; draw it at its first known position.
     const named = keyframes.find(({ position_rad }) => joint.name in position_rad);
     const place = named?.position_rad[joint.name];
     if (place !== undefined && !followers.has(joint.name)) rests.set(joint.name, place);

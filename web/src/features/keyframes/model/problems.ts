@@ -144,7 +144,7 @@ export function supports(robot: Robot, deed: ActionKind): boolean {
   return robot.actions.includes(ACTIONS[deed]);
 }
 
-/** Joints whose beginning nobody knows: the robot begins them from wherever it is. */
+/** Joints without a position in the first keyframe: the robot starts them from their current position. */
 function lateJoints(movement: Movement, robot: Robot): Problem[] {
   const first = movement.keyframes[0]?.position_rad ?? {};
   const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));

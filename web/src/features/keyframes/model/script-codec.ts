@@ -1,6 +1,6 @@
 /**
  * Keyframes as a plain movement script, and back. A script is read back only when it is exactly what would be written
- * from the keyframes in it: what somebody has changed by hand belongs into the code editor, and is never lost here.
+ * from the keyframes in it: a script that was edited by hand opens in the code editor and is never overwritten here.
  */
 import { ACTION_KINDS, actionsOf, type ActionKind, type KeyframeActions, type Keyframe, type Movement } from "./keyframes";
 

@@ -2,7 +2,7 @@
 import { degrees, radians } from "../../../shared/lib/angles";
 import type { ObjectSchema, Parameters, Schema } from "../../../shared/api/movement-library";
 
-/** `list`: numbers, one after the other. `json`: whatever has no field of its own kind. */
+/** `list`: numbers, one after the other. `json`: any value without a field kind of its own. */
 export type FieldKind = "number" | "integer" | "text" | "choice" | "yes-no" | "list" | "json";
 
 export interface Field {

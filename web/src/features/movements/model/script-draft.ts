@@ -1,4 +1,4 @@
-/** A script while somebody writes it: from which version, what is not saved yet, and what others have saved meanwhile. */
+/** A script being edited: its base version, unsaved changes and versions that others saved meanwhile. */
 import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import { ApiError, sentence } from "../../../shared/api/http";
 import type { Draft, StoredValue } from "../../../shared/lib/local-storage";
@@ -82,7 +82,7 @@ export class ScriptDraft {
     return given;
   }
 
-  /** Whether it is saved now. The text stays whatever happens. */
+  /** Saves the draft. Returns whether it is saved now. The text stays after an error. */
   async save(): Promise<boolean> {
     if (this.#saving.value) return false;
     const source = this.#text.value;

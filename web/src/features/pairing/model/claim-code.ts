@@ -12,7 +12,7 @@ export function readCode(typed: string): string | null {
   return CODE.test(code) ? `${code.slice(0, 4)}-${code.slice(4)}` : null;
 }
 
-/** The code in an address's fragment, `#pair=<code>`, or `null`: what is no code is shown to nobody. */
+/** The code in an address's fragment, `#pair=<code>`, or `null`: an invalid code is not shown. */
 export function pairingCode(hash: string): string | null {
   const found = /^#pair=([A-Za-z-]{8,12})$/.exec(hash)?.[1];
   return found === undefined ? null : readCode(found);

@@ -77,7 +77,7 @@ export class UploadDraft {
     await this.#change(new Map([...this.#files.value, ...files]), left);
   }
 
-  /** One file in the place of another, whatever it is called where it came from. */
+  /** Replaces file `name`. The replacement may have any local name. */
   async replace(name: string, content: Uint8Array): Promise<void> {
     await this.#change(new Map([...this.#files.value, [name, content]]), []);
   }

@@ -1,4 +1,4 @@
-/** The files of a robot type as somebody chose them: what belongs to it, and how it is sent. */
+/** Selects the files of a robot type from the chosen folder and packs them for the upload. */
 import type { TypeFolder } from "../../../shared/api/robot-types";
 
 export const MANIFEST = "robot.toml";

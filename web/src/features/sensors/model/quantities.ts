@@ -8,7 +8,7 @@ export interface Quantity {
   label: string;
   /** As shown, which for angles is degrees. */
   unit: string;
-  /** From the unit it is told in to the one it is shown in. */
+  /** Converts from the message's unit to the displayed unit. */
   shown: (value: number) => number;
   /** How the room has it judged; `null` where it does not say. */
   judged: KnownDiagnostic | null;

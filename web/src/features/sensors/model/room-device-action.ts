@@ -66,13 +66,13 @@ export class RoomDeviceAction {
     this.#epoch = epoch;
   }
 
-  /** Have streams measured at this rate; whoever watches hears them. Nothing is kept waiting for their end. */
+  /** Measures streams at this rate; all subscribers receive them. Does not wait for the end. */
   async gather(streams: string[], rateHz: number, durationS: number): Promise<void> {
     const request = { kind: "gather", streams, rate_hz: rateHz, duration_s: durationS } as const;
     await this.#ask(request, "started", durationS * 1000 + MARGIN_MS);
   }
 
-  /** End what the device does now, whoever began it. */
+  /** Cancels the device's current action, including one that another caller started. */
   async stopGathering(): Promise<void> {
     const running = this.#device.state.value?.action ?? null;
     if (running === null) return;

@@ -59,7 +59,7 @@ export class ShareList {
     }
   }
 
-  /** Share it with somebody, or change their part; `forS` null: until it is ended. */
+  /** Shares the device or space with an account, or changes its role; `forS` null: no expiry [s]. */
   async put(account: string, role: SharedRole, forS: number | null): Promise<Share> {
     const share = await this.#api.share(this.#target, account, role, forS);
     if (this.#ended.value?.account.id === share.account.id) this.#ended.value = null;

@@ -1,4 +1,4 @@
-/** Ties what hands hold to a stream: one let-go, whatever kind, ends it. */
+/** Connects pressed inputs to a setpoint stream: releasing any of them ends the stream. */
 import { effect } from "@preact/signals";
 import { useEffect, useMemo, useRef } from "preact/hooks";
 import { PressedInputs } from "../model/pressed-inputs";

@@ -26,7 +26,7 @@ export interface PadReading {
   cross: readonly [number, number];
 }
 
-/** Sticks that nobody touches stand within this of their middle. */
+/** A released stick reads at most this far from its centre. */
 export const DEAD_ZONE = 0.15;
 
 /** Beyond the dead zone the whole range is there, beginning at nought. */
@@ -42,7 +42,7 @@ const SHOULDERS = [4, 5] as const;
 const TRIGGERS = [6, 7] as const;
 const CROSS = { up: 12, down: 13, left: 14, right: 15 } as const;
 
-/** `null` where the pad is not there, or has another layout: then nobody knows which button is which. */
+/** The gamepad's reading; `null`: not connected, or its layout is not standard, so its buttons are unknown. */
 export function readPad(pad: Pad | null | undefined): PadReading | null {
   if (pad?.connected !== true || pad.mapping !== "standard") return null;
   const axis = (index: number): number => clamp(pad.axes[index] ?? 0, -1, 1);

@@ -214,7 +214,7 @@ export class SetpointStreamer {
     }
   }
 
-  /** Send what is wanted now, once, whatever is still on its way. */
+  /** Sends the current setpoint once, even if earlier ones are still in flight. */
   #say(): void {
     const latest = this.#seen(now());
     if (latest !== null) this.#send(latest.message, now());
