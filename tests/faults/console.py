@@ -38,7 +38,7 @@ class Seat(msgspec.Struct):
     """Where an operator sits.
 
     Attributes:
-        socket: Path of the Unix socket of whoever leads it.
+        socket: Path of the Unix socket of the test that controls it.
         api: The API's address.
         token: Access token.
         mqtt_port: Where it reaches the broker.
@@ -142,7 +142,7 @@ class Operator:
         self._sent_s = 0.0
 
     def run(self) -> None:
-        """Obey, and tick 40 times a second, until whoever leads it goes away."""
+        """Process orders and tick at 40 Hz until the controlling test disconnects."""
         self._leader.settimeout(PERIOD_S)
         orders = b""
         next_s = time.monotonic()
@@ -251,7 +251,7 @@ class Operator:
         seen = self._seen
         heard = max(seen[0].epoch if seen else 0, self._state_epoch)
         if heard > epoch:
-            self._lose("somebody else has control")
+            self._lose("another operator has control")
         elif seen and seen[0].epoch == epoch:
             self._obeyed = True
         elif seen and self._obeyed and seen[0].epoch == 0:
@@ -321,7 +321,7 @@ def main() -> None:
         seat = msgspec.json.decode(line, type=Seat)
         child = os.fork()
         if child == 0:
-            with contextlib.suppress(ConnectionError):  # whoever leads it has gone
+            with contextlib.suppress(ConnectionError):  # the controlling test has disconnected
                 Operator(seat).run()
             os._exit(0)
         print(child, flush=True)

@@ -1,7 +1,8 @@
-"""Cuts whatever an arm in motion hangs on, and has the simulation's own record say when it came to rest.
+"""Interrupts the connections and processes behind a moving arm and measures when the arm came to rest.
 
-Each round: an operator takes control and sweeps the arm to and fro; at a random moment something is cut; while it is,
-and after it has been mended, nothing may move until somebody takes control again.
+In each round an operator takes control and sweeps the arm. At a random time one component is interrupted.
+During the interruption and after the repair, the arm must not move until an operator takes control again.
+The trace of the simulation is the measurement.
 """
 
 import contextlib
@@ -28,16 +29,16 @@ OPERATOR = (
     "operator's link forgotten",
 )
 SCRIPT = ("script's processes killed",)
-EVERYBODY = (
+SHARED = (
     "agent cut off", "agent's link stalls", "agent's link forgotten", "broker killed", "broker stopped",
     "functions killed", "functions stopped", "agent stopped",
 )  # fmt: skip
 WATCHED = (*OPERATOR, "agent's link stalls", "agent's link forgotten", "broker stopped")
-"""Of these nobody tells the agent: it is the watchdog that notices."""
+"""Interruptions that the agent detects only by its watchdog."""
 LEASE_MS = 30_000
 SHORT_LEASE_MS = 1_500
 _ON_THE_WAY_MS = 200.0
-"""A setpoint that was sent before a cut may arrive after it, on a busy machine; the agent takes none that is older."""
+"""Maximum age of a setpoint that the agent accepts [ms]. On a busy machine one may arrive after a cut."""
 _LOOK_MS = 400.0
 _WORTH_TELLING_MS = 10.0
 _UNDER_WAY_S = 0.4
@@ -72,7 +73,7 @@ class Tally:
 
     @property
     def late(self) -> list[Result]:
-        """Those that took too long, whoever's fault it was."""
+        """Results above the limit, including those of a starved machine."""
         return [each for each in self.results if each.verdict.rest_ms > MOST_MS]
 
     @property
@@ -80,7 +81,7 @@ class Tally:
         return sum(self.cuts.values())
 
     def add(self, cut: str, results: list[Result]) -> bool:
-        """Count a cut; whether anything was in motion."""
+        """Count a cut. Returns True if an arm was in motion."""
         moving = [each for each in results if each.verdict.in_motion]
         self.results += moving
         if not moving:
@@ -90,7 +91,7 @@ class Tally:
         return True
 
     def table(self) -> Iterator[str]:
-        """Markdown: to zero commanded velocity, from the last right to move and from the cut."""
+        """Markdown table of times to zero commanded velocity, since the last permission to move and since the cut."""
         yield "| cut | cuts | arms in motion | p50 ms | p99 ms | max ms | from the cut, max ms | starved | broken |"
         yield "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
         for cut in (*self.cuts, "all"):
@@ -105,7 +106,7 @@ class Tally:
 
 
 class Arm:
-    """One arm, its record and whoever sits before it."""
+    """One arm, its record and its operator."""
 
     def __init__(self, stack: Stack, name: str) -> None:
         self.stack = stack

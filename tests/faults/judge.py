@@ -60,13 +60,13 @@ class Verdict:
 
 
 def judge(rows: list[Row], *, cut_ms: float, since_ms: float, watched: bool = True) -> Verdict:
-    """What happened from the cut to the end of ``rows``.
+    """Verdict on the motion from the cut to the end of ``rows``.
 
     Args:
-        rows: From some lines before the cut to the moment before somebody may move the arm again.
-        cut_ms: When the cut was made.
-        since_ms: From when on nothing gave the arm the right to move.
-        watched: Whether it is the watchdog that has to notice.
+        rows: Rows from shortly before the cut until an operator may move the arm again.
+        cut_ms: Time of the cut [ms].
+        since_ms: Time from which the arm had no permission to move [ms].
+        watched: Whether the watchdog must detect the cut.
     """
     before = [row for row in rows if row.tick_ms <= cut_ms][-3:]
     speed = _speed(before[0], before[-1]) if len(before) > 1 else 0.0

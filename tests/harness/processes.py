@@ -75,7 +75,7 @@ class Death:
 
 
 class NotingBus:
-    """A broker that takes everything, and at which nobody answers."""
+    """A broker that accepts every connection and never responds."""
 
     def __init__(self, sent: Path, death: Death) -> None:
         self._sent = sent

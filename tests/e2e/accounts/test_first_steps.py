@@ -1,4 +1,4 @@
-"""Somebody who is here for the first time: signs in, has nothing yet, and is told how to get going."""
+"""A new user signs in, has no devices, and sees the first steps."""
 
 from playwright.sync_api import Browser, Page, expect
 
@@ -7,7 +7,7 @@ from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
 
 
-def test_a_newcomer_is_told_how_to_get_going(browser: Browser, machine: Machine) -> None:
+def test_a_new_user_sees_the_first_steps(browser: Browser, machine: Machine) -> None:
     with browser.new_context(viewport={"width": 1440, "height": 900}) as context:
         page = context.new_page()
         page.set_default_timeout(PATIENCE_MS)

@@ -84,7 +84,7 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
     wait_until(lambda: all(line in terminal.text for line in drawn), "the QR code")
     with machine.api() as api, person(browser, link) as page:
         known = {device["id"] for device in api.get("/devices")["items"]}
-        # Nobody is signed in: the code leaves the address and is there again afterwards. Nothing is claimed by itself.
+        # Without a session the code is removed from the address and restored after sign-in. Claiming needs a click.
         expect(page.get_by_text("You followed a pairing link. Sign in to continue")).to_be_visible(timeout=PATIENCE_MS)
         assert "pair=" not in page.url
         page.goto(machine.sign_in_link())

@@ -1,4 +1,4 @@
-"""A robot type from files in somebody's hands to the list: refused so that one can mend it, seen, saved, deleted."""
+"""A robot type upload: errors with advice, preview, save and delete."""
 
 import io
 import zipfile
@@ -137,7 +137,7 @@ def test_a_robot_type_is_mended_seen_saved_and_deleted(
 
 
 def is_refused(page: Page) -> None:
-    """What is no archive says so; then all that is wrong is told at once, each with its file and what to do."""
+    """An invalid archive is rejected; all errors in a valid one are listed with file and advice."""
     torn: FilePayload = {"name": "torn.zip", "mimeType": "application/zip", "buffer": b"PK\x03\x04 and no more"}
     page.get_by_test_id("type-files").set_input_files([torn])
     expect(page.get_by_role("alert").filter(has_text="torn.zip cannot be extracted")).to_be_visible()
@@ -166,7 +166,7 @@ def is_mended(page: Page, folder: Path) -> None:
 
 
 def is_looked_at(page: Page, machine: Machine) -> None:
-    """Seen before it is saved: each joint moves, and nobody else has it."""
+    """The preview moves each joint; the type is not in the list before it is saved."""
     view = page.get_by_test_id("model-view")
     wait_until(lambda: frames(view) > 0, "a picture")
     before, first = frames(view), view.locator("canvas").screenshot()

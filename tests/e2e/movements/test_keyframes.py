@@ -131,7 +131,7 @@ def undone_and_done_again(page: Page) -> None:
 
 
 def opened_again(page: Page, laboratory: Machine, made: list[dict[str, Any]]) -> None:
-    """What is saved is opened again; what somebody changed by hand is not."""
+    """Saved keyframes open again; a script that was edited by hand does not open as keyframes."""
     page.reload()
     expect(page.get_by_test_id("kf-track")).to_be_visible(timeout=PATIENCE_MS)
     assert keyframes(page) == made
@@ -234,7 +234,7 @@ def test_keyframes_are_made_for_a_robot_type_without_a_robot(browser: Browser, l
         ann.get_by_test_id("kf-save").click()
         expect(ann.get_by_test_id("kf-said")).to_have_attribute("data-version", "1", timeout=PATIENCE_MS)
         assert_good_page(ann, "keyframes-type")
-        # From the movement's own page it is opened as keyframes again; nobody's robot has moved.
+        # The movement's page opens it as keyframes again; no robot has moved.
         ann.goto(f"{laboratory.url}/#/movements/nao/at_ease")
         ann.get_by_test_id("as-keyframes").click()
         expect(ann.get_by_test_id("kf-name")).to_have_value("at_ease", timeout=PATIENCE_MS)

@@ -233,7 +233,7 @@ def test_nothing_that_was_written_is_lost_and_versions_come_back(
         wait_until(lambda: written(mine) == SCRIPT + "# theirs\n", "the older text")
         assert api.get(f"/robot-types/ur5/movements/{name}")["source"] == SCRIPT + "# theirs\n"
 
-        # A draft is given up only when somebody says so, and comes back.
+        # A draft is discarded only after confirmation, and can be restored.
         write(mine, "1")
         mine.reload()
         mine.get_by_test_id("discard-draft").click()

@@ -40,7 +40,7 @@ def kill(machine: Machine, program: str) -> None:
 
 
 def in_control(page: Page, api: Api, device: str) -> list[bool]:
-    """Whether somebody has control: by the page, by the cloud, by the robot itself."""
+    """Whether an operator has control according to the page, the cloud and the robot."""
     cloud = api.get(f"/devices/{device}")
     shown = page.get_by_test_id("control-state").get_attribute("data-state")
     return [shown == "mine", cloud["lease"] is not None, cloud["state"]["lease"] is not None]

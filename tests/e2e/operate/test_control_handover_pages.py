@@ -140,7 +140,7 @@ def shorter(route: Route) -> None:
     route.continue_(post_data=json.dumps(asked | {"within_ms": SILENCE_MS}))
 
 
-def test_silence_takes_control_from_nobody(two: tuple[Page, Page]) -> None:
+def test_an_unanswered_request_does_not_take_control(two: tuple[Page, Page]) -> None:
     demo, carol = two
     carol.route("**/lease/requests", shorter)
     ask(carol, demo)

@@ -34,7 +34,7 @@ def reset(page: Page) -> None:
     expect(page.get_by_test_id("stop-banner")).to_be_hidden(timeout=PATIENCE_MS)
 
 
-def test_the_elbow_slider_moves_the_simulation_and_nobody_elses_does(browser: Browser, machine: Machine) -> None:
+def test_the_elbow_slider_works_only_for_the_operator_in_control(browser: Browser, machine: Machine) -> None:
     trace = machine.trace()
     with operator(browser, machine) as ann, operator(browser, machine) as bob:
         expect(ann.get_by_test_id("online")).to_contain_text("online", ignore_case=True)

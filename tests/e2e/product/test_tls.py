@@ -53,7 +53,7 @@ def test_all_of_it_speaks_tls(tmp_path: Path) -> None:
             [sys.executable, "-m", "infra.local.sign_in_link"],
             cwd=ROOT, env=os.environ | {"TELESCOPE_HOME": str(tmp_path)}, capture_output=True, text=True, check=True,
         ).stdout.strip()  # fmt: skip
-        assert link.startswith(f"{machine.url}/#sign-in="), "make link is told the folder alone"
+        assert link.startswith(f"{machine.url}/#sign-in="), "make link receives only the folder"
         with machine.api() as api:
             key = api.post("/api-keys", {"name": "Home Assistant", "role": "viewer"})["token"]
             device = api.device()

@@ -127,7 +127,7 @@ def test_a_console_moves_it_and_sees_it_move(machine: Machine, api: Api, agent: 
 
 @pytest.mark.long
 @pytest.mark.parametrize("victim", ["infra.prosody", "function_app xmpp", "the agent"])
-def test_whatever_is_killed_an_action_ends_once_and_the_next_one_runs(
+def test_an_action_ends_once_after_a_kill_and_the_next_one_runs(
     machine: Machine, api: Api, agent: Agent, victim: str
 ) -> None:
     device = api.device(NAME)["id"]
@@ -154,7 +154,7 @@ def next_done(api: Api, device: str) -> bool:
 
 @pytest.mark.long
 @pytest.mark.parametrize("who", ["the agent", "who speaks for the cloud"])
-def test_whoever_is_frozen_is_gone_within_ten_seconds(machine: Machine, api: Api, agent: Agent, who: str) -> None:
+def test_a_frozen_process_is_offline_within_ten_seconds(machine: Machine, api: Api, agent: Agent, who: str) -> None:
     api.device(NAME)
     pid = agent.pid if who == "the agent" else machine.pid("function_app xmpp")
 

@@ -189,7 +189,7 @@ def test_a_gathering_longer_than_its_action_is_refused(api: Api) -> None:
 
 @pytest.fixture
 def home_assistants_broker(tmp_path: Path) -> Iterator[int]:
-    """A broker of somebody else's, as Home Assistant has one; its port."""
+    """An external broker, such as the one of Home Assistant. Returns its port."""
     with contextlib.closing(socket.socket()) as taken:
         taken.bind(("127.0.0.1", 0))
         port: int = taken.getsockname()[1]

@@ -16,7 +16,7 @@ FIXED = ("ur5", "hanson")
 
 
 def place(page: Page, who: str) -> tuple[float, float]:
-    """Where the plan shows somebody [m]."""
+    """Position of a robot on the plan [m]."""
     mark = page.get_by_test_id(f"place-{who}")
     expect(mark).to_be_visible(timeout=PATIENCE_MS)
     x_m, y_m = (float(mark.get_attribute(f"data-{axis}") or "nan") for axis in "xy")
@@ -66,7 +66,7 @@ def test_the_room_is_seen_and_used(browser: Browser, laboratory: Machine) -> Non
         ann.wait_for_timeout(300)  # one picture may be under way
         last = canvas.get_attribute("data-sequence")
         ann.wait_for_timeout(700)
-        assert canvas.get_attribute("data-sequence") == last, "pictures still come, though nobody watches"
+        assert canvas.get_attribute("data-sequence") == last, "frames still arrive without a viewer"
 
         # One page gathers light, the other turns the lamp on and off.
         open_light(bob)

@@ -1,4 +1,4 @@
-"""A room changes its owner: offered, taken back, offered anew, and taken over by somebody in a browser of their own."""
+"""A room transfer is offered, revoked, offered again, and accepted by another user in a second browser."""
 
 from playwright.sync_api import Browser, Page, expect
 
@@ -36,10 +36,10 @@ def test_a_room_is_offered_taken_back_offered_anew_and_taken_over(browser: Brows
         ann.goto(f"{machine.url}/#/spaces/{room}")
         ann.get_by_test_id("transfer").click()
         expect(ann.get_by_test_id("transfer-terms")).to_contain_text("you cannot undo the transfer")
-        ann.get_by_label("Account name").fill("nobody of that name")
+        ann.get_by_label("Account name").fill("unknown account")
         ann.get_by_test_id("transfer-send").click()
         expect(ann.locator("#transfer-answer")).not_to_be_empty(timeout=PATIENCE_MS)
-        expect(ann.get_by_label("Account name")).to_have_value("nobody of that name")  # nothing is lost
+        expect(ann.get_by_label("Account name")).to_have_value("unknown account")  # nothing is lost
         assert_good_page(ann, "transfer", part="transfers")
         first = offer(ann, TO)
         ann.get_by_role("button", name="Done").click()

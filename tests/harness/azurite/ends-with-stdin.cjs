@@ -1,2 +1,2 @@
-// Loaded before Azurite: it ends when whoever started it does, even without a word.
+// Loaded before Azurite: exits when the process that started it exits.
 process.stdin.on("end", () => process.exit()).resume();

@@ -113,7 +113,7 @@ class Cloud:
         return client
 
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """A request of nobody."""
+        """Send a request without credentials."""
         client = self.client()
         return self.run(client.request(method, path, **options))
 
@@ -132,7 +132,7 @@ class Cloud:
         return Person(self, answer.json(), address=address)
 
     def robot(self, *names: str) -> Robot:
-        """An agent that nobody has claimed, with devices of these names (default: ``arm``)."""
+        """An unclaimed agent with devices of these names (default: ``arm``)."""
         return Robot(self, names or ("arm",))
 
     def start_ingest(self) -> None:

@@ -97,7 +97,7 @@ class Ground:
     Attributes:
         endpoints: ``server`` and ``broker``; who adds a transport adds what it ends at.
         home: The cloud's folder.
-        environment: The server's settings, for whoever starts another program beside it.
+        environment: The server's settings, for further programs of the test.
     """
 
     def __init__(

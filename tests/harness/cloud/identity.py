@@ -70,7 +70,7 @@ class _Answer(BaseHTTPRequestHandler):
         times = {"iat": now - 60, "nbf": now - 60, "exp": now + self.server.lifetime_s}
         who = {"oid": OBJECT_ID, "tid": TENANT_ID}
         claims = {"aud": audience, "iss": "https://sts.windows.net/telescope/", **who, **times}
-        token = jwt.encode(claims, "nobody checks it here, all the same", "HS256")
+        token = jwt.encode(claims, "not verified by the server under test", "HS256")
         answer = {"access_token": token, "expires_on": str(now + 3600), "resource": audience, "token_type": "Bearer"}
         body = json.dumps(answer).encode()
         self.send_response_only(200)

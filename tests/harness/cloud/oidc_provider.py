@@ -1,4 +1,4 @@
-"""OpenID Connect providers for tests: a real one, from npm, and one that lies as it is told.
+"""OpenID Connect providers for tests: a real one from npm, and one with configurable false responses.
 
 with start_provider([new_key()]) as provider: ...
 """
@@ -134,7 +134,7 @@ class Liar:
 
 @contextlib.contextmanager
 def start_liar() -> Iterator[Liar]:
-    """A provider that says whatever it is told to."""
+    """A provider that returns the configured documents and keys."""
     liar = Liar()
 
     class Answer(BaseHTTPRequestHandler):

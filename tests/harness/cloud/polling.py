@@ -27,7 +27,7 @@ class Place(Protocol):
 
 
 class Site:
-    """The functions behind an address, whatever runs them there."""
+    """The functions at an address."""
 
     def __init__(self, base: str, *, clock: MovingClock | None = None) -> None:
         self.clock = clock or MovingClock()
@@ -77,7 +77,7 @@ class PollingRobot(Robot):
         return found
 
     def read(self, items: list[dict[str, Any]]) -> list[Any]:
-        """What is asked in commands that came; nothing is told."""
+        """Decode received commands without sending acknowledgements."""
         self.silent = True
         before = len(self.commands)
         for item in items:
@@ -154,7 +154,7 @@ class _Line:
                     if answer.status_code != 200:
                         raise httpx.HTTPError(answer.text)  # noqa: TRY301
             except (httpx.HTTPError, TimeoutError) as error:
-                # What was not told is told when the command comes again.
+                # Unsent acknowledgements are sent when the command arrives again.
                 self.trouble.append(str(error))
                 time.sleep(robot.pause_s)
             if not robot.wait_ms:

@@ -93,7 +93,7 @@ def _signed(data: bytes) -> None:
     except ProtocolError:
         return
     if body not in examples.BODIES:
-        raise Found("a body that nobody signed")
+        raise Found("an accepted body without a valid signature")
 
 
 def _topic(data: bytes) -> None:
@@ -247,7 +247,7 @@ def _body(data: bytes) -> None:
 
 
 def _packet(data: bytes) -> None:
-    """What a broker hears: first of all, and from somebody whom it has accepted."""
+    """Packets at the broker: the first one, and those of an accepted client."""
     limits = Limits()
     accepted = Framer(limits)
     accepted.accept_all()

@@ -25,7 +25,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
 
 
 class Endless:
-    """A body without a declared length that goes on until nobody asks for more."""
+    """A body without a declared length that continues until the server stops reading."""
 
     def __init__(self, most: int) -> None:
         self.taken = 0
@@ -47,10 +47,10 @@ def operations(world: World) -> list[tuple[str, str, str, dict[str, Any]]]:
 
 
 def caller(operation: dict[str, Any]) -> str:
-    """Who may ask."""
+    """Role that may send the request."""
     names = {name for need in operation["security"] for name in need}
     if not names:
-        return "nobody"
+        return "anonymous"
     return "owner" if "accessToken" in names else "agent"
 
 

@@ -15,9 +15,9 @@ HEADERS = {
 
 
 def test_every_answer_of_every_route_has_the_headers(world: World) -> None:
-    """Refused and served ones alike; what holds a secret is kept by nobody."""
+    """For accepted and rejected requests; responses with secrets are not cached."""
     for name, method, path in operations(world):
-        for caller in ("nobody", "owner", "agent"):
+        for caller in ("anonymous", "owner", "agent"):
             _, answer = ask(world, caller, name, method, path)
             missing = HEADERS - set(answer.headers)
             assert not missing, f"{name} by {caller}: {missing}"

@@ -27,7 +27,7 @@ from tests.harness.paths import ROOT
 PASSWORD, WRONG, NEWER = "correct horse battery", "wrong wrong wrong wrong", "staple correct horse"
 CLIENT_SECRET = "of the provider, 32 letters long"
 MOVE = {"kind": "move_joints", "position_rad": {"wrist_3": 0.2}}
-LOUD = '''"""Every logger of this process says all that it can, whatever it is told."""
+LOUD = '''"""Set every logger of this process to DEBUG, regardless of its configuration."""
 import logging
 
 _set, _configure = logging.Logger.setLevel, logging.basicConfig
@@ -40,14 +40,14 @@ KINDS = {
     "a private key": re.compile("PRIVATE KEY"),
     "an Authorization header": re.compile(r"(?i)authorization\W{1,6}(bearer|basic)\s+[\w-]{10,}"),
 }
-"""What agents and programs make for themselves, of which a test knows only what it looks like."""
+"""Secrets that agents and programs generate; the test knows only their patterns."""
 
 
 PEM = re.compile(rb"-----BEGIN PRIVATE KEY-----.*?-----END PRIVATE KEY-----", re.DOTALL)
 
 
 class Run:
-    """One run: what was in play, and what was said beside the log files."""
+    """One run: the secrets in use, and output other than log files."""
 
     def __init__(self, machine: Machine, folder: Path) -> None:
         self.machine = machine
@@ -63,7 +63,7 @@ class Run:
         self._open.close()
 
     def program(self, name: str, *arguments: str) -> str:
-        """A program of ours, run by whoever administers the machine; what it shows them. Its log is kept."""
+        """Run an administrator's command. Returns its output; keeps its log."""
         done = subprocess.run(
             [sys.executable, "-m", *arguments],
             cwd=ROOT,

@@ -1,6 +1,6 @@
-"""Every topic, by everybody, at real brokers: what is heard and said is what ``topics.txt`` says, and nothing else.
+"""Permissions of each role for each topic at real brokers, as listed in ``topics.txt``.
 
-A cell holds ``s`` where somebody may hear a channel of Anneliese's device, ``p`` where they may speak on it.
+A cell contains ``s`` if the role may subscribe to a channel of Anneliese's device, and ``p`` if it may publish.
 """
 
 import json
@@ -158,7 +158,7 @@ def test_every_channel_has_a_row_and_every_row_a_channel(stage: Stage) -> None:
         assert set(cells.values()) <= {"-", "s", "p", "sp"}
 
 
-def test_nobody_hears_what_they_may_not_by_any_filter(stage: Stage) -> None:
+def test_no_role_receives_forbidden_topics_by_any_filter(stage: Stage) -> None:
     table, leaks, heard_all = expected(), [], 0
     for name in RETAINED:
         stage.ear.publish_acknowledged(stage.topics[name], f"{name} kept", retain=True)
@@ -181,7 +181,7 @@ def test_nobody_hears_what_they_may_not_by_any_filter(stage: Stage) -> None:
     assert not leaks, "\n".join(leaks)
 
 
-def test_nobody_says_what_they_may_not(stage: Stage) -> None:
+def test_no_role_publishes_to_forbidden_topics(stage: Stage) -> None:
     table, leaks, said = expected(), [], 0
     for topic in stage.topics.values():
         stage.ear.subscribe(topic)
@@ -202,7 +202,7 @@ def test_nobody_says_what_they_may_not(stage: Stage) -> None:
     assert not leaks, "\n".join(leaks)
 
 
-def test_nobodys_will_is_said_where_they_may_not_speak(stage: Stage) -> None:
+def test_no_will_is_published_to_forbidden_topics(stage: Stage) -> None:
     table = expected()
     wills = [
         ("presence", stage.topics["presence"]),

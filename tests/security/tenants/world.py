@@ -21,9 +21,9 @@ from tests.harness.paths import ROOT
 OWNER = "Anneliese Musterfrau"
 LABEL = "Kronjuwel"
 MOVEMENT = "secretdance"
-SOURCE = "'only for whoever may see it'"
+SOURCE = "'only for permitted accounts'"
 TYPE_TOLD_OF_REFUSALS = {records.ATTEMPTS, records.AUDIT, records.FORGET, records.EVENTS}
-"""Who tried is counted, recorded and told to the owner; nothing else may change when somebody is refused."""
+"""Tables that record a rejected request. No other table may change."""
 
 Ask = Callable[..., httpx.Response]
 Rows = dict[tuple[str, str, str], str]
@@ -31,7 +31,7 @@ Rows = dict[tuple[str, str, str], str]
 
 @dataclass
 class World:
-    """Who asks, and for what."""
+    """Callers, and the resources that they request."""
 
     cloud: Cloud
     callers: dict[str, Ask]
@@ -39,7 +39,7 @@ class World:
     """Path parameter → Anneliese's; ``<operation>.<parameter>`` where one operation needs another."""
     bodies: dict[str, dict[str, Any]]
     marks: set[str] = field(default_factory=set)
-    """What nobody may read who may not read it."""
+    """Texts that must not reach a caller without access."""
     foreign: tuple[str, ...] = ()
     """What the partitions of Anneliese's rows hold."""
 
@@ -113,7 +113,7 @@ def make(home: Path) -> World:
     world = World(
         cloud,
         callers={
-            "nobody": lambda method, path, **more: cloud.ask(method, API + path, **more),
+            "anonymous": lambda method, path, **more: cloud.ask(method, API + path, **more),
             **{name: person.ask for name, person in people.items()},
             "owner": anna.ask,
             **{f"{role} key": _by_key(cloud, key["token"]) for role, key in keys.items()},
@@ -256,5 +256,5 @@ def _bodies(device: str, space: str, epoch: int, introduction: dict[str, Any]) -
 
 
 def texts(answer: httpx.Response) -> str:
-    """All that somebody is told by an answer."""
+    """All text of a response: headers and body."""
     return json.dumps(dict(answer.headers)) + answer.text

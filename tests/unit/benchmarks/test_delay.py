@@ -1,4 +1,4 @@
-"""The delay keeps each byte, in order, for as long as it says, and stalls what it is told to lose."""
+"""The delay forwards each byte in order after the configured time, and stalls dropped segments."""
 
 import socket
 import time
@@ -78,7 +78,7 @@ def test_what_is_lost_comes_a_retransmission_later_and_holds_up_what_follows() -
         assert time.monotonic() - began >= RTO_MIN_S
 
 
-def test_where_nobody_listens_the_client_is_let_go() -> None:
+def test_the_client_is_disconnected_without_a_server() -> None:
     with socket.create_server((HOST, 0)) as server:
         port = server.getsockname()[1]
     with start_delay(port, rtt_ms=0) as way, socket.create_connection((HOST, way.ports[port]), 10) as client:

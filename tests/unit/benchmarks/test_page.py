@@ -1,4 +1,4 @@
-"""The benchmarks' page says what the results say, and a claim that does not hold is told as such."""
+"""The benchmark page matches the results and marks claims that do not hold."""
 
 import pytest
 

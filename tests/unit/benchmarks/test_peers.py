@@ -1,4 +1,4 @@
-"""The peers do the same work as we do, and nobody's exchange ends by somebody else's answer."""
+"""The compared systems do the same work, and each exchange ends with its own response."""
 
 import threading
 

@@ -17,7 +17,7 @@ def sample(at_s: float, *, mb: float = 100.0, descriptors: int = 20, part: str =
     )
 
 
-def test_a_slope_is_found_whatever_a_fifth_of_the_points_says() -> None:
+def test_the_slope_ignores_a_fifth_of_outliers() -> None:
     at_s = [60.0 * minute for minute in range(50)]
     values = [100 + minute / 60 + (30 if minute % 5 == 0 else 0) for minute in range(50)]
     found = theil_sen(at_s, values)
