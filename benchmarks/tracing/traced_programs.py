@@ -238,8 +238,8 @@ def _tell_control(tell: Tell) -> None:
         return run
 
     _wrap(ActionExecutor, "start", _told_first(lambda *_: tell("checked")))
-    _wrap(Controller, "offer", offered)
-    _wrap(Controller, "step", stepped)
+    _wrap(Controller, "accept_setpoint", offered)
+    _wrap(Controller, "update", stepped)
     _wrap(MujocoDriver, "send", sent)
 
 

@@ -13,7 +13,7 @@ from tests.security.tenants.test_routes import ask
 from tests.security.tenants.world import World, make
 
 PART = 65_536
-LARGER = {"add_robot_type": MAX_UPLOAD, "add_robot_type_look": MAX_UPLOAD}
+LARGER = {"add_robot_type": MAX_UPLOAD, "add_robot_type_preview": MAX_UPLOAD}
 """Everything else has the same limit."""
 
 

@@ -99,7 +99,7 @@ def make(home: Path) -> World:
         "fault": fault,
         "upload": upload,
         "stream": "hidden",
-        "preview": _look(anna),
+        "preview": _preview(anna),
         "robot_type": "ur5",
         "name": MOVEMENT,
         "get_robot_type_file.name": "ur5.xml",
@@ -185,8 +185,8 @@ def _say(cloud: Cloud, robot: Robot, epoch: int) -> None:
     assert '"rejected"' not in answer.text, answer.text
 
 
-def _look(anna: Person) -> str:
-    """A robot type that is looked at before it is saved, and that no checker has seen."""
+def _preview(anna: Person) -> str:
+    """Upload a robot type preview, without a check. Returns its id."""
     folder = ROOT / "robots" / "ur5"
     manifest = (folder / "robot.toml").read_text().replace('type = "ur5"', 'type = "mine"')
     files = {name: (folder / name).read_text() for name in ("ur5.xml", "scene.xml")}
@@ -241,7 +241,7 @@ def _bodies(device: str, space: str, epoch: int, introduction: dict[str, Any]) -
         "start_action": {"request": move, "epoch": epoch},
         "start_actions": {"devices": [device], "request": move},
         "add_robot_type": {"manifest": "x", "files": {}},
-        "add_robot_type_look": {"manifest": "x", "files": {}},
+        "add_robot_type_preview": {"manifest": "x", "files": {}},
         "put_movement": {"source": "1"},
         "check_movement": {"source": "1"},
         "mqtt_credentials": {"purpose": "control", "device": device, "epoch": epoch},

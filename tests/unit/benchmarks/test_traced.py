@@ -13,7 +13,7 @@ from tests.harness.paths import ROOT
 
 
 @pytest.mark.parametrize("program", ["functions", "agent"])
-def test_a_traced_program_starts_with_all_that_it_is_to_tell(program: str) -> None:
+def test_every_traced_function_exists(program: str) -> None:
     # Its help is printed after every function was wrapped; one that is gone would end it before.
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.tracing.traced_programs", program, "--help"],
@@ -25,7 +25,7 @@ def test_a_traced_program_starts_with_all_that_it_is_to_tell(program: str) -> No
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert "usage: python -m" in done.stdout
+    assert "usage: " in done.stdout
 
 
 def test_motion_is_told_once_and_rest_only_after_a_while() -> None:
