@@ -17,10 +17,10 @@ import { SignInPage } from "../features/account/sign-in-page";
 
 const LATER = new Map([...ROWS].map(([name, { load }]) => [name, lazyPage(load)]));
 
-/** Fetch what the address names and what must not be waited for, while it is still being asked who this is. */
+/** Preloads the requested page and the operating pages while the session is being checked. */
 export function fetchEarly(): void {
   for (const [name, { early }] of ROWS) {
-    // What fails here is tried again, and said, when it is opened.
+    // A failed preload is retried, and reported, when the page opens.
     if (early === true || name === route.value.page) LATER.get(name)?.fetch().catch(() => undefined);
   }
 }
@@ -69,7 +69,7 @@ function SignedIn({ api, session, followed, pairing, account }: SignedInProps) {
     const made = new Fleet(api);
     setFleet(made);
     const forget = effect(() => {
-      // Refused credentials mean, nearly always, that the sign-in has ended: the server knows.
+      // Rejected credentials usually mean an expired session: ask the server.
       if (made.link.status.value.state === "refused") void checkSession(api, session);
     });
     return () => {
@@ -90,7 +90,7 @@ function SignedIn({ api, session, followed, pairing, account }: SignedInProps) {
   );
 }
 
-/** The page that the address names. */
+/** The page of the current address. */
 function Opened(props: Omit<PageProps, keyof At>) {
   const { page, at } = route.value;
   const title = ROWS.get(page)?.title ?? "";
@@ -113,7 +113,7 @@ async function checkSession(api: Api, session: Session): Promise<void> {
   }
 }
 
-// The fragment is the route here, so the link moves the focus itself.
+// The fragment holds the route, so the skip link sets the focus in code.
 function focusContent(event: MouseEvent): void {
   event.preventDefault();
   const content = document.getElementById("content");
@@ -121,7 +121,7 @@ function focusContent(event: MouseEvent): void {
   content?.focus();
 }
 
-/** Said once the connection has been away for a moment, and until it is back. */
+/** Notice while the connection is lost, shown after a short delay. */
 function LinkBanner({ fleet }: { fleet: Fleet }) {
   const { state, why } = fleet.link.status.value;
   const [wasUp, setWasUp] = useState(false);

@@ -1,12 +1,12 @@
-/** A page whose code comes when it is opened, so that the first load stays small. */
+/** A page whose code loads when it opens, to keep the first load small. */
 import type { ComponentType } from "preact";
 import { useEffect, useState } from "preact/hooks";
 import { common } from "../shared/i18n/common";
 
 export interface LazyPage<Props> {
-  /** The page; it says so while it is still being loaded, and offers another try where that fails. */
+  /** Renders the page, a loading state, or an error with a retry button. */
   Page: ComponentType<Props>;
-  /** Load it before it is opened. */
+  /** Loads the code in advance. */
   fetch: () => Promise<void>;
 }
 

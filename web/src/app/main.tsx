@@ -22,14 +22,14 @@ const session = new Session(api);
 const followed = new FollowedInvitation(sessionStorage);
 const pairing = new FollowedCode(sessionStorage);
 
-/** Take a sign-in token out of the address before anything else can read, show or keep it. */
+/** Removes a sign-in token from the address before other code can read, show or store it. */
 function takeToken(): string | null {
   const token = signInToken(location.hash);
   if (token !== null) history.replaceState(null, "", `${location.pathname}${location.search}#/`);
   return token;
 }
 
-/** Take an invitation's secret out of the address, as with a sign-in token. */
+/** Removes an invitation's secret from the address, like a sign-in token. */
 function takeInvitation(): void {
   const secret = invitationSecret(location.hash);
   if (secret === null) return;
@@ -37,7 +37,7 @@ function takeInvitation(): void {
   followed.follow(secret);
 }
 
-/** Take a claim code out of the address, as with a sign-in token. */
+/** Removes a claim code from the address, like a sign-in token. */
 function takeCode(): void {
   const code = pairingCode(location.hash);
   if (!location.hash.startsWith("#pair=")) return;
@@ -45,7 +45,7 @@ function takeCode(): void {
   if (code !== null) pairing.follow(code);
 }
 
-/** What went wrong elsewhere, taken out of the address: it is said once. */
+/** Removes an external sign-in error from the address, so that it is shown once. */
 function takeFailure(): string {
   const code = signInFailure(location.hash);
   if (code === null) return "";
@@ -56,7 +56,7 @@ function takeFailure(): string {
 
 takeInvitation();
 takeCode();
-// Whoever has signed in, wherever that led, comes back to what they were invited to.
+// After the sign-in, return the user to the invitation.
 effect(() => {
   if (session.state.value.kind === "in" && followed.state.value.kind === "open") replaceWith(invitationAddress);
 });

@@ -1,4 +1,4 @@
-/** The bar above every page: the parts of the console, the account, the way out. */
+/** The navigation bar: sections of the console, account and sign-out. */
 import type { Account } from "../shared/api/types";
 import type { Session } from "../features/account/model/session";
 import { texts } from "./texts";

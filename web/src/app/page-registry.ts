@@ -1,7 +1,6 @@
 /**
- * Every page there is: its address, what it is called, where it stands in the navigation, and the code that comes when it
- * is opened. Routing, navigation and loading go by this table alone. All pages require a signed-in account:
- * without one, the app shows the sign-in page for every address.
+ * All pages: address, title, navigation entry and lazily loaded code. Routing, navigation and loading use only this
+ * table. All pages require a signed-in account: without one, the app shows the sign-in page for every address.
  */
 import type { Account } from "../shared/api/types";
 import type { ComponentType } from "preact";
@@ -12,7 +11,7 @@ import type { FollowedCode } from "../features/pairing/model/claim-code";
 import type { At, PageName } from "../shared/routing/routes";
 import { texts } from "./texts";
 
-/** What a page is given; each takes of it what it needs. */
+/** Properties that are passed to every page. */
 export interface PageProps extends At {
   api: Api;
   fleet: Fleet;
@@ -26,11 +25,11 @@ type Part = "account" | "devices" | "health" | "movements" | "robotTypes" | "lat
 
 interface Page {
   readonly title: string | ((at: At, fleet: Fleet) => string);
-  /** Which part of the console it belongs to. */
+  /** The section of the console that contains the page. */
   readonly part: Part;
-  /** Its link in the navigation, of one page of each part. */
+  /** The navigation link; one page per section has one. */
   readonly link?: string;
-  /** Its code is fetched with the first load: who operates must not have to wait for it. */
+  /** Whether its code is preloaded, so that operators do not wait for it. */
   readonly early?: true;
   readonly load: () => Loaded;
 }
@@ -140,5 +139,5 @@ export const PAGES = {
   },
 } satisfies Record<PageName, Page>;
 
-/** Typed by what each row may have, not by what it has. */
+/** The table with the general row type instead of the literal types. */
 export const ROWS: ReadonlyMap<PageName, Page> = new Map(Object.entries(PAGES) as [PageName, Page][]);

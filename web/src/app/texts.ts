@@ -1,4 +1,4 @@
-/** Texts of the frame around every page, and the titles of pages. */
+/** Texts of the page frame, and page titles. */
 export const texts = {
   product: "Telescope",
   /** For the browser's tab. */

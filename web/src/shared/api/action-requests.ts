@@ -16,7 +16,7 @@ import type {
   TakePosture,
 } from "../mqtt/protocol.generated";
 
-/** A movement by its name: the cloud adds the script, in its newest version. */
+/** Runs a movement by name; the cloud adds the newest version of its script. */
 export interface RunMovementByName {
   kind: "run_movement";
   name: string;
@@ -36,12 +36,12 @@ export type RobotRequest =
   | Drive
   | GoTo;
 
-/** What is asked of a room device. */
+/** Actions of room devices. */
 export type RoomRequest = CollectData | TakePicture | CaptureRaw | SetControl;
 
 export type AnyRequest = RobotRequest | RoomRequest;
 
-/** Of these nothing has to move: the device itself says that it does them. */
+/** Actions without motion: the device's state confirms them. */
 const STILL: ReadonlySet<AnyRequest["kind"]> = new Set(["say", "set_stiffness", "gather", "shoot", "capture", "set_control"]);
 
 export function moves({ kind }: { kind: AnyRequest["kind"] | "stream" }): boolean {

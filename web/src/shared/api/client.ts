@@ -1,4 +1,4 @@
-/** The HTTP API, as far as the console uses it. The session travels in a cookie that no script can read. */
+/** The HTTP API calls of the console. The session uses an HttpOnly cookie. */
 import type { Account, Action, ActionCallOptions, ControlRequestInfo, Credentials, Device, GrantedLease, LatencyBatch, Lease, Purpose, Series, SignInMethods, SignInSession, Space, Upload, Watcher } from "./types";
 import { HealthApi } from "./health";
 import { LatencyApi } from "./latency";
@@ -28,14 +28,14 @@ interface SignedIn {
   csrf_token: string;
 }
 
-/** One method for each call. All of them throw `ApiError`, and nothing else. */
+/** One method per call. All methods throw only `ApiError`. */
 export class Api {
   readonly #http: Http;
-  /** How devices are. */
+  /** Device health. */
   readonly health: HealthApi;
   readonly library: Library;
   readonly robotTypes: RobotTypes;
-  /** How long things take. */
+  /** Latency samples. */
   readonly latency: LatencyApi;
   readonly transfers: Transfers;
 
@@ -56,12 +56,12 @@ export class Api {
     return this.#signedIn(await this.#http.call("POST", "/auth/password", { body: { name, password } }));
   }
 
-  /** Make an account with an invitation's secret: signs in to it, and redeems the invitation. */
+  /** Creates an account with an invitation's secret, signs in and redeems the invitation. */
   async makeAccount(invitation: string, name: string, password: string): Promise<Account> {
     return this.#signedIn(await this.#http.call("POST", "/auth/accounts", { body: { invitation, name, password } }));
   }
 
-  /** Where a browser goes on to sign in elsewhere, with an invitation for who has no account yet. */
+  /** The URL of the external sign-in, with an invitation for users without an account. */
   async startOpenIdSignIn(invitation: string): Promise<string> {
     const begun = await this.#http.call<{ url: string }>("POST", "/auth/oidc/start", { body: { invitation } });
     return begun.url;
@@ -114,12 +114,12 @@ export class Api {
     return this.#http.all(`${at(target)}/shares`);
   }
 
-  /** Share, or change a share; `forS` null: until it is ended. */
+  /** Creates or changes a share; `forS` null: no expiry [s]. */
   share(target: Target, account: string, role: SharedRole, forS: number | null): Promise<Share> {
     return this.#http.call("POST", `${at(target)}/shares`, { body: { account, role, expires_in_s: forS } });
   }
 
-  /** What is still under way where the broker has not answered; empty where all has ended. */
+  /** The unfinished revocations that the broker has not confirmed; empty if all are complete. */
   async unshare(target: Target, account: string): Promise<string> {
     const rest = await this.#http.call<{ detail: string } | null>("DELETE", `${at(target)}/shares/${account}`);
     return rest?.detail ?? "";
@@ -157,7 +157,7 @@ export class Api {
     await this.#http.call("DELETE", `/api-keys/${id}`);
   }
 
-  /** One page of what was done in the account, the newest first. */
+  /** One page of the account's audit log, newest first. */
   audit(query: AuditQuery, cursor: string | null, limit: number): Promise<AuditPage> {
     const asked = new URLSearchParams({ limit: String(limit) });
     if (query.event !== "") asked.set("event", query.event);
@@ -168,7 +168,7 @@ export class Api {
     return this.#http.call("GET", `/accounts/me/audit?${asked.toString()}`);
   }
 
-  /** Pair an agent by the code it shows; `space` null: into the first one. */
+  /** Pairs an agent by its claim code; `space` null: the account's first space. */
   async claim(code: string, space: string | null = null): Promise<Device[]> {
     const body = space === null ? { code } : { code, space };
     const answer = await this.#http.call<{ devices: Device[] }>("POST", "/agents/claim", { body });
@@ -199,7 +199,7 @@ export class Api {
     return this.#http.call("POST", `/devices/${device}/lease`, { body, waitMs });
   }
 
-  /** Ask the holder for control; `confirmed`: the device shows it. */
+  /** Requests control from the lease holder; `confirmed`: the device displays the request. */
   requestControl(device: string, withinMs: number): Promise<{ request: ControlRequestInfo; confirmed: boolean }> {
     const waitMs = 1000;
     return this.#http.call("POST", requests(device), { body: { within_ms: withinMs, wait_ms: waitMs }, waitMs });
@@ -209,7 +209,7 @@ export class Api {
     return this.#http.call("GET", `${requests(device)}/${id}`);
   }
 
-  /** Give who asks the control that this session holds, or keep it. */
+  /** Hands this session's control over to the requester, or rejects the request. */
   async answerRequest(device: string, id: string, accept: boolean): Promise<void> {
     await this.#http.call("POST", `${requests(device)}/${id}/${accept ? "accept" : "reject"}`);
   }
@@ -218,7 +218,7 @@ export class Api {
     await this.#http.call("DELETE", `${requests(device)}/${id}`, { keepalive: leaving });
   }
 
-  /** Say that this page looks at a device, and hear who else does. */
+  /** Reports this page as a viewer of a device and returns the other viewers. */
   watch(device: string): Promise<{ items: Watcher[]; refresh_ms: number }> {
     return this.#http.call("PUT", `/devices/${device}/viewers`);
   }
@@ -227,17 +227,17 @@ export class Api {
     await this.#http.call("DELETE", `/devices/${device}/viewers`, { keepalive: true });
   }
 
-  /** `null`: call it as its agent does. */
+  /** Renames a device; `null`: use its agent's name. */
   rename(device: string, label: string | null): Promise<Device> {
     return this.#http.call("PUT", `/devices/${device}/label`, { body: { label } });
   }
 
-  /** What can be run on a device: its owner's movements for its robot type, and those that come with the type. */
+  /** Movements available on a device: its owner's for the robot type, and the built-in ones. */
   movements(device: string): Promise<Movement[]> {
     return this.#http.all(`/devices/${device}/movements`);
   }
 
-  /** Ask something of a device; the answer comes when it has got as far as wanted, or after some seconds. */
+  /** Starts an action. Returns when it reaches the requested status, or after a timeout. */
   startAction(device: string, request: AnyRequest, { epoch, waitFor, timeoutMs }: ActionCallOptions, key: string): Promise<Action> {
     const waitMs = waitFor === "done" ? 10_000 : 3_000;
     const body = {
@@ -250,7 +250,7 @@ export class Api {
     return this.#http.call("POST", `/devices/${device}/actions`, { body, waitMs, headers: { "Idempotency-Key": key } });
   }
 
-  /** Add times that this page has measured. */
+  /** Uploads latency samples of this page. */
   async addLatency(device: string, batch: LatencyBatch, key: string): Promise<void> {
     await this.#http.call("POST", `/devices/${device}/latency`, { body: batch, headers: { "Idempotency-Key": key } });
   }
@@ -260,12 +260,12 @@ export class Api {
     return (await this.#http.call<Page<Upload>>("GET", `/devices/${device}/uploads?limit=${limit}`)).items;
   }
 
-  /** One captured file, and where its content can be read for an hour. */
+  /** One captured file, with a content URL that is valid for one hour. */
   upload(device: string, id: string): Promise<Upload & { url: string }> {
     return this.#http.call("GET", `/devices/${device}/uploads/${id}`);
   }
 
-  /** What a stream has measured in between [ms since 1970], in at most so many points. */
+  /** A stream's measurements between two times [ms since 1970], reduced to a maximum number of points. */
   series(device: string, stream: string, fromMs: number, points: number, field: string): Promise<Series> {
     const query = new URLSearchParams({ from: String(Math.round(fromMs)), points: String(points), fields: field });
     return this.#http.call("GET", `/devices/${device}/data/${stream}?${query.toString()}`);
@@ -301,7 +301,7 @@ function requests(device: string): string {
   return `/devices/${device}/lease/requests`;
 }
 
-/** Where what is shared stands. */
+/** The path of a shared device or space. */
 export function at({ kind, id }: Target): string {
   return `/${kind}s/${id}`;
 }

@@ -3,15 +3,15 @@ import type { Http, Page } from "./http";
 import type { Event } from "../mqtt/protocol.generated";
 
 export type Severity = Event["severity"];
-/** `unknown`: nothing is heard of it. */
+/** `unknown`: no messages from the device. */
 export type HealthState = "ok" | "unknown" | "warning" | "fault";
 
 export interface Fault {
-  /** Counts down with time: of all faults the newest sorts first. */
+  /** Decreases with time, so that the newest fault sorts first. */
   id: string;
   code: string;
   state: "raised" | "acknowledged" | "cleared";
-  /** Who noticed: the device itself, the detectors, or the cloud, which no longer hears of it. */
+  /** The source: the device, the detectors, or the cloud (no messages). */
   source: "device" | "detector" | "cloud";
   kind: string;
   severity: Severity;
@@ -25,12 +25,12 @@ export interface Fault {
   acknowledged_at: string | null;
   acknowledged_by: string;
   cleared_at: string | null;
-  /** The first, second … of its code. */
+  /** Occurrence number for its code. */
   count: number;
   worsened: number;
 }
 
-/** One watched field, by means over ten seconds. */
+/** One monitored field, averaged over ten seconds. */
 export interface Watched {
   stream: string;
   field: string;
@@ -67,7 +67,7 @@ export interface DeviceHealth {
   fields: Watched[];
 }
 
-/** One device in the list of all. */
+/** One device in the health list. */
 export interface HealthLine {
   device: string;
   label: string;
@@ -93,7 +93,7 @@ export interface StoredStream {
   fields: string[];
 }
 
-/** One method for each call. All of them throw `ApiError`, and nothing else. */
+/** One method per call. All methods throw only `ApiError`. */
 export const RANK: Readonly<Record<HealthState, number>> = { ok: 0, unknown: 1, warning: 2, fault: 3 };
 
 export class HealthApi {
@@ -103,7 +103,7 @@ export class HealthApi {
     this.#http = http;
   }
 
-  /** Every device's health, worst first; of one space, or of all. */
+  /** Health of all devices, or those of one space, worst first. */
   async all(space: string | null): Promise<HealthLine[]> {
     const lines = await this.#http.all<HealthLine>(space === null ? "/diagnostics" : `/spaces/${space}/diagnostics`);
     return lines.sort((one, other) => RANK[other.health] - RANK[one.health] || one.label.localeCompare(other.label));
@@ -113,7 +113,7 @@ export class HealthApi {
     return this.#http.call("GET", `/devices/${device}/diagnostics`);
   }
 
-  /** Faults that are over, the newest first. */
+  /** Cleared faults, newest first. */
   past(device: string, cursor: string | null, limit: number): Promise<Page<Fault>> {
     return this.#http.call("GET", `/devices/${device}/faults?open=false&${paging(cursor, limit)}`);
   }
@@ -122,7 +122,7 @@ export class HealthApi {
     return this.#http.call("POST", `/devices/${device}/faults/${fault}/acknowledge`);
   }
 
-  /** What happened, the newest first. */
+  /** Events, newest first. */
   events(device: string, cursor: string | null, limit: number): Promise<Page<StoredEvent>> {
     return this.#http.call("GET", `/devices/${device}/events?${paging(cursor, limit)}`);
   }

@@ -1,4 +1,4 @@
-/** Calls to the HTTP API: one session in a cookie that no script can read, one error for all that can go wrong. */
+/** HTTP API calls with an HttpOnly session cookie. All failures are `ApiError`. */
 import { learnServerTime, now } from "../lib/clock";
 
 export interface Page<T> {
@@ -6,11 +6,11 @@ export interface Page<T> {
   cursor: string | null;
 }
 
-/** The server said no (a problem document), or could not be reached (`status` 0). The message is fit for the page. */
+/** The server rejected the call (a problem document) or was unreachable (`status` 0). The message can be displayed. */
 export class ApiError extends Error {
   override name = "ApiError";
   readonly status: number;
-  /** The last part of the problem's type, such as `lease-held`; `unreachable` where there was no answer. */
+  /** The last part of the problem's type, such as `lease-held`; `unreachable` without a response. */
   readonly code: string;
   readonly extra: Readonly<Record<string, unknown>>;
 
@@ -22,36 +22,36 @@ export class ApiError extends Error {
   }
 }
 
-/** How long one call may take, beside what it asked the server to wait [ms]. */
+/** Timeout of one call, in addition to the server-side wait [ms]. */
 const TIMEOUT_MS = 10_000;
 
 export interface CallOptions {
   body?: unknown;
-  /** What the server was asked to wait before it answers [ms]. */
+  /** Requested server-side wait [ms]. */
   waitMs?: number;
   headers?: Record<string, string>;
-  /** Let the call outlive the page. */
+  /** Completes the call after the page closes. */
   keepalive?: boolean;
-  /** It was refused once for want of the session's token. */
+  /** Whether the call is a retry after a missing CSRF token. */
   again?: boolean;
 }
 
-/** All of its methods throw `ApiError`, and nothing else. */
+/** All methods throw only `ApiError`. */
 export class Http {
   readonly #base: string;
-  /** What goes with the cookie in calls that change something: a page of another site cannot know it. */
+  /** CSRF token, sent with changing calls. Other sites cannot read it. */
   #csrf = "";
 
   constructor(base: string) {
     this.#base = base;
   }
 
-  /** The token that this session's answers brought. */
+  /** The CSRF token from this session's responses. */
   trust(csrf: string): void {
     this.#csrf = csrf;
   }
 
-  /** Every page of a list. */
+  /** All pages of a list. */
   async all<T>(path: string): Promise<T[]> {
     const items: T[] = [];
     let cursor: string | null = null;
@@ -90,7 +90,7 @@ export class Http {
     const body = parseBody(text, response.status);
     if (response.ok) return body as T;
     const refused = problem(response.status, body);
-    // Signed in anew in another tab: the cookie is the new session's, and so has the token to be.
+    // After a new sign-in in another tab the cookie has changed, so use the new session's token.
     if (refused.code !== "csrf-token" || options.again === true) throw refused;
     const { csrf_token: csrf } = await this.call<{ csrf_token: string | null }>("GET", "/accounts/me");
     this.trust(csrf ?? "");
@@ -115,7 +115,7 @@ function problem(status: number, body: unknown): ApiError {
   return new ApiError(status, type.split("/").pop() ?? "", message, given);
 }
 
-/** An error's sentence for the page. */
+/** An error as a sentence for display. */
 export function sentence(error: unknown): string {
   return error instanceof Error ? error.message : String(error);
 }

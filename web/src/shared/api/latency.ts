@@ -2,7 +2,7 @@
 import type { Http } from "./http";
 
 export const TRANSPORTS = ["mqtt", "websocket", "http", "http-poll", "xmpp"] as const;
-/** `http` is long polling where an agent does it; `http-poll` asks at an interval. */
+/** `http`: long polling; `http-poll`: polling at an interval. */
 export type Transport = (typeof TRANSPORTS)[number];
 
 export const PATHS = [
@@ -13,20 +13,20 @@ export const PATHS = [
   "operator-cloud",
   "device-cloud",
 ] as const;
-/** From where to where; each is measured on one clock. */
+/** The measured path. Each path uses one clock. */
 export type Path = (typeof PATHS)[number];
 
 export interface Sample {
-  /** By the clock of who measured [ms since 1970]. */
+  /** Time of the measurement on the measuring side's clock [ms since 1970]. */
   atMs: number;
   ms: number;
 }
 
-/** One transport and path, as the cloud tells it. */
+/** Statistics of one transport and path from the cloud. */
 export interface StoredLatency {
   transport: Transport;
   path: Path;
-  /** Of the whole span, and so are the figures: there may be more than samples are kept. */
+  /** Count over the whole period, like the statistics; may exceed the number of stored samples. */
   count: number;
   mean_ms: number | null;
   max_ms: number | null;
@@ -50,7 +50,7 @@ export class LatencyApi {
     return items;
   }
 
-  /** Ask the server whether it is well: there and back over HTTP. */
+  /** Measures one HTTP round trip to the server's health endpoint. */
   async ask(): Promise<void> {
     await this.#http.call("GET", "/health");
   }

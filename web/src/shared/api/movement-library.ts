@@ -1,8 +1,8 @@
-/** Movements of the robot types: what is in the library, saving, checking, and running one on many robots. */
+/** The movement library: list, save, check, and run one movement on several robots. */
 import type { Action } from "./types";
 import { ApiError, type Http } from "./http";
 
-/** What an operator may set: a small part of JSON Schema, with units. */
+/** Parameters of a movement: a subset of JSON Schema, with units. */
 export type Schema = {
   title?: string;
   description?: string;
@@ -49,7 +49,7 @@ export interface RobotTypeEntry {
   state: "checking" | "ready" | "rejected";
 }
 
-/** What is wrong with a script: lines from 1, columns from 0, in characters. An `error` keeps it from being saved. */
+/** A finding in a script: lines from 1, columns from 0 [characters]. An `error` prevents saving. */
 export interface Mark {
   severity: "error" | "warning";
   message: string;
@@ -71,7 +71,7 @@ export interface ScriptParameter {
   kind: "positional" | "keyword" | "rest";
   type?: string;
   default?: string;
-  /** What its strings are names of. */
+  /** The kind of names that its strings refer to. */
   names?: string;
 }
 
@@ -91,13 +91,13 @@ export interface ScriptValue {
   methods?: ScriptCall[];
 }
 
-/** What a script finds, and what the robot type has by name: `joints`, `frames`, `postures` … */
+/** The script API and the robot type's names: `joints`, `frames`, `postures` … */
 export interface Scripting {
   api: { values: ScriptValue[]; functions: ScriptCall[]; modules: string[] };
   names: Record<string, string[]>;
 }
 
-/** What became of one device of many: its action, or why there is none. */
+/** The result for one device: its action, or the reason for a rejection. */
 export interface FleetItem {
   device: string;
   status: number;
@@ -105,10 +105,10 @@ export interface FleetItem {
   problem: { detail: string } | null;
 }
 
-/** The newest version is another than the one that a script was made from; it has not been saved. */
+/** The script was not saved, because a version newer than its base exists. */
 export class MovementChanged extends ApiError {
   override name = "MovementChanged";
-  /** The newest; 0: the movement has been deleted. */
+  /** The newest version; 0: the movement was deleted. */
   readonly version: number;
 
   constructor(error: ApiError) {
@@ -117,7 +117,7 @@ export class MovementChanged extends ApiError {
   }
 }
 
-/** All of its methods throw `ApiError`, and nothing else. */
+/** All methods throw only `ApiError`. */
 export class Library {
   readonly #http: Http;
 
@@ -133,7 +133,7 @@ export class Library {
     return this.#http.all(at(robotType));
   }
 
-  /** The newest version, or the one that is asked for. */
+  /** The newest version, or the requested one. */
   get(robotType: string, name: string, version?: number): Promise<MovementSource> {
     return this.#http.call("GET", at(robotType, name) + (version === undefined ? "" : `?version=${version}`));
   }
@@ -144,8 +144,8 @@ export class Library {
   }
 
   /**
-   * Save a new version. `basedOn`: the version that it was made from, 0 for a new movement.
-   * Throws `MovementChanged` where another is the newest; `ApiError` with `extra.line` where it is no Python.
+   * Saves a new version. `basedOn`: its base version, 0 for a new movement.
+   * Throws `MovementChanged` if a newer version exists, and `ApiError` with `extra.line` for a syntax error.
    */
   async save(robotType: string, name: string, source: string, basedOn: number): Promise<Movement> {
     try {
@@ -155,7 +155,7 @@ export class Library {
     }
   }
 
-  /** All versions of one's own; a built-in one of the same name shows again. */
+  /** Deletes all versions of an own movement; a built-in one of the same name becomes visible again. */
   async remove(robotType: string, name: string): Promise<void> {
     await this.#http.call("DELETE", at(robotType, name));
   }
@@ -168,7 +168,7 @@ export class Library {
     return this.#http.call("GET", `/robot-types/${encodeURIComponent(robotType)}/scripting`);
   }
 
-  /** Run a movement on several devices by one call; each has an answer of its own. `epochs`: of the leases held here. */
+  /** Runs a movement on several devices; returns a result per device. `epochs`: of the leases of this session. */
   async runOnMany(
     devices: readonly string[],
     movement: string,

@@ -1,4 +1,4 @@
-/** Robot types over the HTTP API: those that one may see, and one that is looked at before it is saved. */
+/** Robot types over the HTTP API: the visible ones, and previews of uploads. */
 import type { Http } from "./http";
 import { readTwin, type KnownTwin } from "../mqtt/parse-messages";
 import type { Joint, MimicJoint, PositionDependentLimit } from "../mqtt/protocol.generated";
@@ -29,7 +29,7 @@ export interface RobotType {
   postures: string[];
   expressions: string[];
   behaviours: string[];
-  /** What its robots may be asked for; each says itself what it really takes. */
+  /** Actions of the type; each robot's description lists those it accepts. */
   actions: string[];
   streams: { name: string; rate_hz: number }[];
   built_in: boolean;
@@ -46,7 +46,7 @@ export interface Look {
   robot_type: RobotType;
 }
 
-/** The model as the page draws it, and what else is in it. */
+/** The displayed model, and its other content. */
 export interface TypeModel {
   twin: KnownTwin;
   actuators: string[];
@@ -60,7 +60,7 @@ export interface TypeMovement {
   built_in: boolean;
 }
 
-/** What is sent of a folder: files are text where they are XML, else base64; movements are scripts by name. */
+/** An uploaded folder: XML files as text, other files as base64, movements as scripts by name. */
 export interface TypeFolder {
   manifest: string;
   files: Record<string, string>;
@@ -74,12 +74,12 @@ interface TwinAnswer {
   cameras: string[];
 }
 
-/** How long a large upload may take on a slow line [ms]. */
+/** Timeout of an upload over a slow connection [ms]. */
 const SENDING_MS = 170_000;
-/** What the server is asked to wait for a verdict on what is saved [ms]. */
+/** Requested server-side wait for the validation result [ms]. */
 const VERDICT_MS = 20_000;
 
-/** All of its methods throw `ApiError`, and nothing else but a `MessageError` where a drawing is not one. */
+/** All methods throw only `ApiError`, or `MessageError` for an invalid model. */
 export class RobotTypes {
   readonly #http: Http;
 
@@ -111,7 +111,7 @@ export class RobotTypes {
     await this.#http.call("DELETE", `/robot-types/${type}`);
   }
 
-  /** Where all its files are, as one archive. */
+  /** The URL of an archive with all files. */
   archiveAddress(type: string): string {
     return `/api/v1/robot-types/${type}/archive`;
   }
@@ -120,7 +120,7 @@ export class RobotTypes {
     return `/api/v1/robot-types/${type}/files/${name}`;
   }
 
-  /** Upload for a look; the verdict is asked for afterwards. */
+  /** Uploads a preview; its validation result is requested separately. */
   look(folder: TypeFolder): Promise<Look> {
     return this.#http.call("POST", "/robot-type-previews", { body: { ...folder, wait_ms: 0 }, waitMs: SENDING_MS });
   }
@@ -144,7 +144,7 @@ export class RobotTypes {
 
   async #model(path: string): Promise<TypeModel> {
     const { actuators, cameras, ...twin } = await this.#http.call<TwinAnswer>("GET", path);
-    // Read as what a robot says of itself is: a page draws nothing that has not been looked at.
+    // Validate it like a robot's own model: the page draws validated models only.
     return { twin: readTwin(new TextEncoder().encode(JSON.stringify(twin))), actuators, cameras };
   }
 }

@@ -1,4 +1,4 @@
-/** Who may do what, on the wire: shares, invitations, API keys, and the record of what was done. */
+/** Wire types of shares, invitations, API keys and the audit log. */
 
 export type Role = "owner" | "operator" | "viewer";
 export type SharedRole = Exclude<Role, "owner">;
@@ -8,7 +8,7 @@ export interface Person {
   name: string;
 }
 
-/** What can be shared. */
+/** Kinds of shared resources. */
 export interface Target {
   kind: "device" | "space";
   id: string;
@@ -19,11 +19,11 @@ export interface Share {
   role: SharedRole;
   created_by: string;
   created_at: string;
-  /** `null`: until it is ended. */
+  /** `null`: no expiry. */
   expires_at: string | null;
 }
 
-/** `role` `owner`: something changes hands. */
+/** An invitation. `role` `owner`: a transfer of ownership. */
 export interface Invitation {
   id: string;
   kind: "device" | "space" | "agent";
@@ -32,7 +32,7 @@ export interface Invitation {
   role: Role;
   created_by: string;
   uses: number;
-  /** How long the part lasts from when it is taken [s]; `null`: until it is ended. */
+  /** Duration of the role after acceptance [s]; `null`: no expiry. */
   share_s: number | null;
   expires_at: string;
   /** The only account that may redeem it, shown to the owner; `null`: any account with the secret. */
@@ -55,7 +55,7 @@ export interface InvitationWanted {
 export interface ApiKeyWanted {
   name: string;
   role: SharedRole;
-  /** Ids of devices, and `space:<id>`; empty: all that the account may see. */
+  /** Device ids and `space:<id>`; empty: everything the account can access. */
   only: string[];
   days: number;
 }
@@ -65,13 +65,13 @@ export interface ApiKey extends Omit<ApiKeyWanted, "days"> {
   created_at: string;
   expires_at: string;
   expired: boolean;
-  /** Right to the hour. */
+  /** Accurate to one hour. */
   last_used_at: string | null;
 }
 
 export interface ApiKeyMade {
   api_key: ApiKey;
-  /** Told this once. */
+  /** Returned only in this response. */
   token: string;
 }
 
@@ -96,10 +96,10 @@ export interface AuditPage {
   cursor: string | null;
 }
 
-/** Empty and `null`: everything. */
+/** Filter; empty or `null`: all entries. */
 export interface AuditQuery {
   event: string;
-  /** As the record names it: a device's id, `device:<id>` and `space:<id>` of shares, `key:<id>`. */
+  /** The subject in the log: a device id, `device:<id>` or `space:<id>` for shares, `key:<id>`. */
   target: string;
   sinceMs: number | null;
   untilMs: number | null;

@@ -1,14 +1,14 @@
-/** Handing an agent with its devices, or a space with all that is in it, over to another account that accepts it. */
+/** Transfers an agent with its devices, or a space with its content, to another account. */
 import type { Http } from "./http";
 import type { Invitation, InvitationMade } from "./sharing";
 
-/** What can change hands. */
+/** Kinds of transferable resources. */
 export interface Whole {
   kind: "agent" | "space";
   id: string;
 }
 
-/** All of its methods throw `ApiError`, and nothing else. */
+/** All methods throw only `ApiError`. */
 export class Transfers {
   readonly #http: Http;
 
@@ -16,7 +16,7 @@ export class Transfers {
     this.#http = http;
   }
 
-  /** Those that can still be accepted, oldest first. */
+  /** Open offers, oldest first. */
   open(of: Whole): Promise<Invitation[]> {
     return this.#http.all(at(of));
   }

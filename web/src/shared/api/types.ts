@@ -11,7 +11,7 @@ export interface Account {
   session: string;
 }
 
-/** How one may sign in here; `oidc`: at an OpenID Connect provider. */
+/** Available sign-in methods; `oidc`: OpenID Connect provider. */
 export interface SignInMethods {
   password: boolean;
   oidc: { name: string; url: string } | null;
@@ -26,7 +26,7 @@ export interface SignInSession {
   mine: boolean;
 }
 
-/** Somebody asks for control. `ended`: the lease that it asked for has ended otherwise. */
+/** A request for control. `ended`: the requested lease ended for another reason. */
 export interface ControlRequestInfo {
   id: string;
   requester: string;
@@ -44,11 +44,11 @@ export interface Lease {
   mine: boolean;
   /** The reason for taking it from another operator. */
   reason?: string;
-  /** The open one. */
+  /** The open request. */
   request?: ControlRequestInfo | null;
 }
 
-/** Somebody else who looks at a device. `mine`: this very account, signed in elsewhere. */
+/** Another viewer of a device. `mine`: this account in another session. */
 export interface Watcher {
   name: string;
   role: Role;
@@ -64,7 +64,7 @@ export interface Device {
   robot_type: string;
   agent: string;
   space: string;
-  /** What this account may do with it. A viewer watches, and changes nothing. */
+  /** This account's role on the device. A viewer has read access only. */
   role: Role;
   owner: Person;
   topic: string;
@@ -95,7 +95,7 @@ export interface Action {
   result: Record<string, unknown>;
 }
 
-/** Times of one kind, each measured on this page's clock alone. */
+/** Latency samples of one kind, measured on this page's clock. */
 export interface LatencyBatch {
   transport: "websocket" | "http";
   path: "operator-device" | "operator-cloud";
@@ -113,7 +113,7 @@ export interface Upload {
   verified: boolean;
 }
 
-/** A stretch of a stream: of `raw` samples `mean` is the value itself, and there are no others. */
+/** A section of a stream. With `raw` samples, `mean` is the value and the other lists are empty. */
 export interface Series {
   resolution: string;
   span_ms: number;

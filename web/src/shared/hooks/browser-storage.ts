@@ -1,4 +1,4 @@
-/** The browser's own storage, where it lets a page have it. */
+/** The browser's storage, if the browser permits it. */
 export function storage(): Storage | null {
   try {
     return localStorage;

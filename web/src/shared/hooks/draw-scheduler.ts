@@ -4,13 +4,13 @@
  */
 import { now } from "../lib/clock";
 
-/** Drawing takes at most one part in this many of the page's time. */
+/** Drawing uses at most this fraction (1/n) of the page's time. */
 const TIME_SHARE = 4;
 const LONGEST_WAIT_MS = 400;
-/** Nobody feels a frame that costs less [ms]. */
+/** Frames below this cost are not noticeable [ms]. */
 const FREE_MS = 6;
 
-/** Those that want to draw, in the order in which they asked. */
+/** Slots waiting to draw, in the order of their requests. */
 const waiting = new Set<DrawSlot>();
 let asked = false;
 
@@ -22,7 +22,7 @@ export class DrawSlot {
     this.#draw = draw;
   }
 
-  /** Something has changed: draw when it is this view's turn. */
+  /** Requests a redraw in this view's next turn. */
   ask(): void {
     waiting.add(this);
     next();
@@ -47,7 +47,7 @@ function next(): void {
     const startedAt = now();
     do DrawSlot.next();
     while (waiting.size > 0 && now() - startedAt < FREE_MS / 2);
-    // Without a graphics card a frame can cost the page more than its share; then the next one waits.
+    // Without a GPU a frame can exceed its budget; then the next one is delayed.
     setTimeout(() => {
       const tookMs = now() - startedAt;
       setTimeout(

@@ -1,13 +1,12 @@
 /**
- * What is heard more often than it can be drawn is drawn once a frame. A page that falls behind then draws what is
- * newest, and nothing of what came in between.
+ * Limits signal updates to one per animation frame. A page that falls behind draws only the newest value.
  */
 import { batch, type ReadonlySignal, type Signal, useSignal, useSignalEffect } from "@preact/signals";
 
-/** What each signal is to be with the next frame. */
+/** The next value of each signal. */
 const next = new Map<Signal<unknown>, unknown>();
 
-/** `source`, as it was at the newest frame. */
+/** The value of `source` at the newest frame. */
 export function useFrameSignal<T>(source: ReadonlySignal<T>): ReadonlySignal<T> {
   const drawn = useSignal(source.peek());
   useSignalEffect(() => {

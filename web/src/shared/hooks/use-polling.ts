@@ -3,15 +3,15 @@ import { useCallback, useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../api/http";
 
 export interface Polled<T> {
-  /** The newest answer; `null` before the first. */
+  /** The newest response; `null` before the first. */
   value: T | null;
-  /** Why the last one did not come; empty otherwise. What came before stays. */
+  /** The error of the last call, or "". The previous response stays. */
   trouble: string;
-  /** Ask now. */
+  /** Polls immediately. */
   again: () => void;
 }
 
-/** Ask every so often, and whenever one of `keys` changes, which also forgets what was known. */
+/** Polls at an interval, and when one of `keys` changes, which also clears the last response. */
 export function usePolling<T>(load: () => Promise<T>, everyMs: number, keys: readonly unknown[]): Polled<T> {
   const [value, setValue] = useState<T | null>(null);
   const [trouble, setTrouble] = useState("");

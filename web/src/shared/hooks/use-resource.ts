@@ -2,14 +2,14 @@ import { useEffect, useState } from "preact/hooks";
 import { sentence } from "../api/http";
 
 interface Loaded<T> {
-  /** `null` until it came. */
+  /** `null` until loaded. */
   value: T | null;
-  /** Why it did not come. */
+  /** The error, or "". */
   trouble: string;
   again: () => void;
 }
 
-/** What a call brings, asked for when the page opens. `load` has to be the same as long as the same is wanted. */
+/** Loads a resource on mount. A new `load` function reloads it, so callers memoize it. */
 export function useResource<T>(load: () => Promise<T>): Loaded<T> {
   const [value, setValue] = useState<T | null>(null);
   const [trouble, setTrouble] = useState("");

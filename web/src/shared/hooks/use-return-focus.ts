@@ -1,7 +1,7 @@
 import { useEffect, useRef } from "preact/hooks";
 import type { RefObject } from "preact";
 
-/** For the button that opens something in place: it has the focus again once that is closed. */
+/** Returns the focus to the button that opened an inline panel after the panel closes. */
 export function useReturnFocus(open: boolean): RefObject<HTMLButtonElement | null> {
   const button = useRef<HTMLButtonElement>(null);
   const was = useRef(open);

@@ -1,4 +1,4 @@
-/** Texts that more than one feature shows. */
+/** Texts used by several features. */
 import type { Role } from "../api/sharing";
 import type { Mode } from "../mqtt/protocol.generated";
 
@@ -13,7 +13,7 @@ export const common = {
   allDevices: "All devices",
   deviceMissing: "This device does not exist, or you have no access to it.",
   yesNo: ["Yes", "No"] as const,
-  /** Boolean measurements whose values have their own words: true, false. */
+  /** Labels for the values of boolean measurements: true, false. */
   booleanState: {
     open: ["Open", "Closed"],
     present: ["Motion detected", "No motion"],

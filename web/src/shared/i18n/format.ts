@@ -1,4 +1,4 @@
-/** Numbers, times and sizes as text. Internally SI units and radians; degrees only here. */
+/** Formats numbers, times and sizes. Internal values are SI and radians; only the UI uses degrees. */
 const dateTimeFormat = new Intl.DateTimeFormat("en-GB", { dateStyle: "medium", timeStyle: "short" });
 const oneDigitFormat = new Intl.NumberFormat("en", { minimumFractionDigits: 1, maximumFractionDigits: 1, useGrouping: false });
 const timeFormat = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit" });
@@ -26,7 +26,7 @@ export const format = {
     if (s < 48 * 3600) return `${Math.floor(s / 3600)} h ago`;
     return `${Math.floor(s / 86400)} days ago`;
   },
-  /** Rounded to one unit. */
+  /** Rounded to the largest fitting unit. */
   duration: (s: number): string => {
     const [count, unit] = s < 5400 ? [s / 60, "minute"] : s < 2 * 86_400 ? [s / 3600, "hour"] : [s / 86_400, "day"];
     const whole = Math.max(1, Math.round(count));

@@ -1,4 +1,4 @@
-/** Degrees are for the page only; everything inside is in radians. */
+/** Only the UI uses degrees; internal values are in radians. */
 
 export function degrees(rad: number): number {
   return (rad * 180) / Math.PI;

@@ -1,4 +1,4 @@
-/** The page's own monotonic clock, and how far the server's wall clock is from the page's. */
+/** The page's monotonic clock, and its offset from the server's wall clock. */
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 
 /** The page's monotonic clock [ms]. */
@@ -8,10 +8,10 @@ export function now(): number {
 
 const beat = signal(now());
 
-/** `now()`, four times a second: what shows an age reads this, so that ages grow on the page by themselves. */
+/** `now()`, updated four times per second. Displayed ages subscribe to it. */
 export const clock: ReadonlySignal<number> = beat;
 
-/** Start the beat; returns what stops it. */
+/** Starts the clock updates; returns a function that stops them. */
 export function startClock(): () => void {
   const timer = setInterval(() => (beat.value = now()), 250);
   return () => {
@@ -22,7 +22,7 @@ export function startClock(): () => void {
 let serverOffsetMs: number | null = null;
 let bestRoundTripMs = Infinity;
 
-/** Learn the server's clock from one answer; the answer with the smallest round trip is believed. */
+/** Updates the clock offset from a response; the response with the shortest round trip is used. */
 export function learnServerTime(serverMs: number, askedAt: number, answeredAt: number): void {
   const roundTripMs = answeredAt - askedAt;
   if (Number.isFinite(serverMs) && roundTripMs <= bestRoundTripMs) {
@@ -31,12 +31,12 @@ export function learnServerTime(serverMs: number, askedAt: number, answeredAt: n
   }
 }
 
-/** A wall-clock time of the server [ms since 1970] on the page's monotonic clock [ms]. */
+/** Converts server wall-clock time [ms since 1970] to the page's monotonic clock [ms]. */
 export function onThisClock(serverMs: number): number {
   return serverMs - (serverOffsetMs ?? Date.now() - now());
 }
 
-/** The server's wall clock now [ms since 1970], as far as it is known. */
+/** The estimated current server time [ms since 1970]. */
 export function serverNow(): number {
   return now() + (serverOffsetMs ?? Date.now() - now());
 }

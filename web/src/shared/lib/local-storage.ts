@@ -1,6 +1,6 @@
-/** What this browser keeps for an account: text that is not saved yet, values that were used last. */
+/** Per-account data in this browser: unsaved text and last used values. */
 
-/** As `localStorage` is. A browser may refuse it, and may be full: nothing is kept then, and nothing else happens. */
+/** The interface of `localStorage`. If it is unavailable or full, values are not stored and no error occurs. */
 export type Store = Pick<Storage, "getItem" | "setItem" | "removeItem">;
 
 export class StoredValue<T> {
@@ -8,7 +8,7 @@ export class StoredValue<T> {
   readonly #key: string;
   readonly #fits: (value: unknown) => value is T;
 
-  /** `fits`: whether what was found is what was kept: another version of this page may have written it. */
+  /** `fits`: validates a stored value, which another version of the page may have written. */
   constructor(store: Store | null, key: string, fits: (value: unknown) => value is T) {
     this.#store = store;
     this.#key = `telescope.${key}`;
@@ -24,7 +24,7 @@ export class StoredValue<T> {
     }
   }
 
-  /** Whether it is kept. */
+  /** Whether the value was stored. */
   write(value: T): boolean {
     try {
       this.#store?.setItem(this.#key, JSON.stringify(value));
@@ -38,15 +38,15 @@ export class StoredValue<T> {
     try {
       this.#store?.removeItem(this.#key);
     } catch {
-      // Then it was not kept either.
+      // Unavailable storage holds no value.
     }
   }
 }
 
-/** Text of a movement that is not saved. */
+/** Unsaved text of a movement. */
 export interface Draft {
   source: string;
-  /** The version that it was made from; 0: none. */
+  /** Its base version; 0: none. */
   basedOn: number;
   /** [ms since 1970] */
   at: number;

@@ -1,10 +1,10 @@
 /**
- * Grey pictures of 16 bits, as depth cameras capture them: a browser's own decoder would keep 8 of them.
- * Reads what ISO/IEC 15948 allows of that kind, but for interlacing.
+ * Decodes 16-bit greyscale PNG images from depth cameras; browsers decode only 8 bits.
+ * Supports ISO/IEC 15948 for this format, except interlacing.
  */
 import { MessageError } from "../mqtt/checks";
 
-/** Distances by pixel, row by row from the top [m]; 0 where nothing was within reach. */
+/** Distance per pixel, in rows from the top [m]; 0: out of range. */
 export interface DepthPicture {
   width: number;
   height: number;
@@ -41,7 +41,7 @@ function header(view: DataView, at: number): { width: number; height: number } {
   const width = view.getUint32(at);
   const height = view.getUint32(at + 4);
   if (width < 1 || height < 1 || width * height > MAX_PIXELS) throw new MessageError("the depth picture is too large");
-  // Bits a sample, then: grey, the one compression and the one filter method there are, not interlaced.
+  // Bits per sample, then: greyscale, the standard compression and filter methods, not interlaced.
   const kind = [16, 0, 0, 0, 0].every((wanted, index) => view.getUint8(at + 8 + index) === wanted);
   if (!kind) throw new MessageError("the depth picture is not grey with 16 bits");
   return { width, height };
@@ -56,7 +56,7 @@ async function inflate(parts: Uint8Array<ArrayBuffer>[]): Promise<Uint8Array> {
   }
 }
 
-/** Rows without the filters by which they were made smaller. */
+/** Reverses the PNG row filters. */
 function unfiltered(raw: Uint8Array, width: number, height: number): Uint8Array {
   const stride = width * BYTES;
   if (raw.length !== height * (stride + 1)) throw new MessageError("the depth picture is damaged");

@@ -1,4 +1,4 @@
-/** A value whose changes can be taken back. */
+/** A value with undo and redo. */
 import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-core";
 
 const KEPT = 200;
@@ -18,7 +18,7 @@ export class UndoHistory<T> {
     this.now = this.#now;
   }
 
-  /** A change; those of one `gesture` (a slider that is dragged) after each other are one. */
+  /** Records a change. Consecutive changes of one `gesture` (a slider drag) are one step. */
   change(next: T, gesture = ""): void {
     if (Object.is(next, this.#now.value)) return;
     const goesOn = gesture !== "" && gesture === this.#gesture;
@@ -30,7 +30,7 @@ export class UndoHistory<T> {
     });
   }
 
-  /** The gesture has ended: what follows is another change. */
+  /** Ends the gesture; the next change is a new step. */
   settle(): void {
     this.#gesture = "";
   }

@@ -1,10 +1,10 @@
-/** Pictures of `cam/{name}`: a header of 20 bytes, then the JPEG, as device_agent/protocol/camera_frames.py has them. */
+/** Frames of `cam/{name}`: a 20-byte header, then the JPEG. Same format as device_agent/protocol/camera_frames.py. */
 import { MessageError } from "./checks";
 
 export interface CameraFrame {
-  /** Counts up from one start of the agent to the next. */
+  /** Increases from one agent start to the next. */
   sequence: number;
-  /** When it was taken, on the agent's monotonic clock [ms]. */
+  /** Capture time on the agent's monotonic clock [ms]. */
   tickMs: number;
   /** In pixels. */
   width: number;

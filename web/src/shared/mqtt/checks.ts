@@ -1,14 +1,14 @@
 /** Checks of untrusted JSON values. A failed check throws MessageError with the path of the value. */
 export const MAX_JOINTS = 128;
 
-/** A message that is not what the contract says; the text names the field. */
+/** A message that violates the contract; the text names the field. */
 export class MessageError extends Error {
   override name = "MessageError";
 }
 
 /**
- * Checks one value; `at` is where it stands and `key` its place there, for the error's text. They are put together only
- * for what is wrong: of ten robots two hundred messages come a second, each with a hundred numbers.
+ * Checks one value; `at` is its path and `key` its position there, for the error text. They are joined only on errors:
+ * ten robots publish two hundred messages per second with a hundred numbers each.
  */
 export type Check<T> = (value: unknown, at: string, key?: string | number) => T;
 
@@ -51,7 +51,7 @@ export function list<T>(item: Check<T>, longest: number): Check<T[]> {
   };
 }
 
-/** Numbers by name, of which none is taken for a part of what every object has. */
+/** Numbers by name, without the object prototype's properties. */
 export const byName: Check<Record<string, number>> = (value, at, key) => {
   const entries = Object.entries(anything(value, at, key));
   if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} numbers`, key);

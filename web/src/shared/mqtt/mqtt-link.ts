@@ -1,6 +1,6 @@
 /**
- * One connection to the broker that keeps itself alive: it fetches its own short-lived credentials, moves to new ones
- * before they run out without losing a message, and comes back after a loss with new ones.
+ * A broker connection that reconnects automatically. It fetches short-lived credentials, replaces them before they
+ * expire without losing messages, and uses new ones after a connection loss.
  */
 import type { Credentials } from "../api/types";
 import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
@@ -13,29 +13,29 @@ export type LinkState = "connecting" | "up" | "down" | "refused" | "closed";
 
 export interface LinkStatus {
   state: LinkState;
-  /** Why it is down or refused; empty otherwise. */
+  /** The reason if it is down or rejected, or "". */
   why: string;
 }
 
-/** `retained`: the broker had kept it, so it was said before this page asked. */
+/** `retained`: the message was published before this page subscribed. */
 export type Receiver = (topic: string, payload: Uint8Array, retained: boolean) => void;
 
-/** What the rest of the core needs of a connection. */
+/** The connection interface that the models use. */
 export interface Link {
   readonly status: ReadonlySignal<LinkStatus>;
   readonly up: ReadonlySignal<boolean>;
-  /** Hear a topic or filter; returns what ends it. */
+  /** Subscribes to a topic or filter; returns a function that unsubscribes. */
   subscribe(filter: string, receiver: Receiver): () => void;
-  /** Send now or fail: nothing is ever kept for later. Resolves when sent (QoS 0) or acknowledged (QoS 1). */
+  /** Publishes now or fails; messages are never queued. Resolves when sent (QoS 0) or acknowledged (QoS 1). */
   publish(topic: string, message: object, qos: 0 | 1): Promise<void>;
-  /** There to the broker and back: resolves when it has answered. */
+  /** Pings the broker; resolves with its response. */
   ping(): Promise<void>;
-  /** Fetch new credentials, for what has become visible since, and move to them. */
+  /** Reconnects with new credentials, which include newly visible devices. */
   renew(): void;
   close(): void;
 }
 
-/** Event Grid and AWS IoT Core take no more filters than this in one SUBSCRIBE. */
+/** Maximum filters per SUBSCRIBE at Event Grid and AWS IoT Core. */
 const FILTERS_AT_ONCE = 8;
 const KEEPALIVE_S = 60;
 const PING_AFTER_SILENCE_MS = 5_000;
@@ -51,7 +51,7 @@ interface Connection {
   obtainedAt: number;
   heardAt: number;
   retired: boolean;
-  /** How many pings the broker has not answered yet: it answers them in their order. */
+  /** Number of unanswered pings; the broker responds in order. */
   pings: number;
 }
 
@@ -60,7 +60,7 @@ export class MqttLink implements Link {
   readonly #status = signal<LinkStatus>({ state: "connecting", why: "" });
   readonly #receivers = new Map<string, Set<Receiver>>();
   readonly #wildcards = new Set<string>();
-  /** Topic → the filters that cover it: looked for once, not at each message. Empty after each change of filters. */
+  /** Topic → matching filters, cached per topic. Cleared when filters change. */
   readonly #covering = new Map<string, readonly string[]>();
   #current: Connection | null = null;
   #opening = false;
@@ -153,7 +153,7 @@ export class MqttLink implements Link {
     this.#status.value = { state: "closed", why: "" };
   }
 
-  /** Open a connection beside the current one, if any, and put it in its place. */
+  /** Opens a new connection and replaces the current one, if any. */
   async #open(): Promise<void> {
     if (this.#closed) return;
     if (this.#opening) {
@@ -187,7 +187,7 @@ export class MqttLink implements Link {
     const { client, credentials } = next;
     client.on("message", (topic, payload, packet) => {
       next.heardAt = now();
-      // Two connections may deliver for a moment: every receiver takes a message twice without harm.
+      // Both connections may deliver briefly: receivers accept duplicate messages.
       if (!next.retired) this.#deliver(topic, payload, packet.retain);
     });
     client.on("packetreceive", ({ cmd }) => {
@@ -258,7 +258,7 @@ export class MqttLink implements Link {
     for (const filter of filters) this.#receivers.get(filter)?.forEach((receiver) => receiver(topic, payload, retained));
   }
 
-  /** Subscriptions of one turn go out together, in as few packets as the limit allows. */
+  /** Sends the subscriptions of one event-loop turn together, in as few packets as the limit permits. */
   #subscribeSoon(filter: string): void {
     if (this.#fresh.size === 0) {
       queueMicrotask(() => {
@@ -271,7 +271,7 @@ export class MqttLink implements Link {
     this.#fresh.add(filter);
   }
 
-  /** A link that died without a word is found here, long before the broker's keep-alive. */
+  /** Detects a dead connection before the broker's keep-alive does. */
   #checkAlive(): void {
     const connection = this.#current;
     if (!connection?.client.connected) return;
@@ -279,7 +279,7 @@ export class MqttLink implements Link {
     if (silenceMs > DEAD_AFTER_SILENCE_MS && silenceMs < 4 * DEAD_AFTER_SILENCE_MS) {
       this.#lost(connection);
     } else if (silenceMs > PING_AFTER_SILENCE_MS / 2) {
-      // After a long sleep of the page the silence says nothing: ask first.
+      // After a suspended page, silence is no evidence: ping first.
       if (silenceMs >= 4 * DEAD_AFTER_SILENCE_MS) connection.heardAt = now();
       connection.client.sendPing();
     }
@@ -307,11 +307,11 @@ async function connect(credentials: Credentials, closing: AbortSignal): Promise<
       password: credentials.password,
       keepalive: KEEPALIVE_S,
       connectTimeout: CONNECT_TIMEOUT_MS,
-      // Credentials run out, so a reconnect starts with new ones: ours to do.
+      // Credentials expire, so this class reconnects with new ones.
       reconnectPeriod: 0,
       resubscribe: false,
       queueQoSZero: false,
-      // Its other timers are a worker made from a blob, which the page's policy forbids.
+      // The library's worker timers use a blob URL, which the content security policy forbids.
       timerVariant: "native",
     });
     const settle = (): void => {
@@ -341,7 +341,7 @@ async function connect(credentials: Credentials, closing: AbortSignal): Promise<
 async function subscribeAll(client: MqttClient, filters: readonly string[]): Promise<void> {
   for (let start = 0; start < filters.length; start += FILTERS_AT_ONCE) {
     const batch = filters.slice(start, start + FILTERS_AT_ONCE);
-    // Telemetry is published at QoS 0 and stays so; asking for 1 keeps what matters at 1.
+    // QoS 1 is the maximum: telemetry is still delivered at its published QoS 0.
     await new Promise<void>((resolve, reject) => {
       const failed = (): void => {
         clearTimeout(timer);
@@ -351,7 +351,7 @@ async function subscribeAll(client: MqttClient, filters: readonly string[]): Pro
       const timer = setTimeout(failed, CONNECT_TIMEOUT_MS);
       client.once("close", failed);
       client.subscribe(batch, { qos: 1 }, () => {
-        // A refused filter is no reason to give up the others: what it would bring stays unknown, and is shown so.
+        // A rejected filter does not affect the others; its data stays unknown and is shown as such.
         clearTimeout(timer);
         client.off("close", failed);
         if (client.connected) resolve();

@@ -1,6 +1,6 @@
 /**
- * Reads what arrives from the broker: JSON of the contract's types, every number finite, every list of the length it
- * must have. Unknown fields pass, so that this page still reads a newer robot. Nothing unchecked is ever drawn.
+ * Parses broker messages: JSON of the contract's types, finite numbers and lists of the required length. Unknown fields
+ * are accepted, so that the page can read messages of newer agents. The page draws validated data only.
  */
 import {
   MAX_JOINTS, MessageError, anything, byName, count, fail, flag, list, nullable, number, numbers, object, oneOf, optional, place, text,
@@ -282,7 +282,7 @@ export function readPresence(payload: Uint8Array): Required<Presence> {
   return read(payload, presence, "conn");
 }
 
-/** `desc`. Joint ranges must be ranges, and names must differ. Throws `MessageError`. */
+/** `desc`. Joint ranges must be valid and names unique. Throws `MessageError`. */
 export function readDescription(payload: Uint8Array): KnownDescription {
   const found = read(payload, description, "desc");
   for (const one of found.joints) {
@@ -292,7 +292,7 @@ export function readDescription(payload: Uint8Array): KnownDescription {
   return found;
 }
 
-/** `desc/twin`. Parents stand before their children, so that one pass builds the tree. Throws `MessageError`. */
+/** `desc/twin`. Parents precede their children, so that one pass builds the tree. Throws `MessageError`. */
 export function readTwin(payload: Uint8Array): KnownTwin {
   const found = read(payload, twin, "twin");
   found.bodies.forEach((one, index) => {
@@ -310,7 +310,7 @@ export function readState(payload: Uint8Array): KnownState {
   return read(payload, state, "state");
 }
 
-/** `tele/joints`. All four lists are of one length. Throws `MessageError`. */
+/** `tele/joints`. All four lists have the same length. Throws `MessageError`. */
 export function readTelemetry(payload: Uint8Array): KnownTelemetry {
   const found = read(payload, jointTelemetry, "telemetry");
   const length = found.position_rad.length;
@@ -320,23 +320,23 @@ export function readTelemetry(payload: Uint8Array): KnownTelemetry {
   return found;
 }
 
-/** `tele/{stream}` of every stream but `joints`. Throws `MessageError`. */
+/** `tele/{stream}`, except `joints`. Throws `MessageError`. */
 export function readMeasurements(payload: Uint8Array): Measurements {
   return read(payload, measurements, "measurements");
 }
 
-/** What a `shoot` answers: the values of each stream. Throws `MessageError`. */
+/** The result of `shoot`: the values of each stream. Throws `MessageError`. */
 export function readShot(result: unknown): Record<string, Record<string, number | boolean>> {
   const streams = Object.entries(anything(anything(result, "result")["values"], "result.values"));
   return Object.fromEntries(streams.map(([name, entry]) => [name, values(entry, `result.values.${name}`)]));
 }
 
-/** What a `set_control` answers: what was applied. Throws `MessageError`. */
+/** The result of `set_control`: the applied values. Throws `MessageError`. */
 export function readApplied(result: unknown): Record<string, number> {
   return byName(anything(result, "result")["applied"], "result.applied");
 }
 
-/** One turn of a lidar, as its capture `scan` tells it. `range_m` is `null` where a beam met nothing. */
+/** One lidar revolution from a `scan` capture. `range_m` is `null` for a beam without a return. */
 export interface LidarScan {
   at_ms: number;
   angle_rad: number[];

@@ -1,4 +1,4 @@
-/** Topics, as device_agent/protocol/topics.py has them. `base` is a device's `ts/v1/{space}/{agent}/{device}`. */
+/** Topics, equal to device_agent/protocol/topics.py. `base` is a device's `ts/v1/{space}/{agent}/{device}`. */
 
 export interface DeviceTopics {
   conn: string;
@@ -31,7 +31,7 @@ export function deviceTopics(base: string): DeviceTopics {
   };
 }
 
-/** Whether an MQTT filter covers a topic. */
+/** Whether an MQTT filter matches a topic. */
 export function matches(filter: string, topic: string): boolean {
   const wanted = filter.split("/");
   const given = topic.split("/");

@@ -1,7 +1,7 @@
-/** Where the page is, in the address's fragment, which the server never sees; and the addresses of all pages. */
+/** The current route, stored in the URL fragment, which is not sent to the server; and all page addresses. */
 import { signal, type ReadonlySignal } from "@preact/signals";
 
-/** Parameters of addresses; empty if the page's address has no such parameter. */
+/** Route parameters; empty if the address lacks the parameter. */
 export type At = Readonly<Record<"device" | "id" | "ids" | "name" | "robotType" | "space", string>>;
 
 /** The address of each page: `:name` is a parameter, `:name?` an optional one. */
@@ -46,7 +46,7 @@ const EXPRESSIONS: readonly (readonly [PageName, RegExp])[] = (Object.entries(PA
   ),
 ]);
 
-/** The page of an address; the first one's where there is no such page. */
+/** The page of an address; the first page if none matches. */
 export function read(hash: string): Route {
   for (const [page, expression] of EXPRESSIONS) {
     const found = expression.exec(hash);
@@ -57,7 +57,7 @@ export function read(hash: string): Route {
   return { page: "devices", at: NOTHING };
 }
 
-/** The address of a page, with what its pattern names. */
+/** The address of a page with its parameters. */
 export function pageAddress(page: PageName, at: Partial<At> = {}): string {
   return PATTERNS[page].replaceAll(/\/:(\w+)\??/g, (_, name: keyof At) => (at[name] ? `/${at[name]}` : ""));
 }
@@ -79,12 +79,12 @@ export function deviceAddress(id: string): string {
   return pageAddress("device", { id });
 }
 
-/** The keyframe editor on a device; without a name a new movement. */
+/** The keyframe editor of a device; without a name, a new movement. */
 export function keyframesAddress(device: string, name = ""): string {
   return pageAddress("keyframes", { id: device, name });
 }
 
-/** The same for all robots of a type, without a device. */
+/** The keyframe editor of a robot type, without a device. */
 export function typeKeyframesAddress(robotType: string, name = ""): string {
   return pageAddress("typeKeyframes", { robotType, name });
 }
@@ -114,7 +114,7 @@ export function movementAddress(robotType: string, name: string): string {
   return pageAddress("movement", { robotType, name });
 }
 
-/** Go to a page in the place of this one: the way back does not lead here again. */
+/** Replaces the current history entry with another page. */
 export function replaceWith(to: string): void {
   location.replace(to);
 }

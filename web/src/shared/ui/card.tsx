@@ -5,7 +5,7 @@ import { CollapsibleTitle } from "./collapsible-card";
 interface CardProps {
   title: string;
   class?: string;
-  /** Beside the title: a note, a choice. */
+  /** Content beside the title, such as a note. */
   aside?: ComponentChildren;
   "data-testid"?: string;
   children: ComponentChildren;

@@ -1,4 +1,4 @@
-/** Cards that can be folded away. What is folded draws nothing, and stays folded for this type of device. */
+/** Collapsible cards. A collapsed card draws nothing, and stays collapsed for this device type. */
 import { createContext, type ComponentChildren } from "preact";
 import { useContext, useEffect, useId, useMemo, useRef, useState } from "preact/hooks";
 
@@ -7,14 +7,14 @@ interface Fold {
   close: () => void;
 }
 
-/** Of the card that is folded by the button in its head; `null` where it is none. */
+/** The state of the enclosing collapsible card; `null` outside one. */
 export const CollapseContext = createContext<Fold | null>(null);
 
-/** There is no room for everything on a phone: what one may live without is folded there at first. */
+/** On a phone, optional cards are initially collapsed to save space. */
 const NARROW = "(max-width: 48rem)";
 
 interface FoldableProps {
-  /** Of the card, for what is remembered; `type`: of the device. */
+  /** Storage key of the card; `type`: device type. */
   name: string;
   type: string;
   title: string;
@@ -33,7 +33,7 @@ export function CollapsibleCard({ name, type, title, always = false, children }:
     setOpen(next);
     remember(key, next);
   };
-  // The button that was pressed is another one now: it keeps the focus.
+  // Toggling replaces the button, so move the focus to the new one.
   useEffect(() => {
     if (pressed.current) document.getElementById(id)?.focus();
     pressed.current = false;
@@ -53,7 +53,7 @@ export function CollapsibleCard({ name, type, title, always = false, children }:
   return <CollapseContext.Provider value={fold}>{children}</CollapseContext.Provider>;
 }
 
-/** A card's title: a button where the card can be folded. */
+/** A card's title; a button if the card is collapsible. */
 export function CollapsibleTitle({ title }: { title: string }) {
   const fold = useContext(CollapseContext);
   if (fold === null) return <>{title}</>;
@@ -77,6 +77,6 @@ function remember(key: string, open: boolean): void {
   try {
     localStorage.setItem(key, open ? "open" : "folded");
   } catch {
-    // Then it is as wide as it was at first the next time.
+    // Reset the width to its initial value.
   }
 }

@@ -1,6 +1,6 @@
 /**
- * Colours for a value from 0 to 1. Lightness rises all the way and blue goes to yellow, so that it is read without red and
- * green told apart, and in grey.
+ * Colours for values from 0 to 1. Lightness increases monotonically from blue to yellow, so that the map works with
+ * colour blindness and in greyscale.
  */
 export type Colour = readonly [number, number, number];
 
@@ -16,7 +16,7 @@ const STEPS: readonly Colour[] = [
   [252, 232, 62],
 ];
 
-/** For what has no value. */
+/** Colour for missing values. */
 export const NOTHING: Colour = [128, 128, 128];
 
 export function falseColour(value: number): Colour {

@@ -4,7 +4,7 @@ import { useReturnFocus } from "../hooks/use-return-focus";
 
 interface ConfirmProps {
   label: string;
-  /** What the button does to what: for who does not see what stands beside it. */
+  /** The action and its object, for screen readers. */
   description?: string;
   question: string;
   yes: string;
@@ -14,7 +14,7 @@ interface ConfirmProps {
   "data-testid"?: string;
 }
 
-/** A button for what cannot be undone: it asks, in its own place, and says there what went wrong. */
+/** A button for irreversible actions: it asks for confirmation in place and shows errors there. */
 export function ConfirmButton({ label, description, question, yes, busy, keep, onYes, ...rest }: ConfirmProps) {
   const [asking, setAsking] = useState(false);
   const [working, setWorking] = useState(false);
@@ -22,7 +22,7 @@ export function ConfirmButton({ label, description, question, yes, busy, keep, o
   const ask = useReturnFocus(asking);
   const safe = useRef<HTMLButtonElement>(null);
 
-  // The button that had the focus is gone: it goes to the harmless one.
+  // The focused button is removed: move the focus to Cancel.
   useEffect(() => {
     if (asking) safe.current?.focus();
   }, [asking]);

@@ -7,7 +7,7 @@ interface SecretProps {
   value: string;
 }
 
-/** What is shown once, with a button that copies it. */
+/** A secret that is shown once, with a copy button. */
 export function CopyOnce({ id, label, value }: SecretProps) {
   const field = useRef<HTMLInputElement>(null);
   const [said, setSaid] = useState("");
@@ -16,7 +16,7 @@ export function CopyOnce({ id, label, value }: SecretProps) {
       await navigator.clipboard.writeText(value);
       setSaid(common.copy.copied);
     } catch {
-      // Browsers keep the clipboard from a page that came without TLS from another machine.
+      // Browsers deny clipboard access on insecure origins.
       field.current?.focus();
       field.current?.select();
       setSaid(common.copy.manually);

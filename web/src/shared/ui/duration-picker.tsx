@@ -1,11 +1,11 @@
-/** How long something lasts: one of a few lengths, or a date. */
+/** Selects a duration: a preset or an end date. */
 import { common } from "../i18n/common";
 
 const LENGTHS = { hour: 3600, workday: 8 * 3600, day: 86_400, week: 7 * 86_400, month: 30 * 86_400 } as const;
 
 export interface DurationChoice {
   choice: keyof typeof LENGTHS | "never" | "date" | "keep";
-  /** Of a date input, in the reader's own time. */
+  /** Value of a date input, in local time. */
   date: string;
 }
 
@@ -13,7 +13,7 @@ export const FOR_GOOD: DurationChoice = { choice: "never", date: "" };
 export const AS_IT_IS: DurationChoice = { choice: "keep", date: "" };
 export const ONE_DAY: DurationChoice = { choice: "day", date: "" };
 
-/** In seconds from now; `null`: no end, `undefined`: nothing that can be. `kept`: what was left of it before. */
+/** Duration in seconds from now; `null`: no end, `undefined`: invalid. `kept`: the previous remaining time. */
 export function seconds({ choice, date }: DurationChoice, kept: number | null = null): number | null | undefined {
   if (choice === "never") return null;
   if (choice === "keep") return kept;

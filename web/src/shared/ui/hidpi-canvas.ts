@@ -9,7 +9,7 @@ export function canvasBox(
     if (context === null || width === 0 || height === 0) return;
     const ratio = Math.min(3, devicePixelRatio);
     const [wide, high] = [Math.round(width * ratio), Math.round(height * ratio)];
-    // Setting a size clears, also to the same.
+    // Setting the size clears the canvas, even if it is unchanged.
     if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, height);

@@ -1,18 +1,18 @@
-/** A form in its place on a page: what is asked, a button for it, one that leaves all as it is, and what came of it. */
+/** An inline form: fields, submit and cancel buttons, and a result message. */
 import type { ComponentChildren, Ref } from "preact";
 import { common } from "../i18n/common";
 
 interface AskedFormProps {
   label: string;
-  /** Of the button that does it, and while it is being done. */
+  /** Labels of the submit button: idle and busy. */
   todo: string;
   doing: string;
   busy: boolean;
   close?: string;
-  /** Empty where there is nothing to say. */
+  /** Empty without a message. */
   wrong: string;
   done?: string;
-  /** For fields that what is wrong describes. */
+  /** Id of the message, for `aria-describedby` of invalid fields. */
   answerId?: string;
   form?: Ref<HTMLFormElement>;
   sendTestId?: string;
@@ -48,7 +48,7 @@ export function InlineForm({ label, todo, doing, busy, wrong, done = "", onSend,
   );
 }
 
-/** Who it is for, by the name of their account. What is `wrong` stands in the form's answer, `answerId`. */
+/** The recipient's account name. The error `wrong` is shown in the form message `answerId`. */
 export function AccountNameField(props: { id: string; answerId: string; value: string; wrong: boolean; onInput: (name: string) => void }) {
   return (
     <div class="field">

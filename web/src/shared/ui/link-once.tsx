@@ -1,11 +1,11 @@
-/** A link that is shown this once. */
+/** A link that is shown once. */
 import { useEffect, useRef } from "preact/hooks";
 import { common } from "../i18n/common";
 import { CopyOnce } from "./copy-once";
 
 interface MadeLinkProps {
   link: string;
-  /** For whom and until when. */
+  /** The recipient and the expiry. */
   note: string;
   onDone: () => void;
 }

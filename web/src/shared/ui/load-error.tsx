@@ -1,6 +1,6 @@
 import { common } from "../i18n/common";
 
-/** Why something did not come, with another try; nothing where all is well. */
+/** A load error with a retry button; empty without an error. */
 export function LoadError({ said, again }: { said: string; again: () => void }) {
   if (said === "") return null;
   return (
