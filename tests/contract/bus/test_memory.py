@@ -12,14 +12,8 @@ from function_app.domain.common.problems import Problem
 from function_app.ports.broker_access import BrokerAccessError, Credentials
 from function_app.ports.tables import StoreError
 from tests.contract.bus.suite import BusContract, Heard, Stage
-from tests.fakes.broker import (
-    MemoryBroker,
-    MemoryBrokerAccess,
-    MemoryCommandBus,
-    MemoryConnection,
-    MemoryFeed,
-    MemoryTelemetry,
-)
+from tests.fakes.broker import MemoryBroker, MemoryConnection
+from tests.fakes.broker_ports import MemoryBrokerAccess, MemoryCommandBus, MemoryFeed, MemoryTelemetry
 from tests.harness.network.brokers import Message
 
 SPACE = "ts/v1/space"
@@ -135,7 +129,7 @@ class TestMemoryBrokerAccess:
 
 @pytest.fixture
 def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tests.fakes.broker.RETRY_S", 0)
+    monkeypatch.setattr("tests.fakes.broker_ports.RETRY_S", 0)
 
 
 class TestMemoryFeeds:

@@ -16,7 +16,8 @@ from function_app.entrypoints.http import create_app
 from function_app.ports.tables import Tables
 from function_app.settings import Settings
 from tests.fakes.blobs import MemoryBlobs
-from tests.fakes.broker import MemoryBroker, MemoryBrokerAccess, MemoryCommandBus, MemoryFeed, MemoryTelemetry
+from tests.fakes.broker import MemoryBroker
+from tests.fakes.broker_ports import MemoryBrokerAccess, MemoryCommandBus, MemoryFeed, MemoryTelemetry
 from tests.fakes.clock import MemoryClock
 from tests.fakes.event_loop import VirtualTimeLoop
 from tests.fakes.signing_keys import MemorySigningKeys

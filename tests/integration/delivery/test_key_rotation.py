@@ -17,7 +17,7 @@ from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.harness.network.brokers import RunningBroker, start_broker, wait_until
 from tests.integration.conftest import OpenCloud
-from tests.unit.function_app.services.robot_types.test_movements import MINE, SOURCE
+from tests.unit.function_app.services.robot_types.movements import MINE, SOURCE
 
 LEARN_S, OVERLAP_S = 1800, 86_400
 WAIT_MS = 20_000

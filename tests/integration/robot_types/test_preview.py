@@ -12,7 +12,7 @@ from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS
 from tests.fakes.clock import MovingClock
 from tests.harness.cloud.cloud import Cloud, Person, problem, settings
-from tests.integration.robot_types.test_upload import (
+from tests.integration.robot_types.lever import (
     FILES,
     LEVER,
     SCENE,

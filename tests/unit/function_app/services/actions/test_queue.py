@@ -1,72 +1,21 @@
 """Actions that wait for their turn: first come, first served; after something went wrong nothing starts by itself."""
 
-import contextlib
-from collections.abc import Callable
-from functools import partial
-from typing import Any
-
-import pytest
-
-from device_agent.protocol import AckStatus, CancelAction, Command, MoveJoints, ResetStop, codec, topics
+from device_agent.protocol import AckStatus, CancelAction, MoveJoints, ResetStop, codec, topics
 from function_app.domain.actions.action import GRACE_MS
 from function_app.domain.actions.queue import MAX_QUEUED
 from function_app.services.actions.queue import LOOK_MS
-from function_app.services.maintenance.scheduler import ORPHAN_MS
-from function_app.services.storage import records
-from function_app.services.storage.reminders import SHARDS
-from tests.fakes.agent import Robot
-from tests.fixtures.cloud import Mortal, OpenCloud
-from tests.harness.cloud.cloud import Cloud, Person, problem
-from tests.harness.crash_injection import Killed, elsewhere
+from tests.fixtures.cloud import OpenCloud
+from tests.harness.cloud.cloud import Cloud, problem
 from tests.harness.network.brokers import wait_until
-
-Pair = tuple[Person, Robot]
-QUEUE: dict[str, Any] = {"policy": "queue"}
-ENDED = {"done", "failed", "expired", "cancelled"}
-
-
-def queued(person: Person, device: str, **options: Any) -> str:
-    """One more that waits; gives its id."""
-    answer = person.start(device, **QUEUE, **options)
-    assert (answer.status_code, answer.json()["status"]) == (202, "queued"), answer.text
-    assert answer.json()["reason"] is None
-    action: str = answer.json()["id"]
-    return action
-
-
-def sent(robot: Robot) -> list[str]:
-    """Actions that were sent to the robot, in order."""
-    return [command.id for command in robot.heard(MoveJoints)]
-
-
-def statuses(person: Person, *actions: str) -> list[str]:
-    return [person.action(action)["status"] for action in actions]
-
-
-def reason(person: Person, action: str) -> tuple[str, str]:
-    found = person.action(action)
-    return found["status"], found["reason"]["code"]
-
-
-def notes(cloud: Cloud) -> list[str]:
-    pages = [cloud.run(cloud.functions.tables.query(records.PENDING, str(shard))) for shard in range(SHARDS)]
-    keys = [row.key for page in pages for row in page.rows]
-    return [key for key in keys if key.split(":")[1] not in {"anchor", "audit"}]
-
-
-def pass_time(cloud: Cloud, seconds: float, step_s: float = 1.0) -> None:
-    while seconds > 0:
-        cloud.clock.advance(min(step_s, seconds))
-        seconds -= step_s
-        cloud.sweep()
-
-
-@pytest.fixture
-def running(pair: Pair) -> str:
-    """An action that runs on the robot."""
-    anna, robot = pair
-    action: str = anna.start(robot.device, wait_ms=10_000).json()["id"]
-    return action
+from tests.unit.function_app.services.actions.queue_requests import (
+    QUEUE,
+    Pair,
+    pass_time,
+    queued,
+    reason,
+    sent,
+    statuses,
+)
 
 
 class TestTurns:
@@ -303,145 +252,3 @@ def test_many_that_see_the_end_at_once_start_the_next_once(
             finish()
         assert anna.action(action, wait_ms=20_000, wait_for="started")["status"] == "started"
     assert sent(robot) == [running, *waiting]
-
-
-def hear(process: Cloud, robot: Robot, ack: bytes) -> None:
-    """Have one process take an ack in, which the others do not hear."""
-    process.run(process.functions.action_acks.ingest(topics.parse(robot.topic(topics.ACK)), ack))
-
-
-# ---------------------------------------------------------------- killed between two writes
-
-MOST_WRITES = 16
-SHORT: dict[str, Any] = {"ttl_ms": 2_000, "timeout_ms": 6_000}
-
-
-def settled(cloud: Cloud, robot: Robot, anna: Person) -> dict[str, dict[str, Any]]:
-    """Let time pass and see that nothing is left open; gives the actions, oldest first."""
-    pass_time(cloud, 20, step_s=0.5)
-    pass_time(cloud, 10 + ORPHAN_MS / 1000, step_s=15)
-    pass_time(cloud, 400, step_s=200)
-    page = cloud.run(cloud.functions.tables.query(records.CONTROL, robot.device, limit=1000))
-    rows = {row.key: dict(row.data) for row in page.rows}
-    actions = {data["id"]: data for key, data in reversed(rows.items()) if key.startswith("action:")}
-    assert {data["status"] for data in actions.values()} <= ENDED, actions
-    assert rows["now:slot"]["action"] == ""
-    queue = rows.get("now:queue", {"actions": [], "dropped": {}})
-    assert (list(queue["actions"]), dict(queue["dropped"])) == ([], {})
-    assert notes(cloud) == []
-    assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
-    for action in sent(robot):
-        assert action in actions, "nothing runs that is not written"
-        assert len(set(robot.payloads[action])) == 1
-    return actions
-
-
-def starts(_: Command) -> tuple[AckStatus, ...]:
-    return (AckStatus.RECEIVED, AckStatus.STARTED)
-
-
-def ends(_: Command) -> tuple[AckStatus, ...]:
-    return (AckStatus.RECEIVED, AckStatus.STARTED, AckStatus.DONE)
-
-
-def killed(mortal: Mortal, cloud: Cloud, anna: Person, after: int, work: Callable[[Cloud, Person], object]) -> bool:
-    """Do ``work`` in a process that is killed after so many writes; whether it survived."""
-    process, knife = mortal(cloud.clock)
-    there = elsewhere(process, anna)
-    assert there.get("/accounts/me").status_code == 200
-    knife.left = after
-    with contextlib.suppress(Killed):
-        work(process, there)
-    return knife.left > 0
-
-
-def test_a_start_that_waits_killed_after_any_write_leaves_nothing_open(
-    cloud: Cloud, pair: Pair, mortal: Mortal
-) -> None:
-    _, robot = pair
-    for after in range(1, MOST_WRITES):
-        anna = cloud.sign_in("anna")
-        robot.reports = starts
-        first = anna.start(robot.device, wait_ms=10_000, **SHORT).json()["id"]
-        robot.reports = ends
-        ask = partial(lambda key, _, there: there.start(robot.device, once=key, **QUEUE, **SHORT), f"k{after}")
-        survived = killed(mortal, cloud, anna, after, ask)
-        robot.report(first, AckStatus.DONE)
-        for item in anna.get(f"/devices/{robot.device}/actions").json()["items"]:
-            anna.action(item["id"], wait_ms=20_000)
-        actions = settled(cloud, robot, anna)
-        assert actions[first]["status"] == "done"
-        for action, data in actions.items():
-            assert data["status"] == "done", (after, action, data)
-        if survived:
-            assert after > 3
-            return
-    pytest.fail(f"a start writes more than {MOST_WRITES} times")
-
-
-@pytest.mark.parametrize("last", [AckStatus.DONE, AckStatus.FAILED])
-def test_who_ends_an_action_killed_after_any_write_leaves_the_queue_to_the_timer(
-    cloud: Cloud, pair: Pair, mortal: Mortal, last: AckStatus
-) -> None:
-    _, robot = pair
-    for after in range(1, MOST_WRITES):
-        anna = cloud.sign_in("anna")
-        robot.reports = starts
-        first = anna.start(robot.device, wait_ms=10_000, **SHORT).json()["id"]
-        waiting = [queued(anna, robot.device, **SHORT) for _ in range(2)]
-        pass_time(cloud, 2)  # the timer has seen that they wait
-        robot.reports = ends
-        ack = codec.encode(robot.ack(first, last))
-        survived = killed(mortal, cloud, anna, after, partial(lambda ack, process, _: hear(process, robot, ack), ack))
-        pass_time(cloud, LOOK_MS / 1000 + 1)
-        for action in waiting:
-            anna.action(action, wait_ms=20_000)
-        actions = settled(cloud, robot, anna)
-        assert actions[first]["status"] == last.value
-        assert {actions[action]["status"] for action in waiting} == {
-            "done" if last is AckStatus.DONE else "cancelled"
-        }, after
-        if survived:
-            assert after > 2
-            return
-    pytest.fail(f"an end writes more than {MOST_WRITES} times")
-
-
-def test_a_timer_killed_after_any_write_leaves_nothing_open(cloud: Cloud, pair: Pair, mortal: Mortal) -> None:
-    _, robot = pair
-
-    def work(process: Cloud, _: Person) -> None:
-        for _round in range(12):
-            cloud.clock.advance(1)
-            process.sweep()
-
-    for after in range(1, 60, 3):
-        anna = cloud.sign_in("anna")
-        robot.reports = starts
-        anna.start(robot.device, wait_ms=10_000, **SHORT)
-        robot.reports = ends
-        queued(anna, robot.device, queue_ms=3_000, **SHORT)
-        queued(anna, robot.device, **SHORT)
-        survived = killed(mortal, cloud, anna, after, work)
-        settled(cloud, robot, anna)
-        if survived:
-            return
-    pytest.fail("the timer writes more often than that")
-
-
-def test_a_stop_killed_after_any_write_leaves_nothing_open(cloud: Cloud, pair: Pair, mortal: Mortal) -> None:
-    _, robot = pair
-    for after in range(1, MOST_WRITES):
-        anna = cloud.sign_in("anna")
-        robot.reports = starts
-        first = anna.start(robot.device, wait_ms=10_000, **SHORT).json()["id"]
-        waiting = [queued(anna, robot.device, **SHORT) for _ in range(2)]
-        survived = killed(mortal, cloud, anna, after, lambda _, there: there.post(f"/devices/{robot.device}/stop"))
-        pass_time(cloud, LOOK_MS / 1000 + 1)
-        assert {reason(anna, action) for action in waiting} == {("cancelled", "stopped")}
-        robot.fail(first, "stopped", "The device was stopped.")
-        settled(cloud, robot, anna)
-        assert not set(waiting) & set(sent(robot))
-        if survived:
-            return
-    pytest.fail(f"a stop writes more than {MOST_WRITES} times")

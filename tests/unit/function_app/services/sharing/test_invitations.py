@@ -18,12 +18,6 @@ Three = tuple[Person, Person, Robot]
 DAY_S = 86_400
 
 
-@pytest.fixture
-def three(cloud: Cloud, pair: tuple[Person, Robot]) -> Three:
-    anna, robot = pair
-    return anna, cloud.sign_in("bert"), robot
-
-
 def invite(owner: Person, path: str, **body: Any) -> dict[str, Any]:
     answer = owner.post(path, body)
     assert answer.status_code == 201, answer.text

@@ -1,0 +1,255 @@
+"""Initial states, operations and checks of the kill tests."""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+import pytest
+
+from device_agent.protocol import Ack, AckStatus, MoveJoints, codec, topics
+from function_app.bootstrap import Functions
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
+from function_app.services.actions.requests import ActionRequest
+from function_app.services.maintenance.scheduler import ORPHAN_MS
+from function_app.services.storage import records
+from function_app.services.storage.reminders import SHARDS
+from tests.harness.processes import (
+    Place,
+    SetClock,
+    Work,
+    commands_sent,
+    new_public_key,
+    show_code,
+)
+
+TTL_S, TIMEOUT_S, QUEUE_S = 2, 6, 10
+MOVE = MoveJoints(position_rad={"elbow": 1.0})
+TERMINAL = {"done", "failed", "expired", "cancelled"}
+MOST_STEPS = 60
+
+
+def asked(**more: Any) -> ActionRequest:
+    return ActionRequest(
+        request=MOVE, ttl_ms=1000 * TTL_S, timeout_ms=1000 * TIMEOUT_S, queue_ms=1000 * QUEUE_S, **more
+    )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Somebody with a robot of one device."""
+
+    who: Identity
+    public: str
+    agent: str
+    action: str = ""
+    """One that runs on it."""
+    epoch: int = 0
+    """Of the lease that ``who`` holds."""
+    code: str = ""
+    """The claim code it shows, where nobody has claimed it."""
+
+    @property
+    def device(self) -> str:
+        return f"{self.agent}-arm"
+
+
+async def person(functions: Functions, name: str) -> Identity:
+    return Identity((await functions.sign_in.account(name)).id, name, f"session of {name}")
+
+
+async def paired(functions: Functions, who: Identity, **more: Any) -> Scene:
+    public = new_public_key()
+    agent, code = await show_code(functions, public=public)
+    await functions.claim.claim(who, code, None)
+    return Scene(who, public, agent, **more)
+
+
+async def idle(functions: Functions) -> Scene:
+    return await paired(functions, await person(functions, "anna"))
+
+
+async def running(functions: Functions) -> Scene:
+    scene = await idle(functions)
+    lease, _ = await functions.leases.acquire(scene.who, scene.device, epoch=None, lease_ms=600_000, wait_ms=0)
+    action, _ = await functions.start_action.start(scene.who, scene.device, asked(epoch=lease.epoch))
+    return Scene(scene.who, scene.public, scene.agent, action.id, lease.epoch)
+
+
+async def queued(functions: Functions) -> Scene:
+    scene = await running(functions)
+    for _ in range(2):
+        await functions.start_action.start(scene.who, scene.device, asked(epoch=scene.epoch, policy="queue"))
+    return scene
+
+
+async def asked_for(functions: Functions) -> Scene:
+    """Somebody else asks for the lease that ``who`` holds; ``action`` is the request."""
+    scene = await running(functions)
+    other = Identity(scene.who.account, scene.who.name, "another session")
+    _, asked, _, _ = await functions.control_requests.create(
+        other, scene.device, within_ms=60_000, lease_ms=9_000, wait_ms=0
+    )
+    return Scene(scene.who, scene.public, scene.agent, asked.id, scene.epoch)
+
+
+async def unclaimed(functions: Functions) -> Scene:
+    public = new_public_key()
+    agent, code = await show_code(functions, public=public)
+    # Each robot another person: a claim that is killed counts as a try.
+    return Scene(await person(functions, f"owner of {agent}"), public, agent, code=code)
+
+
+async def start(functions: Functions, scene: Scene) -> None:
+    await functions.start_action.start(scene.who, scene.device, asked())
+
+
+async def start_refused(functions: Functions, scene: Scene) -> None:
+    with pytest.raises(Problem, match="is running"):
+        await start(functions, scene)
+
+
+async def start_once(functions: Functions, scene: Scene) -> None:
+    await functions.start_action.start(scene.who, scene.device, asked(), idempotency_key="key")
+
+
+async def join_queue(functions: Functions, scene: Scene) -> None:
+    await functions.start_action.start(
+        scene.who, scene.device, asked(policy="queue", epoch=scene.epoch or None), idempotency_key="key"
+    )
+
+
+async def cancel(functions: Functions, scene: Scene) -> None:
+    await functions.actions.cancel(scene.who, scene.action)
+
+
+async def report_done(functions: Functions, scene: Scene) -> None:
+    await report(functions, scene.action, AckStatus.DONE)
+
+
+async def take(functions: Functions, scene: Scene) -> None:
+    await functions.leases.acquire(scene.who, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
+
+
+async def release(functions: Functions, scene: Scene) -> None:
+    await functions.leases.release(scene.who, scene.device, epoch=scene.epoch)
+
+
+async def pass_control(functions: Functions, scene: Scene) -> None:
+    await functions.control_requests.accept(scene.who, scene.device, scene.action, wait_ms=0)
+    lease = await functions.leases.get(scene.who, scene.device)
+    assert lease is not None
+    assert (lease.epoch, lease.session) == (scene.epoch + 1, "another session")
+
+
+async def stop(functions: Functions, scene: Scene) -> None:
+    await functions.stop.stop(scene.who, scene.device, "enough")
+
+
+async def unpair(functions: Functions, scene: Scene) -> None:
+    await functions.unpair.unpair(scene.who, scene.agent)
+
+
+async def claim(functions: Functions, scene: Scene) -> None:
+    await functions.claim.claim(scene.who, scene.code, None)
+
+
+async def time_out(functions: Functions, _scene: Scene) -> None:
+    """The timer, when everything's time is over."""
+    cast("SetClock", functions.clock).advance(TIMEOUT_S + QUEUE_S)
+    await functions.scheduler.run_due_jobs()
+
+
+async def report(functions: Functions, action: str, status: AckStatus) -> None:
+    device = action.rpartition("-")[0]
+    agent, _, name = device.partition("-")
+    at_ms = functions.clock.now_ms()
+    ack = Ack(id=action, status=status, sequence=1, at_ms=at_ms, tick_ms=at_ms)
+    topic = topics.parse(topics.device("space", agent, name, topics.ACK))
+    await functions.action_acks.ingest(topic, codec.encode(ack))
+
+
+CASES: dict[str, tuple[Callable[[Functions], Awaitable[Scene]], Work, int]] = {
+    "start": (idle, start, 4),
+    "start with a key": (idle, start_once, 4),
+    "start refused": (running, start_refused, 1),
+    "join the queue": (queued, join_queue, 3),
+    "queue while it is idle": (idle, join_queue, 4),
+    "cancel": (running, cancel, 2),
+    "the end, reported": (running, report_done, 1),
+    "the end before a queue": (queued, report_done, 4),
+    "take": (idle, take, 2),
+    "take again": (running, take, 2),
+    "release": (running, release, 2),
+    "hand over": (asked_for, pass_control, 3),
+    "stop before a queue": (queued, stop, 4),
+    "un-pair": (queued, unpair, 4),
+    "claim": (unclaimed, claim, 4),
+    "timer": (queued, time_out, 4),
+}
+
+
+async def rows_of(functions: Functions, table: str, partition: str) -> dict[str, dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = {}
+    cursor = None
+    while True:
+        page = await functions.tables.query(table, partition, limit=1000, cursor=cursor)
+        found |= {row.key: dict(row.data) for row in page.rows}
+        cursor = page.cursor
+        if cursor is None:
+            return found
+
+
+async def settle(functions: Functions) -> None:
+    """Let time pass, with rounds of the timer, until every promise must have been kept."""
+    clock = cast("SetClock", functions.clock)
+    for step_s in (*([1.0] * (TIMEOUT_S + QUEUE_S + 4)), *([ORPHAN_MS / 2000 + 1] * 3)):
+        clock.advance(step_s)
+        await functions.scheduler.run_due_jobs()
+    notes = [key for shard in range(SHARDS) for key in await rows_of(functions, records.PENDING, str(shard))]
+    # A lease that lasts longer than this has one, for its end; a chain has one for the hour.
+    notes = [key for key in notes if ":anchor:" not in key]
+    leases = [key for key in notes if ":lease:" in key]
+    assert notes == leases
+    assert len(leases) == len({key.rpartition(":")[2] for key in leases})
+
+
+async def look(functions: Functions, place: Place, scenes: list[Scene]) -> None:
+    """Nothing is left open, nothing ran that is not written, and every robot can be used."""
+    await settle(functions)
+    sent = commands_sent(place)
+    for command, payloads in sent.items():
+        assert len(payloads) == 1, f"{command} went out as different commands"
+    written = set()
+    for scene in scenes:
+        rows = await rows_of(functions, records.CONTROL, scene.device)
+        for key, data in rows.items():
+            if key.startswith("action:"):
+                assert data["status"] in TERMINAL, data
+                written.add(data["id"])
+            assert not key.startswith("event:"), "what happened is left untold"
+        assert rows.get("now:slot", {"action": ""})["action"] == ""
+        assert not rows.get("now:queue", {"actions": ()})["actions"]
+    assert actions_sent(sent) <= written, "nothing goes out that is not written"
+    for scene in scenes:
+        public, agent = scene.public, scene.agent
+        _, code = await show_code(functions, public=public)
+        owner = scene.who
+        if code:
+            owner = await person(functions, f"next owner of {agent}")
+            await functions.claim.claim(owner, code, None)
+            assert (await functions.actions.list(owner, scene.device, cursor=None, limit=10))[0] == []
+        row = await functions.tables.get(records.AGENTS, agent, "agent")
+        assert row is not None
+        owner = Identity(row.data["account"], "whoever", owner.session)
+        action, _ = await functions.start_action.start(owner, scene.device, asked())
+        assert action.status.value == "published"
+        await report(functions, action.id, AckStatus.DONE)
+        lease, _ = await functions.leases.acquire(owner, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
+        assert lease.epoch > action.epoch >= max(1, scene.epoch)
+
+
+def actions_sent(sent: dict[str, set[bytes]]) -> set[str]:
+    """Ids of those commands that run something."""
+    runs = (b'"kind":"move_joints"', b'"kind":"run_movement"')
+    return {command for command, payloads in sent.items() if any(kind in one for kind in runs for one in payloads)}

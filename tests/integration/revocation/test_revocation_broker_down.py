@@ -1,0 +1,128 @@
+"""Access revocation while the broker cannot be reached."""
+
+import asyncio
+import contextlib
+import logging
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from device_agent.protocol import ReleaseLease
+from function_app.services.storage import records
+from function_app.services.storage.reminders import SHARDS
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem, settings
+from tests.harness.network.brokers import RunningBroker, start_broker, wait_until
+from tests.integration.revocation.connections import connect, request_credentials
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class Site:
+    """Functions at a broker of their own, which can go away and come back."""
+
+    home: Path
+    folder: Path
+    broker: RunningBroker
+    cloud: Cloud
+    stack: contextlib.ExitStack
+
+    def come_back(self) -> None:
+        was, keys = self.broker, self.home / "keys" / "public.json"
+        again = start_broker(was.kind, self.folder, keys=keys, tcp_port=was.tcp_port, websocket_port=was.websocket_port)
+        self.broker = self.stack.enter_context(again)
+
+
+@pytest.fixture
+def site(request: pytest.FixtureRequest, home: Path, tmp_path: Path) -> Iterator[Site]:
+    with contextlib.ExitStack() as stack:
+        broker = stack.enter_context(start_broker(request.param, tmp_path / "b", keys=home / "keys" / "public.json"))
+        if broker.kind == "mosquitto":
+            (home / "mosquitto").mkdir()
+            shutil.copy(broker.home / "service.password", home / "mosquitto")
+        cloud = stack.enter_context(Cloud(settings(home, broker)))
+        cloud.start_ingest()
+        yield Site(home, tmp_path / "b", broker, cloud, stack)
+
+
+@pytest.mark.parametrize(
+    ("site", "then"), [("amqtt", "nobody"), ("mosquitto", "nobody"), ("amqtt", "owner")], indirect=["site"]
+)
+def test_who_unshares_while_the_broker_is_away_is_told_so_at_once_and_nothing_is_lost(site: Site, then: str) -> None:
+    """``then``: who takes control before the broker is back."""
+    cloud = site.cloud
+    with paired(cloud) as (anna, robot):
+        bert = cloud.sign_in("bert")
+        at = f"/devices/{robot.device}/shares"
+        anna.post(at, {"account": "bert", "role": "operator"})
+        epoch = bert.take(robot.device, lease_ms=600_000).json()["epoch"]
+        running = bert.start(robot.device, epoch=epoch, wait_ms=10_000).json()["id"]
+        held = [
+            request_credentials(bert, purpose="watch"),
+            request_credentials(bert, purpose="control", device=robot.device, epoch=epoch),
+        ]
+        site.broker.stop()
+        asked_s = time.monotonic()
+        answer = anna.delete(f"{at}/{bert.account}")
+        _log.warning("%s is away: answered after %.1f s", site.broker.kind, time.monotonic() - asked_s)
+        assert answer.status_code == 202, answer.text
+        assert "broker" in answer.json()["detail"]
+        problem(bert.get(f"/devices/{robot.device}"), 404, "device-unknown")
+        assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
+        assert anna.action(running)["reason"]["code"] == "unshared"
+        if then == "owner":
+            assert anna.take(robot.device).json()["epoch"] == epoch + 2
+        site.come_back()
+        if then == "nobody":
+            robot.connect()
+
+        def seen_to() -> bool:
+            cloud.clock.advance(1)
+            cloud.sweep()
+            notes = [row.key for shard in range(SHARDS) for row in cloud.run(pending(cloud, shard)).rows]
+            return not any("share-changed" in key for key in notes)
+
+        wait_until(seen_to, "the timer to have told the broker")
+        for client_id, credentials in held:
+            with site.broker.connect(client_id, credentials) as late:
+                assert not late.connected.is_set(), "revoked credentials"
+        if then == "nobody":
+            wait_until(lambda: robot.heard(ReleaseLease), "the end of control at the robot")
+            assert robot.heard(ReleaseLease)[-1].epoch == epoch + 1
+
+
+def pending(cloud: Cloud, shard: int) -> Any:
+    return cloud.functions.tables.query(records.PENDING, str(shard))
+
+
+def test_a_broker_that_is_there_and_never_answers_holds_nobody_up(
+    cloud: Cloud, monkeypatch: pytest.MonkeyPatch, broker: RunningBroker, operator: tuple[Person, Person, Robot]
+) -> None:
+    anna, bert, robot = operator
+    at = f"/devices/{robot.device}/shares"
+    epoch = bert.take(robot.device, lease_ms=600_000).json()["epoch"]
+    bert.start(robot.device, epoch=epoch, wait_ms=10_000)
+    page = connect(broker, bert, purpose="watch")
+
+    async def never(*_: Any, **__: Any) -> None:
+        await asyncio.Event().wait()
+
+    with monkeypatch.context() as patch:
+        patch.setattr("function_app.services.sharing.access_revocation.TELL_S", 0.2)
+        patch.setattr(cloud.functions.access, "revoke", never)
+        patch.setattr(cloud.functions.bus, "publish", never)
+        answer = anna.post(at, {"account": "bert", "role": "viewer"})
+    assert (answer.status_code, answer.json()["role"]) == (202, "viewer")
+    assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
+    assert not page.disconnected.is_set()
+    cloud.clock.advance(2)
+    cloud.sweep()
+    wait_until(page.disconnected.is_set, "the cut")
+    page.close()
+    assert anna.post(at, {"account": "bert", "role": "viewer"}).status_code == 200

@@ -1,0 +1,129 @@
+"""A share that ends during a request of its operator."""
+
+import itertools
+from typing import Any, Literal
+
+import pytest
+
+from device_agent.protocol import GrantLease, MoveJoints, ReleaseLease
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, problem
+from tests.harness.network.brokers import BROKERS, RunningBroker, wait_until
+
+
+@pytest.fixture
+def operator(cloud: Cloud, pair: tuple[Person, Robot]) -> tuple[Person, Person, Robot]:
+    anna, robot = pair
+    bert = cloud.sign_in("bert")
+    assert anna.post(f"/devices/{robot.device}/shares", {"account": "bert", "role": "operator"}).status_code == 201
+    return anna, bert, robot
+
+
+async def end_share(anna: Person, bert: Person, robot: Robot) -> None:
+    sharing, who = anna.cloud.functions.sharing, Identity(anna.account, anna.name, anna.session)
+    await sharing.end(who, await sharing.of(who, "device", robot.device), bert.account)
+
+
+def unshare_at(
+    monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot], moment: Literal["seen", "written"]
+) -> None:
+    """Un-share at one moment of somebody's request: when their role was seen, or when what they wanted was written."""
+    anna, bert, robot = operator
+    functions = anna.cloud.functions
+    target, name = {
+        "seen": (functions.start_action._reminders, "schedule"),
+        "written": (functions.devices, "require_still_allowed"),
+    }[moment]
+    real = getattr(target, name)
+    once = itertools.count()
+
+    async def meanwhile(*given: Any, **named: Any) -> Any:
+        if next(once) == 0:
+            await end_share(anna, bert, robot)
+        return await real(*given, **named)
+
+    monkeypatch.setattr(target, name, meanwhile)
+
+
+@pytest.mark.parametrize("moment", ["seen", "written"])
+def test_an_action_that_starts_while_its_device_is_unshared_never_reaches_it(
+    monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot], moment: Literal["seen", "written"]
+) -> None:
+    anna, bert, robot = operator
+    unshare_at(monkeypatch, operator, moment)
+    problem(bert.start(robot.device, wait_ms=1_000), 404, "device-unknown")
+    (action,) = anna.get(f"/devices/{robot.device}/actions").json()["items"]
+    assert (action["status"], action["reason"]["code"]) == ("failed", "unshared")
+    assert robot.heard(MoveJoints) == []
+    assert anna.start(robot.device, wait_ms=10_000).json()["status"] == "started"
+
+
+def test_a_lease_that_is_taken_while_its_device_is_unshared_is_granted_to_nobody(
+    monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot]
+) -> None:
+    anna, bert, robot = operator
+    unshare_at(monkeypatch, operator, "written")
+    problem(bert.take(robot.device), 404, "device-unknown")
+    assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
+    wait_until(lambda: [command.epoch for command in robot.heard(ReleaseLease)] == [2], "the end of it at the robot")
+    assert robot.heard(GrantLease) == []
+    assert anna.take(robot.device).json()["epoch"] == 3
+
+
+def test_control_is_not_handed_to_somebody_who_is_unshared_at_that_moment(
+    monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot]
+) -> None:
+    anna, bert, robot = operator
+    anna.take(robot.device)
+    at = f"/devices/{robot.device}/lease/requests"
+    request = bert.post(at, {}).json()["request"]["id"]
+    unshare_at(monkeypatch, operator, "written")
+    problem(anna.post(f"{at}/{request}/accept"), 409, "requester-offline")
+    assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
+    assert [command.request.holder for command in robot.heard(GrantLease)] == ["anna"]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("broker", BROKERS, indirect=True)
+def test_credentials_that_are_made_while_their_device_is_unshared_are_no_good(
+    cloud: Cloud, monkeypatch: pytest.MonkeyPatch, broker: RunningBroker, operator: tuple[Person, Person, Robot]
+) -> None:
+    anna, bert, robot = operator
+    access, made = cloud.functions.access, []
+    real = access.issue
+
+    async def issue(grant: Any) -> Any:
+        given = await real(grant)
+        made.append((grant, given))
+        if len(made) == 1:
+            await end_share(anna, bert, robot)
+        return given
+
+    monkeypatch.setattr(access, "issue", issue)
+    problem(bert.post("/mqtt/credentials", {"purpose": "view"}), 503, "busy")
+    ((grant, given),) = made
+    with broker.connect(grant.client_id, given) as client:
+        assert not client.connected.is_set()
+
+
+def test_an_action_of_somebody_unshared_is_not_sent_again(
+    cloud: Cloud, monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot]
+) -> None:
+    anna, bert, robot = operator
+
+    async def killed(*_: Any) -> None:
+        raise Problem("killed", 500, "Killed", "Killed.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cloud.functions.start_action, "_require_still", killed)
+        assert bert.start(robot.device).status_code == 500
+    (action,) = anna.get(f"/devices/{robot.device}/actions").json()["items"]
+    assert action["status"] == "created"
+    tables: Any = cloud.functions.tables
+    tables._run("DELETE FROM rows WHERE tab = 'Shares'")
+    cloud.clock.advance(5)
+    cloud.sweep()
+    ended = anna.action(action["id"])
+    assert (ended["status"], ended["reason"]["code"]) == ("failed", "unshared")
+    assert robot.heard(MoveJoints) == []

@@ -1,0 +1,238 @@
+"""Compilation of uploaded models: concurrent checkers, limits and separate processes."""
+
+import asyncio
+import ctypes
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from device_agent.protocol.manifests import robot_type as manifests
+from device_agent.protocol.manifests.robot_type import RobotType
+from function_app.adapters.model_compiler.compiler import MujocoCompiler
+from function_app.entrypoints.hosts.worker import check_models
+from function_app.ports.model_compiler import CompilerMissingError, ModelReport
+from function_app.services.robot_types.cleanup import CUT_OFF, NO_CHECKER
+from function_app.services.robot_types.model_validation import LEASE_MS, MAX_TRIES
+from function_app.services.robot_types.versions import GIVE_UP_MS
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS
+from tests.harness.cloud.cloud import Cloud, Person, problem
+from tests.harness.network.brokers import PATIENCE_S, wait_until
+from tests.integration.robot_types.lever import (
+    FILES,
+    LEVER,
+    add,
+    advance,
+    blobs,
+    check_all,
+    checking,
+    dies_in,
+    manifest,
+    rows,
+    stop_after,
+)
+
+
+class TestChecker:
+    def test_without_one_the_upload_waits_and_is_refused_in_the_end(self, cloud: Cloud, anna: Person) -> None:
+        added = add(anna, wait_ms=0)
+        assert (added.status_code, added.json()["state"]) == (202, "checking")
+        problem(anna.get("/robot-types/lever/archive"), 409, "robot-type-not-ready")
+        problem(anna.get("/robot-types/lever/movements"), 409, "robot-type-not-ready")
+        problem(anna.put("/robot-types/lever/movements/up", {"source": "1"}), 409, "robot-type-not-ready")
+        problem(add(anna, wait_ms=0), 409, "robot-type-checking")
+        advance(cloud, GIVE_UP_MS - 1_000)
+        assert anna.get("/robot-types/lever").json()["state"] == "checking"
+        advance(cloud, 1_000)
+        shown = anna.get("/robot-types/lever").json()
+        assert (shown["state"], shown["upload"]["errors"]) == ("rejected", [NO_CHECKER])
+        check_all(cloud)
+        assert anna.get("/robot-types/lever").json()["state"] == "rejected", "a verdict stays"
+        assert add(anna, wait_ms=0).json()["version"] == 2
+        check_all(cloud)
+        assert anna.get("/robot-types/lever").json()["state"] == "ready"
+        assert rows(cloud, records.MODEL_CHECKS, "checks") == []
+
+    def test_one_that_is_killed_is_followed_by_another(self, cloud: Cloud, anna: Person) -> None:
+        add(anna, wait_ms=0)
+        with dies_in(cloud):
+            check_all(cloud)
+        assert rows(cloud, records.MODEL_CHECKS, "checks"), "the note outlives it"
+        check_all(cloud)
+        assert anna.get("/robot-types/lever").json()["state"] == "checking", "somebody may still be at it"
+        advance(cloud, LEASE_MS)
+        check_all(cloud)
+        assert anna.get("/robot-types/lever").json()["state"] == "ready"
+
+    def test_a_model_that_kills_every_one_is_refused(self, cloud: Cloud, anna: Person) -> None:
+        add(anna, wait_ms=0)
+        for _ in range(MAX_TRIES):
+            with dies_in(cloud):
+                check_all(cloud)
+            cloud.clock.advance(LEASE_MS / 1000)
+        check_all(cloud)
+        shown = anna.get("/robot-types/lever").json()
+        assert shown["state"] == "rejected"
+        assert "cut off" in shown["upload"]["errors"][0]
+
+    def test_many_give_each_upload_one_verdict(
+        self, cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        compiled: list[str] = []
+
+        async def counting(__: object, robot_type: RobotType, *_: object) -> ModelReport:
+            compiled.append(robot_type.type)
+            await asyncio.sleep(0.01)
+            return ModelReport()
+
+        monkeypatch.setattr(MujocoCompiler, "check", counting)
+        names = [f"lever-{number}" for number in range(12)]
+        waiting = [
+            anna.begin("POST", "/robot-types", json={"manifest": manifest(name), "files": FILES, "wait_ms": 30_000})
+            for name in names
+        ]
+        with checking(cloud, 4):
+            assert [answer().status_code for answer in waiting] == [201] * 12
+        assert sorted(compiled) == sorted(names)
+
+    def test_while_one_is_busy_the_others_wait_for_their_turn(self, cloud: Cloud, anna: Person) -> None:
+        add(anna, "first", wait_ms=0)
+        add(anna, "second", wait_ms=0)
+        cloud.clock.advance((GIVE_UP_MS - 1_000) / 1000)
+        with dies_in(cloud):
+            cloud.run(cloud.functions.model_checks.run())
+        advance(cloud, 1_000)
+        assert anna.get("/robot-types/second").json()["state"] == "checking"
+        check_all(cloud)
+        assert anna.get("/robot-types/second").json()["state"] == "ready"
+
+    def test_one_without_mujoco_says_so_and_gives_the_note_back(
+        self, cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        add(anna, wait_ms=0)
+        with monkeypatch.context() as patch:
+            patch.setattr("importlib.util.find_spec", lambda _: None)
+            with pytest.raises(CompilerMissingError, match="MuJoCo is not installed"):
+                cloud.run(check_models(cloud.functions, drain=True))
+            with pytest.raises(CompilerMissingError):
+                check_all(cloud)
+        check_all(cloud)
+        assert anna.get("/robot-types/lever").json()["state"] == "ready"
+
+    def test_of_two_uploads_at_once_each_gets_a_version_or_is_told_to_wait(self, cloud: Cloud, anna: Person) -> None:
+        body = {"manifest": manifest(), "files": FILES, "wait_ms": 0}
+        waiting = [anna.begin("POST", "/robot-types", json=body) for _ in range(6)]
+        answers = [answer() for answer in waiting]
+        assert [answer.status_code for answer in answers].count(202) == 1
+        for answer in answers:
+            if answer.status_code != 202:
+                problem(answer, 409, "robot-type-checking")
+        check_all(cloud)
+        assert anna.get("/robot-types/lever").json()["version"] == 1
+
+    def test_an_upload_that_is_cut_off_at_any_write_is_ended_and_leaves_nothing(
+        self, cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        cut = 0
+        for after in range(1, 40):
+            with monkeypatch.context() as patch:
+                stop_after(cloud, patch, after)
+                done = add(anna, wait_ms=0)
+            if done.status_code == 202:
+                break
+            cut += 1
+            assert done.status_code == 500
+            advance(cloud, GIVE_UP_MS)
+            state = anna.get("/robot-types/lever")
+            if state.status_code == 200:
+                assert state.json()["upload"]["errors"][0] in {CUT_OFF, NO_CHECKER}
+            else:
+                problem(state, 404, "robot-type-unknown")
+            anna = cloud.sign_in("anna")
+        assert cut > 5
+        check_all(cloud)
+        assert anna.get("/robot-types/lever").json()["state"] == "ready"
+        advance(cloud, DAY_MS)
+        advance(cloud, DAY_MS)
+        assert len({name.split("/")[3] for name in blobs(cloud)}) == 1
+        assert rows(cloud, records.MODEL_CHECKS, "checks") == []
+        assert rows(cloud, records.MODEL_CHECKS, "looks") == []
+
+
+class TestProcesses:
+    """The checker as people run it: a program of its own over the same store."""
+
+    def start(self, cloud: Cloud, *arguments: str) -> subprocess.Popen[bytes]:
+        environment = {**os.environ, "TELESCOPE_HOME": str(cloud.functions.settings.home)}
+        return subprocess.Popen([sys.executable, "-m", "function_app", "check-models", *arguments], env=environment)
+
+    def test_it_checks_what_is_there_and_ends(self, cloud: Cloud, anna: Person) -> None:
+        add(anna, "first", wait_ms=0)
+        add(anna, "second", wait_ms=0)
+        assert self.start(cloud, "--drain").wait(PATIENCE_S) == 0
+        assert [anna.get(f"/robot-types/{name}").json()["state"] for name in ("first", "second")] == ["ready", "ready"]
+
+    def test_what_a_killed_one_had_taken_is_checked_by_the_next(self, cloud: Cloud, anna: Person) -> None:
+        endless = LEVER.replace("<site", '<replicate count="1000000"><body/></replicate><site')
+        add(anna, wait_ms=0, lever__xml=endless)
+        running = self.start(cloud)
+        try:
+            wait_until(lambda: taken(cloud), "the note to be taken")
+        finally:
+            running.kill()
+            running.wait()
+        cloud.clock.advance(LEASE_MS / 1000)
+        cloud.functions.model_checks._compiler = MujocoCompiler(cpu_s=1)
+        check_all(cloud)
+        shown = anna.get("/robot-types/lever").json()
+        assert (shown["state"], len(shown["upload"]["errors"])) == ("rejected", 1)
+
+
+def taken(cloud: Cloud) -> bool:
+    """Whether a checker holds a note."""
+    page = cloud.run(cloud.functions.tables.query(records.MODEL_CHECKS, "checks"))
+    return any(note.data["until_ms"] for note in page.rows)
+
+
+class TestLimits:
+    @pytest.mark.parametrize(
+        "xml",
+        [
+            LEVER.replace("<site", '<replicate count="1000000"><body/></replicate><site'),
+            LEVER.replace(
+                "</mujoco>", '<asset><hfield name="h" nrow="30000" ncol="30000" size="1 1 1 1"/></asset></mujoco>'
+            ),
+            LEVER.replace("<worldbody>", '<size memory="100G"/><worldbody>'),
+        ],
+        ids=["bodies", "heights", "memory"],
+    )
+    def test_a_model_that_would_eat_the_machine_is_refused(
+        self, cloud: Cloud, anna: Person, xml: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(cloud.functions.model_checks, "_compiler", MujocoCompiler(cpu_s=2, wall_s=20))
+        with checking(cloud):
+            refused = problem(add(anna, lever__xml=xml), 422, "robot-type-rejected")
+        assert refused["errors"]
+
+    def test_a_child_that_waits_for_ever_is_ended(
+        self, cloud: Cloud, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        child = tmp_path / "child.py"
+        child.write_text("import time\ntime.sleep(1000)\n")
+        monkeypatch.setattr("function_app.adapters.model_compiler.compiler._CHILD", child)
+        compiler = MujocoCompiler(wall_s=1)
+        found = cloud.run(compiler.check(manifests.parse(manifest()), {"lever.xml": b""}))
+        assert "Simplify" in found.errors[0]
+
+    def test_the_child_reads_nothing_but_the_upload(self, cloud: Cloud, tmp_path: Path) -> None:
+        """Past the look at references: what the kernel itself refuses, where it can."""
+        outside = tmp_path / "outside.xml"
+        outside.write_text(LEVER)
+        xml = f'<mujoco><include file="{outside}"/></mujoco>'.encode()
+        compiler = MujocoCompiler()
+        found = cloud.run(compiler.check(manifests.parse(manifest()), {"lever.xml": xml, "scene.xml": xml}))
+        # Where the kernel has no Landlock, the look at references has to do alone.
+        assert bool(found.errors) == (ctypes.CDLL(None).syscall(444, None, 0, 1) > 0)

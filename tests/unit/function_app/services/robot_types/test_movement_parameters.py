@@ -1,0 +1,89 @@
+"""Parameters of movements: schemas, defaults and refusals."""
+
+from typing import Any, ClassVar
+
+import pytest
+
+from device_agent.protocol import RunMovement
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Person, problem
+from tests.unit.function_app.services.robot_types.movements import MINE, UR5
+
+
+class TestParameters:
+    SCHEMA: ClassVar = {
+        "type": "object",
+        "properties": {
+            "times": {"type": "integer", "minimum": 1, "default": 3},
+            "who": {"type": "string", "enum": ["anna", "bert"]},
+        },
+        "required": ["who"],
+        "additionalProperties": False,
+    }
+
+    def test_built_in_ones_say_what_they_take(self, anna: Person) -> None:
+        for item in anna.get(f"{UR5}/movements").json()["items"]:
+            properties = item["parameters_schema"]["properties"]
+            assert properties["speed"]["default"] > 0
+            assert all(value["description"] for value in properties.values())
+
+    def test_a_schema_is_the_callers_else_the_scripts_else_none(self, anna: Person) -> None:
+        literal = 'PARAMETERS = {"who": {"type": "string"}, "times": {"type": "integer", "default": 1}}'
+        read = anna.put(MINE, {"source": literal}).json()["parameters_schema"]
+        assert (sorted(read["properties"]), read["required"]) == (["times", "who"], ["who"])
+        said = anna.put(MINE, {"source": literal, "parameters_schema": self.SCHEMA}).json()["parameters_schema"]
+        assert said["properties"]["who"]["enum"] == ["anna", "bert"]
+        assert anna.get(MINE).json()["parameters_schema"] == said
+        assert anna.put(MINE, {"source": "1"}).json()["parameters_schema"] is None
+        assert anna.get(MINE, params={"version": 2}).json()["parameters_schema"] == said
+
+    @pytest.mark.parametrize(
+        "schema",
+        [
+            {"type": "object", "properties": {"a": {"$ref": "#"}}},
+            {"type": "object", "properties": {"a": {"type": "string", "pattern": "(a+)+$"}}},
+            {"type": "object", "patternProperties": {}},
+            {"type": "array", "items": {"type": "string"}},
+            {"type": "object", "properties": {"a": {"type": ["string", "null"]}}},
+        ],
+    )
+    def test_what_a_schema_may_not_say_is_refused(self, anna: Person, schema: dict[str, Any]) -> None:
+        problem(anna.put(MINE, {"source": "1", "parameters_schema": schema}), 422, "invalid")
+
+    def test_a_schema_that_contradicts_itself_is_refused(self, anna: Person) -> None:
+        schema = {"type": "object", "properties": {"a": {"type": "integer", "default": "x"}}}
+        refused = problem(anna.put(MINE, {"source": "1", "parameters_schema": schema}), 422, "schema-invalid")
+        assert "$.a" in refused["detail"]
+        problem(anna.put(MINE, {"source": 'PARAMETERS = {"a": 1}'}), 422, "schema-invalid")
+        problem(anna.put(MINE, {"source": "PARAMETERS = f()"}), 422, "movement-invalid")
+
+    def test_an_action_gets_the_defaults_and_keeps_them(self, pair: tuple[Person, Robot]) -> None:
+        anna, robot = pair
+        anna.put(MINE, {"source": "1", "parameters_schema": self.SCHEMA})
+        asked = {"kind": "run_movement", "name": "mine", "parameters": {"who": "bert"}}
+        started = anna.start(robot.device, request=asked, wait_ms=10_000, once="x").json()
+        (command,) = robot.heard(RunMovement)
+        assert isinstance(command.request, RunMovement)
+        assert command.request.parameters == {"who": "bert", "times": 3}
+        assert started["request"]["parameters"] == {"who": "bert", "times": 3}
+        assert anna.start(robot.device, request=asked, wait_ms=10_000, once="x").json()["id"] == started["id"]
+
+    @pytest.mark.parametrize(
+        ("given", "place"),
+        [
+            ({}, "$"),
+            ({"who": "carl"}, "$.who"),
+            ({"who": "anna", "times": 0}, "$.times"),
+            ({"who": "anna", "times": True}, "$.times"),
+            ({"who": "anna", "more": 1}, "$"),
+        ],
+    )
+    def test_what_does_not_fit_is_refused_with_its_place_and_takes_no_slot(
+        self, anna: Person, given: dict[str, Any], place: str
+    ) -> None:
+        device = anna.cloud.robot().pair(anna)
+        anna.put(MINE, {"source": "1", "parameters_schema": self.SCHEMA})
+        asked = {"kind": "run_movement", "name": "mine", "parameters": given}
+        refused = problem(anna.start(device, request=asked), 422, "parameters-invalid")
+        assert refused["place"] == place
+        assert anna.get(f"/devices/{device}/actions").json()["items"] == []

@@ -1,0 +1,168 @@
+"""A claimed device with its series, over tables that can fail."""
+
+import math
+import random
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+
+from device_agent.protocol import Measurements, codec, topics
+from device_agent.protocol.topics import Topic
+from function_app.adapters.local.blobs import FileBlobs
+from function_app.domain.devices.devices import Agent, Device, DeviceSpec
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.telemetry import series
+from function_app.domain.telemetry.series import LEVELS, RetentionPolicy
+from function_app.ports.tables import Tables
+from function_app.services.devices.device_access import DeviceAccess
+from function_app.services.storage import records
+from function_app.services.storage.retention import Retention
+from function_app.services.telemetry.ingest import (
+    InboundMessage,
+    TelemetryIngest,
+    Values,
+)
+from function_app.services.telemetry.series_reader import Part, Range, SeriesReader
+from function_app.services.telemetry.series_writer import Place, SeriesWriter
+
+AGENT = "abcdefghij"
+DEVICE = f"{AGENT}-arm"
+ANNA = Identity("anna", "anna", "s1")
+PLACE = Place(DEVICE, "p1", "health")
+NOW_MS = 1_800_000_000_000
+"""Some moment; not the beginning of a day."""
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.at_ms = NOW_MS
+
+    def now_ms(self) -> int:
+        return self.at_ms
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+class Spoilt:
+    """Tables that fail at a write: before it is done, or after."""
+
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+        self.left: int | None = None
+        self.after = False
+        self.error: BaseException = Killed()
+
+    def __getattr__(self, name: str) -> Any:
+        real = getattr(self._tables, name)
+        if name not in {"create", "replace", "delete", "batch"}:
+            return real
+
+        async def write(*arguments: Any) -> Any:
+            if self.left is not None:
+                if self.left == 0 and not self.after:
+                    raise self.error
+                self.left -= 1
+            done = await real(*arguments)
+            if self.left is not None and self.left < 0:
+                raise self.error
+            return done
+
+        return write
+
+
+class House:
+    """The services over SQLite, and one agent with an arm that is Anna's."""
+
+    def __init__(self, tables: Tables, blobs: FileBlobs) -> None:
+        self.clock = Clock()
+        self.keep = RetentionPolicy()
+        self.tables = Spoilt(tables)
+        self.seen: list[tuple[str, str, Sequence[tuple[int, Values]]]] = []
+        self.blobs = blobs
+        self.reader, self.intake, self.writer, self.forget = self.instance()
+
+    def instance(self) -> tuple[SeriesReader, TelemetryIngest, SeriesWriter, Retention]:
+        tables: Any = self.tables
+        forget = Retention(tables=tables, blobs=self.blobs)
+        writer = SeriesWriter(tables=tables, retention=forget, keep=self.keep, clock=self.clock)
+        devices = DeviceAccess(tables=tables, clock=self.clock)
+        intake = TelemetryIngest(tables=tables, writer=writer, clock=self.clock, observers=[self.observe])
+        return SeriesReader(tables=tables, devices=devices, keep=self.keep, clock=self.clock), intake, writer, forget
+
+    async def observe(self, device: Device, stream: str, means: Sequence[tuple[int, Values]]) -> None:
+        self.seen.append((device.id, stream, means))
+
+    async def pair(self, *, pairing: str = "p1", account: str = "anna") -> None:
+        agent = Agent(
+            id=AGENT,
+            name="lab",
+            public_key="",
+            software="",
+            devices=(DeviceSpec("arm", "arm", "ur5", "Arm"),),
+            created_ms=0,
+            account=account,
+            space="space",
+            pairing=pairing,
+        )
+        await records.upsert(self.tables, records.AGENTS, AGENT, "agent", lambda _: agent, Agent)
+
+    async def read(self, stream: str = "health", **wanted: Any) -> Part:
+        return await self.reader.read(ANNA, DEVICE, stream, Range(**wanted))
+
+
+def message(at_ms: int, stream: str = "health", /, **values: float) -> InboundMessage:
+    body = Measurements(tick_ms=at_ms, at_ms=at_ms, sequence=0, values=dict(values))
+    return InboundMessage(Topic("space", AGENT, "arm", topics.TELE, stream), codec.encode(body))
+
+
+def values_of(part: Part, name: str) -> dict[int, float | None]:
+    return dict(zip(part.at_ms, part.values[name], strict=True))
+
+
+async def assert_whole(house: House, rows: dict[int, dict[str, float]], stream: str = "health") -> None:
+    """Every level of the series holds exactly these samples."""
+    (view,) = [view for view in await house.reader.streams(ANNA, DEVICE) if view.name == stream]
+    assert view.about.count == len(rows)
+    assert (view.about.first_ms, view.about.last_ms) == (min(rows), max(rows))
+    names = {name for values in rows.values() for name in values}
+    assert set(view.about.fields) == names
+    found: dict[int, dict[str, float]] = {}
+    cursor: str | None = None
+    while True:
+        part = await house.read(stream, level="raw", points=1000, cursor=cursor)
+        for index, at_ms in enumerate(part.at_ms):
+            assert at_ms not in found
+            found[at_ms] = {name: value for name in names if (value := part.values[name][index]) is not None}
+        cursor = part.cursor
+        if cursor is None:
+            break
+    assert found == rows
+    for level in LEVELS:
+        part = await house.read(stream, level=level.name, points=1000)
+        assert part.cursor is None
+        starts = sorted({series.floor(at_ms, level.span_ms) for at_ms in rows})
+        assert part.at_ms == starts
+        for name in names:
+            for start_ms, summary in zip(part.at_ms, part.summaries[name], strict=True):
+                inside = [
+                    values[name]
+                    for at_ms, values in sorted(rows.items())
+                    if start_ms <= at_ms < start_ms + level.span_ms and name in values
+                ]
+                if summary is None:
+                    assert not inside
+                    continue
+                assert (summary.samples, summary.low, summary.high) == (len(inside), min(inside), max(inside))
+                assert summary.last == inside[-1]
+                assert summary.total == pytest.approx(math.fsum(inside), rel=1e-9, abs=1e-9)
+
+
+def some_rows(chance: random.Random, count: int, span_ms: int = 200_000) -> dict[int, dict[str, float]]:
+    times = chance.sample(range(NOW_MS - span_ms, NOW_MS), count)
+    return {
+        at_ms: {name: chance.uniform(-100, 100) for name in chance.sample(["a", "b.x", "c"], chance.randint(1, 3))}
+        for at_ms in times
+    }

@@ -1,0 +1,195 @@
+"""Ingested measurements: stored once, for their owner only."""
+
+from typing import Any
+
+import pytest
+
+from device_agent.protocol import Description, Joint, JointTelemetry, Mode, codec, topics
+from device_agent.protocol.topics import Topic
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.telemetry import series
+from function_app.domain.telemetry.series import Samples
+from function_app.ports.tables import StoreError
+from function_app.services.storage import records
+from function_app.services.telemetry.ingest import (
+    GIVE_UP_MS,
+    LEFT_MS,
+    SHARDS,
+    InboundMessage,
+    _Part,
+)
+from function_app.services.telemetry.series_reader import Range
+from tests.unit.function_app.services.telemetry.house import (
+    AGENT,
+    ANNA,
+    DEVICE,
+    NOW_MS,
+    House,
+    Killed,
+    assert_whole,
+    message,
+)
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_measurements_of_claimed_devices_are_stored(house: House) -> None:
+    rows = {NOW_MS - 100 * n: {"temperature_c.elbow": 40.0 + n, "fan": 1.0} for n in range(50)}
+    arrived = [message(at_ms, "health", **values) for at_ms, values in rows.items()]
+    await house.intake.ingest(arrived)
+    await house.intake.ingest(arrived[10:20])
+    await assert_whole(house, rows)
+    for shard in range(SHARDS):
+        assert not (await house.tables.query(records.DATA, str(shard))).rows
+    (seen,) = house.seen
+    assert seen[:2] == (DEVICE, "health")
+    assert [set(values) for _, values in seen[2]] == [{"temperature_c.elbow", "fan"}] * len(seen[2])
+    assert seen[2][-1][0] == NOW_MS
+
+
+async def test_joints_are_stored_under_their_names(house: House) -> None:
+    names = ("shoulder", "élbow", "wrist")
+    joint = Joint(
+        name="", label="", lower_rad=0, upper_rad=1, max_velocity_rad_s=1, max_acceleration_rad_s2=1,
+        max_jerk_rad_s3=1, max_effort_nm=1,
+    )  # fmt: skip
+    joints = tuple(
+        Joint(**{field: getattr(joint, field) for field in joint.__struct_fields__} | {"name": name}) for name in names
+    )
+    description = Description(device="arm", kind="arm", robot_type="ur5", label="Arm", joints=joints)
+    tables: Any = house.tables
+    await records.upsert(tables, records.DESCRIPTIONS, AGENT, "arm", lambda _: description, Description)
+    telemetry = JointTelemetry(
+        tick_ms=1, at_ms=NOW_MS, sequence=1, mode=Mode.STREAMING, position_rad=(0.1, 0.2, 0.3, 0.4),
+        velocity_rad_s=(1.0, 2.0, 3.0, 4.0), effort_nm=(5.0,), commanded_rad=(), loop_age_ms=12.0,
+    )  # fmt: skip
+    await house.intake.ingest(
+        [InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "joints"), codec.encode(telemetry))]
+    )
+    expected = {"loop_age_ms": 12.0, "effort_nm.shoulder": 5.0}
+    for index, name in enumerate(("shoulder", "1", "wrist", "3")):
+        expected[f"position_rad.{name}"] = (0.1, 0.2, 0.3, 0.4)[index]
+        expected[f"velocity_rad_s.{name}"] = index + 1.0
+    await assert_whole(house, {NOW_MS: expected}, "joints")
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        Topic("other", AGENT, "arm", topics.TELE, "health"),
+        Topic("space", AGENT, "leg", topics.TELE, "health"),
+        Topic("space", "klmnopqrst", "arm", topics.TELE, "health"),
+    ],
+)
+async def test_what_does_not_belong_to_a_claimed_device_is_dropped(house: House, topic: Topic) -> None:
+    await house.intake.ingest([InboundMessage(topic, message(NOW_MS, a=1.0).payload)])
+    assert await house.reader.streams(ANNA, DEVICE) == []
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"{}",
+        b'{"tick_ms":1,"at_ms":1,"sequence":1,"values":{}}',
+        b'{"tick_ms":1,"at_ms":1800000000000,"sequence":1,"values":{"a":NaN}}',
+        b'{"tick_ms":1,"at_ms":1800000000000,"sequence":1,"values":{"a":1e999}}',
+        b'{"tick_ms":1,"at_ms":1800000000000,"sequence":1,"values":{"a":1e301}}',
+        b'{"tick_ms":1,"at_ms":1800000000000,"sequence":1,"values":{"a b":1}}',
+        b'{"tick_ms":1,"at_ms":1800000000000,"sequence":1,"values":{"a":"1"}}',
+        b'{"tick_ms":1,"at_ms":-1,"sequence":1,"values":{"a":1}}',
+    ],
+)
+async def test_one_bad_message_does_not_hold_up_the_others(house: House, payload: bytes) -> None:
+    bad = InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "health"), payload)
+    await house.intake.ingest([bad, message(NOW_MS, a=1.0), bad])
+    await assert_whole(house, {NOW_MS: {"a": 1.0}})
+
+
+async def test_a_new_owner_sees_nothing_of_the_former_one(house: House) -> None:
+    await house.intake.ingest([message(NOW_MS, a=1.0)])
+    await house.pair(pairing="p2", account="bert")
+    bert = Identity("bert", "bert", "s2")
+    assert await house.reader.streams(bert, DEVICE) == []
+    for who, code in ((bert, "stream-unknown"), (ANNA, "device-unknown")):
+        with pytest.raises(Problem) as caught:
+            await house.reader.read(who, DEVICE, "health", Range())
+        assert caught.value.code == code
+    house.clock.at_ms += 10_000
+    await house.intake.ingest([message(house.clock.at_ms, b=2.0)])
+    part = await house.reader.read(bert, DEVICE, "health", Range(level="raw"))
+    assert (part.at_ms, list(part.values)) == ([house.clock.at_ms], ["b"])
+
+
+async def test_what_was_left_in_the_queue_is_not_the_next_owners(house: House) -> None:
+    device = (await house.intake._agent(AGENT)).devices["arm"]
+    await house.intake._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
+    await house.pair(pairing="p2", account="bert")
+    house.clock.at_ms += LEFT_MS + 1
+    for _ in range(SHARDS):
+        await house.intake.distribute_backlog()
+    assert await _queued(house) == 0
+    assert await house.reader.streams(Identity("bert", "bert", "s2"), DEVICE) == []
+
+
+async def test_an_observer_that_fails_holds_nothing_up(house: House) -> None:
+    async def fail(*_: Any) -> None:
+        raise RuntimeError("no")
+
+    house.intake._observers = (fail, house.observe)
+    await house.intake.ingest([message(NOW_MS, a=1.0)])
+    assert len(house.seen) == 1
+
+
+@pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
+async def test_a_kill_between_any_two_writes_loses_and_doubles_nothing(house: House, after: bool) -> None:
+    kills = 0
+    for number in range(10):
+        stream = f"s{number}"
+        rows = {house.clock.at_ms - 3_000 * n: {"a": float(n)} for n in range(10)}
+        house.tables.left, house.tables.after = number, after
+        try:
+            await house.intake.ingest([message(at_ms, stream, **values) for at_ms, values in rows.items()])
+        except Killed:
+            kills += 1
+        house.tables.left = None
+        if number == 0 and not after:
+            continue  # nothing was written at all: the broker, or who called, has it still
+        house.clock.at_ms += LEFT_MS + 1
+        _, intake, _, _ = house.instance()
+        for _ in range(SHARDS):
+            await intake.distribute_backlog()
+        assert await _queued(house) == 0
+        await assert_whole(house, rows, stream)
+    assert kills > 5
+
+
+async def _queued(house: House) -> int:
+    return sum([len((await house.tables.query(records.DATA, str(shard))).rows) for shard in range(SHARDS)])
+
+
+async def test_what_can_never_be_distributed_is_given_up(house: House) -> None:
+    await house.intake.ingest([])
+    _, intake, _, _ = house.instance()
+    device = (await intake._agent(AGENT)).devices["arm"]
+    await intake._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
+
+    async def busy(*_: Any) -> Samples:
+        raise Problem("busy", 503, "Busy", "Try again.")
+
+    intake._writer.add = busy  # type: ignore[assignment, method-assign]
+    for later_ms, left in ((LEFT_MS + 1, 1), (GIVE_UP_MS + 1, 0)):
+        house.clock.at_ms = NOW_MS + later_ms
+        for _ in range(SHARDS):
+            await intake.distribute_backlog()
+        assert await _queued(house) == left
+
+
+async def test_a_store_that_is_away_is_said(house: House) -> None:
+    house.tables.left, house.tables.error = 1, StoreError("away")
+    with pytest.raises(StoreError):
+        await house.intake.ingest([message(NOW_MS, a=1.0)])
+    house.tables.left = None
+    await house.intake.ingest([message(NOW_MS, a=1.0)])
+    await assert_whole(house, {NOW_MS: {"a": 1.0}})
