@@ -1,4 +1,4 @@
-"""Signing in as people do: in a real Chromium, by password, and at a provider of another site."""
+"""Sign-in in Chromium: by password, and at an OpenID Connect provider of another site."""
 
 from collections.abc import Iterator
 
@@ -17,7 +17,7 @@ PASSWORD = "correct horse battery"
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """The functions at ``localhost``, and a provider at ``127.0.0.1``: to a browser these are two sites."""
+    """Settings of functions at ``localhost`` with a provider at ``127.0.0.1``; a browser treats these as two sites."""
     port = _free_port()
     home = tmp_path_factory.mktemp("sign-in")
     url = f"http://localhost:{port}"
@@ -70,10 +70,8 @@ def test_a_password_is_set_after_a_link_and_signs_in(browser: Browser, environme
     signed_in(page, "ann")
 
 
-def test_who_signs_in_at_another_site_comes_back_signed_in_and_stays_so(
-    browser: Browser, environment: dict[str, str]
-) -> None:
-    """What is shown here no HTTP client can show: a browser keeps the strict cookie that the way back sets."""
+def test_sign_in_at_a_provider_returns_with_a_lasting_session(browser: Browser, environment: dict[str, str]) -> None:
+    """Only a browser can show that the strict cookie set by the redirect is kept."""
     page = page_of(browser)
     page.goto(environment["TELESCOPE_PUBLIC_URL"])
     page.get_by_test_id("sign-in-elsewhere").click()
@@ -89,9 +87,7 @@ def test_who_signs_in_at_another_site_comes_back_signed_in_and_stays_so(
     assert cookies["telescope_session"]["httpOnly"] is True
 
 
-def test_who_was_invited_and_signs_in_at_another_site_comes_back_to_what_they_were_invited_to(
-    browser: Browser, environment: dict[str, str]
-) -> None:
+def test_sign_in_at_a_provider_returns_to_the_invitation(browser: Browser, environment: dict[str, str]) -> None:
     url = environment["TELESCOPE_PUBLIC_URL"]
     owner = page_of(browser)
     owner.goto(f"{url}/#sign-in={sign_in_link(environment, 'dora')}")
@@ -109,4 +105,4 @@ def test_who_was_invited_and_signs_in_at_another_site_comes_back_to_what_they_we
     expect(page.get_by_test_id("shared-with-me")).to_contain_text("Home", timeout=PATIENCE_MS)
     page.reload()
     signed_in(page, "Name of eve")
-    expect(page.get_by_test_id("shared-with-me")).to_have_count(0)  # it is answered, and asked no more
+    expect(page.get_by_test_id("shared-with-me")).to_have_count(0)  # the accepted invitation is not shown again

@@ -1,4 +1,4 @@
-"""A person pairs a robot by the link that its agent prints in a terminal, and gives it a name and a room."""
+"""A user pairs a robot with the link that its agent prints, and sets its name and room."""
 
 import codecs
 import contextlib
@@ -24,7 +24,7 @@ from tests.harness.paths import ROOT
 
 
 class Terminal:
-    """An agent that enrolls, in a terminal of its own, and all that it has printed."""
+    """An enrolling agent in a pseudo-terminal, and its output."""
 
     def __init__(self, machine: Machine, home: Path) -> None:
         self.text = ""
@@ -75,11 +75,9 @@ def field(page: Page) -> str:
     return page.get_by_test_id("claim-code").input_value()
 
 
-def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
-    browser: Browser, machine: Machine, terminal: Terminal
-) -> None:
+def test_a_robot_is_paired_by_the_link_in_the_terminal(browser: Browser, machine: Machine, terminal: Terminal) -> None:
     link = terminal.link()
-    # The same link stands there as a picture.
+    # The terminal also shows the link as a QR code.
     drawn = claim_prompt.qr_lines(link)
     wait_until(lambda: all(line in terminal.text for line in drawn), "the QR code")
     with machine.api() as api, person(browser, link) as page:
@@ -92,7 +90,7 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
         assert {device["id"] for device in api.get("/devices")["items"]} == known
         assert_good_page(page, "pairing")
 
-        # A wrong code pairs nothing, says so, and costs nothing that was typed.
+        # A wrong code is rejected with a message; the form keeps its input.
         right = field(page)
         page.get_by_test_id("claim-code").fill("bcdf")
         page.get_by_test_id("claim").click()
@@ -115,9 +113,9 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
         expect(row).to_contain_text("Guest room")
         expect(row).to_contain_text("Waiting for the first data")
         spaces = [space["name"] for space in api.get("/spaces")["items"]]
-        assert spaces.count("Guest room") == 1, "the second try went into the space of the first"
+        assert spaces.count("Guest room") == 1, "the second attempt must use the space of the first"
 
-        # It is given a name, and its own again.
+        # Rename it, then reset the name.
         before = row.get_by_role("link").inner_text()
         row.get_by_test_id("rename").press("Enter")
         row.get_by_test_id("name").fill("Visitor")
@@ -127,7 +125,7 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
         row.get_by_test_id("undo-name").press("Enter")
         expect(row.get_by_role("link")).to_have_text(before, timeout=PATIENCE_MS)
 
-        # Used once, the code is worth nothing any more.
+        # A used code is invalid.
         page.get_by_role("button", name="Pair another").click()
         page.get_by_test_id("claim-code").fill(right)
         page.get_by_test_id("claim").click()

@@ -83,11 +83,11 @@ BROKEN = {
     "reacher.xml": WORSE,
     "scene.xml": SCENE.replace("</worldbody>", "</wurldbody>"),
 }
-"""A limit wider than the joint's, a mesh that is not there, and torn XML in line 6."""
+"""Files with a limit wider than the joint's, a missing mesh, and invalid XML in line 6."""
 
 
 def archive(files: Mapping[str, str]) -> FilePayload:
-    """A zip of a folder, with what file managers add."""
+    """A zip archive of a folder, with the entries that file managers add."""
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w") as made:
         for name, text in files.items():
@@ -101,7 +101,7 @@ def at_step(page: Page, step: str) -> None:
 
 
 def replace(page: Page, folder: Path, name: str, text: str) -> None:
-    """One file in the place of one that was chosen."""
+    """Replace one selected file."""
     (folder / name).write_text(text)
     page.locator(f"[data-file='{name}'] input").set_input_files(folder / name)
 
@@ -114,7 +114,7 @@ def finding(page: Page, kind: str, level: str = "error") -> Locator:
     return page.locator(f"[data-testid={level}][data-kind={kind}]")
 
 
-def test_a_robot_type_is_mended_seen_saved_and_deleted(
+def test_a_robot_type_is_corrected_previewed_saved_and_deleted(
     drawing_browser: Browser, machine: Machine, tmp_path: Path
 ) -> None:
     with pages(drawing_browser, machine) as (page,):
@@ -129,7 +129,7 @@ def test_a_robot_type_is_mended_seen_saved_and_deleted(
         is_saved(page, machine)
         is_deleted(page, machine)
 
-        # A type that comes with the installation has its picture too.
+        # A built-in type has a picture too.
         page.locator("[data-type='ur5'] a").click()
         view = page.get_by_test_id("model-view")
         wait_until(lambda: frames(view) > 0, "a picture")
@@ -156,7 +156,7 @@ def is_refused(page: Page) -> None:
 
 
 def is_mended(page: Page, folder: Path) -> None:
-    """The files have stayed, and are exchanged one by one."""
+    """The selected files remain and can be replaced one by one."""
     replace(page, folder, "scene.xml", SCENE)
     replace(page, folder, "robot.toml", MANIFEST)
     expect(page.get_by_test_id("error")).to_have_count(1, timeout=PATIENCE_MS)
@@ -183,7 +183,7 @@ def is_looked_at(page: Page, machine: Machine) -> None:
 
 
 def is_saved(page: Page, machine: Machine) -> None:
-    """It has a page of its own, and is in the list."""
+    """The saved type has a page and is in the list."""
     page.get_by_test_id("save-type").click()
     expect(page.get_by_test_id("type-saved")).to_be_visible(timeout=PATIENCE_MS)
     expect(page.locator("[data-testid=saved-movements] [data-accepted=true]")).to_have_text("bow accepted")
@@ -202,7 +202,7 @@ def is_saved(page: Page, machine: Machine) -> None:
 
 
 def is_deleted(page: Page, machine: Machine) -> None:
-    """While something of it is in use it stays; then it goes."""
+    """A type in use cannot be deleted; an unused one can."""
     page.locator("[data-type='reacher'] a").click()
     page.get_by_test_id("delete-type").click()
     page.get_by_test_id("confirm-yes").click()

@@ -1,4 +1,4 @@
-"""Health and times as a person sees them: a fault put into the simulation, seen, ended; times measured and saved."""
+"""Health and latency pages: an injected fault is raised and ends; latencies are measured and saved."""
 
 import contextlib
 from collections import defaultdict
@@ -18,7 +18,7 @@ UR5_HTTP_MS, UR5_XMPP_MS = "2994.6", "824.25"
 
 @contextlib.contextmanager
 def ill(machine: Machine, device: str, ailment: str) -> Iterator[Path]:
-    """A device of the simulation that suffers from something until the end of the ``with``, or of the file."""
+    """Inject a fault into a simulated device until the context exits or the file is deleted."""
     (folder,) = {path.parent / "faults" for path in machine.home.rglob("agent.toml")}
     folder.mkdir(exist_ok=True)
     file = folder / f"{device}.toml"
@@ -30,17 +30,17 @@ def ill(machine: Machine, device: str, ailment: str) -> Iterator[Path]:
 
 
 def go(page: Page, machine: Machine, address: str) -> None:
-    """Go to a page of the console as a link does: without loading it anew."""
+    """Navigate to a page of the console without a reload."""
     page.evaluate("address => { location.hash = address; }", address)
     assert page.url.startswith(machine.url)
 
 
-def test_a_fault_is_raised_seen_and_ended_and_a_trend_shows_what_was_measured(
+def test_a_fault_is_raised_shown_and_ended_and_a_trend_shows_measurements(
     browser: Browser, laboratory: Machine
 ) -> None:
     with laboratory.api() as api:
         ids = {name: api.device(name)["id"] for name in ("thermometer", "co2")}
-        # A meter that goes wild shows in its trend at once, and is found by the detectors while the rest is looked at.
+        # Wild values appear in the trend at once; the detectors find them during the other checks.
         with (
             ill(laboratory, "co2", "drift = { co2_ppm = 90000.0 }"),
             pages(browser, laboratory) as (ann,),
@@ -52,7 +52,7 @@ def test_a_fault_is_raised_seen_and_ended_and_a_trend_shows_what_was_measured(
 
 
 def raised(page: Page, machine: Machine, device: str) -> None:
-    """The list of devices, all health and the device's own page say so, without being loaded anew."""
+    """The device list, the health page and the device page show the fault without a reload."""
     row = page.locator(f"[data-testid=device-row][data-device='{device}']")
     expect(row.get_by_text("1 fault")).to_be_visible(timeout=PATIENCE_MS)
     row.get_by_role("link").first.click()
@@ -62,13 +62,13 @@ def raised(page: Page, machine: Machine, device: str) -> None:
     line = page.locator(f"[data-testid=health-row][data-device='{device}']")
     expect(line).to_have_attribute("data-health", "fault", timeout=PATIENCE_MS)
     expect(line).to_contain_text("does not respond")
-    assert page.get_by_test_id("health-row").first.get_attribute("data-health") == "fault", "the worst stands first"
+    assert page.get_by_test_id("health-row").first.get_attribute("data-health") == "fault", "the worst device is first"
     assert_good_page(page, "health")
     go(page, machine, f"#/devices/{device}/health")
 
 
 def seen_and_ended(page: Page, cause: Path) -> None:
-    """By the keyboard alone; then the cause ends, and the fault with it."""
+    """Acknowledge by keyboard; the fault ends with its cause."""
     fault = page.get_by_test_id("fault")
     expect(fault).to_have_attribute("data-state", "raised", timeout=PATIENCE_MS)
     button = page.get_by_test_id("acknowledge")
@@ -90,7 +90,7 @@ def seen_and_ended(page: Page, cause: Path) -> None:
 
 
 def trend(page: Page, machine: Machine, device: str) -> None:
-    """The excursion, the band, and the fault that was found in it; read by the keyboard, and as a table."""
+    """The trend shows the excursion, the band and the fault; keyboard and table access work."""
     go(page, machine, f"#/devices/{device}/health")
     page.get_by_text("10 min", exact=True).click()
     now = page.get_by_test_id("trend-now")
@@ -100,7 +100,7 @@ def trend(page: Page, machine: Machine, device: str) -> None:
     row = page.get_by_test_id("watched-row").first
     expect(row).to_have_attribute("data-field", "co2.co2_ppm")
     expect(row).to_contain_text("Limit exceeded")
-    expect(row).to_contain_text("Open door or window")  # as the room's manifest advises
+    expect(row).to_contain_text("Open door or window")  # advice of the room's manifest
     chart = page.get_by_test_id("series")
     wait_until(lambda: int(chart.get_attribute("data-points") or "0") > 5, "points")
     chart.focus()
@@ -115,7 +115,7 @@ def trend(page: Page, machine: Machine, device: str) -> None:
     expect(page.get_by_test_id("trend-table").get_by_role("row")).not_to_have_count(1)
 
 
-def test_times_are_measured_drawn_beside_the_papers_and_saved(browser: Browser, laboratory: Machine) -> None:
+def test_latencies_are_measured_plotted_with_reference_values_and_saved(browser: Browser, laboratory: Machine) -> None:
     with laboratory.api() as api:
         device = api.device("light")["id"]
         with pages(browser, laboratory) as (ann,):
@@ -127,12 +127,12 @@ def test_times_are_measured_drawn_beside_the_papers_and_saved(browser: Browser, 
             expect(measured).to_have_attribute("data-busy", "false", timeout=2 * PATIENCE_MS)
             expect(measured).to_have_attribute("data-count", str(3 * MEASURED))
 
-            # Everything is stored, and drawn once.
+            # All samples are stored and plotted once.
             ann.get_by_test_id("times-path").select_option("operator-cloud")
             for transport in ("http", "websocket"):
                 line = ann.locator(f"[data-testid=times-line][data-transport={transport}]")
                 assert int(line.get_attribute("data-count") or "0") >= MEASURED
-            # The cloud has measured the same requests on its own clock; nothing waits for it to note them.
+            # The cloud stores its own measurements of the same requests asynchronously.
             kinds = (("http", "operator-device"), ("mqtt", "command-started"))
             wait_until(lambda: all(counted(api, device)[kind] >= MEASURED for kind in kinds), "all to be stored")
             counts = counted(api, device)
@@ -142,7 +142,7 @@ def test_times_are_measured_drawn_beside_the_papers_and_saved(browser: Browser, 
                 expect(ann.locator(f"[data-testid=published][data-ms='{ms}']")).to_be_visible()
             assert int(chart.get_attribute("data-references") or "0") > 0
 
-            # What is saved is what is drawn.
+            # The saved file contains the plotted samples.
             ann.get_by_test_id("times-path").select_option("")
             drawn = int(chart.get_attribute("data-samples") or "0")
             with ann.expect_download() as download:
@@ -157,6 +157,6 @@ def test_times_are_measured_drawn_beside_the_papers_and_saved(browser: Browser, 
 
 
 def counted(api: Api, device: str) -> dict[tuple[str, str], int]:
-    """How many samples are stored of each transport and path."""
+    """Number of stored samples by transport and path."""
     items = api.get(f"/devices/{device}/latency")["items"]
     return defaultdict(int, {(item["transport"], item["path"]): item["count"] for item in items})

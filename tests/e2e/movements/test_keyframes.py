@@ -1,4 +1,4 @@
-"""Keyframes in a real Chromium: set, mended, seen, saved, run, recorded; for an arm, a humanoid, a base, a head."""
+"""Keyframe editor: edit, preview, save, run and record, for arm, humanoid, base and head."""
 
 import ast
 from typing import Any
@@ -13,7 +13,7 @@ from tests.harness.network.brokers import wait_until
 
 
 def open_editor(page: Page, laboratory: Machine, name: str) -> None:
-    """The keyframe editor of a robot, by its page, once it knows the robot."""
+    """Open the keyframe editor from the robot's page and wait for the twin."""
     with laboratory.api() as api:
         device = api.device(name)["id"]
     page.goto(f"{laboratory.url}/#/devices/{device}")
@@ -33,7 +33,7 @@ def set_joint(page: Page, joint: str, deg: float) -> None:
 
 
 def keyframes(page: Page) -> list[dict[str, Any]]:
-    """Those in the script that is written."""
+    """Keyframes in the generated script."""
     source = page.get_by_test_id("kf-source").text_content() or ""
     tree = ast.parse(source)
     found = next(
@@ -56,11 +56,11 @@ def run(page: Page) -> None:
     assert status.get_attribute("data-status") == "done", status.text_content()
 
 
-def test_an_arm_s_movement_from_keyframes_to_the_robot(drawing_browser: Browser, laboratory: Machine) -> None:
+def test_keyframes_of_an_arm_are_edited_saved_and_run(drawing_browser: Browser, laboratory: Machine) -> None:
     with pages(drawing_browser, laboratory) as (page,):
         open_editor(page, laboratory, "ur5")
 
-        # Two poses by number and by slider; the way between them is too fast, and one click mends it.
+        # Two poses by number and slider. The motion between them is too fast; one click corrects the time.
         start = keyframes(page)[0]["position_rad"]
         page.get_by_test_id("kf-add").click()
         expect(page.get_by_test_id("kf-marker-2")).to_be_visible()
@@ -87,7 +87,7 @@ def test_an_arm_s_movement_from_keyframes_to_the_robot(drawing_browser: Browser,
         set_joint(page, "shoulder_lift", -80)
         expect(page.get_by_test_id("kf-problems")).to_have_attribute("data-count", "0")
 
-        # The preview moves the drawing and nothing else.
+        # The preview moves only the twin.
         before = laboratory.trace().now()["qpos"]["shoulder_pan"]
         frames = number(page, "kf-view", "frames")
         page.get_by_test_id("kf-play").click()
@@ -95,7 +95,7 @@ def test_an_arm_s_movement_from_keyframes_to_the_robot(drawing_browser: Browser,
         assert number(page, "kf-view", "frames") > frames + 3
         assert abs(laboratory.trace().now()["qpos"]["shoulder_pan"] - before) < 1e-3
 
-        # A draft outlives the page.
+        # A draft survives a reload.
         page.reload()
         expect(page.get_by_test_id("kf-restored")).to_be_visible(timeout=PATIENCE_MS)
         made = keyframes(page)
@@ -107,7 +107,7 @@ def test_an_arm_s_movement_from_keyframes_to_the_robot(drawing_browser: Browser,
         assert_good_page(page, "keyframes")
         page.set_viewport_size({"width": 1440, "height": 900})
 
-        # On the robot it gets to the poses, one after the other.
+        # The robot reaches the poses in order.
         run(page)
         reached = laboratory.trace().rows(3000)
         for one in made[1:]:
@@ -120,7 +120,7 @@ def test_an_arm_s_movement_from_keyframes_to_the_robot(drawing_browser: Browser,
 
 
 def undone_and_done_again(page: Page) -> None:
-    """By keys."""
+    """Edit keyframes by keyboard."""
     page.get_by_test_id("kf-marker-2").focus()
     page.keyboard.press("ArrowRight")
     later = number(page, "kf-marker-2", "time")
@@ -146,9 +146,7 @@ def opened_again(page: Page, laboratory: Machine, made: list[dict[str, Any]]) ->
         assert api.http.delete("/robot-types/ur5/movements/kf-turn").is_success
 
 
-def test_what_moves_the_robot_is_recorded_trimmed_and_becomes_keyframes(
-    drawing_browser: Browser, laboratory: Machine
-) -> None:
+def test_a_recorded_motion_is_trimmed_and_becomes_keyframes(drawing_browser: Browser, laboratory: Machine) -> None:
     with pages(drawing_browser, laboratory) as (page,):
         open_editor(page, laboratory, "ur5")
         home = keyframes(page)[0]["position_rad"]
@@ -172,7 +170,7 @@ def test_what_moves_the_robot_is_recorded_trimmed_and_becomes_keyframes(
         made = keyframes(page)
         assert len(made) >= 2
         assert made[0]["time_s"] == 0
-        assert made[-1]["time_s"] < lasts - 0.2, "its beginning was cut off"
+        assert made[-1]["time_s"] < lasts - 0.2, "the start is trimmed"
         assert max(one["position_rad"].get("shoulder_pan", -9) for one in made) > home["shoulder_pan"] + 0.5
         page.get_by_test_id("kf-undo").click()
         assert len(keyframes(page)) == 1

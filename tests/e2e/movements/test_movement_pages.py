@@ -1,4 +1,4 @@
-"""Movements as a person writes, keeps and runs them, in a real Chromium with real agents."""
+"""Movement pages in Chromium: write, save, version and run movements on real agents."""
 
 import subprocess
 import sys
@@ -38,7 +38,7 @@ def api(machine: Machine) -> Iterator[Api]:
 
 @pytest.fixture
 def second(machine: Machine, api: Api) -> Iterator[Trace]:
-    """Another UR5 behind an agent of its own, for as long as a test lasts."""
+    """A second UR5 with its own agent for one test."""
     home = machine.home / "agents" / SECOND
     program = [sys.executable, "-m", "device_agent"]
     told = ["--home", str(home), "--server", machine.url, "--name", SECOND, "--device", f"{SECOND}=ur5", "--no-wait"]
@@ -60,13 +60,13 @@ def second(machine: Machine, api: Api) -> Iterator[Trace]:
 
 @pytest.fixture
 def name(api: Api, request: pytest.FixtureRequest) -> Iterator[str]:
-    """Of a movement that is only for one test: numbers of versions are never used again."""
+    """Name of a movement for one test; version numbers are never reused."""
     found = "".join(part[0] for part in request.node.name.split("_")[1:])
     yield found
     api.http.delete(f"/robot-types/ur5/movements/{found}")
     device = api.device()["id"]
     home: dict[str, Any] = {"kind": "run_movement", "name": "home"}
-    # In its turn: what the test has begun may still be under way.
+    # Queued, because an action of the test may still run.
     api.post(f"/devices/{device}/actions", {"request": home, "policy": "queue", "wait_ms": 20_000, "wait_for": "done"})
 
 
@@ -84,12 +84,10 @@ def open_script(page: Page, machine: Machine, name: str) -> None:
 
 
 def write(page: Page, text: str) -> None:
-    """As by a paste over everything."""
+    """Replace the text of the editor."""
     script(page).click()
     page.keyboard.press("Control+a")
-    page.keyboard.press(
-        "Delete"
-    )  # text put over several lines has Chromium try styles of its own, which the policy blocks
+    page.keyboard.press("Delete")  # pasted lines trigger inline styles of Chromium, which the policy blocks
     page.keyboard.insert_text(text)
 
 
@@ -103,7 +101,7 @@ def wrist(trace: Trace) -> float:
     return float(trace.now()["qpos"]["wrist_3"])
 
 
-def test_a_movement_is_written_mended_and_saved(browser: Browser, machine: Machine, name: str) -> None:
+def test_a_movement_is_written_corrected_and_saved(browser: Browser, machine: Machine, name: str) -> None:
     with pages(browser, machine) as (page,):
         page.get_by_role("link", name="Movements").click()
         expect(page.get_by_test_id("shelf-ur5-wave")).to_be_visible(timeout=PATIENCE_MS)
@@ -120,7 +118,7 @@ def test_a_movement_is_written_mended_and_saved(browser: Browser, machine: Machi
         page.get_by_test_id("new-name").fill(name)
         page.get_by_test_id("new-movement").click()
 
-        # What is wrong is marked in its line; it is not saved, and the text stays.
+        # The error is marked in its line; the text stays unsaved.
         write(page, BROKEN)
         problem = page.get_by_test_id("problem")
         expect(problem).to_have_count(1, timeout=PATIENCE_MS)
@@ -132,12 +130,12 @@ def test_a_movement_is_written_mended_and_saved(browser: Browser, machine: Machi
         assert written(page) == BROKEN
         assert_good_page(page, "movement-wrong")
 
-        # What the sandbox gives is offered, and the names of this robot type.
+        # Completion offers the script API and names of this robot type.
         write(page, "robot.mo")
         offered = page.get_by_test_id("code").locator(".cm-completionLabel")
         page.keyboard.press("Control+Space")
         expect(offered.filter(has_text="move_joints")).to_be_visible(timeout=PATIENCE_MS)
-        page.wait_for_timeout(200)  # a key that comes with the list is not meant for it
+        page.wait_for_timeout(200)  # the completion list ignores keys right after it opens
         page.keyboard.press("Enter")
         assert written(page) == "robot.move_joints"
         page.keyboard.insert_text("({'el")
@@ -145,7 +143,7 @@ def test_a_movement_is_written_mended_and_saved(browser: Browser, machine: Machi
         expect(offered.filter(has_text="elbow")).to_be_visible(timeout=PATIENCE_MS)
         page.keyboard.press("Escape")
 
-        # Tab leads on, as everywhere.
+        # Tab moves the focus.
         page.keyboard.press("Tab")
         assert page.evaluate("() => document.activeElement.dataset.testid") == "save-movement"
 
@@ -162,7 +160,7 @@ def test_a_movement_runs_with_parameters_from_a_form_and_its_failure_is_marked(
         open_script(page, machine, name)
 
         page.get_by_test_id("choose-ur5").check()
-        # Its parameters are a form, in degrees; what is out of range says so.
+        # The parameter form uses degrees and reports values out of range.
         angle = page.get_by_test_id("parameter-angle_rad")
         angle.fill("120")
         page.get_by_test_id("run-many").click()
@@ -176,7 +174,7 @@ def test_a_movement_runs_with_parameters_from_a_form_and_its_failure_is_marked(
         wait_until(lambda: abs(wrist(machine.trace()) - 0.698) < 0.01, "the wrist to be turned by 40°")
         assert_good_page(page, "movement")
 
-        # A run that fails is marked in its line too.
+        # A failed run is marked in its line too.
         write(page, SCRIPT.replace('print("turned"', 'print(1 / 0, "turned"'))
         page.get_by_test_id("run-many").click()
         expect(row).to_have_attribute("data-status", "failed", timeout=PATIENCE_MS)
@@ -184,7 +182,7 @@ def test_a_movement_runs_with_parameters_from_a_form_and_its_failure_is_marked(
         marked = page.get_by_test_id("problem").filter(has_text="ZeroDivisionError")
         expect(marked).to_have_attribute("data-line", str(failed), timeout=PATIENCE_MS)
 
-        # The last values are there again, on the robot's own page too.
+        # The last values are restored, also on the robot's page.
         page.goto(f"{machine.url}/#/")
         page.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()
         page.get_by_test_id(f"parameters-{name}").click()
@@ -195,7 +193,7 @@ def test_a_movement_runs_with_parameters_from_a_form_and_its_failure_is_marked(
         wait_until(lambda: abs(wrist(machine.trace()) + 0.5236) < 0.01, "the wrist to be turned by -30°")
 
 
-def test_nothing_that_was_written_is_lost_and_versions_come_back(
+def test_unsaved_text_is_kept_and_versions_can_be_restored(
     browser: Browser, machine: Machine, api: Api, name: str
 ) -> None:
     with pages(browser, machine, 2) as (mine, other):
@@ -205,14 +203,14 @@ def test_nothing_that_was_written_is_lost_and_versions_come_back(
         open_script(other, machine, name)
         expect(other.get_by_test_id("save-state")).to_have_attribute("data-version", "1")
 
-        # What is not saved survives a reload.
+        # Unsaved text survives a reload.
         write(mine, SCRIPT + "# mine\n")
         expect(mine.get_by_test_id("save-state")).to_have_attribute("data-changed", "true")
         mine.reload()
         expect(mine.get_by_test_id("restored")).to_be_visible(timeout=PATIENCE_MS)
         assert written(mine) == SCRIPT + "# mine\n"
 
-        # The other tab saves first: it is not saved over, and both are there to see.
+        # The other tab saves first: its version is not overwritten, and both are shown.
         write(other, SCRIPT + "# theirs\n")
         save(other, 2)
         mine.get_by_test_id("save-movement").click()
@@ -224,7 +222,7 @@ def test_nothing_that_was_written_is_lost_and_versions_come_back(
         mine.get_by_test_id("save-over").click()
         expect(mine.get_by_test_id("save-state")).to_have_attribute("data-version", "3", timeout=PATIENCE_MS)
 
-        # An older version is looked at, and saved again as the newest.
+        # An older version is opened and saved as the newest.
         mine.get_by_test_id("version-2").get_by_role("button").click()
         expect(mine.get_by_test_id("restore-version")).to_be_visible(timeout=PATIENCE_MS)
         assert_good_page(mine, "movement-version")
@@ -239,9 +237,9 @@ def test_nothing_that_was_written_is_lost_and_versions_come_back(
         mine.get_by_test_id("discard-draft").click()
         wait_until(lambda: written(mine) == SCRIPT + "# theirs\n", "the saved text")
         mine.get_by_role("button", name="Undo").click()
-        wait_until(lambda: written(mine) == "1", "what was given up")
+        wait_until(lambda: written(mine) == "1", "the discarded draft")
 
-        # Deleting asks in its own place.
+        # Deletion asks for confirmation inline.
         mine.goto(f"{machine.url}/#/movements")
         mine.get_by_test_id(f"remove-{name}").click()
         mine.get_by_test_id("confirm-yes").click()
@@ -264,7 +262,7 @@ def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(
         for trace in (machine.trace(), second):
             wait_until(lambda trace=trace: abs(wrist(trace) - 0.349) < 0.01, "the wrist to be turned by 20°")  # type: ignore[misc]
 
-        # One is cancelled, then both are stopped by the key, wherever the focus is.
+        # One run is cancelled, then the Stop key stops both, independent of the focus.
         page.get_by_test_id("parameter-wait_s").fill("30")
         page.get_by_test_id("run-many").click()
         for row in rows:
@@ -278,7 +276,7 @@ def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(
         for banner in page.get_by_test_id("stop-banner").all():
             expect(banner).to_have_attribute("data-state", "latched", timeout=PATIENCE_MS)
 
-        # A robot that may not run it says why; the other is not asked in vain.
+        # A robot that cannot run the movement gives the reason; the other robot runs it.
         page.get_by_test_id("reset-stop").first.click()
         page.get_by_test_id("confirm-reset").click()
         expect(page.get_by_test_id("stop-banner")).to_have_count(1, timeout=PATIENCE_MS)

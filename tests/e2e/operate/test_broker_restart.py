@@ -1,4 +1,4 @@
-"""The broker dies under an operator whose robot moves: that holds, and the page says so and comes back as it was."""
+"""After a broker failure the moving robot holds, and the page reports it and recovers its state."""
 
 import os
 import signal
@@ -20,13 +20,13 @@ NOTE = """() => {
     };
     new MutationObserver(look).observe(document.body, {subtree: true, childList: true, characterData: true});
 }"""
-"""Keeps all that is said of the link, however short a time: the broker may be back before a test looks."""
+"""Records every text of the link banner, because the broker may recover before the test reads it."""
 TYPED = "0.123"
 
 
 @pytest.fixture(params=BROKERS)
 def site(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Machine, str]]:
-    """The product, and what its broker's program is called."""
+    """The product and the name of its broker program."""
     if request.param == "amqtt":
         yield request.getfixturevalue("machine"), "infra.embedded_broker"
         return
@@ -35,7 +35,7 @@ def site(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Machi
 
 
 def kill(machine: Machine, program: str) -> None:
-    """The broker, with what runs below it."""
+    """Kill the broker and its child processes."""
     os.killpg(machine.pid(program), signal.SIGKILL)
 
 
@@ -46,9 +46,7 @@ def in_control(page: Page, api: Api, device: str) -> list[bool]:
     return [shown == "mine", cloud["lease"] is not None, cloud["state"]["lease"] is not None]
 
 
-def test_a_broker_that_dies_in_mid_motion_costs_that_motion_and_nothing_else(
-    browser: Browser, site: tuple[Machine, str]
-) -> None:
+def test_a_broker_failure_ends_only_the_running_motion(browser: Browser, site: tuple[Machine, str]) -> None:
     machine, program = site
     trace = machine.trace()
     with machine.api() as api, operator(browser, machine) as page:
@@ -67,13 +65,13 @@ def test_a_broker_that_dies_in_mid_motion_costs_that_motion_and_nothing_else(
         assert stopped_in_time(attempt)
         assert any("No connection to the broker" in said for said in page.evaluate("() => window.saidOfTheLink"))
 
-        # The robot had to hold, which ended control: page, cloud and robot say the same.
-        wait_until(lambda: not any(in_control(page, api, device)), "one account of who has control")
+        # The robot held, which ended control: page, cloud and robot agree.
+        wait_until(lambda: not any(in_control(page, api, device)), "page, cloud and robot to agree on control")
         expect(page.get_by_test_id("slider-elbow")).to_be_disabled()
 
         rest = elbow(trace)
         share = 0.75 if rest < 0.5 else 0.25
         drive(page, share, lambda: abs(elbow(trace) - rest) > 0.1, "the elbow following the slider again")
-        wait_until(lambda: len(set(in_control(page, api, device))) == 1, "one account of who has control")
+        wait_until(lambda: len(set(in_control(page, api, device))) == 1, "page, cloud and robot to agree on control")
         assert page.get_by_test_id("pose-2").input_value() == TYPED
         release(page)

@@ -1,4 +1,4 @@
-"""The benchmark of the console measures what it says: every part of a press, in its order."""
+"""The console benchmark measures each phase of a button press in order."""
 
 from itertools import pairwise
 
@@ -9,17 +9,17 @@ from tests.harness.browser.browser import pages
 from tests.harness.browser.product import Machine
 
 CLOCKS_AGREE_MS = 15.0
-"""The simulation's record has a line each 10 ms, and the wall clocks of two programs are read in between."""
+"""Tolerance between clocks [ms]: the trace has 10 ms resolution, and two processes read wall clocks."""
 
 
 def test_every_part_of_a_press_is_measured_and_in_order(drawing_browser: Browser, machine: Machine) -> None:
     with pages(drawing_browser, machine) as (page,):
         found = slider.measure(page, machine, 2)
-        for _ in range(5):  # a busy machine may draw none of six in time
+        for _ in range(5):  # a busy machine may render none of six presses in time
             found = found or slider.presses(page, machine, 2)
         if page.get_by_test_id("release-control").count():
             page.get_by_test_id("release-control").click()
-    assert found, "not one press was drawn in time"
+    assert found, "no press was rendered in time"
     for press in found:
         assert tuple(press.at_ms) == slider.PARTS
         times = list(press.at_ms.values())

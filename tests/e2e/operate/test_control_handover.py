@@ -1,4 +1,4 @@
-"""Control of the simulated arm from hand to hand, in mid-motion, with the real agent: what moves is held at once."""
+"""Control handover of a moving simulated arm with the real agent: the arm holds at once."""
 
 import contextlib
 import time
@@ -13,12 +13,12 @@ from tests.harness.network.brokers import wait_until
 
 FAR, NEAR = {"shoulder_pan": 2.0}, {"shoulder_pan": -2.0}
 SLOW = 0.05
-"""A dozen seconds each way, so that a busy machine still finds the arm on its way."""
+"""Speed share; a motion takes about 12 s, so that the arm still moves on a busy machine."""
 
 
 @pytest.fixture
 def two(machine: Machine) -> Iterator[tuple[Api, Api, str]]:
-    """Two sessions of one owner, and the arm: free, and not stopped, before and after."""
+    """Two sessions of one owner and the arm, which is free and not stopped before and after."""
     with machine.api() as ann, machine.api() as bob:
         device = ann.device()["id"]
         yield ann, bob, device
@@ -34,7 +34,7 @@ def commanded_speed(trace: Trace) -> float:
 
 
 def move(api: Api, device: str, epoch: int, target: dict[str, float]) -> str:
-    """Begin to move slowly; gives the action once the arm is on its way."""
+    """Start a slow motion. Returns the action once the arm moves."""
     request = {"kind": "move_joints", "position_rad": target, "speed": SLOW}
     body = {"request": request, "epoch": epoch, "wait_ms": 10_000}
     action: str = api.post(f"/devices/{device}/actions", body)["id"]
@@ -62,7 +62,7 @@ def refused(api: Api, path: str, body: Any) -> str:
     return code
 
 
-def test_who_is_handed_control_finds_the_arm_at_rest_and_the_former_holder_moves_nothing(
+def test_a_handover_stops_the_arm_and_the_former_holder_cannot_move_it(
     machine: Machine, two: tuple[Api, Api, str]
 ) -> None:
     ann, bob, device = two
@@ -75,7 +75,7 @@ def test_who_is_handed_control_finds_the_arm_at_rest_and_the_former_holder_moves
     request = asked["request"]["id"]
     wait_until(lambda: (state(ann, device)["lease"] or {}).get("request"), "the request in the device's state")
     assert state(ann, device)["lease"]["request"]["id"] == request
-    assert commanded_speed(trace) > 0, "asking changes nothing about motion"
+    assert commanded_speed(trace) > 0, "a request does not affect the motion"
     given = ann.post(f"/devices/{device}/lease/requests/{request}/accept")
     assert (given["epoch"], given["confirmed"]) == (epoch + 1, True)
     last = ended(ann, action)
@@ -90,9 +90,7 @@ def test_who_is_handed_control_finds_the_arm_at_rest_and_the_former_holder_moves
     ann.http.delete(f"/devices/{device}/lease", params={"epoch": epoch + 2})
 
 
-def test_after_a_stop_of_everything_only_who_takes_control_anew_moves_it(
-    machine: Machine, two: tuple[Api, Api, str]
-) -> None:
+def test_after_stop_all_motion_needs_new_control(machine: Machine, two: tuple[Api, Api, str]) -> None:
     ann, bob, device = two
     trace = machine.trace()
     epoch = ann.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
@@ -103,7 +101,7 @@ def test_after_a_stop_of_everything_only_who_takes_control_anew_moves_it(
     assert ended(ann, action)["reason"]["code"] == "stopped"
     wait_until(lambda: commanded_speed(trace) == 0, "rest")
     wait_until(lambda: state(ann, device)["stop"], "the latch in the state")
-    # The device has ended Ann's lease, so control is anybody's; but it moves nothing while it is stopped.
+    # The device ended Ann's lease, so control is free; a stopped device rejects motion.
     wait_until(lambda: ann.get(f"/devices/{device}/lease")["lease"] is None, "the end of the lease")
     other = bob.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
     still = ended(bob, move(bob, device, other, NEAR))
@@ -120,5 +118,5 @@ def test_after_a_stop_of_everything_only_who_takes_control_anew_moves_it(
     ended(bob, again)
     bob.http.delete(f"/devices/{device}/lease", params={"epoch": fresh})
     told = {"stop-ordered", "stop-latched", "stop-reset-ordered", "stop-reset", "control-taken"}
-    # The device's own come when its link is settled.
+    # Events of the device arrive when its link is stable.
     wait_until(lambda: told <= kinds(ann, device), "the events of cloud and device")

@@ -1,4 +1,4 @@
-"""Two people, a browser each, one arm: control goes from hand to hand, and who watches is seen."""
+"""Two users with one arm in two browsers: control handover and the list of viewers."""
 
 import contextlib
 import json
@@ -18,7 +18,7 @@ SILENCE_MS = 12_000
 
 @pytest.fixture
 def two(browser: Browser, machine: Machine) -> Iterator[tuple[Page, Page]]:
-    """Demo, who owns the arm, and Carol, who may operate it; both look at it."""
+    """Pages of the owner (Demo) and an operator (Carol), both on the arm's page."""
     with machine.api("carol") as carol, machine.api() as owner:
         device = owner.device()["id"]
         account = carol.get("/accounts/me")["id"]
@@ -43,12 +43,12 @@ def expect_state(page: Page, state: str) -> None:
 
 
 def take(page: Page) -> None:
-    """Where the robot has ended control by itself, on a machine so busy that it had to hold, take it again."""
+    """Take control again if the robot ended it because setpoints were late on a busy machine."""
     slider, button = page.get_by_test_id("slider-elbow"), page.get_by_test_id("take-control")
 
     def in_hand() -> bool:
         if page.get_by_test_id("control-state").get_attribute("data-state") != "mine" and button.is_visible():
-            with contextlib.suppress(Error):  # gone between the look and the click
+            with contextlib.suppress(Error):  # the button disappeared before the click
                 button.click(timeout=1000)
         return slider.is_enabled()
 
@@ -64,7 +64,7 @@ def ask(asker: Page, holder: Page) -> None:
 
 
 def elbow(machine: Machine) -> float:
-    """Measured by the simulation [rad]."""
+    """Measured position in the simulation [rad]."""
     return float(machine.trace().now()["qpos"]["elbow"])
 
 
@@ -82,9 +82,9 @@ def move_the_elbow(page: Page, machine: Machine) -> None:
     wait_until(moved, "the elbow moving")
 
 
-def test_control_goes_from_hand_to_hand_and_who_watches_is_seen(two: tuple[Page, Page], machine: Machine) -> None:
+def test_control_is_handed_over_and_viewers_are_listed(two: tuple[Page, Page], machine: Machine) -> None:
     demo, carol = two
-    # Each sees that the other looks.
+    # Each page lists the other viewer.
     for page, name in ((demo, "carol"), (carol, "demo")):
         button = page.get_by_test_id("watchers")
         expect(button).to_be_visible(timeout=PATIENCE_MS)
@@ -93,7 +93,7 @@ def test_control_goes_from_hand_to_hand_and_who_watches_is_seen(two: tuple[Page,
     assert_good_page(demo, "watchers")
     demo.get_by_test_id("watchers").press("Enter")
 
-    # Asked, and kept; by keys alone.
+    # Requested and rejected, by keyboard.
     ask(carol, demo)
     assert_good_page(demo, "asked-for-control")
     assert_good_page(carol, "asking-for-control")
@@ -101,13 +101,13 @@ def test_control_goes_from_hand_to_hand_and_who_watches_is_seen(two: tuple[Page,
     expect(carol.get_by_test_id("asked")).to_contain_text("demo keeps control", timeout=PATIENCE_MS)
     expect(demo.get_by_test_id("answered")).to_contain_text("You keep control")
 
-    # Asked, and asked no longer.
+    # Requested and withdrawn.
     ask(carol, demo)
     carol.get_by_test_id("withdraw-request").press("Enter")
     expect(demo.get_by_test_id("accept-request")).to_have_count(0, timeout=PATIENCE_MS)
     expect(carol.get_by_test_id("asked")).to_contain_text("You withdrew your request", timeout=PATIENCE_MS)
 
-    # Asked, and handed over: the one's sliders are dead, the other's move the arm without another click.
+    # Requested and granted: the former holder's sliders are disabled, the new holder's move the arm.
     ask(carol, demo)
     demo.get_by_test_id("accept-request").press("Enter")
     expect_state(demo, "handed")
@@ -117,7 +117,7 @@ def test_control_goes_from_hand_to_hand_and_who_watches_is_seen(two: tuple[Page,
     move_the_elbow(carol, machine)
     expect(demo.get_by_test_id("slider-elbow")).to_be_disabled()
 
-    # The owner takes over, and Carol, who may not, reads why.
+    # The owner takes control; Carol cannot and sees the reason.
     take(carol)
     expect(carol.get_by_test_id("take-over")).to_have_count(0)
     demo.get_by_test_id("take-over").click()
@@ -129,13 +129,13 @@ def test_control_goes_from_hand_to_hand_and_who_watches_is_seen(two: tuple[Page,
     expect(carol.get_by_test_id("slider-elbow")).to_be_disabled()
     demo.get_by_test_id("release-control").click()
     expect_state(demo, "free")
-    # Who goes is no longer seen.
+    # A viewer who leaves is removed from the list.
     carol.goto("about:blank")
     expect(demo.get_by_test_id("watchers")).to_have_count(0, timeout=2 * PATIENCE_MS)
 
 
 def shorter(route: Route) -> None:
-    """The page gives the holder half a minute to answer; here it is less."""
+    """The holder has 30 s to answer; this test uses less."""
     asked: dict[str, Any] = route.request.post_data_json or {}
     route.continue_(post_data=json.dumps(asked | {"within_ms": SILENCE_MS}))
 

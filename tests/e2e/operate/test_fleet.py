@@ -1,4 +1,4 @@
-"""Ten robots on one page: what is shown of each came from it, and the page keeps no more for showing it longer."""
+"""Ten robots on one page: each shows its own values, and memory use stays bounded."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +15,7 @@ from tests.harness.network.brokers import wait_until
 
 SHOWN_MS = 8_000
 KEEPS = 1.5
-"""So many times the memory at most after that: the last twenty seconds of telemetry are still filling."""
+"""Maximum growth factor of the memory; the buffers of 20 s of telemetry still fill."""
 PANS = (
     """() => [...document.querySelectorAll("[data-testid=measured-shoulder_pan]")].map((each) => each.dataset.value)"""
 )
@@ -23,7 +23,7 @@ PANS = (
 
 @pytest.fixture
 def own_machine(tmp_path: Path) -> Iterator[Machine]:
-    """The product, to which robots are added."""
+    """A product for this test, which adds robots."""
     with start_machine(tmp_path / "machine") as machine:
         yield machine
 
@@ -42,7 +42,7 @@ def shows_nothing_of_who_says_nothing(page: Page, machine: Machine, silent: str,
     expect(station.locator(".joint")).to_have_count(0)
 
 
-def test_ten_robots_are_shown_as_they_say_and_memory_stays(own_machine: Machine, drawing_browser: Browser) -> None:
+def test_ten_robots_show_their_own_values_in_bounded_memory(own_machine: Machine, drawing_browser: Browser) -> None:
     with (
         pair_minimal_agents(own_machine, 1) as (silent,),
         start_kinematic_arms(own_machine, ROBOTS) as ids,

@@ -1,4 +1,4 @@
-"""An operator in a real Chromium, a robot in real physics, and what the physics itself says moved."""
+"""An operator in Chromium with a simulated robot; the simulation trace is the measurement."""
 
 import contextlib
 import json
@@ -49,11 +49,11 @@ def test_the_elbow_slider_works_only_for_the_operator_in_control(browser: Browse
         round_trip = ann.get_by_test_id("round-trip")
         assert float(round_trip.get_attribute("data-value") or "nan") > 0
 
-        # The other browser sees it all and can move nothing.
+        # The other browser shows the motion and cannot control it.
         wait_until(lambda: abs(shown(bob) - math.degrees(elbow(trace))) < 0.5, "the other page to show it")
         expect(bob.get_by_test_id("slider-elbow")).to_be_disabled()
         if ann.get_by_test_id("control-state").get_attribute("data-state") != "mine":
-            take(ann)  # the machine was so busy that the robot had to hold on its way
+            take(ann)  # the robot may have ended control on a busy machine
         rest = elbow(trace)
         expect(bob.get_by_test_id("ask-control")).to_be_visible(timeout=PATIENCE_MS)
         expect(bob.get_by_test_id("take-control")).to_have_count(0)
@@ -64,7 +64,7 @@ def test_the_elbow_slider_works_only_for_the_operator_in_control(browser: Browse
 
 
 def assert_not_moved_by_force(page: Page) -> None:
-    """What a page without the lease gets when it asks past its own buttons: no credentials, and no action."""
+    """Direct requests of a page without the lease get no credentials and no action."""
     device = page.evaluate("() => fetch('/api/v1/devices').then(r => r.json())")["items"][0]
     csrf = page.evaluate("() => fetch('/api/v1/accounts/me').then(r => r.json())")["csrf_token"]
     ask = """([path, body, csrf]) => fetch('/api/v1' + path, {method: 'POST', body: JSON.stringify(body),
@@ -131,7 +131,7 @@ def test_a_robot_that_goes_offline_is_shown_as_such(browser: Browser, machine: M
     with operator(browser, machine) as page:
         online = page.get_by_test_id("online")
         expect(online).to_contain_text("online", ignore_case=True)
-        # Killed and at once started again by the supervisor: the page must have noticed, and come back.
+        # The supervisor restarts the killed agent; the page must show offline, then online.
         seen: list[str] = []
         ending = threading.Event()
         machine.kill("device_agent")
@@ -190,7 +190,7 @@ def test_mosquitto_sub_prints_the_telemetry_with_credentials_of_the_api_and_only
 
 
 def test_a_browser_that_is_killed_in_mid_motion_stops_the_arm(playwright: Playwright, machine: Machine) -> None:
-    """Unlike a page that is closed, it says no goodbye: nothing but the watchdog at the robot can act."""
+    """A killed browser sends nothing, so only the robot's watchdog can stop the arm."""
     mark = "--named-by-a-test"
 
     def kill() -> None:

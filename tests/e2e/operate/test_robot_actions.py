@@ -1,4 +1,4 @@
-"""Each of the four robots operated from its page: what is asked for is done in the simulation, and seen to be done."""
+"""Actions of each of the four robots from its page, checked in the simulation and on the page."""
 
 import math
 from itertools import pairwise
@@ -15,7 +15,7 @@ STEPS = ("accepted", "started", "observed", "ended")
 
 
 def open_robot(page: Page, machine: Machine, name: str) -> None:
-    """The page of a robot, once it is heard."""
+    """Open the page of a robot and wait until it is online."""
     with machine.api() as api:
         device = api.device(name)["id"]
     page.goto(f"{machine.url}/#/devices/{device}")
@@ -23,33 +23,33 @@ def open_robot(page: Page, machine: Machine, name: str) -> None:
 
 
 def ask(page: Page, button: str) -> None:
-    """Press a button once it may be pressed: what was before has ended."""
+    """Press a button once it is enabled, after the previous action ended."""
     expect(page.get_by_test_id(button)).to_be_enabled(timeout=PATIENCE_MS)
     page.get_by_test_id(button).click()
 
 
 def assert_done(page: Page, kind: str, *, seen: str = "motion", nth: int = 0) -> None:
-    """The newest command is done, and its line tells of every step, one after the other."""
+    """Assert that the newest command is done and its row shows every step in order."""
     row = page.get_by_test_id("command-trace-row").nth(nth)
     expect(row).to_have_attribute("data-kind", kind, timeout=PATIENCE_MS)
     expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "done", timeout=PATIENCE_MS)
     expect(row).to_have_attribute("data-seen", seen, timeout=PATIENCE_MS)
     times = {step: float(row.get_attribute(f"data-{step}") or "nan") for step in STEPS}
     assert times["accepted"] > 0
-    # Where nothing has to move the robot's own word counts, which may come before its ack.
+    # Without motion the robot's state counts, which may arrive before the acknowledgement.
     chains = [STEPS] if seen == "motion" else [("accepted", "started", "ended"), ("accepted", "observed", "ended")]
     for chain in chains:
         assert all(times[before] <= times[after] for before, after in pairwise(chain)), times
 
 
 def frame(page: Page, row: int) -> list[float]:
-    """The position in a row of the table of frames [m]."""
+    """Position in a row of the frame table [m]."""
     cell = page.get_by_test_id("poses").locator("tbody tr").nth(row).locator("td").first
     return [float(number) for number in (cell.text_content() or "").split()]
 
 
 def joint(machine: Machine, device: str, name: str) -> float:
-    """Measured by the simulation [rad]."""
+    """Measured position in the simulation [rad]."""
     return float(machine.trace(device).now()["qpos"][name])
 
 
@@ -63,7 +63,7 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
         ask(page, "pose-go")
         assert_done(page, "move_pose")
         assert abs(joint(laboratory, "ur5", "elbow") - before["elbow"]) > 0.02
-        # The second joint is where the robot has the frame of the first, after Denavit and Hartenberg.
+        # By the Denavit-Hartenberg convention, the second joint is at the frame of the first.
         told = frame(page, 0)
         page.get_by_text("All joints", exact=True).click()
         expect(page.get_by_test_id("poses").locator("tbody tr")).to_have_count(6)
@@ -77,7 +77,7 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
         for name, was in before.items():
             assert joint(laboratory, "ur5", name) == pytest.approx(was, abs=0.02), name
 
-        # What cannot be is refused, and the robot's own reason is shown.
+        # An impossible pose is rejected with the robot's reason.
         height.fill("3")
         ask(page, "pose-go")
         status = page.get_by_test_id("action-status")
@@ -124,7 +124,7 @@ def test_the_robot_on_wheels_goes_to_a_place_on_the_plan(browser: Browser, labor
         box, at = page.get_by_test_id("pick").bounding_box(), mark.bounding_box()
         assert box is not None
         assert at is not None
-        # A little beside where it stands, and by the fields exactly there.
+        # A goal near its position, then an exact goal by the fields.
         page.get_by_test_id("pick").click(
             position={"x": at["x"] + at["width"] / 2 - box["x"] + 8, "y": at["y"] + at["height"] / 2 - box["y"]}
         )
@@ -144,7 +144,7 @@ def test_the_robot_on_wheels_goes_to_a_place_on_the_plan(browser: Browser, labor
             "the room to see it there",
             30,
         )
-        # Its own eyes are seen, and it is seen from the room.
+        # The robot's camera and the room's camera show frames.
         for view in (0, 1):
             page.get_by_test_id("watch-from").select_option(index=view)
             page.get_by_test_id("camera-live").click()
@@ -173,7 +173,7 @@ def test_the_head_shows_an_expression_and_says_a_sentence(browser: Browser, labo
         assert_good_page(page, "head")
         page.set_viewport_size({"width": 1440, "height": 900})
 
-        # Who has control elsewhere asks for nothing here, and what was typed stays.
+        # A user with control in another tab needs no request here, and the input stays.
         page.get_by_test_id("take-control").click()
         expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", "mine", timeout=PATIENCE_MS)
         expect(other.get_by_test_id("say")).to_be_disabled(timeout=PATIENCE_MS)

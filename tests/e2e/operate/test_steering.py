@@ -1,4 +1,4 @@
-"""Robots moved by hand, by a stick, keys, held pads, a gamepad: while they are held the simulation moves, no longer."""
+"""Manual control by stick, keys, pads and gamepad: the robot moves only while an input is pressed."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -30,7 +30,7 @@ SHOULDER, B = 5, 1
 
 @contextlib.contextmanager
 def at(browser: Browser, machine: Machine, name: str) -> Iterator[Page]:
-    """Somebody on a robot's page."""
+    """A user on a robot's page."""
     with pages(browser, machine) as (page,):
         page.get_by_test_id("device-row").filter(has_text=name).get_by_role("link").first.click()
         expect(page.get_by_test_id("control-state")).to_be_visible(timeout=PATIENCE_MS)
@@ -38,7 +38,7 @@ def at(browser: Browser, machine: Machine, name: str) -> Iterator[Page]:
 
 
 def wheels(trace: Trace) -> tuple[float, float]:
-    """How fast the Qbo's wheels turn in the simulation, left and right [rad/s]."""
+    """Speeds of the Qbo's left and right wheel in the simulation [rad/s]."""
     turning = trace.now()["qvel"]
     return float(turning["left_wheel"]), float(turning["right_wheel"])
 
@@ -56,12 +56,12 @@ def mine(station: Page | Locator) -> bool:
 
 
 def take(station: Page | Locator) -> None:
-    """Take control, again where a busy robot had to hold and has ended it, until the stream may begin."""
+    """Take control until the stream can start; retry if a busy robot ended control."""
     button, stream = station.get_by_test_id("take-control"), station.get_by_test_id("stream-state")
 
     def may() -> bool:
         if not mine(station):
-            with contextlib.suppress(Error):  # gone between the look and the click, or not to be pressed yet
+            with contextlib.suppress(Error):  # the button disappeared or is still disabled
                 button.click(timeout=1000)
         return mine(station) and stream.get_attribute("data-state") != "blocked"
 
@@ -69,7 +69,7 @@ def take(station: Page | Locator) -> None:
 
 
 def give_back(page: Page) -> None:
-    with contextlib.suppress(Error):  # a robot that had to hold has ended it already
+    with contextlib.suppress(Error):  # the robot may have ended control already
         page.get_by_test_id("release-control").click(timeout=1000)
 
 
@@ -80,9 +80,9 @@ def holding(
     moved: Callable[[], bool],
     what: str,
 ) -> None:
-    """Hold something until the simulation has moved, then let go.
+    """Press an input until the simulation has moved, then release it.
 
-    On a machine so busy that setpoints come late, the robot holds and ends the control, as it must: take it again.
+    If setpoints are late on a busy machine, the robot holds and ends control; take it again.
     """
     page = station if isinstance(station, Page) else station.page
     for _ in range(TRIES):
@@ -104,7 +104,7 @@ def hold_key(station: Page | Locator, key: str, moved: Callable[[], bool], what:
     holding(station, lambda: keyboard.down(key), lambda: keyboard.up(key), moved, what)
 
 
-def test_the_base_is_driven_by_stick_and_keys_while_they_are_held(browser: Browser, laboratory: Machine) -> None:
+def test_the_base_moves_while_stick_or_keys_are_pressed(browser: Browser, laboratory: Machine) -> None:
     trace = laboratory.trace("qbo")
     with at(browser, laboratory, "Qbo") as page:
         page.get_by_test_id("tab-drive").click()
@@ -121,22 +121,22 @@ def test_the_base_is_driven_by_stick_and_keys_while_they_are_held(browser: Brows
             page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 2, steps=4)
 
         holding(page, stick, page.mouse.up, lambda: rolls(trace), "the stick driving")
-        wait_until(lambda: stands(trace), "rest after the stick was let go")
+        wait_until(lambda: stands(trace), "rest after the stick was released")
 
         page.get_by_test_id("stick").focus()
         hold_key(page, "ArrowLeft", lambda: wheels(trace)[1] > 0.3 > -0.3 > wheels(trace)[0], "a turn by the arrow key")
-        wait_until(lambda: stands(trace), "rest after the key was let go")
+        wait_until(lambda: stands(trace), "rest after the key was released")
 
-        # Letters reach it from anywhere, but not from a text field; and while the window is left nothing is held.
+        # Letter keys work anywhere except in text fields; a window without focus releases all inputs.
         page.get_by_test_id("tab-drive").focus()
         hold_key(page, "w", lambda: rolls(trace), "driving by the letter key")
-        wait_until(lambda: stands(trace), "rest after the letter key was let go")
+        wait_until(lambda: stands(trace), "rest after the letter key was released")
 
         def leave() -> None:
             page.evaluate("() => dispatchEvent(new Event('blur'))")
 
         holding(page, lambda: page.keyboard.down("w"), leave, lambda: rolls(trace), "driving once more")
-        wait_until(lambda: stands(trace), "rest after the window was left")
+        wait_until(lambda: stands(trace), "rest after the window lost focus")
         page.keyboard.up("w")
         page.get_by_test_id("tab-joints").click()
         page.get_by_test_id("target-head_pan").focus()
@@ -144,11 +144,11 @@ def test_the_base_is_driven_by_stick_and_keys_while_they_are_held(browser: Brows
         page.get_by_test_id("target-head_pan").focus()
         page.keyboard.down("t")
         page.keyboard.up("t")
-        assert mine(page), "a letter in a text field gave control away"
+        assert mine(page), "a letter in a text field released control"
         give_back(page)
 
 
-def test_a_frame_is_moved_while_a_pad_is_held(browser: Browser, laboratory: Machine) -> None:
+def test_a_frame_moves_while_a_pad_is_pressed(browser: Browser, laboratory: Machine) -> None:
     with at(browser, laboratory, "UR5") as page:
         page.get_by_test_id("tab-jog").click()
         pose = page.get_by_test_id("live-pose")
@@ -169,7 +169,7 @@ def test_a_frame_is_moved_while_a_pad_is_held(browser: Browser, laboratory: Mach
 
         holding(page, press, page.mouse.up, lambda: height() > below + 0.02, "the frame rising")
         trace = laboratory.trace("ur5")
-        wait_until(lambda: max(map(abs, trace.now()["qvel"].values())) < 0.01, "rest after the pad was let go")
+        wait_until(lambda: max(map(abs, trace.now()["qvel"].values())) < 0.01, "rest after the pad was released")
         hold_key(page, "f", lambda: height() < below + 0.01, "the frame sinking by its key")
 
         # Joints by keys: the third is the elbow.
@@ -183,7 +183,7 @@ def test_a_frame_is_moved_while_a_pad_is_held(browser: Browser, laboratory: Mach
         expect(page.get_by_test_id("take-control")).to_be_visible(timeout=PATIENCE_MS)
 
 
-def test_a_gamepad_moves_nothing_without_its_dead_man_button(browser: Browser, laboratory: Machine) -> None:
+def test_a_gamepad_needs_its_dead_man_button(browser: Browser, laboratory: Machine) -> None:
     trace = laboratory.trace("qbo")
     with at(browser, laboratory, "Qbo") as page:
         page.get_by_test_id("tab-drive").click()
@@ -198,18 +198,18 @@ def test_a_gamepad_moves_nothing_without_its_dead_man_button(browser: Browser, l
             return lambda: page.evaluate(PRESS, [SHOULDER, down])
 
         holding(page, press(True), press(False), lambda: rolls(trace), "the gamepad driving")
-        wait_until(lambda: stands(trace), "rest after the button was let go")
+        wait_until(lambda: stands(trace), "rest after the button was released")
 
-        # Gone in the middle of it: the same as let go.
+        # A disconnect releases the input.
         def plug(there: bool) -> Callable[[], None]:
             return lambda: page.evaluate("(there) => { window.scriptedPad.connected = there; }", there)
 
-        def plug_and_press() -> None:  # both: it may have been gone in vain already
+        def plug_and_press() -> None:  # reconnect and press, because an earlier attempt may have disconnected it
             plug(True)()
             press(True)()
 
         holding(page, plug_and_press, plug(False), lambda: rolls(trace), "the gamepad driving again")
-        wait_until(lambda: stands(trace), "rest after the gamepad was gone")
+        wait_until(lambda: stands(trace), "rest after the gamepad was disconnected")
         expect(page.get_by_test_id("gamepad")).to_contain_text("disconnected", ignore_case=True)
 
         plug(True)()
@@ -219,7 +219,7 @@ def test_a_gamepad_moves_nothing_without_its_dead_man_button(browser: Browser, l
         reset(page)
 
 
-def test_two_robots_have_a_page_with_a_control_each_and_one_stop(browser: Browser, laboratory: Machine) -> None:
+def test_a_page_of_two_robots_has_separate_control_and_one_stop(browser: Browser, laboratory: Machine) -> None:
     with pages(browser, laboratory) as (page,):
         for name in ("UR5", "Qbo"):
             page.get_by_test_id("device-row").filter(has_text=name).get_by_test_id("pick").check()
@@ -229,14 +229,14 @@ def test_two_robots_have_a_page_with_a_control_each_and_one_stop(browser: Browse
         arm = stations.filter(has=page.get_by_role("heading", name="UR5"))
         qbo = stations.filter(has=page.get_by_role("heading", name="Qbo"))
 
-        # Control of one is not control of the other.
+        # Control is separate for each robot.
         take(arm)
         expect(qbo.get_by_test_id("control-state")).to_have_attribute("data-state", "free")
         take(qbo)
         assert_good_page(page, "together")
         page.set_viewport_size({"width": 1440, "height": 900})
 
-        # Keys move the one that was chosen last, which is marked.
+        # Keys move the selected robot, which is marked.
         trace = laboratory.trace("qbo")
         arm_trace = laboratory.trace("ur5")
         qbo.get_by_test_id("tab-drive").click()
@@ -249,7 +249,7 @@ def test_two_robots_have_a_page_with_a_control_each_and_one_stop(browser: Browse
         hold_key(qbo, "w", lambda: rolls(trace), "driving the chosen one")
         assert speed(arm_trace) < 0.05, "the key moved the other robot"
 
-        # One key for all of them, while one of them moves.
+        # The Stop key stops all robots while one moves.
         holding(qbo, lambda: page.keyboard.down("w"), lambda: None, lambda: rolls(trace), "driving again")
         page.keyboard.press("Escape")
         for station in (arm, qbo):
@@ -266,7 +266,7 @@ def test_two_robots_have_a_page_with_a_control_each_and_one_stop(browser: Browse
 
 
 def speed(trace: Trace) -> float:
-    """Of the fastest joint of a simulation [rad/s]."""
+    """Speed of the fastest joint in a simulation [rad/s]."""
     return max(abs(float(each)) for each in trace.now()["qvel"].values())
 
 

@@ -1,4 +1,4 @@
-"""``make up`` as a person meets it: the ready line, the data that stays, and every way in which it cannot start."""
+"""``make up``: the ready line, persistent data, restarts, and each start failure."""
 
 import functools
 import os
@@ -19,9 +19,9 @@ from tests.harness.paths import ROOT
 
 
 def clear_line(machine: Machine) -> str:
-    """The one line with which it ended; anything like a traceback fails."""
+    """The one error line of a failed start. Fails on a traceback."""
     assert machine.process.wait(30) != 0
-    # Its last words may still be on their way when it has gone.
+    # Output may arrive after the exit.
     wait_until(lambda: any(line.strip() and line != "telescope: starting\n" for line in machine.lines), "a word")
     text = "".join(machine.lines)
     assert "Traceback" not in text
@@ -31,7 +31,7 @@ def clear_line(machine: Machine) -> str:
 
 
 def listeners(machine: Machine) -> list[str]:
-    """Addresses on which the product's three ports listen."""
+    """Addresses on which the three ports of the product listen."""
     found = []
     for family in ("tcp", "tcp6"):
         for line in Path(f"/proc/net/{family}").read_text().splitlines()[1:]:
@@ -43,7 +43,7 @@ def listeners(machine: Machine) -> list[str]:
 
 
 @pytest.mark.parametrize("broker", BROKERS)
-def test_it_gets_ready_ends_cleanly_and_keeps_its_data(tmp_path: Path, broker: str) -> None:
+def test_start_and_clean_exit_keep_the_data(tmp_path: Path, broker: str) -> None:
     with start_machine(tmp_path, TELESCOPE_BROKER=broker) as first:
         assert first.ready.count("\n") == 1
         assert f"{first.url}/ " in first.ready
@@ -54,7 +54,7 @@ def test_it_gets_ready_ends_cleanly_and_keeps_its_data(tmp_path: Path, broker: s
         with first.api() as api:
             device = api.device()
             api.http.put("/robot-types/ur5/movements/mine", json={"source": "robot.home()\n"}).raise_for_status()
-        assert set(listeners(first)) == {"0100007F"}, "something listens beyond loopback"
+        assert set(listeners(first)) == {"0100007F"}, "a port listens beyond loopback"
         children = [
             first.pid(words)
             for words in (f"infra.{broker}", "function_app serve", "function_app work", "-m device_agent")
@@ -68,7 +68,7 @@ def test_it_gets_ready_ends_cleanly_and_keeps_its_data(tmp_path: Path, broker: s
         assert "mine" in [each["name"] for each in api.get("/robot-types/ur5/movements")["items"]]
 
 
-def test_every_part_that_is_killed_comes_back(tmp_path: Path) -> None:
+def test_every_killed_process_is_restarted(tmp_path: Path) -> None:
     with start_machine(tmp_path) as machine, machine.api() as api:
         device = api.device()
         for words in ("infra.embedded_broker", "function_app serve", "function_app work", "-m device_agent"):
@@ -85,7 +85,7 @@ def _runs(machine: Machine, words: str) -> bool:
     return True
 
 
-def test_when_the_supervisor_is_killed_nothing_is_left_behind(tmp_path: Path) -> None:
+def test_a_killed_supervisor_leaves_no_processes(tmp_path: Path) -> None:
     with start_machine(tmp_path) as machine:
         children = [
             machine.pid(words)
@@ -164,7 +164,7 @@ def test_a_damaged_page_of_the_database_is_named_and_kept(tmp_path: Path) -> Non
     assert database.read_bytes() == bytes(whole)
 
 
-def test_help_is_there_for_every_program() -> None:
+def test_every_program_has_help() -> None:
     for program in (["device_agent"], ["device_agent", "enroll"], ["device_agent", "run"], ["function_app"]):
         done = subprocess.run(
             [sys.executable, "-m", *program, "--help"], cwd=ROOT, capture_output=True, text=True, check=True
@@ -172,7 +172,7 @@ def test_help_is_there_for_every_program() -> None:
         assert done.stdout.startswith("usage:")
 
 
-def test_the_agent_says_in_one_line_what_it_lacks(tmp_path: Path) -> None:
+def test_the_agent_reports_a_missing_package_in_one_line(tmp_path: Path) -> None:
     cases = {
         ("run",): "enroll",
         ("enroll", "--server", "http://127.0.0.1:1"): "--device",

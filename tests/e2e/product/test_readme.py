@@ -26,7 +26,7 @@ done"""
 
 
 def commands(page: Path, name: str, machine: Machine, home: Path) -> str:
-    """A block of a page with the addresses and the folder of the test."""
+    """A code block of a page, with the addresses and folder of the test."""
     text = block(page, "runs", name).replace(SERVER, machine.url).replace("8081", str(machine.port + 1))
     return text.replace(".telescope/", f"{home}/").replace("credentials.json", str(home / "credentials.json"))
 
@@ -47,7 +47,7 @@ def test_curl_pairs_a_second_robot_and_runs_a_movement_on_it(machine: Machine, t
         assert code
         pages = [(README, "curl"), (API_GUIDE, "mqtt"), (API_GUIDE, "control")]
         script = "\n".join(commands(page, name, machine, tmp_path) for page, name in pages)
-        # A person reads the code and types; the agent has long been online by then.
+        # Wait until the agent is online, as it is when a user has typed the code.
         script = script.replace('post "devices/', f'{_AWAIT_ONLINE}\npost "devices/', 1)
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", script],

@@ -1,4 +1,4 @@
-"""``TELESCOPE_TLS=1 make up``: page, API, broker and agent speak TLS, and only with who trusts the site."""
+"""``TELESCOPE_TLS=1 make up``: page, API, broker and agent use TLS; clients must trust the site."""
 
 import contextlib
 import os
@@ -22,7 +22,7 @@ from tests.harness.paths import ROOT
 
 @contextlib.contextmanager
 def bridge(machine: Machine, home: Path, key: str, *trusting: str) -> Iterator["subprocess.Popen[str]"]:
-    """The bridge to Home Assistant, whose broker here is just any."""
+    """The bridge to Home Assistant, with a plain Mosquitto in place of its broker."""
     with contextlib.closing(socket.socket()) as taken:
         taken.bind(("127.0.0.1", 0))
         port: int = taken.getsockname()[1]
@@ -45,7 +45,7 @@ def bridge(machine: Machine, home: Path, key: str, *trusting: str) -> Iterator["
         broker.terminate()
 
 
-def test_all_of_it_speaks_tls(tmp_path: Path) -> None:
+def test_all_connections_use_tls(tmp_path: Path) -> None:
     with start_machine(tmp_path, TELESCOPE_TLS="1") as machine:
         assert machine.process.poll() is None, "".join(machine.lines)
         assert machine.ready.startswith(f"ready {machine.url}/ ")
@@ -58,7 +58,7 @@ def test_all_of_it_speaks_tls(tmp_path: Path) -> None:
             key = api.post("/api-keys", {"name": "Home Assistant", "role": "viewer"})["token"]
             device = api.device()
             taken = api.post(f"/devices/{device['id']}/lease", {"wait_ms": 10_000})
-            assert taken["confirmed"], "the agent obeys over mqtts"
+            assert taken["confirmed"], "the agent grants the lease over mqtts"
             issued = api.post("/mqtt/credentials", {"purpose": "view"})
             page = api.http.get(machine.url)
             assert page.headers["strict-transport-security"].startswith("max-age=")
@@ -82,7 +82,7 @@ def test_all_of_it_speaks_tls(tmp_path: Path) -> None:
         ):
             assert trusting.stdout is not None
             assert doubting.stdout is not None
-            assert "ready\n" in iter(trusting.stdout.readline, ""), "the bridge hears over mqtts"
+            assert "ready\n" in iter(trusting.stdout.readline, ""), "the bridge receives over mqtts"
             assert "certificate verify failed" in doubting.stdout.readline().lower()
         stranger = [sys.executable, "-m", "device_agent", "enroll", "--home", str(tmp_path / "stranger"), "--no-wait"]
         refused = subprocess.run(

@@ -1,4 +1,4 @@
-"""The product with an XMPP server, and a robot that speaks XMPP: as people start it, as programs, killed at will."""
+"""The product with an XMPP server and a robot over XMPP, with process failures."""
 
 import contextlib
 import os
@@ -25,7 +25,7 @@ NAME = "remote"
 
 
 class Agent:
-    """``python -m device_agent`` on another machine, as far as it can tell."""
+    """``python -m device_agent`` with its own folder, as on another machine."""
 
     def __init__(self, machine: Machine, home: Path) -> None:
         self.home = home
@@ -34,7 +34,7 @@ class Agent:
         self._process: subprocess.Popen[bytes] | None = None
 
     def enroll(self, api: Api) -> str:
-        """Its id, claimed."""
+        """Enroll and claim the agent. Returns its id."""
         told = ("--server", self._server, "--device", f"{NAME}=ur5", "--transport", "xmpp", "--no-wait")
         said = subprocess.run(
             [sys.executable, "-m", "device_agent", "enroll", "--home", str(self.home), *told],
@@ -112,7 +112,7 @@ def test_an_action_from_start_to_end_over_xmpp(api: Api, agent: Agent) -> None:
 
 
 @pytest.mark.long
-def test_a_console_moves_it_and_sees_it_move(machine: Machine, api: Api, agent: Agent) -> None:
+def test_a_console_moves_the_robot_and_receives_telemetry(machine: Machine, api: Api, agent: Agent) -> None:
     del agent
     device = api.device(NAME)
     with streaming(machine, api, device) as (setpoint, seen):
@@ -166,7 +166,7 @@ def test_a_frozen_process_is_offline_within_ten_seconds(machine: Machine, api: A
     os.kill(pid, signal.SIGSTOP)
     began_s = time.monotonic()
     try:
-        wait_until(gone, "it to be seen as gone")
+        wait_until(gone, "it to be offline")
         assert time.monotonic() - began_s < 10
     finally:
         os.kill(pid, signal.SIGCONT)
@@ -177,7 +177,7 @@ def test_a_frozen_process_is_offline_within_ten_seconds(machine: Machine, api: A
 def streaming(
     machine: Machine, api: Api, device: dict[str, Any]
 ) -> Iterator[tuple[Callable[[float], int], Callable[[], list[JointTelemetry]]]]:
-    """A lease, and a console over MQTT: sends a setpoint of the wrist, and sees telemetry."""
+    """A console over MQTT with a lease: sends wrist setpoints and receives telemetry."""
     lease = api.post(f"/devices/{device['id']}/lease", {"wait_ms": 10_000})
     assert lease["confirmed"]
     given = [
@@ -219,8 +219,8 @@ def streaming(
 
 
 @pytest.mark.long
-def test_how_long_it_takes_beside_mqtt(machine: Machine, api: Api, agent: Agent) -> None:
-    """Prints the figures; the paper's own are 824 ms over XMPP and 2,995 ms over HTTP."""
+def test_latency_over_xmpp_and_mqtt(machine: Machine, api: Api, agent: Agent) -> None:
+    """Prints the figures; the published ones are 824 ms over XMPP and 2,995 ms over HTTP."""
     del agent
     devices = {"mqtt": api.device("ur5"), "xmpp": api.device(NAME)}
     starts: dict[str, list[float]] = {name: [] for name in devices}

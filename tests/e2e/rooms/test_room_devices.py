@@ -1,4 +1,4 @@
-"""The laboratory as people reach its devices: by HTTP and over the broker, with agent, functions and broker running."""
+"""Room devices of the laboratory over HTTP and MQTT, with agent, functions and broker."""
 
 import contextlib
 import hashlib
@@ -34,7 +34,7 @@ def api(laboratory: Machine) -> Iterator[Api]:
 
 @contextlib.contextmanager
 def watching(api: Api, device: dict[str, Any], *names: str) -> Iterator[Client]:
-    """Somebody who may see the account's devices, listening to a class and name of one."""
+    """A client with the account's read credentials, subscribed to one channel of a device."""
     given = api.post("/mqtt/credentials", {"purpose": "view"})
     login = Credentials(given["username"], given["password"])
     client = Client(given["client_id"], login, port=given["tcp"]["port"]).open()
@@ -60,7 +60,7 @@ def refused(api: Api, device: dict[str, Any], **request: Any) -> httpx.Response:
     return api.http.post(f"/devices/{device['id']}/actions", json={"request": request})
 
 
-def test_the_lab_starts_with_everything_that_stands_in_it(laboratory: Machine) -> None:
+def test_the_laboratory_starts_with_all_its_devices(laboratory: Machine) -> None:
     room = rooms.load(ROOT / "robots" / "rooms" / "lab")
     with laboratory.api() as api:
         for name in room.names:
@@ -71,13 +71,13 @@ def test_the_lab_starts_with_everything_that_stands_in_it(laboratory: Machine) -
         assert laboratory.trace("ur5").now()["qpos"]["wrist_3"] == pytest.approx(0.2, abs=0.02)
 
 
-def test_one_shot_measures_now(api: Api) -> None:
+def test_take_picture_returns_current_values(api: Api) -> None:
     done = act(api, api.device("thermometer"), kind="shoot")
     assert done["status"] == "done", done
     assert 10 < done["result"]["values"]["temperature"]["temperature_c"] < 35
 
 
-def test_one_gathers_and_any_number_reads_it(api: Api) -> None:
+def test_collected_data_reach_all_readers(api: Api) -> None:
     lidar = api.device("lidar")
     seen: dict[int, int] = {}
     with watching(api, lidar, topics.TELE) as one, watching(api, lidar, topics.TELE) as other:
@@ -91,10 +91,10 @@ def test_one_gathers_and_any_number_reads_it(api: Api) -> None:
                 seen[number] = seen.get(number, 0) + len(measured(client))
             return bool(api.get(f"/actions/{begun['id']}")["status"] == "done")
 
-        wait_until(ended, "the end of the gathering")
+        wait_until(ended, "the collection to end")
     done = api.get(f"/actions/{begun['id']}")
     gathered = done["result"]["samples"]["range"]
-    # How fast a busy machine is, is not the question; that it is faster than its own 5 Hz, and that all hear it, is.
+    # The rate must exceed the stream's own 5 Hz, also on a busy machine; all readers must receive it.
     assert gathered > 7 * FOR_S
     assert min(seen.values()) >= gathered - 2
     with contextlib.ExitStack() as stack:
@@ -102,14 +102,14 @@ def test_one_gathers_and_any_number_reads_it(api: Api) -> None:
         base = f"{api.http.base_url}devices/{lidar['id']}/data"
 
         def stored(reader: httpx.Client) -> int:
-            time.sleep(0.05)  # an account has so many requests a second, as any program's
+            time.sleep(0.05)  # stay below the request limit of the account
             answer = reader.get(f"{base}/range", params={"resolution": "raw"})
             return len(answer.json()["at_ms"]) if answer.is_success else 0
 
         wait_until(lambda: all(stored(reader) >= gathered for reader in readers), "all of it to be stored")
 
 
-def test_a_capture_is_in_the_blob_store_as_it_was_taken(api: Api) -> None:
+def test_a_capture_is_stored_unchanged(api: Api) -> None:
     for name, capture, media_type in (("camera", "image", "image/png"), ("lidar", "scan", "application/json")):
         device = api.device(name)
         done = act(api, device, kind="capture", name=capture)
@@ -121,7 +121,7 @@ def test_a_capture_is_in_the_blob_store_as_it_was_taken(api: Api) -> None:
         assert hashlib.sha256(content).hexdigest() == found["sha256"]
 
 
-def test_what_is_set_is_measured_by_others_and_stop_refuses_it(api: Api) -> None:
+def test_a_set_control_is_measured_by_other_devices_and_rejected_after_stop(api: Api) -> None:
     door, contact = api.device("door"), api.device("door_contact")
     with watching(api, contact, topics.TELE) as watcher:
         done = act(api, door, kind="set_control", control="opening", value=0.5)
@@ -143,7 +143,7 @@ def test_what_is_set_is_measured_by_others_and_stop_refuses_it(api: Api) -> None
         wait_until(lambda: any(not each.values["open"] for each in measured(watcher)), "the door to be shut")
 
 
-def test_pictures_come_to_who_may_see_them(api: Api) -> None:
+def test_frames_reach_permitted_viewers(api: Api) -> None:
     camera = api.device("camera")
     with watching(api, camera, topics.CAM) as watcher:
         pictures: list[bytes] = []
@@ -169,10 +169,10 @@ values = {name: reading["values"] for name, reading in seen.items()}
 there = values["positions"]["y_m.ur5"] > 1, values["light"]["light_lux"] > 1, "people" in values["presence"]
 print(*there, room.taken(2.5, -1.45))
 """
-"""Asks the room for everything; the last is the desk of the head."""
+"""Reads every stream of the room; the last one is the desk of the head."""
 
 
-def test_a_script_is_told_what_the_room_knows(api: Api) -> None:
+def test_a_script_reads_the_room(api: Api) -> None:
     saved = api.http.put("/robot-types/hanson/movements/what_the_room_knows", json={"source": LOOKS})
     assert saved.is_success, saved.text
     done = act(api, api.device("hanson"), kind="run_movement", name="what_the_room_knows")
@@ -181,7 +181,7 @@ def test_a_script_is_told_what_the_room_knows(api: Api) -> None:
     assert "True True True True" in json.dumps(api.get(f"/actions/{done['id']}")), done
 
 
-def test_a_gathering_longer_than_its_action_is_refused(api: Api) -> None:
+def test_a_collection_longer_than_its_action_is_rejected(api: Api) -> None:
     answer = refused(api, api.device("lidar"), kind="gather", rate_hz=1.0, duration_s=4000.0)
     assert answer.status_code == 422
     assert "timeout_ms" in answer.json()["detail"]
@@ -203,7 +203,7 @@ def home_assistants_broker(tmp_path: Path) -> Iterator[int]:
         broker.wait(20)
 
 
-def test_home_assistant_is_shown_the_room_and_moves_its_door(
+def test_home_assistant_shows_the_room_and_moves_its_door(
     laboratory: Machine, api: Api, home_assistants_broker: int
 ) -> None:
     door = api.device("door")

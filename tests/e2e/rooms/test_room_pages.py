@@ -1,4 +1,4 @@
-"""The laboratory as a person sees and uses it: its plan, its camera, its lamp, in a real Chromium."""
+"""Pages of the laboratory in Chromium: plan, camera and lamp."""
 
 import math
 
@@ -24,7 +24,7 @@ def place(page: Page, who: str) -> tuple[float, float]:
 
 
 def picture(page: Page) -> str:
-    """The pixels that are on the canvas now."""
+    """Current pixels of the canvas."""
     shown: str = page.get_by_test_id("camera-picture").evaluate("canvas => canvas.toDataURL()")
     return shown
 
@@ -38,10 +38,10 @@ def open_device(page: Page, name: str) -> None:
     expect(page.locator(".desk.room")).to_be_visible(timeout=PATIENCE_MS)
 
 
-def test_the_room_is_seen_and_used(browser: Browser, laboratory: Machine) -> None:
+def test_plan_camera_and_lamp_of_the_room(browser: Browser, laboratory: Machine) -> None:
     room = rooms.load(ROOT / "robots" / "rooms" / "lab")
     with pages(browser, laboratory, 2) as (ann, bob):
-        # The four robots stand on the plan where the room sees them, the fixed ones where they are screwed down.
+        # The plan shows the four robots at their measured positions, mounted ones at their bases.
         ann.get_by_test_id("plan-link").click()
         for name in ROBOTS:
             x_m, y_m = place(ann, name)
@@ -54,7 +54,7 @@ def test_the_room_is_seen_and_used(browser: Browser, laboratory: Machine) -> Non
 
         assert_good_page(ann, "plan")
 
-        # A pin opens what hangs there.
+        # A pin opens the page of its device.
         ann.get_by_test_id("plan").get_by_role("link", name="Camera in the corner").click()
         ann.get_by_test_id("camera-live").click()
         canvas = ann.get_by_test_id("camera-picture")
@@ -63,18 +63,18 @@ def test_the_room_is_seen_and_used(browser: Browser, laboratory: Machine) -> Non
         wait_until(lambda: picture(ann) != first, "another picture")
         ann.get_by_test_id("camera-live").click()
         expect(ann.get_by_test_id("camera-live")).to_have_attribute("aria-pressed", "false")
-        ann.wait_for_timeout(300)  # one picture may be under way
+        ann.wait_for_timeout(300)  # one frame may be in flight
         last = canvas.get_attribute("data-sequence")
         ann.wait_for_timeout(700)
         assert canvas.get_attribute("data-sequence") == last, "frames still arrive without a viewer"
 
-        # One page gathers light, the other turns the lamp on and off.
+        # One page collects light values, the other switches the lamp.
         open_light(bob)
         ann.goto(f"{laboratory.url}/#/")
         open_device(ann, "Lamps on the ceiling")
         ann.get_by_test_id("level-most").click()
         expect(ann.get_by_test_id("applied-level")).to_have_attribute("data-value", "1", timeout=PATIENCE_MS)
-        bob.wait_for_timeout(1500)  # the meter's own lag
+        bob.wait_for_timeout(1500)  # lag of the light meter
         bright = lux(bob)
         ann.get_by_test_id("level-least").click()
         expect(ann.get_by_test_id("applied-level")).to_have_attribute("data-value", "0", timeout=PATIENCE_MS)
@@ -83,7 +83,7 @@ def test_the_room_is_seen_and_used(browser: Browser, laboratory: Machine) -> Non
         bob.get_by_test_id("gather").click()
         expect(bob.get_by_test_id("gather-state")).to_have_attribute("data-running", "false", timeout=PATIENCE_MS)
 
-        # As it was, for who comes next; by the keyboard.
+        # Restore the state for other tests, by keyboard.
         slider = ann.get_by_test_id("set-level")
         slider.focus()
         for _ in range(7):
@@ -96,7 +96,7 @@ def applied(page: Page) -> float:
 
 
 def open_light(page: Page) -> None:
-    """The light meter's page, measuring five times a second."""
+    """Open the light meter's page and collect at 5 Hz."""
     page.get_by_test_id("search").fill("light meter")
     expect(page.get_by_test_id("device-row")).to_have_count(1)
     open_device(page, "Light")

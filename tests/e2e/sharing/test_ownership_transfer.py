@@ -11,7 +11,7 @@ ROOM = "Annex"
 
 
 def offer(page: Page, to: str) -> str:
-    """Fill in the form that is open, and give the link."""
+    """Fill in the open form. Returns the link."""
     page.get_by_label("Account name").fill(to)
     page.get_by_test_id("transfer-send").click()
     expect(page.get_by_test_id("invitation-link")).to_be_visible(timeout=PATIENCE_MS)
@@ -23,7 +23,7 @@ def rooms(machine: Machine, account: str) -> set[str]:
         return {space["name"] for space in api.get("/spaces")["items"] if space["role"] == "owner"}
 
 
-def test_a_room_is_offered_taken_back_offered_anew_and_taken_over(browser: Browser, machine: Machine) -> None:
+def test_a_room_transfer_is_revoked_offered_again_and_accepted(browser: Browser, machine: Machine) -> None:
     with Api(machine) as api:
         room = api.post("/spaces", {"name": ROOM})["id"]
     theirs = machine.sign_in_link(TO)
@@ -39,21 +39,21 @@ def test_a_room_is_offered_taken_back_offered_anew_and_taken_over(browser: Brows
         ann.get_by_label("Account name").fill("unknown account")
         ann.get_by_test_id("transfer-send").click()
         expect(ann.locator("#transfer-answer")).not_to_be_empty(timeout=PATIENCE_MS)
-        expect(ann.get_by_label("Account name")).to_have_value("unknown account")  # nothing is lost
+        expect(ann.get_by_label("Account name")).to_have_value("unknown account")  # the input stays
         assert_good_page(ann, "transfer", part="transfers")
         first = offer(ann, TO)
         ann.get_by_role("button", name="Done").click()
         expect(ann.get_by_test_id("transfer")).to_be_focused()
         expect(ann.get_by_test_id("offers")).to_contain_text(f"Offered to {TO}")
         assert_good_page(ann, "transfer-open", part="transfers")
-        # Taken back, its link is worth nothing.
+        # The link of a revoked offer is invalid.
         ann.get_by_role("button", name=f"Revoke: Offered to {TO}").click()
         ann.get_by_test_id("confirm-yes").click()
         expect(ann.get_by_test_id("offers")).to_have_count(0, timeout=PATIENCE_MS)
         berta.goto(first)
         expect(berta.get_by_role("alert")).not_to_be_empty(timeout=PATIENCE_MS)
         expect(berta.get_by_test_id("accept")).to_have_count(0)
-        # Offered anew: nothing changes before it is accepted, and then it is hers.
+        # Offered again: the owner changes only on acceptance.
         ann.get_by_test_id("transfer").click()
         berta.goto(offer(ann, TO))
         expect(berta.get_by_test_id("terms")).to_contain_text("cannot undo this", timeout=PATIENCE_MS)
@@ -67,9 +67,7 @@ def test_a_room_is_offered_taken_back_offered_anew_and_taken_over(browser: Brows
         assert ROOM not in rooms(machine, "demo")
 
 
-def test_the_bar_above_every_page_fits_a_phone_and_says_in_the_tab_which_page_it_is(
-    browser: Browser, machine: Machine
-) -> None:
+def test_the_header_fits_a_phone_and_the_title_names_the_page(browser: Browser, machine: Machine) -> None:
     with (
         person(browser, machine.sign_in_link()) as ann,
     ):

@@ -1,4 +1,4 @@
-"""An arm that is shared by link, moved by a guest, and un-shared in mid-motion: the real agent holds it at once."""
+"""Access to a shared arm is revoked while a guest moves it: the real agent holds it at once."""
 
 import time
 
@@ -13,7 +13,7 @@ def target_rad(trace: Trace) -> float:
     return found
 
 
-def test_a_guest_who_is_unshared_in_mid_motion_leaves_the_arm_at_rest(machine: Machine) -> None:
+def test_revoking_a_moving_guest_stops_the_arm(machine: Machine) -> None:
     trace = machine.trace()
     with machine.api() as owner, machine.api("guest") as guest:
         device = owner.device()["id"]
@@ -33,7 +33,7 @@ def test_a_guest_who_is_unshared_in_mid_motion_leaves_the_arm_at_rest(machine: M
         assert answer.status_code == httpx.codes.NO_CONTENT
         wait_until(lambda: at_rest(trace), "rest")
         ended = owner.get(f"/actions/{action}", wait_ms=20_000, wait_for="done")
-        # Whoever says it first: the cloud, or the device that has lost the lease.
+        # The cloud or the device may report the end first.
         assert (ended["status"], ended["reason"]["code"]) in {("failed", "unshared"), ("failed", "lease_lost")}
         gone = guest.http.post(f"/devices/{device}/actions", json={"request": request})
         assert gone.status_code == httpx.codes.NOT_FOUND
@@ -41,7 +41,7 @@ def test_a_guest_who_is_unshared_in_mid_motion_leaves_the_arm_at_rest(machine: M
         time.sleep(0.5)
         assert target_rad(trace) == still_rad
         taken = owner.post(f"/devices/{device}/lease", {"lease_ms": 10_000})
-        assert taken["confirmed"] is True, "the owner goes on from there"
+        assert taken["confirmed"] is True, "the owner can take control"
         owner.http.delete(f"/devices/{device}/lease", params={"epoch": taken["epoch"]})
 
 

@@ -1,4 +1,4 @@
-"""Two people, a browser each: one shares an arm by link, the other moves it and loses it again. Keys and the record."""
+"""Two users in two browsers share an arm by link and revoke access; API keys and the audit log."""
 
 import httpx
 from playwright.sync_api import Browser, Page, expect
@@ -12,7 +12,7 @@ PASSWORD = "seven quiet robots wave"
 
 
 def elbow(machine: Machine) -> float:
-    """Measured by the simulation [rad]."""
+    """Measured position in the simulation [rad]."""
     return float(machine.trace().now()["qpos"]["elbow"])
 
 
@@ -21,7 +21,7 @@ def open_arm(page: Page) -> None:
     expect(page.get_by_test_id("control-state")).to_be_visible(timeout=PATIENCE_MS)
 
 
-def test_who_is_invited_by_link_moves_the_arm_until_the_owner_ends_it(browser: Browser, machine: Machine) -> None:
+def test_an_invited_user_moves_the_arm_until_the_owner_revokes_access(browser: Browser, machine: Machine) -> None:
     with person(browser, machine.sign_in_link()) as ann:
         open_arm(ann)
         ann.get_by_test_id("invite").click()
@@ -29,14 +29,14 @@ def test_who_is_invited_by_link_moves_the_arm_until_the_owner_ends_it(browser: B
         link = ann.get_by_test_id("invitation-link").input_value()
         assert_good_page(ann, "sharing-link", part="access")
         with person(browser, link) as bob:
-            assert link.partition("=")[2] not in bob.url, "the secret is taken out of the address"
+            assert link.partition("=")[2] not in bob.url, "the secret is removed from the address"
             expect(bob.get_by_test_id("join")).to_be_visible(timeout=PATIENCE_MS)
             assert_good_page(bob, "invited")
             bob.get_by_label("Your name").fill("Bob")
             bob.get_by_label("Choose a password").fill("password1234")
             bob.get_by_test_id("join").click()
             expect(bob.locator("#join-answer")).not_to_be_empty(timeout=PATIENCE_MS)
-            expect(bob.get_by_label("Your name")).to_have_value("Bob")  # nothing that was typed is lost
+            expect(bob.get_by_label("Your name")).to_have_value("Bob")  # the input stays
             bob.get_by_label("Choose a password").fill(PASSWORD)
             bob.get_by_test_id("join").click()
             bob.get_by_test_id("shared-with-me").get_by_role("link", name="UR5").click()
@@ -44,14 +44,14 @@ def test_who_is_invited_by_link_moves_the_arm_until_the_owner_ends_it(browser: B
             row = ann.get_by_test_id("person").filter(has_text="Bob")
             expect(row).to_contain_text("Operator", timeout=PATIENCE_MS)
             ann.get_by_role("button", name="Done").click()
-            expect(ann.get_by_test_id("invite")).to_be_focused()  # who works with keys alone goes on from there
+            expect(ann.get_by_test_id("invite")).to_be_focused()  # keyboard users continue from here
             ann.get_by_test_id("invite").click()
             ann.get_by_role("button", name="Change the access of Bob").click()
             assert_good_page(ann, "sharing", part="access")
             row.get_by_test_id("remove").click()
             expect(bob.get_by_test_id("no-access")).to_contain_text("no longer have access", timeout=PATIENCE_MS)
             assert_good_page(bob, "access-ended")
-            # Undone, it is his again, by itself; and gone for good.
+            # Undo restores access; the second removal is final.
             ann.get_by_test_id("undo").click()
             expect(bob.get_by_test_id("control-state")).to_be_visible(timeout=PATIENCE_MS)
             row.get_by_test_id("remove").click()
@@ -63,7 +63,7 @@ def move_the_elbow(page: Page, machine: Machine) -> None:
     before = elbow(machine)
 
     def moved() -> bool:
-        # On a machine so busy that setpoints come late the robot holds and ends the control: take it again.
+        # On a busy machine late setpoints end control; take it again.
         slider = page.get_by_test_id("slider-elbow")
         if page.get_by_test_id("control-state").get_attribute("data-state") != "mine" or slider.is_disabled():
             button = page.get_by_test_id("take-control")
@@ -77,9 +77,7 @@ def move_the_elbow(page: Page, machine: Machine) -> None:
     wait_until(moved, "the elbow moving")
 
 
-def test_a_key_is_made_for_one_device_used_and_revoked_and_the_record_tells_of_it(
-    browser: Browser, machine: Machine
-) -> None:
+def test_an_api_key_is_created_used_revoked_and_audited(browser: Browser, machine: Machine) -> None:
     with person(browser, machine.sign_in_link()) as ann:
         expect(ann.get_by_test_id("device-row").first).to_be_visible(timeout=PATIENCE_MS)
         ann.get_by_test_id("signed-in").click()

@@ -1,4 +1,4 @@
-"""A person at the console: a real Chromium, signed in. A script error, or a breach of the policy, fails the test."""
+"""A signed-in user in Chromium. A script error or a violation of the content policy fails the test."""
 
 import contextlib
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from playwright.sync_api import Browser, Page, Playwright, expect
 from tests.harness.browser.product import Machine
 
 PATIENCE_MS = 90_000
-"""How long a person waits for what has to appear [ms]: the machine may be slow, and busy."""
+"""Timeout for elements to appear on a busy machine [ms]."""
 expect.set_options(timeout=PATIENCE_MS)
 _COMMON = [
     "--no-sandbox",
@@ -21,12 +21,12 @@ _COMMON = [
 ]
 FLAGS = [*_COMMON, "--enable-unsafe-swiftshader"]
 FLAT = [*_COMMON, "--disable-3d-apis"]
-"""Without the twin: drawn without a graphics card it costs more than much of what is asked of a page."""
+"""Chromium arguments without 3D rendering, which is expensive without a graphics card."""
 
 
 @contextlib.contextmanager
 def chromium(playwright: Playwright, flags: list[str] = FLAGS) -> Iterator[Browser]:
-    """The browser of this machine, closed at the end."""
+    """Chromium of this machine, closed on exit."""
     browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=flags)
     try:
         yield browser
@@ -36,7 +36,7 @@ def chromium(playwright: Playwright, flags: list[str] = FLAGS) -> Iterator[Brows
 
 @contextlib.contextmanager
 def person(browser: Browser, address: str) -> Iterator[Page]:
-    """Somebody with a browser of their own. Fails on any script error, and on what the page's policy has stopped."""
+    """A user with a separate browser context. Fails on script errors and policy violations."""
     context = browser.new_context(viewport={"width": 1440, "height": 900})
     context.set_default_timeout(PATIENCE_MS)
     page = context.new_page()
@@ -53,7 +53,7 @@ def person(browser: Browser, address: str) -> Iterator[Page]:
 
 @contextlib.contextmanager
 def pages(browser: Browser, machine: Machine, count: int = 1) -> Iterator[list[Page]]:
-    """Tabs of one sign-in, on the list of devices."""
+    """Tabs of one session, on the device list."""
     context = browser.new_context(viewport={"width": 1440, "height": 900})
     context.set_default_timeout(PATIENCE_MS)
     errors: list[str] = []

@@ -1,4 +1,4 @@
-"""What is asked of every page of the console: nothing that keeps people out, nothing cut off, and a picture of it."""
+"""Checks for every page of the console: accessibility, layout and a picture."""
 
 import os
 from pathlib import Path
@@ -30,18 +30,18 @@ _OUTSIDE: Final = """() => {
 
 
 def assert_good_page(page: Page, name: str, *, part: str | None = None) -> None:
-    """See that axe finds nothing serious in dark and in light, and that nothing stands out at the side of a phone.
+    """Assert that axe finds no serious violation in either theme and that the page fits a phone.
 
-    With ``TELESCOPE_PICTURES`` set pictures of it are kept for the documentation.
+    If ``TELESCOPE_PICTURES`` is set, saves pictures for the documentation.
 
     Args:
-        page: What is looked at.
-        name: Of the pictures.
-        part: The test id of the part that is meant, where the rest of the page is looked at elsewhere.
+        page: The page to check.
+        name: File name of the pictures.
+        part: Test id of the part to check; default: the whole page.
     """
     chosen = "html" if part is None else f"[data-testid={part}]"
     if page.evaluate("() => typeof axe") == "undefined":
-        page.evaluate(_AXE.read_text())  # past the page's policy, as a debugger may
+        page.evaluate(_AXE.read_text())  # bypasses the page's policy, as a debugger does
     found = []
     for scheme in ("dark", "light"):
         page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
@@ -53,7 +53,7 @@ def assert_good_page(page: Page, name: str, *, part: str | None = None) -> None:
             outside = page.evaluate(_OUTSIDE)
             if not outside:
                 break
-            page.wait_for_timeout(_BETWEEN_LOOKS_MS)  # what is drawn to size is drawn anew a moment later
+            page.wait_for_timeout(_BETWEEN_LOOKS_MS)  # canvases are redrawn shortly after a resize
         assert outside == [], f"{name} is wider than {size['width']} pixels: " + "; ".join(outside)
         if os.environ.get("TELESCOPE_PICTURES"):
             _picture(page, _PICTURES / f"console-{name}-{size['width']}.png", chosen)
@@ -63,5 +63,5 @@ def _picture(page: Page, path: Path, chosen: str) -> None:
     page.locator(chosen).evaluate("e => e.scrollIntoView({block: 'start'})")
     page.evaluate("() => document.activeElement.matches(':read-only') || document.activeElement.blur()")
     if page.locator("canvas").count():
-        page.wait_for_timeout(_DRAWN_WITHIN_MS)  # a canvas of another size is empty until it is drawn again
+        page.wait_for_timeout(_DRAWN_WITHIN_MS)  # a resized canvas is empty until it is redrawn
     page.screenshot(path=path)

@@ -1,4 +1,4 @@
-"""The whole product as ``make up`` starts it, for tests that look at it from outside."""
+"""The whole product as ``make up`` starts it, for black-box tests."""
 
 import contextlib
 import json
@@ -28,7 +28,7 @@ _COLUMNS = (("qpos", "joints"), ("qvel", "joints"), ("target", "actuators"), ("c
 
 
 def free_ports() -> int:
-    """The first of four free ports in a row."""
+    """First of four consecutive free ports."""
     for _ in range(100):
         with contextlib.ExitStack() as stack:
             first = stack.enter_context(socket.socket())
@@ -59,7 +59,7 @@ class Machine:
 
     @property
     def trusted(self) -> ssl.SSLContext:
-        """Trusts the authority that the product has made for itself, where it speaks TLS."""
+        """SSL context that trusts the product's own certificate authority; None without TLS."""
         return ssl.create_default_context(cafile=str(self.home / "tls" / "ca.crt") if self.tls else None)
 
     @property
@@ -67,19 +67,19 @@ class Machine:
         return next(line for line in self.lines if line.startswith("ready"))
 
     def sign_in_link(self, account: str = "demo") -> str:
-        """A new one-time link, as an administrator makes one."""
+        """A new one-time sign-in link of ``make link``."""
         return f"{self.url}/#sign-in={sign_in_link({'TELESCOPE_HOME': str(self.home)}, account)}"
 
     def api(self, account: str = "demo") -> "Api":
-        """The HTTP API, signed in."""
+        """The HTTP API with a session."""
         return Api(self, account)
 
     def trace(self, device: str = "ur5") -> "Trace":
-        """What the simulation of a device has written down."""
+        """The simulation trace of a device."""
         return Trace(self.home / "trace" / f"{device}.ndjson")
 
     def pid(self, words: str) -> int:
-        """The process of ours whose command line has these words."""
+        """Id of the product's process whose command line contains these words."""
         listed = subprocess.run(["ps", "-eo", "pid,ppid,args"], capture_output=True, text=True, check=True).stdout
         found = [line for line in listed.splitlines() if words in line and int(line.split()[1]) == self.process.pid]
         assert len(found) == 1, f"{words}: {found}"
@@ -89,7 +89,7 @@ class Machine:
         os.kill(self.pid(words), signal.SIGKILL)
 
     def interrupt(self) -> int:
-        """Ctrl-C; the exit code."""
+        """Send SIGINT. Returns the exit code."""
         self.process.send_signal(signal.SIGINT)
         return self.process.wait(60)
 
@@ -98,14 +98,14 @@ class Machine:
 
 
 class Api:
-    """One sign-in's view of the HTTP API. ``with`` closes it."""
+    """The HTTP API with the session of one account. The context manager closes it."""
 
     def __init__(self, machine: Machine, account: str = "demo") -> None:
         self.http = httpx.Client(base_url=f"{machine.url}/api/v1", timeout=30, verify=machine.trusted)
         link = machine.sign_in_link(account).partition("#sign-in=")[2]
         signed_in = self.http.post("/auth/sign-in", json={"link": link})
         assert signed_in.status_code == httpx.codes.OK, signed_in.text
-        self.http.headers["X-CSRF-Token"] = signed_in.json()["csrf_token"]  # with the cookie, which it keeps
+        self.http.headers["X-CSRF-Token"] = signed_in.json()["csrf_token"]  # the client keeps the cookie
 
     def __enter__(self) -> Self:
         return self
@@ -137,7 +137,7 @@ class Api:
 
 
 def moves(api: Api, device: str) -> bool:
-    """Whether a little of the arm's wrist can be moved now."""
+    """Return True if a small wrist motion succeeds."""
     move = {"kind": "move_joints", "position_rad": {"wrist_3": 0.2}}
     try:
         answer = api.http.post(
@@ -149,33 +149,33 @@ def moves(api: Api, device: str) -> bool:
 
 
 class Trace:
-    """The simulation's own record, line by line: what really moved."""
+    """Reader of a simulation trace."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def rows(self, newest: int = 800) -> list[dict[str, Any]]:
-        """The newest rows; what the file has as lists is given by name."""
+        """The newest rows, with joint values by name."""
         rows = []
         with self._path.open("rb") as file:
             names: dict[str, list[str]] = json.loads(file.readline())
             file.seek(max(file.tell(), self._path.stat().st_size - newest * _ROW_BYTES))
             for line in file.read().splitlines():
-                with contextlib.suppress(ValueError):  # the first and the last line may be torn
+                with contextlib.suppress(ValueError):  # the first and the last line may be incomplete
                     row = json.loads(line)
                     if "qpos" in row:
                         rows.append(row | {key: dict(zip(names[of], row[key], strict=True)) for key, of in _COLUMNS})
         return rows
 
     def now(self) -> dict[str, Any]:
-        return self.rows(20)[-1]  # a row of a robot with many joints is longer than most
+        return self.rows(20)[-1]  # rows of robots with many joints are longer
 
 
 @contextlib.contextmanager
 def start_machine(home: Path, *, port: int = 0, **settings: str) -> Iterator[Machine]:
-    """``make up``'s program, until the end of the ``with``; ``settings`` are environment variables.
+    """Start the program of ``make up``; ``settings`` are environment variables. The context stops it.
 
-    Waits for the ready line, or for the end of the process.
+    Waits for the ready line or the end of the process.
     """
     with start_program("infra.local", home, port or free_ports(), settings) as machine:
         yield machine
@@ -183,12 +183,12 @@ def start_machine(home: Path, *, port: int = 0, **settings: str) -> Iterator[Mac
 
 @contextlib.contextmanager
 def start_program(program: str, home: Path, port: int, settings: Mapping[str, str]) -> Iterator[Machine]:
-    """As ``start_machine``, by a module that stands in place of ``make up``'s."""
+    """Like ``start_machine``, with another module in place of the one of ``make up``."""
     environment = os.environ | {
         "TELESCOPE_HOME": str(home),
         "TELESCOPE_PORT": str(port),
         "TELESCOPE_TRACE": str(home / "trace"),
-        "TELESCOPE_ROOM": "none",  # most of what is asked of the whole product needs one arm
+        "TELESCOPE_ROOM": "none",  # most tests need one arm
         **settings,
     }
     process = subprocess.Popen(
@@ -228,7 +228,7 @@ def start_program(program: str, home: Path, port: int, settings: Mapping[str, st
 
 
 def ready_link(line: str) -> str:
-    """The sign-in link in a ready line."""
+    """Return the sign-in link of a ready line."""
     found = re.search(r"http\S+#sign-in=\S+", line)
     assert found, line
     return found[0]
