@@ -15,7 +15,7 @@ import { useReturnFocus } from "../../shared/hooks/use-return-focus";
 import { CopyOnce } from "../../shared/ui/copy-once";
 import "./account.css";
 
-/** What a key may be kept to, by the name it has in `only`. */
+/** Scopes of an API key, by their value in `only`. */
 type Names = ReadonlyMap<string, string>;
 
 export function ApiKeys({ api, fleet }: { api: Api; fleet: Fleet }) {

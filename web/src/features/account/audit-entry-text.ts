@@ -5,7 +5,7 @@ import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 
-/** What things are called, by the ids that records have. What is not in it is called by its id. */
+/** Names by record id. An id without a name is shown as it is. */
 export interface Names {
   accounts: ReadonlyMap<string, string>;
   /** Devices and spaces. */
@@ -105,7 +105,7 @@ function role(data: AuditRecord["data"]): string {
   return given in common.role ? common.role[given as Role] : given;
 }
 
-/** Whatever has no end is kept as a time that never comes: far beyond what a calendar shows. */
+/** A missing end is stored as a time in the far future; times after this limit mean "no end". */
 const NEVER_MS = Date.UTC(9000, 0);
 
 function until(ms: unknown): string {

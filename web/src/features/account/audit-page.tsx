@@ -22,7 +22,7 @@ interface Filter {
 
 const ALL: Filter = { what: "", on: "", from: "", to: "" };
 
-/** Of date inputs, in the reader's own time; `to` with that whole day. */
+/** Values of date inputs in local time; `to` includes the whole day. */
 function query({ what, on, from, to }: Filter): AuditQuery {
   const start = (date: string): number => new Date(`${date}T00:00`).getTime();
   return {
@@ -34,14 +34,14 @@ function query({ what, on, from, to }: Filter): AuditQuery {
   };
 }
 
-/** Who did what in one's account. */
+/** The audit log of the account. */
 export function AuditLogPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const reader = useMemo(() => new AuditReader(api), [api]);
   const [filter, setFilter] = useState(ALL);
   const [spaces, setSpaces] = useState<readonly Space[]>([]);
   const [keys, setKeys] = useState<readonly ApiKey[]>([]);
   useEffect(() => {
-    // Only names: where they cannot be read, ids stand in their place.
+    // Names only: on an error, ids are shown instead.
     api.spaces().then(setSpaces, () => undefined);
     api.apiKeys().then(setKeys, () => undefined);
   }, [api]);
@@ -81,7 +81,7 @@ export function AuditLogPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   );
 }
 
-/** Of keys that are there, and of those that records tell of. */
+/** Names of existing keys, and of deleted keys in the log. */
 function keyNames(keys: readonly ApiKey[], records: readonly AuditRecord[]): ReadonlyMap<string, string> {
   const names = new Map(keys.map(({ id, name }) => [id, name]));
   for (const { event, target, data } of records) {
@@ -93,7 +93,7 @@ function keyNames(keys: readonly ApiKey[], records: readonly AuditRecord[]): Rea
 
 interface FiltersProps {
   filter: Filter;
-  /** Groups of what a record can be about: title, then values and names. */
+  /** Subject filter groups: title, then values and names. */
   subjects: readonly [string, readonly [string, string][]][];
   onChange: (filter: Filter) => void;
 }

@@ -9,7 +9,7 @@ import { texts } from "./texts";
 import { ApiKeys } from "./api-keys";
 import { auditLogAddress, deviceListAddress } from "../../shared/routing/routes";
 
-/** One's own account: its password, where else one is signed in, its API keys, and what was done in it. */
+/** The user's account: password, other sessions, API keys and audit log. */
 export function AccountPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const [changes, setChanges] = useState(0);
   return (

@@ -11,16 +11,16 @@ interface SignInProps {
   api: Api;
   session: Session;
   followed: FollowedInvitation;
-  /** The link of an agent was followed, which is to be paired. */
+  /** The user followed an agent's pairing link. */
   pairing: boolean;
-  /** What went wrong before; empty at a first visit. */
+  /** The previous error; empty on a first visit. */
   why: string;
 }
 
 export function SignInPage({ api, session, followed, pairing, why }: SignInProps) {
   const [methods, setMethods] = useState<SignInMethods | null>(null);
   useEffect(() => {
-    // Where that cannot be read, what always works is offered.
+    // If the methods cannot be loaded, offer the default method.
     api.signInMethods().then(setMethods, () => setMethods({ password: true, oidc: null }));
   }, [api]);
   const elsewhere = methods?.oidc ?? null;
@@ -71,7 +71,7 @@ interface InvitedElsewhereProps {
   name: string;
 }
 
-/** Sign in at the provider, and bring the invitation along: it belongs in no address, so this is no plain link. */
+/** Signs in at the provider with the invitation. A form sends its secret, so that no URL contains it. */
 function InvitedElsewhere({ api, followed, secret, name }: InvitedElsewhereProps) {
   const [busy, setBusy] = useState(false);
   const [wrong, setWrong] = useState("");

@@ -1,4 +1,4 @@
-/** What a robot can be asked to do besides being steered: a card for each ability that its description names. */
+/** Action cards of a robot: one for each capability in its description. */
 import { actionUnavailableReason } from "../devices";
 import type { DeviceSession, Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
@@ -18,7 +18,7 @@ import { StiffnessCard } from "./stiffness-card";
 export interface ActionCardProps {
   session: DeviceSession;
   description: KnownDescription;
-  /** Why nothing can be asked for now; empty where it can. */
+  /** Why actions are unavailable now, or "". */
   no: string;
 }
 
@@ -59,7 +59,7 @@ export function ActionCards({ fleet, session }: ActsProps) {
   );
 }
 
-/** Ask for it under our lease, or, without one, under one that the cloud takes for it. */
+/** Starts the action under this page's lease, or under one that the cloud takes for it. */
 export function startAction({ actions, control }: DeviceSession, request: AnyRequest, back?: AnyRequest): void {
   void actions.start(request, control.epoch, back);
 }

@@ -11,7 +11,7 @@ interface ShareProps {
   testid?: string;
 }
 
-/** A share, in percent. */
+/** A fraction, shown in percent. */
 export function ShareField({ label, value, least, onChange, testid }: ShareProps) {
   const id = useId();
   const percent = format.percent(value);
@@ -37,7 +37,7 @@ export function ShareField({ label, value, least, onChange, testid }: ShareProps
 interface NumberFieldProps {
   label: string;
   unit: string;
-  /** As it is typed. */
+  /** The typed text. */
   value: string;
   onInput: (value: string) => void;
   optional?: boolean;
@@ -65,13 +65,13 @@ export function NumberField({ label, unit, value, onInput, optional = false, tes
   );
 }
 
-/** `null`: none, or not finite. */
+/** The number; `null`: empty or not finite. */
 export function numberOf(typed: string): number | null {
   const value = Number(typed.trim().replace(",", ".").replace("−", "-"));
   return typed.trim() === "" || !Number.isFinite(value) ? null : value;
 }
 
-/** All of them, or `null`. */
+/** All numbers; `null` if one is missing. */
 export function numbersOf(typed: readonly string[]): number[] | null {
   const values = typed.map(numberOf);
   return values.every((value) => value !== null) ? values : null;

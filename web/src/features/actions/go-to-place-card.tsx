@@ -1,4 +1,4 @@
-/** Go to a place in the room: pointed at on its plan, or typed. */
+/** Drives to a place in the room, selected on the floor plan or typed. */
 import type { Fleet } from "../devices/model";
 import { Drawing, useFloorPlan } from "../spaces";
 import { useEffect, useMemo, useState } from "preact/hooks";

@@ -3,7 +3,7 @@ import { texts } from "./texts";
 import { startAction, type ActionCardProps } from "./action-cards";
 import { NumberField, numbersOf } from "./action-form-fields";
 
-/** Turn the gaze to a point, in the robot's own frame: x ahead, y to its left, z up. */
+/** Turns the gaze to a point in the robot's frame: x forward, y left, z up. */
 export function LookAtCard({ session, no }: ActionCardProps) {
   const [point, setPoint] = useState(["1.0", "0.0", "0.5"]);
   const [x, y, z] = numbersOf(point) ?? [];

@@ -10,7 +10,7 @@ import { NumberField, numbersOf, ShareField } from "./action-form-fields";
 
 type Way = "direct" | "straight" | "plan";
 
-/** Bring a frame to a pose in the robot's base: metres, and turns about the base's x, y and z in degrees. */
+/** Moves a frame to a pose in the robot's base: metres, and rotations about x, y and z in degrees. */
 export function MoveToPoseCard({ session, description, no }: ActionCardProps) {
   const { device } = session;
   const frames = description.frames;
@@ -23,7 +23,7 @@ export function MoveToPoseCard({ session, description, no }: ActionCardProps) {
     if (pose !== null) setFields(pose);
   };
   const heard = device.telemetry.value !== null;
-  // A form that begins empty would have one type six numbers to move a centimetre.
+  // Start with the current pose, so that a small move does not require six numbers.
   useEffect(() => {
     if (fields.every((field) => field === "")) here();
   }, [heard]);
@@ -83,7 +83,7 @@ export function MoveToPoseCard({ session, description, no }: ActionCardProps) {
   );
 }
 
-/** Where the device says that the frame is now, as the fields show it; `null` where it is not live. */
+/** The frame's current pose as field values; `null` without live data. */
 function measured(device: DeviceStore, frame: string): readonly string[] | null {
   const index = device.description.value?.frames.indexOf(frame) ?? -1;
   const pose = device.telemetry.value?.message.frames[index];

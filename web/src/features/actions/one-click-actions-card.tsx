@@ -1,4 +1,4 @@
-/** What a robot shows by one button: postures, behaviours, expressions. */
+/** Actions with one button: postures, behaviours and expressions. */
 import { useState } from "preact/hooks";
 import type { AnyRequest } from "../../shared/api/action-requests";
 import { texts } from "./texts";

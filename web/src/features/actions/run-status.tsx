@@ -58,7 +58,7 @@ export function RunStatusPanel({ device, control, actions }: RunStatusProps) {
   );
 }
 
-/** What was asked, the steps it has made, how far it is. */
+/** The request, its steps and its progress. */
 export function RunSteps({ run }: { run: Run }) {
   const name = describeRequest(run.request);
   return (
@@ -79,7 +79,7 @@ export function RunSteps({ run }: { run: Run }) {
   );
 }
 
-/** Undoes what has ended, also where it ended half way; not what was never begun. */
+/** Undoes an ended action, including a partial one; not an action that never started. */
 function UndoButton({ device, control, actions, run }: RunStatusProps & { run: Run }) {
   const { back } = run;
   const begun = run.steps.some(({ status }) => status === "started");

@@ -4,10 +4,10 @@ import { texts } from "./texts";
 import { startAction, type ActionCardProps } from "./action-cards";
 
 const LONGEST = 2000;
-/** As in BCP 47: `en`, `sk`, `en-GB`; or nothing. */
+/** A BCP 47 tag: `en`, `sk`, `en-GB`; or empty. */
 const LANGUAGE = /^([A-Za-z]{1,8}(-[A-Za-z0-9]{1,8})*)?$/;
 
-/** Enter says it; Shift and Enter begin a new line. What was said goes, what was not stays. */
+/** Enter sends the text; Shift+Enter starts a new line. The text is cleared only after success. */
 export function SpeechCard({ session, no }: ActionCardProps) {
   const [text, setText] = useState("");
   const [language, setLanguage] = useState("");
@@ -72,7 +72,7 @@ export function SpeechCard({ session, no }: ActionCardProps) {
   );
 }
 
-/** Tells once that what was asked to be said has been begun. */
+/** Calls back once when the speech starts. */
 function useSaid(actions: ActionRunner, asked: { current: string }, said: (text: string) => void): void {
   const run = actions.run.value;
   const begun = run?.request.kind === "say" && (run.status === "started" || run.status === "done") ? run.key : "";

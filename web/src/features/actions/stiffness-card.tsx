@@ -6,7 +6,7 @@ import { ShareField } from "./action-form-fields";
 
 const ALL = "";
 
-/** How strongly joints hold. What they hold with now is shown as the device tells it. */
+/** Sets joint stiffness. The current values come from the device. */
 export function StiffnessCard({ session, description, no }: ActionCardProps) {
   const [joint, setJoint] = useState(ALL);
   const [value, setValue] = useState(1);
@@ -57,7 +57,7 @@ export function StiffnessCard({ session, description, no }: ActionCardProps) {
   );
 }
 
-/** The device names only the joints that hold with less than all their strength. */
+/** The device reports only joints with reduced stiffness. */
 function Told({ told, live }: { told: Readonly<Record<string, number>> | null; live: boolean }) {
   if (told === null) return <p class="quiet small">{texts.stiffnessUnknown}</p>;
   const less = Object.entries(told);

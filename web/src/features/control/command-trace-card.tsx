@@ -1,4 +1,4 @@
-/** How long things take, and what became of the last commands: nothing here is guessed. */
+/** Latency and the trace of the last commands, from measurements only. */
 import { actionTexts, describeRequest } from "../actions";
 import type { Step } from "../actions/model";
 import type { DeviceSession } from "../devices/model";
@@ -78,7 +78,7 @@ function Row({ line }: { line: TraceLine }) {
   );
 }
 
-/** When, and by which way it was heard. */
+/** Time and source of a step. */
 function Cell({ step, note, bad = false }: { step: Step<TraceStatus> | undefined; note: string; bad?: boolean }) {
   if (step === undefined) return <td class="quiet">{format.unknown}</td>;
   const said = [note, note === "" || note === actionTexts.status.done ? texts.trace.heard[step.heard] : ""];

@@ -13,11 +13,11 @@ interface ControlBarProps {
   device: DeviceStore;
   control: Control;
   stop: StopSwitch;
-  /** Who else looks at it, where that is asked. */
+  /** Other viewers, if tracked. */
   watching?: Watchers;
 }
 
-/** Always in sight: who has control, taking, asking for it and giving it back, who else watches, and Stop. */
+/** Always visible: the lease holder, take, request and release control, other viewers, and Stop. */
 export function ControlBar({ device, control, stop, watching }: ControlBarProps) {
   const names = useId();
   const [open, setOpen] = useState(false);
@@ -69,7 +69,7 @@ function mayTakeOver(device: DeviceStore, control: Control): boolean {
   return device.info.value.role === "owner" && anothers(device, control);
 }
 
-/** Take, ask for, or give back: what there is to do now. */
+/** Take, request or release control, depending on the state. */
 function HoldButton({ device, control }: { device: DeviceStore; control: Control }) {
   const state = control.state.value;
   const describedYet = device.description.value !== null;

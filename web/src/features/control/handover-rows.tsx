@@ -1,4 +1,4 @@
-/** Asking for control, answering who asks, taking over: rows of the control bar, which they make higher and never cover. */
+/** Control bar rows: request control, respond to a request, take over. They extend the bar and cover nothing. */
 import type { DeviceStore } from "../devices/model";
 import { useComputed } from "@preact/signals";
 import { useEffect, useId, useRef, useState } from "preact/hooks";
@@ -7,7 +7,7 @@ import { clock } from "../../shared/lib/clock";
 import type { Control } from "./model/lease";
 import { texts } from "./texts";
 
-/** Seconds that are left, for eyes: read out each second it would drown everything else. */
+/** Remaining seconds, hidden from screen readers, which would announce every second. */
 function Left({ until, as }: { until: number; as: (s: number) => string }) {
   const text = useComputed(() => as(Math.max(0, Math.ceil((until - clock.value) / 1000))));
   return (
@@ -39,7 +39,7 @@ export function RequestControlButton({ control }: { control: Control }) {
   );
 }
 
-/** What has become of asking. */
+/** The outcome of the control request. */
 export function PendingRequest({ control }: { control: Control }) {
   const state = control.asking.state.value;
   return (
@@ -75,12 +75,12 @@ function Read({ text, control, wrong = false }: { text: string; control: Control
   );
 }
 
-/** Who asks, how long there is to answer, and both answers. The focus stays where it was: hands are on a robot. */
+/** The requester, the remaining time and both responses. Does not move the focus, because the operator is steering. */
 export function AnswerRequest({ control }: { control: Control }) {
   const asked = control.asked.value;
   const answered = control.answered.value;
   const sending = answered.kind === "sending";
-  // What was asked and is asked no longer, without an answer of ours: withdrawn, or too late.
+  // The request ended without our response: withdrawn or expired.
   const [gone, setGone] = useState("");
   const last = useRef<string | null>(null);
   const held = control.state.value.kind === "held";

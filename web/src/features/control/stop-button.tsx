@@ -8,7 +8,7 @@ interface StopBannerProps {
   stop: StopSwitch;
 }
 
-/** What has become of a stop. Its place is there from the start, so that a change in it is spoken. */
+/** The state of Stop. The live region always exists, so that screen readers announce changes. */
 export function StopBanner({ device, stop }: StopBannerProps) {
   const state = stop.state.value;
   const problem = stop.problem.value;

@@ -1,4 +1,4 @@
-/** How many others look at a device, and who they are: as the server tells, for as long as it is heard. */
+/** Number and names of the other viewers, while the server's list is current. */
 import { Age } from "../../shared/ui/age";
 import { onThisClock } from "../../shared/lib/clock";
 import type { Watchers } from "./model/watchers";

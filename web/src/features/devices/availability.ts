@@ -1,9 +1,9 @@
-/** Whether something may be asked of a device now, and if not, why. */
+/** Whether a device accepts actions now, and if not, why. */
 import type { Control } from "../control/model";
 import type { DeviceStore } from "./model/device-store";
 import { texts } from "./texts";
 
-/** Empty where it may. */
+/** Why the device is unavailable, or "". */
 export function unavailableReason(device: DeviceStore): string {
   if (device.info.value.role === "viewer") return texts.unavailable.viewer;
   if (device.reach.value === "offline" || device.reach.value === "unknown") return texts.unavailable.offline;
@@ -11,7 +11,7 @@ export function unavailableReason(device: DeviceStore): string {
   return "";
 }
 
-/** The same of what only one can ask, and one thing at a time: of a robot. Empty where it may. */
+/** Why an exclusive action on a robot is unavailable, or "". */
 export function actionUnavailableReason(device: DeviceStore, control: Control): string {
   const no = unavailableReason(device);
   if (no !== "") return no;

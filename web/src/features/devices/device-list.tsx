@@ -1,4 +1,4 @@
-/** Devices of one space: robots first, with all that is known of them, then what hangs in the room. */
+/** Devices of one space: robots with details first, then room devices. */
 import { MultiRobotCheckbox } from "../steering";
 import { LastSeenAge, ReachChip } from "./reach-chip";
 import type { HealthLine } from "../../shared/api/health";
@@ -13,7 +13,7 @@ import { deviceAddress } from "../../shared/routing/routes";
 interface DeviceListsProps {
   devices: readonly DeviceStore[];
   fleet: Fleet;
-  /** What the cloud has found of their health, by id. What a device says itself is shown without. */
+  /** The cloud's health results by id. Faults that a device reports are shown without them. */
   found?: ReadonlyMap<string, HealthLine> | undefined;
 }
 
@@ -101,7 +101,7 @@ function SensorTile({ device, line }: { device: DeviceStore; line: HealthLine | 
   );
 }
 
-/** What is wrong with it, by its own word or by what was found in its measurements: what is only worth knowing left out. */
+/** Faults from the device or from its measurements, without informational ones. */
 export function faultsOf(device: DeviceStore, line: HealthLine | undefined): number {
   const found = line === undefined ? 0 : line.counts.error + line.counts.warning;
   return Math.max(found, device.state.value?.faults.length ?? 0);

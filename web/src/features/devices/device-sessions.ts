@@ -1,4 +1,4 @@
-/** The devices that are operated on a page, from its opening to its end. */
+/** Sessions of the devices that a page operates. */
 import type { Account } from "../../shared/api/types";
 import { useEffect, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
@@ -6,7 +6,7 @@ import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
 import { DeviceSession } from "./model/device-session";
 
-/** One session for each device, in their order; none before the page is there. One key stops them all. */
+/** One session per device, in order; none before the page is mounted. One key stops all of them. */
 export function useDeviceSessions(
   api: Api,
   fleet: Fleet,
@@ -17,7 +17,7 @@ export function useDeviceSessions(
   const ids = devices.map(({ id }) => id).join(" ");
 
   useEffect(() => {
-    // Without a device the key is anybody's.
+    // Without a device the key stays unused.
     if (devices.length === 0) return undefined;
     const made = devices.map((device) => new DeviceSession(api, fleet.link, device, account.name));
     setStations(made);
@@ -46,7 +46,7 @@ export function useDeviceSessions(
         watching.seen(false);
       }
     };
-    // In the capture phase: no field or menu may keep the key from stopping a robot.
+    // In the capture phase, so that no field or menu can block the Stop key.
     addEventListener("keydown", press, { capture: true });
     document.addEventListener("visibilitychange", visibility);
     addEventListener("blur", blur);
@@ -59,7 +59,7 @@ export function useDeviceSessions(
       for (const session of made) session.dispose();
       setStations([]);
     };
-    // Devices are the same as long as their ids are.
+    // Devices change only with their ids.
   }, [api, fleet, ids, account]);
 
   return sessions;

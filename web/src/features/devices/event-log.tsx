@@ -4,7 +4,7 @@ import type { DeviceStore } from "./model/device-store";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 
-/** What lasts (faults) and what happened (events), newest first. */
+/** Active faults and past events, newest first. */
 export function EventLog({ device }: { device: DeviceStore }) {
   const events = device.events.value;
   const faults = device.state.value?.faults ?? [];

@@ -15,9 +15,9 @@ import { usePolling } from "../../shared/hooks/use-polling";
 import { pairAddress, spaceAddress } from "../../shared/routing/routes";
 
 const EVERYTHING: DeviceFilter = { search: "", kinds: "all", whose: "all", onlyTrouble: false };
-/** Fewer devices than this are seen at a glance. */
+/** Below this number of devices, no filter is shown. */
 const SEARCH_FROM = 5;
-/** Of each device the cloud reads what is open: seldom, for what the device says itself comes without asking. */
+/** Interval for reading open faults from the cloud; devices publish their own faults immediately [ms]. */
 const HEALTH_EVERY_MS = 30_000;
 
 export function DeviceListPage({ api, fleet }: { api: Api; fleet: Fleet }) {
@@ -66,7 +66,7 @@ export function DeviceListPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   );
 }
 
-/** Rooms by name, devices in the order of the list. */
+/** Spaces by name, devices in list order. */
 function bySpace(devices: readonly DeviceStore[], fleet: Fleet): [string, DeviceStore[]][] {
   const groups = new Map<string, DeviceStore[]>();
   for (const device of devices) {
@@ -79,7 +79,7 @@ function bySpace(devices: readonly DeviceStore[], fleet: Fleet): [string, Device
 interface SearchProps {
   wanted: DeviceFilter;
   change: (wanted: DeviceFilter) => void;
-  /** Some devices are other people's. */
+  /** Whether some devices belong to other accounts. */
   shared: boolean;
   shown: number;
   all: number;

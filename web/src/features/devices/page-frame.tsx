@@ -1,4 +1,4 @@
-/** The frame of a page about one device beside its own: who it is, its control, its Stop, and its other pages. */
+/** The frame of a device's secondary pages: name, control, Stop and links to its other pages. */
 import type { Account } from "../../shared/api/types";
 import { ControlBar, StopBanner } from "../control";
 import { LastSeenAge, ReachChip } from "./reach-chip";

@@ -18,7 +18,7 @@ export function ReachChip({ device, ...rest }: { device: DeviceStore; "data-test
 
 /** The age of the device's last message, updated every second. */
 export function LastSeenAge({ device }: { device: DeviceStore }) {
-  // A signal in the text: with two hundred devices on a page only the words that change are touched.
+  // A signal in the text, so that with 200 devices only the changed words are updated.
   const text = useComputed(() => {
     const heardAt = device.lastSeenAt.value;
     return heardAt === null ? common.never : format.age(Math.max(0, clock.value - heardAt));

@@ -1,4 +1,4 @@
-/** Calling a device something else, in its own place, with the way back. For its owner. */
+/** Renames a device in place, with undo. For its owner. */
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
@@ -11,7 +11,7 @@ export function RenameDevice({ api, device }: { api: Api; device: DeviceStore })
   const [typed, setTyped] = useState<string | null>(null);
   const [busy, setBusy] = useState(false);
   const [wrong, setWrong] = useState("");
-  /** What it was called before the last change. */
+  /** The name before the last change. */
   const [before, setBefore] = useState<string | null>(null);
   const opener = useReturnFocus(typed !== null);
   const field = useRef<HTMLInputElement>(null);

@@ -104,7 +104,7 @@ interface DeskProps {
   access: ComponentChildren;
 }
 
-/** What is seen of a robot, what steers it, and what it is asked to do: three columns, on a phone one below the other. */
+/** A robot's page: views, steering and actions in three columns; one column on a phone. */
 function Desk({ api, fleet, session, account, access }: DeskProps) {
   const { device, control, actions } = session;
   const views = useCameraSources(fleet, device);

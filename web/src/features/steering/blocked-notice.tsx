@@ -1,10 +1,10 @@
-/** Whether a page may move a robot now, and what has become of what it streams. */
+/** Whether the page can move the robot now, and the state of its setpoint stream. */
 import type { Control } from "../control/model";
 import type { DeviceStore } from "../devices/model";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
 import { texts } from "./texts";
 
-/** Why nothing here can move the robot now; `null` when it can. */
+/** Why the page cannot move the robot now; `null` if it can. */
 export function blockedReason(device: DeviceStore, control: Control): string | null {
   if (control.streamer.value === null) return texts.joints.takeFirst;
   const mode = device.mode.value;

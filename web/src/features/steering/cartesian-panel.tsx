@@ -14,7 +14,7 @@ import { useHeldKeys } from "./inputs/keyboard-help";
 import type { PanelProps } from "./panel-props";
 import { NumberWithUnit } from "../../shared/ui/number-with-unit";
 
-/** What a hand may ask for beside a robot [mm/s], as ISO 10218-1 bounds it where people are near; and turning [°/s]. */
+/** Maximum jog speed [mm/s], from ISO 10218-1 for people near a robot; and rotation [°/s]. */
 const LINEAR_MM_S = { least: 5, most: 250, step: 5, first: 60 };
 const ANGULAR_DEG_S = { least: 1, most: 60, step: 1, first: 15 };
 
@@ -24,7 +24,7 @@ const SIGNS = [1, -1] as const;
 
 type Axes = "base" | "tool";
 
-/** A frame moved along and about axes while a pad, a key or a stick is held. */
+/** Moves a frame along and about its axes while a button, key or stick is held. */
 export function CartesianPanel({ device, streamer, active, pad }: PanelProps) {
   const frames = device.description.value?.frames ?? [];
   const [picked, setPicked] = useState<string | null>(null);
@@ -108,7 +108,7 @@ export function CartesianPanel({ device, streamer, active, pad }: PanelProps) {
   );
 }
 
-/** Where the frame is measured to be, in the robot's base. */
+/** The measured pose of the frame in the robot's base. */
 function LivePose({ device, frame }: { device: DeviceStore; frame: string }) {
   const index = device.description.value?.frames.indexOf(frame) ?? -1;
   const pose = device.telemetry.value?.message.frames[index];

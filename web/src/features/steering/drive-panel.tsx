@@ -17,7 +17,7 @@ import { VirtualStick } from "./inputs/virtual-stick";
 
 const PERCENT = { least: 5, most: 100, step: 5, first: 50 };
 
-/** The base driven while a stick, a key or a gamepad is held. */
+/** Drives the base while a stick, key or gamepad is held. */
 export function DrivePanel({ device, streamer, active, pad }: PanelProps) {
   const limits = device.description.value?.base ?? { forward_m_s: 0, left_m_s: 0, turn_rad_s: 0 };
   const [percent, setPercent] = useState(PERCENT.first);
@@ -73,7 +73,7 @@ interface VelocitiesProps {
   limits: BaseLimits;
 }
 
-/** What is asked of the base, and what it says that it does, where it measures that. */
+/** The commanded velocity of the base, and the measured one if available. */
 function Velocities({ device, streamer, limits }: VelocitiesProps) {
   const stream = device.description.value?.streams.find(({ name }) => name === "odometry")?.name;
   const measured = stream === undefined ? null : device.measured(stream).value;

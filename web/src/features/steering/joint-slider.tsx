@@ -1,4 +1,4 @@
-/** One joint to be set: a number, a slider with its limits, and beside them where it is measured to be. */
+/** Sets one joint with a number or a slider with limits; shows the measured position. */
 import { useRef, useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
@@ -9,13 +9,13 @@ interface JointRowProps {
   joint: Joint;
   /** Target position [rad]; `undefined`: unknown. */
   targetRad: number | undefined;
-  /** Where it is measured [rad]; `undefined`: it is not. */
+  /** Measured position [rad]; `undefined`: not measured. */
   measuredRad: number | undefined;
-  /** Sets the target [rad]; `null`: it cannot be set now. */
+  /** Sets the target [rad]; `null`: disabled. */
   onSet: ((positionRad: number) => void) | null;
-  /** What is measured is no longer what is. */
+  /** The measurement is out of date. */
   old?: boolean;
-  /** It is the one that keys move. */
+  /** Whether keys move this joint. */
   chosen?: boolean;
 }
 
@@ -78,7 +78,7 @@ export function JointSlider({ joint, targetRad, measuredRad, onSet, old = false,
   );
 }
 
-/** Degrees that a key moves a slider; 0 for a key that must do nothing; `null` for keys that are not ours. */
+/** Step of a key on a slider [°]; 0: suppressed key; `null`: unhandled key. */
 function stepOf(event: KeyboardEvent): number | null {
   const size = event.shiftKey ? 10 : event.altKey ? 0.1 : 1;
   switch (event.key) {
@@ -94,7 +94,7 @@ function stepOf(event: KeyboardEvent): number | null {
       return -10;
     case "Home":
     case "End":
-      // One key must not send a joint across its whole range.
+      // A single key must not move a joint across its whole range.
       return 0;
     default:
       return null;
@@ -108,7 +108,7 @@ interface TargetFieldProps {
   onSet: (deg: number) => void;
 }
 
-/** The target as a number. What is typed counts at Enter, and is forgotten when the field is left. */
+/** The target as a number. Enter applies the input; leaving the field discards it. */
 function TargetField({ joint, target, disabled, onSet }: TargetFieldProps) {
   const [typed, setTyped] = useState<string | null>(null);
   const field = useRef<HTMLInputElement>(null);

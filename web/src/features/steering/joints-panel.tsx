@@ -14,11 +14,11 @@ import { JointSlider } from "./joint-slider";
 import { useHeldKeys, useKey } from "./inputs/keyboard-help";
 import type { PanelProps } from "./panel-props";
 
-/** How fast a held key moves the target [rad/s], and how far ahead of the joint at most [rad]. */
+/** Speed of the target while a key is held [rad/s], and its maximum lead over the joint [rad]. */
 const RATE_RAD_S = radians(20);
 const LEAD_RAD = radians(4);
 const STEP_MS = 40;
-/** What differs by less is shown the same [rad]. */
+/** Smaller differences are not visible [rad]. */
 const SHOWN_RAD = 1e-5;
 
 export function JointsPanel({ device, streamer, active, pad }: PanelProps) {
@@ -82,7 +82,7 @@ interface LiveJointProps extends Pick<PanelProps, "device" | "streamer"> {
   chosen: boolean;
 }
 
-/** Reads what changes many times a second by itself, so that the panel need not. */
+/** Subscribes to telemetry itself, so that the panel does not render at telemetry rate. */
 function LiveJoint({ joint, index, device, telemetry, streamer, chosen }: LiveJointProps) {
   const measured = useShown(telemetry, (message) => message.position_rad[index]);
   const commanded = useShown(telemetry, (message) => message.commanded_rad[index]);
@@ -98,7 +98,7 @@ function LiveJoint({ joint, index, device, telemetry, streamer, chosen }: LiveJo
   );
 }
 
-/** One position of the newest telemetry: the same number for as long as the row would look the same. */
+/** One position of the newest telemetry; changes only if the displayed value changes. */
 function useShown(
   telemetry: DeviceStore["telemetry"],
   of: (message: KnownTelemetry) => number | undefined,
@@ -109,7 +109,7 @@ function useShown(
   });
 }
 
-/** Turns the chosen joint while a key, or the stick of a gamepad, is held: its target runs ahead by a little. */
+/** Moves the selected joint while a key or gamepad stick is held; the target leads by a small amount. */
 function useTurning({ device, streamer, active, pad }: PanelProps, chosen: number): void {
   const amount = useRef(0);
   const held = useMemo(
@@ -123,13 +123,13 @@ function useTurning({ device, streamer, active, pad }: PanelProps, chosen: numbe
       }),
     [],
   );
-  // Without control arrows scroll the page, as ever.
+  // Without control, arrow keys scroll the page.
   useHeldKeys(active && streamer !== null, held, JOINT_KEYS);
   useGamepadInputs(pad, held, ({ left }) => left[1]);
   useEffect(
     () =>
       effect(() => {
-        // As with a velocity: what has ended the stream ends what was held.
+        // As with a velocity, the end of the stream also spends the pressed inputs.
         const ended = streamer?.ended.value ?? null;
         if (streamer === null || (ended !== null && ended !== "reached")) held.releaseAll();
       }),

@@ -1,11 +1,11 @@
-/** The record of what was done in one's account, read page by page. */
+/** The account's audit log, read page by page. */
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
 import { sentence } from "../../../shared/api/http";
 import type { AuditQuery, AuditRecord } from "../../../shared/api/sharing";
 
 const PAGE = 50;
-/** Where a filter lets little through, pages come empty: so many are asked for before the reader is asked. */
+/** A strict filter can return empty pages: this many are read before the user must continue. */
 const PAGES_AT_ONCE = 5;
 
 export const ALL_ENTRIES: AuditQuery = { event: "", target: "", sinceMs: null, untilMs: null };
@@ -24,14 +24,14 @@ export class AuditReader {
   readonly records: ReadonlySignal<readonly AuditRecord[]> = this.#records;
   readonly busy: ReadonlySignal<boolean> = this.#busy;
   readonly trouble: ReadonlySignal<string> = this.#trouble;
-  /** Whether there may be older ones. */
+  /** Whether older entries may exist. */
   readonly more: ReadonlySignal<boolean> = this.#more;
 
   constructor(api: Api) {
     this.#api = api;
   }
 
-  /** Begin anew with another filter. */
+  /** Restarts with another filter. */
   ask(query: AuditQuery): Promise<void> {
     this.#query = query;
     this.#cursor = null;
@@ -61,11 +61,11 @@ export class AuditReader {
   }
 }
 
-/** Names of accounts, as far as these records tell them. */
+/** Account names that occur in these records. */
 export function accountIdsOf(records: readonly AuditRecord[]): ReadonlyMap<string, string> {
   const names = new Map<string, string>();
   for (const { account: id, actor, key, data } of records) {
-    // With a key the name says the key's too.
+    // For an API key, the name includes the key's name.
     if (id !== "" && actor !== "" && key === "") names.set(id, actor);
     const { with: other, name } = data;
     if (typeof other === "string" && typeof name === "string" && name !== "") names.set(other, name);
@@ -73,7 +73,7 @@ export function accountIdsOf(records: readonly AuditRecord[]): ReadonlyMap<strin
   return names;
 }
 
-/** What a record is about: `device:abc-arm` → `["device", "abc-arm"]`; what names no kind has an empty one. */
+/** The subject of a record: `device:abc-arm` → `["device", "abc-arm"]`; the kind is empty if not given. */
 export function subjectOf(on: string): [kind: string, id: string] {
   const found = /^(device|space|agent|key):(.+)$/.exec(on);
   return found?.[1] === undefined || found[2] === undefined ? ["", on] : [found[1], found[2]];

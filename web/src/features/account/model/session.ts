@@ -1,4 +1,4 @@
-/** Who is signed in. The token of a sign-in link is used once and kept nowhere. */
+/** The signed-in account. The token of a sign-in link is used once and never stored. */
 import type { Account } from "../../../shared/api/types";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
@@ -6,7 +6,7 @@ import { ApiError, sentence } from "../../../shared/api/http";
 
 export type SessionState =
   | { kind: "checking" }
-  /** `why` says what went wrong with a link, or why the session ended; empty at a first visit. */
+  /** `why`: the error of a sign-in link or the reason for the session's end; empty on a first visit. */
   | { kind: "out"; why: string }
   | { kind: "in"; account: Account };
 
@@ -20,15 +20,15 @@ export class Session {
   }
 
   /**
-   * Use a link's token, or find the session that the browser already has.
+   * Signs in with a link's token, or resumes the browser's session.
    *
-   * `failed` says what went wrong with signing in elsewhere, where the browser has just come back from.
+   * `failed`: the error of an external sign-in from which the browser has just returned.
    */
   async start(link: string | null, failed = ""): Promise<void> {
     this.#state.value = { kind: "checking" };
     try {
       if (link !== null) await this.#api.signIn(link);
-      // The cookie is what counts from here on: asking proves that the browser has it.
+      // From here on the cookie identifies the session: this call proves that the browser stored it.
       this.#state.value = { kind: "in", account: await this.#api.me() };
     } catch (error) {
       const firstVisit = link === null && error instanceof ApiError && error.status === 401;
@@ -36,13 +36,13 @@ export class Session {
     }
   }
 
-  /** Sign in by name and password. Throws what the server says against it. */
+  /** Signs in with name and password. Throws the server's error. */
   async enter(name: string, password: string): Promise<void> {
     await this.#api.signInByPassword(name, password);
     this.#state.value = { kind: "in", account: await this.#api.me() };
   }
 
-  /** Make an account with an invitation, and be signed in to it. Throws what the server says against it. */
+  /** Creates an account with an invitation and signs in to it. Throws the server's error. */
   async join(invitation: string, name: string, password: string): Promise<void> {
     await this.#api.makeAccount(invitation, name, password);
     this.#state.value = { kind: "in", account: await this.#api.me() };
@@ -56,13 +56,13 @@ export class Session {
     }
   }
 
-  /** The server no longer knows this session. */
+  /** The session has expired on the server. */
   ended(why: string): void {
     if (this.#state.value.kind === "in") this.#state.value = { kind: "out", why };
   }
 }
 
-/** The token in an address's fragment, `#sign-in=<token>`, or `null`. */
+/** The token in a URL fragment, `#sign-in=<token>`, or `null`. */
 export function signInToken(hash: string): string | null {
   const found = /^#sign-in=([^&]+)$/.exec(hash);
   if (found?.[1] === undefined) return null;
@@ -73,7 +73,7 @@ export function signInToken(hash: string): string | null {
   }
 }
 
-/** Why signing in elsewhere came to nothing, in `#sign-in-failed=<code>`, or `null`. */
+/** The error code of an external sign-in, in `#sign-in-failed=<code>`, or `null`. */
 export function signInFailure(hash: string): string | null {
   return /^#sign-in-failed=([a-z-]{1,40})$/.exec(hash)?.[1] ?? null;
 }

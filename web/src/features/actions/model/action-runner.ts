@@ -1,6 +1,6 @@
 /**
- * What a device is asked to do, each request followed from the click to its end: by the acks of the device, and by
- * asking the cloud. Robots and room devices alike.
+ * Starts actions on a robot or room device and tracks each from the click to its end, by the device's acks and by
+ * polling the cloud.
  */
 import type { Action, ActionCallOptions, ActionStatus } from "../../../shared/api/types";
 import type { DeviceStore } from "../../devices/model";
@@ -28,38 +28,38 @@ export type RunStatus =
   | "refused"
   | "unanswered";
 
-/** Who told of a step: this page itself, the device by its ack, or the cloud in an answer. */
+/** Source of a step: this page, the device's ack, or the cloud's response. */
 export type Channel = "page" | "device" | "cloud";
 
 export interface Step<Status = RunStatus> {
   status: Status;
-  /** On the page's clock, from the click [ms]. */
+  /** Time since the click on the page's clock [ms]. */
   afterMs: number;
   heard: Channel;
 }
 
 export interface Run {
-  /** Its Idempotency-Key: the same request counts once. */
+  /** Its Idempotency-Key: a repeated request counts once. */
   key: string;
   request: AnyRequest;
   /** On the page's clock [ms]. */
   clickedAt: number;
   id: string | null;
   status: RunStatus;
-  /** The steps seen so far, in their order. */
+  /** The received steps, in order. */
   steps: readonly Step[];
   why: string;
   output: string;
   progress: number | null;
   result: Readonly<Record<string, unknown>>;
-  /** What undoes it, where anything does. */
+  /** The request that undoes it, if any. */
   back: AnyRequest | null;
 }
 
 export interface ActionOptions extends ActionCallOptions {
-  /** What undoes it; otherwise the result of `undoRequestOf`. */
+  /** The request that undoes it; by default the result of `undoRequestOf`. */
   back?: AnyRequest;
-  /** What the cloud answers, where it was asked by another call: of many devices at once. */
+  /** The cloud's response, if one call started actions on several devices. */
   asked?: Promise<Action>;
 }
 
@@ -77,7 +77,7 @@ const RANK: Readonly<Record<RunStatus, number>> = {
 const KEPT = 20;
 const POLL_MS = 10_000;
 const RETRY_MS = 2_000;
-/** Asked again with the same key after a broken call, but never later than this: nothing may move by surprise [ms]. */
+/** A failed call is retried with the same key for at most this long, so that no motion starts unexpectedly [ms]. */
 const AGAIN_WITHIN_MS = 2_000;
 /** The cloud releases the lease of a run this long after the run ends; the page then reads the holder again [ms]. */
 const LEASE_AFTER_MS = 1_000;
@@ -96,9 +96,9 @@ export class ActionRunner {
   readonly #device: DeviceStore;
   readonly #pursuits = signal<readonly Pursuit[]>([]);
 
-  /** The newest first; they stay after their end, the last twenty of them. */
+  /** The last twenty actions, newest first, including ended ones. */
   readonly runs: ReadonlySignal<readonly Run[]> = computed(() => this.#pursuits.value.map(({ run }) => run.value));
-  /** The newest that was started from this page. */
+  /** The newest action of this page. */
   readonly run: ReadonlySignal<Run | null> = computed(() => this.runs.value[0] ?? null);
 
   constructor(api: Api, device: DeviceStore) {
@@ -106,17 +106,17 @@ export class ActionRunner {
     this.#device = device;
   }
 
-  /** Ask for something: under our lease where there is one, else under one that the cloud takes for this run. */
+  /** Starts an action under this page's lease, or under one that the cloud takes for this run. */
   async start(request: AnyRequest, epoch: number | null, back?: AnyRequest): Promise<Run> {
     return this.#begin(request, back === undefined ? { epoch } : { epoch, back }).begun;
   }
 
-  /** Follow what was asked of this device by another call; the run after that call's answer. */
+  /** Tracks an action that another call started; returns the run after that call's response. */
   async follow(request: AnyRequest, asked: Promise<Action>): Promise<Run> {
     return this.#begin(request, { epoch: null, asked }).begun;
   }
 
-  /** Ask, and wait until it is as far as wanted, or has ended otherwise. */
+  /** Starts an action and waits for the requested status or the end. */
   async ask(request: AnyRequest, asking: ActionOptions): Promise<Run> {
     return this.#begin(request, asking).reached(asking.waitFor ?? "done");
   }
@@ -147,7 +147,7 @@ export class ActionRunner {
   }
 }
 
-/** One request on its way. */
+/** One request in progress. */
 class Pursuit {
   readonly #api: Api;
   readonly #device: DeviceStore;
@@ -156,7 +156,7 @@ class Pursuit {
   #disposed = false;
 
   readonly run: ReadonlySignal<Run>;
-  /** The run after the first answer of the cloud. */
+  /** The run after the cloud's first response. */
   readonly begun: Promise<Run>;
 
   constructor(api: Api, device: DeviceStore, request: AnyRequest, asking: ActionOptions) {
@@ -181,7 +181,7 @@ class Pursuit {
     void this.reached("done").then(() => setTimeout(() => void this.#refreshLease(), LEASE_AFTER_MS));
   }
 
-  /** The run once it has come that far, or has ended. */
+  /** The run when it reaches the status or ends. */
   reached(status: "started" | "done"): Promise<Run> {
     return new Promise((resolve) => {
       const forget = effect(() => {
@@ -204,7 +204,7 @@ class Pursuit {
   dispose(): void {
     this.#disposed = true;
     this.#endAcks();
-    // Whoever waits for it waits no longer.
+    // Release all waiting callers.
     this.#run.value = { ...this.#run.value };
   }
 
@@ -213,7 +213,7 @@ class Pursuit {
       const action = await this.#post(asking);
       if (this.#disposed) return this.#run.value;
       this.#run.value = { ...this.#run.value, id: action.id };
-      // First what the device has said meanwhile, which was heard before this answer.
+      // Apply the device's acks first: they arrived before this response.
       this.#endAcks = this.#device.onAck(action.id, (ack, at) => this.#hearAck(ack, at));
       this.#hear(action);
       void this.#poll(action.id);
@@ -236,7 +236,7 @@ class Pursuit {
     }
   }
 
-  /** The device's own acks are quicker; asking covers what this page did not hear. */
+  /** The device's acks are faster; polling covers acks that this page did not receive. */
   async #poll(id: string): Promise<void> {
     while (!this.#disposed && !ended(this.#run.value)) {
       try {
@@ -278,13 +278,13 @@ function withStep(steps: Run["steps"], step: Step): Run["steps"] {
   const after = steps.findIndex(({ status }) => RANK[status] >= RANK[step.status]);
   if (after < 0) return [...steps, step];
   const next = steps[after];
-  // Known already, or another end than the first.
+  // A duplicate, or a second terminal status.
   if (next === undefined || RANK[next.status] === RANK[step.status]) return steps;
-  // The answer overtook the ack: it cannot have been later than what followed it.
+  // The response overtook the ack: the step cannot be later than its successor.
   return steps.toSpliced(after, 0, { ...step, afterMs: Math.min(step.afterMs, next.afterMs) });
 }
 
-/** Output only grows; the cloud and the device may tell it at different lengths. */
+/** Output only grows; the cloud and the device may report it with different lengths. */
 function longer(one: string, other: string): string {
   return one.length >= other.length ? one : other;
 }

@@ -1,9 +1,9 @@
-/** What undoes a request: from where the device is, as it says itself, at the moment of the click. */
+/** The undo request of an action, from the device's reported state at the click. */
 import type { DeviceStore } from "../../devices/model";
 import { clamp } from "../../../shared/lib/angles";
 import type { AnyRequest } from "../../../shared/api/action-requests";
 
-/** These leave the joints elsewhere than they were. */
+/** Actions that change the joint positions. */
 const JOINTS: ReadonlySet<AnyRequest["kind"]> = new Set([
   "move_joints",
   "move_pose",
@@ -22,13 +22,13 @@ export function undoRequestOf(device: DeviceStore, request: AnyRequest): AnyRequ
   if (!known || telemetry === null || !device.live.value) return null;
   const positions = description.joints.flatMap((joint, index) => {
     const measured = telemetry.message.position_rad[index];
-    // A servo may droop a little beyond its range: the way back must be one that is taken.
+    // A servo may settle slightly outside its range: clamp, so that the undo request is accepted.
     return measured === undefined ? [] : [[joint.name, clamp(measured, joint.lower_rad, joint.upper_rad)] as const];
   });
   return { kind: "move_joints", position_rad: Object.fromEntries(positions), plan: true };
 }
 
-/** Only where all of them held alike: one request sets one strength. */
+/** Only if all joints had the same stiffness: one request sets one value. */
 function stiffnessBefore(device: DeviceStore, joints: readonly string[]): AnyRequest | null {
   const state = device.state.value;
   const names = joints.length > 0 ? joints : (device.description.value?.joints ?? []).map(({ name }) => name);

@@ -1,6 +1,6 @@
 /**
- * What became of the last commands of this page: sent, accepted, started, observed, ended, each by what this page heard
- * itself and on its own clock. A stream of setpoints is one line, as an action is.
+ * Traces the last commands of this page: sent, accepted, started, observed, ended. Each step uses messages that this page
+ * received, and its own clock. A setpoint stream is one line, like an action.
  */
 import { type ActionRunner, ended, type Run, type RunStatus, type Step } from "../../actions/model";
 import type { DeviceStore } from "../../devices/model";
@@ -13,7 +13,7 @@ import { moves, type AnyRequest } from "../../../shared/api/action-requests";
 
 export type TraceStatus = RunStatus | "observed";
 
-/** How it was seen: something moved, or the device says of itself that it does what was asked. */
+/** How the command was observed: measured motion, or the device's reported state. */
 export type SeenBy = "motion" | "state";
 
 export interface TraceLine {
@@ -23,18 +23,18 @@ export interface TraceLine {
   clickedAt: number;
   status: RunStatus;
   steps: readonly Step<TraceStatus>[];
-  /** `null` while nothing was observed. */
+  /** `null` until an effect is observed. */
   seenBy: SeenBy | null;
-  /** Of an action a sentence; of a stream why it ended, as the streamer names it. */
+  /** For an action, a sentence; for a stream, the streamer's end reason. */
   why: string;
 }
 
 const KEPT = 20;
-/** Measured this far from where it was at the click: it moved [rad; slides and bases: m]. */
+/** Change since the click that counts as motion [rad; prismatic joints and bases: m]. */
 export const MOVED = 0.005;
-/** Faster than this at the click: it moved already, for another reason [rad/s]. */
+/** A joint faster than this at the click was already moving [rad/s]. */
 const UNDER_WAY_RAD_S = 0.02;
-/** Telemetry that comes so late after the end may still show what was done [ms]. */
+/** Telemetry up to this long after the end still counts as observation [ms]. */
 const GRACE_MS = 400;
 const ODOMETRY = "odometry";
 const PLACE = ["x_m", "y_m", "yaw_rad"] as const;
@@ -69,7 +69,7 @@ export class CommandTrace {
         untracked(() => this.#attendStream(streamer, state !== "idle"));
       }),
       effect(() => {
-        // Whatever the device says is looked at when it comes.
+        // Evaluate every device message on arrival.
         const news = [device.telemetry.value, device.state.value, device.measured(ODOMETRY).value];
         if (news.some((one) => one !== null)) untracked(() => this.#look());
       }),
@@ -133,7 +133,7 @@ export class CommandTrace {
     }
   }
 
-  /** The telemetry that names a setpoint of this stream: the device has taken it; and then that it follows. */
+  /** Telemetry that acknowledges a setpoint of this stream shows acceptance, and then motion. */
   #lookAtStream(): void {
     const [newest] = this.#streams.value;
     const message = this.#device.telemetry.value?.message;
@@ -149,7 +149,7 @@ interface Seen {
   by: SeenBy;
 }
 
-/** Where a device was at the click, and whether it is elsewhere since. */
+/** The device's pose at the click, and whether it has changed since. */
 class Watch {
   readonly #device: DeviceStore;
   readonly #since: number;
@@ -163,7 +163,7 @@ class Watch {
   action: string | null = null;
   endedAt: number | null = null;
 
-  /** `motion`: only what moves counts, unless nothing has by the end. `mode`: what the device says while it does it. */
+  /** `motion`: requires motion, unless none occurs until the end. `mode`: the mode that the device reports meanwhile. */
   constructor(device: DeviceStore, since: number, motion: boolean, mode: "action" | "streaming") {
     this.#device = device;
     this.#since = since;
@@ -172,11 +172,11 @@ class Watch {
     const message = device.telemetry.value?.message;
     this.#wasBusy = message?.mode === mode;
     this.#stiffness = JSON.stringify(device.state.value?.stiffness ?? {});
-    // What moves already moves for another reason: where it is when this begins counts.
+    // A joint that already moves does so for another reason: compare with its position at the start.
     if (message?.velocity_rad_s.every((velocity) => Math.abs(velocity) < UNDER_WAY_RAD_S) === true) this.#take();
   }
 
-  /** What was observed, once; `null` before. */
+  /** The first observation; `null` before. */
   look(): Seen | null {
     const telemetry = this.#device.telemetry.value;
     const state = this.#device.state.value;
@@ -227,7 +227,7 @@ function lineOf({ key, request, clickedAt, status, steps, why }: Run): TraceLine
 
 function withSeen(line: TraceLine, seen: Seen | undefined): TraceLine {
   if (seen === undefined) return line;
-  // Its place is before the end, whichever this page happened to hear first.
+  // Insert it before the end, independent of the order of arrival.
   const at = line.steps.findIndex(({ status }) => !["sent", "accepted", "started"].includes(status));
   const step = { status: "observed", afterMs: seen.afterMs, heard: "device" } as const;
   return { ...line, seenBy: seen.by, steps: at < 0 ? [...line.steps, step] : line.steps.toSpliced(at, 0, step) };

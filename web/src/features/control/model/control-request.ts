@@ -6,10 +6,10 @@ import type { Api } from "../../../shared/api/client";
 import { now, onThisClock } from "../../../shared/lib/clock";
 import { ApiError, sentence } from "../../../shared/api/http";
 
-/** How long the holder is given [ms]. */
+/** Time for the holder to respond [ms]. */
 export const ANSWER_WITHIN_MS = 30_000;
 const LOOK_MS = 1_000;
-/** What was not heard of so long after its end is not waited for any longer [ms]. */
+/** Grace time after the deadline before the request counts as expired [ms]. */
 const AFTER_MS = 5_000;
 
 export type Ended = Exclude<ControlRequestInfo["outcome"], "open">;
@@ -17,7 +17,7 @@ export type Ended = Exclude<ControlRequestInfo["outcome"], "open">;
 export type ControlRequestState =
   | { kind: "none" }
   | { kind: "sending" }
-  /** `until`: on the page's clock. `shown`: the device shows it to everybody, so the holder sees it at once. */
+  /** `until`: on the page's clock. `shown`: the device publishes the request, so the holder sees it immediately. */
   | { kind: "open"; id: string; epoch: number; until: number; shown: boolean; of: string }
   | { kind: "over"; how: Ended; of: string }
   | { kind: "failed"; why: string };
@@ -38,7 +38,7 @@ export class ControlRequest {
     this.#api = api;
     this.#device = device;
     this.#accepted = accepted;
-    // The device tells of a new epoch, or of the end of the request, before the next look would.
+    // The device reports a new epoch, or the end of the request, before the next poll.
     this.#forget = effect(() => {
       const told = device.state.value?.lease ?? null;
       const asked = this.#state.peek();
@@ -65,7 +65,7 @@ export class ControlRequest {
     }
   }
 
-  /** Ask no longer. Where it was accepted in the same moment control is here, and stays until it is given back. */
+  /** Withdraws the request. If it was accepted at the same moment, this session keeps control until released. */
   async withdraw(): Promise<void> {
     const asked = this.#state.value;
     if (asked.kind !== "open") return;
@@ -78,7 +78,7 @@ export class ControlRequest {
     }
   }
 
-  /** What it came to has been read, or is of no interest any more. */
+  /** Clears the outcome. */
   clear(): void {
     const { kind } = this.#state.value;
     if (kind === "over" || kind === "failed") this.#state.value = { kind: "none" };
@@ -92,7 +92,7 @@ export class ControlRequest {
     if (asked.kind === "open") this.#takeBack(asked.id);
   }
 
-  /** The page is going away: the call outlives it. */
+  /** The page closes: the call completes after it. */
   #takeBack(id: string): void {
     void this.#api.withdrawRequest(this.#device.id, id, true).catch(() => undefined);
   }
@@ -114,7 +114,7 @@ export class ControlRequest {
     try {
       outcome = (await this.#api.controlRequest(this.#device.id, asked.id)).outcome;
     } catch (error) {
-      // Another request has come after it: that its lease has ended is all that is known.
+      // A newer request replaced it: only the end of its lease is known.
       const gone = error instanceof ApiError && error.status === 404;
       outcome = gone ? "ended" : now() > asked.until + AFTER_MS ? "expired" : "open";
     }

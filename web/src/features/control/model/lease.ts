@@ -1,4 +1,4 @@
-/** Control of one device from this page: the lease, its renewal, its loss, and the stream of setpoints it allows. */
+/** Control of one device: acquires, renews and loses the lease, and owns its setpoint stream. */
 import type { GrantedLease } from "../../../shared/api/types";
 import type { DeviceStore, OpenRequestHere } from "../../devices/model";
 import { RoundTrip } from "../../latency/model";
@@ -18,18 +18,18 @@ export type ControlState =
   | { kind: "taking" }
   | { kind: "held"; epoch: number; confirmed: boolean }
   | { kind: "lost"; why: string }
-  /** Given to who asked for it. */
+  /** Handed over to the requester. */
   | { kind: "handed"; to: string }
   | { kind: "refused"; why: string };
 
-/** The holder's answer to who asks for control. */
+/** The holder's response to a control request. */
 export type AnswerState =
   | { kind: "none" }
   | { kind: "sending"; accept: boolean }
   | { kind: "kept"; from: string }
   | { kind: "failed"; why: string };
 
-/** Makes the connection over which setpoints go. */
+/** Creates the setpoint connection. */
 export type OpenControlLink = (device: string, epoch: number) => Link;
 
 export class Control {
@@ -45,7 +45,7 @@ export class Control {
   #expiry: ReturnType<typeof setTimeout> | undefined;
   #cleanups: (() => void)[] = [];
   #obeyed = false;
-  /** To whom control is being handed over: its end is no loss then. */
+  /** The new operator during a handover, whose lease end is not a loss. */
   #handingTo: string | null = null;
   readonly #answer = signal<AnswerState>({ kind: "none" });
 
@@ -54,7 +54,7 @@ export class Control {
   /** The response to another operator's request. */
   readonly answered: ReadonlySignal<AnswerState> = this.#answer;
   readonly state: ReadonlySignal<ControlState> = this.#state;
-  /** There while the lease is held. */
+  /** Set while the lease is held. */
   readonly streamer: ReadonlySignal<SetpointStreamer | null> = this.#streamer;
   /** The connection for setpoints; `null` without a lease. */
   readonly linkStatus: ReadonlySignal<LinkStatus | null> = this.#linkStatus;
@@ -64,13 +64,13 @@ export class Control {
     this.#device = device;
     this.#openLink =
       openLink ?? ((id, epoch) => new MqttLink(() => api.credentials({ purpose: "control", device: id, epoch })));
-    // What was accepted is this session's already: to renew it is all there is to do.
+    // The accepted lease already belongs to this session: only renew it.
     this.asking = new ControlRequest(api, device, (epoch) => {
       void this.#begin(() => api.renewLease(device.id, LEASE_MS, epoch));
     });
   }
 
-  /** Who asks this page for control. */
+  /** The open control request to this page. */
   readonly asked = computed<OpenRequestHere | null>(() =>
     this.#state.value.kind === "held" ? this.#device.request.value : null,
   );
@@ -90,7 +90,7 @@ export class Control {
     await this.#begin(() => this.#api.takeOver(this.#device.id, LEASE_MS, reason));
   }
 
-  /** What became of an answer, or of asking, has been read. */
+  /** Clears the outcome of a response or request. */
   read(): void {
     this.asking.clear();
     if (this.#answer.value.kind !== "sending") this.#answer.value = { kind: "none" };
@@ -98,7 +98,7 @@ export class Control {
     if (kind === "handed" || kind === "lost" || kind === "refused") this.#state.value = { kind: "none" };
   }
 
-  /** Hand control to who asks, or keep it. */
+  /** Hands control over to the requester, or rejects the request. */
   async answer(accept: boolean): Promise<void> {
     const asked = this.asked.value;
     if (asked === null || this.#answer.value.kind === "sending") return;
@@ -128,7 +128,7 @@ export class Control {
     }
   }
 
-  /** Give control back. `leaving`: the page is going away, the call must outlive it. */
+  /** Releases control. `leaving`: the page closes, so the call must complete after it. */
   async release(leaving = false): Promise<void> {
     const { epoch } = this;
     if (epoch === null) return;
@@ -137,19 +137,19 @@ export class Control {
       await this.#api.releaseLease(this.#device.id, epoch, leaving);
       this.#device.setLease(null);
     } catch (error) {
-      // The lease ends by itself soon; the page has let go already.
+      // The lease expires soon; the page already stopped streaming.
       if (!(error instanceof ApiError && error.code === "lease-lost")) {
         this.#state.value = { kind: "lost", why: sentence(error) };
       }
     }
   }
 
-  /** The page can no longer be seen: what it streams must end. */
+  /** The page is hidden: its streams must end. */
   hidden(): void {
     this.#streamer.value?.end("hidden");
   }
 
-  /** Stop was pressed: nothing may be sent any more. */
+  /** Stop was pressed: ends all streams. */
   stopped(): void {
     this.#streamer.value?.end("stopped");
   }
@@ -210,7 +210,7 @@ export class Control {
         if (!current.confirmed) this.#state.value = { ...current, confirmed: true };
       } else if (this.#obeyed && latest?.message.epoch === 0) {
         this.#lose("The robot has ended it: it was stopped, or had to hold. Take control again to go on.");
-        // Nobody can use this lease any more: let others have the next one.
+        // This lease is unusable: release it, so that other operators can take the next one.
         void this.#api.releaseLease(this.#device.id, epoch, false).catch(() => undefined).then(() => this.#device.refreshLease());
         return;
       }

@@ -1,4 +1,4 @@
-/** Stop: told to the robot by every way there is, again and again, until the robot itself says that it has stopped. */
+/** Stop: sent to the robot over all channels repeatedly, until the robot confirms that it has stopped. */
 import type { DeviceStore } from "../../devices/model";
 import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
@@ -10,21 +10,21 @@ import type { KnownState } from "../../../shared/mqtt/parse-messages";
 import type { Stop } from "../../../shared/mqtt/protocol.generated";
 
 export const REPEAT_MS = 200;
-/** No word from the robot for this long: the page must say so, loudly [ms]. */
+/** Without confirmation for this long, the page shows a prominent warning [ms]. */
 export const DOUBT_MS = 1_000;
 /** Stop is republished for at most this long; after it, an operator must be at the robot [ms]. */
 export const GIVE_UP_MS = 60_000;
 
 export type StopState =
   | { kind: "clear" }
-  /** Sent and not yet confirmed; `doubtful` once that takes longer than it should. */
+  /** Sent and not confirmed; `doubtful` after `DOUBT_MS`. */
   | { kind: "sending"; doubtful: boolean }
   | { kind: "latched" }
   | { kind: "unconfirmed" };
 
 type Pressed =
   | { kind: "sending"; at: number; doubtful: boolean }
-  /** The cloud has it from the robot that it stopped; this page has not heard it yet. */
+  /** The robot confirmed to the cloud that it stopped; this page has not received the state yet. */
   | { kind: "told"; at: number }
   | { kind: "unconfirmed" };
 
@@ -41,7 +41,7 @@ export class StopSwitch {
   #stateAtPress: KnownState | null = null;
 
   readonly resetting: ReadonlySignal<boolean> = this.#resetting;
-  /** What went wrong with the last stop or reset; `null` otherwise. */
+  /** The error of the last stop or reset, or `null`. */
   readonly problem: ReadonlySignal<string | null> = this.#problem;
 
   readonly state = computed<StopState>(() => {
@@ -59,12 +59,12 @@ export class StopSwitch {
     this.#watch = effect(() => {
       const latest = device.telemetry.value;
       const pressed = this.#pressed.value;
-      // What the robot itself says, a moment after the cloud, counts from then on.
+      // The robot's own state takes precedence once it arrives.
       if (pressed?.kind === "told" && latest !== null && latest.receivedAt > pressed.at + DOUBT_MS) {
         queueMicrotask(() => this.#finish(null));
       }
       if (pressed?.kind !== "sending") return;
-      // Only what was said after the press confirms it. `state` comes without a time of arrival: any change of it is new.
+      // Only messages after the press confirm it. `state` has no arrival time: any change of it is new.
       const seen = latest !== null && latest.receivedAt >= pressed.at && latest.message.mode === "stopped";
       const told = device.state.value !== this.#stateAtPress && device.state.value?.mode === "stopped";
       if (seen || told) {
@@ -73,7 +73,7 @@ export class StopSwitch {
     });
   }
 
-  /** Latch Stop. May be pressed again at any time. */
+  /** Latches Stop. Can be repeated at any time. */
   press(reason = "Stop pressed on the console"): void {
     if (this.#device.info.value.role === "viewer") {
       this.#problem.value = "You can watch this device, but not stop it. Ask its owner or an operator at the robot.";
@@ -104,7 +104,7 @@ export class StopSwitch {
     );
   }
 
-  /** Release the latch. Nothing resumes. */
+  /** Resets the latch. No motion resumes. */
   async reset(): Promise<void> {
     this.#resetting.value = true;
     this.#problem.value = null;
@@ -125,7 +125,7 @@ export class StopSwitch {
   }
 
   #publish(message: Stop): void {
-    // Where the broker is out of reach the HTTP call is the other way; the banner says which one failed.
+    // If the broker is unreachable, the HTTP call is the second channel; the banner names the failed one.
     this.#link.publish(this.#device.topics.stop, message, 1).catch(() => undefined);
   }
 

@@ -1,10 +1,10 @@
-/** Says that this page looks at a device for as long as it can be seen, and hears who else does. */
+/** Reports this page as a viewer while it is visible, and reads the other viewers. */
 import type { Watcher } from "../../../shared/api/types";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
 
 const AGAIN_MS = 10_000;
-/** What the server says itself is taken within these bounds [ms]. */
+/** Bounds for the interval that the server requests [ms]. */
 const BOUNDS_MS = [2_000, 60_000] as const;
 
 export class Watchers {
@@ -14,7 +14,7 @@ export class Watchers {
   #timer: ReturnType<typeof setTimeout> | undefined;
   #on = false;
 
-  /** Who else looks at it; `null` while that is not known. */
+  /** The other viewers; `null`: unknown. */
   readonly others: ReadonlySignal<readonly Watcher[] | null> = this.#others;
 
   constructor(api: Api, id: string) {
@@ -22,7 +22,7 @@ export class Watchers {
     this.#id = id;
   }
 
-  /** The page can be seen, or no longer. */
+  /** The page became visible or hidden. */
   seen(visible: boolean): void {
     if (visible === this.#on) return;
     this.#on = visible;

@@ -1,4 +1,4 @@
-/** All devices that this account may see. */
+/** All devices that this account can access. */
 import type { Device } from "../../../shared/api/types";
 import { effect, signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
@@ -19,9 +19,9 @@ export class Fleet {
   readonly #forget: () => void;
   #cut = false;
 
-  /** By id, in the order of the list; `null` until the first answer. */
+  /** By id, in list order; `null` until the first response. */
   readonly devices: ReadonlySignal<ReadonlyMap<string, DeviceStore> | null> = this.#devices;
-  /** Why the list could not be read the last time; `null` when it could. */
+  /** The error of the last read, or `null`. */
   readonly trouble: ReadonlySignal<string | null> = this.#trouble;
 
   constructor(api: Api, link?: Link) {
@@ -32,7 +32,7 @@ export class Fleet {
     this.#forget = this.#askWhenCut();
   }
 
-  /** The name of a space, or its id while that is all that is known. */
+  /** The name of a space, or its id until the name is loaded. */
   spaceName(id: string): string {
     return this.#spaces.value.get(id) ?? id;
   }
@@ -47,7 +47,7 @@ export class Fleet {
     }
   }
 
-  /** Pair an agent with this account by the code it shows; its devices. Throws `ApiError`. */
+  /** Pairs an agent by its claim code; returns its devices. Throws `ApiError`. */
   async claim(code: string, space: string | null = null): Promise<Device[]> {
     const devices = await this.#api.claim(code, space);
     await this.refresh();
@@ -62,7 +62,7 @@ export class Fleet {
     this.link.close();
   }
 
-  /** A share that ends or changes cuts the connection: what may be seen now is asked for at once, and when it is back. */
+  /** A share that ends or changes closes the connection: reload the list now and after the reconnect. */
   #askWhenCut(): () => void {
     let was = this.link.status.value.state;
     return effect(() => {
@@ -100,11 +100,11 @@ export class Fleet {
       this.#ends.delete(id);
     }
     const added = [...next.keys()].some((id) => !known.has(id));
-    // Only a changed list is a new list for what draws it.
+    // Replace the list only if it changed, to avoid needless rendering.
     if (added || gone.length > 0 || this.#devices.value === null) {
       const first = this.#devices.value === null;
       this.#devices.value = next;
-      // What the broker lets this connection hear was fixed when its credentials were made.
+      // The credentials fix the topics that this connection may subscribe to.
       if (added && !first) this.link.renew();
     }
   }

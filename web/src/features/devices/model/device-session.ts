@@ -1,4 +1,4 @@
-/** All with which one device is operated from this page: control of it, its stop, what it is asked to do. */
+/** Operates one device from this page: control, Stop and actions. */
 import { ActionRunner } from "../../actions/model";
 import { CommandTrace, Control, StopSwitch, Watchers } from "../../control/model";
 import { LatencySamples } from "../../latency/model";
@@ -28,7 +28,7 @@ export class DeviceSession {
     this.watchers = new Watchers(api, device.id);
   }
 
-  /** Stop the device, and send nothing more. */
+  /** Stops the device and ends all streams. */
   stopNow(): void {
     this.control.stopped();
     this.stop.press();

@@ -1,4 +1,4 @@
-/** One device as the page knows it: only what it or the cloud has said, with the time at which it was heard. */
+/** The state of one device: messages from the device and the cloud, with their arrival times. */
 import type { Device, Lease } from "../../../shared/api/types";
 import { MessageError } from "../../../shared/mqtt/checks";
 import { RecentTelemetry } from "../../twin/model";
@@ -12,12 +12,12 @@ import { readFrame, type CameraFrame } from "../../../shared/mqtt/camera-frame";
 import type { Measurements, Presence } from "../../../shared/mqtt/protocol.generated";
 import { deviceTopics, type DeviceTopics } from "../../../shared/mqtt/topics";
 
-/** `unknown`: this page has no connection of its own, so it cannot say. */
+/** `unknown`: this page has no broker connection. */
 export type Reach = "online" | "stale" | "offline" | "unknown";
 
-/** Watched closely, a device that has sent no telemetry for this long is stale [ms]. */
+/** On its own page, a device without telemetry for this long is stale [ms]. */
 export const STALE_MS = 1_000;
-/** In the list only `state` is heard, every 30 s: two of them missed, and a little [ms]. */
+/** The list receives only `state`, every 30 s: two missed messages and a margin [ms]. */
 export const LIST_STALE_MS = 65_000;
 const EVENTS_KEPT = 20;
 
@@ -27,10 +27,10 @@ export interface Timed<T> {
   receivedAt: number;
 }
 
-/** `receivedAt`: on the page's clock, when it came [ms]. */
+/** `receivedAt`: arrival time on the page's clock [ms]. */
 export type AckReceiver = (ack: KnownAck, receivedAt: number) => void;
 
-/** The newest of one stream; `everyMs`: how long after the one before it came, `null` for the first. */
+/** The newest message of a stream; `everyMs`: time since the previous one, `null` for the first. */
 export interface MeasuredValues extends Timed<Measurements> {
   everyMs: number | null;
 }
@@ -41,7 +41,7 @@ export interface OpenRequestHere {
   until: number;
 }
 
-/** What is measured on its own page and comes this much later than it should is stale [ms]. */
+/** On the device's own page, a stream that is this late is stale [ms]. */
 const LATE_MS = 1_000;
 const PERIODS = 3;
 
@@ -75,12 +75,12 @@ export class DeviceStore {
   readonly state: ReadonlySignal<KnownState | null> = this.#state;
   readonly telemetry: ReadonlySignal<Timed<KnownTelemetry> | null> = this.#telemetry;
   readonly events: ReadonlySignal<readonly KnownEvent[]> = this.#events;
-  /** Who the cloud says has control. The device's own word is in `state`. */
+  /** The lease holder according to the cloud. The device's own report is in `state`. */
   readonly lease: ReadonlySignal<Lease | null>;
-  /** Why the newest message of some topic could not be read; `null` when all could. */
+  /** The parse error of a topic's newest message; `null`: none. */
   readonly trouble = computed<string | null>(() => [...this.#troubles.value.values()].at(-1) ?? null);
 
-  /** When the device, or the cloud for it, last said anything, on the page's clock [ms]. */
+  /** Time of the last message from the device, or from the cloud for it, on the page's clock [ms]. */
   readonly lastSeenAt = computed(() => {
     const at = this.#info.value.last_seen_at;
     const told = at === null ? null : onThisClock(Date.parse(at));
@@ -90,7 +90,7 @@ export class DeviceStore {
 
   /** Age of the newest telemetry [ms]; `null` before the first. */
   readonly telemetryAgeMs = computed(() => {
-    // Sampled with the clock: asked at every message it would always be nought.
+    // Sampled with the clock: at the arrival of a message it would always be 0.
     const at = clock.value;
     const latest = this.#telemetry.peek();
     return latest === null ? null : Math.max(0, at - latest.receivedAt);
@@ -107,16 +107,16 @@ export class DeviceStore {
     return heardAt === null || clock.value - heardAt > LIST_STALE_MS ? "stale" : "online";
   });
 
-  /** Whether what is shown of the device is what it is now. */
+  /** Whether the displayed state is current. */
   readonly live = computed(() => this.reach.value === "online");
 
-  /** What it does, by its newest telemetry; `undefined` before the first. Changes seldom, where telemetry does not. */
+  /** The mode from the newest telemetry; `undefined` before the first. Changes less often than telemetry. */
   readonly mode = computed(() => this.#telemetry.value?.message.mode);
 
-  /** What makes its motion other than asked for, as it names it; empty where nothing does. */
+  /** Active restrictions of its motion, as the device reports them. */
   readonly limited = computed(() => this.#telemetry.value?.message.limited.join(", ") ?? "");
 
-  /** Latched, by the newest word of the device. */
+  /** Whether Stop is latched, according to the device's newest message. */
   readonly stopped = computed(() => {
     const latest = this.#telemetry.value?.message;
     const state = this.#state.value;
@@ -139,8 +139,8 @@ export class DeviceStore {
   });
 
   /**
-   * Who asks the holder for control; `until`: on the page's clock. By the word of the device where it shows the lease
-   * that is in force, else by the cloud's.
+   * The open control request; `until`: on the page's clock. From the device if it reports the current lease, otherwise
+   * from the cloud.
    */
   readonly request = computed<OpenRequestHere | null>(() => {
     const told = this.#state.value?.lease ?? null;
@@ -164,7 +164,7 @@ export class DeviceStore {
     this.lease = this.#lease;
   }
 
-  /** The cloud's newest word, from the list of devices. */
+  /** Applies the cloud's newest entry from the device list. */
   update(info: Device): void {
     this.#info.value = info;
     this.#lease.value = info.lease;
@@ -182,7 +182,7 @@ export class DeviceStore {
     }
   }
 
-  /** Hear presence and state: enough for a list. Returns what ends it. */
+  /** Subscribes to presence and state, for a list. Returns a function that unsubscribes. */
   watch(): () => void {
     return this.#subscribe({
       [this.topics.conn]: (payload, _, retained) => this.#hearPresence(readPresence(payload), retained),
@@ -195,7 +195,7 @@ export class DeviceStore {
     });
   }
 
-  /** Hear everything else too: what the device's own page shows. Returns what ends it. */
+  /** Subscribes to all topics of the device's own page. Returns a function that unsubscribes. */
   watchClosely(): () => void {
     this.#close.value = true;
     const end = this.#subscribe({
@@ -219,12 +219,12 @@ export class DeviceStore {
     };
   }
 
-  /** The newest measurements of a stream other than the joints'; `null` before the first. */
+  /** The newest measurements of a stream, except `joints`; `null` before the first. */
   measured(stream: string): ReadonlySignal<MeasuredValues | null> {
     return this.#measuredOf(stream);
   }
 
-  /** Whether a stream is older than three of its periods and a second: the description's period, or the one seen. */
+  /** Whether a stream is older than three periods plus one second; uses the described or the observed period. */
   late(stream: string): boolean {
     const newest = this.#measuredOf(stream).value;
     if (newest === null || !this.#link.up.value) return true;
@@ -233,7 +233,7 @@ export class DeviceStore {
     return clock.value - newest.receivedAt > LATE_MS + PERIODS * periodMs;
   }
 
-  /** Hear what a device is, and no more: enough to offer what it has. Returns what ends it. */
+  /** Subscribes to the description only. Returns a function that unsubscribes. */
   watchDescription(): () => void {
     return this.#subscribe({
       [this.topics.desc]: (payload, topic) => {
@@ -242,7 +242,7 @@ export class DeviceStore {
     });
   }
 
-  /** Hear what a device is and what it measures: enough for a plan. Returns what ends it. */
+  /** Subscribes to the description and measurements, for a floor plan. Returns a function that unsubscribes. */
   watchMeasurements(): () => void {
     return this.#subscribe({
       [this.topics.desc]: (payload, topic) => {
@@ -254,7 +254,7 @@ export class DeviceStore {
     });
   }
 
-  /** Hear the pictures of a camera. Nothing is sent to this page before, or after what is returned is called. */
+  /** Subscribes to a camera's frames. Returns a function that unsubscribes. */
   watchCamera(name: string, receiver: (frame: CameraFrame) => void): () => void {
     return this.#subscribe({
       [this.topics.cam(name)]: (payload) => {
@@ -264,7 +264,7 @@ export class DeviceStore {
     });
   }
 
-  /** Hear the acks of one command, from the first that this page has seen. Returns what ends it. */
+  /** Subscribes to the acks of one command, including those already received. Returns a function that unsubscribes. */
   onAck(id: string, receiver: AckReceiver): () => void {
     const mine: AckReceiver = (ack, receivedAt) => {
       if (ack.id === id) receiver(ack, receivedAt);
@@ -291,7 +291,7 @@ export class DeviceStore {
     };
   }
 
-  /** Each new connection brings what is retained again: what is drawn from it must not be built again for that. */
+  /** A new connection delivers retained messages again: unchanged ones must not trigger a redraw. */
   #isNew(topic: string, payload: Uint8Array): boolean {
     const known = this.#retained.get(topic);
     if (known?.length === payload.length && known.every((byte, index) => byte === payload[index])) return false;
@@ -310,7 +310,7 @@ export class DeviceStore {
 
   #hearPresence(presence: Required<Presence>, retained: boolean): void {
     const known = this.#presence.value;
-    // The will of an older connection may come after the word of a newer one.
+    // The will of an older connection may arrive after messages of a newer one.
     if (known !== null && presence.session < known.session) return;
     this.#presence.value = presence;
     this.#noteHeard(presence.at_ms, retained);
@@ -322,7 +322,7 @@ export class DeviceStore {
     if (wanted !== undefined && message.position_rad.length !== wanted) {
       throw new MessageError(`telemetry has ${message.position_rad.length} joints, the description ${wanted}`);
     }
-    // Older than what is shown, unless the agent has started again and its clock with it.
+    // Older than the displayed message, unless the agent restarted with a new clock.
     if (known !== undefined && message.tick_ms <= known.tick_ms && message.at_ms <= known.at_ms) return;
     const at = now();
     this.#telemetry.value = { message, receivedAt: at };
@@ -342,7 +342,7 @@ export class DeviceStore {
   #hearMeasurements(topic: string, message: Measurements): void {
     const newest = this.#measuredOf(topic.slice(topic.lastIndexOf("/") + 1));
     const known = newest.value;
-    // The same twice, or out of order, unless the agent has started again.
+    // A duplicate or out of order, unless the agent restarted.
     if (known !== null && message.tick_ms <= known.message.tick_ms && message.at_ms <= known.message.at_ms) return;
     const at = now();
     newest.value = { message, receivedAt: at, everyMs: known === null ? null : at - known.receivedAt };
@@ -362,7 +362,7 @@ export class DeviceStore {
     for (const receiver of this.#ackReceivers) receiver(ack, receivedAt);
   }
 
-  /** A retained message was said some time ago: its own time counts, never a later one than now. */
+  /** A retained message is older than its arrival: use its own time, but never a future one. */
   #noteHeard(atMs: number, retained: boolean): void {
     const at = retained ? Math.min(now(), onThisClock(atMs)) : now();
     if (this.#heardAt.value === null || at > this.#heardAt.value) this.#heardAt.value = at;

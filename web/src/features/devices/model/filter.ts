@@ -6,19 +6,19 @@ export type KindFilter = "all" | "robots" | "sensors";
 export type OwnerFilter = "all" | "mine" | "shared";
 
 export interface DeviceFilter {
-  /** Words, all of which have to be somewhere in label, name, type, kind or room. */
+  /** Words that must all occur in the label, name, type, kind or space. */
   search: string;
   kinds: KindFilter;
   whose: OwnerFilter;
   onlyTrouble: boolean;
 }
 
-/** A room device's entry in its room makes its type, so type and kind are one. */
+/** For a room device, type and kind are equal. */
 export function isRoomDevice({ kind, robot_type: type }: Pick<Device, "kind" | "robot_type">): boolean {
   return kind === type;
 }
 
-/** `faults`: how many the device tells of, or the cloud has found. */
+/** `faults`: number of faults from the device or the cloud. */
 export function matchesFilter(device: DeviceStore, space: string, faults: number, wanted: DeviceFilter): boolean {
   const { search, kinds, whose, onlyTrouble } = wanted;
   const info = device.info.value;

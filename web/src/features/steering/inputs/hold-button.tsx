@@ -12,7 +12,7 @@ interface HoldButtonProps<T> {
   children: ComponentChildren;
 }
 
-/** It counts while it is held, by pointer or by Space or Enter: a pointer that is lost, or a focus, lets it go. */
+/** Active while held with the pointer, Space or Enter. Losing the pointer or the focus releases it. */
 export function HoldButton<T>({ held, name, part, label, disabled, children, ...rest }: HoldButtonProps<T>) {
   useEffect(() => () => held.release(name), [held, name]);
   const letGo = (): void => held.release(name);

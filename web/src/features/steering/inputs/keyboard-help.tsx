@@ -1,4 +1,4 @@
-/** The keys that move a robot: what they are, and who hears them. */
+/** Keyboard control of a robot: key handlers and the list of keys. */
 import { signal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
 import type { PressedInputs } from "../model/pressed-inputs";
@@ -6,14 +6,14 @@ import type { SteeringMode } from "../model/steerable-parts";
 import { texts } from "../texts";
 
 const STORED = "telescope-keys";
-/** Whether keys move a robot from anywhere on the page; else only while the focus is on its controls. */
+/** Whether keys work everywhere on the page, or only while the focus is on the robot's controls. */
 const everywhere = signal(localStorage.getItem(STORED) !== "off");
 
 const TEXT = 'input:not([type="range"], [type="checkbox"], [type="radio"]), textarea, select, [contenteditable], .cm-editor';
-/** What moves by arrows itself. */
+/** Elements that use the arrow keys themselves. */
 const ARROWS_TAKEN = 'input, [role="tab"], [role="radiogroup"], [tabindex="0"]:not([data-takes-keys])';
 
-/** Whether a key is meant for the robot, and not for what has the focus. */
+/** Whether a key event is for the robot, and not for the focused element. */
 function forTheRobot(event: KeyboardEvent): boolean {
   if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return false;
   const at = event.target instanceof Element ? event.target : null;
@@ -23,7 +23,7 @@ function forTheRobot(event: KeyboardEvent): boolean {
   return everywhere.value || at.closest("[data-takes-keys]") !== null;
 }
 
-/** Hear keys while `active`; what `onKey` answers with `true` was for the robot, and does nothing else. */
+/** Handles keys while `active`. If `onKey` returns `true`, the default action is suppressed. */
 export function useKey(active: boolean, onKey: (event: KeyboardEvent) => boolean): void {
   const newest = useRef(onKey);
   newest.current = onKey;
@@ -37,7 +37,7 @@ export function useKey(active: boolean, onKey: (event: KeyboardEvent) => boolean
   }, [active]);
 }
 
-/** Hold what a key stands for while it is down. A key that comes up is heard wherever the focus has gone. */
+/** Presses an input while its key is down. The key's release is detected even if the focus has moved. */
 export function useHeldKeys<T>(active: boolean, held: PressedInputs<T>, map: Readonly<Record<string, T>>): void {
   useKey(active, (event) => {
     const part = map[event.code];
@@ -58,7 +58,7 @@ export function useHeldKeys<T>(active: boolean, held: PressedInputs<T>, map: Rea
   }, [active, held, map]);
 }
 
-/** The keys of what is shown, in place: nothing may lie over Stop. */
+/** The keys of the visible panel, shown inline so that nothing covers Stop. */
 export function KeyboardHelp({ way }: { way: SteeringMode }) {
   const rows = [...texts.steer.keys[way], ...texts.steer.keys.always];
   return (

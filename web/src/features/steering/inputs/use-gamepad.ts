@@ -1,22 +1,22 @@
-/** Looks at the gamepads of this computer. A browser tells of none until a button of it has been pressed. */
+/** Polls the computer's gamepads. A browser reports a gamepad only after a button press. */
 import { useSignal, useSignalEffect, type ReadonlySignal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
 import { readPad, type PadReading } from "../model/gamepad-mapping";
 import type { PressedInputs } from "../model/pressed-inputs";
 
-/** Not with the page's frames: those wait where drawing is slow, and a button that was let go must not [ms]. */
+/** Polling interval. Independent of animation frames, which slow drawing would delay [ms]. */
 const LOOK_EVERY_MS = 20;
 
 export interface PadWatch {
-  /** The newest of the first gamepad that can be read; `null`: there is none. */
+  /** The newest reading of the first usable gamepad; `null`: none. */
   reading: ReadonlySignal<PadReading | null>;
-  /** What is to be said of gamepads; empty while there was none. */
+  /** The newest gamepad notice; `null`: none. */
   news: ReadonlySignal<PadNews | null>;
 }
 
 export type PadNews = { kind: "connected" | "gone"; id: string } | { kind: "unknown"; id: string };
 
-/** Look at gamepads while `active`; `onStop` hears of every press of the button that stops. */
+/** Polls gamepads while `active`; `onStop` is called for each press of the Stop button. */
 export function useGamepad(active: boolean, onStop: () => void): PadWatch {
   const reading = useSignal<PadReading | null>(null);
   const news = useSignal<PadNews | null>(null);
@@ -49,7 +49,7 @@ export function useGamepad(active: boolean, onStop: () => void): PadWatch {
   return { reading, news };
 }
 
-/** Hold what a gamepad's sticks say while its dead-man button is held; `null` from `part`: nothing for this panel. */
+/** Applies a gamepad's sticks while its dead-man button is held. */
 export function useGamepadInputs<T>(watch: PadWatch, held: PressedInputs<T>, part: (reading: PadReading) => T): void {
   const was = useRef(false);
   const newest = useRef(part);

@@ -6,9 +6,9 @@ import type { SetpointStreamer } from "../model/setpoint-streamer";
 import type { Velocity } from "../model/steerable-parts";
 
 /**
- * What is held of a panel, as the velocity that `asked` makes of it.
+ * The pressed inputs of a panel. `asked` converts them to a velocity.
  *
- * @param streamer There while this page may move the robot.
+ * @param streamer Set while this page may move the robot.
  */
 export function usePressedInputs<T>(streamer: SetpointStreamer | null, asked: (parts: readonly T[]) => Velocity): PressedInputs<T> {
   const newest = useRef({ streamer, asked });
@@ -22,14 +22,14 @@ export function usePressedInputs<T>(streamer: SetpointStreamer | null, asked: (p
       }),
     [],
   );
-  // What it means may have changed: the speed, the axes.
+  // The speed or axes may have changed: send the velocity again.
   useEffect(() => {
     if (held.any) held.again();
   });
   useEffect(
     () =>
       effect(() => {
-        // Ended by something else: what is still pressed must not begin anew by itself.
+        // The stream ended for another reason: inputs that are still pressed must not restart it.
         if ((streamer?.velocity.value ?? null) === null) held.spend();
       }),
     [held, streamer],

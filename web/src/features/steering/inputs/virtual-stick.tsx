@@ -4,7 +4,7 @@ import type { PressedInputs } from "../model/pressed-inputs";
 import type { Push } from "../model/steerable-parts";
 import { texts } from "../texts";
 
-/** Nearer to the middle than this is the middle. */
+/** Dead zone around the centre. */
 const MIDDLE = 0.1;
 const NAME = "stick";
 
@@ -13,7 +13,7 @@ interface StickProps {
   disabled: boolean;
 }
 
-/** A round stick: up is forward, to a side turns. It springs back when it is let go, or its pointer is lost. */
+/** A virtual stick: up is forward, sideways turns. It returns to the centre on release or pointer loss. */
 export function VirtualStick({ held, disabled }: StickProps) {
   const [at, setAt] = useState<[number, number]>([0, 0]);
   const letGo = (): void => {

@@ -1,7 +1,7 @@
-/** What a gamepad says, in the layout that browsers call standard. Nothing of it counts without the dead-man button. */
+/** Readings of a gamepad with the standard layout. They apply only while the dead-man button is held. */
 import { clamp } from "../../../shared/lib/angles";
 
-/** What is needed of a browser's `Gamepad`. */
+/** The used part of the browser's `Gamepad`. */
 export interface Pad {
   readonly id: string;
   readonly index: number;
@@ -14,22 +14,22 @@ export interface Pad {
 export interface PadReading {
   id: string;
   index: number;
-  /** Either of the upper shoulder buttons is held. */
+  /** Whether an upper shoulder button is held (dead-man button). */
   held: boolean;
   stop: boolean;
-  /** To the right and up, -1…1. */
+  /** Right and up, -1…1. */
   left: readonly [number, number];
   right: readonly [number, number];
-  /** By the triggers: right less left. */
+  /** Triggers: right minus left. */
   lift: number;
-  /** By the cross: right less left, up less down. */
+  /** D-pad: right minus left, up minus down. */
   cross: readonly [number, number];
 }
 
 /** A released stick reads at most this far from its centre. */
 export const DEAD_ZONE = 0.15;
 
-/** Beyond the dead zone the whole range is there, beginning at nought. */
+/** Rescales values outside the dead zone to the whole range, starting at 0. */
 export function beyondDeadZone(x: number, y: number): [number, number] {
   const length = Math.hypot(x, y);
   if (!(length > DEAD_ZONE)) return [0, 0];

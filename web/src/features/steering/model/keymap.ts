@@ -1,4 +1,4 @@
-/** The one map of keys that move a robot. Letters are named by their place on a keyboard, so that they lie as drawn. */
+/** Key map for steering. Codes name physical positions, so that the layout is the same on every keyboard. */
 import { AT_REST, direction, type Direction, type Push } from "./steerable-parts";
 
 const push = (part: Partial<Push>): Push => ({ ...AT_REST, ...part });
@@ -31,10 +31,10 @@ export const JOG_KEYS: Readonly<Record<string, Direction>> = {
   KeyL: direction("about", 2, -1),
 };
 
-/** Which way a chosen joint goes. */
+/** Direction of the selected joint. */
 export const JOINT_KEYS: Readonly<Record<string, 1 | -1>> = { ArrowUp: 1, ArrowRight: 1, ArrowDown: -1, ArrowLeft: -1 };
 
-/** The joint that a number key chooses: 1 is the first, 0 the tenth. `null`: it is no number key. */
+/** The joint index of a number key: 1 is the first joint, 0 the tenth. `null`: not a number key. */
 export function jointOfKey(code: string): number | null {
   const digit = /^(?:Digit|Numpad)([0-9])$/.exec(code)?.[1];
   if (digit === undefined) return null;

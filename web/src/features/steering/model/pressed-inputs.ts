@@ -1,13 +1,13 @@
 /**
- * What hands hold at one moment, on pads, sticks, keys and gamepads, each under a name of its own. Whatever ends a
- * stream spends what is held then: it counts for nothing until it has been let go and is pressed anew.
+ * The currently pressed buttons, sticks, keys and gamepads, each by name. The end of a stream spends all pressed inputs:
+ * a spent input has no effect until it is released and pressed again.
  */
 export class PressedInputs<T> {
   readonly #parts = new Map<string, T>();
   readonly #spent = new Set<string>();
   readonly #tell: (parts: readonly T[]) => void;
 
-  /** `tell`: hears of every change; nothing is held where the list is empty. */
+  /** `tell`: called after every change; an empty list means that no input is pressed. */
   constructor(tell: (parts: readonly T[]) => void) {
     this.#tell = tell;
   }
@@ -18,7 +18,7 @@ export class PressedInputs<T> {
     this.keep(name, part);
   }
 
-  /** It is held still, perhaps elsewhere. */
+  /** Updates a pressed input, for example a moved stick. */
   keep(name: string, part: T): void {
     if (this.#spent.has(name)) return;
     this.#parts.set(name, part);
@@ -30,7 +30,7 @@ export class PressedInputs<T> {
     if (this.#parts.delete(name)) this.again();
   }
 
-  /** The stream has ended. */
+  /** Spends all pressed inputs after the end of a stream. */
   spend(): void {
     for (const name of this.#parts.keys()) this.#spent.add(name);
     this.#parts.clear();
@@ -42,7 +42,7 @@ export class PressedInputs<T> {
     this.again();
   }
 
-  /** Say it again: what it means has changed. */
+  /** Calls `tell` again, because the meaning of the inputs changed. */
   again(): void {
     this.#tell([...this.#parts.values()]);
   }

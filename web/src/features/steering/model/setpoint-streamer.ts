@@ -1,8 +1,7 @@
 /**
- * Streams what the operator wants of one device while a lease is held, 40 times a second, for as long as the page can
- * see the robot: joint targets until they are reached, a velocity (of a frame or of the base) for as long as it is held.
- * There is one of these at a time, the newest. Whatever is in doubt ends the stream; nothing is sent again by itself
- * afterwards.
+ * Streams setpoints to one device at 40 Hz while the lease is held and telemetry is fresh: joint targets until they are
+ * reached, or a velocity of a frame or the base while an input is held. Only the newest of them is active. Any doubt ends
+ * the stream, which never resumes automatically.
  */
 import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import { clamp, radians } from "../../../shared/lib/angles";
@@ -12,21 +11,21 @@ import type { Joint, Setpoint } from "../../../shared/mqtt/protocol.generated";
 import { restOf, type Velocity, type SteeringMode } from "./steerable-parts";
 
 export const PERIOD_MS = 25;
-/** Telemetry older than this is not fresh: the agent would refuse a setpoint that echoes it [ms]. */
+/** Telemetry older than this is stale: the agent would reject a setpoint that echoes it [ms]. */
 export const FRESH_MS = 200;
-/** After this long without fresh telemetry the target is given up, so that nothing moves by surprise later [ms]. */
+/** Without fresh telemetry for this long the target is abandoned, to prevent unexpected motion later [ms]. */
 export const ABANDON_MS = 1_000;
-/** The same of a velocity: the robot's watchdog has stopped it by then, and it must not start again by itself [ms]. */
+/** The same for a velocity: the robot's watchdog has stopped it by then, and it must not restart [ms]. */
 export const LOST_MS = 400;
-/** A velocity that was let go: rest is sent for so long, and until the robot rests, so that its watchdog need not act [ms]. */
+/** After release, zero velocity is sent for this long and until the robot rests, so that its watchdog is not needed [ms]. */
 export const SETTLE_MS = 400;
 const SETTLE_AT_MOST_MS = 1_500;
-/** Measured this close to the target is there [rad]. */
+/** Tolerance of the measured position at the target [rad]. */
 export const REACHED_RAD = radians(0.2);
-/** Commanded this close to the target: the agent has nothing left to do [rad]. */
+/** Tolerance of the commanded position at the target [rad]. */
 const COMMANDED_RAD = radians(0.02);
 const STILL_RAD_S = 0.005;
-/** Not there, yet nothing moves for this long: something holds it back, and streaming on would not help [ms]. */
+/** Without motion for this long before the target, the robot is blocked and the stream ends [ms]. */
 export const STUCK_MS = 2_000;
 
 export type StreamState = "idle" | "streaming" | "waiting";
@@ -38,9 +37,9 @@ export type Targets = Readonly<Record<string, number>>;
 export interface StreamerOptions {
   epoch: number;
   joints: readonly Joint[];
-  /** Sends one setpoint; rejects when there is no connection. */
+  /** Sends one setpoint; rejects without a connection. */
   send: (setpoint: Setpoint) => Promise<void>;
-  /** The newest telemetry of the device, if any, with when it came on the page's clock [ms]. */
+  /** The newest telemetry of the device, if any, with its arrival time on the page's clock [ms]. */
   telemetry: () => Seen | null;
 }
 
@@ -49,7 +48,7 @@ interface Seen {
   receivedAt: number;
 }
 
-/** A velocity that is held, or, since `letGoAt`, the rest that follows it. */
+/** An active velocity, or, after `letGoAt`, the zero velocity that follows it. */
 interface Held {
   velocity: Velocity;
   letGoAt: number | null;
@@ -72,14 +71,14 @@ export class SetpointStreamer {
   readonly state: ReadonlySignal<StreamState> = this.#state;
   /** Why the last stream ended. */
   readonly ended: ReadonlySignal<EndedBecause> = this.#ended;
-  /** What is streamed; `null`: nothing. */
+  /** The active stream; `null`: none. */
   readonly way = computed<SteeringMode | null>(() => {
     if (this.#state.value === "idle") return null;
     return this.#held.value?.velocity.kind ?? "joints";
   });
-  /** Where the joints are to go, as far as anybody knows: a velocity leads nowhere in particular. */
+  /** Joint targets, if known: a velocity has no target. */
   readonly goal = computed<Targets | null>(() => (this.way.value === "joints" ? this.#targets.value : null));
-  /** The velocity that is held now; `null`: none. */
+  /** The active velocity; `null`: none. */
   readonly velocity = computed<Velocity | null>(() => {
     const held = this.#held.value;
     return held?.letGoAt === null ? held.velocity : null;
@@ -91,7 +90,7 @@ export class SetpointStreamer {
     this.#timer = setInterval(() => this.tick(), PERIOD_MS);
   }
 
-  /** Targets of a device at rest are where it is commanded to be, so that the next small step is a small step. */
+  /** At rest, targets follow the commanded positions, so that a small step stays small. */
   follow(): void {
     const latest = this.#options.telemetry();
     if (this.way.peek() === "joints" || latest === null) return;
@@ -100,7 +99,7 @@ export class SetpointStreamer {
     if (Object.entries(next).some(([name, position]) => known[name] !== position)) this.#targets.value = next;
   }
 
-  /** The operator wants this joint there [rad]; clamped to the joint's range. */
+  /** Sets a joint's target [rad], clamped to the joint's range. */
   setTarget(name: string, positionRad: number): void {
     const joint = this.#options.joints.find((one) => one.name === name);
     if (joint === undefined || !Number.isFinite(positionRad)) return;
@@ -108,7 +107,7 @@ export class SetpointStreamer {
     const target = clamp(positionRad, joint.lower_rad, joint.upper_rad);
     this.#leaveFor("joints");
     batch(() => {
-      // A first touch starts from where the robot is now, not from where a slider was left.
+      // Start from the robot's current position, not from the slider's last value.
       this.follow();
       this.#targets.value = { ...this.#targets.value, [name]: target };
       this.#movedAt = at;
@@ -118,8 +117,7 @@ export class SetpointStreamer {
   }
 
   /**
-   * The operator holds this: a frame or the base moves so until `letGo`. Said again with another velocity, that counts.
-   * What is at rest is not held.
+   * Starts or changes a velocity of a frame or the base, until `letGo`. A zero velocity does not start a stream.
    */
   hold(velocity: Velocity): void {
     if (!parts(velocity).every(Number.isFinite)) return;
@@ -136,7 +134,7 @@ export class SetpointStreamer {
     this.tick();
   }
 
-  /** Nothing is held any more: rest is asked for at once, and until the robot rests. Joint targets stay. */
+  /** Releases the velocity: sends zero velocity until the robot rests. Joint targets stay. */
   letGo(): void {
     const held = this.#held.value;
     if (held?.letGoAt !== null) return;
@@ -144,7 +142,7 @@ export class SetpointStreamer {
     this.#say();
   }
 
-  /** End the stream now; targets return to the robot. A velocity ends with rest. */
+  /** Ends the stream; targets return to the robot's positions. A velocity ends with zero velocity. */
   end(because: EndedBecause): void {
     if (this.#state.value === "idle") return;
     this.letGo();
@@ -161,7 +159,7 @@ export class SetpointStreamer {
     this.end(null);
   }
 
-  /** One step; the timer's work. */
+  /** One timer step. */
   tick(): void {
     if (this.#state.value === "idle") return;
     const at = now();
@@ -181,7 +179,7 @@ export class SetpointStreamer {
     }
   }
 
-  /** The newest telemetry, while an agent would take a setpoint that answers it. */
+  /** The newest telemetry, if an agent would still accept a setpoint that echoes it. */
   #seen(at: number): Seen | null {
     const latest = this.#options.telemetry();
     return latest === null || at - latest.receivedAt > FRESH_MS ? null : latest;
@@ -199,7 +197,7 @@ export class SetpointStreamer {
     this.#ended.value = null;
   }
 
-  /** Another way of steering begins: what was asked before must not go on beside it. */
+  /** Ends the previous steering mode, so that two modes are never active together. */
   #leaveFor(next: SteeringMode): void {
     const way = this.way.value;
     if (way === next) return;
@@ -207,7 +205,7 @@ export class SetpointStreamer {
       this.end("let-go");
     } else if (way === "joints") {
       const latest = this.#options.telemetry();
-      // Joints that were on their way stay where they have come to.
+      // Moving joints stop at their current positions.
       this.#targets.value = named(this.#options.joints, latest?.message.commanded_rad ?? []);
       this.#say();
       this.end(null);
@@ -223,7 +221,7 @@ export class SetpointStreamer {
   #stream(message: KnownTelemetry, at: number): void {
     if (this.#held.value === null ? this.#reached(message, at) : this.#settled(this.#held.value, message, at)) return;
     if (this.#sending > 0) {
-      // The last one has not left yet. The newest target will go instead of queueing behind it.
+      // The previous setpoint is still being sent. Do not queue: the newest target is sent next.
       if (at - this.#sentAt > this.#patienceMs) this.end("no-connection");
       return;
     }
@@ -232,7 +230,7 @@ export class SetpointStreamer {
 
   #send(message: KnownTelemetry, at: number): void {
     const { epoch } = this.#options;
-    // Another page of the same sign-in may have counted on in this lease: an agent takes rising numbers only.
+    // Another page of this session may have used higher numbers in this lease: an agent requires increasing ones.
     if (message.epoch === epoch) this.#sequence = Math.max(this.#sequence, message.setpoint_sequence);
     this.#sequence += 1;
     this.#sending += 1;
@@ -259,7 +257,7 @@ export class SetpointStreamer {
     );
   }
 
-  /** Whether what was let go rests. */
+  /** Whether the robot rests after a release. */
   #settled({ letGoAt }: Held, message: KnownTelemetry, at: number): boolean {
     if (letGoAt === null || at - letGoAt < SETTLE_MS) return false;
     if (!still(message) && at - letGoAt < SETTLE_AT_MOST_MS) return false;
@@ -280,7 +278,7 @@ export class SetpointStreamer {
     const rests = still(message);
     if (!rests) this.#movedAt = at;
     if (rests && at - this.#movedAt > STUCK_MS && at - this.#startedAt > STUCK_MS) {
-      // Close enough is there: a servo may droop by more than the page's tolerance.
+      // Commanded at the target counts as reached: a servo may deviate by more than the page's tolerance.
       this.end(commanded ? "reached" : "stuck");
       return true;
     }

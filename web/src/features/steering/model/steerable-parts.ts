@@ -1,11 +1,11 @@
-/** What of a device can be steered, by its own description, and what a hand on the controls asks of it. */
+/** Steering modes from a device's description, and the velocities for pressed inputs. */
 import { clamp } from "../../../shared/lib/angles";
 import type { KnownDescription } from "../../../shared/mqtt/parse-messages";
 import type { BaseLimits, DriveTarget, JogTarget } from "../../../shared/mqtt/protocol.generated";
 import type { Vector3 } from "../../../shared/lib/vectors";
 
 export type SteeringMode = "joints" | "jog" | "drive";
-/** A velocity: it counts only while it is held. */
+/** A velocity, active only while an input is held. */
 export type Velocity = JogTarget | DriveTarget;
 
 /** The kinds of setpoint that this device follows. */
