@@ -150,7 +150,7 @@ class EventGrid(TelescopeBroker):
         self.everything: str = ""
         """Grant all rights to this client id, for tests."""
 
-    def admit(self, connect: Connect) -> Admission:
+    def authenticate(self, connect: Connect) -> Admission:
         if self.everything and connect.client_id == self.everything:
             rights: Any = Rights(None, Client(connect.client_id), connect.client_id)
             return Admission(rights, "", 0)

@@ -130,7 +130,7 @@ class Operator:
         self._seen: tuple[JointTelemetry, float] | None = None
         self._state_epoch = 0
         self._link: Link | None = None
-        self._watch = Link(seat, lambda: self._post("/mqtt/credentials", purpose="watch"), self._heard)
+        self._watch = Link(seat, lambda: self._post("/mqtt/credentials", purpose="view"), self._heard)
         self.epoch: int | None = None
         self._obeyed = False
         self._ends_s = 0.0

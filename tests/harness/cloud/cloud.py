@@ -43,6 +43,12 @@ TOKEN_MS = ACCESS_S * 1000
 T = TypeVar("T")
 
 
+def connect_to_broker(issued: dict[str, Any], *, on_message: Callable[[Message], None] | None = None) -> Client:
+    """Returns a connection to a real broker with credentials that the API issued."""
+    credentials = Credentials(issued["username"], issued["password"])
+    return Client(issued["client_id"], credentials, port=issued["tcp"]["port"], on_message=on_message).open()
+
+
 class Cloud:
     """One instance of the functions, with the ingest beside it.
 
@@ -98,10 +104,9 @@ class Cloud:
 
     def connect(self, issued: dict[str, Any], *, on_message: Callable[[Message], None] | None = None) -> Client:
         """A connection to the broker with credentials that the API has issued."""
-        credentials = Credentials(issued["username"], issued["password"])
         if self.memory is None:
-            client = Client(issued["client_id"], credentials, port=issued["tcp"]["port"], on_message=on_message)
-            return client.open()
+            return connect_to_broker(issued, on_message=on_message)
+        credentials = Credentials(issued["username"], issued["password"])
         connection = self.memory.broker.connect(issued["client_id"], credentials, on_message=on_message)
         return cast("Client", connection)
 

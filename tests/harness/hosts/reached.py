@@ -10,7 +10,7 @@ from device_agent.protocol.security import signing
 from function_app import bootstrap, settings
 from tests.fakes.agent import Robot
 from tests.fakes.clock import MovingClock
-from tests.harness.cloud.cloud import API, Cloud
+from tests.harness.cloud.cloud import API, Cloud, connect_to_broker
 from tests.harness.hosts.host import PATIENCE_S, Host
 
 
@@ -21,6 +21,7 @@ class Reached:
         self.host = host
         self.clock = MovingClock()
         self._environment = environment
+        self.connect = connect_to_broker
 
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
         return httpx.request(method, self.host.url + path, timeout=PATIENCE_S, **options)

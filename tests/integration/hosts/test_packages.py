@@ -100,7 +100,7 @@ def test_the_package_for_aws_answers_and_reaches_its_store(for_aws: Path, moto: 
 def test_a_folder_that_is_not_empty_is_left_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine").touch()
     assert package_for_aws([str(tmp_path)]) == 1
-    assert capsys.readouterr().err == f"telescope: {tmp_path} is not empty; give a new folder\n"
+    assert capsys.readouterr().err == f"telescope: {tmp_path} is not empty; choose a new folder\n"
     assert [each.name for each in tmp_path.iterdir()] == ["mine"]
 
 

@@ -95,7 +95,7 @@ def test_a_joint_that_is_stuck_raises_a_fault_in_the_state_and_in_the_cloud(
     anna, robot = pair
     eventually(lambda: arm.heard(topics.TELE, Measurements, "health"))
     (tmp_path / "arm.toml").write_text('stuck = ["elbow"]')
-    eventually(lambda: arm.driver._fault_injector.seen != (0, 0))  # type: ignore[attr-defined]
+    eventually(lambda: arm.driver._fault_injector.version != (0, 0))  # type: ignore[attr-defined]
     elbow_rad = UR5.home_rad["elbow"]
     ack = arm.end(arm.command(MoveJoints(position_rad={"elbow": elbow_rad - 0.5}, speed=0.05), epoch=1))
     assert ack.status is AckStatus.FAILED
@@ -109,6 +109,6 @@ def test_a_joint_that_is_stuck_raises_a_fault_in_the_state_and_in_the_cloud(
     # It holds where it is, and may be moved again: the fault is not for ever.
     eventually(lambda: arm.heard(topics.STATE, State)[-1].mode is not Mode.FAULT)
     (tmp_path / "arm.toml").unlink()
-    eventually(lambda: arm.driver._fault_injector.seen == (0, 0))  # type: ignore[attr-defined]
+    eventually(lambda: arm.driver._fault_injector.version == (0, 0))  # type: ignore[attr-defined]
     ack = arm.end(arm.command(MoveJoints(position_rad={"elbow": elbow_rad - 0.2}, speed=0.5), epoch=2))
     assert ack.status is AckStatus.DONE

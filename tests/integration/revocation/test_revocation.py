@@ -83,7 +83,7 @@ def one_round(broker: RunningBroker, anna: Person, bert: Person, gate: Gate, cha
     robot, at = gate.robot, f"/devices/{gate.robot.device}/shares"
     assert anna.post(at, {"account": bert.name, "role": "operator"}).status_code == 201
     epoch = bert.take(robot.device, lease_ms=600_000).json()["epoch"]
-    page = connect(broker, bert, purpose="watch")
+    page = connect(broker, bert, purpose="view")
     stick = connect(broker, bert, purpose="control", device=robot.device, epoch=epoch)
     topic = f"{topics.ROOT}/{robot.space}/{robot.id}/{robot.names[0]}/{topics.CTL}/{epoch}"
     ended = threading.Event()

@@ -64,7 +64,7 @@ def test_who_unshares_while_the_broker_is_away_is_told_so_at_once_and_nothing_is
         epoch = bert.take(robot.device, lease_ms=600_000).json()["epoch"]
         running = bert.start(robot.device, epoch=epoch, wait_ms=10_000).json()["id"]
         held = [
-            request_credentials(bert, purpose="watch"),
+            request_credentials(bert, purpose="view"),
             request_credentials(bert, purpose="control", device=robot.device, epoch=epoch),
         ]
         site.broker.stop()
@@ -108,7 +108,7 @@ def test_a_broker_that_is_there_and_never_answers_holds_nobody_up(
     at = f"/devices/{robot.device}/shares"
     epoch = bert.take(robot.device, lease_ms=600_000).json()["epoch"]
     bert.start(robot.device, epoch=epoch, wait_ms=10_000)
-    page = connect(broker, bert, purpose="watch")
+    page = connect(broker, bert, purpose="view")
 
     async def never(*_: Any, **__: Any) -> None:
         await asyncio.Event().wait()
