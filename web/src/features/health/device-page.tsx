@@ -1,4 +1,4 @@
-/** How one device is: what is watched of it with its trend, and its faults from the first report to the end. */
+/** Health of one device: monitored fields with trends, and faults from the first report to the end. */
 import type { DeviceStore } from "../devices/model";
 import { shown } from "../sensors";
 import { type Quantity, quantityOf } from "../sensors/model";
@@ -175,7 +175,7 @@ interface FieldsProps {
   show: (stream: string, field: string) => void;
 }
 
-/** All that is watched: what it is now, what is usual, what is allowed; a press shows its trend. */
+/** All monitored fields: current, usual and permitted values; a click shows the trend. */
 function Fields({ device, fields, at, show }: FieldsProps) {
   const description = device.description.value;
   if (fields.length === 0) return null;

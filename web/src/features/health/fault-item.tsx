@@ -141,7 +141,7 @@ const PAGE = 200;
 const PAGES = 5;
 const SHOWN = 50;
 
-/** What the device and the cloud told in the minute before, during, and in the minute after; read when it is opened. */
+/** Messages from one minute before the fault to one minute after it; loaded when opened. */
 function Around({ api, device, fault }: Pick<FaultItemProps, "api" | "device"> & { fault: Fault }) {
   const [events, setEvents] = useState<readonly StoredEvent[] | null>(null);
   const [why, setWhy] = useState("");

@@ -1,4 +1,4 @@
-/** One measured field over hours, days, weeks: the stored series with its least and greatest, continued live. */
+/** One measured field over hours to weeks: the stored series with minimum and maximum, continued live. */
 import type { DeviceStore } from "../devices/model";
 import { Figure, HistoryCard, Limits, shown, useRecording } from "../sensors";
 import type { Quantity, Recording } from "../sensors/model";

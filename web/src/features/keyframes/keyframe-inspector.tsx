@@ -1,4 +1,4 @@
-/** The keyframe that is chosen: its time, where its joints are, and what is done there. */
+/** The selected keyframe: its time, joint positions and steps. */
 import { supports } from "./model/problems";
 import { JointSlider } from "../steering";
 import { Card } from "../../shared/ui/card";

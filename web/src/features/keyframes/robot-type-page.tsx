@@ -1,4 +1,4 @@
-/** The keyframe editor of a robot type, for who has no robot at hand: nothing moves but the drawing. */
+/** The keyframe editor of a robot type without a robot: only the drawing moves. */
 import { robotOf } from "./model/robot-of-type";
 import { useCallback, useMemo } from "preact/hooks";
 import type { Api } from "../../shared/api/client";

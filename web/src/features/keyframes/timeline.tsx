@@ -1,4 +1,4 @@
-/** Keyframes in time: markers that are dragged or moved by keys, and the preview's playhead above them. */
+/** The timeline: keyframe markers, moved by dragging or keys, and the preview's playhead. */
 import { stretchAll } from "./model/problems";
 import { Card } from "../../shared/ui/card";
 import { useRef } from "preact/hooks";

@@ -1,4 +1,4 @@
-/** How long things take: of all devices, or of one, where it can be measured here and now. */
+/** Latency of all devices, or of one, which can be probed. */
 import type { Account } from "../../shared/api/types";
 import { DevicePageFrame } from "../devices";
 import type { DeviceSession, DeviceStore, Fleet } from "../devices/model";

@@ -1,4 +1,4 @@
-/** Response times as the papers plot them, and their shares. Loaded only where they are looked at. */
+/** Response-time plots as in the papers, and their distribution. Loaded on demand. */
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
 import { format } from "../../shared/i18n/format";

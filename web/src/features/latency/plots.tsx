@@ -1,4 +1,4 @@
-/** The papers' plots: response times over samples, and beside them the share that was no slower. */
+/** The papers' plots: response times over samples, and the cumulative distribution. */
 import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Published } from "./model/published-figures";

@@ -1,4 +1,4 @@
-/** What may be written at a place of a script: the calls that the jail gives, and the names that the robot type has. */
+/** Completions for a script: calls of the sandbox API and names of the robot type. */
 import type { Completion, CompletionContext, CompletionResult } from "@codemirror/autocomplete";
 import { syntaxTree } from "@codemirror/language";
 import type { EditorState } from "@codemirror/state";

@@ -329,7 +329,7 @@ interface ProblemsProps {
   onGo: (place: Place) => void;
 }
 
-/** The same as the marks in the text, as a list: for who does not see or reach those. */
+/** The findings as a list, for users who cannot see or reach the marks in the text. */
 function Problems({ places, text, onGo }: ProblemsProps) {
   return (
     <section aria-label={texts.editor.problems}>

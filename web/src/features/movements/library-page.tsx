@@ -1,4 +1,4 @@
-/** All movements, robot type by robot type: find one, open it, begin a new one, delete one's own. */
+/** All movements by robot type: search, open, create, and delete own ones. */
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { useEffect, useId, useState } from "preact/hooks";

@@ -1,4 +1,4 @@
-/** What an operator may set for a movement, as fields; what is wrong stands beside each. */
+/** Parameter fields of a movement, each with its error. */
 import { useId, useMemo, useState } from "preact/hooks";
 import { storedParameters } from "../../shared/lib/local-storage";
 import type { ObjectSchema, Parameters } from "../../shared/api/movement-library";

@@ -1,4 +1,4 @@
-/** All versions of a movement: look at one, beside what is in the editor, and bring it back. */
+/** All versions of a movement: compare one with the editor, and restore it. */
 import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";

@@ -1,4 +1,4 @@
-/** Pairing an agent: by the code it shows or the link it prints, into a space; and then naming what has come. */
+/** Pairs an agent by its code or link with a space, then names its devices. */
 import type { Device, Space } from "../../shared/api/types";
 import { LastSeenAge, ReachChip, RenameDevice } from "../devices";
 import type { Fleet } from "../devices/model";
@@ -49,7 +49,7 @@ interface PairFormProps extends PairingPageProps {
   onPaired: (devices: readonly Device[]) => void;
 }
 
-/** Whatever a link says, nothing is claimed without a click. What was typed stays until it has come to something. */
+/** A link never claims a code without a click. Input stays until the pairing succeeds. */
 function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
   const linked = pairing.code.value;
   const [typed, setTyped] = useState(linked ?? "");

@@ -1,4 +1,4 @@
-/** Files of a robot type: dropped, or chosen as a folder, an archive or one by one. They stay until it is saved. */
+/** Selects robot type files: dropped, or chosen as folder, archive or single files. They stay until saved. */
 import { Card } from "../../shared/ui/card";
 import { useRef, useState } from "preact/hooks";
 import type { UploadDraft } from "./model/upload-draft";

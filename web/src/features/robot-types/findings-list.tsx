@@ -1,4 +1,4 @@
-/** What is wrong with a robot type, or worth knowing: where it stands, what it is, what to do. */
+/** Errors and warnings of a robot type: location, description and advice. */
 import { degrees } from "../../shared/lib/angles";
 import type { Finding } from "./model/parse-findings";
 import { format } from "../../shared/i18n/format";

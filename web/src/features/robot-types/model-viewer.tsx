@@ -1,4 +1,4 @@
-/** A robot type's model, moved by sliders: what it looks like, and how far each joint goes. */
+/** A robot type's model with a slider for the range of each joint. */
 import { useScene } from "../twin";
 import { Card } from "../../shared/ui/card";
 import { useEffect, useState } from "preact/hooks";

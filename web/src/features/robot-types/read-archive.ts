@@ -1,6 +1,6 @@
 /** Files from where people have them: a folder, an archive, or dropped. Only this knows the archives' library. */
 
-/** Nobody's robot type is larger, unpacked [bytes]; an archive that says so is not unpacked. */
+/** Maximum unpacked size [bytes]; larger archives are not unpacked. */
 const MOST_BYTES = 50_000_000;
 
 export class ArchiveError extends Error {

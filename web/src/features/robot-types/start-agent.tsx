@@ -1,4 +1,4 @@
-/** What comes after a type: an agent with a robot of it. */
+/** The next step after adding a robot type: start an agent with such a robot. */
 import { AgentCommands } from "../help";
 import { Card } from "../../shared/ui/card";
 import { texts } from "./texts";

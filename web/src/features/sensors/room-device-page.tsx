@@ -38,7 +38,7 @@ export function RoomDevicePage({ api, fleet, session, access }: RoomDeskProps) {
   const { device, control, actions } = session;
   const roomAction = useMemo(() => new RoomDeviceAction(api, device, actions, () => control.epoch), [api, device, actions, control]);
   useEffect(() => void roomAction.list(), [roomAction]);
-  // Somebody else may have captured something: the list is asked for anew whenever an action has ended.
+  // Another user may have captured files: reload the list after every action.
   const action = useComputed(() => device.state.value?.action?.id ?? null);
   useSignalEffect(() => {
     if (action.value === null) void roomAction.list();

@@ -295,7 +295,7 @@ function Mark({ place, device, label, left, top, receivedAt, index }: MarkProps)
   );
 }
 
-/** Where everybody was in the last half minute, on the page's clock. */
+/** Positions of robots and people in the last 30 s, on the page's clock. */
 function useTrails(perception: DeviceStore | null): { readonly current: ReadonlyMap<string, Trail> } {
   const trails = useRef(new Map<string, Trail>());
   useEffect(() => {

@@ -30,7 +30,7 @@ describe("a list of devices", () => {
     expect(matchesFilter(device({}), "Lab", 0, { ...ALL, whose: "mine" })).toBe(true);
   });
 
-  it("keeps what needs a look: by a fault that anybody found, or since it is not there", () => {
+  it("keeps what needs a look: by a fault, or because it is offline", () => {
     expect(matchesFilter(device({}), "Lab", 0, { ...ALL, onlyTrouble: true })).toBe(false);
     expect(matchesFilter(device({}), "Lab", 1, { ...ALL, onlyTrouble: true })).toBe(true);
     expect(matchesFilter(device({}, "stale"), "Lab", 0, { ...ALL, onlyTrouble: true })).toBe(true);

@@ -202,7 +202,7 @@ export class Control {
         return;
       }
       if (heard > epoch) {
-        this.#lose("Somebody else has control now.");
+        this.#lose("Another operator has control now.");
         return;
       }
       if (latest?.message.epoch === epoch) {

@@ -1,11 +1,11 @@
-/** How devices are: what is watched of them, and their faults from the first report to the end. */
+/** Device health: monitored fields, and faults from the first report to the end. */
 import type { DeviceStore, Reach } from "../../devices/model";
 import { type Quantity, quantityOf } from "../../sensors/model";
 import type { Fault, HealthState, Watched } from "../../../shared/api/health";
 import type { KnownDescription, KnownTelemetry } from "../../../shared/mqtt/parse-messages";
 import type { Fault as ReportedFault } from "../../../shared/mqtt/protocol.generated";
 
-/** A fault as the cloud has it and as the device says it now: where the two differ, that is shown. */
+/** A fault as stored in the cloud and as reported by the device; differences are shown. */
 export interface Standing {
   /** What the cloud has stored of it; `null`: only the device says so. */
   stored: Fault | null;
@@ -44,7 +44,7 @@ export function openCount(stored: readonly Pick<Fault, "source" | "code">[] | nu
   return stored.filter(({ source }) => source !== "device").length + told.length;
 }
 
-/** What is worse of what the cloud has judged and what the page sees of the device by itself. */
+/** The worse of the cloud's result and the page's own observation. */
 export function healthNow(stored: HealthState, told: readonly ReportedFault[] | null, reach: Reach): HealthState {
   if ((told?.length ?? 0) > 0) return "fault";
   if (stored === "ok" && (reach === "offline" || reach === "stale")) return "unknown";
@@ -78,7 +78,7 @@ const JOINTS = "joints";
 const OF_JOINTS = ["position_rad", "velocity_rad_s", "effort_nm"] as const;
 const LOOP_AGE = "loop_age_ms";
 
-/** The newest of a field that this page has heard from the device; `null` before the first. */
+/** The newest value of a field from the device; `null` before the first. */
 export function newestOf(device: DeviceStore, stream: string, field: string): Newest | null {
   const message = stream === JOINTS ? device.telemetry.value?.message : device.measured(stream).value?.message;
   if (message === undefined) return null;

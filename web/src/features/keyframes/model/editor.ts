@@ -1,4 +1,4 @@
-/** One movement that is being edited: its changes, what is chosen, the preview, and the draft that outlives the page. */
+/** Editor state of one movement: changes, selection, preview, and the draft that persists after the page closes. */
 import { plan, poseAt } from "./plan";
 import { problems } from "./problems";
 import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";

@@ -20,7 +20,7 @@ export interface Place {
   yaw_rad?: number;
 }
 
-/** What is done where a keyframe is reached, one after the other in this order, while time stands still. */
+/** Steps at a keyframe, executed in this order while the movement pauses. */
 export interface KeyframeActions {
   posture?: string;
   behaviour?: string;
@@ -137,7 +137,7 @@ export function hasAction(keyframe: KeyframeActions): boolean {
   return ACTION_KINDS.some((deed) => keyframe[deed] !== undefined);
 }
 
-/** A keyframe in time: between its neighbours, or with all that follows (`shifting`). The first one is at 0. */
+/** Moves a keyframe in time between its neighbours, or with all later ones (`shifting`). The first one stays at 0. */
 export function setTime(movement: Movement, index: number, time: number, shifting: boolean): Movement {
   const { keyframes } = movement;
   const before = keyframes[index - 1];

@@ -6,7 +6,7 @@ import { ACTION_KINDS, type ActionKind, type Movement, type Robot, LONGEST_S, SH
 
 // ---------------------------------------------------------------- checks
 
-/** What is wrong at one keyframe, and what mends it. A `warning` runs all the same. */
+/** A problem at one keyframe, and its fix. A `warning` does not prevent running. */
 export interface Problem {
   severity: "error" | "warning";
   keyframe: number;

@@ -1,4 +1,4 @@
-/** What a robot did, as its telemetry told it, and as few keyframes that come near enough to it. */
+/** A recording of telemetry, and its approximation by few keyframes. */
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 import { startAtZero, poseOf, normalize, type Keyframe, type Movement, type Positions, type Robot } from "./keyframes";
 import type { KnownEvent, KnownTelemetry } from "../../../shared/mqtt/parse-messages";
@@ -119,7 +119,7 @@ function pairs(list: readonly number[]): [number, number][] {
   return list.slice(1).map((one, index) => [list[index] ?? 0, one]);
 }
 
-/** How far a sample is from the line between two others, in the joint that is furthest from it [rad]. */
+/** Maximum joint distance of a sample from the line between two others [rad]. */
 function offLine(samples: readonly Sample[], begin: number, end: number, index: number): number {
   const [from, to, one] = [samples[begin], samples[end], samples[index]];
   if (from === undefined || to === undefined || one === undefined) return 0;
@@ -130,7 +130,7 @@ function offLine(samples: readonly Sample[], begin: number, end: number, index: 
   }, 0);
 }
 
-/** Keyframes that come as near as `toleranceRad` to what was recorded. Joints that did not move are named once. */
+/** Keyframes within `toleranceRad` of the recording. Joints without motion occur once. */
 export function keyframesOf(take: Recording, toleranceRad: number, robot: Robot): Keyframe[] {
   const { samples } = take;
   if (samples.length === 0) return [];

@@ -52,7 +52,7 @@ function literal({ time_s, position_rad, ...deeds }: Keyframe): string {
 
 export type ParsedScript = { kind: "keyframes"; movement: Movement } | { kind: "changed" } | { kind: "other" };
 
-/** `changed`: it has keyframes and more than the editor writes. `other`: it never was the editor's. */
+/** `changed`: keyframes with manual edits. `other`: not written by the editor. */
 export function readScript(source: string): ParsedScript {
   const lines = source.split("\n");
   const begin = lines.indexOf(OPENS);

@@ -1,4 +1,4 @@
-/** How long things take: the stored samples of operators, agents and the cloud, and what they come to. */
+/** Latency statistics from the stored samples of operators, agents and the cloud. */
 import type { Path, Sample, StoredLatency, Transport } from "../../../shared/api/latency";
 import { percentile } from "./round-trip";
 
@@ -84,7 +84,7 @@ export function distribution(samples: readonly Sample[]): [ms: number[], share: 
   return [ends, ends.map((ms) => (sorted.findLastIndex((one) => one <= ms) + 1) / sorted.length)];
 }
 
-/** A table for other programs, of exactly what is drawn: one row for each sample, after one of names. */
+/** CSV export of the displayed samples: a header row, then one row per sample. */
 export function csv(lines: readonly Line[], label: (device: string) => string): string {
   const rows = lines.flatMap((line) =>
     line.samples.map(({ atMs, ms }) => [line.device, label(line.device), line.transport, line.path, new Date(atMs).toISOString(), String(ms)]),
@@ -92,7 +92,7 @@ export function csv(lines: readonly Line[], label: (device: string) => string): 
   return [["device", "label", "transport", "path", "at", "ms"], ...rows].map((row) => row.map(cell).join(",") + "\r\n").join("");
 }
 
-/** As RFC 4180; what a spreadsheet would take for a formula is no name of ours, and is quoted into text. */
+/** Quotes a field as in RFC 4180; text that a spreadsheet would read as a formula is escaped. */
 function cell(text: string): string {
   const safe = /^[=+\-@\t]/.test(text) ? `'${text}` : text;
   return /[",\r\n']/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;

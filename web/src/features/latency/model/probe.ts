@@ -1,4 +1,4 @@
-/** Measuring here and now, by requests that move nothing: one after the other, each on this page's clock alone. */
+/** Measures latency now by sequential requests without motion, on this page's clock. */
 import type { LatencyBatch } from "../../../shared/api/types";
 import type { DeviceStore } from "../../devices/model";
 import type { Sample } from "../../../shared/api/latency";

@@ -1,4 +1,4 @@
-/** What the papers that this system follows have printed of their own response times, to hold one's own beside. */
+/** Response times published in the papers, for comparison. */
 import type { Path } from "../../../shared/api/latency";
 
 /** One published figure. Nothing here was measured by this page. */

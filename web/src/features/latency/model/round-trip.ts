@@ -1,4 +1,4 @@
-/** The time from sending a setpoint to seeing the telemetry that answers it, on one clock: this page's. */
+/** Time from sending a setpoint to the telemetry that echoes it, on this page's clock. */
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 
 export interface RoundTripFigures {
@@ -29,7 +29,7 @@ export class RoundTrip {
     return this.#figures;
   }
 
-  /** Telemetry names a setpoint of ours. Counts once for each sequence, at its first telemetry. */
+  /** Telemetry echoes a setpoint of this page. Each sequence number counts once. */
   seen(sequence: number, sentMs: number, nowMs: number): void {
     const tookMs = nowMs - sentMs;
     if (sequence <= this.#lastSequence || tookMs < 0) return;

@@ -1,4 +1,4 @@
-/** Times that this page has measured, on their way to the cloud: in batches, seldom, and none twice. */
+/** Uploads this page's latency samples in infrequent batches, each once. */
 import type { LatencyBatch } from "../../../shared/api/types";
 import { effect } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
@@ -44,7 +44,7 @@ export class LatencySamples {
     });
   }
 
-  /** Send what there is; what could not be sent goes again, as it was, with the next. */
+  /** Sends the pending samples; a failed batch is sent again unchanged. */
   async send(): Promise<void> {
     if (this.#sending) return;
     this.#sending = true;

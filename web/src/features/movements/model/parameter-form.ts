@@ -1,4 +1,4 @@
-/** A movement's parameters as fields of a form: text in, values out, and what is wrong with each. */
+/** Form fields for a movement's parameters: converts text to values, with an error per field. */
 import { degrees, radians } from "../../../shared/lib/angles";
 import type { ObjectSchema, Parameters, Schema } from "../../../shared/api/movement-library";
 
@@ -56,7 +56,7 @@ export function fill(fields: readonly Field[], used: Parameters = {}): Filled {
   return Object.fromEntries(fields.map((field) => [field.name, startText(field, used[field.name])]));
 }
 
-/** The values of a form. A field that is empty and need not be filled is left out: the script's own default counts. */
+/** The values of a form. Empty optional fields are omitted, so that the script's default applies. */
 export function read(fields: readonly Field[], filled: Filled): Read {
   const values: Parameters = {};
   const wrong: Record<string, Wrong> = {};

@@ -6,7 +6,7 @@ import { MovementChanged, type Library, type Movement, type MovementSource } fro
 
 export type Loading = { kind: "loading" } | { kind: "there" } | { kind: "failed"; why: string };
 
-/** Somebody has saved meanwhile; `theirs` is `null` where the movement has been deleted. */
+/** Another user saved meanwhile; `theirs` is `null` if the movement was deleted. */
 export interface Conflict {
   theirs: MovementSource | null;
 }
@@ -101,7 +101,7 @@ export class ScriptDraft {
     }
   }
 
-  /** Save this text as the newest, over what others have saved: theirs stays among the versions. */
+  /** Saves this text as the newest version; versions of other users remain in the list. */
   async saveOver(): Promise<boolean> {
     this.#basedOn = this.#conflict.value?.theirs?.version ?? 0;
     this.#conflict.value = null;
@@ -120,7 +120,7 @@ export class ScriptDraft {
     this.#basedOn = saved.version;
     this.#conflict.value = null;
     this.#restored.value = null;
-    // Somebody may have written on while it was saved.
+    // The user may have edited the text during the save.
     this.#keep();
   }
 

@@ -1,4 +1,4 @@
-/** Places in a script: the server counts characters, an editor the units of UTF-16. */
+/** Converts script positions: the server counts characters, the editor UTF-16 units. */
 import type { Mark } from "../../../shared/api/movement-library";
 
 export interface Place {

@@ -6,7 +6,7 @@ const KEY = "telescope.pair";
 /** The agent's alphabet has no vowels and nothing that looks like a digit. */
 const CODE = /^[BCDFGHJKLMNPQRSTVWXZ]{8}$/;
 
-/** As the server takes it, `BCDF-GHJK`; `null` for what is none. Small letters, blanks and hyphens are forgiven. */
+/** Normalizes a code to `BCDF-GHJK`; `null`: invalid. Accepts lower case, spaces and hyphens. */
 export function readCode(typed: string): string | null {
   const code = typed.toUpperCase().replace(/[^A-Z0-9]/g, "");
   return CODE.test(code) ? `${code.slice(0, 4)}-${code.slice(4)}` : null;

@@ -1,4 +1,4 @@
-/** What a check has found wrong, taken apart: which file, which line, what kind, so that a page can say what to do. */
+/** Parses validation errors into file, line and kind, so that the page can give advice. */
 
 export type FindingKind =
   | "range"
@@ -76,7 +76,7 @@ export function readFinding(error: string): Finding {
   };
 }
 
-/** All that was found, by file; of one file by line. What is about no file comes first. */
+/** All findings, sorted by file and line. Findings without a file come first. */
 export function readFindings(errors: readonly string[]): Finding[] {
   const found = errors.map(readFinding);
   return found.sort((one, other) => one.file.localeCompare(other.file) || (one.line ?? 0) - (other.line ?? 0));

@@ -1,4 +1,4 @@
-/** A robot type on its way: files that stay until it is saved, and what the server's checkers make of them. */
+/** A robot type upload: its files until saved, and the server's validation results. */
 import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import { now } from "../../../shared/lib/clock";
 import { readFindings, type Finding } from "./parse-findings";

@@ -34,7 +34,7 @@ export class ShareList {
   readonly ended: ReadonlySignal<Share | null> = this.#ended;
   /** What of that end is still under way, in the server's words; empty where nothing is. */
   readonly rest: ReadonlySignal<string> = this.#rest;
-  /** Somebody may redeem one at any time: the lists are worth asking for again. */
+  /** Whether invitations are open, which can be redeemed at any time, so that the lists need polling. */
   readonly waits = computed(() => this.#invitations.value.length > 0);
 
   constructor(api: Api, target: Target) {

@@ -2,7 +2,7 @@
 
 export type Values = Readonly<Record<string, number | boolean>>;
 
-/** Somebody in the room, at the moment of the measurement. */
+/** A robot or person in the room at the time of the measurement. */
 export interface Place {
   /** A robot's name at its agent, or `person`, `person-2`. */
   name: string;

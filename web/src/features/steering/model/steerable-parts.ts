@@ -13,7 +13,7 @@ export function steeringModesOf(description: KnownDescription | null): SteeringM
   if (description === null) return [];
   const ways: SteeringMode[] = [];
   if (description.joints.length > 0) ways.push("joints");
-  // Whoever brings a frame to a pose can also move it along: both need the robot's shape.
+  // A robot that can move a frame to a pose can also jog it: both need its kinematics.
   if (description.actions.includes("move_pose") && description.frames.length > 0) ways.push("jog");
   if (description.base !== null) ways.push("drive");
   return ways;
