@@ -1,4 +1,4 @@
-"""``device_agent run``, whose broker is reached through another port and whose watchdog may be set wrong."""
+"""``device_agent run`` with another broker port and a configurable watchdog time."""
 
 import sys
 from typing import Any

@@ -1,8 +1,8 @@
-"""An operator's page without the page: takes control, streams setpoints and gives up by the rules of ``web/src/core``.
+"""An operator without a browser: takes control and streams setpoints by the rules of the console.
 
-``python -m tests.faults.console`` is a warm parent: each line that it reads (JSON, see ``Seat``) becomes an operator, a
-fork of itself, whose process id it answers with. An operator obeys lines over the Unix socket it was given, ``take``,
-``sweep`` and ``rest``, and says there what happens to it: ``held``, ``moving``, ``lost``, ``ended``.
+``python -m tests.faults.console`` is a warm parent process. For each input line (JSON, see ``Seat``) it forks an operator
+and prints the process id. An operator receives the orders ``take``, ``sweep`` and ``rest`` over its Unix socket, and
+sends the events ``held``, ``moving``, ``lost`` and ``ended``.
 """
 
 import contextlib
@@ -30,21 +30,21 @@ ABANDON_S = 1.0
 RETRY_S = 1.0
 _BACK_OFF_S = 0.25
 _NEAR_RAD = 0.3
-"""This close to one end of its way the operator turns to the other, so that the arm is hardly ever at rest."""
+"""Distance to an end of the range at which the operator reverses, so that the arm rarely rests."""
 _MOVING_RAD_S = 0.3
 
 
 class Seat(msgspec.Struct):
-    """Where an operator sits.
+    """Configuration of one operator process.
 
     Attributes:
         socket: Path of the Unix socket of the test that controls it.
-        api: The API's address.
+        api: Address of the API.
         token: Access token.
-        mqtt_port: Where it reaches the broker.
-        device: Its device's id.
+        mqtt_port: Port of the broker.
+        device: Id of the device.
         joint: Index of the joint that it moves, between ``low_rad`` and ``high_rad``.
-        stubborn: A page whose clock is broken: streams on after its lease has run out.
+        stubborn: Whether it streams on after its lease has expired, like a page with a wrong clock.
     """
 
     socket: str
@@ -62,7 +62,7 @@ class Seat(msgspec.Struct):
 
 
 class Link:
-    """One connection to the broker that comes back after a loss with new credentials, until it is closed."""
+    """A connection to the broker that reconnects with new credentials until it is closed."""
 
     def __init__(self, seat: Seat, obtain: Callable[[], dict[str, Any]], hear: Callable[[str, bytes], None]) -> None:
         self._seat = seat
@@ -118,7 +118,7 @@ def _send_at_once(_client: paho.Client, _userdata: Any, opened: Any) -> None:
 
 
 class Operator:
-    """One person before one device."""
+    """An operator of one device."""
 
     def __init__(self, seat: Seat) -> None:
         self.seat = seat
@@ -165,7 +165,7 @@ class Operator:
     # ------------------------------------------------------------ orders
 
     def take(self) -> None:
-        """Take control; a lease that may be left is given up first."""
+        """Release a remaining lease and take control."""
         if self.epoch is not None:
             self._lose("taken again", tell=False)
         asked_s = time.monotonic()
@@ -185,7 +185,7 @@ class Operator:
         self._tell(held=epoch, confirmed=granted["confirmed"])
 
     def sweep(self) -> None:
-        """Drag the slider to and fro."""
+        """Sweep the slider between both ends."""
         seen = self._seen
         if self.epoch is None or seen is None:
             self._tell(ended="blind")
@@ -196,7 +196,7 @@ class Operator:
         self._sweeping, self._told = True, False
 
     def rest(self) -> None:
-        """Let the slider go."""
+        """Release the slider."""
         self._sweeping = False
 
     # ------------------------------------------------------------ the page's rules
@@ -271,7 +271,7 @@ class Operator:
             if self.epoch == epoch:
                 self._renewed(granted, asked_s)
         except ValueError:
-            self._renew_s = float("inf")  # refused; what the robot says of it decides
+            self._renew_s = float("inf")  # rejected; the robot's state decides
         except requests.RequestException:
             self._renew_s = time.monotonic() + RETRY_S
 
@@ -292,7 +292,7 @@ class Operator:
         self._sweeping = False
         self._tell(ended=why)
 
-    # ------------------------------------------------------------ wires
+    # ------------------------------------------------------------ connections
 
     def _heard(self, topic: str, payload: bytes) -> None:
         if topic.endswith("/tele/joints"):

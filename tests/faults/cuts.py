@@ -42,12 +42,12 @@ _ON_THE_WAY_MS = 200.0
 _LOOK_MS = 400.0
 _WORTH_TELLING_MS = 10.0
 _UNDER_WAY_S = 0.4
-"""What a script's first move takes to be in full swing."""
+"""Time until the first move of a script is at speed [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """One arm at one cut."""
+    """The result of one arm at one cut."""
 
     cut: str
     arm: str
@@ -56,11 +56,11 @@ class Result:
 
 @dataclass
 class Tally:
-    """Everything that was seen.
+    """Results of all cuts.
 
     Attributes:
-        cuts: How often each was made with something in motion.
-        spoilt: Rounds in which nothing moved when the cut came: not counted, made again.
+        cuts: Number of cuts of each kind with an arm in motion.
+        spoilt: Rounds without motion at the cut; they are repeated.
     """
 
     results: list[Result] = field(default_factory=list)
@@ -116,7 +116,7 @@ class Arm:
         self.kind = (0, False)
 
     def sit(self, lease_ms: int = LEASE_MS, *, stubborn: bool = False) -> Console:
-        """An operator of this kind, a new one where the last is of another or is gone."""
+        """Return an operator of this kind; start a new one if needed."""
         if self.console is None or self.kind != (lease_ms, stubborn):
             self.leave()
             self.console = self.stack.console(self.name, lease_ms=lease_ms, stubborn=stubborn)
@@ -129,7 +129,7 @@ class Arm:
             self.console = None
 
     def set_in_motion(self, lease_ms: int = LEASE_MS, *, stubborn: bool = False) -> bool:
-        """Take control and sweep; whether it moves."""
+        """Take control and sweep. Returns True if the arm moves."""
         deadline_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline_s:
             console = self.sit(lease_ms, stubborn=stubborn)
@@ -151,7 +151,7 @@ class Arm:
         return False
 
     def run_script(self) -> bool:
-        """Have a script sweep the arm; whether it runs."""
+        """Sweep the arm by a script. Returns True if the script runs."""
         device = f"/devices/{self.stack.agent_id}-{self.name}"
         try:
             epoch = self.stack.post(f"{device}/lease", lease_ms=LEASE_MS, wait_ms=2_000)["epoch"]
@@ -163,21 +163,21 @@ class Arm:
         return bool(action["status"] == "started")
 
     def verdict(self, cut: str, cut_ms: float, since_ms: float, *, begin_ms: float | None = None) -> Verdict:
-        """Of what happened until now; ``begin_ms``: when it last moved freely, where that is not the cut."""
+        """Judge the motion until now; ``begin_ms`` is the time of the last free motion if it is not the cut."""
         end_ms, begin_ms = now_ms(), cut_ms if begin_ms is None else begin_ms
         rows = [row for row in self.record.read() if begin_ms - _LOOK_MS <= row.tick_ms <= end_ms]
         self.record.forget(end_ms - _LOOK_MS)
         return judge(rows, cut_ms=cut_ms, since_ms=since_ms, watched=cut in WATCHED)
 
     def last_setpoint_ms(self, cut_ms: float) -> float:
-        """When the agent was given the last one that was sent before the cut."""
+        """Time at which the agent received the last setpoint sent before the cut."""
         given = self.stack.setpoints[self.name]
         self.stack.setpoints[self.name] = given[-200:]
         return max((at_ms for at_ms in given if at_ms <= cut_ms + _ON_THE_WAY_MS), default=cut_ms)
 
 
 class Bench:
-    """Makes rounds, and counts."""
+    """Runs rounds and counts the results."""
 
     def __init__(self, stack: Stack, *, seed: int) -> None:
         self.stack = stack
@@ -191,7 +191,7 @@ class Bench:
             arm.record.close()
 
     def one_by_one(self, rounds: int) -> None:
-        """Every arm by itself, all at the same time: so many rounds each."""
+        """Run this number of rounds on each arm in parallel."""
         chances = [random.Random(self.chance.random()) for _ in self.arms]
 
         def work(arm: Arm, chance: random.Random) -> None:
@@ -205,7 +205,7 @@ class Bench:
                 done.result()
 
     def together(self, cut: str) -> None:
-        """One cut for all arms."""
+        """Make one cut that affects all arms."""
         while not self.tally.add(cut, self._round_of_all(cut)):
             pass
 
@@ -264,14 +264,14 @@ class Bench:
         mend()
         time.sleep(0.6)
         begin_ms = cut_ms
-        if cut == "agent stopped":  # nothing moved while it was; from its waking on it has to know better
+        if cut == "agent stopped":  # the stopped agent did not move; the limit counts from its resumption
             cut_ms, since_ms = mended_ms, dict.fromkeys(since_ms, mended_ms)
         return [
             Result(cut, arm.name, arm.verdict(cut, cut_ms, since_ms[arm.name], begin_ms=begin_ms)) for arm in self.arms
         ]
 
     def _since_ms(self, arm: Arm, cut: str, cut_ms: float) -> float:
-        """From when on nothing gave the arm the right to move."""
+        """Time from which the arm had no permission to move."""
         if cut.startswith("functions"):
             grants = [at_ms for at_ms in self.stack.commands[arm.name] if at_ms <= cut_ms + _ON_THE_WAY_MS]
             return max(grants) + SHORT_LEASE_MS
@@ -320,4 +320,4 @@ class Bench:
 
 
 def mends_itself() -> None:
-    """It mends itself."""
+    """No repair is needed."""

@@ -1,4 +1,4 @@
-"""Judges, by the simulation's own record, whether an arm came to rest in time and stayed there."""
+"""Judges from the simulation trace whether an arm came to rest in time and stayed at rest."""
 
 import json
 import math
@@ -9,20 +9,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 MOST_MS = 350.0
-"""From the last setpoint that reached the agent (or from what else lets it move) to zero commanded velocity."""
+"""Limit [ms] from the last setpoint (or other permission to move) to zero commanded velocity."""
 _STILL_RAD = 1e-8
-"""Between two lines of the record, 10 ms: below any velocity that a controller commands."""
+"""Change between two rows of 10 ms that counts as rest, below any commanded velocity."""
 _REST_ROWS = 10
-"""A tenth of a second: turning back passes through zero, and a control loop that is late stands still for a moment."""
+"""Duration of rest: a reversal passes through zero, and a late control loop pauses shortly."""
 _ROW_MS = 20.0
-"""Lines come every 10 ms; a longer gap is a time in which the agent's process did not run."""
+"""Rows are due every 10 ms; in a longer gap the agent's process did not run."""
 _LET_GO_RAD_S = 0.03
 _LET_GO_AFTER_MS = 140.0
-"""Braking begins later than this. Who hardly moves by then has let the slider go: control stays, and may be used."""
+"""Braking starts later than this. An arm that hardly moves by then had its slider released."""
 
 
 class Row(NamedTuple):
-    """One line of the record: time on the machine's monotonic clock, and where the arm is commanded to be."""
+    """One row of the trace: monotonic time and commanded positions."""
 
     tick_ms: float
     target_rad: tuple[float, ...]
@@ -30,16 +30,16 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What one cut did to one arm.
+    """Effect of one cut on one arm.
 
     Attributes:
-        speed_rad_s: Fastest commanded joint at the cut.
-        rest_ms: From the reference to the first line of rest; infinite where there was none.
-        cut_ms: The same from the cut.
-        starved_ms: Time in between in which the control loop did not get to run: lines that are late, or that have no
-            new command though the arm moves (one is due every 8 ms). The machine's fault, not the agent's.
-        moved_again: Whether anything was commanded to move after rest.
-        let_go: Whether it hardly moved any more when braking would have begun.
+        speed_rad_s: Speed of the fastest commanded joint at the cut.
+        rest_ms: Time from the reference to the first row of rest; infinite without rest.
+        cut_ms: Time from the cut to the first row of rest.
+        starved_ms: Time in which the control loop was not scheduled: late rows, or rows without a
+            new command of a moving arm (due every 8 ms). A property of the machine, not of the agent.
+        moved_again: Whether a motion was commanded after rest.
+        let_go: Whether the arm hardly moved when braking would have started.
     """
 
     speed_rad_s: float
@@ -55,7 +55,7 @@ class Verdict:
 
     @property
     def kept(self) -> bool:
-        most_ms = MOST_MS + self.starved_ms + (_ROW_MS if self.starved_ms else 0.0)  # which is known to a line or two
+        most_ms = MOST_MS + self.starved_ms + (_ROW_MS if self.starved_ms else 0.0)  # known to one or two rows
         return self.rest_ms <= most_ms and not self.moved_again
 
 
@@ -85,7 +85,7 @@ def judge(rows: list[Row], *, cut_ms: float, since_ms: float, watched: bool = Tr
 
 
 class Record:
-    """A trace file, read as it grows."""
+    """Reader of a growing trace file."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb")
@@ -110,7 +110,7 @@ class Record:
 
 
 def share(values: Iterable[float], part: float) -> float:
-    """The value below which ``part`` of them lie."""
+    """The quantile ``part`` of the values."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, math.ceil(part * len(ordered)) - 1)] if ordered else math.nan
 
@@ -125,7 +125,7 @@ def _same(one: Row, other: Row) -> bool:
 
 
 def _starved(rows: list[Row]) -> float:
-    """Of rows that end with the first of rest."""
+    """Starved time in rows that end with the first row of rest."""
     total_ms = 0.0
     for row, later in pairwise(rows[:-1]):
         gap_ms = later.tick_ms - row.tick_ms

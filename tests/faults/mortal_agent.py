@@ -1,11 +1,11 @@
-"""A real device, office, executor and journal over a toy arm, in processes that kill themselves at any step.
+"""A real device with a fake arm, in processes that kill themselves at any step.
 
-``python -m tests.faults.mortal_agent`` is a warm parent: each line that it reads is one life (JSON, see ``Life``),
-which it leads in a fork of itself and answers with the exit status. A step is what a ``kill -9`` can fall between: a
-write to the journal, a message published, a move begun.
+``python -m tests.faults.mortal_agent`` is a warm parent process. Each input line is one run (JSON, see ``Life``). The
+parent executes it in a fork and prints the exit status. A step is a write to the journal, a published message or the
+start of a move; a ``kill -9`` can occur between steps.
 
-A life appends to files that outlive it: ``heard`` has every answer that was published, a line each; ``moved`` every
-move that the arm was really told to make, by the command's number, with the cloud's time of that moment.
+A run appends to files that persist: ``heard`` contains each published acknowledgement, one per line; ``moved`` each
+move of the arm, with the number of the command and the cloud time.
 """
 
 import json
@@ -38,7 +38,7 @@ from tests.harness.agent.pinned_keys import pinned_keys_of
 from tests.harness.agent.sandbox import LateSandbox
 
 TARGET_RAD = 1e-4
-"""The elbow's target [rad] times this is the number of the command that moved it: so each move says whose it is."""
+"""Factor from the elbow's target [rad] to the number of the command, so that each move identifies its command."""
 SPACE, AGENT, DEVICE = "s", "a", "arm"
 _GIVE_UP_S = 60.0
 _LINK_LOST = 0.03
@@ -46,15 +46,15 @@ _UNHEARD = 0.25
 
 
 class Life(msgspec.Struct):
-    """One life of the agent.
+    """One run of the agent process.
 
     Attributes:
-        folder: Where journal, ``heard`` and ``moved`` are.
+        folder: Folder of the journal, ``heard`` and ``moved``.
         key: The cloud's private key, base64.
-        dies_at: The step instead of which it is killed; ``None``: lives on until everything has an end.
-        cloud_ms: The cloud's time at its start; has nothing to do with this machine's.
-        seed: Of what the link does.
-        orders: Command bodies in the order in which they arrive, some several times.
+        dies_at: Step at which the process is killed; ``None``: runs until all commands have ended.
+        cloud_ms: Cloud time at the start; independent of the machine's clock [ms].
+        seed: Seed of the simulated link.
+        orders: Command bodies in order of arrival, with duplicates.
     """
 
     folder: str
@@ -66,7 +66,7 @@ class Life(msgspec.Struct):
 
 
 class Steps:
-    """Counts, and kills at the chosen one."""
+    """Counts steps and kills the process at the chosen one."""
 
     def __init__(self, dies_at: int | None) -> None:
         self._dies_at = dies_at
@@ -77,11 +77,11 @@ class Steps:
         with self._lock:
             if self._dies_at is not None and self.count >= self._dies_at:
                 os.kill(os.getpid(), signal.SIGKILL)
-                time.sleep(_GIVE_UP_S)  # the signal is on its way; nothing may follow
+                time.sleep(_GIVE_UP_S)  # wait for the signal; no further step may run
             self.count += 1
 
     def around(self, owner: Any, name: str) -> Any:
-        """A patch that makes a call a step on either side."""
+        """A patch that counts a step before and after a call."""
         real = getattr(owner, name)
 
         def stepping(*arguments: Any, **options: Any) -> Any:
@@ -94,7 +94,7 @@ class Steps:
 
 
 class Ledger:
-    """A file to append to, whole lines only; what was written survives the kill of the process."""
+    """An append-only file of whole lines; written lines survive a kill of the process."""
 
     def __init__(self, path: Path) -> None:
         self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
@@ -105,7 +105,7 @@ class Ledger:
 
 
 class Body:
-    """The device of one life."""
+    """The device of one run."""
 
     def __init__(self, life: Life) -> None:
         self.life = life
@@ -177,7 +177,7 @@ class Body:
         retain: bool = False,
         delivered: Callable[[], None] | None = None,
     ) -> bool:
-        """A broker that now and then does not confirm; measurements go nowhere."""
+        """A transport that sometimes does not acknowledge, and drops measurements."""
         del qos, retain
         if topics.parse(topic).kind != topics.ACK:
             return True
@@ -193,7 +193,7 @@ class Body:
 
 
 def swift() -> Any:
-    """A toy arm that is there at once: a thousand lives are to take minutes."""
+    """A fake arm that reaches each target at once, so that a thousand runs take minutes."""
     slow = robot_type()
     joints = tuple(
         msgspec.structs.replace(

@@ -1,4 +1,4 @@
-"""The whole product in processes that can be cut off, frozen and killed one by one: several arms behind one agent."""
+"""The whole product with several arms, in processes that can be disconnected, frozen or killed one by one."""
 
 import contextlib
 import json
@@ -39,12 +39,12 @@ while True:
 
 
 def now_ms() -> float:
-    """The clock of the record: monotonic, one for all processes of this machine."""
+    """Monotonic clock of the trace, shared by all processes of the machine [ms]."""
     return time.monotonic() * 1000
 
 
 class Console:
-    """One operator's process, and what it says."""
+    """An operator process and its messages."""
 
     def __init__(self, process: int, listener: socket.socket, proxy: Proxy) -> None:
         self.process = process
@@ -55,12 +55,12 @@ class Console:
         self._torn = b""
 
     def order(self, what: str) -> None:
-        """Raises: OSError: It is dead."""
+        """Raises: OSError: The process has exited."""
         self.said.clear()
         self._line.sendall(what.encode() + b"\n")
 
     def hear(self, *kinds: str, within_s: float) -> dict[str, Any] | None:
-        """The first thing of one of these kinds that it says after the last order."""
+        """The first message of one of these kinds after the last order."""
         deadline_s = time.monotonic() + within_s
         while True:
             found = next((each for each in self.said if set(kinds) & set(each)), None)
@@ -82,17 +82,17 @@ class Console:
 
 
 class Stack:
-    """Started processes. ``start`` gives one.
+    """The started processes; see ``start``.
 
     Attributes:
-        AGENT: The program that is the agent.
+        AGENT: Module of the agent program.
     """
 
     AGENT = "tests.faults.agent"
 
     def __init__(self, kind: BrokerKind, arms: int, *, watchdog_s: float) -> None:
         self.names = [f"arm{number}" for number in range(arms)]
-        self.home = Path(tempfile.mkdtemp(prefix="ts-"))  # a Unix socket's path has a hundred characters at most
+        self.home = Path(tempfile.mkdtemp(prefix="ts-"))  # the path of a Unix socket has at most 108 bytes
         self.port = free_ports()
         self.setpoints: dict[str, list[float]] = defaultdict(list)
         self.commands: dict[str, list[float]] = defaultdict(list)
@@ -141,23 +141,23 @@ class Stack:
         self.agent_id = self.post("/agents/claim", code=said[said.index("code") + 1])["agent"]
         self.agent = self._child("agent", self.AGENT, *self.agent_arguments(self.agent_mqtt.port))
         self.agent.wait_for_line("running", PATIENCE_S)
-        with contextlib.suppress(PermissionError):  # what moves metal goes before what only talks, where one may say so
+        with contextlib.suppress(PermissionError):  # raise the priority of the agent's control loop, if permitted
             os.setpriority(os.PRIO_PGRP, self.pid(self.agent), _AGENT_NICE)
         wait_until(lambda: all(each["online"] for each in self.devices()), "the arms to be online", PATIENCE_S)
         (self.space,) = {each["topic"].split("/")[2] for each in self.devices()}
 
     def agent_arguments(self, mqtt_port: int) -> list[str]:
-        """Of the agent's program, that is to find the broker there."""
+        """Command line of the agent with this broker port."""
         return [str(mqtt_port), str(self._watchdog_s), *self._agent_home, "--trace", str(self.trace)]
 
-    # ------------------------------------------------------------ for the bench
+    # ------------------------------------------------------------ operations
 
     def devices(self) -> list[dict[str, Any]]:
         found: list[dict[str, Any]] = self.http.get("/devices").json()["items"]
         return found
 
     def post(self, path: str, **body: Any) -> dict[str, Any]:
-        """Raises: httpx.HTTPError: Refused or not reached."""
+        """Raises: httpx.HTTPError: Rejected or unreachable."""
         answer = self.http.post(path, json=body)
         answer.raise_for_status()
         found: dict[str, Any] = answer.json()
@@ -172,7 +172,7 @@ class Stack:
         wait_until(well, "the functions to be well", PATIENCE_S)
 
     def console(self, name: str, *, lease_ms: int, stubborn: bool) -> Console:
-        """A new operator before this arm."""
+        """A new operator of this arm."""
         path = self.home / f"{name}.socket"
         path.unlink(missing_ok=True)
         proxy = Proxy(self.port + 1)
@@ -189,7 +189,7 @@ class Stack:
             return Console(int(self._consoles(msgspec.json.encode(seat).decode())), listener, proxy)
 
     def below(self, child: SupervisedProcess) -> list[int]:
-        """The process ids of all that a program has started, and what those have."""
+        """Ids of all descendants of a process."""
         parents = {}
         for folder in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
@@ -205,7 +205,7 @@ class Stack:
         return child._process.pid
 
     def signal(self, child: SupervisedProcess, number: int) -> None:
-        """To a program and all below it: mosquitto runs behind a program of ours."""
+        """Send a signal to a process and its descendants; mosquitto is a child of the broker program."""
         below = self.below(child)
         self._dying = below if number == signal.SIGKILL else []
         for process in (self.pid(child), *below):
@@ -213,7 +213,7 @@ class Stack:
                 os.kill(process, number)
 
     def revive(self, child: SupervisedProcess) -> None:
-        """Start what was killed, once what it ran has let go of its ports."""
+        """Restart a killed program after its child processes have released their ports."""
         assert child._process is not None
         child._process.wait(PATIENCE_S)
         wait_until(lambda: not any(map(_alive, self._dying)), "what was killed to be gone", PATIENCE_S)
@@ -286,7 +286,7 @@ def _alive(process: int) -> bool:
 
 @contextlib.contextmanager
 def start(kind: BrokerKind, arms: int, *, watchdog_s: float = 0.3) -> Iterator[Stack]:
-    """The product with so many arms, for the time of a ``with``."""
+    """Start the product with this number of arms; the context stops it."""
     stack = Stack(kind, arms, watchdog_s=watchdog_s)
     try:
         stack.begin()

@@ -44,7 +44,7 @@ def test_a_moving_arm_rests_in_time_after_each_kind_of_cut() -> None:
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("kind", BROKERS)
-def test_an_arm_in_motion_rests_in_time_at_each_of_a_thousand_cuts(kind: BrokerKind) -> None:
+def test_a_moving_arm_rests_in_time_after_a_thousand_cuts(kind: BrokerKind) -> None:
     plan = [*SHARED, *SCRIPT] * 4
     random.Random(4).shuffle(plan)
     tally = bench(kind, 4, plan, rounds=3, seed=5, more=10)
@@ -64,7 +64,7 @@ def rows(*targets: float) -> list[Row]:
     return [Row(1000 + EVERY_ROUND_MS * index, (target, 0.0)) for index, target in enumerate(targets)]
 
 
-def test_the_judge_measures_to_the_first_line_of_rest() -> None:
+def test_the_judge_measures_to_the_first_row_of_rest() -> None:
     moving = [0.01 * index for index in range(31)]
     found = judge(rows(*moving, *[0.4] * 40), cut_ms=1100, since_ms=1090)
     assert found.in_motion
@@ -85,7 +85,7 @@ def test_the_judge_finds(targets: list[float]) -> None:
     assert not judge(rows(*targets), cut_ms=1100, since_ms=1100).kept
 
 
-def test_a_control_loop_that_did_not_get_to_run_is_told_from_one_that_is_late() -> None:
+def test_a_starved_control_loop_differs_from_a_late_one() -> None:
     moving = [0.01 * index for index in range(15)]
     found = judge(
         rows(*moving, *[0.14] * 5, *(0.14 + each for each in moving), *[0.28] * 40), cut_ms=1100, since_ms=1100
@@ -93,7 +93,7 @@ def test_a_control_loop_that_did_not_get_to_run_is_told_from_one_that_is_late() 
     assert (found.rest_ms, found.starved_ms) == (240, 60)
 
 
-def test_a_slider_that_was_let_go_is_not_an_arm_in_motion() -> None:
+def test_a_released_slider_is_not_motion() -> None:
     settled = [0.01 * index for index in range(12)]
     found = judge(rows(*settled, *[0.11] * 40, 0.5), cut_ms=1100, since_ms=1100)
     assert found.moved_again
@@ -101,7 +101,7 @@ def test_a_slider_that_was_let_go_is_not_an_arm_in_motion() -> None:
     assert not judge(rows(*settled, *[0.11] * 40, 0.5), cut_ms=1100, since_ms=1100, watched=False).kept
 
 
-def test_turning_back_is_not_rest() -> None:
+def test_a_reversal_is_not_rest() -> None:
     up = [0.01 * index for index in range(15)]
     found = judge(rows(*up, up[-1], *reversed(up), *[0.0] * 40), cut_ms=1100, since_ms=1100)
     assert found.rest_ms == 200

@@ -1,4 +1,4 @@
-"""The executor under ``kill -9`` at any step: nothing is done twice, nothing stays without an end."""
+"""The executor under ``kill -9`` at any step: no command runs twice or stays without a final state."""
 
 import json
 import random
@@ -19,12 +19,12 @@ from tests.harness.agent.device_harness import signed_movement
 from tests.harness.paths import ROOT
 
 LIVES = 30
-"""Lives on one journal, one after another; the last is not cut short."""
+"""Number of consecutive runs on one journal; the last one is not killed."""
 NEW_ORDERS = 4
 TTL_MS = 10_000
 _MOST_STEPS = 150
 _SLOW = 0.03
-"""Share of the speed at which a move takes a second: long enough to be cancelled."""
+"""Speed share at which a move takes one second, long enough for a cancellation."""
 Agent = Any
 
 
@@ -40,7 +40,7 @@ def agent() -> Iterator[Agent]:
 
 
 class Cloud:
-    """One cloud and one journal: what was ordered, and what became of it."""
+    """A cloud and a journal: issued commands and their results."""
 
     def __init__(self, agent: Agent, folder: Path, seed: int) -> None:
         folder.mkdir()
@@ -63,7 +63,7 @@ class Cloud:
         return command
 
     def new_orders(self) -> list[Command]:
-        """Moves, each to a place of its own; now and then a script, a slow one that is cancelled, a lease."""
+        """Moves to distinct targets, with some scripts, cancelled slow moves, and leases."""
         made = []
         for _ in range(NEW_ORDERS):
             self.epoch += 1
@@ -107,7 +107,7 @@ class Cloud:
         return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
     def ends(self) -> dict[str, set[tuple[str, str]]]:
-        """The different ends that were heard of each command."""
+        """Distinct final states published for each command."""
         found: dict[str, set[tuple[str, str]]] = {}
         for row in self.rows("heard"):
             if AckStatus(row["status"]).terminal:
@@ -133,7 +133,7 @@ class Cloud:
 
 
 SLACK_MS = 1000
-"""From the look at the clock to the motors' first step, on a busy machine."""
+"""Tolerance from the clock check to the first motor command on a busy machine [ms]."""
 
 
 def lead(agent: Agent, folder: Path, journals: int, *, seed: int) -> Counter[str]:
@@ -147,7 +147,7 @@ def lead(agent: Agent, folder: Path, journals: int, *, seed: int) -> Counter[str
     return said
 
 
-def test_no_kill_makes_the_agent_do_anything_twice_or_leave_it_without_an_end(agent: Agent, tmp_path: Path) -> None:
+def test_a_kill_never_repeats_a_command_or_leaves_it_without_an_end(agent: Agent, tmp_path: Path) -> None:
     said = lead(agent, tmp_path, 2, seed=4)
     assert said["kills"] > 25
     assert {"done", "cancelled", "expired", "agent_restarted", "progress"} <= set(said), "too few things happened"
@@ -155,7 +155,7 @@ def test_no_kill_makes_the_agent_do_anything_twice_or_leave_it_without_an_end(ag
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_a_thousand_kills_leave_nothing_done_twice_or_without_an_end(agent: Agent, tmp_path: Path) -> None:
+def test_a_thousand_kills_never_repeat_a_command_or_leave_it_without_an_end(agent: Agent, tmp_path: Path) -> None:
     said: Counter[str] = Counter()
     seed = 1000
     while said["kills"] < 1000:

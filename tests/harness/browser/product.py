@@ -59,7 +59,7 @@ class Machine:
 
     @property
     def trusted(self) -> ssl.SSLContext:
-        """SSL context that trusts the product's own certificate authority; None without TLS."""
+        """SSL context that trusts the product's own certificate authority if it uses TLS."""
         return ssl.create_default_context(cafile=str(self.home / "tls" / "ca.crt") if self.tls else None)
 
     @property

@@ -1,4 +1,4 @@
-"""``python -m tests.security.fuzz [SECONDS] [TARGET …]``: each target so long, and a table of what that has reached."""
+"""``python -m tests.security.fuzz [SECONDS] [TARGET …]``: fuzz each target this long, print a coverage table."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Valid examples to start from. Those of JSON messages are made from their types, so that new ones are among them."""
+"""Valid seed examples. Those of JSON messages are derived from their types, so that new types are included."""
 
 import json
 from collections.abc import Iterator
@@ -17,12 +17,12 @@ KINDS: tuple[Any, ...] = (
     protocol.Presence, protocol.Description, protocol.Twin, protocol.State, protocol.JointTelemetry,
     protocol.Measurements, protocol.Event, protocol.Ack, protocol.Command, protocol.Setpoint, protocol.Stop, Control,
 )  # fmt: skip
-"""What travels as JSON by topics."""
+"""Types of the JSON messages of all topics."""
 _DEEPEST = 4
 
 
 def variants(kind: Any) -> Iterator[Any]:
-    """Plain values that are of this type: every member of a union, every value of an enumeration once."""
+    """Plain values of this type: each member of a union and each value of an enumeration once."""
     yield from _of(inspect.type_info(kind), 0)
 
 
@@ -74,7 +74,7 @@ def _struct(fields: tuple[inspect.Field, ...], tag: dict[str, Any], depth: int) 
 
 
 def seeds(kinds: tuple[Any, ...]) -> tuple[bytes, ...]:
-    """Examples of several types, after a byte that says which."""
+    """Examples of several types, each after a byte with the index of the type."""
     found = (
         bytes([number]) + json.dumps(value).encode() for number, kind in enumerate(kinds) for value in variants(kind)
     )
@@ -82,7 +82,7 @@ def seeds(kinds: tuple[Any, ...]) -> tuple[bytes, ...]:
 
 
 def _bodies() -> tuple[Any, ...]:
-    """What the API is asked with."""
+    """Types of the API's request bodies."""
     from function_app.entrypoints import http  # noqa: F401 (all that there are)
 
     found, look = [], [Request]

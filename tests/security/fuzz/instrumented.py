@@ -1,4 +1,4 @@
-"""Whose branches each target counts. Imports nothing: what it names is to be imported instrumented."""
+"""Modules whose branches each target counts. Imports nothing, because the named modules are instrumented on import."""
 
 _PROTOCOL = "device_agent.protocol"
 _TARGETS = "tests.security.fuzz.targets"

@@ -1,6 +1,6 @@
 """``python -m tests.security.fuzz.run FOLDER TARGET,TARGET``: run each target under atheris in a fork of this process.
 
-What libFuzzer says of each goes into the folder: ``TARGET`` from its examples on, ``TARGET-empty`` of an empty input
+The folder receives the libFuzzer output: ``TARGET`` from the examples, ``TARGET-empty`` from an empty input
 alone. Its own options may follow (``-max_total_time=60``, ``-runs=1000``, ``-seed=1``).
 """
 
@@ -19,16 +19,16 @@ _ODD: tuple[Any, ...] = (
     None, True, 0, -1, 2**53, 2**63, 2**64, 10**400, 0.5, -0.0, 1e308, float("nan"), float("inf"), float("-inf"), "",
     "a", "\0", "\ud800", "é", "+", "#", "../..", "a" * 300, "a" * 3000, [], {}, [[[[]]]], {"": {}},
 )  # fmt: skip
-"""What stands for a value of another kind, size or sense."""
+"""Replacement values of another type, size or meaning."""
 _EMPTY = "-empty"
 _RESHAPED = 0.5
-"""Share of the inputs that are changed as JSON; the others byte by byte."""
+"""Share of inputs mutated as JSON; the others are mutated as bytes."""
 _PREFIX = {"messages": 1, "bodies": 1, "http": 2}
-"""Bytes before the JSON of a target's input."""
+"""Number of bytes before the JSON of a target's input."""
 
 
 def reshape(data: bytes, prefix: int, chance: random.Random) -> bytes | None:
-    """The same JSON with one thing in it changed; ``None`` where it is no JSON."""
+    """The JSON with one mutation; ``None`` if the input is not JSON."""
     try:
         whole = json.loads(data[prefix:])
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""One target under the fuzzer, in a process of its own, and what libFuzzer says of it."""
+"""Runs one target under the fuzzer in its own process and parses the libFuzzer output."""
 
 import re
 import subprocess
@@ -17,12 +17,12 @@ _DONE = re.compile(r"^Done ([0-9]+) runs", re.MULTILINE)
 
 
 class Crashed(Exception):  # noqa: N818 (what a fuzzer is for)
-    """Something got out of a parser that must not; the text is the fuzzer's own, with the input."""
+    """A parser raised an undocumented exception; the text is the fuzzer's output with the input."""
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """What one run has reached: branches of the parser's code ("edges")."""
+    """Coverage of one run: branches of the parser ("edges")."""
 
     name: str
     runs: int
@@ -36,10 +36,10 @@ class Session:
 
 
 def fuzz(names: Sequence[str], *options: str) -> Iterator[Session]:
-    """Run targets with libFuzzer's own options, one after another in one process.
+    """Run targets sequentially with these libFuzzer options.
 
     Raises:
-        Crashed: One found something.
+        Crashed: A target found an error.
     """
     with tempfile.TemporaryDirectory(prefix="ts-fuzz-") as folder:
         done = subprocess.run(

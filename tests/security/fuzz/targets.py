@@ -1,7 +1,7 @@
-"""What is fuzzed: each parser of something that others wrote, with valid examples to start from.
+"""Fuzz targets: each parser of untrusted input, with valid seed examples.
 
-A target is given bytes. It lets nothing out but what the parser documents, looks whether every number that comes out is
-finite, and that what was read, written and read again is the same.
+A target receives bytes. It allows only the parser's documented exceptions and checks that each parsed number is
+finite and that a round trip through the serializer is stable.
 """
 
 import atexit
@@ -45,15 +45,15 @@ _KEYS = {signing.key_id(_KEY.public_key()): _KEY.public_key()}
 
 
 class Found(Exception):  # noqa: N818 (what a fuzzer is for)
-    """The parser let through what it must not."""
+    """The parser accepted invalid input."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """One parser.
+    """One fuzzed parser.
 
     Attributes:
-        try_out: Given bytes, raises only when something is wrong with the parser.
+        try_out: Parses bytes; raises only if the parser is wrong.
         seeds: Valid examples.
     """
 
@@ -62,7 +62,7 @@ class Target:
 
 
 def _message(data: bytes) -> None:
-    """The first byte chooses the type."""
+    """The first byte selects the type."""
     if not data:
         return
     kind = examples.KINDS[data[0] % len(examples.KINDS)]
@@ -82,7 +82,7 @@ def _written(found: Any) -> bytes | None:
     try:
         return codec.encode(found)
     except ProtocolError as error:
-        if "is the most" in str(error):  # written out in full it is longer than it came
+        if "is the most" in str(error):  # serialized, it is longer than the input
             return None
         raise Found(str(error)) from error
 
@@ -152,7 +152,7 @@ def _line_of_a_script(data: bytes) -> None:
 
 
 def _answer(data: bytes) -> None:
-    """What a server says to an agent: a byte for the status, one for the call, then the body."""
+    """A server response to an agent: one byte for the status, one for the call, then the body."""
     if len(data) < 2:
         return
     clock = CloudClock()
@@ -233,7 +233,7 @@ class _Asked:
 
 
 def _body(data: bytes) -> None:
-    """What the API is asked with; the first byte chooses the type."""
+    """A request body; the first byte selects the type."""
     if not data:
         return
     asked: Any = _Asked(data[1:])

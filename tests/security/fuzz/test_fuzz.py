@@ -1,4 +1,4 @@
-"""Every parser of what others wrote, under a fuzzer for a moment; ``make fuzz`` gives each of them its time."""
+"""A short fuzz run of each parser of untrusted input; ``make fuzz`` runs longer."""
 
 import sys
 
@@ -13,7 +13,7 @@ SLOW = ("home", "robot_type")
 
 @pytest.mark.skipif(sys.platform != "linux", reason="atheris, the fuzzer, is installed on Linux alone")
 @pytest.mark.parametrize(("slow", "runs"), [(False, 2000), (True, 300)], ids=["quick", "slow"])
-def test_nothing_but_what_is_documented_gets_out_of_any_parser(slow: bool, runs: int) -> None:
+def test_parsers_raise_only_documented_errors(slow: bool, runs: int) -> None:
     assert set(TARGETS) == set(instrumented.MODULES)
     sessions = list(fuzz([name for name in TARGETS if (name in SLOW) == slow], f"-runs={runs}", "-seed=1"))
     print(*(session.row for session in sessions), sep="\n")
@@ -30,7 +30,7 @@ def test_nothing_but_what_is_documented_gets_out_of_any_parser(slow: bool, runs:
         ("home", b'{"agent": "a", "space": "s", "account": "s", "keys": {"k": "A\xc0A"}, "owner": ""}'),
     ],
 )
-def test_what_was_found_once_is_not_found_again(name: str, found: bytes) -> None:
+def test_earlier_findings_stay_fixed(name: str, found: bytes) -> None:
     TARGETS[name].try_out(found)
 
 
@@ -40,11 +40,11 @@ def test_every_example_passes() -> None:
             target.try_out(seed)
 
 
-def test_a_number_that_is_not_finite_is_found_wherever_it_is() -> None:
+def test_a_non_finite_number_is_found_at_any_depth() -> None:
     with pytest.raises(Found):
         _check_finite({"a": [1, ({"b": float("nan")},)]})
 
 
-def test_a_crash_is_told_with_its_input() -> None:
+def test_a_crash_is_reported_with_its_input() -> None:
     with pytest.raises(Crashed, match="no-such-parser"):
         list(fuzz(["no-such-parser"]))

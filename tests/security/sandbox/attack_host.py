@@ -184,9 +184,9 @@ class Surroundings:
 
 
 def strays(sandbox: SandboxHost, session: int) -> int:
-    """What is alive of a script: of its session, or a child of a zygote of this process but for the ready ones."""
+    """Live processes of a script: of its session, or children of a zygote except prepared ones."""
     count = 0
-    with sandbox._lock:  # so that meanwhile none is made ready
+    with sandbox._lock:  # no process is prepared meanwhile
         parents = zygotes()
         waiting = {process_of(parent.ready[1]) for parent in (sandbox._own, sandbox._wrapped) if parent.ready}
         for stat in Path("/proc").glob("[0-9]*/stat"):
@@ -204,7 +204,7 @@ def process_of(process: SandboxProcess) -> int:
 
 
 def zygotes() -> list[int]:
-    """Process ids of this process's children that are zygotes, and of theirs behind bubblewrap."""
+    """Ids of the zygote processes of this process, including those in bubblewrap."""
     found: list[int] = []
     seen = [os.getpid()]
     while seen:

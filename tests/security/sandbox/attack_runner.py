@@ -1,4 +1,4 @@
-"""Starts an attack host as root, or as a user that may do nothing."""
+"""Starts an attack host as root or as an unprivileged user."""
 
 import json
 import os
@@ -19,7 +19,7 @@ UNPRIVILEGED = 65534
 
 
 class AttackRunner:
-    """an attack host and the pipe to it."""
+    """An attack host and its pipe."""
 
     def __init__(self, *, root: bool, layers: Sequence[str] = LAYERS) -> None:
         self._results: dict[str, Result] = {}
@@ -33,20 +33,20 @@ class AttackRunner:
         )
 
     def attack(self, name: str, *, untrusted: bool = False) -> Result:
-        """One of the attacks."""
+        """Run one of the attacks."""
         result = self.run(name, ATTACKS[name], untrusted=untrusted)
         if not untrusted:
             self._results[name] = result
         return result
 
     def attacked(self, name: str) -> Result:
-        """What came of an attack that was tried before."""
+        """Return the cached result of an attack, or run it."""
         if name not in self._results:
             self._results[name] = self.attack(name)
         return self._results[name]
 
     def run(self, name: str, source: str, *, untrusted: bool = False) -> Result:
-        """Any script."""
+        """Run any script."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps([name, source, untrusted]).encode() + b"\n")
@@ -65,7 +65,7 @@ class AttackRunner:
 
 
 def inside(source: str) -> str:
-    """A script with the attacks' own tools."""
+    """A script with the functions of the attacks."""
     return PRELUDE + source
 
 

@@ -1,4 +1,4 @@
-"""A script in the sandbox moves the simulated UR5: by joints, to poses, and not where it may not go."""
+"""A sandboxed script moves the simulated UR5 by joints and poses within its limits."""
 
 import json
 import math
@@ -33,7 +33,7 @@ def arm(tmp_path: Path) -> Iterator[DeviceHarness]:
     harness.stop()
 
 
-def test_a_frame_goes_where_it_is_sent(arm: DeviceHarness) -> None:
+def test_a_frame_reaches_its_pose(arm: DeviceHarness) -> None:
     source = (
         "import json\n"
         "robot.home(speed=1)\n"
@@ -64,13 +64,13 @@ def test_a_frame_goes_where_it_is_sent(arm: DeviceHarness) -> None:
         ("robot.look((1, 0, 0))", "this robot has no look"),
     ],
 )
-def test_what_the_arm_cannot_or_may_not_do_is_refused(arm: DeviceHarness, call: str, says: str) -> None:
+def test_motions_outside_the_limits_are_rejected(arm: DeviceHarness, call: str, says: str) -> None:
     reason = arm.end(arm.command(arm.script(call), epoch=1)).reason
     assert reason is not None
     assert says in reason.message
 
 
-def test_what_the_keyframe_editor_writes_is_good_and_is_played(arm: DeviceHarness) -> None:
+def test_a_script_of_the_keyframe_editor_is_played(arm: DeviceHarness) -> None:
     source = WRITTEN.read_text()
     assert check_script(source, TYPES.load("ur5")).marks == ()
     order = msgspec.structs.replace(arm.script(source + TELLS), parameters={"speed": 2})

@@ -1,4 +1,4 @@
-"""No route takes more of a body than it says, and none takes it in before it has found that out."""
+"""Every route enforces its body limit while it reads the body."""
 
 from collections.abc import AsyncIterator, Iterator
 from typing import Any
@@ -14,7 +14,7 @@ from tests.security.tenants.world import World, make
 
 PART = 65_536
 LARGER = {"add_robot_type": MAX_UPLOAD, "add_robot_type_preview": MAX_UPLOAD}
-"""Everything else has the same limit."""
+"""Routes with a larger limit than the default."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def caller(operation: dict[str, Any]) -> str:
 
 
 def asked(world: World, name: str, method: str, path: str, who: str, **body: Any) -> Any:
-    """Its answer to this body, in the place of the one that the world has for it."""
+    """Response to this body instead of the default one."""
     robot: Any = getattr(world.callers["agent"], "__self__", None)
     if who == "agent":
         body["headers"] = {"Authorization": f"Bearer {robot.token()}", **body.get("headers", {})}
@@ -68,7 +68,7 @@ def asked(world: World, name: str, method: str, path: str, who: str, **body: Any
     return ask(World(world.cloud, {who: send}, world.ids, {}), who, name, method, path)[1]
 
 
-def test_every_route_with_a_body_refuses_one_that_is_too_large_and_reads_no_more_of_it(world: World) -> None:
+def test_every_route_rejects_a_body_that_is_too_large_without_reading_it(world: World) -> None:
     seen = 0
     for name, method, path, operation in operations(world):
         if "requestBody" not in operation:
@@ -88,7 +88,7 @@ def test_every_route_with_a_body_refuses_one_that_is_too_large_and_reads_no_more
     assert seen > 30
 
 
-def test_no_route_without_a_body_takes_any(world: World) -> None:
+def test_routes_without_a_body_read_none(world: World) -> None:
     for name, method, path, operation in operations(world):
         if "requestBody" in operation:
             continue

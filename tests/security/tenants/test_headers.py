@@ -1,4 +1,4 @@
-"""The headers of every answer."""
+"""Headers of every response."""
 
 from tests.security.tenants.test_routes import ask, operations
 from tests.security.tenants.world import World
@@ -14,7 +14,7 @@ HEADERS = {
 }
 
 
-def test_every_answer_of_every_route_has_the_headers(world: World) -> None:
+def test_every_response_has_the_security_headers(world: World) -> None:
     """For accepted and rejected requests; responses with secrets are not cached."""
     for name, method, path in operations(world):
         for caller in ("anonymous", "owner", "agent"):

@@ -1,8 +1,8 @@
-"""Every route, by everybody: each cell is written down in ``routes.txt``, and a route that is not fails.
+"""Access of every role to every route, as listed in ``routes.txt``; an unlisted route fails.
 
-A cell says ``401``, ``403`` or ``404``: refused so. ``ok``: served. ``read``: served, and changes nothing of
-Anneliese's. ``own``: answered from the caller's own world alone. Refusals and ``own`` name nothing of hers and change
-nothing of hers.
+``401``, ``403`` or ``404``: rejected with this status. ``ok``: served. ``read``: served without a change of
+Anneliese's data. ``own``: served only from the caller's data. Rejections and ``own`` neither reveal nor change
+her data.
 """
 
 import re
@@ -33,7 +33,7 @@ def expected() -> dict[str, dict[str, str]]:
 
 
 def operations(world: World) -> list[tuple[str, str, str]]:
-    """Name, method and path of each."""
+    """Name, method and path of each operation."""
     found = [
         (str(operation["operationId"]), method.upper(), path.removeprefix("/api/v1"))
         for path, methods in world.cloud.app.openapi()["paths"].items()
@@ -52,7 +52,7 @@ def ask(world: World, caller: str, name: str, method: str, path: str) -> tuple[s
 
 
 def wrong(world: World, cell: str, asked: str, answer: httpx.Response, before: Rows) -> str:
-    """What is wrong with an answer; empty where nothing is."""
+    """The error in a response; empty if it is correct."""
     status = str(answer.status_code)
     if cell in {"ok", "read"} and status in REFUSED:
         return f"is refused: {answer.text}"
@@ -81,7 +81,7 @@ def test_every_route_has_a_row_and_every_row_a_route(world: World) -> None:
         assert set(cells.values()) <= REFUSED | {"ok", "own", "read"}, name
 
 
-def test_no_route_tells_or_changes_what_it_may_not(world: World) -> None:
+def test_no_route_reveals_or_changes_data_without_access(world: World) -> None:
     table = expected()
     leaks, counts = [], Counter[str]()
     for name, method, path in operations(world):

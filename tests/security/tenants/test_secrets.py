@@ -1,7 +1,7 @@
-"""A whole run of the product's own processes, each as loud as it can be: no secret that was in play is in any log.
+"""A full run of the product with all loggers at DEBUG: no secret appears in any log.
 
-Everything that makes, takes or carries a secret is done once, rightly and wrongly. What is meant for the eyes of one
-person (the link of the ready line, the claim code that an agent shows) goes to their terminal, and to no log.
+Each operation with a secret runs once correctly and once incorrectly. Output for one
+user (the link of the ready line, the claim code of an agent) goes to the terminal and to no log.
 """
 
 import base64
@@ -76,7 +76,7 @@ class Run:
         return done.stdout
 
     def sign_in(self, name: str) -> httpx.Client:
-        """Somebody's page."""
+        """The console of an account."""
         shown = self.program(f"link of {name}", "function_app", "sign-in-link", "--account", name)
         link = shown.strip().partition("#sign-in=")[2]
         page = self.page()
@@ -111,7 +111,7 @@ def ok(answer: httpx.Response) -> Any:
 
 
 def people(run: Run) -> tuple[httpx.Client, httpx.Client]:
-    """Sign in, set and change passwords, mistype them; and begin at a provider that is away."""
+    """Sign in, set and change passwords, enter wrong ones, and start at an unreachable provider."""
     demo, bert = run.sign_in("demo"), run.sign_in("bert")
     ok(demo.put("/accounts/me/password", json={"password": PASSWORD}))
     ok(demo.put("/accounts/me/password", json={"password": NEWER, "old_password": PASSWORD}))
@@ -130,7 +130,7 @@ def people(run: Run) -> tuple[httpx.Client, httpx.Client]:
 
 
 def keys_and_invitations(run: Run, demo: httpx.Client, bert: httpx.Client, device: str) -> None:
-    """Make, use, misuse and revoke."""
+    """Create, use, misuse and revoke keys and links."""
     made = ok(demo.post("/api-keys", json={"name": "app", "role": "operator", "days": 1}))
     by_key = {"Authorization": f"Bearer {made['token']}"}
     ok(run.page().get("/devices", headers=by_key))
@@ -154,7 +154,7 @@ def keys_and_invitations(run: Run, demo: httpx.Client, bert: httpx.Client, devic
 
 
 def control(run: Run, demo: httpx.Client, bert: httpx.Client, device: str) -> None:
-    """Take control, move, say it at the broker, hand over; and come to the broker with what is not right."""
+    """Take control, move, publish, hand over, and connect to the broker with wrong credentials."""
     epoch = ok(demo.post(f"/devices/{device}/lease", json={"wait_ms": 20_000}))["epoch"]
     ok(demo.post(f"/devices/{device}/actions", json={"request": MOVE, "epoch": epoch}))
     given = {
@@ -187,7 +187,7 @@ def control(run: Run, demo: httpx.Client, bert: httpx.Client, device: str) -> No
 
 
 def pairing(run: Run, demo: httpx.Client) -> None:
-    """Another agent is claimed, asks for its credentials, and is un-paired; a code is mistyped."""
+    """Claim another agent, request its credentials, unpair it, and enter a wrong code."""
     home = str(run.folder / "other")
     server = ("--server", run.machine.url, "--device", "other=ur5")
     shown = run.program("enrolment", "device_agent", "enroll", "--home", home, *server, "--no-wait").split()
@@ -206,7 +206,7 @@ def rotation(run: Run) -> None:
 
 
 def kept(run: Run) -> dict[str, str]:
-    """Secrets that are kept in files of mode 0600: private keys as they may be written, and passwords of programs."""
+    """Secrets in files of mode 0600: private keys in each encoding, and passwords of programs."""
     found = {}
     for path in [*run.machine.home.rglob("*"), *run.folder.rglob("*")]:
         if not path.is_file() or path.stat().st_mode & 0o077:
@@ -223,7 +223,7 @@ def kept(run: Run) -> dict[str, str]:
 
 
 def use(run: Run) -> None:
-    """Everything, from the first sign-in to the sign-out."""
+    """All operations, from the first sign-in to the sign-out."""
     demo, bert = people(run)
     device = next(each["id"] for each in ok(demo.get("/devices"))["items"] if each["name"] == "ur5")
     keys_and_invitations(run, demo, bert, device)
@@ -237,7 +237,7 @@ def use(run: Run) -> None:
 
 
 def whole_run(broker: str, folder: Path) -> Run:
-    """Do all of it, and end; ``said`` then has all logs."""
+    """Run all operations and stop the product; ``said`` then contains all logs."""
     quiet = folder / "loud"
     quiet.mkdir()
     (quiet / "sitecustomize.py").write_text(LOUD)
@@ -281,7 +281,7 @@ def leaks(run: Run) -> Iterator[str]:
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("broker", ["amqtt", pytest.param("mosquitto", marks=pytest.mark.long)])
-def test_no_secret_of_a_whole_run_is_in_any_log(broker: str, tmp_path: Path) -> None:
+def test_no_secret_is_in_any_log(broker: str, tmp_path: Path) -> None:
     run = whole_run(broker, tmp_path)
     assert {"functions.log", "worker.log", "broker.log", "agent.log", "ur5.ndjson"} <= set(run.said)
     assert "DEBUG" in run.said["functions.log"] + run.said["worker.log"], "the functions could have said more"

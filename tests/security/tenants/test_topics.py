@@ -33,7 +33,7 @@ RETAINED = ("presence", "description", "twin", "state")
 
 
 class Stage(NamedTuple):
-    """Who takes part, each by the credentials that the functions gave; and one who may say and hear everything."""
+    """The broker, a client for each role with its issued credentials, and one with all permissions."""
 
     broker: RunningBroker
     roles: dict[str, dict[str, Any]]
@@ -51,7 +51,7 @@ def expected() -> dict[str, dict[str, str]]:
 
 
 def channels() -> dict[str, str]:
-    """Name → address, as the document of the protocol says."""
+    """Channel → address, from the AsyncAPI document."""
     document = json.loads((ROOT / "docs" / "asyncapi.json").read_text())
     return {name: channel["address"] for name, channel in document["channels"].items()}
 
@@ -145,7 +145,7 @@ def join(stage: Stage, role: str, **options: Any) -> Client:
 
 
 def barrier(client: Client, topic: str) -> None:
-    """A round trip: what the broker had for this client before it has come."""
+    """A round trip, after which all earlier messages have arrived."""
     client.paho.unsubscribe(topic)
     client.subscribe(topic)
 
@@ -221,7 +221,7 @@ def test_no_will_is_published_to_forbidden_topics(stage: Stage) -> None:
                 client.vanish()
                 wait_until(client.disconnected.is_set, "the end of the connection")
             client.close()
-    # Whoever goes after them is heard after them.
+    # A message published later arrives after their wills.
     last = join(stage, "agent", will=Message(stage.topics["presence"], b"last", 1, retain=False))
     last.vanish()
     said = []

@@ -1,7 +1,7 @@
-"""Two tenants over one store, everybody who may or may not ask, and everything that there is to be found.
+"""Two tenants in one store, callers of every role, and marked data.
 
-No broker: agents poll, and what they say is handed to the ingest as it would come. After each request the tables are
-put back, so that no cell of the matrix depends on another.
+Without a broker: agents poll, and their messages go directly to the ingest. After each request the tables are
+restored, so that the cells of the matrix are independent.
 """
 
 import json
@@ -41,7 +41,7 @@ class World:
     marks: set[str] = field(default_factory=set)
     """Texts that must not reach a caller without access."""
     foreign: tuple[str, ...] = ()
-    """What the partitions of Anneliese's rows hold."""
+    """Texts in the partition keys of Anneliese's rows."""
 
     def rows(self) -> Rows:
         db: Any = self.cloud.functions.tables
@@ -53,14 +53,14 @@ class World:
         db._run("CREATE TEMP TABLE kept AS SELECT * FROM rows", ())
 
     def put_back(self) -> None:
-        """The tables as they were when they were kept."""
+        """Restore the saved tables."""
         db: Any = self.cloud.functions.tables
         db._run("DELETE FROM rows", ())
         db._run("INSERT INTO rows SELECT * FROM kept", ())
 
 
 def make(home: Path) -> World:
-    """The world, with a mark in everything of Anneliese's that has a text."""
+    """Create the world, with a mark in each text field of Anneliese's data."""
     cloud = Cloud(settings(home))
     for silent, name in ((cloud.functions.bus, "publish"), (cloud.functions.access, "revoke")):
         setattr(silent, name, _nothing)
@@ -71,7 +71,7 @@ def make(home: Path) -> World:
     robot, foreign = _paired(cloud, anna), _paired(cloud, people["stranger"])
     device, space = robot.device, robot.space
     anna.put(f"/robot-types/ur5/movements/{MOVEMENT}", {"source": SOURCE, "description": "geheim"})
-    _made(anna.post("/spaces", {"name": "Speicher"}))  # one's only space cannot be handed over
+    _made(anna.post("/spaces", {"name": "Speicher"}))  # an owner's only space cannot be transferred
     invitations = {
         "withdraw_device_invitation": _made(anna.post(f"/devices/{device}/invitations", {"role": "viewer"})),
         "withdraw_space_invitation": _made(anna.post(f"/spaces/{space}/invitations", {"role": "viewer"})),
@@ -143,7 +143,7 @@ def make(home: Path) -> World:
 
 
 async def _nothing(*_: object, **__: object) -> None:
-    """There is no broker to wait for."""
+    """Do nothing, because there is no broker."""
 
 
 def _made(answer: httpx.Response) -> dict[str, Any]:
@@ -168,7 +168,7 @@ def _paired(cloud: Cloud, owner: Person) -> Robot:
 
 
 def _say(cloud: Cloud, robot: Robot, epoch: int) -> None:
-    """Online, with a fault, and with something measured."""
+    """Set the device online, with a fault and a measurement."""
     at_ms = cloud.clock.now_ms()
     short = Fault(code="short", message="Kurzschluss", since_ms=1)
     state = State(device="arm", at_ms=at_ms, tick_ms=1, mode=Mode.FAULT, epoch=epoch, faults=(short,))
