@@ -1,8 +1,8 @@
 """An operator without a browser: takes control and streams setpoints by the rules of the console.
 
 ``python -m tests.faults.console`` is a warm parent process. For each input line (JSON, see ``Seat``) it forks an
-operator and prints the process id. An operator receives the orders ``take``, ``sweep`` and ``rest`` over its Unix socket, and
-sends the events ``held``, ``moving``, ``lost`` and ``ended``.
+operator and prints the process id. An operator receives the orders ``take``, ``sweep`` and ``rest`` over its Unix
+socket, and sends the events ``held``, ``moving``, ``lost`` and ``ended``.
 """
 
 import contextlib

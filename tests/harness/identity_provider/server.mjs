@@ -12,7 +12,7 @@ lines.once("line", (line) => {
   let answer;
   server.listen(port, "127.0.0.1", () => {
     const issuer = `http://127.0.0.1:${server.address().port}`;
-    // Whoever signs in is who they say: the forms for that are the package's own, for development.
+    // Accepts every account name without a password, with the development forms of the package.
     const provider = new Provider(issuer, {
       clients: [client],
       jwks: { keys },

@@ -23,7 +23,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "azurite"
 PROGRAM = FOLDER / "node_modules" / "azurite" / "dist" / "src" / "azurite.js"
 ACCOUNT = "devstoreaccount1"
 KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr/KBHBeksoGMGw=="
-"""Azurite's, known to everybody."""
+"""Well-known development credentials of Azurite."""
 START_WITHIN_S = 60
 _LISTENS = re.compile(r"Azurite (Blob|Table) service is successfully listening at (https?://127\.0\.0\.1:\d+)")
 
