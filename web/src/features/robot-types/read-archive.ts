@@ -1,4 +1,4 @@
-/** Files from where people have them: a folder, an archive, or dropped. Only this knows the archives' library. */
+/** Reads files from a folder, an archive or a drop. Only this module uses the archive library. */
 
 /** Maximum unpacked size [bytes]; larger archives are not unpacked. */
 const MOST_BYTES = 50_000_000;

@@ -13,7 +13,7 @@ import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
 import "./sensors.css";
 
-/** Without a picture for this long, what is shown is not live [ms]; a slow camera has three of its periods. */
+/** Without a frame for this long, the image is not live [ms]; for a slow camera, three periods. */
 const STALLED_MS = 2_000;
 /** Over which the rate is counted [ms]. */
 const RATE_OVER_MS = 3_000;
@@ -133,7 +133,7 @@ function Caption({ shown, running, rate }: { shown: Shown; running: boolean; rat
   return <>{texts.camera.live(width, height, format.oneDigit(rate))}</>;
 }
 
-/** Decodes one picture at a time and drops those that come meanwhile: what is drawn is always the newest. */
+/** Decodes one frame at a time and drops frames that arrive meanwhile, so that the newest is drawn. */
 class Painter {
   readonly #canvas: { readonly current: HTMLCanvasElement | null };
   readonly #drawn: (frame: CameraFrame, arrivals: readonly number[]) => void;

@@ -1,4 +1,4 @@
-/** What there is to be seen of a robot: through its own cameras, or from the room that it stands in. */
+/** Camera views of a robot: its own cameras and those of its room. */
 import type { DeviceStore, Fleet } from "../devices/model";
 import { useEffect, useState } from "preact/hooks";
 import { texts } from "./texts";

@@ -23,7 +23,7 @@ interface Point {
   y: number;
 }
 
-/** How far everything is: near is dark, far is light, what is out of reach is grey. Any point can be read. */
+/** Depth image: near is dark, far is light, out of range is grey. Every point can be read. */
 export function DepthCard({ device, roomAction }: { device: DeviceStore; roomAction: RoomDeviceAction }) {
   const canvas = useRef<HTMLCanvasElement>(null);
   const scale = useRef<HTMLCanvasElement>(null);

@@ -1,4 +1,4 @@
-/** What one field has measured over time: from the cloud's store, continued with what this page hears. */
+/** History of one measured field: the stored series, continued with live measurements. */
 import type { DeviceStore } from "../devices/model";
 import { newestOf } from "../health/model";
 import { effect } from "@preact/signals";
@@ -16,7 +16,7 @@ import { colour, onColourChange } from "../../shared/ui/canvas-theme";
 
 const DRAW_EVERY_MS = 500;
 const POINTS = 400;
-/** The cloud stores what it hears some seconds later: asked again, it fills the gap up to what was heard here. */
+/** The cloud stores measurements with a delay: reloading after this time closes the gap to the live data [ms]. */
 const AGAIN_MS = 30_000;
 const FAR = 10;
 
@@ -66,7 +66,7 @@ interface HistoryProps {
   spanMs: number;
   binary: boolean;
   old: boolean;
-  /** What else is to be seen. With it the plot can be read point by point, by keyboard or pointer. */
+  /** Details of a point. With it the plot can be read point by point, by keyboard or pointer. */
   marks?: Omit<Marks, "cursor">;
 }
 
@@ -176,7 +176,7 @@ function tellPlace(element: HTMLElement, columns: Columns, cursor: number | null
   element.setAttribute("aria-valuetext", said(columns, at, quantity));
 }
 
-/** The index of the measured point next to a time; -1 where there is none. */
+/** The index of the measured point nearest to a time; -1: none. */
 function nearest([times, means]: Columns, time: number): number {
   let found = -1;
   times.forEach((one, index) => {
@@ -187,7 +187,7 @@ function nearest([times, means]: Columns, time: number): number {
   return found;
 }
 
-/** Where a key leads: the index of a measured point, or `null` where the key means nothing here. */
+/** The index of the point that a key selects, or `null` for other keys. */
 function steps(key: string, columns: Columns, cursor: number | null): number | null {
   const by = { ArrowLeft: -1, ArrowRight: 1, PageUp: -FAR, PageDown: FAR, Home: -Infinity, End: Infinity }[key];
   const measured = columns[1].flatMap((mean, index) => (mean === null ? [] : [index]));

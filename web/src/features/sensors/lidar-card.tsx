@@ -21,7 +21,7 @@ interface Taken {
   at: number;
 }
 
-/** What a lidar sees, round it and to scale: its nearest things live, and every beam of a scan that was taken. */
+/** Lidar view to scale: live nearest distances per sector, and all beams of a captured scan. */
 export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAction: RoomDeviceAction | null }) {
   const canvas = useRef<HTMLCanvasElement>(null);
   const [taken, setTaken] = useState<Taken | null>(null);
@@ -108,7 +108,7 @@ function sectorsOf(values: Values): number[] {
   return found;
 }
 
-/** Its x axis is up, counter-clockwise is to the left, as one looks down on it. As large as what is seen allows. */
+/** Top view: x axis up, counter-clockwise to the left. Scaled to the largest distance. */
 function draw(context: CanvasRenderingContext2D, width: number, height: number, sectors: number[], scan: LidarScan | null): void {
   const wide = (2 * Math.PI) / sectors.length;
   const beams = (scan?.range_m ?? []).flatMap((m, index) => (m === null ? [] : [spot(scan?.angle_rad[index] ?? 0, m)]));

@@ -13,7 +13,7 @@ import { shown } from "./readings-card";
 
 const LEAST_HZ = 0.001;
 const MOST_HZ = 50;
-/** More values of a single measurement than this would push all else away; the rest is in its own card. */
+/** Maximum number of values per measurement here; the rest is in its own card. */
 const MOST_SHOWN = 12;
 
 type Time = keyof typeof texts.collect.times;

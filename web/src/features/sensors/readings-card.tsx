@@ -1,4 +1,4 @@
-/** What one stream measures: a number with its history, a state with since when, or, of many values, a table. */
+/** Readings of one stream: a number with its history, a state with its start time, or a table. */
 import type { DeviceStore } from "../devices/model";
 import { Age } from "../../shared/ui/age";
 import { Card } from "../../shared/ui/card";
@@ -120,7 +120,7 @@ export function Figure({ quantity, value }: { quantity: Quantity; value: number 
   );
 }
 
-/** A door's contact, a motion detector: what it says, and since when it has said so. */
+/** A boolean sensor, such as a door contact: its state and the start of that state. */
 function Status({ recording, field, value, loads }: { recording: Recording; field: string; value: boolean; loads: number }) {
   const since = useMemo(() => recording.since(), [recording, value, loads]);
   const [yes, no] = common.booleanState[field] ?? common.yesNo;

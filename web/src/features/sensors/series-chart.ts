@@ -1,4 +1,4 @@
-/** A line over time with the limits that its room gives. Loaded only where one is looked at. */
+/** A line chart over time with the room's limits. Loaded on demand. */
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
 import { digits, type Quantity } from "./model/quantities";
@@ -31,7 +31,7 @@ interface Options {
   colour: string;
 }
 
-/** A limit is shown where it does not make what is measured too small to be read. */
+/** Shows a limit unless it would compress the measured range too much. */
 const LIMIT_WITHIN = 12;
 /** Of the value: smaller changes are noise, and are drawn as what they are. */
 const SMALLEST_SHARE = 0.02;
@@ -145,7 +145,7 @@ function paintLimits(plot: uPlot, { judged, shown }: Quantity): void {
   ctx.restore();
 }
 
-/** The band of what is usual as two dashed lines, faults as a strip below with a line where each began, the cursor. */
+/** Draws the usual range as two dashed lines, faults as a strip with start lines, and the cursor. */
 function paintMarks(plot: uPlot, { usual, faults, cursor }: Marks): void {
   const { ctx, bbox } = plot;
   const right = bbox.left + bbox.width;

@@ -17,7 +17,7 @@ interface SettingsProps {
   roomAction: RoomDeviceAction;
 }
 
-/** What can be set, within the limits of the device's own description, and what it is now. */
+/** Settings of a device within the limits of its description, with the current values. */
 export function SettingsCard({ device, roomAction }: SettingsProps) {
   const description = device.description.value;
   const no = unavailableReason(device);

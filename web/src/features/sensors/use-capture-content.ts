@@ -2,7 +2,7 @@
 import type { Taken } from "./model/room-device-action";
 import { texts } from "./texts";
 
-/** Throws an `Error` whose message is fit for the page: the store may be elsewhere, and not let this page read. */
+/** Throws an `Error` with a displayable message: a store on another origin may reject this page. */
 export async function contentOf({ url }: Taken): Promise<Uint8Array<ArrayBuffer>> {
   try {
     const response = await fetch(url, { credentials: "omit" });

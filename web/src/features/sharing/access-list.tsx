@@ -42,14 +42,14 @@ type PartProps = Omit<AccessProps, "goes" | "role" | "whole">;
 
 const ID = "access";
 
-/** Bring who has access into sight, and the focus there. The fragment is the route here: a link cannot do it. */
+/** Scrolls to the access list and focuses it. A link cannot do this, because the fragment holds the route. */
 export function goToAccess(): void {
   const card = document.getElementById(ID);
   card?.scrollIntoView({ block: "start" });
   card?.querySelector<HTMLElement>("button, input")?.focus({ preventScroll: true });
 }
 
-/** Who has access to a device or a space, and for its owner all that changes it. */
+/** The access list of a device or space, with the owner's controls. */
 export function AccessList({ role, whole, goes, ...rest }: AccessProps) {
   return (
     <div id={ID} class="access" data-testid="access">
@@ -330,7 +330,7 @@ function OpenLink({ invitation, sharing }: { invitation: Invitation; sharing: Sh
   );
 }
 
-/** Who has access to a device because the space it stands in is shared with them. */
+/** Accounts with access to a device through its space. */
 function ThroughSpace({ api, space }: { api: Api; space: { id: string; name: string } }) {
   const [shares, setShares] = useState<readonly Share[]>([]);
   const [wrong, setWrong] = useState("");

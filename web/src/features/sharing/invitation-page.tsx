@@ -54,7 +54,7 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
 
   const failed = (error: unknown): void => {
     const final = error instanceof ApiError && error.code === "invitation-unknown";
-    // An account that was made at the provider has taken it on the way here.
+    // An account created at the provider has already redeemed it.
     if (final && away) followed.joined();
     else setWrong({ text: sentence(error), final });
   };
@@ -183,7 +183,7 @@ function Accepted({ invitation: { kind, target, label, role } }: { invitation: I
   );
 }
 
-/** The account was made with the invitation: all that is shared with it came from there. */
+/** Whether the account was created with the invitation, the source of all its shares. */
 function Joined({ api, fleet, account }: InvitationPageProps) {
   const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
   const [wrong, setWrong] = useState("");

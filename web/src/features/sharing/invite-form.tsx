@@ -26,7 +26,7 @@ interface InviteFormProps {
   onClose: () => void;
 }
 
-/** Invite by the name of an account, or by a link. What was typed stays until it has come to something. */
+/** Invites an account by name or by a link. Input stays until the invitation succeeds. */
 export function InviteForm({ sharing, onClose }: InviteFormProps) {
   const [how, setHow] = useState<"link" | "name">("link");
   const [name, setName] = useState("");

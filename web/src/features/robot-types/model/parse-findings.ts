@@ -30,7 +30,7 @@ export interface Finding {
   kind: FindingKind;
   /** What the check said, without file and line. */
   said: string;
-  /** What it is about, such as a joint's or a file's name; empty where nothing is named. */
+  /** The affected name, such as a joint or file; may be empty. */
   about: string;
   /** Of a range: what the model allows [rad]. */
   range_rad: readonly [number, number] | null;

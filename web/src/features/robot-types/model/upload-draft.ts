@@ -20,7 +20,7 @@ export type LocalFault = "no-manifest" | "too-large" | null;
 
 const ASK_EVERY_MS = 500;
 
-/** Files may be exchanged at any time: what is under way for the ones before is forgotten. */
+/** Files can be replaced at any time; pending results for the previous files are discarded. */
 export class UploadDraft {
   readonly #types: RobotTypes;
   readonly #files = signal<Files>(new Map());
@@ -42,7 +42,7 @@ export class UploadDraft {
   readonly step: ReadonlySignal<DraftStep> = this.#step;
   readonly look: ReadonlySignal<Look | null> = this.#look;
   readonly model: ReadonlySignal<TypeModel | null> = this.#model;
-  /** Why nothing came of the last try, such as a server that cannot be reached. */
+  /** The error of the last attempt, such as an unreachable server. */
   readonly trouble: ReadonlySignal<string> = this.#trouble;
   readonly saved: ReadonlySignal<RobotType | null> = this.#saved;
   readonly movements: ReadonlySignal<readonly SavedMovement[]> = this.#movements;
@@ -64,10 +64,10 @@ export class UploadDraft {
     this.#types = types;
   }
 
-  /** Files that come beside those that are there, in the place of those of the same name; then all is checked. */
+  /** Adds files, replaces those with the same name, and validates all. */
   async add(entries: Files): Promise<void> {
     const { files, left } = selectFiles(entries);
-    // A single file is exchanged by its own name, wherever it lies in the folder.
+    // A single file replaces the file with the same name in any folder.
     for (const [name, content] of [...files]) {
       const known = [...this.#files.value.keys()].filter((each) => each.endsWith(`/${name}`));
       if (name.includes("/") || this.#files.value.has(name) || known.length !== 1) continue;
@@ -168,7 +168,7 @@ export class UploadDraft {
     try {
       return await this.#types.lookModel(look.id);
     } catch (error) {
-      // One that cannot be drawn can be good all the same; a warning says so.
+      // A model that cannot be drawn can still be valid; a warning reports it.
       if (error instanceof ApiError && error.code === "model-unknown") return null;
       throw error;
     }

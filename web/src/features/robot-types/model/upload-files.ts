@@ -35,7 +35,7 @@ export function selectFiles(entries: Files): SelectedUpload {
   return { files, left };
 }
 
-/** What a folder holds, as the server wants it; `null` without a manifest. */
+/** The folder's content in the server's format; `null` without a manifest. */
 export function packFiles(files: Files): TypeFolder | null {
   const text = new TextDecoder();
   const manifest = files.get(MANIFEST);

@@ -1,4 +1,4 @@
-/** What a measured value is called and in which unit it is shown: by its room's own words, else by its name. */
+/** Label and unit of a measured value, from the room's description or from its name. */
 import { degrees } from "../../../shared/lib/angles";
 import type { KnownDescription, KnownDiagnostic } from "../../../shared/mqtt/parse-messages";
 

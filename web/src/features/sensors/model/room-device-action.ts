@@ -1,4 +1,4 @@
-/** What this page asks of one room device: one thing at a time, and what became of it. */
+/** Actions of this page on one room device, one at a time, and their outcome. */
 import type { Upload } from "../../../shared/api/types";
 import type { ActionOptions, ActionRunner, Run } from "../../actions/model";
 import type { DeviceStore } from "../../devices/model";
@@ -27,7 +27,7 @@ export interface Taken {
   url: string;
 }
 
-/** What a control was asked to be, and what the device says it has made of it. */
+/** The requested and the applied value of a control. */
 export interface Setting {
   asked: number;
   /** `null` while the answer is awaited, or where there was none. */
@@ -85,7 +85,7 @@ export class RoomDeviceAction {
     this.#try(() => (this.#shot.value = { at: now(), streams: readShot(done.result) }));
   }
 
-  /** Take something raw; where it can be read, or `null` where it failed, which `why` says. */
+  /** Captures raw data; returns its location, or `null` on an error in `why`. */
   async capture(name: string): Promise<Taken | null> {
     const done = await this.#ask({ kind: "capture", name }, "done", CAPTURE_TIMEOUT_MS);
     const id = done?.result["upload"];
@@ -113,7 +113,7 @@ export class RoomDeviceAction {
     }
   }
 
-  /** Set a control. While one setting is under way, only the newest of those that follow is sent. */
+  /** Sets a control. During a request, only the newest of the following values is sent. */
   async set(control: string, value: number): Promise<void> {
     this.#wanted.set(control, value);
     this.#note(control, { asked: value, applied: null, why: "" });
@@ -149,7 +149,7 @@ export class RoomDeviceAction {
     this.#settings.value = new Map(this.#settings.value).set(control, setting);
   }
 
-  /** The run once it has come as far as wanted; `null` where it did not, which `why` says. */
+  /** The run at the requested status; `null` on an error in `why`. */
   async #ask(request: RoomRequest, waitFor: Required<ActionOptions>["waitFor"], timeoutMs: number): Promise<Run | null> {
     this.#busy.value = request.kind;
     this.#why.value = "";

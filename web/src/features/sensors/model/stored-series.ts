@@ -1,4 +1,4 @@
-/** What one field has measured: what the cloud has stored of it, and what this page has heard since. */
+/** A measured field: the stored series and the live measurements since. */
 import type { Series } from "../../../shared/api/types";
 
 export interface Sample {
@@ -16,7 +16,7 @@ export class Recording {
   #live: Sample[] = [];
   #spanMs = 0;
 
-  /** Take what the cloud has stored. What was heard here is finer, so it stays. */
+  /** Merges the stored series. Live measurements have a higher resolution, so they stay. */
   load(series: Series, field: string): void {
     const column = series.fields[field];
     this.#spanMs = series.span_ms;

@@ -1,4 +1,4 @@
-/** An invitation whose link was followed. Its secret stays in this tab until it is answered: signing in may lead away. */
+/** An opened invitation link. Its secret stays in this tab until the user responds, also during an external sign-in. */
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 
 const KEY = "telescope.invitation";

@@ -32,7 +32,7 @@ export class ShareList {
   readonly trouble: ReadonlySignal<string> = this.#trouble;
   /** What was ended last and can be given back, with what was left of its time. */
   readonly ended: ReadonlySignal<Share | null> = this.#ended;
-  /** What of that end is still under way, in the server's words; empty where nothing is. */
+  /** The server's message about an unfinished revocation; empty if complete. */
   readonly rest: ReadonlySignal<string> = this.#rest;
   /** Whether invitations are open, which can be redeemed at any time, so that the lists need polling. */
   readonly waits = computed(() => this.#invitations.value.length > 0);
