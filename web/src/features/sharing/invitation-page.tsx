@@ -183,7 +183,7 @@ function Accepted({ invitation: { kind, target, label, role } }: { invitation: I
   );
 }
 
-/** Whether the account was created with the invitation, the source of all its shares. */
+/** The page after an account was created with the invitation: everything that is shared with it. */
 function Joined({ api, fleet, account }: InvitationPageProps) {
   const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
   const [wrong, setWrong] = useState("");
