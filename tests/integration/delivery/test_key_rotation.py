@@ -47,7 +47,7 @@ def old_key(cloud: Cloud) -> Ed25519PrivateKey:
 
 
 def follow(robot: Robot) -> None:
-    """Learn as an agent does, from what is told with its credentials."""
+    """Learn as an agent does, from the key announcement it receives with its credentials."""
     given = robot.ask("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
     for statement in given["key_statements"]:
         told = codec.decode(signing.verify(statement.encode(), robot._keys, context=KEYS_CONTEXT), NewKey)
@@ -125,7 +125,7 @@ def test_an_agent_is_told_by_an_order_that_the_old_key_signed(pair: tuple[Person
     for tick in range(3):
         robot.say_state(State(device="arm", mode=Mode.IDLE, epoch=0, at_ms=tick, tick_ms=tick))
     wait_until(lambda: robot.heard(RotateKey) != [], "the order")
-    anna.take(robot.device)  # comes after whatever else had been sent
+    anna.take(robot.device)  # sent after every earlier command
     assert len(robot.heard(RotateKey)) == 1
     order = robot.heard(RotateKey)[0].request
     assert isinstance(order, RotateKey)

@@ -167,7 +167,7 @@ class TestMailbox:
         cloud.sweep()
         assert not any(isinstance(request, MoveJoints) for request in robot.read(robot.fetch()))
 
-    def test_it_is_emptied_by_time_where_nobody_asks(self, cloud: Cloud, anna: Person, robot: PollingRobot) -> None:
+    def test_entries_expire_when_the_agent_does_not_poll(self, cloud: Cloud, anna: Person, robot: PollingRobot) -> None:
         anna.take(robot.device, wait_ms=100)
         anna.post(f"/devices/{robot.device}/stop")
         assert len(mailbox(cloud, robot)) == 4, "two commands, and a place for the answer to each"

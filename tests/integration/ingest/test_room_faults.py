@@ -81,7 +81,7 @@ def test_people_behind_a_closed_door_raise_a_fault_of_the_air_and_the_open_door_
     with cloud.robot("co2") as robot:
         air = Air(cloud, anna, robot, monkeypatch)
         air.live(30)
-        assert open_faults(anna, robot) == [], "nobody is there"
+        assert open_faults(anna, robot) == [], "the room is empty"
         air.people += [Pedestrian(air.world.manifest.people[0]) for _ in range(12)]
         air.live(16)
         (warned,) = open_faults(anna, robot)

@@ -37,7 +37,7 @@ def asked(**more: Any) -> ActionRequest:
 
 @dataclass(frozen=True)
 class Scene:
-    """Somebody with a robot of one device."""
+    """A person and a robot with one device."""
 
     who: Identity
     public: str
@@ -47,7 +47,7 @@ class Scene:
     epoch: int = 0
     """Of the lease that ``who`` holds."""
     code: str = ""
-    """The claim code it shows, where nobody has claimed it."""
+    """The claim code of an agent that is not claimed yet."""
 
     @property
     def device(self) -> str:
@@ -84,7 +84,7 @@ async def queued(functions: Functions) -> Scene:
 
 
 async def asked_for(functions: Functions) -> Scene:
-    """Somebody else asks for the lease that ``who`` holds; ``action`` is the request."""
+    """Another session requests the lease that ``who`` holds; ``action`` is the request."""
     scene = await running(functions)
     other = Identity(scene.who.account, scene.who.name, "another session")
     _, asked, _, _ = await functions.control_requests.create(
@@ -241,7 +241,7 @@ async def look(functions: Functions, place: Place, scenes: list[Scene]) -> None:
             assert (await functions.actions.list(owner, scene.device, cursor=None, limit=10))[0] == []
         row = await functions.tables.get(records.AGENTS, agent, "agent")
         assert row is not None
-        owner = Identity(row.data["account"], "whoever", owner.session)
+        owner = Identity(row.data["account"], "former owner", owner.session)
         action, _ = await functions.start_action.start(owner, scene.device, asked())
         assert action.status.value == "published"
         await report(functions, action.id, AckStatus.DONE)

@@ -141,7 +141,7 @@ def see_that_all_is_recorded(place: Place, *, stride: int) -> None:
     """The tables say what was changed; the chain has each of it, once, in the words of who did it or as unknown."""
 
     async def prepare(functions: Functions, step: int) -> tuple[str, str, str]:
-        # Somebody else each time: who is killed while claiming has used up one of their few tries.
+        # A new person each time: a killed claim uses up one of the few attempts.
         account = await functions.sign_in.account(f"anna {step}")
         agent, code = await show_code(functions)
         return account.id, agent, code

@@ -39,7 +39,7 @@ def letters(cloud: Cloud, robot: PollingRobot) -> list[str]:
 
 
 def pass_time(cloud: Cloud, robot: PollingRobot, seconds: float, step_s: float = 0.5) -> None:
-    """Time with its timer, while the robot asks and says that it has received what comes, and no more."""
+    """Advance time and run the timer while the robot polls and acknowledges receipt only."""
     while seconds > 0:
         cloud.clock.advance(step_s)
         seconds -= step_s
@@ -109,7 +109,7 @@ def test_an_ack_killed_after_any_write_is_told_again_and_counts_once(
         survived = knife.left > 0
         assert (answer.status_code == 200) is survived
         if anna.action(action)["status"] != "done":
-            assert robot.fetch() == [item], "until it is written the command comes again, whatever becomes of the agent"
+            assert robot.fetch() == [item], "the command is delivered again until its result is stored"
         assert robot.tell_raw(message).status_code == 200
         assert robot.fetch() == []
         assert anna.action(action)["status"] == "done"

@@ -156,7 +156,7 @@ class Machine(RuleBasedStateMachine):
         for person in self.people.values():
             answer = person.get(f"/devices/{self.robot.device}/actions", params={"limit": 200})
             if person.account != self.owner:
-                assert answer.status_code == 404, "nobody sees another's"
+                assert answer.status_code == 404, "accounts cannot read each other's resources"
                 continue
             items = answer.json()["items"]
             assert set(self.open) == {item["id"] for item in items}
@@ -193,13 +193,11 @@ def explore(broker: MemoryBroker, keys: Path, folder: Path, *, examples: int, st
 
 
 @pytest.mark.timeout(300)
-def test_whatever_happens_in_whatever_order_the_promises_hold(broker: MemoryBroker, keys: Path, tmp_path: Path) -> None:
+def test_the_invariants_hold_for_every_sequence(broker: MemoryBroker, keys: Path, tmp_path: Path) -> None:
     explore(broker, keys, tmp_path, examples=12, steps=25, seeded=True)
 
 
 @pytest.mark.long
 @pytest.mark.timeout(3_600)
-def test_whatever_happens_in_whatever_order_the_promises_hold_for_long(
-    broker: MemoryBroker, keys: Path, tmp_path: Path
-) -> None:
+def test_the_invariants_hold_for_every_sequence_for_long(broker: MemoryBroker, keys: Path, tmp_path: Path) -> None:
     explore(broker, keys, tmp_path, examples=500, steps=60, seeded=False)

@@ -77,7 +77,7 @@ async def act(functions: Functions, what: str, scene: Scene, number: int) -> Non
         case "take over":
             await functions.leases.acquire(third, device, epoch=None, lease_ms=600_000, wait_ms=0, over="why not")
         case "reset":
-            with mock.patch.object(stop, "CONFIRM_MS", 0):  # nobody confirms here
+            with mock.patch.object(stop, "CONFIRM_MS", 0):  # no device confirms here
                 await functions.stop.reset(third, device)
 
 
@@ -156,7 +156,7 @@ def see_one_outcome(place: Place, rounds: int) -> None:
         )
 
     outcomes = run_here(place, whole)
-    assert len(outcomes) > 1, f"nobody raced: {outcomes}"
+    assert len(outcomes) > 1, f"no race occurred: {outcomes}"
     for (device, epoch), kinds in orders(place).items():
         granted = kinds["grant_lease"] + kinds["reset_stop"]
         assert granted <= 1, f"epoch {epoch} of {device} was given twice"

@@ -126,7 +126,7 @@ def see_exactly_one_winner(place: Place, rounds: int) -> None:
             expected = {"won": RACERS} if lost == "won" else {"won": 1, lost: RACERS - 1}
             assert got == expected, f"{what}, round {round_}"
         winners = {number for number, each in enumerate(found) if "won" in each[what]}
-        assert len(winners) > 1, f"{what}: one process won every round, so nobody raced"
+        assert len(winners) > 1, f"{what}: one process won every round, so no race occurred"
     run_here(place, lambda functions: look(functions, prizes))
 
 

@@ -1,4 +1,4 @@
-"""How fast, and how surely, somebody who operates loses it when a device is un-shared: while they stream and order."""
+"""An operator loses access when a share ends, even while streaming setpoints and starting actions."""
 
 import logging
 import random

@@ -29,7 +29,7 @@ async def end_share(anna: Person, bert: Person, robot: Robot) -> None:
 def unshare_at(
     monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot], moment: Literal["seen", "written"]
 ) -> None:
-    """Un-share at one moment of somebody's request: when their role was seen, or when what they wanted was written."""
+    """End the share during an operator's request: after the role check or after the write."""
     anna, bert, robot = operator
     functions = anna.cloud.functions
     target, name = {
@@ -60,7 +60,7 @@ def test_an_action_that_starts_while_its_device_is_unshared_never_reaches_it(
     assert anna.start(robot.device, wait_ms=10_000).json()["status"] == "started"
 
 
-def test_a_lease_that_is_taken_while_its_device_is_unshared_is_granted_to_nobody(
+def test_a_lease_acquired_while_the_share_ends_is_not_granted(
     monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot]
 ) -> None:
     anna, bert, robot = operator
@@ -72,7 +72,7 @@ def test_a_lease_that_is_taken_while_its_device_is_unshared_is_granted_to_nobody
     assert anna.take(robot.device).json()["epoch"] == 3
 
 
-def test_control_is_not_handed_to_somebody_who_is_unshared_at_that_moment(
+def test_control_is_not_passed_to_an_operator_whose_share_ends(
     monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot]
 ) -> None:
     anna, bert, robot = operator
@@ -107,7 +107,7 @@ def test_credentials_that_are_made_while_their_device_is_unshared_are_no_good(
         assert not client.connected.is_set()
 
 
-def test_an_action_of_somebody_unshared_is_not_sent_again(
+def test_an_action_of_a_former_operator_is_not_resent(
     cloud: Cloud, monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot]
 ) -> None:
     anna, bert, robot = operator

@@ -19,7 +19,7 @@ def watching(broker: RunningBroker, person: Person) -> Client:
 
 
 @pytest.mark.parametrize("broker", BROKERS, indirect=True)
-def test_signing_out_ends_the_sessions_own_connections_and_nobody_elses(
+def test_signing_out_ends_only_the_sessions_own_connections(
     cloud: Cloud, broker: RunningBroker, pair: tuple[Person, Robot]
 ) -> None:
     anna, _ = pair

@@ -30,6 +30,6 @@ def checker(cloud: Cloud) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def bert(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Person]:
-    """Somebody whose uploads are checked, for tests that leave nothing behind but versions."""
+    """A person whose uploads are checked, shared by tests that leave only versions behind."""
     with Cloud(settings(tmp_path_factory.mktemp("home")), clock=MovingClock()) as cloud, checking(cloud):
         yield cloud.sign_in("bert")

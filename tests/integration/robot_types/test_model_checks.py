@@ -62,7 +62,7 @@ class TestChecker:
             check_all(cloud)
         assert rows(cloud, records.MODEL_CHECKS, "checks"), "the note outlives it"
         check_all(cloud)
-        assert anna.get("/robot-types/lever").json()["state"] == "checking", "somebody may still be at it"
+        assert anna.get("/robot-types/lever").json()["state"] == "checking", "another checker may still process it"
         advance(cloud, LEASE_MS)
         check_all(cloud)
         assert anna.get("/robot-types/lever").json()["state"] == "ready"

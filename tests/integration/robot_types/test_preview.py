@@ -1,4 +1,4 @@
-"""A robot type that is looked at before it is saved: compiled, drawn, found by nobody else, and gone by itself."""
+"""Previews of unsaved robot types: compiled, rendered, private to their author, and deleted after a time."""
 
 from collections.abc import Iterator
 from pathlib import Path

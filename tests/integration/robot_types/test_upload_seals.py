@@ -14,7 +14,7 @@ from tests.integration.robot_types.lever import add, check_all
 
 
 class TestSeal:
-    """Somebody can write to the stores: what was checked is used, or nothing."""
+    """With write access to the stores an attacker cannot change a checked robot type unnoticed."""
 
     @pytest.fixture
     def lever(self, cloud: Cloud, anna: Person) -> Place:

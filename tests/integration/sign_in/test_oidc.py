@@ -57,7 +57,7 @@ def closed(home: Path, provider: str) -> Iterator[Cloud]:
 
 
 class Browser:
-    """Somebody's, at our page and at the provider's."""
+    """A browser with cookies of the console and of the provider."""
 
     def __init__(self, cloud: Cloud) -> None:
         self.cloud = cloud
@@ -92,7 +92,7 @@ def failed(answer: httpx.Response, why: str) -> None:
     assert "set-cookie" not in answer.headers
 
 
-def test_somebody_signs_in_and_is_the_same_account_the_next_time(here: Cloud) -> None:
+def test_repeated_sign_in_returns_the_same_account(here: Cloud) -> None:
     local = here.sign_in("Name of anna")
     browser, again, other = Browser(here), Browser(here), Browser(here)
     answer = browser.sign_in("anna")
@@ -100,7 +100,7 @@ def test_somebody_signs_in_and_is_the_same_account_the_next_time(here: Cloud) ->
     assert "HttpOnly; SameSite=Strict" in answer.headers["set-cookie"]
     me = browser.me().json()
     assert me["name"] == "Name of anna"
-    assert me["id"] != local.account, "nobody is somebody by name"
+    assert me["id"] != local.account, "an equal name is not the same account"
     assert me["csrf_token"]
     assert len(here.run(browser.page.get(f"{API}/spaces")).json()["items"]) == 1
     (session,) = here.run(browser.page.get(f"{API}/accounts/me/sessions")).json()["items"]
@@ -119,7 +119,7 @@ def test_somebody_signs_in_and_is_the_same_account_the_next_time(here: Cloud) ->
 
 
 class TestWhoMayCome:
-    """A provider knows people whom nobody here has asked in."""
+    """The provider also authenticates users without an invitation."""
 
     @staticmethod
     def invite(owner: Person, **more: Any) -> str:
@@ -161,14 +161,14 @@ class TestWhoMayCome:
         problem(closed.run(other.page.post(START, json={"invitation": secret})), 404, "invitation-unknown")
         failed(other.sign_in("mallory"), "uninvited")
 
-    def test_an_invitation_that_ends_meanwhile_lets_nobody_in(self, closed: Cloud) -> None:
+    def test_an_invitation_that_expires_during_sign_in_is_refused(self, closed: Cloud) -> None:
         owner = closed.sign_in("anna")
         browser = Browser(closed)
         place = sign_in_there(browser.start_with(self.invite(owner, expires_in_s=300)), "bert")
         closed.clock.advance(301)
         failed(browser.back(place), "uninvited")
 
-    def test_an_invitation_for_somebody_with_an_account_lets_nobody_else_in(self, closed: Cloud) -> None:
+    def test_an_invitation_for_an_existing_account_admits_no_other_user(self, closed: Cloud) -> None:
         owner, _ = closed.sign_in("anna"), closed.sign_in("carl")
         browser = Browser(closed)
         place = sign_in_there(browser.start_with(self.invite(owner, account="carl")), "bert")
@@ -218,8 +218,8 @@ def test_a_way_back_is_good_once_and_in_the_browser_that_began(here: Cloud) -> N
     assert anna.me().status_code == 200
 
 
-def test_somebody_elses_code_signs_nobody_in(here: Cloud) -> None:
-    """The verifier is not theirs, so the provider refuses it: to nobody, and not to whom it was given afterwards."""
+def test_a_stolen_code_is_refused(here: Cloud) -> None:
+    """The PKCE verifier does not match, so the provider rejects the code."""
     anna, mallory = Browser(here), Browser(here)
     stolen = sign_in_there(anna.start(), "anna").params["code"]
     own = sign_in_there(mallory.start(), "mallory")

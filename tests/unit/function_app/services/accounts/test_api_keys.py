@@ -21,7 +21,7 @@ Pair = tuple[Person, Robot]
 
 
 class Program(Person):
-    """Somebody else's program, by an API key."""
+    """A third-party program with an API key."""
 
     def __init__(self, cloud: Cloud, token: str) -> None:
         self.cloud = cloud
@@ -124,7 +124,7 @@ def test_a_viewers_key_moves_and_stops_nothing(pair: Pair) -> None:
     assert issued["subscribe"]
 
 
-def test_an_operators_key_takes_control_from_nobody(pair: Pair) -> None:
+def test_an_operators_key_cannot_take_over_control(pair: Pair) -> None:
     anna, robot = pair
     _, program = make(anna)
     anna.take(robot.device)
@@ -230,7 +230,7 @@ class TestRevoking:
         problem(anna.delete(f"{KEYS}/{key}"), 404, "api-key-unknown")
         assert anna.get(KEYS).json()["items"] == []
 
-    def test_its_connections_and_its_control_end_and_nobody_elses(self, pair: Pair, broker: MemoryBroker) -> None:
+    def test_only_its_own_connections_and_control_end(self, pair: Pair, broker: MemoryBroker) -> None:
         anna, robot = pair
         (key, program), (_, other) = make(anna), make(anna)
         epoch = program.take(robot.device, lease_ms=600_000, wait_ms=10_000).json()["epoch"]

@@ -68,14 +68,14 @@ def test_a_wrong_one_and_an_unknown_name_are_answered_the_same(cloud: Cloud, ann
     cloud.sign_in("carl")  # has none
     refused = [
         problem(sign_in(cloud, name, text), 401, "unauthorized")
-        for name, text in (("anna", BETTER), ("nobody", GOOD), ("carl", GOOD), ("annna", GOOD), ("anna", GOOD + " "))
+        for name, text in (("anna", BETTER), ("unknown", GOOD), ("carl", GOOD), ("annna", GOOD), ("anna", GOOD + " "))
     ]
     assert all(each == refused[0] for each in refused)
     assert anna.get("/accounts/me").status_code == 200
 
 
 @pytest.mark.usefixtures("anna")
-def test_a_name_that_nobody_has_costs_a_whole_hash(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_name_costs_a_whole_hash(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
     from argon2 import PasswordHasher
 
     done: list[str] = []
@@ -86,14 +86,14 @@ def test_a_name_that_nobody_has_costs_a_whole_hash(cloud: Cloud, monkeypatch: py
         return verify(self, stored, text)
 
     monkeypatch.setattr(PasswordHasher, "verify", counted)
-    for name in ("anna", "nobody"):
+    for name in ("anna", "unknown"):
         sign_in(cloud, name, BETTER)
     assert len(done) == 2
     assert done[0] == done[1]
 
 
 class TestNames:
-    """However somebody writes a name, it is one person's."""
+    """Names that differ only in case belong to one account."""
 
     def test_a_name_signs_in_in_any_spelling_and_is_shown_in_its_first(self, cloud: Cloud, anna: Person) -> None:
         for name in ("ANNA", "Anna", "\uff21nna", " anna\u00a0"):
@@ -124,7 +124,7 @@ class TestNames:
         problem(sign_in(cloud, "anna", GOOD), 429, "too-many-tries")
 
     def test_an_account_from_before_is_found_by_its_own_spelling(self, cloud: Cloud) -> None:
-        """Names were once told apart by their case; nobody who had one loses it, or finds somebody else's there."""
+        """Names were once case-sensitive: accounts from that time keep their names and data."""
         old = {"account": "o" * 20, "space": "s" * 20}
         cloud.run(cloud.functions.tables.create(records.ACCOUNTS, Row("name:Dora", "account", old)))
         assert cloud.sign_in("Dora").account == old["account"]
@@ -152,7 +152,7 @@ class TestGuessing:
         assert sign_in(cloud, "anna", GOOD).status_code == 200
 
     @pytest.mark.usefixtures("anna")
-    def test_an_address_guesses_thirty_times_at_whatever_names(self, cloud: Cloud) -> None:
+    def test_an_address_has_thirty_attempts_over_all_names(self, cloud: Cloud) -> None:
         statuses = [sign_in(cloud, f"n{number}", GOOD, address="198.51.100.7").status_code for number in range(31)]
         assert statuses == [401] * 30 + [429]
         problem(sign_in(cloud, "anna", GOOD, address="198.51.100.7"), 429, "too-many-tries")
@@ -281,7 +281,7 @@ class TestJoining:
         assert sign_in(cloud, "dora", GOOD).json()["account"]["id"] == dora.account
         problem(self.join(cloud, invitation, "emil"), 404, "invitation-unknown")
 
-    def test_nobody_joins_without_one_or_takes_a_name(self, cloud: Cloud, invitation: str) -> None:
+    def test_joining_needs_an_invitation_and_an_unused_name(self, cloud: Cloud, invitation: str) -> None:
         problem(self.join(cloud, "x" * 43), 404, "invitation-unknown")
         problem(self.join(cloud, invitation, "anna"), 409, "name-taken")
         problem(self.join(cloud, invitation, "dora", "short"), 422, "password-weak")

@@ -315,7 +315,7 @@ def test_progress_and_output_are_shown_while_it_runs(pair: Pair) -> None:
 def test_what_the_device_says_it_cannot_is_refused_at_once_with_what_it_can(pair: Pair) -> None:
     anna, robot = pair
     asked = {"kind": "take_posture", "name": "Sit", "speed": 0.5}
-    assert anna.start(robot.device, request=asked, wait_ms=10_000).status_code == 200, "nobody knows yet"
+    assert anna.start(robot.device, request=asked, wait_ms=10_000).status_code == 200, "its postures are not known yet"
     robot.report(robot.heard(TakePosture)[0].id, AckStatus.DONE)
     description = Description(
         device="arm",

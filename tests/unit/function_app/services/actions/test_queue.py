@@ -75,7 +75,7 @@ class TestTurns:
         cloud.sweep()
         assert anna.action(action)["status"] == "started"
 
-    def test_what_nobody_took_in_time_leaves_the_turn_to_the_next(self, cloud: Cloud, pair: Pair, running: str) -> None:
+    def test_an_unaccepted_action_expires_and_the_next_starts(self, cloud: Cloud, pair: Pair, running: str) -> None:
         anna, robot = pair
         first, second = queued(anna, robot.device, ttl_ms=2_000), queued(anna, robot.device)
         robot.silent = True

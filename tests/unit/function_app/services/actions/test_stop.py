@@ -109,7 +109,7 @@ def test_everything_that_one_may_operate_is_stopped_and_what_is_anothers_is_not(
         assert not other.commands
         assert not other.stops
         assert stopped(bert.post("/stop")) == {other.device: True}
-    assert cloud.sign_in("nobody").post("/stop").json() == {"items": []}
+    assert cloud.sign_in("clara").post("/stop").json() == {"items": []}
 
 
 def test_one_that_is_dead_keeps_no_other_waiting_and_is_named(two_rooms: tuple[Person, Robot, Robot, str]) -> None:

@@ -76,7 +76,7 @@ class TestWhatIsRecorded:
         assert anna.put("/accounts/me/password", {"password": "correct horse battery"}).status_code == 204
         wrong = {"name": "anna", "password": "wrong wrong wrong"}
         before = cloud.run(cloud.functions.audit_reader.head(CLOUD)) or Head(0, "")
-        for name in ("anna", "nobody", "anna"):
+        for name in ("anna", "unknown", "anna"):
             answer = cloud.ask("POST", f"{API}/auth/password", json={**wrong, "name": name})
             assert answer.status_code == 401, answer.text
         assert cloud.ask("POST", f"{API}/auth/sign-in", json={"link": "x" * 43}).status_code == 401
@@ -92,7 +92,7 @@ class TestWhatIsRecorded:
         ]
         after = cloud.run(cloud.functions.audit_reader.head(CLOUD))
         assert after is not None
-        assert after.seq == before.seq + 2, "of a name that nobody has, and of a link"
+        assert after.seq == before.seq + 2, "one for the unknown name, one for the link"
         told = json.dumps(anna.get("/accounts/me/audit").json())
         assert not [secret for secret in ("horse", "wrong wrong", anna.token) if secret in told]
 

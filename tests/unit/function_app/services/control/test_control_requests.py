@@ -53,7 +53,7 @@ def outcome(person: Person, robot: Robot, request: str) -> str:
 
 
 def told(person: Person, robot: Robot) -> list[str]:
-    """Kinds of what is told of control, oldest first."""
+    """Kinds of control events, oldest first."""
     items = person.get(f"/devices/{robot.device}/events").json()["items"]
     return [item["kind"] for item in reversed(items) if item["kind"].startswith(("control", "order"))]
 
@@ -116,7 +116,7 @@ def test_what_is_withdrawn_is_over(held: Three) -> None:
     assert "control-request-withdrawn" in told(anna, robot)
 
 
-def test_silence_takes_control_from_nobody(cloud: Cloud, held: Three) -> None:
+def test_an_unanswered_request_does_not_move_control(cloud: Cloud, held: Three) -> None:
     anna, other, robot = held
     request = asked(other, robot, within_ms=5_000)
     cloud.clock.advance(5)
@@ -171,7 +171,7 @@ def test_an_answer_given_twice_is_given_once(held: Three) -> None:
     assert lease(other, robot)["epoch"] == 2
 
 
-def test_what_nobody_holds_cannot_be_asked_for_and_ones_own_neither(held: Three) -> None:
+def test_a_free_lease_and_ones_own_lease_cannot_be_requested(held: Three) -> None:
     anna, other, robot = held
     problem(ask(anna, robot), 409, "lease-already-held")
     anna.delete(f"/devices/{robot.device}/lease?epoch=1")
@@ -182,9 +182,7 @@ def test_what_nobody_holds_cannot_be_asked_for_and_ones_own_neither(held: Three)
 
 
 @pytest.mark.parametrize("how", ["released", "expired", "taken again", "reset"])
-def test_a_request_ends_with_the_lease_that_it_asks_for_and_gives_control_to_nobody(
-    cloud: Cloud, held: Three, how: str
-) -> None:
+def test_a_request_ends_with_its_lease_and_moves_no_control(cloud: Cloud, held: Three, how: str) -> None:
     anna, other, robot = held
     anna.take(robot.device, epoch=1, lease_ms=5_000)
     request = asked(other, robot)

@@ -118,7 +118,7 @@ def test_a_person_is_no_agent_and_an_agent_no_person(cloud: Cloud, pair: Pair) -
     problem(cloud.robot().ask("POST", "/mqtt/credentials", json={"purpose": "agent"}), 401, "unauthorized")
 
 
-def test_somebody_without_devices_may_watch_nothing(cloud: Cloud, broker: MemoryBroker) -> None:
+def test_an_account_without_devices_may_watch_nothing(cloud: Cloud, broker: MemoryBroker) -> None:
     issued = cloud.sign_in("clara").post("/mqtt/credentials", {"purpose": "view"}).json()
     assert (issued["publish"], issued["subscribe"]) == ([], [])
     with connect(broker, issued) as client:

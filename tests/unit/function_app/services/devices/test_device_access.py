@@ -77,7 +77,7 @@ def test_a_robot_that_is_silent_for_90_s_is_not_believed_to_be_there(cloud: Clou
     assert anna.get(f"/devices/{robot.device}").json()["online"] is True
 
 
-def test_nobody_speaks_for_what_is_not_theirs(cloud: Cloud, pair: Pair) -> None:
+def test_an_agent_cannot_publish_for_another(cloud: Cloud, pair: Pair) -> None:
     anna, robot = pair
     with paired(cloud, "bert") as (_, other):
         before = anna.get("/devices").json()
@@ -140,7 +140,7 @@ class TestAcks:
         robot.silent = False
         assert anna.start(robot.device, wait_ms=10_000).status_code == 200, "the slot is free"
 
-    def test_after_the_end_a_late_ack_frees_nobody_elses_slot(self, cloud: Cloud, pair: Pair) -> None:
+    def test_a_late_ack_does_not_free_another_actions_slot(self, cloud: Cloud, pair: Pair) -> None:
         anna, robot = pair
         first = anna.start(robot.device, wait_ms=10_000).json()["id"]
         done = robot.report(first, AckStatus.DONE)

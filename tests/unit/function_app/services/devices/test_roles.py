@@ -1,6 +1,6 @@
-"""Every route that names something of somebody's, and every topic, for every role: made from the documents themselves.
+"""Every route of an owned resource and every topic, for every role: generated from the API documents.
 
-A route or a channel that is new has no row here, and fails until somebody has said who may.
+A new route or channel fails until this file lists the permitted roles.
 """
 
 import re
@@ -17,7 +17,7 @@ from tests.harness.cloud.cloud import MOVE, Cloud, Person, paired
 from tests.harness.network.brokers import Message, wait_until
 
 NAMED = {"device", "agent", "action", "space"}
-"""What a route names in its path when it is about something of somebody's."""
+"""Path parameters that name an owned resource."""
 SEEING = {
     "get_device", "get_lease", "list_actions", "get_action", "list_events", "list_faults",
     "get_latency", "list_uploads", "get_upload", "get_diagnostics", "list_space_diagnostics", "get_control_request",
@@ -58,7 +58,7 @@ BODIES: dict[str, Any] = {
 REFUSED = {401, 403, 404}
 CHANNELS = {name: channel["address"] for name, channel in asyncapi.document()["channels"].items()}
 HEARD = {"presence", "description", "twin", "state", "joints", "measurements", "camera", "event", "ack"}
-"""By whoever may see the device."""
+"""By every account that may see the device."""
 UNHEARD = {"late_joints", "late_measurements", "command", "setpoint", "stop"}
 
 

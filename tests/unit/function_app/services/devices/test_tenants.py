@@ -141,14 +141,14 @@ def test_what_is_not_there_is_answered_as_what_is_anothers(
     strangers: tuple[Person, Robot, str, Person, Robot],
 ) -> None:
     _, robot, action, bert, _ = strangers
-    nobodys = "zzzzzzzzzz"
+    unknown = "zzzzzzzzzz"
     for foreign, missing in (
-        (f"/devices/{robot.device}", f"/devices/{nobodys}-arm"),
-        (f"/actions/{action}", f"/actions/{nobodys}-arm-{action[-20:]}"),
-        (f"/devices/{robot.device}/actions", f"/devices/{nobodys}-arm/actions"),
+        (f"/devices/{robot.device}", f"/devices/{unknown}-arm"),
+        (f"/actions/{action}", f"/actions/{unknown}-arm-{action[-20:]}"),
+        (f"/devices/{robot.device}/actions", f"/devices/{unknown}-arm/actions"),
     ):
         one, two = bert.get(foreign).json(), bert.get(missing).json()
-        assert one["detail"].replace(robot.id, nobodys) == two["detail"]
+        assert one["detail"].replace(robot.id, unknown) == two["detail"]
         assert {**one, "detail": ""} == {**two, "detail": ""}
 
 

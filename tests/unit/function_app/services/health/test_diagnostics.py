@@ -187,7 +187,7 @@ def test_what_passes_its_limit_is_told_at_once_and_not_at_the_end_of_the_minute(
     assert [fault["severity"] for fault in open_faults(anna, robot)] == ["error"]
 
 
-def test_what_nobody_has_said_the_limits_of_is_worth_knowing_and_no_warning(cloud: Cloud, pair: Pair) -> None:
+def test_a_value_without_limits_is_reported_without_a_warning(cloud: Cloud, pair: Pair) -> None:
     anna, robot = pair
     life = Life(cloud, robot)
     life.live(20 * MINUTE, fan_hz=still(50), door=still(0))
@@ -302,10 +302,10 @@ def test_what_a_killed_worker_left_is_put_right_within_a_minute(
     assert open_faults(anna, robot) == []
 
 
-def test_a_robot_type_nobody_knows_and_a_hundred_fields_are_watched_without_limits(cloud: Cloud) -> None:
+def test_an_unknown_robot_type_with_a_hundred_fields_is_monitored_without_limits(cloud: Cloud) -> None:
     anna = cloud.sign_in("anna")
     with cloud.robot() as robot:
-        devices = [{"name": "arm", "kind": "arm", "robot_type": "nobody-knows", "label": "Arm"}]
+        devices = [{"name": "arm", "kind": "arm", "robot_type": "unknown-type", "label": "Arm"}]
         code = robot.enroll(devices=devices).json()["claim_code"]
         anna.post("/agents/claim", {"code": code})
         robot.space = robot.enrollment()["space"]

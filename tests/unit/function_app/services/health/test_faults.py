@@ -1,4 +1,4 @@
-"""A fault's life, whoever notices it and however many do."""
+"""Lifecycle of a fault that one or several sources report."""
 
 from typing import Any
 
@@ -243,7 +243,7 @@ class TestSilence:
         assert self.open(anna, robot) == ["silent"]
 
 
-def test_nobody_sees_or_acknowledges_what_is_not_theirs(cloud: Cloud, pair: Pair) -> None:
+def test_faults_of_another_account_can_be_neither_read_nor_acknowledged(cloud: Cloud, pair: Pair) -> None:
     anna, robot = pair
     say(cloud, robot, "encoder")
     (fault,) = faults(anna, robot)

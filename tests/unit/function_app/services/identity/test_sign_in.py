@@ -46,7 +46,7 @@ def test_ten_who_bring_one_link_at_once_are_one_session(cloud: Cloud) -> None:
 
 
 @pytest.mark.parametrize("link", ["x", "", "A" * 43, "🤖", "x" * 201])
-def test_what_is_no_link_signs_nobody_in(cloud: Cloud, link: str) -> None:
+def test_an_invalid_link_is_refused(cloud: Cloud, link: str) -> None:
     assert sign_in(cloud, link).status_code in {401, 422}
 
 
@@ -139,7 +139,7 @@ class TestCookie:
         problem(cloud.ask("POST", f"{API}/auth/token", headers=headers), 401, "unauthorized")
 
     @pytest.mark.parametrize("site", ["cross-site", "same-site"])
-    def test_another_sites_page_signs_nobody_in(self, cloud: Cloud, site: str) -> None:
+    def test_a_cross_site_request_cannot_sign_in(self, cloud: Cloud, site: str) -> None:
         link = cloud.link("mallory")
         headers = {"Sec-Fetch-Site": site}
         problem(cloud.ask("POST", SIGN_IN, json={"link": link}, headers=headers), 403, "forbidden")

@@ -1,4 +1,4 @@
-"""What the timer mends: commands nobody answered, actions without an end, and processes killed between two writes."""
+"""Timer repairs: unacknowledged commands, actions without an end, and processes killed between two writes."""
 
 import time
 from collections.abc import Callable
@@ -84,7 +84,7 @@ class TestWithoutAnswer:
             "robot.home()"
         ]
 
-    def test_it_expires_when_nobody_can_take_it_any_more(self, cloud: Cloud, pair: Pair) -> None:
+    def test_it_expires_after_its_time_to_live(self, cloud: Cloud, pair: Pair) -> None:
         anna, robot = pair
         robot.silent = True
         action = anna.start(robot.device, ttl_ms=2_000).json()["id"]
@@ -126,7 +126,7 @@ class TestWithoutAnswer:
         robot.silent = False
         assert anna.start(robot.device, wait_ms=10_000).status_code == 200
 
-    def test_what_nobody_published_before_the_unpairing_ends(self, cloud: Cloud, pair: Pair) -> None:
+    def test_an_unpublished_command_ends_with_the_unpairing(self, cloud: Cloud, pair: Pair) -> None:
         anna, robot = pair
         robot.silent = True
         action = anna.start(robot.device).json()["id"]

@@ -1,4 +1,4 @@
-"""What an agent tells over HTTP is taken in as what it says over MQTT, and nobody else may tell it."""
+"""Messages that an agent sends over HTTP are ingested as over MQTT; other callers are refused."""
 
 import json
 import time
@@ -153,7 +153,7 @@ class TestWhoMayAsk:
             problem(anna.ask(method, where, json=body), 401, "unauthorized")
             problem(cloud.ask(method, f"/api/v1{where}", json=body), 401, "unauthorized")
 
-    def test_nobody_before_it_is_claimed(self, cloud: Cloud) -> None:
+    def test_messages_before_the_claim_are_refused(self, cloud: Cloud) -> None:
         robot = PollingRobot(cloud)
         robot.enroll()
         problem(robot.poll(), 409, "agent-unclaimed")
@@ -209,7 +209,7 @@ SAID: list[dict[str, Any]] = [
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_whatever_is_told_is_stored_or_refused(
+def test_every_message_is_stored_or_refused(
     cloud: Cloud, anna: Person, robot: PollingRobot, data: st.DataObject
 ) -> None:
     kinds = [

@@ -98,7 +98,7 @@ class TestEnroll:
         answer = robot.ask("POST", "/agents/enroll", token=robot.token(**claims), json=robot.introduction())
         problem(answer, 401, "unauthorized")
 
-    def test_nobody_enrolls_anothers_key(self, alone: Cloud) -> None:
+    def test_an_agent_cannot_enroll_with_anothers_key(self, alone: Cloud) -> None:
         robot, thief = alone.robot(), alone.robot()
         answer = thief.ask("POST", "/agents/enroll", json=thief.introduction(public_key=robot.public))
         problem(answer, 401, "unauthorized")
@@ -187,7 +187,7 @@ class TestClaim:
         clock.advance(300)
         assert alone.sign_in("anna").post("/agents/claim", {"code": robot.code()}).status_code == 200
 
-    def test_an_address_has_five_wrong_tries_whoever_asks_from_there(self, alone: Cloud, clock: MovingClock) -> None:
+    def test_an_address_has_five_wrong_tries_over_all_callers(self, alone: Cloud, clock: MovingClock) -> None:
         for number in range(5):
             guesser = alone.sign_in(f"guesser{number}", address="10.0.0.9")
             problem(guesser.post("/agents/claim", {"code": "BCDF-GHJK"}), 404, "claim-code-unknown")

@@ -54,7 +54,7 @@ def retained(cloud: Cloud, broker: MemoryBroker, space: str, agent: str, *names:
 
 
 def ends(cloud: Cloud, *actions: str) -> set[tuple[str, str]]:
-    """How they ended, whoever may see them."""
+    """How each of them ended, independent of the current owner."""
     found = [cloud.run(cloud.functions.start_action._action_store.get(action)) for action in actions]
     return {(each.action.status.value, (each.action.reason or {}).get("code", "")) for each in found if each}
 
@@ -105,7 +105,7 @@ def test_nothing_of_what_an_agent_said_under_one_owner_shows_to_the_next(cloud: 
 
 
 @pytest.mark.parametrize("after", range(1, 24, 2))
-def test_whoever_unpairs_killed_after_any_write_leaves_the_rest_to_the_timer(
+def test_an_unpairing_killed_after_any_write_is_completed_by_the_timer(
     cloud: Cloud, pair: Pair, mortal: Mortal, broker: MemoryBroker, after: int
 ) -> None:
     anna, robot = pair
@@ -185,7 +185,7 @@ class TestMoving:
         (foreign,) = bert.get("/spaces").json()["items"]
         problem(anna.put(f"/agents/{robot.id}/space", {"space": foreign["id"]}), 404, "space-unknown")
         problem(bert.put(f"/agents/{robot.id}/space", {"space": foreign["id"]}), 404, "agent-unknown")
-        problem(anna.put("/agents/nobody/space", {"space": robot.space}), 404, "agent-unknown")
+        problem(anna.put("/agents/unknown/space", {"space": robot.space}), 404, "agent-unknown")
 
     def test_to_where_it_is_changes_nothing(self, pair: Pair) -> None:
         anna, robot = pair

@@ -43,7 +43,7 @@ class TestVersions:
         problem(anna.get(WAVE, params={"version": 2}), 404, "movement-version-unknown")
         problem(anna.get(f"{MINE}/versions"), 404, "movement-unknown")
 
-    def test_nobody_else_sees_them(self, alone: Cloud, anna: Person) -> None:
+    def test_other_accounts_cannot_read_them(self, alone: Cloud, anna: Person) -> None:
         anna.put(MINE, {"source": SOURCE})
         anna.put(WAVE, {"source": SOURCE})
         bert = alone.sign_in("bert")

@@ -26,7 +26,7 @@ ASKED = {"policy": "queue"}
 
 
 def edit(cloud: Cloud, table: str, place: tuple[str, str], kind: type[Any], **changes: Any) -> None:
-    """Change a stored record as nobody does by a request."""
+    """Change a stored record directly, as no request can."""
     tables = cloud.functions.tables
     row = cloud.run(tables.get(table, *place))
     assert row is not None
@@ -87,7 +87,7 @@ class TestItsTurn:
 
         self.expect_no_turn(pair, bert, change, "unshared")
 
-    def test_nor_does_one_of_somebody_who_has_signed_out(self, cloud: Cloud, pair: Pair) -> None:
+    def test_nor_does_one_of_a_signed_out_session(self, cloud: Cloud, pair: Pair) -> None:
         other = cloud.sign_in("anna")
         sign_out = lambda _: other.post("/auth/sign-out")  # noqa: E731
         self.expect_no_turn(pair, other, sign_out, "signed-out")

@@ -1,4 +1,4 @@
-"""Sharing by link, and handing an agent or a space over to somebody who accepts it."""
+"""Sharing by link, and transfer of an agent or a space to an account that accepts it."""
 
 from typing import Any
 
@@ -209,7 +209,7 @@ def test_of_two_who_accept_a_transfer_at_once_one_gets_it(cloud: Cloud, three: T
 
 
 @pytest.mark.parametrize("after", [1, 5, 9, 17])
-def test_whoever_accepts_killed_after_any_write_leaves_the_rest_to_the_timer(
+def test_an_acceptance_killed_after_any_write_is_completed_by_the_timer(
     cloud: Cloud, three: Three, mortal: Mortal, after: int
 ) -> None:
     anna, bert, robot = three

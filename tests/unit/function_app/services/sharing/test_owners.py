@@ -1,4 +1,4 @@
-"""What an owner does to what is theirs: what would leave nobody is refused, with what to do instead."""
+"""Operations of an owner: one that would leave no owner is refused, and the error names the alternative."""
 
 from typing import Any
 
@@ -49,8 +49,8 @@ def test_nothing_is_handed_to_an_account_that_there_is_not(three: Three) -> None
         (f"/devices/{robot.device}/invitations", {"role": "viewer"}),
         (f"/devices/{robot.device}/shares", {"role": "viewer"}),
     ):
-        told = problem(anna.post(path, {"account": "nobody", **body}), 404, "account-unknown")
-        assert "'nobody'" in told["detail"]
+        told = problem(anna.post(path, {"account": "unknown", **body}), 404, "account-unknown")
+        assert "'unknown'" in told["detail"]
         assert "invitation" in told["detail"], "who has no account gets one by a link"
     assert anna.get(f"/agents/{robot.id}/transfers").json()["items"] == []
     stands(anna, bert, robot)
@@ -83,7 +83,7 @@ def test_an_invitation_that_its_maker_tries_is_not_used_up(cloud: Cloud, three: 
     assert clara.get(f"/devices/{robot.device}").json()["role"] == role
 
 
-def test_nobody_is_left_without_a_space(three: Three) -> None:
+def test_the_last_space_cannot_be_given_away(three: Three) -> None:
     anna, bert, robot = three
     problem(anna.post(f"/spaces/{robot.space}/transfers", {}), 409, "last-space")
     second = anna.post("/spaces", {"name": "second"}).json()["id"]

@@ -169,7 +169,7 @@ def test_what_cannot_be_shared_so(three: Three) -> None:
         for body, status, code in (
             ({"account": "bert", "role": "owner"}, 422, "invalid"),
             ({"account": "bert", "role": "operator", "expires_in_s": 1}, 422, "invalid"),
-            ({"account": "nobody here", "role": "viewer"}, 404, "account-unknown"),
+            ({"account": "no account", "role": "viewer"}, 404, "account-unknown"),
             ({"account": "anna", "role": "viewer"}, 422, "invalid"),
         ):
             problem(anna.post(f"/{on}/shares", body), status, code)
@@ -192,7 +192,7 @@ def test_a_share_is_changed_listed_and_given_back(three: Three) -> None:
     assert kinds.count("unshared") == 1
 
 
-def test_an_unpaired_agent_is_shared_with_nobody_not_even_when_it_comes_back(three: Three) -> None:
+def test_unpairing_ends_every_share_and_pairing_again_restores_none(three: Three) -> None:
     anna, bert, robot = three
     share(anna, f"devices/{robot.device}", bert, "operator")
     assert anna.delete(f"/agents/{robot.id}").status_code == 204

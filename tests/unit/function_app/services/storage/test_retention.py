@@ -113,7 +113,7 @@ class TestRows:
         run(alone, NOW_MS)
         assert left(alone) == []
 
-    def test_a_row_that_somebody_changes_meanwhile_is_looked_at_again(self, alone: Cloud) -> None:
+    def test_a_concurrently_changed_row_is_read_again(self, alone: Cloud) -> None:
         put(alone, "a", "b")
         tables, inner = alone.functions.tables, alone.functions.tables.batch
 
@@ -222,7 +222,7 @@ def test_wrong_tries_are_forgotten_when_they_no_longer_count(alone: Cloud) -> No
     assert notes(alone, records.ATTEMPTS) == []
 
 
-def test_an_agent_that_nobody_claims_is_forgotten_after_a_week_and_no_other(cloud: Cloud) -> None:
+def test_only_an_unclaimed_agent_is_deleted_after_a_week(cloud: Cloud) -> None:
     lost, waiting, claimed, given_back = (cloud.robot() for _ in range(4))
     anna = cloud.sign_in("anna")
     claimed.pair(anna)

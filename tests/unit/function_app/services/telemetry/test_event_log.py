@@ -1,4 +1,4 @@
-"""What happened to a device can be read by those who may see it, page by page, and by nobody else."""
+"""Only accounts with access to a device can read its events, page by page."""
 
 from typing import Any
 
@@ -53,7 +53,7 @@ def test_a_cursor_of_another_list_is_refused(pair: Pair) -> None:
     assert answer.json()["type"].endswith("cursor-invalid")
 
 
-def test_nobody_else_sees_them_and_a_later_owner_none_from_before(cloud: Cloud, pair: Pair) -> None:
+def test_other_accounts_and_later_owners_cannot_read_earlier_events(cloud: Cloud, pair: Pair) -> None:
     anna, robot = pair
     happened(cloud, robot, 1)
     bert = cloud.sign_in("bert")

@@ -145,7 +145,7 @@ def test_what_cannot_be_is_refused(cloud: Cloud, pair: Pair) -> None:
     assert known(anna, robot.device) == []
 
 
-def test_nobody_sees_or_adds_to_what_is_not_theirs(cloud: Cloud, pair: Pair) -> None:
+def test_latency_of_another_account_can_be_neither_read_nor_reported(cloud: Cloud, pair: Pair) -> None:
     anna, robot = pair
     samples = body([(cloud.clock.now_ms(), 5.0)])
     with paired(cloud, "bert") as (bert, other):
@@ -234,7 +234,7 @@ def test_the_cloud_counts_what_the_end_of_an_action_tells_once(cloud: Cloud, pai
     answered, started = (_ms(anna, robot, path) for path in ("command-answered", "command-started"))
     assert len(answered) == len(started) == 3
     for first, second in zip(answered, started, strict=True):
-        assert 0 <= first <= second < 60_000, "by the cloud's clock, whatever the agent's says"
+        assert 0 <= first <= second < 60_000, "measured by the cloud's clock, not the agent's"
 
 
 def _ms(who: Person, robot: Robot, path: str) -> list[float]:

@@ -1,4 +1,4 @@
-"""What robots measure, from the broker to whoever asks."""
+"""Live measurements, from the broker to the API."""
 
 from typing import Any
 

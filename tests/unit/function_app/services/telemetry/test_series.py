@@ -1,4 +1,4 @@
-"""Samples into their series and out again: each counts once, whoever sends it how often and in whatever order."""
+"""Series of samples: each sample counts once, independent of sender, repetition and order."""
 
 import asyncio
 import math
@@ -93,7 +93,7 @@ async def test_a_device_has_so_many_streams_and_a_stream_so_many_fields(house: H
     assert len(part.summaries) == series.MAX_FIELDS
 
 
-async def test_a_live_stream_is_written_without_reading_until_somebody_else_writes_it(house: House) -> None:
+async def test_a_live_stream_is_written_without_reading_until_another_writer_appears(house: House) -> None:
     rows: dict[int, dict[str, float]] = {}
     reads = 0
     real = house.writer._read

@@ -141,7 +141,7 @@ def test_an_agent_uploads_of_its_own_devices(cloud: Cloud, pair: tuple[Person, R
     problem(anna.post(path, {**WANTED, "device": "arm"}), 401, "unauthorized")
 
 
-def test_nobody_sees_a_strangers_or_a_former_owners_captures(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
+def test_captures_of_other_and_former_owners_cannot_be_read(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
     anna, robot = pair
     begun = begin(anna, robot)
     send(cloud, begun, PICTURE)
@@ -199,7 +199,7 @@ def test_a_page_from_an_upload_does_not_run(cloud: Cloud, pair: tuple[Person, Ro
     assert answer.headers["x-content-type-options"] == "nosniff"
 
 
-def test_addresses_of_nobody_are_refused(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
+def test_unsigned_addresses_are_refused(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
     anna, robot = pair
     begun = begin(anna, robot)
     for token in ("x", "a.b.c", anna.token, begun["url"].rpartition("/")[2][:-4], "%00", "é"):
