@@ -121,7 +121,7 @@ class Ring(Struct, frozen=True):
         return min(moments, default=_NEVER_MS)
 
     def rotated(self, key: Ed25519PrivateKey, *, now_ms: int, learn_ms: int, overlap_ms: int) -> "Ring":
-        """With a new key behind the others, of which devices are told by the one before.
+        """Returns a ring with an additional key, announced to devices by a statement of the previous key.
 
         Raises:
             RotationRefused: Devices are still learning the last one.

@@ -131,7 +131,7 @@ class Cloud:
         return self.run(made())
 
     def sign_in(self, name: str, *, address: str = "127.0.0.1") -> "Person":
-        """Somebody in a new sign-in session, who asks from ``address``."""
+        """Returns a person in a new sign-in session whose requests come from ``address``."""
         answer = self.ask("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
         assert answer.status_code == 200, answer.text
         return Person(self, answer.json(), address=address)
@@ -285,7 +285,7 @@ def problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def paired(cloud: Cloud, owner: str = "anna", *names: str) -> Iterator[tuple[Person, Robot]]:
-    """Somebody with a robot that is connected and known to be online."""
+    """Yields a person and a paired robot that is online."""
     person = cloud.sign_in(owner)
     with cloud.robot(*names) as robot:
         robot.pair(person)

@@ -52,7 +52,7 @@ def sign_in_links(environment: Mapping[str, str], *names: str) -> list[str]:
 
 
 def sign_in(host: Host, site: Site, home: Path, name: str, environment: Mapping[str, str] | None = None) -> Visitor:
-    """Somebody in a new sign-in session at this host."""
+    """Returns a person in a new sign-in session at this host."""
     link = sign_in_link({"TELESCOPE_HOME": str(home), **(environment or {})}, name)
     answer = site.ask("POST", f"{API}/auth/sign-in", json={"link": link})
     assert answer.status_code == 200, f"{host.url}: {answer.text}"

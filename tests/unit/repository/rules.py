@@ -30,7 +30,10 @@ FORBIDDEN_STEMS: Final = frozenset(
     )
     for word in line.split()
 )
-_WORDS: Final = ("whoever", "somebody", "nobody", "whatever", "what comes", "is told", "are told")
+_WORDS: Final = [
+    word.replace("-", "").replace("_", " ")
+    for word in ["who-ever", "some-body", "no-body", "what-ever", "what_-comes", "is_-told", "are_-told"]
+]
 FORBIDDEN_WORDS: Final = re.compile(rf"\b(?:{'|'.join(_WORDS)})\b", re.IGNORECASE)
 """Dialect of earlier versions. The words are split so that this file does not contain them."""
 
