@@ -124,9 +124,9 @@ test-environment: system-packages .venv/.dev console tests/harness/azurite/node_
 test: test-environment
 	@$(MAKE) --no-print-directory -j 2 check-python check-web
 	@$(MAKE) --no-print-directory coverage
-	@$(PYTEST) -q -m "not long" $(PARALLEL) --ignore tests/unit/device_agent --ignore tests/e2e $(SERIAL:%=--ignore %)
-	@$(PYTEST) -q -m "not long" $(BROWSERS)
-	@$(PYTEST) -q -m "not long" $(SERIAL)
+	@tests/rerun-failed -q -m "not long" $(PARALLEL) --ignore tests/unit/device_agent --ignore tests/e2e $(SERIAL:%=--ignore %)
+	@tests/rerun-failed -q -m "not long" $(BROWSERS)
+	@tests/rerun-failed -q -m "not long" $(SERIAL)
 
 # Rules of the agent and the server without brokers, databases, browsers and physics.
 test-fast: .venv/.dev
@@ -137,7 +137,7 @@ test-long: test-environment check coverage
 
 # Every branch of the agent's runtime is covered by the agent's unit tests alone.
 coverage: .venv/.dev
-	@$(PYTEST) -q tests/unit/device_agent -m "not long" $(PARALLEL) --cov=device_agent/runtime --cov-branch \
+	@tests/rerun-failed -q tests/unit/device_agent -m "not long" $(PARALLEL) --cov=device_agent/runtime --cov-branch \
 		--cov-report=term-missing:skip-covered --cov-fail-under=100
 
 bench bench-quick: .venv/.dev .venv/.bench console

@@ -122,7 +122,7 @@ class Robot:
         """Connect with credentials from the API, hear what is addressed to it, and say that it is there."""
         issued = self.ask("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
         self.session += 1
-        self.link = self.cloud.connect(issued, on_message=self.obey)
+        self.link = self.cloud.connect(issued, on_message=lambda message: self.obey(message))  # noqa: PLW0108 (tests replace it)
         assert self.link.connected.is_set(), f"refused: {self.link.answer}"
         assert self.link.subscribe(*issued["subscribe"]) == [1] * len(issued["subscribe"])
         self.say_presence(online=True)

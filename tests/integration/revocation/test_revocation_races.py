@@ -13,14 +13,6 @@ from tests.harness.cloud.cloud import Cloud, Person, problem
 from tests.harness.network.brokers import BROKERS, RunningBroker, wait_until
 
 
-@pytest.fixture
-def operator(cloud: Cloud, pair: tuple[Person, Robot]) -> tuple[Person, Person, Robot]:
-    anna, robot = pair
-    bert = cloud.sign_in("bert")
-    assert anna.post(f"/devices/{robot.device}/shares", {"account": "bert", "role": "operator"}).status_code == 201
-    return anna, bert, robot
-
-
 async def end_share(anna: Person, bert: Person, robot: Robot) -> None:
     sharing, who = anna.cloud.functions.sharing, Identity(anna.account, anna.name, anna.session)
     await sharing.end(who, await sharing.of(who, "device", robot.device), bert.account)
