@@ -16,26 +16,26 @@ _NICE = 10
 
 
 def main() -> None:
-    """Serve requests until the agent closes the socket."""
+    """Serve plan requests until the agent closes the socket."""
     os.nice(_NICE)
     link = MessageSocket(socket.socket(fileno=0))
-    requests: queue.SimpleQueue[PlanRequest] = queue.SimpleQueue()
+    plan_queue: queue.SimpleQueue[PlanRequest] = queue.SimpleQueue()
     scene = msgspec.msgpack.decode(_receive(link), type=PlannerScene)
-    threading.Thread(target=_listen, args=(link, requests), daemon=True).start()
+    threading.Thread(target=_listen, args=(link, plan_queue), daemon=True).start()
     geometry, error_text = None, ""
     try:
         geometry = MujocoGeometry(scene.robot_type, scene.scene_path, base_pose=scene.room)
     except GeometryError as error:
         error_text = str(error)
     while True:
-        request = requests.get()
+        request = plan_queue.get()
         link.send(PlanResponse(error=error_text) if geometry is None else _respond(geometry, request))
 
 
-def _listen(link: MessageSocket, requests: queue.SimpleQueue[PlanRequest]) -> None:
-    """Receive requests during planning, too, so that the process exits as soon as the agent does."""
+def _listen(link: MessageSocket, plan_queue: queue.SimpleQueue[PlanRequest]) -> None:
+    """Receive plan requests during planning, too, so that the process exits as soon as the agent does."""
     while True:
-        requests.put(msgspec.msgpack.decode(_receive(link), type=PlanRequest))
+        plan_queue.put(msgspec.msgpack.decode(_receive(link), type=PlanRequest))
 
 
 def _receive(link: MessageSocket) -> bytes:
