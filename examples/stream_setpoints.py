@@ -38,8 +38,8 @@ try:
         message = json.loads(payload)
         if source.endswith("/desc"):
             joints = [each["name"] for each in message["joints"]]
-        if source.endswith("/desc") or not joints:
-            continue
+        if source.endswith("/desc") or not joints or not messages.empty():
+            continue  # only the newest telemetry: a setpoint that echoes an old tick is rejected
         if abs(message["position_rad"][joints.index(joint)] - target_rad) < TOLERANCE_RAD:
             print(f"{joint} reached {target_rad} rad; loop age {message['loop_age_ms']:.0f} ms")
             break

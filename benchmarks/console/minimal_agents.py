@@ -9,6 +9,7 @@ import httpx
 from device_agent.ports.clock import wall_ms
 from tests.fakes.agent import Robot
 from tests.harness.browser.product import Machine
+from tests.harness.cloud.cloud import connect_to_broker
 
 if TYPE_CHECKING:
     from tests.harness.cloud.cloud import Cloud, Person
@@ -27,6 +28,7 @@ class _Functions:
     def __init__(self, machine: Machine) -> None:
         self._http = httpx.Client(base_url=machine.url, timeout=30)
         self.clock = _Clock()
+        self.connect = connect_to_broker
 
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
         return self._http.request(method, path, **options)

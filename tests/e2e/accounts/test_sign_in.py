@@ -64,7 +64,7 @@ def test_a_password_is_set_after_a_link_and_signs_in(browser: Browser, environme
     page.get_by_test_id("sign-in-name").fill("ann")
     page.get_by_test_id("sign-in-password").fill("another one")
     page.get_by_test_id("sign-in").click()
-    expect(page.get_by_text("do not belong together")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_text("Name or password is wrong")).to_be_visible(timeout=PATIENCE_MS)
     page.get_by_test_id("sign-in-password").fill(PASSWORD)
     page.get_by_test_id("sign-in").click()
     signed_in(page, "ann")
