@@ -23,7 +23,7 @@ import msgspec
 from infra.local.supervisor import SupervisedProcess
 from tests.faults.console import Seat
 from tests.harness.browser.product import free_ports
-from tests.harness.network.brokers import BrokerKind, wait_until
+from tests.harness.network.brokers import MODULES, BrokerKind, wait_until
 from tests.harness.network.proxy import HOST, Proxy
 from tests.harness.paths import ROOT
 
@@ -113,7 +113,7 @@ class Stack:
         ports = ["--tcp-port", str(self.port + 1), "--websocket-port", str(self.port + 2)]
         keys = ["--keys", str(self.home / "keys" / "public.json")]
         site = ["--home", str(self.home / "mosquitto")]
-        self.broker = self._child("broker", f"infra.{self._kind}", *ports, *(keys if self._kind == "amqtt" else site))
+        self.broker = self._child("broker", MODULES[self._kind], *ports, *(keys if self._kind == "amqtt" else site))
         self.broker.wait_for_line("ready", PATIENCE_S)
         self.functions = self._child("functions", "function_app", "serve")
         self._child("worker", "function_app", "work")

@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.harness.agent.arm import drive, elbow, end_in_mid_motion, operator, release, stopped_in_time
 from tests.harness.browser.product import Api, Machine, start_machine
-from tests.harness.network.brokers import BROKERS, wait_until
+from tests.harness.network.brokers import BROKERS, MODULES, wait_until
 
 NOTE = """() => {
     window.saidOfTheLink = [];
@@ -31,7 +31,7 @@ def site(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Machi
         yield request.getfixturevalue("machine"), "infra.embedded_broker"
         return
     with start_machine(tmp_path, TELESCOPE_BROKER=request.param) as machine:
-        yield machine, f"infra.{request.param}"
+        yield machine, MODULES[request.param]
 
 
 def kill(machine: Machine, program: str) -> None:

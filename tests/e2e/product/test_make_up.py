@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from tests.harness.browser.product import Machine, free_ports, moves, ready_link, start_machine
-from tests.harness.network.brokers import BROKERS, wait_until
+from tests.harness.network.brokers import BROKERS, MODULES, wait_until
 from tests.harness.paths import ROOT
 
 
@@ -57,7 +57,7 @@ def test_start_and_clean_exit_keep_the_data(tmp_path: Path, broker: str) -> None
         assert set(listeners(first)) == {"0100007F"}, "a port listens beyond loopback"
         children = [
             first.pid(words)
-            for words in (f"infra.{broker}", "function_app serve", "function_app work", "-m device_agent")
+            for words in (MODULES[broker], "function_app serve", "function_app work", "-m device_agent")
         ]
         assert first.interrupt() == 0
         for pid in children:

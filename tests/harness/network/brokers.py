@@ -34,6 +34,7 @@ from tests.harness.paths import ROOT
 BrokerKind = Literal["amqtt", "mosquitto"]
 Transport = Literal["tcp", "websockets"]
 BROKERS: tuple[BrokerKind, ...] = ("amqtt", "mosquitto")
+MODULES = {"amqtt": "infra.embedded_broker", "mosquitto": "infra.mosquitto"}
 TRANSPORTS: tuple[Transport, ...] = ("tcp", "websockets")
 HOST = "127.0.0.1"
 PATIENCE_S = 120.0
