@@ -121,7 +121,7 @@ class Body:
     def live(self) -> None:
         key = Ed25519PrivateKey.from_private_bytes(self.life.key)
         writes = [self.steps.around(Journal, name) for name in ("begin", "record", "delivered", "save_epoch")]
-        with mock.patch.object(Controller, "move", self._counted(Controller.start_joint_goal)):
+        with mock.patch.object(Controller, "start_joint_goal", self._counted(Controller.start_joint_goal)):
             for write in writes:
                 write.start()
             journal = Journal(self.folder / "journal.db")
