@@ -28,7 +28,7 @@ not measured left no hole."""
 def kept(agent: OwnAgent, *, late: bool) -> list[bytes]:
     """What lies in the outbox on disk."""
     with contextlib.closing(sqlite3.connect(agent.store.outbox, timeout=20)) as database:
-        rows = database.execute("SELECT payload FROM kept WHERE late = ? ORDER BY id", (late,)).fetchall()
+        rows = database.execute("SELECT payload FROM items WHERE late = ? ORDER BY id", (late,)).fetchall()
     return [row[0] for row in rows]
 
 

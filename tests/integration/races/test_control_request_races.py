@@ -101,7 +101,7 @@ async def look(functions: Functions, scene: Scene, number: int, did: dict[str, s
     assert row is not None
     raised = {what for what in RAISES if did[what] == "done"}
     assert row.data["epoch"] == 1 + len(raised), (did, row.data)
-    outcome: str = row.data["asked"]["outcome"]
+    outcome: str = row.data["request"]["outcome"]
     found = await functions.devices.get(scene.who("holder"), device)
     events, _ = await functions.events.read(found, cursor=None, limit=100)
     kinds = Counter(event["kind"] for event in events)

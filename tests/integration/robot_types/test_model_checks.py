@@ -76,7 +76,7 @@ class TestChecker:
         check_all(cloud)
         shown = anna.get("/robot-types/lever").json()
         assert shown["state"] == "rejected"
-        assert "cut off" in shown["upload"]["errors"][0]
+        assert "interrupted" in shown["upload"]["errors"][0]
 
     def test_many_give_each_upload_one_verdict(
         self, cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch

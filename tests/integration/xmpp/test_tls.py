@@ -94,7 +94,7 @@ def test_with_a_trusted_certificate_the_password_is_asked_for_under_tls(
 ) -> None:
     prosody, pem = server
     sent = watched(monkeypatch)
-    assert "refuses the password" in refusal(prosody.port, pem, monkeypatch)
+    assert "rejects the password" in refusal(prosody.port, pem, monkeypatch)
     (auth,) = [secure for secure, data in sent if "<auth" in data]
     assert auth is True
 
