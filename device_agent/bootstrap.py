@@ -294,12 +294,7 @@ def _ground(neighbours: Mapping[str, RoomDriver]) -> ObstacleMap | None:
 
 
 def _outbox(
-    store: IdentityStore,
-    configuration: AgentConfig,
-    pairing: Pairing,
-    *,
-    publish: Publish,
-    quiet: Callable[[], bool],
+    store: IdentityStore, configuration: AgentConfig, pairing: Pairing, *, publish: Publish, quiet: Callable[[], bool]
 ) -> Outbox:
     own = f"{topics.ROOT}/{pairing.space}/{pairing.agent}/"
     buffer = configuration.buffer

@@ -4,9 +4,7 @@ A movement script for the UR5. Store it in the console under *Movements*, or wit
 ``PUT /robot-types/ur5/movements/nod`` and the body ``{"source": "…"}``.
 """
 
-PARAMETERS = {
-    "times": {"type": "integer", "minimum": 1, "maximum": 5, "default": 2, "description": "How often"},
-}
+PARAMETERS = {"times": {"type": "integer", "minimum": 1, "maximum": 5, "default": 2, "description": "How often"}}
 
 times = parameters.get("times", 2)
 for count in range(times):

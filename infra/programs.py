@@ -71,6 +71,23 @@ def free_ports(host: str, *ports: int) -> list[int]:
         return [listening_socket.getsockname()[1] for listening_socket in sockets]
 
 
+def explain(error: Exception, *, server: str, host: str, home: Path) -> int:
+    """Print why a server cannot be started, with advice; returns the exit code."""
+    match error:
+        case NotInstalledError():
+            text, code = str(error), CANNOT_START
+        case PortTakenError():
+            text, code = f"{error}; choose another port", CANNOT_START
+        case socket.gaierror():
+            text, code = f"'{host}' has no IPv4 address, which {server} needs", BAD_INPUT
+        case OSError():
+            text, code = f"cannot use {error.filename or home}: {error.strerror}", BAD_INPUT
+        case _:
+            text, code = str(error), BAD_INPUT
+    _print_error(text)
+    return code
+
+
 def supervise(
     name: str, command: Sequence[str], *, host: str, ports: Sequence[int], ready: str, watched: Path | None = None
 ) -> int:
@@ -102,19 +119,20 @@ def supervise(
         command,
         stdin=subprocess.DEVNULL,
         stdout=sys.stderr.fileno(),  # standard output is reserved for the ready line
-        preexec_fn=_die_with_parent,  # noqa: PLW1509 (single-threaded)
+        preexec_fn=lambda: signal_with_parent(signal.SIGKILL),  # noqa: PLW1509 (single-threaded)
         start_new_session=True,  # Ctrl-C only reaches this program, which stops the server
     )
     if stopping:
         child.terminate()
     elif _wait_for_ports(name, child, host, ports):
         print(ready, flush=True)  # noqa: T201 (command-line program)
-    changes = _FileChanges(watched)
+    stamp = _stamp(watched)
     while child.poll() is None:
         try:
             child.wait(_STOP_S if stopping else _POLL_S if watched else None)
         except subprocess.TimeoutExpired:
-            if stopping or changes.detect():
+            previous, stamp = stamp, _stamp(watched)
+            if stopping or stamp != previous:
                 child.send_signal(signal.SIGKILL if stopping else signal.SIGHUP)
     if stopping:
         return 0
@@ -122,24 +140,13 @@ def supervise(
     return ENDED
 
 
-class _FileChanges:
-    """Detects changes of a file."""
-
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
-        self._stamp = self._read_stamp()
-
-    def detect(self) -> bool:
-        """Whether the file has changed since the last call."""
-        previous, self._stamp = self._stamp, self._read_stamp()
-        return self._stamp != previous
-
-    def _read_stamp(self) -> tuple[int, int] | None:
-        try:
-            path = self._path.stat() if self._path else None
-        except OSError:
-            return None
-        return None if path is None else (path.st_mtime_ns, path.st_ino)
+def _stamp(path: Path | None) -> tuple[int, int] | None:
+    """A value that differs after a change of the file."""
+    try:
+        stat = path.stat() if path else None
+    except OSError:
+        return None
+    return stat and (stat.st_mtime_ns, stat.st_ino)
 
 
 def _wait_for_ports(name: str, child: "subprocess.Popen[bytes]", host: str, ports: Sequence[int]) -> bool:
@@ -163,7 +170,7 @@ def _print_error(text: str) -> None:
     print(f"broker: {text}", file=sys.stderr)  # noqa: T201 (command-line program)
 
 
-def _die_with_parent() -> None:
-    """Linux: kill the server when this program exits, so that it does not keep the port."""
+def signal_with_parent(number: signal.Signals) -> None:
+    """Linux, in a new child process: receive a signal when the parent process exits."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)

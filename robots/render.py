@@ -11,9 +11,7 @@ Requires a software renderer (Debian: ``libosmesa6``), but no display.
 import argparse
 import math
 import os
-import struct
 import sys
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -27,6 +25,7 @@ import numpy as np
 
 from device_agent.config import catalogue
 from device_agent.protocol.manifests import robot_type
+from device_agent.sensors import png
 from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 WIDTH, HEIGHT, CAMERA = 800, 600, "picture"
@@ -95,21 +94,6 @@ def sheet(images: Sequence[Any]) -> Any:
     return np.concatenate(rows, axis=0)
 
 
-def png(image: Any) -> bytes:
-    """An image as PNG: signature, header, one compressed block of rows, end.
-
-    Rows are stored as differences to the row above (filter 2), which compress well for drawings.
-    """
-    height, width, _ = image.shape
-    above = np.vstack([np.zeros_like(image[:1]), image[:-1]])
-    rows = b"".join(b"\2" + row.tobytes() for row in (image - above))
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    parts = ((b"IHDR", header), (b"IDAT", zlib.compress(rows, 9)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in parts
-    )
-
-
 def main() -> None:
     """Command line."""
     types = catalogue.TYPES.folders()
@@ -143,7 +127,7 @@ def main() -> None:
             image = sheet(images)
         else:
             image = scene.render(arguments.camera)
-    arguments.file.write_bytes(png(image))
+    arguments.file.write_bytes(png.encode(image))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import pytest
 
 from tests.harness.stores.emulators import StoreKind, start_emulator
 
-pytest_plugins = ["tests.fixtures.cloud"]
+pytest_plugins = ["tests.fixtures.brokers", "tests.fixtures.cloud", "tests.fixtures.sampling"]
 
 
 @pytest.fixture(autouse=True)

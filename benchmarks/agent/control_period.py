@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from benchmarks.reporting.report import percentile
 from device_agent import geometry
 from device_agent.ports.geometry import RobotGeometry
 from device_agent.protocol import JointTarget, Setpoint
@@ -48,11 +49,7 @@ def setpoints(controller: Controller, kind: RobotType) -> Iterator[None]:
         if period % SETPOINT_PERIODS == 0:
             sequence += 1
             asked = Setpoint(
-                epoch=1,
-                sequence=sequence,
-                echo_tick_ms=now_ms,
-                sent_ms=0.0,
-                target=JointTarget(position_rad=target),
+                epoch=1, sequence=sequence, echo_tick_ms=now_ms, sent_ms=0.0, target=JointTarget(position_rad=target)
             )
             controller.accept_setpoint(asked, now_s=now_ms / 1000, tick_ms=now_ms + LOOP_AGE_MS)
         yield
@@ -82,7 +79,7 @@ def measure(kind: RobotType, shape: RobotGeometry | None, source: Source) -> lis
         controller.update(period * kind.period_ms / 1000)
         if controller.moving:
             found.append((time.thread_time() - began) * 1000)
-    return sorted(found)
+    return found
 
 
 def main() -> None:
@@ -95,8 +92,7 @@ def main() -> None:
     for label, source in (("setpoints", setpoints), ("moves", moves)):
         for known, looked_at in ((None, "ranges only"), (shape, "with its shape")):
             times = measure(kind, known, source)
-            last = len(times) - 1
-            marks = "".join(f"{times[round(last * mark)]:8.3f}" for mark in (0.5, 0.95, 0.99, 1))
+            marks = "".join(f"{percentile(times, mark):8.3f}" for mark in (0.5, 0.95, 0.99, 1))
             print(f"{label + ', ' + looked_at:28}{marks}")
 
 

@@ -19,10 +19,11 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.reporting.report import percentile
 from device_agent import __main__ as agent
 from device_agent.config.catalogue import ROOMS
 from device_agent.runtime.control import control_loop
@@ -40,12 +41,12 @@ MOVEMENTS = {"ur5": "slow_square", "nao": "wave", "qbo": "patrol", "hanson": "lo
 PARTS = (
     ("physics", ("mujoco-world",)),
     ("control loops", ("-loop",)),
-    ("drawing for cameras", ("studio", "llvmpipe")),
+    ("drawing for cameras", ("renderer", "llvmpipe")),
     ("perception", ("perception",)),
     ("sensors, JPEG", ("-sensing",)),
     ("robots' other streams", ("-reporter",)),
     ("network", ("mqtt", "outbox", "paho")),
-    ("orders, journal, events", ("-office", "action-", "script-")),
+    ("orders, journal, events", ("-commands", "action-", "script-")),
 )
 OTHER = "else"
 DIVIDER = "--"
@@ -96,23 +97,20 @@ def _watch(report: Path, for_s: float, gaps: dict[str, list[float]]) -> None:
     }
     named["threads that ended"] = (used_s - sum(cost.values())) / took_s * 100
     cost[OTHER] = used_s - sum(spent for part, spent in cost.items() if part != OTHER)
-    report.write_text(
-        json.dumps(
-            {
-                "factor": (last.time_s - first.time_s) / took_s,
-                "lost_ms": last.lag_ms - first.lag_ms,
-                "cost_percent": {part: spent_s / took_s * 100 for part, spent_s in cost.items()},
-                "else_percent": {name: percent for name, percent in named.items() if percent >= TOLD_PERCENT},
-                "agent_percent": used_s / took_s * 100,
-                "others_percent": (_busy_s() - busy - used_s) / took_s * 100,
-                "gaps_ms": {
-                    name: [len(each), *([round(_at(each, mark) * 1000, 2) for mark in _MARKS])]
-                    for name, each in sorted(gaps.items())
-                    if name.endswith("-loop") and each
-                },
-            }
-        )
-    )
+    result = {
+        "factor": (last.time_s - first.time_s) / took_s,
+        "lost_ms": last.lag_ms - first.lag_ms,
+        "cost_percent": {part: spent_s / took_s * 100 for part, spent_s in cost.items()},
+        "else_percent": {name: percent for name, percent in named.items() if percent >= TOLD_PERCENT},
+        "agent_percent": used_s / took_s * 100,
+        "others_percent": (_busy_s() - busy - used_s) / took_s * 100,
+        "gaps_ms": {
+            name: [len(each), *([round(percentile(each, mark) * 1000, 2) for mark in _MARKS])]
+            for name, each in sorted(gaps.items())
+            if name.endswith("-loop") and each
+        },
+    }
+    report.write_text(json.dumps(result))
 
 
 def _threads() -> dict[str, float]:
@@ -139,11 +137,6 @@ def _part(thread: str) -> str:
     return next((part for part, names in PARTS if any(name in thread for name in names)), OTHER)
 
 
-def _at(values: Iterable[float], mark: float) -> float:
-    ordered = sorted(values)
-    return ordered[round((len(ordered) - 1) * mark)]
-
-
 # ------------------------------------------------------------ beside it
 
 
@@ -158,15 +151,8 @@ class Laboratory(local.LocalStack):
 
     def _run(self, name: str, *arguments: str) -> Any:
         if name == "agent":
-            arguments = (
-                "-m",
-                "benchmarks.agent.laboratory",
-                str(self._for_s),
-                "--agent",
-                str(self._report),
-                DIVIDER,
-                *arguments[2:],
-            )
+            own = ("benchmarks.agent.laboratory", str(self._for_s), "--agent", str(self._report))
+            arguments = ("-m", *own, DIVIDER, *arguments[2:])
         return super()._run(name, *arguments)
 
     def operate(self, ending: threading.Event) -> None:
@@ -203,15 +189,8 @@ def measure(for_s: float, broker: str, port: int) -> None:
     """Starts the product, measures and stops it."""
     with tempfile.TemporaryDirectory(prefix="ts-bench-lab-") as folder:
         report = Path(folder) / "report.json"
-        chosen = settings.read(
-            os.environ
-            | {
-                "TELESCOPE_HOME": folder,
-                "TELESCOPE_PORT": str(port),
-                "TELESCOPE_BROKER": broker,
-                "TELESCOPE_ROOM": ROOM,
-            }
-        )
+        wanted = {"HOME": folder, "PORT": str(port), "BROKER": broker, "ROOM": ROOM}
+        chosen = settings.read(os.environ | {f"TELESCOPE_{name}": value for name, value in wanted.items()})
         laboratory = Laboratory(chosen, report, for_s)
         ending = threading.Event()
         try:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import mujoco
 
-from benchmarks.agent.laboratory import _at
+from benchmarks.reporting.report import percentile
 from device_agent.geometry.mujoco_geometry import MujocoGeometry
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
@@ -100,10 +100,10 @@ def measure(for_s: float, *, planning: bool) -> None:
         loop.thread.join()
     print("with planning" if planning else "without planning")
     for name, loop in loops.items():
-        late_ms = " ".join(f"{_at(loop.late_s, mark) * 1000:8.2f}" for mark in _MARKS)
+        late_ms = " ".join(f"{percentile(loop.late_s, mark) * 1000:8.2f}" for mark in _MARKS)
         print(f"  {name:8} {len(loop.late_s):6} periods, late p50, p95, p99, max ms {late_ms}")
     if took_s:
-        print(f"  {len(took_s)} plans, p50 {_at(took_s, 0.5) * 1000:.0f} ms, max {max(took_s) * 1000:.0f} ms")
+        print(f"  {len(took_s)} plans, p50 {percentile(took_s, 0.5) * 1000:.0f} ms, max {max(took_s) * 1000:.0f} ms")
         print(f"  memory of the program that plans: {_planner_mb():.0f} MB")
 
 

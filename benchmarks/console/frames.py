@@ -94,10 +94,7 @@ def open_together(page: Page, machine: Machine, ids: Sequence[str]) -> None:
     """Opens one page with all devices and waits until each receives telemetry and is drawn."""
     page.goto(f"{machine.url}/#/operate/{','.join(ids)}")
     expect(page.get_by_test_id("robot-panel")).to_have_count(len(ids), timeout=PATIENCE_MS)
-    wait_until(
-        lambda: [frames > 0 for frames in page.evaluate(DRAWN)] == [True] * len(ids),
-        "every twin",
-    )
+    wait_until(lambda: [frames > 0 for frames in page.evaluate(DRAWN)] == [True] * len(ids), "every twin")
 
 
 def show_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:

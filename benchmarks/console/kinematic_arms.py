@@ -82,7 +82,7 @@ def _pattern(machine: Machine) -> _Pattern:
 def _introduce(robot: Robot, name: str, pattern: _Pattern) -> None:
     def say(kind: str, message: msgspec.Struct, more: str = "") -> None:
         topic = topics.device(robot.space, robot.id, name, kind, more)
-        robot.say(topic, msgspec.structs.replace(message, device=name), retain=True)
+        robot.publish(topic, msgspec.structs.replace(message, device=name), retain=True)
 
     say(topics.DESC, pattern.description)
     say(topics.DESC, pattern.twin, topics.TWIN)
@@ -91,7 +91,7 @@ def _introduce(robot: Robot, name: str, pattern: _Pattern) -> None:
 
 def _tell_state(robot: Robot, name: str) -> None:
     state = State(device=name, at_ms=wall_ms(), tick_ms=tick_ms(), mode=Mode.IDLE, epoch=0)
-    robot.say(topics.device(robot.space, robot.id, name, topics.STATE), state, retain=True)
+    robot.publish(topics.device(robot.space, robot.id, name, topics.STATE), state, retain=True)
 
 
 def _swing(everyone: list[tuple[Robot, str]], pattern: _Pattern, over: threading.Event) -> None:

@@ -30,7 +30,7 @@ class _Functions:
         self.clock = _Clock()
         self.connect = connect_to_broker
 
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         return self._http.request(method, path, **options)
 
     def close(self) -> None:

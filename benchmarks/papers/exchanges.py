@@ -84,7 +84,7 @@ def xmpp(stack: contextlib.ExitStack, ports: Ports, port: int) -> Exchange:
 
     def exchange() -> None:
         _require_none(heard)
-        sender.say(stanza)
+        sender.send(stanza)
         heard.get(timeout=TIMEOUT_S)
 
     return exchange

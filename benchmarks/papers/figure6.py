@@ -125,15 +125,15 @@ def judge(report: Report, taken: dict[str, list[float]]) -> None:
     found = taken[ANNOUNCED]
     report.claims += [
         Claim(
-            text="request and response of a room client behind 15 ms of round trip, on average (printed: 63)",
-            seen=statistics.fmean(found),
-            bound=MEAN_MOST_MS,
-            unit="ms",
+            "request and response of a room client behind 15 ms of round trip, on average (printed: 63)",
+            statistics.fmean(found),
+            MEAN_MOST_MS,
+            "ms",
         ),
         Claim(
-            text=f"the same exchange of a room client, the worst of {len(found):,} (printed: 103)",
-            seen=max(found),
-            bound=WORST_MOST_MS,
-            unit="ms",
+            f"the same exchange of a room client, the worst of {len(found):,} (printed: 103)",
+            max(found),
+            WORST_MOST_MS,
+            "ms",
         ),
     ]

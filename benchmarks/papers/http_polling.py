@@ -89,9 +89,9 @@ class _Receiver(PollingRobot):
         self.arrived: queue.SimpleQueue[float] = queue.SimpleQueue()
         self.reports = lambda _: (AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE)
 
-    def obey(self, message: Message) -> None:
+    def handle(self, message: Message) -> None:
         self.arrived.put(time.perf_counter())
-        super().obey(message)
+        super().handle(message)
 
 
 def long_poll(stack: contextlib.ExitStack, ports: Mapping[int, int], ground: Ground) -> Exchange:

@@ -46,7 +46,7 @@ class Chart(msgspec.Struct, frozen=True, kw_only=True):
     log: bool = False
 
 
-class Claim(msgspec.Struct, frozen=True, kw_only=True):
+class Claim(msgspec.Struct, frozen=True):
     """A target and its measured value.
 
     Attributes:

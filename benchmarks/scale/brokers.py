@@ -91,7 +91,8 @@ def publishers_of(broker: RunningBroker) -> Iterator[Callable[[float, float], Ru
     listens = "ts/v1/lab/+/+/tele/+"
     issued = broker.issue(broker.grant("ear", subscribe=(listens,)))
     ear = SubscriberOptions(broker.tcp_port, "ear", issued.username, issued.password, listens)
-    with program("ear", ear) as listener, program("fleet", PublisherOptions(broker.tcp_port, robots)) as fleet:
+    options = PublisherOptions(broker.tcp_port, robots)
+    with program("subscriber", ear) as listener, program("publishers", options) as fleet:
 
         def ask(rate_hz: float, seconds: float) -> Run:
             before_s = processor_s(broker.process.pid)
@@ -146,6 +147,6 @@ def claims(runs: list[Run]) -> list[Claim]:
     for run in runs:
         if run.rate_hz == RATES_HZ[run.kind]:
             what = f"{ROBOTS} robots × {run.rate_hz:g} Hz through {run.kind} to one subscriber"
-            found.append(Claim(text=f"{what}: lost", seen=run.lost, bound=0, unit="messages"))
-            found.append(Claim(text=f"{what}: p99", seen=run.heard.p99_ms, bound=LATE_MS, unit="ms"))
+            found.append(Claim(f"{what}: lost", run.lost, 0, "messages"))
+            found.append(Claim(f"{what}: p99", run.heard.p99_ms, LATE_MS, "ms"))
     return found

@@ -93,7 +93,7 @@ class FunctionsUnderTest:
 
 def clients(stack: contextlib.ExitStack, what: str, ports: list[int], pids: list[int], requests: list[Request]) -> Ask:
     """Starts clients for some servers."""
-    asker = stack.enter_context(program("askers", HttpLoad(ports, CONNECTIONS, requests)))
+    asker = stack.enter_context(program("http_load", HttpLoad(ports, CONNECTIONS, requests)))
 
     def ask(seconds: float) -> Load:
         before_s = sum(map(processor_s, pids))
@@ -225,10 +225,10 @@ def claims(one: list[Load]) -> list[Claim]:
     by_name = {load.what: load.answered.per_s for load in one}
     return [
         Claim(
-            text=f"`{what}` by one process, authenticated, to a bare FastAPI's requests/s",
-            seen=by_name[what] / by_name[BARE],
-            bound=LEAST,
-            unit="×",
+            f"`{what}` by one process, authenticated, to a bare FastAPI's requests/s",
+            by_name[what] / by_name[BARE],
+            LEAST,
+            "×",
             at_least=True,
         )
         for what in (LIST, ONE)

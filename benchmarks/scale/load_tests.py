@@ -128,7 +128,7 @@ class LoadTest:
         )
         broker = self._stand.machine.pid("infra.mosquitto")
         load, began_s = os.getloadavg()[0], time.monotonic()
-        with program("ear", ear) as listener, self.living(count, rate_hz, seconds, gap_s) as process:
+        with program("subscriber", ear) as listener, self.living(count, rate_hz, seconds, gap_s) as process:
             progress = _Progress(process, count)
             known_s = progress.first_s - began_s
             progress.wait()

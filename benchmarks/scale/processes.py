@@ -6,18 +6,23 @@ from pathlib import Path
 _TICKS_S = os.sysconf("SC_CLK_TCK")
 
 
-def family(process: int) -> list[int]:
-    """Returns a process and its descendants."""
-    parents: dict[int, int] = {}
+def parents() -> dict[int, int]:
+    """Returns the parent of each process of this machine."""
+    found: dict[int, int] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
         except OSError:  # the process has ended
             continue
-        parents[int(stat.parent.name)] = int(fields[1])
-    found = [process]
+        found[int(stat.parent.name)] = int(fields[1])
+    return found
+
+
+def family(process: int) -> list[int]:
+    """Returns a process and its descendants."""
+    parent_of, found = parents(), [process]
     for each in found:
-        found += [child for child, parent in parents.items() if parent == each]
+        found += [child for child, parent in parent_of.items() if parent == each]
     return found
 
 

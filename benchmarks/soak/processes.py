@@ -1,6 +1,5 @@
 """Memory, descriptors and threads of each process of the product, from ``/proc``."""
 
-import contextlib
 import threading
 import time
 from collections.abc import Iterator
@@ -8,6 +7,8 @@ from pathlib import Path
 from typing import Final, Self
 
 import msgspec
+
+from benchmarks.scale.processes import family, parents
 
 _PARTS: Final = (
     ("function_app serve", "functions"),
@@ -103,17 +104,9 @@ def look(root: int, at_s: float) -> Iterator[Sample]:
 
 def _family(root: int) -> dict[int, str]:
     """Returns the process ids of the product and the part of each."""
-    parents: dict[int, int] = {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-    found = {root: STARTER}
-    waiting = [root]
-    while waiting:
-        parent = waiting.pop()
-        for process in [each for each, above in parents.items() if above == parent]:
-            found[process] = _part(process, found[parent])
-            waiting.append(process)
+    parent_of, found = parents(), {root: STARTER}
+    for process in family(root)[1:]:  # parents come first
+        found[process] = _part(process, found.get(parent_of.get(process, root), STARTER))
     return found
 
 

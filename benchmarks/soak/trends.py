@@ -16,6 +16,7 @@ _POINTS: Final = 60
 """Largest number of medians per series: adjacent samples are not independent, so they are combined."""
 _LEAST_POINTS: Final = 4
 _LEAST: Final = 0.1
+_SUMS: Final = ("processes", "rss_mb", "pss_mb", "own_mb", "descriptors", "threads")
 
 
 class Slope(msgspec.Struct, frozen=True):
@@ -121,15 +122,6 @@ def together(samples: Iterable[Sample]) -> list[Sample]:
         if each.part != CHILDREN:
             looks.setdefault(each.at_s, []).append(each)
     return [
-        Sample(
-            at_s=at_s,
-            part=TOGETHER,
-            processes=sum(each.processes for each in found),
-            rss_mb=sum(each.rss_mb for each in found),
-            pss_mb=sum(each.pss_mb for each in found),
-            own_mb=sum(each.own_mb for each in found),
-            descriptors=sum(each.descriptors for each in found),
-            threads=sum(each.threads for each in found),
-        )
+        Sample(at_s=at_s, part=TOGETHER, **{name: sum(getattr(each, name) for each in found) for name in _SUMS})
         for at_s, found in looks.items()
     ]

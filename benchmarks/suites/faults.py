@@ -166,11 +166,11 @@ def claims(found: list[FaultResult], stops: list[StopResult], orders: Counted) -
         mine = _select(stops, way=way)
         braking = percentile([each.braking_ms for each in mine], 0.99)
         text = f"Stop by {way} → braking begins, p99 of {len(mine)}"
-        made.append(Claim(text=text, seen=braking, bound=_STOP_MOST_MS, unit="ms"))
+        made.append(Claim(text, braking, _STOP_MOST_MS, "ms"))
     for speed in SPEEDS:
         zero = [each.zero_ms for each in _select(stops, way=MESSAGE, speed=speed)]
         text = f"Stop by {MESSAGE} → zero commanded velocity, arm {_WORDS[speed]}, p99 of {len(zero)}"
-        made.append(Claim(text=text, seen=percentile(zero, 0.99), bound=_STOP_MOST_MS, unit="ms"))
+        made.append(Claim(text, percentile(zero, 0.99), _STOP_MOST_MS, "ms"))
     rest = [math.inf if each.moved_again else each.stop_ms for each in found if each.stop_ms is not None]
     slowest = max(found, key=lambda each: each.recovery_s)
     accepted = sum(each[0] for each in orders.values())
@@ -178,24 +178,22 @@ def claims(found: list[FaultResult], stops: list[StopResult], orders: Counted) -
     return [
         *made,
         Claim(
-            text=f"last fresh setpoint → zero commanded velocity, and rest until a new lease, most of {len(rest)}",
-            seen=max(rest),
-            bound=_WATCHDOG_MOST_MS,
-            unit="ms",
+            f"last fresh setpoint → zero commanded velocity, and rest until a new lease, most of {len(rest)}",
+            max(rest),
+            _WATCHDOG_MOST_MS,
+            "ms",
         ),
         Claim(
-            text=f"recovery after each fault, slowest: {slowest.fault} over {slowest.broker}",
-            seen=slowest.recovery_s,
-            bound=_RECOVERY_MOST_S,
-            unit="s",
+            f"recovery after each fault, slowest: {slowest.fault} over {slowest.broker}",
+            slowest.recovery_s,
+            _RECOVERY_MOST_S,
+            "s",
         ),
+        Claim(f"lost, of {accepted} orders", sum(each[1] for each in orders.values()), 0, "orders"),
         Claim(
-            text=f"lost, of {accepted} orders", seen=sum(each[1] for each in orders.values()), bound=0, unit="orders"
-        ),
-        Claim(
-            text="duplicated: actions executed twice, setpoints applied after newer ones",
-            seen=sum(each[2] for each in orders.values()) + undone,
-            bound=0,
-            unit="times",
+            "duplicated: actions executed twice, setpoints applied after newer ones",
+            sum(each[2] for each in orders.values()) + undone,
+            0,
+            "times",
         ),
     ]

@@ -67,12 +67,7 @@ _TOPICS: Final = ("bench/limit/there", "bench/limit/back")
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     """Measures both brokers; on each, all paths run interleaved."""
-    report = Report(
-        suite="limit",
-        title="Against the limit",
-        quick=quick,
-        about=[_ABOUT],
-    )
+    report = Report(suite="limit", title="Against the limit", quick=quick, about=[_ABOUT])
     rounds, each = (6, 25) if quick else (20, 50)
     for kind in BROKERS:
         say(f"{kind}: starting")
@@ -90,16 +85,16 @@ def _judge(report: Report, kind: str, taken: dict[str, list[float]]) -> None:
     mqtt, echo = median(taken["MQTT, QoS 0"]), median(taken["HTTP"])
     report.claims += [
         Claim(
-            text=f"setpoint → applied → seen again, to a bare round trip over {kind}",
-            seen=median(taken["setpoint"]) / mqtt,
-            bound=SETPOINT_MOST,
-            unit="×",
+            f"setpoint → applied → seen again, to a bare round trip over {kind}",
+            median(taken["setpoint"]) / mqtt,
+            SETPOINT_MOST,
+            "×",
         ),
         Claim(
-            text=f"`POST actions` until started, to bare HTTP and a bare round trip over {kind}",
-            seen=median(taken["action"]) / (median(taken["MQTT, QoS 1"]) + echo),
-            bound=ACTION_MOST,
-            unit="×",
+            f"`POST actions` until started, to bare HTTP and a bare round trip over {kind}",
+            median(taken["action"]) / (median(taken["MQTT, QoS 1"]) + echo),
+            ACTION_MOST,
+            "×",
         ),
     ]
 

@@ -87,28 +87,20 @@ def claims(held: list[DescriptorTrend], people: Load, for_s: float) -> list[Clai
     length = f"{for_s / 60:.0f} min of load"
     return [
         Claim(
-            text=f"own memory of all that runs, after warm-up, over {length}",
-            seen=product.own.percent_per_h,
-            bound=_SLOPE_MOST,
-            unit="%/h",
+            f"own memory of all that runs, after warm-up, over {length}", product.own.percent_per_h, _SLOPE_MOST, "%/h"
+        ),
+        Claim(f"of the one that grows fastest by itself ({worst.part})", worst.own.percent_per_h, _SLOPE_MOST, "%/h"),
+        Claim(
+            f"descriptors that any process has more of after {length}",
+            max(each.more_descriptors for each in held),
+            0,
+            "more",
         ),
         Claim(
-            text=f"of the one that grows fastest by itself ({worst.part})",
-            seen=worst.own.percent_per_h,
-            bound=_SLOPE_MOST,
-            unit="%/h",
-        ),
-        Claim(
-            text=f"descriptors that any process has more of after {length}",
-            seen=max(each.more_descriptors for each in held),
-            bound=0,
-            unit="more",
-        ),
-        Claim(
-            text=f"errors in {length}: {people.done['HTTP requests']:,} requests, {people.done['actions']:,} actions",
-            seen=sum(people.errors.values()),
-            bound=0,
-            unit="errors",
+            f"errors in {length}: {people.done['HTTP requests']:,} requests, {people.done['actions']:,} actions",
+            sum(people.errors.values()),
+            0,
+            "errors",
         ),
     ]
 
@@ -119,18 +111,17 @@ def _quick_claims(held: list[DescriptorTrend], people: Load) -> list[Claim]:
     found = []
     if whole is not None:
         found = [
-            Claim(text=f"{each.text} (whole run of {whole.made})", seen=each.seen, bound=each.bound, unit=each.unit)
-            for each in whole.claims
+            Claim(f"{each.text} (whole run of {whole.made})", each.seen, each.bound, each.unit) for each in whole.claims
         ]
     return [
         *found,
         Claim(
-            text="descriptors that any process has more of, within a minute of load",
-            seen=max(each.more_descriptors for each in held),
-            bound=0,
-            unit="more",
+            "descriptors that any process has more of, within a minute of load",
+            max(each.more_descriptors for each in held),
+            0,
+            "more",
         ),
-        Claim(text="errors in a minute of load", seen=sum(people.errors.values()), bound=0, unit="errors"),
+        Claim("errors in a minute of load", sum(people.errors.values()), 0, "errors"),
     ]
 
 

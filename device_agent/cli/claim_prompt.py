@@ -22,14 +22,7 @@ def link(server: str, code: str) -> str:
 
 
 def show(claim: Claim, server: str, *, qr: bool, out: TextIO | None = None) -> None:
-    """Print code and link, and the QR code if the terminal can display it.
-
-    Args:
-        claim: The claim with its code.
-        server: URL of the server.
-        qr: Whether to show the QR code.
-        out: Output; standard output by default.
-    """
+    """Print code and link to ``out`` (default: standard output), and with ``qr`` the QR code if it can be displayed."""
     out = out or sys.stdout
     code = claim.code or ""
     address = link(server, code)

@@ -65,18 +65,9 @@ def add_commands(commands: Commands, home: Path) -> None:
 
 
 def announce(api: CloudClient, config: AgentConfig, *, qr: bool) -> Claim:
-    """Register the agent, and show the claim code if it is not claimed yet.
-
-    Args:
-        api: The HTTP API.
-        config: The agent's configuration.
-        qr: Whether to show a QR code.
-    """
+    """Register the agent, and show the claim code, with ``qr`` as a QR code too, if it is not claimed yet."""
     claim = api.enroll(
-        name=config.name,
-        software=SOFTWARE,
-        transport=config.transport,
-        devices=catalogue.enrolled_devices(config),
+        name=config.name, software=SOFTWARE, transport=config.transport, devices=catalogue.enrolled_devices(config)
     )
     if claim.code is not None:
         claim_prompt.show(claim, config.server, qr=qr)

@@ -21,11 +21,7 @@ def add_commands(commands: Commands, _home: Path) -> None:
         "--into", type=Path, default=Path(), metavar="FOLDER", help="parent folder (default: the current folder)"
     )
     parser.add_argument(
-        "--without",
-        action="append",
-        default=[],
-        metavar="ACTUATOR",
-        help="omit this actuator; may be repeated",
+        "--without", action="append", default=[], metavar="ACTUATOR", help="omit this actuator; may be repeated"
     )
     parser.set_defaults(command=_import_model)
 

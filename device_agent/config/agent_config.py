@@ -108,10 +108,7 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     @classmethod
     def load(cls, folder: Path) -> "AgentConfig":
-        """Read and check ``agent.toml``.
-
-        Args:
-            folder: The agent's folder.
+        """Read and check ``agent.toml`` in the agent's folder.
 
         Raises:
             ConfigError: The file is missing or invalid; the message names the field.

@@ -14,11 +14,7 @@ _RENEW_AT_SHARE = 2 / 3
 
 
 class ClientCertificate:
-    """Manages ``device.crt`` and ``device.key`` of the agent's folder.
-
-    Args:
-        folder: The agent's folder.
-    """
+    """Manages ``device.crt`` and ``device.key`` of the agent's folder."""
 
     def __init__(self, folder: Path) -> None:
         self._certificate = folder / "device.crt"

@@ -65,11 +65,7 @@ class Pairing(Struct, frozen=True, kw_only=True):
 
 
 class IdentityStore:
-    """Reads and writes the agent's folder. The constructor does not access the disk.
-
-    Args:
-        folder: The agent's folder; created on the first write.
-    """
+    """Reads and writes the agent's folder, which the first write creates. The constructor does not access the disk."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -79,10 +75,7 @@ class IdentityStore:
         self._pairing = folder / "pairing.json"
 
     def private_key(self, *, create: bool = False) -> Ed25519PrivateKey:
-        """The agent's private key.
-
-        Args:
-            create: Generate a key if there is none.
+        """The agent's private key; with ``create`` generated if there is none.
 
         Raises:
             ConfigError: The key is missing, unreadable or of another kind.
@@ -107,10 +100,7 @@ class IdentityStore:
         return key
 
     def certificate_authority(self, file_name: str) -> Path | None:
-        """Path of the pinned certificate authority, or ``None`` if none is configured.
-
-        Args:
-            file_name: ``ca`` of ``agent.toml``.
+        """Path of the pinned certificate authority, ``ca`` of ``agent.toml``, or ``None`` if that is empty.
 
         Raises:
             ConfigError: The file is missing.
@@ -177,10 +167,8 @@ class IdentityStore:
         path = self.folder / "running.lock"
         with contextlib.ExitStack() as stack:
             try:
-                database = stack.enter_context(
-                    contextlib.closing(sqlite3.connect(path, timeout=0, isolation_level=None))
-                )
-                database.execute("BEGIN EXCLUSIVE")
+                database = sqlite3.connect(path, timeout=0, isolation_level=None)
+                stack.enter_context(contextlib.closing(database)).execute("BEGIN EXCLUSIVE")
             except sqlite3.Error as error:
                 if "locked" in str(error):
                     raise ConfigError(

@@ -17,6 +17,7 @@ from device_agent.geometry.lever_arms import LeverArms
 from device_agent.ports.geometry import Clearance, GeometryError
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation.mjcf.equality_joints import EqualityJoints
+from device_agent.simulation.mjcf.twin import away_m
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.intp]
@@ -284,7 +285,7 @@ class ApproachingPairs:
 
     @property
     def any(self) -> bool:
-        """Whether any pair could static collide."""
+        """Whether any pair could still collide."""
         return bool(self._room) or bool(len(self._frame_near))
 
     def safe_share(self, segment: int, step_m: float) -> float:
@@ -346,17 +347,11 @@ def _pairs(model: Any, base: int, lever_arms: LeverArms, *, scenery_m: float | N
 
 
 def _away(model: Any, static: Sequence[int], base: int) -> dict[int, float]:
-    """Lower bound of each static object's distance from the base's origin [m]."""
+    """Lower bound of each static object's distance from the base's origin [m]; planes are infinite."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    found = {}
-    for geom in static:
-        if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_PLANE):
-            continue  # infinite
-        offset = data.geom_xmat[geom].reshape(3, 3).T @ (data.xpos[base] - data.geom_xpos[geom])
-        box = model.geom_aabb[geom]
-        found[geom] = float(np.linalg.norm(np.maximum(np.abs(offset - box[:3]) - box[3:], 0.0)))
-    return found
+    plane = int(mujoco.mjtGeom.mjGEOM_PLANE)
+    return {geom: away_m(model, data, geom, data.xpos[base]) for geom in static if model.geom_type[geom] != plane}
 
 
 def _meet(model: Any, a: int, b: int) -> bool:

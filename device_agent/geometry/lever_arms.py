@@ -57,10 +57,7 @@ class LeverArms:
         reach = float(np.linalg.norm(box[:3]) + np.linalg.norm(box[3:]) + np.linalg.norm(model.geom_pos[geom]))
         at = int(model.geom_bodyid[geom])
         while at not in (0, base):
-            for joint in np.flatnonzero(model.jnt_bodyid == at).tolist():
-                slides = model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_SLIDE)
-                offset = float(np.linalg.norm(model.jnt_pos[joint]))
-                reach += float(np.max(np.abs(model.jnt_range[joint]))) if slides else 2 * offset
+            reach += sum(self._moves_m(joint) for joint in np.flatnonzero(model.jnt_bodyid == at).tolist())
             reach += float(np.linalg.norm(model.body_pos[at]))
             at = int(model.body_parentid[at])
         return reach
@@ -94,14 +91,22 @@ class LeverArms:
         reach, at = float(np.linalg.norm(position)) + radius_m, body
         while at > 0:
             for joint in np.flatnonzero(model.jnt_bodyid == at).tolist():
-                offset = float(np.linalg.norm(model.jnt_pos[joint]))
-                slides = model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_SLIDE)
                 if joint in self._joints:
-                    lever[self._joints.index(joint)] = 1.0 if slides else reach + offset
-                reach += float(np.max(np.abs(model.jnt_range[joint]))) if slides else 2 * offset
+                    offset = float(np.linalg.norm(model.jnt_pos[joint]))
+                    lever[self._joints.index(joint)] = 1.0 if self._slides(joint) else reach + offset
+                reach += self._moves_m(joint)
             reach += float(np.linalg.norm(model.body_pos[at]))
             at = int(model.body_parentid[at])
         return lever
+
+    def _slides(self, joint: int) -> bool:
+        return bool(self._model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+    def _moves_m(self, joint: int) -> float:
+        """Largest displacement of the body's origin by the joint [m]."""
+        if self._slides(joint):
+            return float(np.max(np.abs(self._model.jnt_range[joint])))
+        return 2 * float(np.linalg.norm(self._model.jnt_pos[joint]))
 
     def _carries(self, joint: int, geom: int) -> bool:
         at = int(self._model.geom_bodyid[geom])

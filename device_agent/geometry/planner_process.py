@@ -1,18 +1,20 @@
 """Client of the planner process: planning holds the interpreter lock, which would delay the control loops.
 
 The process starts with the first request and keeps running, because starting it takes as long as several plans. The
-client kills it when a request is cancelled. It exits by itself when the socket to the agent closes.
+client kills it when a request is cancelled. It exits by itself when the connection to the agent closes. Messages are
+MessagePack, which unlike JSON can encode infinities.
 """
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
 import weakref
 from collections.abc import Callable, Sequence
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import msgspec
@@ -26,8 +28,6 @@ _POLL_S = 0.02
 """Interval at which cancellation is checked."""
 _STARTUP_S = 30.0
 """Time for start-up and response, in addition to the planning time."""
-_LENGTH = 4
-"""Size of the length field before each message [bytes]."""
 CANCELLED = "the plan was cancelled"
 
 
@@ -80,54 +80,14 @@ class PlanResponse(msgspec.Struct, frozen=True, kw_only=True):
     error: str = ""
 
 
-class MessageSocket:
-    """Length-prefixed MessagePack messages over a socket; unlike JSON it can encode infinities."""
-
-    def __init__(self, connection: socket.socket) -> None:
-        self._socket = connection
-        self._buffer = b""
-
-    def send(self, message: msgspec.Struct) -> None:
-        """Send one message."""
-        content = msgspec.msgpack.encode(message)
-        self._socket.settimeout(None)
-        self._socket.sendall(len(content).to_bytes(_LENGTH, "big") + content)
-
-    def receive(self, timeout_s: float | None) -> bytes | None:
-        """The next message; ``None`` after the timeout.
-
-        Raises:
-            EOFError: The peer closed the connection.
-        """
-        self._socket.settimeout(timeout_s)
-        while True:
-            length = _LENGTH + int.from_bytes(self._buffer[:_LENGTH], "big")
-            if len(self._buffer) >= max(length, _LENGTH + 1):
-                content, self._buffer = self._buffer[_LENGTH:length], self._buffer[length:]
-                return content
-            try:
-                received = self._socket.recv(1 << 16)
-            except TimeoutError:
-                return None
-            except OSError as error:
-                raise EOFError from error
-            if not received:
-                raise EOFError
-            self._buffer += received
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
-
 class _Process:
     """The planner process, if it runs."""
 
     def __init__(self) -> None:
         self.running: subprocess.Popen[bytes] | None = None
-        self.link: MessageSocket | None = None
+        self.link: Connection | None = None
 
-    def start(self, scene: PlannerScene) -> MessageSocket:
+    def start(self, scene: PlannerScene) -> Connection:
         """Start the process unless it runs.
 
         Raises:
@@ -136,7 +96,7 @@ class _Process:
         if self.link is not None and self.running is not None and self.running.poll() is None:
             return self.link
         self.stop()
-        own_end, child_end = socket.socketpair()
+        own_end, child_end = Pipe()
         with child_end:
             try:
                 self.running = subprocess.Popen(
@@ -149,9 +109,9 @@ class _Process:
             except OSError as error:
                 own_end.close()
                 raise PlannerLostError(f"the planner process does not start: {error}") from error
-        self.link = MessageSocket(own_end)
-        self.link.send(scene)
-        return self.link
+        self.link = own_end
+        own_end.send_bytes(msgspec.msgpack.encode(scene))
+        return own_end
 
     def stop(self) -> int:
         """Kill the process if it runs; returns its exit code."""
@@ -204,16 +164,16 @@ class PlannerProcess:
         until_s = time.monotonic() + request.within_s + _STARTUP_S
         try:
             link = self._process.start(self._scene)
-            link.send(request)
-            while (received := link.receive(_POLL_S)) is None:
+            link.send_bytes(msgspec.msgpack.encode(request))
+            while not link.poll(_POLL_S):
                 if ended():
                     raise GeometryError(CANCELLED)
                 if time.monotonic() > until_s:
                     raise PlannerLostError("the planner process does not respond; try again")
+            return msgspec.msgpack.decode(link.recv_bytes(), type=PlanResponse)
         except (EOFError, OSError) as error:
             reason = _exit_reason(self._process.stop())
             raise PlannerLostError(f"the planner process has ended ({reason}); try again") from error
-        return msgspec.msgpack.decode(received, type=PlanResponse)
 
 
 def _exit_reason(code: int) -> str:

@@ -1,14 +1,14 @@
-"""The planner process (see ``planner_process``); its standard input is a socket to the agent."""
+"""The planner process (see ``planner_process``); its standard input is a connection to the agent."""
 
 import os
 import queue
-import socket
 import threading
+from multiprocessing.connection import Connection
 
 import msgspec
 
 from device_agent.geometry.mujoco_geometry import MujocoGeometry
-from device_agent.geometry.planner_process import MessageSocket, PlannerScene, PlanRequest, PlanResponse
+from device_agent.geometry.planner_process import PlannerScene, PlanRequest, PlanResponse
 from device_agent.ports.geometry import GeometryError
 
 _NICE = 10
@@ -16,9 +16,9 @@ _NICE = 10
 
 
 def main() -> None:
-    """Serve plan requests until the agent closes the socket."""
+    """Serve plan requests until the agent closes the connection."""
     os.nice(_NICE)
-    link = MessageSocket(socket.socket(fileno=0))
+    link = Connection(0)
     plan_queue: queue.SimpleQueue[PlanRequest] = queue.SimpleQueue()
     scene = msgspec.msgpack.decode(_receive(link), type=PlannerScene)
     threading.Thread(target=_listen, args=(link, plan_queue), daemon=True).start()
@@ -29,21 +29,21 @@ def main() -> None:
         error_text = str(error)
     while True:
         request = plan_queue.get()
-        link.send(PlanResponse(error=error_text) if geometry is None else _respond(geometry, request))
+        response = PlanResponse(error=error_text) if geometry is None else _respond(geometry, request)
+        link.send_bytes(msgspec.msgpack.encode(response))
 
 
-def _listen(link: MessageSocket, plan_queue: queue.SimpleQueue[PlanRequest]) -> None:
+def _listen(link: Connection, plan_queue: queue.SimpleQueue[PlanRequest]) -> None:
     """Receive plan requests during planning, too, so that the process exits as soon as the agent does."""
     while True:
         plan_queue.put(msgspec.msgpack.decode(_receive(link), type=PlanRequest))
 
 
-def _receive(link: MessageSocket) -> bytes:
+def _receive(link: Connection) -> bytes:
     try:
-        content = link.receive(None)
-    except EOFError:
+        return link.recv_bytes()
+    except (EOFError, OSError):
         os._exit(0)
-    return content or b""
 
 
 def _respond(geometry: MujocoGeometry, request: PlanRequest) -> PlanResponse:

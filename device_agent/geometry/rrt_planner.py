@@ -56,12 +56,7 @@ class RrtPlanner:
         self._bounds = bounds
 
     def plan(
-        self,
-        start_rad: Sequence[float],
-        goal_rad: Sequence[float],
-        *,
-        seed: int,
-        within_s: float,
+        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int, within_s: float
     ) -> tuple[tuple[float, ...], ...]:
         """See ``RobotGeometry.plan``."""
         start, goal = np.array(start_rad, dtype=np.float64), np.array(goal_rad, dtype=np.float64)

@@ -13,29 +13,17 @@ from device_agent.load_generator.robot import SwarmRobot
 from device_agent.ports.clock import CloudClock, wall_ms
 from device_agent.protocol import Presence, codec, topics
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
-from device_agent.transports import tls
 from device_agent.transports.backoff import BackOff
 from device_agent.transports.http import responses
 from device_agent.transports.http.client import CloudClient
-from device_agent.transports.mqtt import BrokerAccess
+from device_agent.transports.mqtt import BrokerAccess, broker_access
 
 SOFTWARE = "telescope-swarm 0.1.0"
 _REFRESH_AT = 0.8
 
 
 class LoadAgent:
-    """One agent.
-
-    Args:
-        plan: The run.
-        api: Its view of the HTTP API.
-        pairing: Whose it is.
-        shape: What all arms have in common.
-        clock: Knows the cloud's time.
-        dialect: Shared by all.
-        figures: What counts.
-        pool: Threads for what blocks.
-    """
+    """One agent of a run. ``pool`` has threads for blocking calls."""
 
     def __init__(
         self,
@@ -130,23 +118,13 @@ class LoadAgent:
         staying.cancel()
 
     def _access(self) -> BrokerAccess:
-        given = responses.read(self._api.credentials(), responses.MqttCredentials)
-        if not self._plan.may_connect_to(given.tcp.host):
-            raise ValueError(
-                f"the server's broker is at {given.tcp.host}, which was not named; say --broker {given.tcp.host}"
-            )
-        if given.tcp.certificate_after_ms is not None:
+        credentials = responses.read(self._api.credentials(), responses.MqttCredentials)
+        host = credentials.tcp.host
+        if not self._plan.may_connect_to(host):
+            raise ValueError(f"the server's broker is at {host}, which was not named; say --broker {host}")
+        if credentials.tcp.certificate_after_ms is not None:
             raise ValueError("the server's broker wants a certificate of each agent; a swarm has none")
-        return BrokerAccess(
-            host=given.tcp.host,
-            port=given.tcp.port,
-            client_id=given.client_id,
-            username=given.username,
-            password=given.password,
-            subscribe=given.subscribe,
-            lifetime_s=given.lifetime_s,
-            tls=tls.broker(tls=given.tcp.tls, server=self._api.server, ca=self._api.ca, own=None),
-        )
+        return broker_access(credentials, self._api)
 
     def _receive(self, topic: str, payload: bytes) -> None:
         before = self._robot.refused

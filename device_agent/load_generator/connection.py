@@ -1,18 +1,17 @@
 """One agent's broker connection without a thread: paho handles MQTT, the shared event loop handles the socket."""
 
 import asyncio
-import contextlib
-import socket
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Any
 
 import paho.mqtt.client as mqtt
-from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.enums import MQTTProtocolVersion
 
 from device_agent.load_generator.metrics import Metrics
-from device_agent.transports.mqtt.transport import KEEP_ALIVE_S, BrokerAccess
+from device_agent.transports.mqtt.connection import disable_nagle
+from device_agent.transports.mqtt.transport import KEEP_ALIVE_S, BrokerAccess, new_client
 
 CONNECT_TIMEOUT_S = 10.0
 """Connection timeout [s]; longer than that of a real agent, since many agents connect at once."""
@@ -37,12 +36,7 @@ class OlderDialect(Exception):  # noqa: N818 (a result, not an error)
 class Link:
     """One connection, from its CONNECT to its end. Everything but the connecting itself runs in the event loop.
 
-    Args:
-        access: Where and as whom.
-        dialect: Shared by all.
-        will: Topic and payload of the will.
-        figures: What counts.
-        receive: Called with topic and payload of what arrives and was not kept by the broker.
+    ``will`` is topic and payload; ``receive`` gets topic and payload of each message that was not retained.
     """
 
     def __init__(
@@ -141,19 +135,8 @@ class Link:
     # ------------------------------------------------------------ paho and the event loop
 
     def _new_client(self, will: tuple[str, bytes]) -> mqtt.Client:
-        version = self._dialect.version
-        options: dict[str, Any] = {} if version is MQTTProtocolVersion.MQTTv5 else {"clean_session": True}
-        access = self._access
-        client = mqtt.Client(
-            CallbackAPIVersion.VERSION2, access.client_id, protocol=version, reconnect_on_failure=False, **options
-        )
-        client.username_pw_set(access.username, access.password)
-        if access.tls is not None:
-            client.tls_set_context(access.tls)
-        client.will_set(will[0], will[1], qos=1, retain=True)
-        client.max_inflight_messages_set(100)
-        client.connect_timeout = CONNECT_TIMEOUT_S
-        client.on_socket_open = _no_delay
+        client = new_client(self._access, self._dialect.version, will, connect_timeout_s=CONNECT_TIMEOUT_S)
+        client.on_socket_open = disable_nagle
         client.on_socket_close = lambda *_: self._let_go()
         client.on_socket_register_write = lambda *_: self._to_flush()
         client.on_connect = self._on_connect
@@ -229,9 +212,3 @@ class Link:
         self._figures.counts.heard_bytes += len(message.topic) + len(message.payload)
         if not message.retain:
             self._receive(message.topic, bytes(message.payload))
-
-
-def _no_delay(_client: mqtt.Client, _userdata: object, opened: Any) -> None:
-    """Disable Nagle's algorithm: otherwise a small message may wait 40 ms."""
-    with contextlib.suppress(OSError, AttributeError):
-        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

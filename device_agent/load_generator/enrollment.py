@@ -10,6 +10,7 @@ from typing import TypeVar
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from device_agent.config import private_file
 from device_agent.config.identity_store import Pairing
 from device_agent.load_generator.account import Account
 from device_agent.load_generator.kinematic_arm import DEVICE
@@ -38,17 +39,14 @@ class Keys:
 
         Raises:
             LoadTestError: The file is not one of these.
-            OSError: It cannot be read or written.
+            ConfigError: It cannot be written.
+            OSError: It cannot be read.
         """
         known = self._read()
         missing = count - len(known)
         if missing > 0:
             known += [signing.generate().private_bytes_raw() for _ in range(missing)]
-            self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            fresh = self._path.with_suffix(".new")
-            fresh.touch(mode=0o600)
-            fresh.write_bytes(msgspec.json.encode([base64.b64encode(key).decode() for key in known]))
-            fresh.replace(self._path)
+            private_file.write(self._path, msgspec.json.encode([base64.b64encode(key).decode() for key in known]))
         return [Ed25519PrivateKey.from_private_bytes(key) for key in known[:count]]
 
     def _read(self) -> list[bytes]:
@@ -64,13 +62,7 @@ class Keys:
 
 
 class Enrollment:
-    """Enrolls and claims agents. Blocks; runs in a thread pool.
-
-    Args:
-        plan: The run.
-        kind: What the robots say they are.
-        clock: Learns the cloud's time.
-    """
+    """Enrolls and claims agents. Blocks; runs in a thread pool."""
 
     def __init__(self, plan: LoadOptions, kind: RobotType, clock: CloudClock) -> None:
         self._plan = plan

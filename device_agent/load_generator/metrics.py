@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from msgspec import Struct
-from msgspec.structs import asdict
+from msgspec.structs import asdict, replace
 
 _MOST_SAMPLES = 200_000
 
@@ -75,7 +75,7 @@ class Metrics:
         self.confirm_ms.clear()
         self._all_lag_ms.clear()
         self._all_confirm_ms.clear()
-        self._steady = (time.monotonic(), time.process_time(), _copy(self.counts))
+        self._steady = (time.monotonic(), time.process_time(), replace(self.counts))
 
     def line(self, memory_bytes: float) -> str:
         """One line with changes since the previous one."""
@@ -84,7 +84,7 @@ class Metrics:
         now, before = self.counts, self._before
         lag, confirm = percentile(self.lag_ms, 99), percentile(self.confirm_ms, 99)
         self._gather()
-        self._line_s, self._before = now_s, _copy(now)
+        self._line_s, self._before = now_s, replace(now)
         text = (
             f"{now_s - self._began_s:6.0f} s  {self.connected} of {self.agents} connected  "
             f"{(now.out - before.out) / passed_s:.1f} out/s  {(now.heard - before.heard) / passed_s:.1f} in/s  "
@@ -142,7 +142,3 @@ def _spread(values: Sequence[float]) -> dict[str, float | int | None]:
 
 def _ms(value: float | None) -> str:
     return "-" if value is None else f"{value:.1f} ms"
-
-
-def _copy(counts: Counts) -> Counts:
-    return Counts(**asdict(counts))

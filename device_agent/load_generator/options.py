@@ -22,24 +22,7 @@ class LoadTestError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadOptions:
-    """Options of one run.
-
-    Attributes:
-        cloud: URL of the server.
-        broker: Host of the broker, if it differs from the server's.
-        ca: Certificate authority of an ``https`` server.
-        count: Number of agents.
-        rate_hz: Telemetry rate per agent [Hz].
-        joints: Joints per arm.
-        type: Robot type that the agents report.
-        seconds: Duration from the first connection on [s].
-        spread_s: Time over which the agents connect [s].
-        home: Folder of the agents' keys.
-        sign_in: One-time sign-in link.
-        token: Access token.
-        json: Output file; ``None`` for none.
-        every_s: Interval of progress lines [s].
-    """
+    """Options of one run; the help texts of ``add_options`` describe them. No ``json`` file: print only."""
 
     cloud: str
     count: int = 100

@@ -219,12 +219,7 @@ class SwarmRobot:
     def _ack(self, command: str, status: AckStatus, **more: Any) -> None:
         sequence, _ = self._answers.get(command, (0, b""))
         ack = Ack(
-            id=command,
-            status=status,
-            sequence=sequence + 1,
-            at_ms=wall_ms(),
-            tick_ms=_tick_ms(self._now_s),
-            **more,
+            id=command, status=status, sequence=sequence + 1, at_ms=wall_ms(), tick_ms=_tick_ms(self._now_s), **more
         )
         payload = codec.encode(ack)
         self._answers[command] = (sequence + 1, payload)

@@ -77,10 +77,7 @@ class GridFloorMap:
 
     def centre(self, row: int, column: int) -> tuple[float, float]:
         """x, y of a cell's centre in the room [m]."""
-        return (
-            self.lower_m[0] + (column + 0.5) * self.resolution_m,
-            self.lower_m[1] + (row + 0.5) * self.resolution_m,
-        )
+        return (self.lower_m[0] + (column + 0.5) * self.resolution_m, self.lower_m[1] + (row + 0.5) * self.resolution_m)
 
     def at(self, x_m: float, y_m: float) -> bool:
         """Whether a point is blocked; points outside the grid are."""

@@ -51,14 +51,7 @@ class SandboxProcess(Protocol):
         """Kill the process at once. Callable from any thread and repeatedly; never blocks."""
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until the process is dead.
-
-        Args:
-            timeout_s: Maximum time [s].
-
-        Returns:
-            Whether the process is dead.
-        """
+        """Wait until the process is dead, at most ``timeout_s`` [s]. Returns whether it is."""
 
     def ending(self) -> str:
         """Why a dead process ended; empty if it exited by itself or was killed by ``kill``."""
@@ -79,8 +72,7 @@ class Sandbox(Protocol):
     def refusal(self, *, untrusted: bool) -> str | None:
         """Why scripts cannot run here, with the remedy, or ``None`` if they can.
 
-        Args:
-            untrusted: Whether the script's author is not the agent's owner; such scripts need an additional layer.
+        Scripts are ``untrusted`` if the author is not the agent's owner; they need an additional layer.
         """
 
     def open(self, limits: Limits, *, untrusted: bool) -> SandboxProcess:

@@ -14,12 +14,8 @@ class Process(Protocol):
     def step(self, model: Any, data: Any, time_s: float) -> None:
         """Advance to ``time_s``. Called in the world's thread before each group of steps (4 ms); must be fast.
 
-        It may write mocap poses, and controls, positions and external forces of its own actuators, joints and bodies.
-
-        Args:
-            model: ``MjModel``; only colours and lights may change.
-            data: ``MjData``.
-            time_s: Simulated time [s].
+        It may write mocap poses, and controls, positions and external forces of its own actuators, joints and bodies
+        in ``data``, an ``MjData``. In the ``MjModel`` only colours and lights may change. ``time_s`` is simulated [s].
         """
 
 
@@ -52,13 +48,10 @@ class SimulatedWorld(Protocol):
         """Add a process, from the next group of steps."""
 
     def copy(self, into: Any) -> None:
-        """Copy the current state: positions, velocities, mocap poses, controls and time of one moment.
+        """Copy positions, velocities, mocap poses, controls and time of one moment into the caller's ``MjData``.
 
         Computes poses of bodies, geoms, sites, cameras and lights, but no contacts and sensors. Does not delay the
         world's thread.
-
-        Args:
-            into: An ``MjData`` of ``model`` that belongs to the caller.
         """
 
     def set(self, name: str, value: float) -> float:

@@ -28,13 +28,7 @@ class Transport(Protocol):
         """
 
     def publish(
-        self,
-        topic: str,
-        payload: bytes,
-        *,
-        qos: int,
-        retain: bool = False,
-        delivered: Callable[[], None] | None = None,
+        self, topic: str, payload: bytes, *, qos: int, retain: bool = False, delivered: Callable[[], None] | None = None
     ) -> bool:
         """Send a message. Thread-safe; never blocks.
 

@@ -14,15 +14,7 @@ _log = logging.getLogger(__name__)
 
 
 class Agent:
-    """Connects devices to a transport.
-
-    Args:
-        devices: Devices by name.
-        transport: Not yet started.
-        outbox: Not yet started.
-        readings: Receives the measurements of the space's other agents.
-        address: Space and agent.
-    """
+    """Connects devices to a transport."""
 
     def __init__(
         self,

@@ -53,29 +53,7 @@ _log = logging.getLogger(__name__)
 
 
 class Device:
-    """One device of an agent.
-
-    Args:
-        name: Name of the device at the agent, a level of its topics.
-        label: Name for operators.
-        space: Id of the space.
-        agent: Id of the agent.
-        robot_type: Joints, limits, period.
-        driver: Not yet connected; a ``RoomDevice`` for a device of a room.
-        journal: Open.
-        cloud_clock: Time for ``ttl_ms``.
-        keys: The cloud's pinned keys.
-        publish: Sends a message.
-        outbox: Stores and forwards events and measurements.
-        readings: Newest measurements of the space's devices.
-        sandbox: Runs movement scripts.
-        owner: Id of the account that the agent is paired with.
-        interlocks: Rules by which room sensors slow or hold this device.
-        geometry: Shape of the robot, if its type has a model.
-        obstacle_map: Newest obstacle map of the room, if sensors publish one.
-        speech: Speech synthesis of this machine, if it has one.
-        uploads: Storage for synthesized speech.
-    """
+    """One device of an agent."""
 
     def __init__(
         self,

@@ -49,15 +49,7 @@ class _Received:
 
 
 class ReadingCache:
-    """The newest reading of each source. Thread-safe; memory is bounded by the fixed set of sources.
-
-    Args:
-        space: Id of the space.
-        agent: Id of this agent.
-        own: Names of this agent's devices, which may be named without the agent's id.
-        named: Device and stream of each source in ``agent.toml``.
-        clock_s: Monotonic clock [s].
-    """
+    """The newest reading of each source. Thread-safe; memory is bounded by the fixed set of sources."""
 
     def __init__(
         self,
@@ -90,11 +82,7 @@ class ReadingCache:
         return tuple(filters)
 
     def latest(self, device: str, stream: str) -> Reading | None:
-        """The newest reading, or ``None`` if none has arrived since the agent started.
-
-        Args:
-            device: Id of a device of this space, or name of a device of this agent.
-            stream: Name of the stream.
+        """The newest reading of a device's stream, or ``None`` if none has arrived since the agent started.
 
         Raises:
             Refused: ``agent.toml`` does not name this stream, so the agent does not subscribe to it.
@@ -136,13 +124,7 @@ class ReadingCache:
             self._store(source, codec.decode(payload, Measurements))
 
     def record(self, device: str, stream: str, measured: Measurements | JointTelemetry) -> None:
-        """Store a measurement of a device of this agent.
-
-        Args:
-            device: Name of the device.
-            stream: Name of the stream.
-            measured: New measurement.
-        """
+        """Store a measurement of a device of this agent."""
         source = self.source(device, stream)
         if source in self.sources:
             self._store(source, measured)

@@ -160,10 +160,7 @@ class SandboxHost:
 
 
 class _Zygote:
-    """One zygote process, started on demand. The owner synchronizes access.
-
-    Args:
-        wrapper: Returns the command that wraps the process.
+    """One zygote process, started on demand, in a process that ``wrapper`` names. The owner synchronizes access.
 
     Attributes:
         missing: Layer → why this machine lacks it; known once started.
@@ -338,34 +335,12 @@ def _bubblewrap() -> tuple[str, ...]:
     capabilities = ("--cap-add", "CAP_SETUID", "--cap-add", "CAP_SETGID", "--cap-add", "CAP_SETPCAP")
     namespaces = ("--unshare-ipc", "--unshare-pid", "--unshare-net", "--unshare-uts", "--unshare-cgroup-try")
     user = capabilities if os.geteuid() == 0 else ("--unshare-user",)
-    return (
-        "bwrap",
-        *namespaces,
-        *user,
-        "--dev-bind",
-        "/dev/null",
-        "/dev/null",
-        "--new-session",
-        "--clearenv",
-        *_variables(),
-        *system,
-        *own,
-        "--",
-    )
-
-
-def _variables() -> tuple[str, ...]:
-    return tuple(part for name, value in _ENVIRONMENT.items() for part in ("--setenv", name, value))
+    null = ("--dev-bind", "/dev/null", "/dev/null")
+    variables = [part for name, value in _ENVIRONMENT.items() for part in ("--setenv", name, value)]
+    return ("bwrap", *namespaces, *user, *null, "--new-session", "--clearenv", *variables, *system, *own, "--")
 
 
 _SYSTEM = (
-    "/usr/lib",
-    "/usr/lib64",
-    "/usr/bin",
-    "/usr/sbin",
-    "/sbin",
-    "/lib",
-    "/lib64",
-    "/etc/ld.so.cache",
-    "/etc/localtime",
+    *("/usr/lib", "/usr/lib64", "/usr/bin", "/usr/sbin", "/sbin", "/lib", "/lib64"),
+    *("/etc/ld.so.cache", "/etc/localtime"),
 )

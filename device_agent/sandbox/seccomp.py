@@ -58,14 +58,7 @@ def build() -> Filter:
             _add(library, filter_, action, name)
     _allow_memory(library, filter_)
     # Reading a limit of this process; never setting one.
-    _add(
-        library,
-        filter_,
-        library.ALLOW,
-        "prlimit64",
-        library.Arg(0, library.EQ, 0),
-        library.Arg(2, library.EQ, 0),
-    )
+    _add(library, filter_, library.ALLOW, "prlimit64", library.Arg(0, library.EQ, 0), library.Arg(2, library.EQ, 0))
     return filter_  # type: ignore[no-any-return]
 
 

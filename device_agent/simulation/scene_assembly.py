@@ -8,12 +8,10 @@ from typing import Any
 import mujoco
 
 from device_agent.ports.driver import DriverError
-from device_agent.simulation.mjcf.equality_joints import EqualityJoints
+from device_agent.simulation.mjcf.equality_joints import SCALAR_JOINTS, EqualityJoints
 from device_agent.simulation.mjcf.options import copy_options
 
 TIMESTEP_S = 0.002
-SCALAR_JOINTS = frozenset({int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)})
-"""Joint types with one position. As ``int``: MuJoCo's enumerations do not equal the numbers in its arrays."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,3 +86,14 @@ def home_state(model: Any, home: Mapping[str, float], settings: Mapping[str, flo
             data.ctrl[actuator] = data.qpos[model.jnt_qposadr[joint]]
     mujoco.mj_forward(model, data)
     return data
+
+
+def is_servo(model: Any, actuator: int, *, order: int) -> bool:
+    """Whether an actuator is a servo on a joint: of position (``order`` 0) or velocity (1)."""
+    gain = model.actuator_gainprm[actuator, 0]
+    return bool(
+        model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
+        and model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+        and gain > 0
+        and model.actuator_biasprm[actuator, 1 + order] == -gain
+    )

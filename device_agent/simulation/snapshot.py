@@ -63,36 +63,25 @@ def take(data: Any, *, passive_gravity: Floats, addresses: Mapping[str, int], la
         lag_s: Simulated time lost so far [s].
         fault: Why the world has stopped.
     """
-    arrays = [
-        np.array(source)
-        for source in (
-            data.qpos,
-            data.qvel,
-            data.qfrc_actuator + passive_gravity * data.qfrc_gravcomp,
-            data.ctrl,
-            data.xpos,
-            data.xquat,
-            data.site_xpos,
-            data.mocap_pos,
-            data.mocap_quat,
-        )
-    ]
-    for array in arrays:
-        array.setflags(write=False)
-    qpos, qvel, effort, ctrl, xpos, xquat, site_xpos, mocap_pos, mocap_quat = arrays
+    arrays = {
+        "qpos": data.qpos,
+        "qvel": data.qvel,
+        "effort": data.qfrc_actuator + passive_gravity * data.qfrc_gravcomp,
+        "ctrl": data.ctrl,
+        "body_position_m": data.xpos,
+        "body_quaternion": data.xquat,
+        "site_position_m": data.site_xpos,
+        "mocap_position_m": data.mocap_pos,
+        "mocap_quaternion": data.mocap_quat,
+    }
+    copies = {name: np.array(array) for name, array in arrays.items()}
+    for copy in copies.values():
+        copy.setflags(write=False)
     return Snapshot(
         time_s=float(data.time),
         taken_s=time.monotonic(),
-        qpos=qpos,
-        qvel=qvel,
-        effort=effort,
-        ctrl=ctrl,
-        body_position_m=xpos,
-        body_quaternion=xquat,
-        site_position_m=site_xpos,
-        mocap_position_m=mocap_pos,
-        mocap_quaternion=mocap_quat,
         lag_ms=lag_s * 1000,
         fault=fault,
         addresses=addresses,
+        **copies,
     )

@@ -18,7 +18,8 @@ import numpy as np
 from device_agent.ports.driver import DriverError
 from device_agent.ports.simulation import Process
 from device_agent.simulation.actuator_ramps import ActuatorRamps, control_rows
-from device_agent.simulation.scene_assembly import SCALAR_JOINTS, TIMESTEP_S, Placement, assemble, home_state
+from device_agent.simulation.mjcf.equality_joints import SCALAR_JOINTS
+from device_agent.simulation.scene_assembly import TIMESTEP_S, Placement, assemble, home_state
 from device_agent.simulation.snapshot import Floats, Ints, Snapshot, take
 from device_agent.simulation.stepper import Stepper
 from device_agent.simulation.trace import Trace

@@ -10,7 +10,6 @@ from device_agent.config.errors import ConfigError
 from device_agent.config.identity_store import Pairing
 from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
-from device_agent.transports import tls
 from device_agent.transports.http import responses
 from device_agent.transports.http.client import CloudClient
 from device_agent.transports.pairing_monitor import SOFTWARE, PairingMonitor
@@ -68,7 +67,7 @@ def make(wiring: Wiring) -> Transport:
 
 
 def _mqtt(wiring: Wiring) -> Transport:
-    from device_agent.transports.mqtt import BrokerAccess, MqttTransport  # noqa: PLC0415 (only if selected)
+    from device_agent.transports.mqtt import BrokerAccess, MqttTransport, broker_access  # noqa: PLC0415 (only if selected)
 
     api = wiring.open_api()
 
@@ -81,16 +80,7 @@ def _mqtt(wiring: Wiring) -> Transport:
                 now_ms=wiring.now_ms() or after_ms,
                 request_chain=lambda request: responses.read(api.certificate(request), responses.Certificate).chain,
             )
-        return BrokerAccess(
-            host=credentials.tcp.host,
-            port=credentials.tcp.port,
-            client_id=credentials.client_id,
-            username=credentials.username,
-            password=credentials.password,
-            subscribe=credentials.subscribe,
-            lifetime_s=credentials.lifetime_s,
-            tls=tls.broker(tls=credentials.tcp.tls, server=api.server, ca=api.ca, own=own),
-        )
+        return broker_access(credentials, api, own=own)
 
     return MqttTransport(
         access=access,

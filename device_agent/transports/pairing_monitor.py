@@ -33,6 +33,9 @@ def pairing_of(claimed: responses.Claimed) -> Pairing:
 class PairingMonitor:
     """Detects that the agent was unpaired or moved to another space, and follows key rotations.
 
+    Requests raise ``CloudError`` if the cloud rejects them or the pairing is not valid, and ``OSError`` if the cloud
+    cannot be reached.
+
     Args:
         pairing: The pairing with which the agent was built.
         config: Sent to the cloud at the first connection, so that changes of ``agent.toml`` need no new enrollment.
@@ -49,12 +52,7 @@ class PairingMonitor:
         self.outdated = threading.Event()
 
     def credentials(self, api: CloudClient) -> dict[str, Any]:
-        """Broker credentials for the space.
-
-        Raises:
-            CloudError: The cloud rejects the request, or the agent belongs to another space.
-            OSError: The cloud cannot be reached.
-        """
+        """Broker credentials for the space."""
         credentials = self._request(api, api.credentials)
         own = f"{topics.ROOT}/{self._pairing.space}/{self._pairing.agent}/"
         if not all(str(pattern).startswith(own) for pattern in credentials.get("subscribe", ())):
@@ -62,27 +60,13 @@ class PairingMonitor:
         return credentials
 
     def xmpp_credentials(self, api: CloudClient) -> dict[str, Any]:
-        """Credentials for the XMPP server.
-
-        Raises:
-            CloudError: The cloud rejects the request, or the agent belongs to another space.
-            OSError: The cloud cannot be reached.
-        """
+        """Credentials for the XMPP server."""
         credentials = self._request(api, api.xmpp_credentials)
         self._check_space(credentials)
         return credentials
 
     def check(self, api: CloudClient, *, within_s: float = 10.0) -> None:
-        """Check that the pairing is still valid.
-
-        Args:
-            api: The HTTP API.
-            within_s: Timeout [s].
-
-        Raises:
-            CloudError: The pairing is not valid, or the cloud rejects the agent.
-            OSError: The cloud cannot be reached.
-        """
+        """Check within ``within_s`` [s] that the pairing is still valid."""
         enrollment = self._request(api, lambda: api.enrollment(within_s=within_s))
         if enrollment.get("state") != "claimed":
             raise self._mark_outdated("this agent was unpaired")

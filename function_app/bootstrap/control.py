@@ -38,7 +38,6 @@ class ControlServices(MessagingServices):
             lease_store=self.lease_store,
             revocation=self.revocation,
             command_sender=self.command_sender,
-            access=self.access,
             control_events=self.control_events,
             clock=self.clock,
         )
@@ -49,6 +48,7 @@ class ControlServices(MessagingServices):
             tables=self.tables,
             devices=self.devices,
             leases=self.leases,
+            revocation=self.revocation,
             lease_store=self.lease_store,
             command_sender=self.command_sender,
             control_events=self.control_events,

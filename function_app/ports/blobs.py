@@ -120,3 +120,27 @@ def check_upload(length: int) -> None:
     """
     if not 0 <= length <= MAX_UPLOAD_BYTES:
         raise ValueError(f"an upload has 0 to {MAX_UPLOAD_BYTES} bytes, not {length}")
+
+
+def check_name(name: str) -> None:
+    """Check the name of a blob.
+
+    Raises:
+        ValueError: It is empty, too long, or no Unicode text.
+    """
+    if not 1 <= len(name) <= MAX_NAME_LENGTH:
+        raise ValueError(f"a blob's name has 1 to {MAX_NAME_LENGTH} characters, not {len(name)}")
+    try:
+        name.encode()
+    except UnicodeEncodeError as error:
+        raise ValueError("a blob's name is Unicode text without lone surrogates") from error
+
+
+def check_size(size: int) -> None:
+    """Check the size of a blob [bytes].
+
+    Raises:
+        ValueError: It is larger than ``MAX_BYTES``.
+    """
+    if size > MAX_BYTES:
+        raise ValueError(f"a blob holds at most {MAX_BYTES} bytes, not {size}")

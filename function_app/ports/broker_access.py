@@ -77,9 +77,6 @@ class BrokerAccess(Protocol):
 
         Call it every few seconds, from any number of instances.
 
-        Args:
-            now_s: Current time [s since 1970].
-
         Raises:
             BrokerAccessError: The broker is not reachable; the next call catches up.
         """
@@ -96,3 +93,13 @@ class BrokerAccess(Protocol):
 
     async def close(self) -> None:
         """Close the connection. May be called twice."""
+
+
+def check_revocation(client_id: str | None, principal: str | None) -> None:
+    """Check the arguments of ``revoke``.
+
+    Raises:
+        ValueError: Not exactly one of them was passed.
+    """
+    if (client_id is None) == (principal is None):
+        raise ValueError("revoke takes exactly one of client_id and principal")

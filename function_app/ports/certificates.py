@@ -32,9 +32,7 @@ class Certificates(Protocol):
     async def issue(self, agent: str, request: str) -> Issued:
         """Issue a certificate with the agent's id as common name, regardless of the subject in the request.
 
-        Args:
-            agent: Agent id.
-            request: PKCS #10 request (PEM), signed by its own key.
+        ``request`` is a PKCS #10 request (PEM), signed by its own key.
 
         Raises:
             CertificateRefused: The request or its signature is not valid, or brokers do not support the key type.

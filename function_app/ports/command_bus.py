@@ -33,11 +33,7 @@ class CommandBus(Protocol):
     async def publish(self, topic: str, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
         """Publish a message; returns when the broker confirmed it (QoS 1) or the bytes were sent (QoS 0).
 
-        Args:
-            topic: Topic.
-            payload: At most 128 KB; 64 KB if retained.
-            qos: 0 or 1.
-            retain: Store the message for later subscribers in place of the previous one.
+        A payload has at most 128 KB, 64 KB if the broker retains it; ``qos`` is 0 or 1.
 
         Raises:
             BusUnavailable: Not confirmed within a few seconds.

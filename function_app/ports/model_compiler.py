@@ -51,13 +51,8 @@ class ModelCompiler(Protocol):
     ) -> ModelReport:
         """Compile model and scene and compare them with the manifest.
 
-        Args:
-            robot_type: The manifest.
-            files: Name → content.
-            missing: Referenced files that do not exist; the rest is checked without them.
-
-        Returns:
-            The report. Exceeding time or memory limits is an error in the report.
+        ``files`` maps names to contents. Files that are ``missing`` are referenced but do not exist; the rest is
+        checked without them. Exceeding time or memory limits is an error in the report.
 
         Raises:
             CompilerMissingError: The compiler is not available.

@@ -31,11 +31,8 @@ class OidcProvider(Protocol):
     async def address(self, *, state: str, nonce: str, challenge: str, redirect: str) -> str:
         """The URL to which a browser is redirected for sign-in.
 
-        Args:
-            state: Returned by the browser.
-            nonce: Returned in the signed token.
-            challenge: S256 challenge of the verifier passed to ``redeem``.
-            redirect: Callback URL.
+        The browser returns ``state``, the signed token ``nonce``; ``challenge`` is the S256 challenge of the verifier
+        that is passed to ``redeem``, and ``redirect`` the callback URL.
 
         Raises:
             OidcError: The provider is not reachable or its metadata are not valid.
@@ -44,12 +41,7 @@ class OidcProvider(Protocol):
     async def redeem(self, *, code: str, verifier: str, nonce: str, redirect: str, issuer: str | None) -> Subject:
         """The person whom the provider signed in.
 
-        Args:
-            code: Authorization code from the callback.
-            verifier: PKCE verifier.
-            nonce: As sent.
-            redirect: As sent.
-            issuer: ``iss`` parameter of the callback, if present (RFC 9207).
+        ``code`` and ``issuer`` (``iss``, RFC 9207) are parameters of the callback, the others as sent to ``address``.
 
         Raises:
             OidcError: The code is rejected, or the token is not signed, not for this client, expired, or of another

@@ -18,9 +18,7 @@ class PasswordHasher(Protocol):
     async def check(self, stored: str | None, password: str) -> bool:
         """Whether the password matches.
 
-        Args:
-            stored: Result of ``make``; ``None`` takes equally long and never matches.
-            password: Password to verify.
+        ``stored`` is a result of ``make``; ``None`` takes equally long and never matches.
         """
 
     def outdated(self, stored: str) -> bool:

@@ -78,8 +78,7 @@ class SigningKeys(Protocol):
     async def public(self, wanted: str = "") -> Mapping[str, Ed25519PublicKey]:
         """All keys whose signatures are valid now, by ``signing.key_id``.
 
-        Args:
-            wanted: Id of the key to look up; an unknown id causes the store to be read again.
+        An unknown key id in ``wanted`` causes the store to be read again.
         """
 
     async def archive(self) -> Mapping[str, Ed25519PublicKey]:

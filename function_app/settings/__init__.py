@@ -7,15 +7,7 @@ from pathlib import Path
 
 from device_agent.protocol.manifests.shipped import ROBOTS
 from function_app.settings.access import OidcClient, RateLimits, Tls, read_oidc, read_rate_limits, read_tls
-from function_app.settings.broker import (
-    Broker,
-    EventGridBus,
-    EventGridWebhook,
-    IotBus,
-    Xmpp,
-    read_broker,
-    read_xmpp,
-)
+from function_app.settings.broker import Broker, EventGridBus, EventGridWebhook, IotBus, Xmpp, read_broker, read_xmpp
 from function_app.settings.environment import Environment, SettingsError
 from function_app.settings.storage import (
     AwsStore,

@@ -79,10 +79,7 @@ def read_tls(env: Environment) -> Tls | None:
     ca = env.file("TELESCOPE_TLS_CA") if env.get("TELESCOPE_TLS_CA") else None
     agents = env.folder("TELESCOPE_TLS_AGENTS", Path()) if env.get("TELESCOPE_TLS_AGENTS") else None
     return Tls(
-        certificate=env.file("TELESCOPE_TLS_CERTIFICATE"),
-        key=env.file("TELESCOPE_TLS_KEY"),
-        ca=ca,
-        agents=agents,
+        certificate=env.file("TELESCOPE_TLS_CERTIFICATE"), key=env.file("TELESCOPE_TLS_KEY"), ca=ca, agents=agents
     )
 
 

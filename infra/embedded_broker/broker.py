@@ -105,12 +105,7 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         self._revocations.close()
 
     async def _create_server_instance(
-        self,
-        listener_name: str,
-        listener_type: ListenerType,
-        address: str | None,
-        port: int,
-        ssl_context: Any,
+        self, listener_name: str, listener_type: ListenerType, address: str | None, port: int, ssl_context: Any
     ) -> Any:
         """Create the server of one listener on its bound socket; overrides amqtt."""
         del address, port, ssl_context
@@ -143,19 +138,18 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
 
     def _connected(self, transport: Transport) -> Connection:
         kind = "TCP" if isinstance(transport, TcpTransport) else "WebSocket"
-        connection = Connection(self, transport, asyncio.get_running_loop().time(), kind)
+        connection = Connection(self, transport, time.monotonic(), kind)
         self._connections.add(connection)
         if len(self._connections) > self.limits.connections:
             connection.close(f"more than {self.limits.connections} connections")
         return connection
 
     async def _run_timers(self) -> None:
-        loop = asyncio.get_running_loop()
         while True:
             await asyncio.sleep(_TICK_S)
             try:
                 self._refresh_keys()
-                now_s, wall_s = loop.time(), time.time()
+                now_s, wall_s = time.monotonic(), time.time()
                 for connection in list(self._connections):
                     connection.tick(now_s, wall_s)
             except Exception as error:  # noqa: BLE001 (the loop must continue after any error)
@@ -228,7 +222,7 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         self._clients[connection.client_id] = connection
 
     def unregister(self, connection: Connection) -> None:
-        """Unregister a connection."""
+        """Unregister a connection. Called once for each, admitted or not."""
         self._connections.discard(connection)
         if self._clients.get(connection.client_id) is connection:
             del self._clients[connection.client_id]

@@ -11,17 +11,19 @@ Where the specification leaves a choice, the broker is strict:
 
 import logging
 from collections import deque
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 from amqtt.mqtt.packet import CONNECT, DISCONNECT, PINGREQ, PUBACK, PUBLISH, SUBSCRIBE, UNSUBSCRIBE
 
 from device_agent.protocol.security import revocation
 from device_agent.protocol.security.grants import Grant
 from infra.embedded_broker import packets
-from infra.embedded_broker.limits import Limits
 from infra.embedded_broker.listeners import Transport
-from infra.embedded_broker.packets import Connect, Frame, MalformedPacket, Publish
+from infra.embedded_broker.packets import Frame, MalformedPacket, Publish
 from infra.embedded_broker.routing import valid_filter, valid_topic
+
+if TYPE_CHECKING:
+    from infra.embedded_broker.broker import TelescopeBroker
 
 log = logging.getLogger("telescope.broker")
 
@@ -46,41 +48,10 @@ class Refused(Exception):  # noqa: N818 (a response, not an error)
         self.code = code
 
 
-class ConnectionBroker(Protocol):
-    """Operations of the broker that a connection uses."""
-
-    limits: Limits
-
-    def authenticate(self, connect: Connect) -> Admission:
-        """Authenticate a CONNECT; raises ``Refused``, without effect on other connections."""
-
-    def register(self, connection: "Connection") -> None:
-        """Register an admitted connection under its client id; closes the previous one."""
-
-    def unregister(self, connection: "Connection") -> None:
-        """Unregister a connection. Called once for each, admitted or not."""
-
-    def publish(self, topic: str, payload: bytes, *, qos: int, retain: bool, owner: str) -> bool:
-        """Send a message to all subscribers and retain it if requested; False if it cannot be retained."""
-
-    def subscribe(self, connection: "Connection", pattern: str, qos: int) -> None:
-        """Add a filter and send its retained messages to the connection."""
-
-    def unsubscribe(self, connection: "Connection", pattern: str) -> None:
-        """Remove a filter."""
-
-    def revoke(self, payload: bytes) -> None:
-        """Apply a message of the control topic.
-
-        Raises:
-            ValueError: The message is invalid.
-        """
-
-
 class Connection:
     """The state of one client. All methods run on the broker's event loop and never block."""
 
-    def __init__(self, broker: ConnectionBroker, transport: Transport, now_s: float, peer: str) -> None:
+    def __init__(self, broker: "TelescopeBroker", transport: Transport, now_s: float, peer: str) -> None:
         self.admission: Admission | None = None
         self.filters: set[str] = set()
         self._broker = broker

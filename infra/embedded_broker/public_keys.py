@@ -45,11 +45,8 @@ class KeyRing:
             raise KeysError(f"cannot read the keys in {self._path}: {error.strerror}") from error
         self._version = version
         keys = self._parse(text)
-        changed = {name: signing.public_text(key) for name, key in keys.items()} != {
-            name: signing.public_text(key) for name, key in self._keys.items()
-        }
-        self._keys = keys
-        return changed
+        previous, self._keys = self._keys, keys
+        return keys != previous
 
     def read(self, token: str) -> Grant:
         """The grant in a token.

@@ -1,7 +1,6 @@
 """Revoked tokens, stored across restarts until every affected token has expired."""
 
 import contextlib
-import json
 import os
 import time
 from collections.abc import Iterator
@@ -75,7 +74,7 @@ class Revocations:
         entry = _Entry(field, value, revoke.before_s if by_time and revoke.before_s is not None else time.time())
         self._store(entry)
         if self._file is not None:
-            self._file.write(f"{self._line(entry)}\n")
+            self._file.write(_line(entry))
             self._file.flush()
             os.fsync(self._file.fileno())
         if len(self._before) >= self._tidy_at:
@@ -108,7 +107,7 @@ class Revocations:
         temporary.touch(mode=0o600)
         with contextlib.ExitStack() as on_error:
             file = on_error.enter_context(temporary.open("w"))
-            file.writelines(f"{self._line(_Entry(*key, before))}\n" for key, before in self._before.items())
+            file.writelines(_line(_Entry(*key, before)) for key, before in self._before.items())
             file.flush()
             os.fsync(file.fileno())
             temporary.replace(self._path)
@@ -130,6 +129,6 @@ class Revocations:
                 except msgspec.MsgspecError:
                     continue
 
-    @staticmethod
-    def _line(entry: _Entry) -> str:
-        return json.dumps(msgspec.to_builtins(entry))
+
+def _line(entry: _Entry) -> str:
+    return msgspec.json.encode(entry).decode() + "\n"

@@ -219,12 +219,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--broker", default="127.0.0.1", help="host of Home Assistant's MQTT broker")
     parser.add_argument("--port", type=int, default=1883, help="its port")
     parser.add_argument("--user", default="", help="its user; the password is in HOME_ASSISTANT_PASSWORD")
-    parser.add_argument(
-        "--broker-ca",
-        type=Path,
-        metavar="FILE",
-        help="use TLS with this CA certificate (PEM)",
-    )
+    parser.add_argument("--broker-ca", type=Path, metavar="FILE", help="use TLS with this CA certificate (PEM)")
     return parser.parse_args()
 
 

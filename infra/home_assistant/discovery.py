@@ -54,14 +54,7 @@ def topic(device: str, kind: str, name: str = "") -> str:
 def announce_values(
     device: str, description: Description, stream: str, values: Mapping[str, float | bool]
 ) -> Iterator[Announcement]:
-    """Configurations of a stream's values.
-
-    Args:
-        device: Its id.
-        description: Its description.
-        stream: Name of the stream.
-        values: One measurement.
-    """
+    """Configurations of the values of a stream, as one measurement contains them."""
     controls = {control.name for control in description.controls}
     for field, value in values.items():
         if stream == SETTINGS and field in controls:
@@ -70,9 +63,8 @@ def announce_values(
         if quantity.endswith(_FOR_PROGRAMS):
             continue
         selector = f"value_json['values']['{field}']"
-        content = _common(device, description, f"{stream}-{field}", _readable(quantity, part)) | {
-            "state_topic": topic(device, "tele", stream)
-        }
+        content = _common(device, description, f"{stream}-{field}", _readable(quantity, part))
+        content["state_topic"] = topic(device, "tele", stream)
         if isinstance(value, bool):
             content["value_template"] = "{{ 'ON' if " + selector + " else 'OFF' }}"
             if quantity in _BINARY:
@@ -91,9 +83,8 @@ def announce_device(device: str, description: Description) -> Iterator[Announcem
     for control in description.controls:
         yield _announce("number", device, f"set-{control.name}", _number(device, description, control))
     for camera in description.cameras:
-        content = _common(device, description, f"cam-{camera.name}", camera.name) | {
-            "topic": topic(device, "cam", camera.name)
-        }
+        content = _common(device, description, f"cam-{camera.name}", camera.name)
+        content["topic"] = topic(device, "cam", camera.name)
         yield _announce("camera", device, f"cam-{camera.name}", content)
 
 

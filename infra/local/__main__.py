@@ -118,23 +118,15 @@ class LocalStack:
         """Create certificates for this machine's address, unless others are installed; report their state."""
         config = self._settings
         option = ("--show",) if config.certificate[0].exists() else ("--address", config.host)
-        log_progress(
-            f"TLS {self._run_once('-m', 'infra.tls', '--home', str(config.tls_home), *option).splitlines()[0]}"
-        )
-
+        state = self._run_once("-m", "infra.tls", "--home", str(config.tls_home), *option).splitlines()[0]
+        log_progress(f"TLS {state}")
         if config.certificates and not (config.tls_home / "devices-ca.key").exists():
             self._run_once("-m", "infra.tls", "--home", str(config.tls_home), "--devices")
 
     def _broker(self) -> list[str]:
         config = self._settings
-        ports = [
-            "--host",
-            config.host,
-            "--tcp-port",
-            str(config.mqtt_port),
-            "--websocket-port",
-            str(config.websocket_port),
-        ]
+        ports = ["--host", config.host, "--tcp-port", str(config.mqtt_port)]
+        ports += ["--websocket-port", str(config.websocket_port)]
         if config.tls:
             certificate, key = config.certificate
             ports += ["--certificate", str(certificate), "--certificate-key", str(key)]

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
+from infra import files
+
 XMPP_DOMAIN = "telescope.localhost"
 """Domain of a single machine; not resolvable."""
 ROOMS = Path(__file__).resolve().parents[2] / "robots" / "rooms"
@@ -114,9 +116,7 @@ def save_started(settings: Settings, environment: Mapping[str, str]) -> None:
     """
     values = {name: environment[name] for name in _STORED if name in environment}
     settings.home.mkdir(parents=True, exist_ok=True, mode=0o700)
-    temporary = settings.home / f"{_STARTED}.new"
-    temporary.write_text(json.dumps(values, indent=1) + "\n")
-    temporary.replace(settings.home / _STARTED)
+    files.write(settings.home / _STARTED, json.dumps(values, indent=1).encode(), mode=0o644)
 
 
 def load_started(environment: Mapping[str, str]) -> dict[str, str]:

@@ -1,6 +1,5 @@
 """Supervised child processes: start, monitor, restart and stop."""
 
-import ctypes
 import signal
 import subprocess
 import sys
@@ -8,10 +7,11 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from infra import programs
+
 _STOP_TIMEOUT_S = 8.0
 _STABLE_S = 10.0
 _MAX_RESTARTS = 5
-_PR_SET_PDEATHSIG = 1
 
 
 class StartError(Exception):
@@ -49,7 +49,7 @@ class SupervisedProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,  # Ctrl-C only reaches this process, which stops the others in order
-                preexec_fn=_stop_with_parent if sys.platform == "linux" else None,  # noqa: PLW1509 (one thread here)
+                preexec_fn=lambda: programs.signal_with_parent(signal.SIGTERM),  # noqa: PLW1509 (one thread here)
             )
         self._started_s = time.monotonic()
 
@@ -113,8 +113,3 @@ class SupervisedProcess:
         """The last output line, or a reference to the log."""
         lines = [line for line in self.output_lines() if line.strip()]
         return lines[-1] if lines else f"{self.name} exited without output; see {self.log}"
-
-
-def _stop_with_parent() -> None:
-    """Linux: receive SIGTERM when the parent process exits."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -5,7 +5,6 @@ is in use or mosquitto is not installed; 2 if the folder cannot be used; 1 if mo
 """
 
 import argparse
-import socket
 import sys
 from pathlib import Path
 
@@ -24,25 +23,10 @@ def main() -> int:
         binary, plugin = configuration.binary(), configuration.plugin()
         tcp_port, websocket_port = programs.free_ports(host, arguments.tcp_port, arguments.websocket_port)
         configuration.write(
-            home,
-            host=host,
-            tcp_port=tcp_port,
-            websocket_port=websocket_port,
-            plugin_path=plugin,
-            tls=_tls(arguments),
+            home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin, tls=_tls(arguments)
         )
-    except programs.NotInstalledError as error:
-        print(f"broker: {error}", file=sys.stderr)
-        return programs.CANNOT_START
-    except programs.PortTakenError as error:
-        print(f"broker: {error}; choose another port", file=sys.stderr)
-        return programs.CANNOT_START
-    except socket.gaierror:
-        print(f"broker: '{arguments.host}' has no IPv4 address, which mosquitto needs", file=sys.stderr)
-        return programs.BAD_INPUT
-    except OSError as error:
-        print(f"broker: cannot use {error.filename or home}: {error.strerror}", file=sys.stderr)
-        return programs.BAD_INPUT
+    except (programs.NotInstalledError, programs.PortTakenError, OSError) as error:
+        return programs.explain(error, server="mosquitto", host=arguments.host, home=home)
     return programs.supervise(
         "mosquitto",
         [binary, "-c", str(home / configuration.CONFIGURATION_FILE)],

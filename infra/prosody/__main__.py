@@ -5,7 +5,6 @@ not installed; 2 if an argument or the folder is invalid; 1 if Prosody exits. Er
 """
 
 import argparse
-import socket
 import sys
 from pathlib import Path
 
@@ -20,7 +19,7 @@ def main() -> int:
         host = programs.address(arguments.host)
         binary = configuration.binary()
         (port,) = programs.free_ports(host, arguments.port)
-        configuration.write(
+        text = configuration.configuration(
             arguments.home,
             domain=arguments.domain,
             host=host,
@@ -29,16 +28,9 @@ def main() -> int:
             certificate=arguments.certificate,
             key=arguments.key,
         )
-    except programs.NotInstalledError as error:
-        return _fail(str(error), programs.CANNOT_START)
-    except programs.PortTakenError as error:
-        return _fail(f"{error}; choose another port", programs.CANNOT_START)
-    except socket.gaierror:
-        return _fail(f"'{arguments.host}' has no IPv4 address, which Prosody needs", programs.BAD_INPUT)
-    except configuration.ConfigurationError as error:
-        return _fail(str(error), programs.BAD_INPUT)
-    except OSError as error:
-        return _fail(f"cannot use {error.filename or arguments.home}: {error.strerror}", programs.BAD_INPUT)
+        configuration.write(arguments.home, text)
+    except (programs.NotInstalledError, programs.PortTakenError, OSError, configuration.ConfigurationError) as error:
+        return programs.explain(error, server="Prosody", host=arguments.host, home=arguments.home)
     command = [binary, "--config", str((arguments.home / configuration.CONFIGURATION_FILE).absolute()), "-F"]
     return programs.supervise("prosody", command, host=host, ports=(port,), ready=f"ready xmpp={port}")
 
@@ -57,11 +49,6 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--key", type=Path, help="the certificate's private key (PEM)")
     return parser.parse_args()
-
-
-def _fail(text: str, code: int) -> int:
-    print(f"broker: {text}", file=sys.stderr)
-    return code
 
 
 if __name__ == "__main__":

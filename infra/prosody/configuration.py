@@ -32,25 +32,12 @@ def binary() -> str:
     return programs.find("prosody", package=PACKAGE)
 
 
-def write(
-    home: Path,
-    *,
-    domain: str,
-    host: str,
-    port: int,
-    verify_url: str,
-    certificate: Path | None = None,
-    key: Path | None = None,
-) -> None:
+def write(home: Path, text: str) -> None:
     """Write the configuration file.
 
     Raises:
-        ConfigurationError: An argument is invalid.
         OSError: ``home`` cannot be written.
     """
-    text = configuration(
-        home, domain=domain, host=host, port=port, verify_url=verify_url, certificate=certificate, key=key
-    )
     home.mkdir(parents=True, exist_ok=True, mode=0o700)
     (home / "certs").mkdir(exist_ok=True)  # Prosody warns if its certificate folder is missing
     path = home / CONFIGURATION_FILE
@@ -59,14 +46,7 @@ def write(
 
 
 def configuration(
-    home: Path,
-    *,
-    domain: str,
-    host: str,
-    port: int,
-    verify_url: str,
-    certificate: Path | None,
-    key: Path | None,
+    home: Path, *, domain: str, host: str, port: int, verify_url: str, certificate: Path | None, key: Path | None
 ) -> str:
     """The text of ``prosody.cfg.lua``.
 

@@ -34,7 +34,7 @@ def create(folder: Path, *, now: dt.datetime) -> None:
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"Telescope agents {secrets.token_hex(4)}")])
     end = now + dt.timedelta(days=server_ca.CA_DAYS)
     ca_certificate = (
-        _builder(name, name, key, now, end)
+        server_ca.builder(name, name, key, now, end)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(server_ca.usage(authority=True), critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
@@ -42,7 +42,7 @@ def create(folder: Path, *, now: dt.datetime) -> None:
     )
     service_key = ec.generate_private_key(ec.SECP256R1())
     service = (
-        _builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "service")]), name, service_key, now, end)
+        server_ca.builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "service")]), name, service_key, now, end)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH]), critical=True)
         .sign(key, hashes.SHA256())
@@ -55,17 +55,3 @@ def create(folder: Path, *, now: dt.datetime) -> None:
     crl = revocation_list.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
     files.write(folder / REVOKED, crl, mode=0o644)
     files.write(folder / CA_CERTIFICATE, server_ca.pem(ca_certificate), mode=0o644)
-
-
-def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: dt.datetime, end: dt.datetime
-) -> x509.CertificateBuilder:
-    return (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - dt.timedelta(minutes=5))
-        .not_valid_after(end)
-    )

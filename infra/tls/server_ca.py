@@ -86,13 +86,7 @@ def create(folder: Path, site: Names, *, now: dt.datetime) -> None:
     networks = [ipaddress.ip_network(each) for each in site.addresses]
     permitted = [*(x509.DNSName(name) for name in site.dns), *(x509.IPAddress(each) for each in networks)]
     certificate = (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(subject)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _SKEW)
-        .not_valid_after(now + dt.timedelta(days=CA_DAYS))
+        builder(subject, subject, key, now, now + dt.timedelta(days=CA_DAYS))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage(authority=True), critical=True)
         .add_extension(x509.NameConstraints(permitted_subtrees=permitted, excluded_subtrees=None), critical=True)
@@ -194,6 +188,21 @@ def key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
     )
 
 
+def builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: dt.datetime, end: dt.datetime
+) -> x509.CertificateBuilder:
+    """A certificate of a key, valid until ``end``, without extensions."""
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _SKEW)
+        .not_valid_after(end)
+    )
+
+
 def usage(*, authority: bool) -> x509.KeyUsage:
     """Key usage extension."""
     return x509.KeyUsage(
@@ -218,14 +227,9 @@ def _issue(
 ) -> None:
     key = ec.generate_private_key(ec.SECP256R1())
     end = min(now + dt.timedelta(days=SERVER_DAYS), authority.not_valid_after_utc)
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Telescope")])
     certificate = (
-        x509.CertificateBuilder()
-        .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Telescope")]))
-        .issuer_name(authority.subject)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _SKEW)
-        .not_valid_after(end)
+        builder(subject, authority.subject, key, now, end)
         .add_extension(x509.SubjectAlternativeName(alternatives), critical=False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(usage(authority=False), critical=True)

@@ -50,7 +50,7 @@ def main() -> None:
     arguments = parser.parse_args()
     settings = {name: float(value) for name, _, value in (text.partition("=") for text in arguments.setting)}
     image = draw(arguments.room, arguments.camera, after_s=arguments.after_s, settings=settings)
-    arguments.file.write_bytes(render.png(image))
+    arguments.file.write_bytes(render.png.encode(image))
 
 
 if __name__ == "__main__":

@@ -12,9 +12,8 @@ from device_agent.protocol import AckStatus, Fault, Measurements, Mode, RunMovem
 from tests.api.transcript import Transcript
 from tests.harness.cloud.cloud import API, MOVE
 from tests.harness.cloud.people import Visitor
-from tests.harness.cloud.polling import PollingRobot, Site, _Line
+from tests.harness.cloud.polling import PollingRobot, Site
 from tests.harness.hosts import Host
-from tests.harness.network.brokers import Message
 
 PUBLIC_URL = "http://telescope.test"
 """What the functions believe to be their address."""
@@ -32,30 +31,11 @@ class Recorder(Site):
         self.transcript = Transcript()
         self.silent = False
 
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
-        answer = super().ask(method, path, **options)
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        answer = super().request(method, path, **options)
         if not self.silent:
             self.transcript.write(method, path, answer)
         return answer
-
-
-class SteppedRobot(PollingRobot):
-    """Asks for commands, obeys and reports when the conversation says so."""
-
-    def connect(self) -> "SteppedRobot":
-        self.session += 1
-        line: Any = _Line(self)  # never started: it has no thread
-        self.link = line
-        self.say_presence(online=True)
-        return self
-
-    def step(self) -> None:
-        line: Any = self.link
-        for item in self.poll(wait_ms=0).json()["items"]:
-            self.obey(Message(item["topic"], item["payload"].encode(), 1, retain=False))
-        told, line._said = line._said, []
-        if told:
-            assert self.tell_raw(*told).status_code == 200
 
 
 class Conversation:
@@ -65,7 +45,7 @@ class Conversation:
         self.host = host
         self.site = Recorder(host.url)
         self._links = links
-        self.robot = SteppedRobot(self.site, "arm", "leg")
+        self.robot = PollingRobot(self.site, "arm", "leg")
         self.site.transcript.know(self.robot.id, "robot")
         self.site.transcript.know(self.robot.public, "robot's key")
 
@@ -96,7 +76,7 @@ class Conversation:
 
     def knock(self) -> None:
         """Without credentials, and with invalid ones."""
-        ask = self.site.ask
+        ask = self.site.request
         ask("GET", f"{API}/health")
         ask("GET", f"{API}/devices")
         ask("GET", f"{API}/devices", headers={"Authorization": "Bearer nonsense"})
@@ -107,16 +87,16 @@ class Conversation:
         ask("POST", f"{API}/auth/sign-in", content=b" " * 1_000_001)
 
     def sign_in(self, link: str) -> Visitor:
-        answer = self.site.ask("POST", f"{API}/auth/sign-in", json={"link": link})
+        answer = self.site.request("POST", f"{API}/auth/sign-in", json={"link": link})
         assert answer.status_code == 200, answer.text
-        assert self.site.ask("POST", f"{API}/auth/sign-in", json={"link": link}).status_code == 401
+        assert self.site.request("POST", f"{API}/auth/sign-in", json={"link": link}).status_code == 401
         person = Visitor(self.site, answer.json())
         person.get("/accounts/me")
         person.get("/spaces")
         return person
 
     def claim(self) -> None:
-        self.robot.ask("GET", "/agents/enrollment", token="nonsense")
+        self.robot.request("GET", "/agents/enrollment", token="nonsense")
         code = self.robot.code()
         self.robot.enrollment()
         self.anna.post("/agents/claim", {"code": code, "space": "nowhere"})
@@ -125,7 +105,7 @@ class Conversation:
         self.robot.space = self.robot.enrollment()["space"]
         self.robot.enroll(software="toy 2")
         self.robot._keys = self.keys()
-        self.robot.connect()
+        self.robot.open_link()
 
     def keys(self) -> dict[str, Any]:
         from device_agent.protocol.security import signing
@@ -177,9 +157,9 @@ class Conversation:
         self.anna.post(path, {"wait_ms": 0, "epoch": epoch, "lease_ms": 60_000})
         self.anna.post(path, {"wait_ms": 0, "epoch": epoch + 1})
         self.anna.post(path, {"lease_ms": 1})
-        self.anna.ask("DELETE", path, params={"epoch": epoch + 1})
-        self.anna.ask("DELETE", path)
-        assert self.anna.ask("DELETE", path, params={"epoch": epoch}).status_code == 204
+        self.anna.request("DELETE", path, params={"epoch": epoch + 1})
+        self.anna.request("DELETE", path)
+        assert self.anna.request("DELETE", path, params={"epoch": epoch}).status_code == 204
         self.anna.get(path)
         self.robot.step()
 
@@ -213,7 +193,7 @@ class Conversation:
         self.anna.post(path, {"take_over": True})
         taken = self.anna.post(path, {"wait_ms": 0, "take_over": True, "reason": ODD[:6]}).json()
         self.again.get(path)
-        assert self.anna.ask("DELETE", path, params={"epoch": taken["epoch"]}).status_code == 204
+        assert self.anna.request("DELETE", path, params={"epoch": taken["epoch"]}).status_code == 204
         self.robot.step()
 
     def actions(self) -> None:
@@ -234,7 +214,7 @@ class Conversation:
         request = {"kind": "run_movement", "name": "mine", "parameters": {"note": ODD, "deep": [[{"a": 1.5}]]}}
         wave = self.start(request=request)
         self.robot.step()
-        (command,) = self.robot.heard(RunMovement)
+        (command,) = self.robot.received(RunMovement)
         assert isinstance(command.request, RunMovement)
         assert command.request.source == SOURCE + "#"
         self.anna.post(f"/actions/{wave}/cancel")
@@ -280,7 +260,7 @@ class Conversation:
             (item,) = self.anna.get(f"/devices/{device}/actions", params={"limit": 1}).json()["items"]
             assert item["status"] == "started"
             name = device.partition("-")[2]
-            self.robot.say(self.robot.topic(topics.ACK, name), self.robot.ack(item["id"], AckStatus.DONE))
+            self.robot.publish(self.robot.topic(topics.ACK, name), self.robot.ack(item["id"], AckStatus.DONE))
 
         assert self.anna.post(f"/devices/{self.robot.device}/stop", {"reason": ODD[:6]}).json() == {"confirmed": False}
         self.robot.step()
@@ -296,9 +276,11 @@ class Conversation:
         topic = topics.device(robot.space, robot.id, "arm", topics.TELE, "health")
         for number in range(5):
             at_ms = now_ms - 1000 * number
-            robot.say(topic, Measurements(tick_ms=at_ms, at_ms=at_ms, sequence=number, values={"temperature_c": 40.5}))
+            robot.publish(
+                topic, Measurements(tick_ms=at_ms, at_ms=at_ms, sequence=number, values={"temperature_c": 40.5})
+            )
         fault = Fault(code="hot", message="The elbow is hot.", since_ms=now_ms)
-        robot.say_state(State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0, faults=(fault,)))
+        robot.publish_state(State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0, faults=(fault,)))
         self.host.tick()
         self.anna.get(f"/devices/{device}/data")
         data = self.anna.get(f"/devices/{device}/data/health").json()
@@ -338,7 +320,7 @@ class Conversation:
 
     def accounts(self) -> None:
         """A password, and an API key."""
-        ask, good = self.site.ask, "grüß 🤖 correct horse"
+        ask, good = self.site.request, "grüß 🤖 correct horse"
         ask("GET", f"{API}/auth/methods")
         ask("GET", f"{API}/auth/oidc/start")
         self.bert.put("/accounts/me/password", {"password": "short"})
@@ -358,18 +340,18 @@ class Conversation:
     def mistakes(self) -> None:
         device = self.robot.device
         for method, path in (("PUT", f"/devices/{device}/lease"), ("PATCH", "/devices"), ("GET", "/nothing")):
-            self.anna.ask(method, path)
+            self.anna.request(method, path)
         for query in ({"cursor": ODD}, {"cursor": "x" * 2001}, {"limit": "0"}, {"limit": "1001"}, {"limit": "ü"}):
             self.anna.get("/devices", params=query)
         self.anna.post("/mqtt/credentials", {"purpose": "control", "device": device, "epoch": 1})
-        self.robot.ask("GET", "/devices")
-        self.robot.ask("GET", "/agents/aaaaaaaaaa/commands")
+        self.robot.request("GET", "/devices")
+        self.robot.request("GET", "/agents/aaaaaaaaaa/commands")
 
     def leave(self) -> None:
         assert self.anna.delete(f"/agents/{self.robot.id}").status_code == 204
         assert self.anna.get(f"/devices/{self.robot.device}").status_code == 404
         self.anna.get("/devices")
-        self.robot.ask("GET", "/agents/enrollment")
+        self.robot.request("GET", "/agents/enrollment")
         for number in range(6):
             answer = self.bert.post("/agents/claim", {"code": f"BCDF-GHJ{'KLMNPQ'[number]}"})
             assert answer.status_code in {404, 429}

@@ -60,9 +60,9 @@ def furnish(host: Host, site: Site, anna: Visitor, another: Visitor, robot: Poll
     robot.report(actions[0], AckStatus.DONE)
     now_ms = robot.cloud.clock.now_ms()
     measured = Measurements(tick_ms=now_ms, at_ms=now_ms, sequence=1, values={"temperature_c": 40.0})
-    robot.say(topics.device(robot.space, robot.id, "arm", topics.TELE, "health"), measured)
+    robot.publish(topics.device(robot.space, robot.id, "arm", topics.TELE, "health"), measured)
     fault = Fault(code="hot", message="The elbow is hot.", since_ms=now_ms)
-    robot.say_state(State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0, faults=(fault,)))
+    robot.publish_state(State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0, faults=(fault,)))
     host.tick()
     faults = anna.get(f"/devices/{robot.device}/faults").json()["items"]
     streams = anna.get(f"/devices/{robot.device}/data").json()["items"]

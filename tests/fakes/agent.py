@@ -84,16 +84,16 @@ class Robot:
             headers={"kid": signing.key_id(key.public_key())},
         )
 
-    def ask(self, method: str, path: str, *, token: str = "", **options: Any) -> httpx.Response:
+    def request(self, method: str, path: str, *, token: str = "", **options: Any) -> httpx.Response:
         headers = {"Authorization": f"Bearer {token or self.token()}"}
-        return self.cloud.ask(method, PREFIX + path, headers=headers, **options)
+        return self.cloud.request(method, PREFIX + path, headers=headers, **options)
 
     def introduction(self, **changes: Any) -> dict[str, Any]:
         devices = [{"name": name, "kind": "arm", "robot_type": "ur5", "label": name.title()} for name in self.names]
         return {"name": "lab", "public_key": self.public, "software": "toy 1", "devices": devices, **changes}
 
     def enroll(self, **changes: Any) -> httpx.Response:
-        return self.ask("POST", "/agents/enroll", json=self.introduction(**changes))
+        return self.request("POST", "/agents/enroll", json=self.introduction(**changes))
 
     def code(self) -> str:
         answer = self.enroll()
@@ -102,7 +102,7 @@ class Robot:
         return code
 
     def enrollment(self, wait_ms: int = 0) -> dict[str, Any]:
-        answer = self.ask("GET", "/agents/enrollment", params={"wait_ms": wait_ms})
+        answer = self.request("GET", "/agents/enrollment", params={"wait_ms": wait_ms})
         assert answer.status_code == 200, answer.text
         found: dict[str, Any] = answer.json()
         return found
@@ -120,28 +120,28 @@ class Robot:
 
     def connect(self) -> Self:
         """Connect with credentials from the API, hear what is addressed to it, and say that it is there."""
-        issued = self.ask("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
+        issued = self.request("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
         self.session += 1
-        self.link = self.cloud.connect(issued, on_message=lambda message: self.obey(message))  # noqa: PLW0108 (tests replace it)
+        self.link = self.cloud.connect(issued, on_message=lambda message: self.handle(message))  # noqa: PLW0108 (tests replace it)
         assert self.link.connected.is_set(), f"refused: {self.link.answer}"
         assert self.link.subscribe(*issued["subscribe"]) == [1] * len(issued["subscribe"])
-        self.say_presence(online=True)
+        self.publish_presence(online=True)
         return self
 
     def topic(self, kind: str, name: str = "") -> str:
         return topics.device(self.space, self.id, name or self.names[0], kind)
 
-    def say(self, topic: str, message: Any, *, retain: bool = False) -> None:
+    def publish(self, topic: str, message: Any, *, retain: bool = False) -> None:
         assert self.link is not None
         self.link.publish_acknowledged(topic, codec.encode(message), retain=retain)
 
-    def say_presence(self, *, online: bool, session: int | None = None) -> None:
+    def publish_presence(self, *, online: bool, session: int | None = None) -> None:
         number = self.session if session is None else session
         message = Presence(online=online, session=number, at_ms=self.cloud.clock.now_ms())
-        self.say(topics.conn(self.space, self.id), message, retain=True)
+        self.publish(topics.conn(self.space, self.id), message, retain=True)
 
-    def say_state(self, state: State) -> None:
-        self.say(self.topic(topics.STATE), state, retain=True)
+    def publish_state(self, state: State) -> None:
+        self.publish(self.topic(topics.STATE), state, retain=True)
 
     def ack(self, command: str, status: AckStatus, **more: Any) -> Ack:
         sequence = self._sequences[command] = self._sequences.get(command, 0) + 1
@@ -151,17 +151,17 @@ class Robot:
     def report(self, command: str, status: AckStatus, **more: Any) -> Ack:
         """Report about an action, when the test wants it."""
         ack = self.ack(command, status, **more)
-        self.say(self.topic(topics.ACK), ack)
+        self.publish(self.topic(topics.ACK), ack)
         return ack
 
     def fail(self, command: str, code: str, message: str) -> None:
         self.report(command, AckStatus.FAILED, reason=Reason(code=code, message=message))
 
-    def heard(self, kind: type[T]) -> list[Command]:
+    def received(self, kind: type[T]) -> list[Command]:
         """Signed commands of this kind, in order."""
         return [command for command in self.commands if isinstance(command.request, kind)]
 
-    def obey(self, message: Message) -> None:
+    def handle(self, message: Message) -> None:
         """Called on the connection's own thread."""
         topic = topics.parse(message.topic)
         if topic.kind == topics.STOP:

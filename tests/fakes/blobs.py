@@ -7,14 +7,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from typing import NamedTuple
 from urllib.parse import quote
 
-from function_app.ports.blobs import (
-    MAX_BYTES,
-    MAX_NAME_LENGTH,
-    Download,
-    TransferRefused,
-    Upload,
-    check_upload,
-)
+from function_app.ports.blobs import Download, TransferRefused, Upload, check_name, check_size, check_upload
 
 
 class _Address(NamedTuple):
@@ -37,21 +30,24 @@ class MemoryBlobs:
         self._now_s = now_s
 
     async def put(self, name: str, content: bytes) -> None:
-        self._check(name, len(content))
+        check_name(name)
+        check_size(len(content))
         await asyncio.sleep(0)
         self.contents[name] = bytes(content)
 
     async def get(self, name: str) -> bytes | None:
-        self._check(name)
+        check_name(name)
         await asyncio.sleep(0)
         return self.contents.get(name)
 
     async def append(self, name: str, content: bytes) -> None:
-        self._check(name, len(self.contents.get(name, b"")) + len(content))
-        self.contents[name] = self.contents.get(name, b"") + content
+        check_name(name)
+        new = self.contents.get(name, b"") + content
+        check_size(len(new))
+        self.contents[name] = new
 
     async def delete(self, name: str) -> None:
-        self._check(name)
+        check_name(name)
         self.contents.pop(name, None)
 
     async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
@@ -63,12 +59,12 @@ class MemoryBlobs:
 
     async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
         check_upload(length)
-        self._check(name)
+        check_name(name)
         url = self._sign(_Address(name, True, content_type, self._now_s() + lifetime_s, length))
         return Upload("PUT", url, {"Content-Length": str(length), "Content-Type": content_type})
 
     async def presign_download(self, name: str, *, content_type: str, lifetime_s: int) -> str:
-        self._check(name)
+        check_name(name)
         return self._sign(_Address(name, False, content_type, self._now_s() + lifetime_s))
 
     async def receive(self, token: str, headers: Mapping[str, str], content: AsyncIterator[bytes]) -> None:
@@ -104,17 +100,6 @@ class MemoryBlobs:
         if address is None or address.upload != upload or address.expires_s <= self._now_s():
             raise TransferRefused(403, "The address is not one of ours, or has expired. Ask for a new one.")
         return address
-
-    @staticmethod
-    def _check(name: str, size: int = 0) -> None:
-        if not 1 <= len(name) <= MAX_NAME_LENGTH or not _is_text(name):
-            raise ValueError(f"a blob's name is Unicode text of 1 to {MAX_NAME_LENGTH} characters")
-        if size > MAX_BYTES:
-            raise ValueError(f"a blob has at most {MAX_BYTES} bytes, not {size}")
-
-
-def _is_text(name: str) -> bool:
-    return name.encode(errors="replace").decode() == name
 
 
 async def _parts(content: bytes) -> AsyncIterator[bytes]:

@@ -5,9 +5,8 @@ import contextlib
 import functools
 import logging
 import secrets
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from device_agent.protocol import Ack, codec, topics
 from device_agent.protocol.errors import ProtocolError
@@ -15,7 +14,7 @@ from device_agent.protocol.security import grants
 from device_agent.protocol.security.grants import Grant
 from device_agent.protocol.topics import ANY
 from function_app.domain.common.problems import Problem
-from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials
+from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials, check_revocation
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.device_feed import BatchHandler, Handler
 from function_app.ports.tables import StoreError
@@ -43,8 +42,7 @@ class MemoryBrokerAccess:
         return True
 
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
-        if (client_id is None) == (principal is None):
-            raise ValueError("revoke takes exactly one of client_id and principal")
+        check_revocation(client_id, principal)
         self._require_broker()
         self._broker.revoke(lambda grant: grant.client_id == client_id or principal in grants.covering(grant.principal))
 
@@ -124,28 +122,31 @@ class _Acks(AsyncIterator[Ack]):
         return await self._waiting.get()
 
 
-class _Arrived(NamedTuple):
-    topic: str
-    payload: bytes
-
-
 class _MemorySubscription:
-    """What the feeds share: a queue of messages, stored one after another."""
+    """A queue of topics and payloads that are stored one after another."""
 
     filters: tuple[str, ...]
 
     def __init__(self, broker: MemoryBroker) -> None:
         self.broker = broker
-        self._queue: asyncio.Queue[_Arrived] = asyncio.Queue()
+        self._queue: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue()
 
     def matches(self, topic: str) -> bool:
         return any(topics.matches(pattern, topic) for pattern in self.filters)
 
     def deliver(self, message: Message) -> None:
-        self._queue.put_nowait(_Arrived(message.topic, message.payload))
+        self._queue.put_nowait((message.topic, message.payload))
 
     async def stored(self) -> None:
         await self._queue.join()
+
+    @contextlib.contextmanager
+    def _attached(self) -> Iterator[None]:
+        self.broker.attach_feed(self)
+        try:
+            yield
+        finally:
+            self.broker.detach_feed(self)
 
 
 class MemoryFeed(_MemorySubscription):
@@ -157,14 +158,11 @@ class MemoryFeed(_MemorySubscription):
     )
 
     async def run(self, handler: Handler) -> None:
-        self.broker.attach_feed(self)
-        try:
+        with self._attached():
             while True:
-                message = await self._queue.get()
-                await _store(functools.partial(handler, *message), message.topic)
+                topic, payload = await self._queue.get()
+                await _store(functools.partial(handler, topic, payload), topic)
                 self._queue.task_done()
-        finally:
-            self.broker.detach_feed(self)
 
 
 class MemoryTelemetry(_MemorySubscription):
@@ -175,16 +173,13 @@ class MemoryTelemetry(_MemorySubscription):
         self.filters = (topics.device(ANY, ANY, ANY, topics.LATE if late else topics.TELE, ANY),)
 
     async def run(self, handler: BatchHandler) -> None:
-        self.broker.attach_feed(self)
-        try:
+        with self._attached():
             while True:
                 batch = [await self._queue.get()]
                 batch += [self._queue.get_nowait() for _ in range(self._queue.qsize())]
                 await _store(functools.partial(handler, batch), "telemetry")
                 for _ in batch:
                     self._queue.task_done()
-        finally:
-            self.broker.detach_feed(self)
 
 
 async def _store(handle: Callable[[], Awaitable[None]], name: str) -> None:

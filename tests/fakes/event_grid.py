@@ -228,11 +228,8 @@ def event_grid_cloud(home: Path) -> Iterator[tuple[Cloud, RunningBroker, EventGr
             grid.webhook = lambda asked: _ask(cloud, asked)
             process: Any = None
             kind: Any = "eventgrid"
-            yield (
-                cloud,
-                RunningBroker(kind, home, process, ports[TCP], ports[WEBSOCKET], access, cloud.loop),
-                grid,
-            )
+            broker = RunningBroker(kind, home, process, ports[TCP], ports[WEBSOCKET], cloud.loop, access=access)
+            yield cloud, broker, grid
 
 
 async def _known(token: str) -> bool:

@@ -225,11 +225,7 @@ class Operator:
         self._sequence += 1
         target = JointTarget(position_rad=dict(zip(self.seat.joints, self._target_rad, strict=True)))
         setpoint = Setpoint(
-            epoch=self.epoch,
-            sequence=self._sequence,
-            echo_tick_ms=message.tick_ms,
-            sent_ms=now_s * 1000,
-            target=target,
+            epoch=self.epoch, sequence=self._sequence, echo_tick_ms=message.tick_ms, sent_ms=now_s * 1000, target=target
         )
         if self._link is not None and self._link.publish(f"{self.seat.topic}/ctl/{self.epoch}", codec.encode(setpoint)):
             self._sent_s = now_s

@@ -169,13 +169,7 @@ class Body:
         return move
 
     def _publish(
-        self,
-        topic: str,
-        payload: bytes,
-        *,
-        qos: int,
-        retain: bool = False,
-        delivered: Callable[[], None] | None = None,
+        self, topic: str, payload: bytes, *, qos: int, retain: bool = False, delivered: Callable[[], None] | None = None
     ) -> bool:
         """A transport that sometimes does not acknowledge, and drops measurements."""
         del qos, retain

@@ -1,75 +1,97 @@
 """Processes that are killed between two writes."""
 
-from collections.abc import Callable
+import itertools
+import os
+import signal
+from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any
 
-from function_app.ports.tables import Page, Row, Tables, Write
+from function_app.ports.tables import Tables
 from tests.harness.cloud.cloud import Cloud, Person
+
+WRITES = frozenset({"create", "replace", "delete", "batch", "put", "append"})
 
 
 class Killed(Exception):  # noqa: N818 (an outcome that the test wants)
-    """The process is gone."""
+    """The simulated process has ended."""
 
 
-class Knife:
-    """Ends a process after its next so many writes."""
+class CrashPoint:
+    """Ends a simulated process after its next ``left`` writes; afterwards it neither reads nor writes."""
 
     def __init__(self) -> None:
         self.left: int | None = None
         self.written = 0
 
-    def check(self) -> None:
-        if self.left is not None and self.left <= 0:
-            raise Killed
+    @property
+    def survived(self) -> bool:
+        return self.left is None or self.left > 0
 
-    def wrote(self) -> None:
+    async def read(self, call: Callable[..., Awaitable[Any]], *arguments: Any, **options: Any) -> Any:
+        self._check()
+        return await call(*arguments, **options)
+
+    async def write(self, call: Callable[..., Awaitable[Any]], *arguments: Any) -> Any:
+        self._check()
+        result = await call(*arguments)
         self.written += 1
         if self.left is not None:
             self.left -= 1
-        self.check()
+        self._check()
+        return result
+
+    def _check(self) -> None:
+        if not self.survived:
+            raise Killed
 
 
-class CutTables:
-    """Real tables of a process that the knife ends: after that it neither reads nor writes."""
+class KillPoint:
+    """Ends this process instead of step number ``at`` (counted from 0): a write, or a message to a device.
 
-    def __init__(self, inner: Tables, knife: Knife) -> None:
-        self._inner = inner
-        self._knife = knife
+    Args:
+        at: ``None``: never.
+        simulated: Raise ``Killed`` at this step and all later ones; otherwise end the process, as ``kill -9`` does.
+    """
 
-    async def get(self, table: str, partition: str, key: str) -> Row | None:
-        self._knife.check()
-        return await self._inner.get(table, partition, key)
+    def __init__(self, at: int | None, *, simulated: bool = False) -> None:
+        self._at = at
+        self._steps = itertools.count()
+        self._simulated = simulated
+        self.reached = False
 
-    async def query(self, *arguments: Any, **options: Any) -> Page:
-        self._knife.check()
-        return await self._inner.query(*arguments, **options)
+    async def read(self, call: Callable[..., Awaitable[Any]], *arguments: Any, **options: Any) -> Any:
+        if self.reached:
+            raise Killed
+        return await call(*arguments, **options)
 
-    async def create(self, table: str, row: Row) -> Row:
-        created: Row = await self._cut(self._inner.create, table, row)
-        return created
+    async def write(self, call: Callable[..., Awaitable[Any]], *arguments: Any) -> Any:
+        self.step()
+        return await call(*arguments)
 
-    async def replace(self, table: str, row: Row) -> Row:
-        replaced: Row = await self._cut(self._inner.replace, table, row)
-        return replaced
-
-    async def delete(self, table: str, row: Row) -> None:
-        await self._cut(self._inner.delete, table, row)
-
-    async def batch(self, table: str, writes: list[Write]) -> tuple[Row, ...]:
-        written: tuple[Row, ...] = await self._cut(self._inner.batch, table, writes)
-        return written
-
-    async def _cut(self, write: Callable[..., Any], *arguments: Any) -> Any:
-        self._knife.check()
-        done = await write(*arguments)
-        self._knife.wrote()
-        return done
-
-    async def close(self) -> None:
-        await self._inner.close()
+    def step(self) -> None:
+        self.reached = self.reached or (self._at is not None and next(self._steps) >= self._at)
+        if self.reached:
+            if not self._simulated:
+                os.kill(os.getpid(), signal.SIGKILL)
+            raise Killed
 
 
-def elsewhere(cloud: Cloud, person: Person) -> Person:
-    """The same session, at another process."""
+def crashing_tables(tables: Tables, point: CrashPoint | KillPoint) -> Tables:
+    """Tables of a process that ends at this point."""
+
+    class CrashingTables:
+        def __getattr__(self, name: str) -> Any:
+            return partial(point.write if name in WRITES else point.read, getattr(tables, name))
+
+        async def close(self) -> None:
+            await tables.close()
+
+    found: Any = CrashingTables()
+    return found  # type: ignore[no-any-return]
+
+
+def at_instance(cloud: Cloud, person: Person) -> Person:
+    """The session of a person at another instance."""
     account = {"id": person.account, "name": person.name}
     return Person(cloud, {"access_token": person.token, "account": account, "session": person.session})

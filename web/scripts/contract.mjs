@@ -1,12 +1,13 @@
-// Writes src/shared/mqtt/protocol.generated.ts from docs/asyncapi.json; with --check says whether it is what the document says.
-// It knows the part of JSON Schema that the document uses and refuses the rest, so that nothing is left out in silence.
-import { readFileSync, writeFileSync } from "node:fs";
+// Writes src/shared/mqtt/protocol.generated.ts from docs/asyncapi.json; with --check fails if the file is stale.
+// It supports the part of JSON Schema that the document uses and rejects the rest.
+import { readdirSync, readFileSync, writeFileSync } from "node:fs";
 
 const source = new URL("../../docs/asyncapi.json", import.meta.url);
 const target = new URL("../src/shared/mqtt/protocol.generated.ts", import.meta.url);
+const web = new URL("../", import.meta.url);
 
 const HEAD = `// Generated from docs/asyncapi.json by \`make contract\`; do not edit.
-// Only types: what arrives is checked in messages.ts before anything else sees it. SI units and radians.
+// The types that the console uses. parse-messages.ts validates received messages. SI units and radians.
 `;
 
 /** Keys that restrict a value without changing its TypeScript type. */
@@ -57,7 +58,23 @@ function declaration(name, schema) {
 }
 
 const { schemas } = JSON.parse(readFileSync(source, "utf8")).components;
-const text = [HEAD, ...Object.entries(schemas).map(([name, schema]) => declaration(name, schema))].join("\n");
+
+/** Names that the console and its tests import from the generated file. */
+function imported() {
+  const files = ["src", "tests"].flatMap((folder) => readdirSync(new URL(folder, web), { recursive: true }).map((file) => `${folder}/${file}`));
+  const lists = files
+    .filter((file) => /\.tsx?$/.test(file))
+    .flatMap((file) => [...readFileSync(new URL(file, web), "utf8").matchAll(/\{([^{}]*)\} from "[^"]*protocol\.generated"/g)]);
+  return lists.flatMap(([, list]) => list.match(/\w+/g) ?? []).filter((name) => name in schemas);
+}
+
+const used = new Set(imported());
+// A set also visits members that are added during the iteration.
+for (const name of used) {
+  for (const [, other] of JSON.stringify(schemas[name]).matchAll(/"\$ref":"[^"]*\/(\w+)"/g)) used.add(other);
+}
+const declarations = Object.entries(schemas).filter(([name]) => used.has(name)).map(([name, schema]) => declaration(name, schema));
+const text = [HEAD, ...declarations].join("\n");
 
 if (process.argv.includes("--check")) {
   if (readFileSync(target, "utf8") !== text) {

@@ -75,7 +75,7 @@ class AssistedWalk:
         model: Any,
         *,
         base: int,
-        soles: tuple[int, int],
+        soles: Sequence[int],
         servos: Mapping[int, int],
         actuators: Ints,
         legs: Legs,
@@ -256,9 +256,7 @@ class BipedDriver(MujocoDriver):
         Raises:
             DriverError: A value is not finite, not connected, or the simulation has stopped.
         """
-        snapshot, walker = self._live(), self._walking()
-        if not all(map(math.isfinite, twist)):
-            raise DriverError("a commanded twist is not finite")
+        snapshot, walker = self._driven(twist), self._walking()
         fastest, sideways = self._limits.max_linear_m_s, self._limits.max_linear_m_s * self._limits.sideways
         turning = self._limits.max_angular_rad_s
         applied = Twist(
@@ -282,14 +280,9 @@ class BipedDriver(MujocoDriver):
         self._require()
         walker = self._walking()
         place = self._start.shifted(walker.walked.x_m, walker.walked.y_m)
-        return {
-            "x_m": round(place.x_m, 4),
-            "y_m": round(place.y_m, 4),
-            "yaw_rad": round(math.remainder(place.yaw_rad + walker.walked.yaw_rad, 2 * math.pi), 4),
-            "forward_m_s": round(walker.velocity.forward_m_s, 4),
-            "left_m_s": round(walker.velocity.left_m_s, 4),
-            "turn_rad_s": round(walker.velocity.turn_rad_s, 4),
-        }
+        yaw_rad = math.remainder(place.yaw_rad + walker.walked.yaw_rad, 2 * math.pi)
+        values = {"x_m": place.x_m, "y_m": place.y_m, "yaw_rad": yaw_rad, **walker.velocity._asdict()}
+        return {name: round(value, 4) for name, value in values.items()}
 
     def close(self) -> None:
         """See ``MujocoDriver``; also stops a walk."""
@@ -318,8 +311,9 @@ class BipedDriver(MujocoDriver):
         ):
             raise DriverError(f"the base of '{self._type.type}' has no free joint; it cannot walk")
         data = mujoco.MjData(model)
-        self._start = _place(data.qpos[int(model.jnt_qposadr[model.body_jntadr[self._base]]) :])
         free = int(model.jnt_qposadr[model.body_jntadr[self._base]])
+        x, y = data.qpos[free : free + 2].tolist()
+        self._start = FloorPose(x, y, heading(data.qpos[free + 3 : free + 7]))
         data.qpos[free : free + 7] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
         mujoco.mj_kinematics(model, data)
         left, right = (
@@ -333,7 +327,7 @@ class BipedDriver(MujocoDriver):
             self._walk,
             model,
             base=self._base,
-            soles=(self._site(model, self._walk.soles[0]), self._site(model, self._walk.soles[1])),
+            soles=[self._site(model, sole) for sole in self._walk.soles],
             servos=dict(zip(self._actuators.tolist(), self._qpos.tolist(), strict=True)),
             actuators=self._actuators[self._leg_joints],
             legs=make_legs(left, right, (feet[0][0], feet[0][1], feet[0][2])),
@@ -375,10 +369,6 @@ def upright(quaternion: Floats) -> float:
     """Cosine of the angle between the z axis and the vertical."""
     _, x, y, _ = quaternion.tolist()
     return float(1.0 - 2.0 * (x * x + y * y))
-
-
-def _place(free_joint: Floats) -> FloorPose:
-    return FloorPose(float(free_joint[0]), float(free_joint[1]), heading(free_joint[3:7]))
 
 
 def _point(vector: Floats) -> Point:

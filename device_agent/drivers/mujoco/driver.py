@@ -15,13 +15,14 @@ from device_agent.drivers.mujoco.fault_injection import NO_FAULTS, FaultInjector
 from device_agent.drivers.mujoco.motor_model import HEALTH, MotorModel
 from device_agent.drivers.mujoco.servo_gains import ServoGains
 from device_agent.ports import skills
-from device_agent.ports.driver import DriverError, Observation
+from device_agent.ports.driver import DriverError, Observation, Twist
 from device_agent.ports.sensor import Frame
 from device_agent.ports.skills import Skill, SkillError, Stage
 from device_agent.protocol import Pose, SetStiffness, Twin
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation.mjcf import twin
-from device_agent.simulation.scene_assembly import SCALAR_JOINTS
+from device_agent.simulation.mjcf.equality_joints import SCALAR_JOINTS
+from device_agent.simulation.scene_assembly import is_servo
 from device_agent.simulation.snapshot import Floats, Ints, Snapshot
 from device_agent.simulation.world import STALE_S, World
 
@@ -239,6 +240,13 @@ class MujocoDriver:
         applied: Floats = np.minimum(np.maximum(position_rad, self._lower), self._upper)
         return applied
 
+    def _driven(self, twist: Twist) -> Snapshot:
+        """The newest snapshot, for a twist of finite values."""
+        snapshot = self._live()
+        if not all(map(math.isfinite, twist)):
+            raise DriverError("a commanded twist is not finite")
+        return snapshot
+
     def _require(self) -> None:
         if not self._connected:
             raise DriverError(f"'{self._device}' is not connected")
@@ -284,7 +292,8 @@ class MujocoDriver:
         for name, joint, actuator in zip(names, joints, actuators, strict=True):
             if model.jnt_type[joint] not in SCALAR_JOINTS:
                 raise DriverError(f"joint '{name}' of '{self._type.type}' is neither a hinge nor a slide")
-            if not _is_position_servo(model, actuator, joint):
+            on_joint = model.actuator_trnid[actuator, 0] == joint and model.actuator_gear[actuator, 0] == 1
+            if not (on_joint and is_servo(model, actuator, order=0)):
                 raise DriverError(f"actuator '{name}' of '{self._type.type}' is not a position servo on joint '{name}'")
         self._qpos = np.array([model.jnt_qposadr[joint] for joint in joints], dtype=np.intp)
         self._dof = np.array([model.jnt_dofadr[joint] for joint in joints], dtype=np.intp)
@@ -338,15 +347,3 @@ def _bases(w: float, x: float, y: float, z: float) -> tuple[Floats, Floats]:
 def _turned_by(w: float, x: float, y: float, z: float) -> list[list[float]]:
     """The matrix of q → q ⊗ (w, x, y, z)."""
     return [[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]]
-
-
-def _is_position_servo(model: Any, actuator: int, joint: int) -> bool:
-    gain = model.actuator_gainprm[actuator, 0]
-    return bool(
-        model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
-        and model.actuator_trnid[actuator, 0] == joint
-        and model.actuator_gear[actuator, 0] == 1
-        and model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
-        and gain > 0
-        and model.actuator_biasprm[actuator, 1] == -gain
-    )

@@ -3,7 +3,7 @@
 import math
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import mujoco
@@ -13,6 +13,7 @@ from device_agent.drivers.mujoco.driver import MujocoDriver
 from device_agent.ports.driver import DriverError, Twist
 from device_agent.protocol.manifests.capabilities import Wheels
 from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.simulation.scene_assembly import is_servo
 from device_agent.simulation.snapshot import Floats, Ints, Snapshot
 from device_agent.simulation.world import World
 
@@ -70,13 +71,7 @@ class Odometry:
 
     def values(self) -> dict[str, float]:
         """Values of the stream."""
-        return {
-            "x_m": round(self.x_m, 4),
-            "y_m": round(self.y_m, 4),
-            "yaw_rad": round(self.yaw_rad, 4),
-            "forward_m_s": round(self.forward_m_s, 4),
-            "turn_rad_s": round(self.turn_rad_s, 4),
-        }
+        return {name: round(value, 4) for name, value in asdict(self).items()}
 
 
 def wheel_speeds(wheels: Wheels, twist: Twist, *, fastest_rad_s: float) -> tuple[Floats, Twist]:
@@ -149,9 +144,7 @@ class WheeledDriver(MujocoDriver):
         Raises:
             DriverError: A value is not finite, not connected, or the simulation has stopped.
         """
-        snapshot = self._live()
-        if not all(map(math.isfinite, twist)):
-            raise DriverError("a commanded twist is not finite")
+        snapshot = self._driven(twist)
         speeds, applied = wheel_speeds(self._wheels, twist, fastest_rad_s=self._fastest_rad_s)
         if self._brake is not None:
             self._brake.driven_s = snapshot.time_s
@@ -213,19 +206,9 @@ class WheeledDriver(MujocoDriver):
         directions = np.ascontiguousarray(beams @ data.site_xmat[site].reshape(3, 3).T).ravel()
         geoms, distances = np.empty(len(beams), dtype=np.int32), np.empty(len(beams))
         mujoco.mj_multiRay(
-            self._world.model,
-            data,
-            data.site_xpos[site],
-            directions,
-            _ALL_GROUPS,
-            True,
-            self._base,
-            geoms,
-            distances,
-            None,
-            len(beams),
-            farthest_m,
-        )
+            self._world.model, data, data.site_xpos[site], directions, _ALL_GROUPS, True, self._base, geoms, distances,
+            None, len(beams), farthest_m,
+        )  # fmt: skip
         hit = distances[distances >= 0]
         return float(hit.min()) if len(hit) else 2 * farthest_m
 
@@ -258,26 +241,16 @@ class WheeledDriver(MujocoDriver):
                 self._sites[part] = (site, kind == "floor")
 
 
-def _beams() -> Floats:
-    return np.array(
-        [
-            (math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw), math.sin(pitch))
-            for pitch in _BEAM_PITCH_RAD
-            for yaw in _BEAM_YAW_RAD
-        ]
-    )
-
-
-_BEAMS = _beams()
+_BEAMS = np.array(
+    [
+        (math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw), math.sin(pitch))
+        for pitch in _BEAM_PITCH_RAD
+        for yaw in _BEAM_YAW_RAD
+    ]
+)
 
 
 def _is_velocity_servo(model: Any, actuator: int) -> bool:
-    gain = model.actuator_gainprm[actuator, 0]
-    return bool(
-        model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
-        and model.jnt_type[model.actuator_trnid[actuator, 0]] == int(mujoco.mjtJoint.mjJNT_HINGE)
-        and model.actuator_ctrllimited[actuator]
-        and model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
-        and gain > 0
-        and model.actuator_biasprm[actuator, 2] == -gain
-    )
+    joint = model.actuator_trnid[actuator, 0]
+    on_hinge = is_servo(model, actuator, order=1) and model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_HINGE)
+    return bool(on_hinge and model.actuator_ctrllimited[actuator])

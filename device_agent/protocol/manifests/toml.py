@@ -13,12 +13,7 @@ Manifest = TypeVar("Manifest", bound=msgspec.Struct)
 
 
 def load(path: Path, parse: Callable[[str], Manifest], *, named: str) -> Manifest:
-    """Read and check a manifest.
-
-    Args:
-        path: The file.
-        parse: Reads and checks the text.
-        named: The field that must equal the folder's name.
+    """Read and check a manifest, whose field ``named`` must equal the folder's name.
 
     Raises:
         ProtocolError: The file is missing, not TOML, or a field is wrong. The message names file and field.

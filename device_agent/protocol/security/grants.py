@@ -22,24 +22,15 @@ ALGORITHM = "EdDSA"
 AUDIENCE = "telescope/mqtt"
 
 _EVERY_DEVICE = f"{topics.ROOT}/+/+/+"
-SERVICE_PUBLISH = (
-    *(f"{_EVERY_DEVICE}/{kind}" for kind in (topics.CMD, topics.STOP)),
-    topics.conn(topics.ANY, topics.ANY),
-    *(f"{_EVERY_DEVICE}/{kind}" for kind in (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)),
-    f"{_EVERY_DEVICE}/{topics.DESC}/+",
-    f"{_EVERY_DEVICE}/{topics.TELE}/+",
-    f"{_EVERY_DEVICE}/{topics.LATE}/+",
-    revocation.TOPIC,
-)
-"""Topics to which the functions publish: commands, and messages of agents that use HTTP."""
 SERVICE_SUBSCRIBE = (
     topics.conn(topics.ANY, topics.ANY),
     *(f"{_EVERY_DEVICE}/{kind}" for kind in (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)),
-    f"{_EVERY_DEVICE}/{topics.DESC}/+",
-    f"{_EVERY_DEVICE}/{topics.TELE}/+",
-    f"{_EVERY_DEVICE}/{topics.LATE}/+",
+    *(f"{_EVERY_DEVICE}/{kind}/+" for kind in (topics.DESC, topics.TELE, topics.LATE)),
 )
-"""Topics to which the functions subscribe."""
+"""Topics to which the functions subscribe: all messages of agents but setpoints and camera frames."""
+_COMMANDS = (f"{_EVERY_DEVICE}/{topics.CMD}", f"{_EVERY_DEVICE}/{topics.STOP}")
+SERVICE_PUBLISH = (*_COMMANDS, *SERVICE_SUBSCRIBE, revocation.TOPIC)
+"""Topics to which the functions publish: commands, and messages of agents that use HTTP."""
 
 
 class Grant(Struct, frozen=True, kw_only=True):
@@ -154,17 +145,13 @@ def agent_command_topics(space: str, agent: str) -> tuple[str, ...]:
 def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> Grant:
     """Grant of an agent: publish for its devices, receive their commands, and read the measurements of its space."""
     own = f"{topics.ROOT}/{space}/{agent}"
-    published = (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)
     return Grant(
         principal=f"agent:{agent}",
         client_id=agent,
         publish=(
             topics.conn(space, agent),
-            *(f"{own}/+/{kind}" for kind in published),
-            f"{own}/+/{topics.DESC}/+",
-            f"{own}/+/{topics.TELE}/+",
-            f"{own}/+/{topics.LATE}/+",
-            f"{own}/+/{topics.CAM}/+",
+            *(f"{own}/+/{kind}" for kind in (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)),
+            *(f"{own}/+/{kind}/+" for kind in (topics.DESC, topics.TELE, topics.LATE, topics.CAM)),
         ),
         subscribe=(
             *agent_command_topics(space, agent),

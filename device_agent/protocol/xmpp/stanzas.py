@@ -74,7 +74,7 @@ def message(
         stanza.set("id", receipt)
         SubElement(stanza, "request", {"xmlns": RECEIPTS})
     if body:
-        SubElement(stanza, "body").text = "".join(letter for letter in body if not _UNFIT.match(letter))
+        SubElement(stanza, "body").text = _UNFIT.sub("", body)
     for pattern in listen:
         SubElement(stanza, "listen", {"xmlns": NAMESPACE, "topic": pattern})
     element = SubElement(stanza, "m", {"xmlns": NAMESPACE, "topic": topic})
@@ -98,7 +98,7 @@ def rejection(to: str, message_id: str, reason: str) -> str:
     error = SubElement(stanza, "error", {"type": "modify"})
     SubElement(error, "not-acceptable", {"xmlns": "urn:ietf:params:xml:ns:xmpp-stanzas"})
     text = SubElement(error, "text", {"xmlns": "urn:ietf:params:xml:ns:xmpp-stanzas"})
-    text.text = "".join(letter for letter in reason[:MAX_REASON] if not _UNFIT.match(letter))
+    text.text = _UNFIT.sub("", reason[:MAX_REASON])
     return tostring(stanza, encoding="unicode")
 
 

@@ -49,17 +49,11 @@ class DeviceContext:
     """Parts of a device that its actions use.
 
     Attributes:
-        robot_type: Joints, frames, capabilities, home.
-        controller: Moves the device.
         observe: Newest observation, or ``None`` before the first one.
-        geometry: Shape of the robot, if its type has a model.
         skills: Driver with skills, if it has any.
-        readings: Newest measurements of the space's other devices.
         own_readings: Newest reading of each stream of this device except ``joints``.
-        room_device: The device, if it is a room device.
         name: Name of the device in the positions that room sensors publish.
         obstacle_map: Newest obstacle map of the room, if sensors publish one. ``go_to`` needs it.
-        speech: Output of speech.
         wake: Called after a goal has started; see ``ControlLoop.wake``.
     """
 

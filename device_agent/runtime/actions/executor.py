@@ -4,11 +4,11 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol
 
 from device_agent.ports.sandbox import Sandbox
 from device_agent.protocol import AckStatus, ActionState, Command, Reason, RoomTask, RunMovement, Task
-from device_agent.runtime.actions.call_action import CallAction
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.actions.script_action import MAX_OUTPUT, ScriptAction, ScriptFailed, ScriptSandbox
@@ -25,15 +25,7 @@ _log = logging.getLogger(__name__)
 
 
 class ActionExecutor:
-    """The running action of one device. Thread-safe.
-
-    Args:
-        context: The device.
-        policy: Decides which scripts may run.
-        sandbox: Runs scripts.
-        report: Journals and publishes an ack.
-        sync: Writes the journal to disk; raises if it cannot.
-    """
+    """The running action of one device. Thread-safe."""
 
     def __init__(
         self,
@@ -69,7 +61,7 @@ class ActionExecutor:
             elif isinstance(request, RoomTask):
                 run.reserve(room_actions.create(request, self._context.room_device, run.add_output))
             else:
-                run.reserve(CallAction(request, run.robot))
+                run.reserve(room_actions.OneShotAction(partial(run.robot.execute_task, request)))
             self._run = run
         threading.Thread(target=self._execute, args=(run,), name=f"action-{command.id}", daemon=True).start()
         run.report_started()
@@ -148,18 +140,11 @@ class _TimedScript:
             self._script.run()
         finally:
             timer.cancel()
-        return {"limited": self._robot.limited} if self._robot.limited else {}
+        return self._robot.limits()
 
 
 class _Run:
-    """One action from start to end.
-
-    Args:
-        command: The command of the action.
-        context: The device.
-        report: Journals and publishes an ack.
-        sync: See ``ActionExecutor``.
-    """
+    """One action from start to end."""
 
     def __init__(self, command: Command, context: DeviceContext, report: Report, sync: Callable[[], None]) -> None:
         self._sync = sync

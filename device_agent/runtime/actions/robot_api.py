@@ -7,7 +7,7 @@ from typing import Any
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import GeometryError, RobotGeometry
 from device_agent.ports.script_calls import AskLatest, AskState, Call, Home, Play
-from device_agent.protocol import Drive, GoTo, LookAt, MoveJoints, MovePose
+from device_agent.protocol import Drive, GoTo, LookAt, MoveJoints, MovePose, RobotTask
 from device_agent.runtime.actions.device_context import SCRIPT_NAMES, DeviceContext, by_name, tag
 from device_agent.runtime.actions.skill_runner import SkillRunner
 from device_agent.runtime.authority.authority import Reservation
@@ -23,9 +23,6 @@ from device_agent.runtime.readings import Reading
 
 class RobotApi:
     """``RobotApiProtocol`` of one action.
-
-    Args:
-        context: The device.
 
     Attributes:
         limited: Limits that changed the motion so far, as telemetry names them.
@@ -88,6 +85,15 @@ class RobotApi:
             case _:
                 self.skill_runner.run(call)
         return None
+
+    def execute_task(self, task: RobotTask) -> dict[str, Any]:
+        """Execute a single task to its end; losing the reservation ends it. Returns ``limits``."""
+        self.execute(task)
+        return self.limits()
+
+    def limits(self) -> dict[str, Any]:
+        """The part of a result that lists what limited the motion."""
+        return {"limited": self.limited} if self.limited else {}
 
     def _check_supported(self, call: Call) -> None:
         if type(call) not in self._supported:

@@ -13,15 +13,7 @@ from device_agent.runtime.storage.journal import Journal
 
 
 class ScriptPolicy:
-    """Checks of one device for scripts, in addition to those of their commands.
-
-    Args:
-        device: Name of the device.
-        robot_type: Id of its robot type.
-        owner: Id of the account that the agent is paired with; empty if the pairing does not contain it.
-        keys: The cloud's pinned public keys by key id.
-        journal: Open.
-    """
+    """Checks of one device for scripts, in addition to those of their commands."""
 
     def __init__(
         self, *, device: str, robot_type: str, owner: str, keys: Mapping[str, Ed25519PublicKey], journal: Journal

@@ -28,27 +28,14 @@ class JointMover(Protocol):
     ended: threading.Event
 
     def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
-        """Move to joint positions [rad] and wait.
-
-        Raises:
-            Refused: The robot did not reach the positions.
-        """
+        """Move to joint positions [rad] and wait."""
 
     def wait_for(self, goal: MotionGoal) -> None:
-        """Wait for the end of a goal.
-
-        Raises:
-            Refused: The goal was interrupted.
-        """
+        """Wait for the end of a goal."""
 
 
 class SkillRunner:
-    """Runs the skills of one action.
-
-    Args:
-        context: The device.
-        mover: The action.
-    """
+    """Runs the skills of one action."""
 
     def __init__(self, context: DeviceContext, mover: JointMover) -> None:
         self._context = context

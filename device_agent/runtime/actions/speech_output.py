@@ -24,15 +24,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class Utterance:
-    """A prepared utterance.
-
-    Attributes:
-        text: The words.
-        language: The requested language.
-        duration_s: Duration [s].
-        has_audio: Whether there is audio.
-        upload: Id of the uploaded audio, once ``stored``.
-    """
+    """A prepared utterance. ``upload`` is the id of its audio once ``stored`` is set, or empty."""
 
     text: str
     language: str
@@ -43,15 +35,7 @@ class Utterance:
 
 
 class SpeechOutput:
-    """Speech of one device.
-
-    Args:
-        device: Name of the device.
-        speech: Speech synthesis of this machine, if it has one.
-        uploads: Storage for audio, from which the UI fetches it.
-        record: Receives the event when an utterance starts.
-        on_start: Called with the duration [s] when an utterance starts.
-    """
+    """Speech of one device. ``on_start`` receives the duration [s] when an utterance starts."""
 
     def __init__(
         self,

@@ -30,11 +30,8 @@ class Reservation:
 class Authority:
     """The right to move one device. Not thread-safe: the controller locks.
 
-    Args:
-        gate: Lease gate with the epochs of the previous run.
-        latch: Stop latch of the previous run.
-        hold: Called when the current source of motion loses the right to move the device.
-        record: Receives an event for each change of authority. It must not block or call the controller.
+    ``hold`` is called when the current source of motion loses the right to move. ``record`` receives an event
+    for each change of authority; it must not block or call the controller.
 
     Attributes:
         changed: Set when epochs or latch changed and must be journalled; the command processor clears it.
@@ -71,11 +68,7 @@ class Authority:
         return self._gate.current(now_s)
 
     def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> bool:
-        """Accept a grant or renewal. Returns True if the epoch is new and the previous holder lost control.
-
-        Raises:
-            Refused: The epoch is stale or burned.
-        """
+        """See ``Controller.grant``. Returns True if the epoch is new and the previous holder lost control."""
         before, previous = self._gate.epoch, self._gate.granted
         self._gate.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason)
         new = self._superseded(before, previous)
@@ -84,20 +77,12 @@ class Authority:
         return new
 
     def release(self, epoch: int) -> None:
-        """End the lease that its holder released.
-
-        Raises:
-            Refused: The epoch is older than the lease in force.
-        """
+        """See ``Controller.release``."""
         self._gate.fence(epoch)
         self.end(Refused("lease_lost", "control was released"))
 
     def fence(self, epoch: int) -> bool:
-        """Check the epoch of a signed command. Returns True if it is new and the previous holder lost control.
-
-        Raises:
-            Refused: The epoch is stale or burned.
-        """
+        """Check the epoch of a signed command. Returns True if it is new and the previous holder lost control."""
         before, previous = self._gate.epoch, self._gate.granted
         self._gate.fence(epoch)
         if epoch == before and epoch <= self._gate.burned:
@@ -138,12 +123,7 @@ class Authority:
         return failed
 
     def end(self, why: Refused, lease: Lease | None = None) -> None:
-        """Burn the epoch in force: control must be taken again.
-
-        Args:
-            why: Reason.
-            lease: The lease that ends, if the gate no longer knows it.
-        """
+        """Burn the epoch in force: control must be taken again. ``lease``: the one that the gate has just ended."""
         self.changed.set()
         self._record_end(lease or self._gate.granted, why)
         self._gate.burn()

@@ -68,13 +68,7 @@ class EventRecorder:
             self._add(_stamped(event))
 
     def record_rejection(self, event: EventRecord, *, code: str, now_s: float) -> None:
-        """Record a rejection that may occur repeatedly.
-
-        Args:
-            event: The rejection.
-            code: Rejections of one kind with the same code are counted together.
-            now_s: Monotonic clock [s].
-        """
+        """Record a rejection; repeated ones of a kind with the same ``code`` are counted. ``now_s``: monotonic."""
         with self._lock:
             key = (event.kind, code)
             repeated = self._repeated.get(key)
@@ -88,11 +82,7 @@ class EventRecorder:
                 self._lost += 1
 
     def drain(self, now_s: float) -> list[EventRecord]:
-        """Remove and return the events to publish now, oldest first.
-
-        Args:
-            now_s: Monotonic clock [s]; infinity returns every counted rejection too.
-        """
+        """Remove and return the events to publish now, oldest first; at infinity, also all counted rejections."""
         with self._lock:
             events = list(self._waiting)
             self._waiting.clear()
@@ -122,12 +112,7 @@ class EventRecorder:
 
 
 def event_message(device: str, event: EventRecord) -> Event:
-    """The wire message of a recorded event.
-
-    Args:
-        device: Name of the device.
-        event: With its time.
-    """
+    """The wire message of a recorded event."""
     return Event(
         id=uuid.uuid4().hex,
         device=device,

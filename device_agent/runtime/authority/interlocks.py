@@ -14,12 +14,7 @@ from device_agent.runtime.readings import Reading, ReadingCache
 
 
 def engagement(rule: InterlockRule, reading: Reading | None) -> str | None:
-    """Why an interlock is engaged, or ``None`` if the reading shows that the room is clear.
-
-    Args:
-        rule: The interlock.
-        reading: The newest reading of its stream; ``None`` if none has arrived.
-    """
+    """Why an interlock is engaged, or ``None`` if the reading shows that the room is clear."""
     source = f"{rule.device}/{rule.stream}"
     if reading is None:
         return f"no measurement of {source} has arrived"
@@ -52,15 +47,7 @@ class _RuleState:
 
 
 class Interlocks:
-    """Interlocks of one device. The control loop calls ``update`` each period.
-
-    Args:
-        rules: From ``agent.toml``.
-        readings: Subscribed to the streams of the rules.
-        restrict: Slows or holds the device.
-        lift: Removes a restriction.
-        record: Records that a rule started or stopped acting: event, code, monotonic clock [s].
-    """
+    """Interlocks of one device. The control loop calls ``update`` each period."""
 
     def __init__(
         self,
@@ -79,11 +66,7 @@ class Interlocks:
         self._record = record
 
     def update(self, now_s: float) -> None:
-        """Check every rule, and act on changes.
-
-        Args:
-            now_s: Monotonic clock [s].
-        """
+        """Check every rule, and act on changes."""
         for state, source in zip(self._states, self._sources, strict=True):
             why = engagement(state.rule, self._readings.read(source))
             if why != state.why:

@@ -23,10 +23,6 @@ class LeaseGate:
 
     ``epoch`` is the highest epoch seen. ``burned`` is the highest epoch that the device no longer accepts. An epoch is
     burned when its lease ends, and when motion is held because setpoints stopped. Motion resumes only with a new epoch.
-
-    Args:
-        epoch: Highest epoch seen before a restart.
-        burned: Highest epoch burned before a restart.
     """
 
     def __init__(self, *, epoch: int = 0, burned: int = 0) -> None:

@@ -49,20 +49,7 @@ _log = logging.getLogger(__name__)
 
 
 class CommandProcessor:
-    """Verifies, deduplicates, applies and acknowledges commands; publishes state and events.
-
-    Args:
-        address: Space, agent and name of the device, to which commands must be addressed.
-        controller: Leases and Stop.
-        executor: Actions.
-        publisher: Publishes acks, state and events.
-        events: Events to publish.
-        journal: Open.
-        cloud_clock: Time for ``ttl_ms``.
-        keys: The cloud's pinned keys.
-        wake: Called after a Stop, so that it does not wait for the next control period.
-        device_faults: Faults that the driver does not raise as errors.
-    """
+    """Verifies, deduplicates, applies and acknowledges commands; publishes state and events."""
 
     def __init__(
         self,
@@ -97,11 +84,7 @@ class CommandProcessor:
         self._thread = threading.Thread(target=self._run, name=f"{self._name}-commands", daemon=True)
 
     def start(self, twin: Twin | None) -> None:
-        """Start to process commands.
-
-        Args:
-            twin: Drawing of the device, published after each connection.
-        """
+        """Start to process commands. The drawing of the device is published after each connection."""
         self._twin = twin
         self._thread.start()
 
@@ -249,8 +232,8 @@ class CommandProcessor:
             case CancelAction(action=action):
                 self._executor.cancel(action, command.caller)
             case action:
-                # Journalled before it starts: after a crash it is ended, never run again.
-                self._publisher.ack_transient(command.id, AckStatus.ACCEPTED)
+                # Only the next ack, which follows at once, is journalled. After a crash the action is not run again.
+                self._publisher.send_ack(self._publisher.create_ack(command.id, AckStatus.ACCEPTED))
                 self._executor.start(command, action)
                 self._write_journal()
                 return

@@ -19,12 +19,7 @@ def limits_of(base: Base) -> Twist:
 
 
 class BaseMotion:
-    """The commanded twist of a base.
-
-    Args:
-        base: Its limits.
-        period_s: The control period [s].
-    """
+    """The commanded twist of a base."""
 
     def __init__(self, base: Base, period_s: float) -> None:
         linear, angular = base.max_linear_acceleration_m_s2, base.max_angular_acceleration_rad_s2

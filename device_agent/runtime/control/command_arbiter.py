@@ -38,12 +38,7 @@ class ControlOutput:
 
 
 class CommandArbiter:
-    """Selects the source of motion in each period. Not thread-safe: the controller locks.
-
-    Args:
-        robot_type: Joints and control period.
-        state: State of the device's control.
-    """
+    """Selects the source of motion in each period. Not thread-safe: the controller locks."""
 
     def __init__(self, robot_type: RobotType, state: ControlState) -> None:
         self._joints = robot_type.joints
@@ -137,8 +132,8 @@ class CommandArbiter:
             authority.end(Refused("watchdog", "setpoints stopped arriving"))
         stream.clear()
         goals.brake()
-        held = self._state.mode is Mode.HOLDING and (goals.moving or authority.burned)
-        return Mode.HOLDING if held else Mode.IDLE
+        holds = self._state.mode is Mode.HOLDING and (goals.moving or authority.burned)
+        return Mode.HOLDING if holds else Mode.IDLE
 
     def _limited(self) -> tuple[str, ...]:
         """Limits that change the motion, for telemetry."""

@@ -29,6 +29,7 @@ Each setpoint triggers a message. Consoles send setpoints 25 ms apart; a message
 """
 _RECONNECT_PERIOD_S = 1.0
 _REST_TIMEOUT_S = 1.0
+_STOP_TIMEOUT_S = 2.0
 _MIN_PASSED_S = 1e-4
 """Lower bound of the time since the last period: ``ruckig`` cannot plan for a duration of 0 [s]."""
 _log = logging.getLogger(__name__)
@@ -37,14 +38,8 @@ _log = logging.getLogger(__name__)
 class ControlLoop:
     """One thread that never waits for disk or network. Callers of ``wake`` may run a period in their own thread.
 
-    Args:
-        robot_type: The control period.
-        driver: Not yet connected; only this loop calls ``observe`` and ``send``.
-        controller: Computes the commands.
-        name: Name of the device.
-        publish: Called with telemetry: 20 Hz at rest, 50 Hz in motion, and with each applied setpoint at up to 50 Hz.
-            It must not block.
-        check_interlocks: Called before each period with the monotonic clock [s]. It must be quick; an error holds.
+    ``publish`` receives telemetry at 20 Hz at rest, at 50 Hz in motion, and with each applied setpoint at up to 50 Hz.
+    ``check_interlocks`` is called before each period with the monotonic clock [s]. Neither may block.
     """
 
     def __init__(
@@ -100,10 +95,12 @@ class ControlLoop:
             time.sleep(self._period_s)
         self._stopping.set()
         self._requested.set()
-        if self._period_lock.acquire(timeout=2):  # a running period ends first; then the driver may be closed
+        if self._period_lock.acquire(
+            timeout=_STOP_TIMEOUT_S
+        ):  # a running period ends first; then the driver may be closed
             self._period_lock.release()
         if self._thread.is_alive():
-            self._thread.join(timeout=2)
+            self._thread.join(timeout=_STOP_TIMEOUT_S)
 
     def wake(self) -> None:
         """Start the next period now if the device is at rest, in this thread if the driver is ``RunsInline``.
@@ -144,7 +141,7 @@ class ControlLoop:
         """Sleep until the next period. Returns True if a device at rest was woken earlier."""
         pause_s = max(0.0, self._next_s - time.monotonic())
         if self._out_of_turn or self._controller.moving:
-            time.sleep(pause_s)
+            self._stopping.wait(pause_s)
             return False
         return self._requested.wait(pause_s)
 

@@ -15,24 +15,7 @@ from device_agent.runtime.errors import Refused
 
 
 class ControlState:
-    """Everything that the controller's lock protects. Not thread-safe.
-
-    Args:
-        robot_type: Joints and limits.
-        gate: Lease gate with the epochs of the previous run.
-        latch: Stop latch of the previous run.
-        geometry: Shape of the robot; without it, clearance is not checked.
-        record: Receives an event for each change of authority.
-
-    Attributes:
-        limits: Limits of the positions.
-        goals: Executes the goals of actions.
-        motion: Motion of the joints.
-        stream: Setpoints of the operator.
-        stiffness: Stiffness of the joints.
-        authority: The right to move.
-        mode: Mode of the last period.
-    """
+    """Everything that the controller's lock protects; see ``Controller`` for the arguments."""
 
     def __init__(
         self,

@@ -134,11 +134,6 @@ class Controller:
     def accept_setpoint(self, setpoint: Setpoint, *, now_s: float, tick_ms: int) -> None:
         """Accept a streamed setpoint; the newest replaces the previous one.
 
-        Args:
-            setpoint: The message.
-            now_s: Monotonic clock [s].
-            tick_ms: The same clock as telemetry shows it [ms].
-
         Raises:
             Refused: No lease, out of order, too old, or unknown joints; nothing changed. If the room holds the device,
                 the lease also ends, so that the device does not start when a person leaves.

@@ -23,10 +23,6 @@ _SAME_RAD = 1e-4
 class GoalExecutor:
     """Joints and base of one device, and their current goal. Not thread-safe: the controller locks.
 
-    Args:
-        robot_type: Joints and limits.
-        limits: Limits of the positions.
-
     Attributes:
         motion: Motion of the joints.
         base: Motion of the base, if there is one.
@@ -44,11 +40,7 @@ class GoalExecutor:
     # ------------------------------------------------------------ goals
 
     def start_joint_goal(self, position_rad: Mapping[str, float], speed: float) -> JointGoal:
-        """Start a motion to joint positions [rad]. Joints without a position stay.
-
-        Raises:
-            Refused: Unknown joint, position not finite or out of range, or no clearance there.
-        """
+        """See ``Controller.start_joint_goal``."""
         if not 0 < speed <= 1:
             raise Refused("bad_speed", f"speed must be above 0 and at most 1, not {speed}")
         target = self._limits.resolve_target(position_rad, self.motion.position_rad)
@@ -59,11 +51,7 @@ class GoalExecutor:
         return goal
 
     def start_trajectory(self, trajectory: Trajectory) -> TrajectoryGoal:
-        """Start to follow a trajectory that starts at the current position.
-
-        Raises:
-            Refused: It starts elsewhere, or leaves a joint's range.
-        """
+        """See ``Controller.start_trajectory``."""
         start_rad = trajectory.position_rad[0]
         distance_rad = float(np.max(np.abs(start_rad - self.motion.position_rad), initial=0.0))
         if self.motion.moving or not distance_rad <= _SAME_RAD:
@@ -75,11 +63,7 @@ class GoalExecutor:
         return goal
 
     def start_drive(self, twist: Twist, duration_s: float) -> DriveGoal:
-        """Start to drive the base at a twist for a time [s].
-
-        Raises:
-            Refused: No base, not finite, or beyond the limits of the base.
-        """
+        """See ``Controller.start_drive``."""
         if self.base is None:
             raise Refused("no_base", "this robot does not drive")
         if not 0 < duration_s <= _MAX_DRIVE_S:
@@ -116,14 +100,7 @@ class GoalExecutor:
                 self.brake()  # motion that setpoints started does not continue during an action
 
     def check_clearance(self, late_s: float) -> Clearance | None:
-        """The obstacle on the path of the next period and of the braking after it, if any.
-
-        Args:
-            late_s: Delay of the present period [s].
-
-        Raises:
-            MotionError: The generator found no trajectory.
-        """
+        """The obstacle on the path of the next period and of the braking after it; ``late_s``: its delay [s]."""
         if self.motion.braking:
             if self.motion.moving and late_s > self._period_s / 2:
                 self.motion.catch_up(late_s)  # a busy machine must not lengthen a hold
@@ -131,11 +108,7 @@ class GoalExecutor:
         return self._limits.find_obstacle(self.motion.propose())
 
     def update(self, passed_s: float | None = None) -> None:
-        """Advance one period, or ``passed_s`` of it [s].
-
-        Raises:
-            MotionError: The generator found no trajectory.
-        """
+        """Advance one period, or ``passed_s`` of it [s]."""
         self.motion.update(passed_s)
         if self.base is not None:
             self.base.update(passed_s)

@@ -14,12 +14,7 @@ SETTLE_TIMEOUT_S = 2.0
 
 
 class GoalTolerance:
-    """Goal tolerance of one device. Not thread-safe: the controller locks.
-
-    Args:
-        names: Names of the joints.
-        period_s: The control period [s].
-    """
+    """Goal tolerance of one device. Not thread-safe: the controller locks."""
 
     def __init__(self, names: Sequence[str], period_s: float) -> None:
         self._names = names

@@ -4,18 +4,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ruckig import (
-    ControlInterface,
-    InputParameter,
-    OutputParameter,
-    Result,
-    Ruckig,
-    RuckigError,
-    Synchronization,
-)
-from ruckig import (
-    Trajectory as RuckigTrajectory,
-)
+from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError, Synchronization
+from ruckig import Trajectory as RuckigTrajectory
 
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.control.trajectory_follower import TrajectoryFollower
@@ -64,9 +54,6 @@ def generate(calculate: Callable[[Any, Any], Result], request: InputParameter, o
 
 class JointMotion:
     """Commanded position and velocity of each joint.
-
-    Args:
-        robot_type: Limits of each joint and the braking deceleration.
 
     Attributes:
         waits: Joints that wait for other joints, as ``limited`` names them.
@@ -165,12 +152,7 @@ class JointMotion:
         )
 
     def follow_trajectory(self, trajectory: Trajectory, *, share: float) -> None:
-        """Follow a trajectory that starts at the resting position.
-
-        Args:
-            trajectory: Inside the joints' ranges.
-            share: Share of the trajectory's speed, above 0 and at most 1.
-        """
+        """Follow a trajectory that starts at the resting position."""
         self._target = trajectory.position_rad[-1].tolist()
         if self._follower is None and not self.moving and self._rests_at(trajectory.position_rad[0].tolist()):
             self._follower = TrajectoryFollower(
@@ -264,9 +246,6 @@ class JointMotion:
     def update(self, passed_s: float | None = None) -> list[float]:
         """Advance one period, as proposed if it was, or ``passed_s`` of a period without a proposal.
 
-        Args:
-            passed_s: Time since the last period began, if this one is early [s].
-
         Returns:
             The position to command now, shape (n,) [rad].
 
@@ -326,14 +305,7 @@ class JointMotion:
         self._tracked = measured_rad
 
     def catch_up(self, lost_s: float) -> None:
-        """Reduce the velocity as if the device had braked for ``lost_s``; the position is unchanged.
-
-        Args:
-            lost_s: Delay of the present period [s].
-
-        Raises:
-            MotionError: The generator found no trajectory.
-        """
+        """Reduce the velocity as if the device had braked for ``lost_s``; the position is unchanged."""
         if self._follower is not None:
             self._follower.catch_up(lost_s)
             self.velocity_rad_s = self._follower.velocity_rad_s.tolist()

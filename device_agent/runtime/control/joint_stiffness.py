@@ -9,9 +9,6 @@ from device_agent.runtime.errors import Refused
 class JointStiffness:
     """Joint stiffness of one device. Not thread-safe: the controller locks.
 
-    Args:
-        robot_type: Joints and their ranges.
-
     Attributes:
         limited: Compliant joints, as telemetry names them.
         soft: Indices of the joints with reduced stiffness.

@@ -4,28 +4,18 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from device_agent.ports.geometry import Clearance, RobotGeometry
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.joint_couplings import Couplings
-
-Floats = npt.NDArray[np.float64]
+from device_agent.runtime.planning.trajectory import Floats
 
 _SAME_RAD = 1e-9
 
 
 class MotionLimits:
-    """Limits of one device's positions. Stateless.
-
-    Args:
-        robot_type: Joints and their ranges.
-        geometry: Shape of the robot; without it, only ranges are checked.
-
-    Attributes:
-        names: Names of the limits.
-    """
+    """Limits of one device's positions. Stateless."""
 
     def __init__(self, robot_type: RobotType, geometry: RobotGeometry | None) -> None:
         self._joints = robot_type.joints

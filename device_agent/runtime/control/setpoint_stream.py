@@ -34,11 +34,6 @@ JOINT_SPEED = "speed: joints"
 class SetpointStream:
     """The newest setpoint and the motion that it requests. Not thread-safe: the controller locks.
 
-    Args:
-        robot_type: Joints, and the share of the speed that setpoints may use.
-        limits: Limits of the positions.
-        geometry: Shape of the robot, if known.
-
     Attributes:
         applied_sequence: Sequence of the newest applied setpoint; 0 before the first one of a lease.
         sent_ms: The operator's clock in that setpoint.
@@ -134,25 +129,13 @@ class SetpointStream:
         return self._received_s > -math.inf
 
     def is_fresh(self, now_s: float, braking_s: float, *, late_s: float) -> bool:
-        """Whether the newest setpoint applies: braking after this period still ends before the watchdog time.
-
-        Args:
-            now_s: Monotonic clock [s].
-            braking_s: Braking time of the device [s].
-            late_s: Possible delay of the next period [s].
-        """
+        """Whether the newest setpoint applies: braking after this period still ends before the watchdog time."""
         return _is_fresh(now_s - self._received_s, braking_s, late_s, _MIN_FRESH_S)
 
     def drive_base(self, base: BaseMotion, now_s: float, *, late_s: float, allowed: float) -> None:
         """Move the base at the newest twist while it is fresh; else brake.
 
         A zero twist means that the operator released the control: the base brakes instead of slowing down gently.
-
-        Args:
-            base: Motion of the base.
-            now_s: Monotonic clock [s].
-            late_s: Possible delay of the next period [s].
-            allowed: Share of the speed that the room allows, above 0.
         """
         self._base_limits = ()
         fresh = _is_fresh(now_s - self._twist_received_s, base.braking_time_s(), late_s, _MIN_FRESH_BASE_S)
@@ -168,12 +151,7 @@ class SetpointStream:
         base.follow(Twist(*(part * share * allowed for part in twist)))
 
     def apply(self, motion: JointMotion, *, allowed: float) -> None:
-        """Move the joints towards the newest setpoint.
-
-        Args:
-            motion: Motion of the joints.
-            allowed: Share of the speed that the room allows, above 0.
-        """
+        """Move the joints towards the newest setpoint."""
         if self._setpoint is not None and self._setpoint.sequence != self.applied_sequence:
             self._set_target(self._setpoint.target, motion)
             self.applied_sequence, self.sent_ms = self._setpoint.sequence, self._setpoint.sent_ms

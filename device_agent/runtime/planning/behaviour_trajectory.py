@@ -30,12 +30,7 @@ class SpokenLine:
 
 
 class BehaviourTrajectory:
-    """Positions of the joints over time. Each joint moves from rest to rest, so it never overshoots its positions.
-
-    Args:
-        robot_type: Joints, limits, visemes.
-        start_rad: Positions at the start, shape (n,) [rad].
-    """
+    """Positions of the joints over time. Each joint moves from rest to rest, so it never overshoots its positions."""
 
     def __init__(self, robot_type: RobotType, start_rad: Sequence[float]) -> None:
         self._type = robot_type
@@ -46,12 +41,7 @@ class BehaviourTrajectory:
         self._end_s = 0.0
 
     def add_keyframes(self, keyframes: Sequence[Keyframe], durations_s: Mapping[str, float]) -> list[SpokenLine]:
-        """Add a behaviour; returns its spoken lines.
-
-        Args:
-            keyframes: Keyframes of the robot type.
-            durations_s: Text → speaking time [s].
-        """
+        """Add a behaviour with the speaking time of each text [s]; returns its spoken lines."""
         lines = []
         for keyframe in keyframes:
             if keyframe.say:

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from device_agent.ports.geometry import RobotGeometry
 from device_agent.protocol import Pose, Vector3
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
+from device_agent.runtime.planning.trajectory import Floats
 
 _ITERATIONS = 60
 _STEP_RAD = 1e-5
@@ -16,8 +16,6 @@ _NEAR_RAD = 5e-4
 _DAMPING = 1e-3
 _MAX_STEP_RAD = 0.3
 _MIN_DISTANCE_M = 1e-3
-
-Array = NDArray[np.float64]
 
 
 def solve_gaze(
@@ -43,7 +41,7 @@ def solve_gaze(
     upper = np.array([robot_type.joints[index].upper_rad for index in turning])
     axis = np.array(gaze.axis) / np.linalg.norm(gaze.axis)
 
-    def error(joints: Array) -> Array:
+    def error(joints: Floats) -> Floats:
         """Differences between actual and required viewing directions, frame after frame."""
         position = np.array(start_rad, dtype=float)
         position[turning] = joints
@@ -67,7 +65,7 @@ def solve_gaze(
     raise Refused("out_of_reach", f"{', '.join(gaze.joints)} cannot turn far enough to look there")
 
 
-def _direction_error(pose: Pose, axis: Array, point_m: Vector3) -> Array:
+def _direction_error(pose: Pose, axis: Floats, point_m: Vector3) -> Floats:
     """Difference between the actual and the required viewing direction of a frame, as unit vectors."""
     offset = np.array(point_m) - np.array(pose[:3])
     distance = float(np.linalg.norm(offset))
@@ -76,7 +74,7 @@ def _direction_error(pose: Pose, axis: Array, point_m: Vector3) -> Array:
     return np.asarray(offset / distance - _rotated(pose, axis))
 
 
-def _rotated(pose: Pose, axis: Array) -> Array:
+def _rotated(pose: Pose, axis: Floats) -> Floats:
     """An axis of a frame, in the base frame."""
     w, vector = pose[3], np.array(pose[4:])
     around = 2 * np.cross(vector, axis)

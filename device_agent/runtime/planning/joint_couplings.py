@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from device_agent.protocol.manifests.capabilities import PositionDependentLimit
 from device_agent.protocol.manifests.robot_type import RobotType
-
-Floats = npt.NDArray[np.float64]
+from device_agent.runtime.planning.trajectory import Floats
 
 _SAME_RAD = 1e-6
 _MIMIC_TOLERANCE_RAD = 1e-3
@@ -62,11 +60,7 @@ class _DependentRange:
 
 
 class Couplings:
-    """Joint couplings of a robot type. Stateless; positions are in the type's order, shape (n,).
-
-    Args:
-        robot_type: Its ``mimic_joints`` and ``position_dependent_limits``.
-    """
+    """Joint couplings of a robot type. Stateless; positions are in the type's order, shape (n,)."""
 
     def __init__(self, robot_type: RobotType) -> None:
         self._names = [joint.name for joint in robot_type.joints]

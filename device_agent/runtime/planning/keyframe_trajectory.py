@@ -53,11 +53,6 @@ _SHAPE = _shape(_U)
 class KeyframeTrajectory:
     """Trajectory through keyframes, from rest to rest.
 
-    Args:
-        robot_type: Joints and limits.
-        start_rad: Positions at the start, shape (n,) [rad].
-        play: Keyframes with times from the start, and the speed factor.
-
     Attributes:
         limited: Limits that made it slower than requested, as telemetry names them.
 

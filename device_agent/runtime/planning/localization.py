@@ -25,11 +25,7 @@ class Pose2D:
 
 
 class PoseEstimator:
-    """Estimates the pose: odometry has no delay but drifts, room positions are late but do not drift.
-
-    Args:
-        name: Name of the device in the room's positions.
-    """
+    """Estimates the pose: odometry has no delay but drifts, room positions are late but do not drift."""
 
     def __init__(self, name: str) -> None:
         self._name = name

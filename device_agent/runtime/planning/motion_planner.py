@@ -25,13 +25,7 @@ _MIN_NORM = 1e-6
 
 
 class MotionPlanner:
-    """Motion planner of one robot.
-
-    Args:
-        robot_type: Joints and limits.
-        geometry: Shape of the robot.
-        seed: Seed of the search, for reproducible results.
-    """
+    """Motion planner of one robot."""
 
     def __init__(self, robot_type: RobotType, geometry: RobotGeometry, *, seed: int = 0) -> None:
         self._seed = seed
@@ -42,13 +36,7 @@ class MotionPlanner:
     def plan(
         self, start_rad: Sequence[float], goal_rad: Sequence[float], *, speed: float, ended: Callable[[], bool]
     ) -> Trajectory:
-        """A collision-free trajectory with blended corners.
-
-        Args:
-            start_rad: Start positions, shape (n,) [rad].
-            goal_rad: Goal positions, shape (n,) [rad].
-            speed: Share of each joint's velocity limit.
-            ended: Whether the caller has ended the search.
+        """A collision-free trajectory with blended corners; ``ended`` is polled, and ends the search.
 
         Raises:
             Refused: No path was found, or the search was ended.
@@ -68,13 +56,7 @@ class MotionPlanner:
         raise Refused("no_way", "the paths that were found are too narrow; move to a place with more room first")
 
     def plan_straight(self, start_rad: Sequence[float], frame: str, pose: Pose, *, speed: float) -> Trajectory:
-        """A trajectory on which a frame moves straight to a pose, and turns at a constant rate.
-
-        Args:
-            start_rad: Start positions, shape (n,) [rad].
-            frame: One of the geometry's frames.
-            pose: Target pose in the robot's base frame.
-            speed: Share of each joint's velocity limit.
+        """A trajectory on which a frame moves straight to a pose in the base frame, and turns at a constant rate.
 
         Raises:
             Refused: Out of reach, not straight, or something is in the way.

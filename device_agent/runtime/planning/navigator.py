@@ -29,14 +29,7 @@ _FACING_RAD = 0.5
 
 
 class Navigator:
-    """Navigation to one goal.
-
-    Args:
-        goal: x, y in the room [m].
-        yaw_rad: Final heading; ``None``: any.
-        limits: Highest twist of the base.
-        radius_m: Radius of the robot [m].
-    """
+    """Navigation to one goal."""
 
     def __init__(self, goal: tuple[float, float], yaw_rad: float | None, *, limits: Twist, radius_m: float) -> None:
         self._goal = goal

@@ -58,13 +58,7 @@ def estimate_duration_s(text: str) -> float:
 
 
 def visemes_of(text: str, duration_s: float, available: Collection[str]) -> list[tuple[float, str]]:
-    """Times from the start [s] and names of visemes, in order of time.
-
-    Args:
-        text: Spoken text.
-        duration_s: Its duration.
-        available: Visemes of the robot. Sounds without a suitable one are omitted.
-    """
+    """Times from the start [s] and names of the available visemes, in order of time."""
     plain = unicodedata.normalize("NFD", text.lower())
     parts: list[tuple[str, float]] = []
     for token in _TOKENS.findall(plain):

@@ -58,7 +58,7 @@ class OneShotAction:
         return self._call()
 
     def kill(self) -> None:
-        """Do nothing: a measurement or upload ends by itself, and the sensor loop applies Stop to actuators."""
+        """Do nothing: the end of the reservation ends motion, measurements end by themselves, the loop applies Stop."""
 
 
 def create(request: RoomTask, room_device: RoomDevice | None, on_output: OnOutput) -> CollectAction | OneShotAction:

@@ -21,11 +21,6 @@ _MIN_RATE_HZ = 0.001
 class RoomDevice:
     """One room device. As thread-safe as its driver.
 
-    Args:
-        driver: Not yet connected.
-        manifest: Streams, cameras, captures and controls.
-        uploads: Storage for captures, if the agent has one.
-
     Attributes:
         driver: As given; the sensor loop connects it.
         manifest: As given.

@@ -39,16 +39,7 @@ class _Source:
 
 
 class SensorLoop:
-    """One thread that reads the sources that are due.
-
-    Args:
-        room_device: Its driver is not yet connected.
-        controller: Leases, Stop and interlocks.
-        name: Name of the device.
-        publish: Called with a stream's name and its measurement; must not block.
-        publish_frame: Called with a camera's name and its frame; must not block.
-        check_interlocks: Called in each iteration with the monotonic clock [s]. An error holds.
-    """
+    """One thread that reads the sources that are due. Its callbacks must not block; an error of an interlock holds."""
 
     def __init__(
         self,

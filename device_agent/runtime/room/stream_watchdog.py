@@ -30,19 +30,10 @@ class _SourceState:
 
 
 class StreamWatchdog:
-    """Watchdog of one device's sources. Thread-safe.
-
-    Args:
-        watches: Limits from the room's manifest.
-        rate_hz: Present rate of a source [Hz].
-        clock_s: Monotonic clock [s].
-    """
+    """Watchdog of one device's sources. Thread-safe."""
 
     def __init__(
-        self,
-        watches: Sequence[Watch],
-        rate_hz: Callable[[str], float],
-        clock_s: Callable[[], float] = time.monotonic,
+        self, watches: Sequence[Watch], rate_hz: Callable[[str], float], clock_s: Callable[[], float] = time.monotonic
     ) -> None:
         self._watches = tuple(watches)
         self._rate_hz = rate_hz
@@ -74,10 +65,10 @@ class StreamWatchdog:
         """Present faults; a continuing fault keeps its message and the time of its detection."""
         now_s = self._clock_s()
         with self._lock:
-            found = {f"{what}.{source}": message for what, source, message in self._check(now_s)}
+            messages = {f"{what}.{source}": message for what, source, message in self._check(now_s)}
             self._open = {
                 code: self._open.get(code) or Fault(code=code, message=message, since_ms=wall_ms())
-                for code, message in found.items()
+                for code, message in messages.items()
             }
             return tuple(self._open.values())
 

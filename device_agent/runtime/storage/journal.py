@@ -48,11 +48,7 @@ class DeviceRecord:
 
 
 class Journal:
-    """The journal of an agent. Thread-safe.
-
-    Args:
-        path: The database file; its folder must exist.
-    """
+    """The journal of an agent. Thread-safe."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -107,10 +107,6 @@ class OutboxStore:
     def put(self, items: Iterable[OutboxItem], *, now_ms: int) -> None:
         """Store items atomically, and enforce the bounds.
 
-        Args:
-            items: Oldest first.
-            now_ms: Wall clock [ms since 1970].
-
         Raises:
             OutboxStoreError: None of them is stored.
         """
@@ -158,23 +154,12 @@ class OutboxStore:
         self._change(write)
 
     def drop(self, ids: Iterable[int]) -> None:
-        """Drop and count items that were never acknowledged.
-
-        Raises:
-            OutboxStoreError: Not all of them are dropped.
-        """
+        """Drop and count items that were never acknowledged."""
         for number in ids:
             self._drop("id = ?", (number,))
 
     def count(self, dropped: Mapping[tuple[str, bool], int]) -> None:
-        """Count messages that were dropped before they were stored.
-
-        Args:
-            dropped: Number by device and whether they are measurements.
-
-        Raises:
-            OutboxStoreError: They are not counted.
-        """
+        """Count messages that were dropped before they were stored."""
 
         def write(database: sqlite3.Connection) -> int:
             for (device, late), count in dropped.items():

@@ -22,17 +22,8 @@ LINGER_S = 60.0
 """Time after the end of control in which cameras keep their rate, because the operator may still watch [s]."""
 
 
-class CameraStreamer:
-    """Polls a driver for camera frames, and publishes them.
-
-    Args:
-        cameras: Cameras of the robot type, with their frame rates.
-        driver: Takes the pictures; ``None`` if it has no cameras.
-        name: Name of the device.
-        publish: Called with a camera's name and its frame; must not block.
-        is_controlled: Whether the robot has a lease holder.
-        linger_s: See ``LINGER_S``.
-    """
+class CameraStreamer(PeriodicPoller):
+    """Polls a driver for camera frames, and publishes them."""
 
     def __init__(
         self,
@@ -42,25 +33,15 @@ class CameraStreamer:
         name: str,
         publish: Callable[[str, CameraFrame], None],
         is_controlled: Callable[[], bool],
-        linger_s: float = LINGER_S,
     ) -> None:
+        super().__init__(() if driver is None else cameras, self._stream, device=name, kind="camera")
         self._publish = publish
         self._is_controlled = is_controlled
-        self._linger_s = linger_s
         self._linked = False
         self._controlled_s = -math.inf
         self._last_frame_s: dict[str, float] = {}
         self._driver = driver
         self._sequences: Counter[str] = Counter()
-        self._poller = PeriodicPoller(() if driver is None else cameras, self._stream, device=name, kind="camera")
-
-    def start(self) -> None:
-        """Start to stream, if there are cameras."""
-        self._poller.start()
-
-    def stop(self) -> None:
-        """Stop. May be called twice."""
-        self._poller.stop()
 
     def link_changed(self, up: bool) -> None:
         """Pause without a link."""
@@ -70,7 +51,7 @@ class CameraStreamer:
         now_s = time.monotonic()
         if self._is_controlled():
             self._controlled_s = now_s
-        live = now_s - self._controlled_s <= self._linger_s
+        live = now_s - self._controlled_s <= LINGER_S
         if not self._linked or not (live or now_s - self._last_frame_s.get(camera, -math.inf) >= IDLE_PERIOD_S):
             return False
         self._last_frame_s[camera] = now_s

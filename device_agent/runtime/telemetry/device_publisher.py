@@ -62,37 +62,14 @@ class StateSnapshot:
 
     def key(self) -> tuple[object, ...]:
         """The part whose change triggers a new ``state``; progress alone does not."""
-        return (
-            self.mode,
-            self.epoch,
-            self.ended,
-            self.lease,
-            self.control_request,
-            self.latch,
-            tuple((fault.code, fault.message) for fault in self.faults),
-            self.action and self.action.id,
-            self.restrictions,
-            self.stiffness,
-        )
+        unchanged = (getattr(self, name) for name in self.__slots__ if name not in {"faults", "action"})
+        return *unchanged, tuple((fault.code, fault.message) for fault in self.faults), self.action and self.action.id
 
 
 class DevicePublisher:
     """Publisher of one device. Thread-safe.
 
     Only the command processor calls ``publish_description``, ``publish_state`` and ``record_delivered``.
-
-    Args:
-        address: Space, agent and name.
-        label: Name for operators.
-        robot_type: Joints, limits, streams.
-        room_device: Manifest of a room device.
-        simulated: Whether the device is simulated.
-        limits: Names of the limits that the agent enforces.
-        actions: Kinds of the supported actions.
-        interlocks: Rules by which room sensors slow or hold the device.
-        journal: Open.
-        publish: Sends a message.
-        outbox: Stores and forwards events and measurements.
 
     Attributes:
         rejections: Number of rejections by code.
@@ -153,10 +130,6 @@ class DevicePublisher:
         ack = self.create_ack(command, status, **fields)
         self._journal.record(ack)
         self.send_ack(ack)
-
-    def ack_transient(self, command: str, status: AckStatus) -> None:
-        """Publish the next ack of a command without journalling it, because another one follows at once."""
-        self.send_ack(self.create_ack(command, status))
 
     def send_ack(self, ack: Ack) -> None:
         """Publish a journalled ack."""

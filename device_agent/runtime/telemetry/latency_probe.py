@@ -6,6 +6,7 @@ dropped.
 """
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -34,33 +35,12 @@ _log = logging.getLogger(__name__)
 
 
 class LatencyProbe:
-    """A transport that measures the messages of another transport.
+    """A transport that measures the messages of another transport."""
 
-    Args:
-        transport: Sends the messages. Not yet started.
-        upload: Uploads samples to the cloud.
-        at_ms: Time of a sample [ms since 1970].
-        upload_period_s: See ``UPLOAD_PERIOD_S``.
-        device_period_s: See ``DEVICE_PERIOD_S``.
-        spacing_s: See ``SPACING_S``.
-    """
-
-    def __init__(
-        self,
-        transport: Transport,
-        *,
-        upload: Upload,
-        at_ms: Callable[[], int],
-        upload_period_s: float = UPLOAD_PERIOD_S,
-        device_period_s: float = DEVICE_PERIOD_S,
-        spacing_s: float = SPACING_S,
-    ) -> None:
+    def __init__(self, transport: Transport, *, upload: Upload, at_ms: Callable[[], int]) -> None:
         self._transport = transport
         self._upload = upload
         self._at_ms = at_ms
-        self._upload_period_s = upload_period_s
-        self._device_period_s = device_period_s
-        self._spacing_s = spacing_s
         self._lock = threading.Lock()
         self._timed_s: dict[str, float] = {}
         self._samples: dict[str, deque[Sample]] = {}
@@ -81,13 +61,7 @@ class LatencyProbe:
         self._thread.start()
 
     def publish(
-        self,
-        topic: str,
-        payload: bytes,
-        *,
-        qos: int,
-        retain: bool = False,
-        delivered: Callable[[], None] | None = None,
+        self, topic: str, payload: bytes, *, qos: int, retain: bool = False, delivered: Callable[[], None] | None = None
     ) -> bool:
         """See ``Transport.publish``."""
         device = self._start_sample(topic) if qos else None
@@ -107,7 +81,7 @@ class LatencyProbe:
             return None
         now_s = time.monotonic()
         with self._lock:
-            if now_s - self._timed_s.get(parsed.device, -self._spacing_s) < self._spacing_s:
+            if now_s - self._timed_s.get(parsed.device, -math.inf) < SPACING_S:
                 return None
             self._timed_s[parsed.device] = now_s
         return parsed.device
@@ -123,16 +97,16 @@ class LatencyProbe:
     # ------------------------------------------------------------ upload thread
 
     def _run(self) -> None:
-        while not self._stopping.wait(self._upload_period_s):
+        while not self._stopping.wait(UPLOAD_PERIOD_S):
             self._upload_one()
 
     def _upload_one(self) -> None:
         """Upload the samples of the device that has waited longest; a failed upload is dropped."""
-        now_s, period_s = time.monotonic(), self._device_period_s
+        now_s = time.monotonic()
         with self._lock:
-            due = (name for name in self._samples if now_s - self._uploaded_s.get(name, -period_s) >= period_s)
-            device = min(due, key=lambda name: self._uploaded_s.get(name, 0.0), default=None)
-            if device is None:
+            uploaded_s = {name: self._uploaded_s.get(name, -math.inf) for name in self._samples}
+            device = min(uploaded_s, key=uploaded_s.__getitem__, default=None)
+            if device is None or now_s - uploaded_s[device] < DEVICE_PERIOD_S:
                 return
             samples = tuple(self._samples.pop(device))
             self._uploaded_s[device] = now_s

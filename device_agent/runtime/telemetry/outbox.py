@@ -123,14 +123,9 @@ class Outbox:
         self._wake.set()
 
     def add_measurement(self, topic: str, payload: bytes, *, at_ms: int, sent: bool, now_s: float) -> None:
-        """Store a measurement at the reduced rate; quick enough for the control loop.
+        """Store a measurement at the reduced rate; if ``sent``, only if the link turns out to be lost.
 
-        Args:
-            topic: Topic for late delivery.
-            payload: The message.
-            at_ms: Time of the measurement [ms since 1970].
-            sent: Whether the link accepted it; then it is stored only if the link turns out to be lost.
-            now_s: Monotonic clock [s].
+        It is quick enough for the control loop.
         """
         with self._lock:
             stream = self._streams.setdefault(topic, _SampledStream(now_s, deque()))

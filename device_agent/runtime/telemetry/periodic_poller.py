@@ -25,11 +25,7 @@ class _Schedule:
 class PeriodicPoller:
     """Polls each source at its rate until it is stopped. Missed polls are dropped.
 
-    Args:
-        sources: Names and rates.
-        poll: Called with the name of a source; may block, and raise ``DriverError``.
-        device: Name of the device, for the log.
-        kind: Kind of the sources, for the log.
+    ``poll`` is called with the name of a source. It may block, and raise ``DriverError``.
     """
 
     def __init__(self, sources: Iterable[Stream], poll: Callable[[str], None], *, device: str, kind: str) -> None:

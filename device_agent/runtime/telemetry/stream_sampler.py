@@ -15,15 +15,8 @@ from device_agent.runtime.readings import Reading, Values
 from device_agent.runtime.telemetry.periodic_poller import PeriodicPoller
 
 
-class StreamSampler:
-    """Polls the streams of a driver, and publishes them.
-
-    Args:
-        streams: Streams of the robot type.
-        driver: Measures the streams; ``None`` if it measures only joints.
-        name: Name of the device.
-        publish: Called with each stream's measurements; must not block for long.
-    """
+class StreamSampler(PeriodicPoller):
+    """Polls the streams of a driver, and publishes them."""
 
     def __init__(
         self,
@@ -33,20 +26,12 @@ class StreamSampler:
         name: str,
         publish: Callable[[str, Measurements], None],
     ) -> None:
+        polled = [] if driver is None else [stream for stream in streams if stream.name != topics.JOINTS]
+        super().__init__(polled, self._sample, device=name, kind="stream")
         self._publish = publish
         self._sequences: Counter[str] = Counter()
         self._latest: Mapping[str, tuple[Values, float]] = {}
-        polled = [] if driver is None else [stream for stream in streams if stream.name != topics.JOINTS]
         self._driver = driver
-        self._poller = PeriodicPoller(polled, self._sample, device=name, kind="stream")
-
-    def start(self) -> None:
-        """Start to poll, if there are streams."""
-        self._poller.start()
-
-    def stop(self) -> None:
-        """Stop. May be called twice."""
-        self._poller.stop()
 
     def latest(self) -> Mapping[str, Reading]:
         """The newest values of each measured stream."""

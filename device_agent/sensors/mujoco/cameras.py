@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import simplejpeg
 
-from device_agent.ports.sensor import Bytes, Capture, Frame, Image, SensorError
+from device_agent.ports.sensor import Bytes, Capture, Depths, Frame, Image, SensorError
 from device_agent.ports.simulation import SimulatedWorld
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors import png
 from device_agent.sensors.mujoco.base import SimulatedSensor
 from device_agent.sensors.mujoco.noise import generator
-from device_agent.simulation.renderer import RenderedImage, Renderer, renderer_of
+from device_agent.simulation.renderer import Renderer, renderer_of
 
 FRESH_S = 0.1
 """Maximum age of the image that ``raw`` returns."""
@@ -80,11 +80,25 @@ class Camera(SimulatedSensor):
         if renderer is None:
             raise SensorError(f"'{self._device.name}' is not connected")
         rendered = renderer.render(self._camera, width=self._width, height=self._height, depth=self.DEPTH)
-        self._newest = image = self._image(rendered)
+        rgb, depth_m = self._measure(rendered.pixels)
+        self._newest = image = Image(
+            taken_s=rendered.taken_s,
+            position_m=rendered.position_m,
+            rotation=rendered.rotation,
+            fovy_rad=self._fovy_rad,
+            rgb=rgb,
+            depth_m=depth_m,
+        )
         return image
 
-    def _image(self, rendered: RenderedImage) -> Image:
+    def _measure(self, pixels: Any) -> tuple[Bytes | None, Depths | None]:
+        """Rendered pixels with noise: colours, or depth [m]."""
         raise NotImplementedError
+
+    def _shifted(self, noise: Any) -> Any:
+        """A random part of prepared noise, as large as the image."""
+        down, right = self._random.integers(0, _TILES, 2).tolist()
+        return noise[down : down + self._height, right : right + self._width]
 
 
 class ColourCamera(Camera):
@@ -110,17 +124,9 @@ class ColourCamera(Camera):
             return super().capture(name)
         return Capture("image/png", png.encode(self._take().rgb))
 
-    def _image(self, rendered: RenderedImage) -> Image:
-        down, right = self._random.integers(0, _TILES, 2).tolist()
-        noise = self._grain[down : down + self._height, right : right + self._width]
-        rgb: Bytes = np.clip(rendered.pixels.astype(np.int16) + noise, 0, 255).astype(np.uint8)
-        return Image(
-            taken_s=rendered.taken_s,
-            position_m=rendered.position_m,
-            rotation=rendered.rotation,
-            fovy_rad=self._fovy_rad,
-            rgb=rgb,
-        )
+    def _measure(self, pixels: Any) -> tuple[Bytes | None, Depths | None]:
+        grainy = pixels.astype(np.int16) + self._shifted(self._grain)
+        return np.clip(grainy, 0, 255).astype(np.uint8), None
 
 
 class DepthCamera(Camera):
@@ -154,16 +160,8 @@ class DepthCamera(Camera):
         millimetres = np.rint(depth_m / _MILLIMETRE)
         return Capture("image/png", png.encode(np.clip(millimetres, 0, _FAR_MM).astype(np.uint16)))
 
-    def _image(self, rendered: RenderedImage) -> Image:
-        down, right = self._random.integers(0, _TILES, 2).tolist()
-        noise = self._noise[down : down + self._height, right : right + self._width]
-        true_m = rendered.pixels
-        depth_m = true_m + noise * (np.float32(0.0012) + np.float32(0.0019) * np.square(true_m - np.float32(0.4)))
-        depth_m[(true_m < self._nearest_m) | (true_m > self._furthest_m)] = np.inf
-        return Image(
-            taken_s=rendered.taken_s,
-            position_m=rendered.position_m,
-            rotation=rendered.rotation,
-            fovy_rad=self._fovy_rad,
-            depth_m=depth_m,
-        )
+    def _measure(self, pixels: Any) -> tuple[Bytes | None, Depths | None]:
+        deviation = np.float32(0.0012) + np.float32(0.0019) * np.square(pixels - np.float32(0.4))
+        depth_m = pixels + self._shifted(self._noise) * deviation
+        depth_m[(pixels < self._nearest_m) | (pixels > self._furthest_m)] = np.inf
+        return None, depth_m

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
-_SCALAR = frozenset({int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)})
+SCALAR_JOINTS = frozenset({int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)})
+"""Joint types with one position. As ``int``: MuJoCo's enumerations do not equal the numbers in its arrays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,7 @@ class EqualityJoints:
         return {
             other: float(row[address])
             for other, address in enumerate(self._model.jnt_qposadr)
-            if self._model.jnt_type[other] in _SCALAR and row[address]
+            if self._model.jnt_type[other] in SCALAR_JOINTS and row[address]
         }
 
     def offset(self, joint: int) -> float:

@@ -14,7 +14,8 @@ import mujoco
 import numpy as np
 
 from device_agent.protocol.topics import is_id
-from device_agent.simulation.mjcf.equality_joints import EqualityJoints
+from device_agent.simulation.mjcf.equality_joints import SCALAR_JOINTS, EqualityJoints
+from device_agent.simulation.scene_assembly import is_servo
 
 GUESSED = "  # guessed"
 _SPEED_RAD_S, _SPEED_M_S = 0.5, 0.05
@@ -142,16 +143,11 @@ def _check_servos(model: Any) -> None:
 def _unsupported(model: Any, index: int) -> str:
     if model.actuator_trntype[index] != int(mujoco.mjtTrn.mjTRN_JOINT):
         return "does not act on a joint"
-    if model.jnt_type[model.actuator_trnid[index, 0]] not in (
-        int(mujoco.mjtJoint.mjJNT_HINGE),
-        int(mujoco.mjtJoint.mjJNT_SLIDE),
-    ):
+    if model.jnt_type[model.actuator_trnid[index, 0]] not in SCALAR_JOINTS:
         return "acts on a joint that is neither a hinge nor a slide"
     if model.actuator_gear[index, 0] != 1:
         return f"has a gear of {model.actuator_gear[index, 0]:g}"
-    gain = model.actuator_gainprm[index, 0]
-    affine = model.actuator_biastype[index] == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    servo = affine and gain > 0 and model.actuator_biasprm[index, 1] == -gain and not model.actuator_dyntype[index]
+    servo = is_servo(model, index, order=0) and not model.actuator_dyntype[index]
     return "" if servo else "is not a position servo"
 
 

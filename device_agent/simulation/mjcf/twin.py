@@ -10,7 +10,7 @@ import numpy as np
 
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import Body, Geometry, Quaternion, Twin, TwinJoint, Vector3
-from device_agent.simulation.mjcf.equality_joints import EqualityJoints
+from device_agent.simulation.mjcf.equality_joints import SCALAR_JOINTS, EqualityJoints
 
 _LAST_VISIBLE_GROUP = 2
 _DIGITS = 12
@@ -56,16 +56,8 @@ def build_twin(model: Any, *, base: int, device: str, prefix: str = "", scenery_
             bodies.append(Body(name=_name(model, body, prefix), parent=-1, position_m=_ORIGIN, quaternion=_IDENTITY,
                                geometries=_shapes(model, body)))  # fmt: skip
         elif model.body_parentid[body] in index_of:
-            bodies.extend(
-                _moving(
-                    model,
-                    body,
-                    index_of[model.body_parentid[body]],
-                    len(bodies),
-                    prefix,
-                    equality_joints=equality_joints,
-                )
-            )
+            parent = index_of[model.body_parentid[body]]
+            bodies += _moving(model, body, parent, len(bodies), prefix=prefix, equality_joints=equality_joints)
         else:
             continue
         index_of[body] = len(bodies) - 1
@@ -73,7 +65,7 @@ def build_twin(model: Any, *, base: int, device: str, prefix: str = "", scenery_
 
 
 def _moving(
-    model: Any, body: int, parent: int, first: int, prefix: str, *, equality_joints: EqualityJoints
+    model: Any, body: int, parent: int, first: int, *, prefix: str, equality_joints: EqualityJoints
 ) -> list[Body]:
     """The twin bodies of one model body: a chain if it has several joints."""
     joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
@@ -97,17 +89,12 @@ def _moving(
 
 
 def _joint(model: Any, joint: int, prefix: str, equality_joints: EqualityJoints) -> TwinJoint:
-    kinds: dict[int, Literal["hinge", "slide"]] = {
-        int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
-        int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
-    }
     name = model.joint(joint).name.removeprefix(prefix)
-    kind = kinds.get(int(model.jnt_type[joint]))
-    if kind is None:
+    if model.jnt_type[joint] not in SCALAR_JOINTS:
         raise DriverError(f"joint '{name}' is neither a hinge nor a slide; a twin supports no other joints")
     return TwinJoint(
         name=name,
-        kind=kind,
+        kind="hinge" if model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_HINGE) else "slide",
         axis=_vector(model.jnt_axis[joint]),
         anchor_m=_vector(model.jnt_pos[joint]),
         reference_rad=_round(model.qpos0[model.jnt_qposadr[joint]] - equality_joints.offset(joint)),
@@ -128,7 +115,7 @@ def _scene(model: Any, base: int, within_m: float) -> Body:
     for body in range(model.nbody):
         if model.body_weldid[body] == 0 and model.body_mocapid[body] < 0 and model.body_rootid[body] != base:
             for geom in _visible(model, body):
-                if _away_m(model, data, geom, data.xpos[base]) > within_m:
+                if away_m(model, data, geom, data.xpos[base]) > within_m:
                     continue
                 in_world = np.empty(4)
                 mujoco.mju_mat2Quat(in_world, data.geom_xmat[geom])
@@ -140,8 +127,8 @@ def _scene(model: Any, base: int, within_m: float) -> Body:
     return Body(name="scene", parent=-1, position_m=_ORIGIN, quaternion=_IDENTITY, geometries=tuple(geometries))
 
 
-def _away_m(model: Any, data: Any, geom: int, point: Any) -> float:
-    """Distance from a point to a geom's bounding box or to a plane [m]."""
+def away_m(model: Any, data: Any, geom: int, point: Any) -> float:
+    """Distance from a point in the world to a geom's bounding box or to a plane [m]."""
     offset = data.geom_xmat[geom].reshape(3, 3).T @ (point - data.geom_xpos[geom])
     if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_PLANE):
         return abs(float(offset[2]))

@@ -16,6 +16,7 @@ its thermostat proportionally and is fully open 1 K below the setpoint.
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from device_agent.protocol.manifests.room import Room
@@ -90,23 +91,15 @@ class Climate:
             capacity=parameters.capacity_j_k,
             elapsed_s=elapsed_s,
         )
-        self._co2 = _first_order(
-            self._co2,
-            gain=CO2_M3_S * people
-            + (fresh_m3_s * parameters.outside_co2_ppm + through_door_m3_s * parameters.corridor_co2_ppm) / _PPM,
-            loss=fresh_m3_s + through_door_m3_s,
-            capacity=self._volume_m3,
-            elapsed_s=elapsed_s,
+        exchanged = partial(
+            _first_order, loss=fresh_m3_s + through_door_m3_s, capacity=self._volume_m3, elapsed_s=elapsed_s
         )
+        co2_ppm_m3_s = fresh_m3_s * parameters.outside_co2_ppm + through_door_m3_s * parameters.corridor_co2_ppm
+        self._co2 = exchanged(self._co2, gain=CO2_M3_S * people + co2_ppm_m3_s / _PPM)
         outside_g_m3 = water_g_m3(parameters.outside_c, parameters.outside_humidity_percent)
         corridor_g_m3 = water_g_m3(parameters.corridor_c, _CORRIDOR_HUMIDITY_PERCENT)
-        self._water_g_m3 = _first_order(
-            self._water_g_m3,
-            gain=WATER_G_S * people + fresh_m3_s * outside_g_m3 + through_door_m3_s * corridor_g_m3,
-            loss=fresh_m3_s + through_door_m3_s,
-            capacity=self._volume_m3,
-            elapsed_s=elapsed_s,
-        )
+        water_g_s = fresh_m3_s * outside_g_m3 + through_door_m3_s * corridor_g_m3
+        self._water_g_m3 = exchanged(self._water_g_m3, gain=WATER_G_S * people + water_g_s)
 
     def _inside(self, x_m: float, y_m: float) -> bool:
         (x_lower, y_lower), (x_upper, y_upper) = self._plan.lower_m, self._plan.upper_m

@@ -62,6 +62,9 @@ class QueuedCommand:
 class CloudClient:
     """Client of one agent. One call at a time; ``abort`` at any time.
 
+    Every call raises ``CloudError`` if the cloud rejects the request, and ``OSError`` if the cloud cannot be reached.
+    ``TimeoutError``, an ``OSError``, means that the cloud has not responded in time.
+
     Args:
         server: URL of the server, ``http://host:port``.
         key: The agent's private key; it is never sent.
@@ -78,23 +81,10 @@ class CloudClient:
         self._http = Session()
 
     def enroll(self, *, name: str, software: str, transport: str, devices: list[dict[str, str]]) -> Claim:
-        """Register the agent, its devices and its transport. Idempotent.
-
-        Raises:
-            CloudError: The cloud rejects the request.
-            OSError: The cloud cannot be reached.
-        """
-        response = self._call(
-            "POST",
-            "/agents/enroll",
-            json={
-                "name": name,
-                "public_key": signing.public_text(self._key.public_key()),
-                "software": software,
-                "transport": transport,
-                "devices": devices,
-            },
-        )
+        """Register the agent, its devices and its transport. Idempotent."""
+        body = {"name": name, "software": software, "transport": transport, "devices": devices}
+        body["public_key"] = signing.public_text(self._key.public_key())
+        response = self._call("POST", "/agents/enroll", json=body)
         try:
             return msgspec.convert(response, Claim)
         except msgspec.ValidationError as error:
@@ -106,21 +96,12 @@ class CloudClient:
         Args:
             wait_s: Long poll: the cloud waits for a claim up to this time [s].
             within_s: Additional timeout [s].
-
-        Raises:
-            CloudError: The cloud rejects the request.
-            OSError: The cloud cannot be reached.
         """
         wait = {"wait_ms": round(wait_s * 1000)} if wait_s else {}
         return self._call("GET", "/agents/enrollment", params=wait, timeout=within_s + wait_s)
 
     def credentials(self) -> dict[str, Any]:
-        """Short-lived broker credentials.
-
-        Raises:
-            CloudError: The cloud rejects the request, for example because the agent was unpaired.
-            OSError: The cloud cannot be reached.
-        """
+        """Short-lived broker credentials."""
         return self._call("POST", "/mqtt/credentials", json={"purpose": "agent"})
 
     def commands(self, agent: str, *, wait_s: float, limit: int, have: Collection[str]) -> list[QueuedCommand]:
@@ -131,11 +112,6 @@ class CloudClient:
             wait_s: Long poll: the cloud waits for a command up to this time [s].
             limit: Maximum number of commands.
             have: Ids of received commands, which are not sent again.
-
-        Raises:
-            CloudError: The cloud rejects the request.
-            TimeoutError: The cloud does not respond in time.
-            OSError: The cloud cannot be reached.
         """
         wait = {"wait_ms": round(wait_s * 1000)} if wait_s else {}
         query = {"limit": limit, "have": list(have), **wait}
@@ -154,17 +130,10 @@ class CloudClient:
             For each message ``None`` if the cloud has stored it, otherwise why it is rejected for good.
 
         Raises:
-            CloudError: The cloud rejects the request.
-            TimeoutError: No response in time: the messages may have been stored, and may be sent again.
-            OSError: The cloud cannot be reached; as above.
+            OSError: No response: the messages may have been stored, and may be sent again.
         """
         parts = b",".join(b'{"topic":"%s","payload":%s}' % (topic.encode(), payload) for topic, payload in messages)
-        response = self._call(
-            "POST",
-            f"/agents/{agent}/messages",
-            data=b'{"messages":[%s]}' % parts,
-            timeout=within_s,
-        )
+        response = self._call("POST", f"/agents/{agent}/messages", data=b'{"messages":[%s]}' % parts, timeout=within_s)
         try:
             return [None if result["status"] == "stored" else str(result["detail"]) for result in response["results"]]
         except (KeyError, TypeError) as error:
@@ -175,30 +144,15 @@ class CloudClient:
         self._http.abort()
 
     def xmpp_credentials(self) -> dict[str, Any]:
-        """Credentials for the XMPP server.
-
-        Raises:
-            CloudError: The cloud rejects the request, for example because the agent was unpaired.
-            OSError: The cloud cannot be reached.
-        """
+        """Credentials for the XMPP server."""
         return self._call("POST", "/xmpp/credentials", json={"purpose": "agent"})
 
     def certificate(self, request: str) -> dict[str, Any]:
-        """A client certificate for a request (PKCS 10, PEM).
-
-        Raises:
-            CloudError: The cloud rejects the request.
-            OSError: The cloud cannot be reached.
-        """
+        """A client certificate for a request (PKCS 10, PEM)."""
         return self._call("POST", "/agents/certificate", json={"request": request})
 
     def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
-        """POST to a path below ``/api/v1``.
-
-        Raises:
-            CloudError: The cloud rejects the request.
-            OSError: The cloud cannot be reached.
-        """
+        """POST to a path below ``/api/v1``."""
         return self._call("POST", path, json=body)
 
     def _call(self, method: str, path: str, *, timeout: float = _TIMEOUT_S, **request: Any) -> dict[str, Any]:
@@ -210,9 +164,8 @@ class CloudClient:
                 auth=_Bearer(self._token()),
                 timeout=(min(_CONNECT_S, timeout), timeout),
                 allow_redirects=False,
-                verify=True
-                if self.ca is None
-                else str(self.ca),  # passed per request: an environment variable would override the session's
+                # Passed with each request: an environment variable would override that of the session.
+                verify=True if self.ca is None else str(self.ca),
                 **request,
             )
         except requests.Timeout as error:

@@ -6,12 +6,9 @@ from device_agent.transports.http.client import CloudClient
 
 
 class LatencyReports:
-    """Reports latency samples of one agent.
+    """Reports latency samples of one agent, whose transport is ``mqtt``, ``http``, ``http-poll`` or ``xmpp``.
 
-    Args:
-        agent: Id of the agent.
-        transport: Transport of the messages: ``mqtt``, ``http``, ``http-poll`` or ``xmpp``.
-        open_api: Creates a client for exclusive use.
+    ``open_api`` creates a client for exclusive use.
     """
 
     def __init__(self, agent: str, transport: str, open_api: Callable[[], CloudClient]) -> None:
@@ -28,12 +25,6 @@ class LatencyReports:
             OSError: The cloud cannot be reached.
         """
         api = self._api = self._api or self._open_api()
-        api.post(
-            f"/agents/{self._agent}/latency",
-            {
-                "device": device,
-                "transport": self._transport,
-                "path": "device-cloud",
-                "samples": [{"at_ms": at_ms, "ms": ms} for at_ms, ms in samples],
-            },
-        )
+        report = {"device": device, "transport": self._transport, "path": "device-cloud"}
+        points = [{"at_ms": at_ms, "ms": ms} for at_ms, ms in samples]
+        api.post(f"/agents/{self._agent}/latency", {**report, "samples": points})

@@ -14,12 +14,7 @@ _WITHIN_S = 60.0
 
 
 class HttpUploads:
-    """Uploads of one agent.
-
-    Args:
-        agent: Id of the agent.
-        open_api: Creates a client for exclusive use.
-    """
+    """Uploads of one agent; ``open_api`` creates a client for exclusive use."""
 
     def __init__(self, agent: str, open_api: Callable[[], CloudClient]) -> None:
         self._agent = agent

@@ -48,7 +48,7 @@ class Connection:
         for end in (self._wake_reader, self._wake_writer):
             end.setblocking(False)
         self._selector.register(self._wake_reader, selectors.EVENT_READ)
-        client.on_socket_open = _no_delay
+        client.on_socket_open = disable_nagle
         client.on_message = self._on_message
         client.on_publish = self._on_publish
 
@@ -168,7 +168,7 @@ class Connection:
             self._pending_calls.append(delivered)
 
 
-def _no_delay(_client: mqtt.Client, _userdata: object, sock: Any) -> None:
-    """Without this option a small message may wait 40 ms for the peer's delayed acknowledgement."""
+def disable_nagle(_client: mqtt.Client, _userdata: object, sock: Any) -> None:
+    """Set TCP_NODELAY: without this option a small message may wait 40 ms for the peer's delayed acknowledgement."""
     with contextlib.suppress(OSError, AttributeError):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import paho.mqtt.client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
@@ -17,7 +17,10 @@ from paho.mqtt.reasoncodes import ReasonCode
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
 from device_agent.protocol import Presence, codec, topics
+from device_agent.transports import tls
 from device_agent.transports.backoff import BackOff
+from device_agent.transports.http.client import CloudClient
+from device_agent.transports.http.responses import MqttCredentials
 from device_agent.transports.mqtt.connection import Connection
 
 KEEP_ALIVE_S = 4
@@ -60,6 +63,53 @@ class BrokerAccess:
     subscribe: tuple[str, ...]
     lifetime_s: float
     tls: ssl.SSLContext | None = None
+
+
+def broker_access(
+    credentials: MqttCredentials, api: CloudClient, *, own: tuple[Path, Path] | None = None
+) -> BrokerAccess:
+    """The access that the cloud grants; ``own``: client certificate and key.
+
+    Raises:
+        OSError: The pinned authority cannot be read.
+        ValueError: The server uses TLS, but the broker does not.
+    """
+    return BrokerAccess(
+        host=credentials.tcp.host,
+        port=credentials.tcp.port,
+        client_id=credentials.client_id,
+        username=credentials.username,
+        password=credentials.password,
+        subscribe=credentials.subscribe,
+        lifetime_s=credentials.lifetime_s,
+        tls=tls.broker(tls=credentials.tcp.tls, server=api.server, ca=api.ca, own=own),
+    )
+
+
+def new_client(
+    access: BrokerAccess,
+    version: MQTTProtocolVersion,
+    will: tuple[str, bytes],
+    *,
+    connect_timeout_s: float,
+    manual_ack: bool = False,
+) -> mqtt.Client:
+    """A client with a retained will (topic and payload), without callbacks."""
+    client = mqtt.Client(
+        CallbackAPIVersion.VERSION2,
+        access.client_id,
+        protocol=version,
+        reconnect_on_failure=False,
+        manual_ack=manual_ack,
+        clean_session=None if version is MQTTProtocolVersion.MQTTv5 else True,
+    )
+    client.username_pw_set(access.username, access.password)
+    if access.tls is not None:
+        client.tls_set_context(access.tls)
+    client.will_set(*will, qos=1, retain=True)
+    client.max_inflight_messages_set(100)
+    client.connect_timeout = connect_timeout_s
+    return client
 
 
 class MqttTransport:
@@ -110,13 +160,7 @@ class MqttTransport:
         self._thread.start()
 
     def publish(
-        self,
-        topic: str,
-        payload: bytes,
-        *,
-        qos: int,
-        retain: bool = False,
-        delivered: Callable[[], None] | None = None,
+        self, topic: str, payload: bytes, *, qos: int, retain: bool = False, delivered: Callable[[], None] | None = None
     ) -> bool:
         """Implements ``Transport.publish``."""
         connection = self._connection
@@ -231,22 +275,9 @@ class MqttTransport:
             connection.turn(_DISCONNECT_S / 10)
 
     def _new_client(self, access: BrokerAccess) -> mqtt.Client:
-        options: dict[str, Any] = {} if self._version is MQTTProtocolVersion.MQTTv5 else {"clean_session": True}
-        client = mqtt.Client(
-            CallbackAPIVersion.VERSION2,
-            access.client_id,
-            protocol=self._version,
-            reconnect_on_failure=False,
-            manual_ack=True,
-            **options,
-        )
-        client.username_pw_set(access.username, access.password)
-        if access.tls is not None:
-            client.tls_set_context(access.tls)
-        client.will_set(self._presence_topic, self._presence(online=False), qos=1, retain=True)
+        will = (self._presence_topic, self._presence(online=False))
+        client = new_client(access, self._version, will, connect_timeout_s=_CONNECT_TIMEOUT_S, manual_ack=True)
         client.max_queued_messages_set(_MAX_QUEUED)
-        client.max_inflight_messages_set(100)
-        client.connect_timeout = _CONNECT_TIMEOUT_S
         client.on_connect = self._on_connect
         client.on_disconnect = self._on_disconnect
         client.on_subscribe = self._on_subscribe

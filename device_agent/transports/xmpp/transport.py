@@ -21,11 +21,10 @@ from device_agent.protocol import Presence, codec
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.xmpp import stanzas
 from device_agent.protocol.xmpp.stream import Login, Stream, StreamError
+from device_agent.transports.backoff import BackOff
 
 _CONFIRM_S = 5.0
 _DISCONNECT_S = 0.5
-_MIN_BACK_OFF_S = 0.2
-_MAX_BACK_OFF_S = 15.0
 _REFRESH_AT = 0.8
 """Share of the password's lifetime after which it is renewed at a quiet moment."""
 _REFRESH_LATEST = 0.97
@@ -120,9 +119,9 @@ class XmppTransport:
     # ------------------------------------------------------------ connections
 
     def _run(self) -> None:
-        back_off_s = _MIN_BACK_OFF_S
+        back_off = BackOff()
         while not self._stopping.is_set():
-            started_s = time.monotonic()
+            back_off.attempt()
             try:
                 access = self._access()
                 asyncio.run(self._connect_once(access))
@@ -130,12 +129,8 @@ class XmppTransport:
                 _log.warning("no link: %s", error)
             except Exception:  # noqa: BLE001 (the transport must keep reconnecting after any error)
                 _log.exception("no link")
-            if time.monotonic() - started_s > _MAX_BACK_OFF_S:
-                back_off_s = _MIN_BACK_OFF_S
-            # Full jitter: agents that lost one server together must not reconnect together.
-            if self._stopping.wait(random.uniform(_MIN_BACK_OFF_S / 2, back_off_s)):  # noqa: S311 (not a secret)
+            if self._stopping.wait(back_off.wait_s()):
                 return
-            back_off_s = min(2 * back_off_s, _MAX_BACK_OFF_S)
 
     async def _connect_once(self, access: XmppAccess) -> None:
         link = self._link = _Link(access, self._receive)
@@ -198,7 +193,7 @@ class _Link:
         present: JIDs of the gateways that are online.
         peer: The chosen gateway.
         up: Whether it has acknowledged the agent's presence.
-        left: Whether the gateway went offline offline since.
+        left: Whether the gateway went offline since.
         session: Session number.
     """
 

@@ -6,27 +6,19 @@ characters (``names``), which are whole in the object's metadata.
 
 import asyncio
 import base64
-import random
 import re
 from typing import Any
-from weakref import WeakValueDictionary
 
 from function_app.adapters.aws import names
 from function_app.adapters.aws.client import Client, Refused
-from function_app.adapters.shared import row_codec
-from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH, Upload, check_upload
-from function_app.ports.tables import StoreError
+from function_app.adapters.shared.appending import Appends
+from function_app.ports.blobs import Upload, check_name, check_size, check_upload
 
-TRIES = 30
-"""How often an append begins anew because another instance has written to the same blob meanwhile."""
-_PAUSE_S = 0.01
-_LONGEST_PAUSE_S = 0.2
 _PAGE = 1_000
 """Most keys that S3 lists at once."""
 _FIRST = "us-east-1"
 """Amazon's first region, which is not named when a bucket is made there."""
 _TAIL = "tail"
-_NO_NAME = "a blob's name is Unicode text without lone surrogates"
 _NOT_THERE = frozenset({"404", "NoSuchKey"})
 _WRITTEN_MEANWHILE = frozenset({"ConditionalRequestConflict", "PreconditionFailed", "NoSuchKey"})
 _HIDDEN = re.compile(r"[\x00-!]|(?:(?<=/)|^)\.", re.ASCII)
@@ -48,7 +40,7 @@ class S3Blobs:
             region=region,
             endpoint=endpoint,
         )
-        self._appending: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        self._appends = Appends()
 
     async def prepare(self) -> None:
         """Make the bucket where there is none. Safe to repeat, by many at once.
@@ -61,50 +53,33 @@ class S3Blobs:
             await self._client.call("create_bucket", Bucket=self._bucket, **(place if self._region != _FIRST else {}))
         except Refused as error:
             if error.code != "BucketAlreadyOwnedByYou":
-                raise self._client.unusable(error) from error
+                raise
 
     async def put(self, name: str, content: bytes) -> None:
-        """See ``Blobs``."""
-        _check(content)
+        check_size(len(content))
         place = self._place(name)
-        await self._ask("put_object", **place, **_metadata(name), Body=content)
+        await self._client.call("put_object", **place, **_metadata(name), Body=content)
 
     async def get(self, name: str) -> bytes | None:
-        """See ``Blobs``."""
         found = await self._read(self._place(name))
         return None if found is None else found[0]
 
     async def append(self, name: str, content: bytes) -> None:
-        """See ``Blobs``."""
-        _check(content)
-        place = self._place(name)
-        # S3 only writes whole objects. Local writers take turns; the ETag detects other instances.
-        async with self._appending.setdefault(name, asyncio.Lock()):
-            for attempt in range(TRIES):
-                if await self._append(place, _metadata(name), content):
-                    return
-                pause_s = min(_PAUSE_S * 2**attempt, _LONGEST_PAUSE_S)
-                await asyncio.sleep(random.uniform(0, pause_s))  # noqa: S311 (spreads writers)
-        raise StoreError(f"too many append to the blob '{name}' at once. Try again.")
+        check_size(len(content))
+        place, metadata = self._place(name), _metadata(name)
+        # S3 only writes whole objects; the ETag detects other instances.
+        await self._appends.run(name, lambda: self._append(place, metadata, content))
 
     async def delete(self, name: str) -> None:
-        """See ``Blobs``."""
-        await self._ask("delete_object", **self._place(name))
+        await self._client.call("delete_object", **self._place(name))
 
     async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
-        """See ``Blobs``."""
-        if not row_codec.is_text(prefix):
-            raise ValueError(_NO_NAME)
         if limit < 1:
             return ()
-        question = {
-            "Bucket": self._bucket,
-            "Prefix": encode(prefix[: names.HEAD]),
-            "MaxKeys": min(limit, _PAGE),
-        }
+        question = {"Bucket": self._bucket, "Prefix": encode(prefix[: names.HEAD]), "MaxKeys": min(limit, _PAGE)}
         found: list[str] = []
         while True:
-            answer = await self._ask("list_objects_v2", **question)
+            answer = await self._client.call("list_objects_v2", **question)
             some = await asyncio.gather(*(self._name(each["Key"]) for each in answer.get("Contents", ())))
             found += (name for name in some if name is not None and name.startswith(prefix))
             if not answer["IsTruncated"] or _whole(found, limit):
@@ -113,13 +88,12 @@ class S3Blobs:
         return tuple(sorted(found)[:limit])
 
     async def size(self, name: str) -> int | None:
-        """See ``Blobs``."""
         try:
             found = await self._client.call("head_object", **self._place(name))
         except Refused as error:
             if error.code in _NOT_THERE:
                 return None
-            raise self._client.unusable(error) from error
+            raise
         return int(found["ContentLength"])
 
     async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
@@ -140,7 +114,6 @@ class S3Blobs:
         return Upload("PUT", url, headers)
 
     async def presign_download(self, name: str, *, content_type: str, lifetime_s: int) -> str:
-        """See ``Blobs``."""
         return await self._client.presign(
             "get_object",
             lifetime_s=lifetime_s,
@@ -150,7 +123,6 @@ class S3Blobs:
         )
 
     async def close(self) -> None:
-        """See ``Blobs``."""
         await self._client.close()
 
     async def _name(self, key: str) -> str | None:
@@ -163,14 +135,11 @@ class S3Blobs:
         except Refused as error:
             if error.code in _NOT_THERE:
                 return None
-            raise self._client.unusable(error) from error
+            raise
         return shown[: names.HEAD] + base64.b64decode(found["Metadata"][_TAIL]).decode()
 
     def _place(self, name: str) -> dict[str, str]:
-        if not 1 <= len(name) <= MAX_NAME_LENGTH:
-            raise ValueError(f"a blob's name has 1 to {MAX_NAME_LENGTH} characters, not {len(name)}")
-        if not row_codec.is_text(name):
-            raise ValueError(_NO_NAME)
+        check_name(name)
         key = encode(name[: names.HEAD])
         return {"Bucket": self._bucket, "Key": key if not names.is_long(name) else key + names.digest(name)}
 
@@ -181,7 +150,7 @@ class S3Blobs:
         except Refused as error:
             if error.code in _NOT_THERE:
                 return None
-            raise self._client.unusable(error) from error
+            raise
         return found["Body"], found["ETag"]
 
     async def _append(self, place: dict[str, str], metadata: dict[str, Any], content: bytes) -> bool:
@@ -191,24 +160,18 @@ class S3Blobs:
             return True
         old, condition = (b"", {"IfNoneMatch": "*"}) if found is None else (found[0], {"IfMatch": found[1]})
         new = old + content
-        _check(new)
+        check_size(len(new))
         try:
             await self._client.call("put_object", **place, **metadata, **condition, Body=new)
         except Refused as error:
             if error.code not in _WRITTEN_MEANWHILE:
-                raise self._client.unusable(error) from error
+                raise
             if not error.tried_again:
                 return False
             # Its answer may have been lost, and what the SDK then sent again found our own writing.
             now = await self._read(place)
             return now is not None and now[0].startswith(new)
         return True
-
-    async def _ask(self, operation: str, **parameters: Any) -> dict[str, Any]:
-        try:
-            return await self._client.call(operation, **parameters)
-        except Refused as error:
-            raise self._client.unusable(error) from error
 
 
 def encode(name: str) -> str:
@@ -234,8 +197,3 @@ def _metadata(name: str) -> dict[str, Any]:
     if not names.is_long(name):
         return {}
     return {"Metadata": {_TAIL: base64.b64encode(name[names.HEAD :].encode()).decode()}}
-
-
-def _check(content: bytes) -> None:
-    if len(content) > MAX_BYTES:
-        raise ValueError(f"a blob holds at most {MAX_BYTES} bytes, not {len(content)}")

@@ -16,11 +16,8 @@ _EXISTS = "ResourceAlreadyExistsException"
 class IotCertificates:
     """``Certificates`` in AWS IoT Core.
 
-    Args:
-        region: Amazon's region.
-        policy: What the names of the IoT policies of agents begin with; ``prepare`` makes them. They speak of the thing
-            that a certificate belongs to: its name is the agent's id, its attribute ``space`` the agent's space.
-        endpoint: An emulator's address, ``None`` for Amazon's own.
+    ``prepare`` makes the agents' IoT policies, whose names begin with ``policy``. They refer to the thing that a
+    certificate belongs to: its name is the agent's id, its attribute ``space`` the agent's space.
     """
 
     wanted = True
@@ -41,7 +38,6 @@ class IotCertificates:
         )
 
     async def issue(self, agent: str, request: str) -> Issued:
-        """See ``Certificates``."""
         from cryptography import x509  # noqa: PLC0415 (only where certificates are in use)
 
         csr.read(request)
@@ -54,22 +50,21 @@ class IotCertificates:
                 await self._client.call("attach_policy", policyName=name, target=made["certificateArn"])
             # Last: an interrupted run leaves a certificate without access.
             await self._client.call("update_certificate", certificateId=made["certificateId"], newStatus="ACTIVE")
-        except (Refused, StoreError) as error:
-            raise self._said(error) from error
+        except StoreError as error:
+            raise _access_error(error) from error
         chain = str(made["certificatePem"])
         ends = x509.load_pem_x509_certificate(chain.encode()).not_valid_after_utc
         return Issued(chain, int(ends.timestamp() * 1000))
 
     async def place(self, agent: str, space: str) -> None:
-        """See ``Certificates``."""
         try:
             with contextlib.suppress(Refused):  # it is there, or the next call says what is wrong
                 await self._client.call("create_thing", thingName=agent)
             await self._client.call(
                 "update_thing", thingName=agent, attributePayload={"attributes": {"space": space}, "merge": True}
             )
-        except (Refused, StoreError) as error:
-            raise self._said(error) from error
+        except StoreError as error:
+            raise _access_error(error) from error
 
     async def prepare(self) -> None:
         """Make the policies of agents, or bring them up to date. Safe to repeat.
@@ -86,8 +81,8 @@ class IotCertificates:
                     if error.code != _EXISTS:
                         raise
                     await self._renew(name, document)
-        except (Refused, StoreError) as error:
-            raise self._said(error) from error
+        except StoreError as error:
+            raise _access_error(error) from error
 
     async def _renew(self, name: str, document: str) -> None:
         """IoT Core keeps five versions of a policy; older ones than the present say nothing any more."""
@@ -104,23 +99,19 @@ class IotCertificates:
         return {f"{self._policy}-{number}": text for number, text in enumerate(iot_policies.agents(place=place))}
 
     async def revoke(self, agent: str) -> None:
-        """See ``Certificates``."""
         try:
             found = await self._client.call("list_thing_principals", thingName=agent)
             for arn in found["principals"]:
                 certificate = str(arn).rpartition("/")[2]
                 await self._client.call("update_certificate", certificateId=certificate, newStatus="REVOKED")
-        except Refused as error:
-            if error.code != _MISSING:  # it never had one
-                raise self._said(error) from error
         except StoreError as error:
-            raise self._said(error) from error
+            if not isinstance(error, Refused) or error.code != _MISSING:  # it never had one
+                raise _access_error(error) from error
 
     async def close(self) -> None:
-        """See ``Certificates``."""
         await self._client.close()
         await self._caller.close()
 
-    def _said(self, error: Refused | StoreError) -> BrokerAccessError:
-        said = self._client.unusable(error) if isinstance(error, Refused) else error
-        return BrokerAccessError(str(said).rstrip("."))
+
+def _access_error(error: StoreError) -> BrokerAccessError:
+    return BrokerAccessError(str(error).rstrip("."))

@@ -7,9 +7,12 @@ import asyncio
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from function_app.ports.tables import StoreError
+
+if TYPE_CHECKING:
+    from botocore.exceptions import ClientError
 
 THREADS = 16
 """Calls under way at once; more wait for one of them."""
@@ -37,19 +40,14 @@ _NO_RIGHTS = frozenset(
     }
 )
 _TOO_MUCH = frozenset(
-    {
-        "ProvisionedThroughputExceededException",
-        "RequestLimitExceeded",
-        "SlowDown",
-        "ThrottlingException",
-    }
+    {"ProvisionedThroughputExceededException", "RequestLimitExceeded", "SlowDown", "ThrottlingException"}
 )
 
 T = TypeVar("T")
 
 
-class Refused(Exception):  # noqa: N818 (an outcome that callers look at)
-    """The service's answer is no.
+class Refused(StoreError):  # noqa: N818 (an outcome that callers look at)
+    """The service refused a request. The text says what it means and what to do, in one line.
 
     Attributes:
         code: The service's word for why.
@@ -96,10 +94,17 @@ class Client:
         """The answer to one of the SDK's operations. A body in it has been read.
 
         Raises:
-            Refused: The answer is no; ``unusable`` words what the caller did not expect.
-            StoreError: There is no answer.
+            Refused: The service refused the request.
+            StoreError: The service cannot be used.
         """
-        return await self._in_thread(lambda: self._call(operation, parameters))
+
+        def ask(client: Any) -> dict[str, Any]:
+            answer: dict[str, Any] = getattr(client, operation)(**parameters)
+            if "Body" in answer:
+                answer["Body"] = answer["Body"].read()
+            return answer
+
+        return await self._in_thread(ask)
 
     async def presign(self, operation: str, *, lifetime_s: int, **parameters: Any) -> str:
         """A presigned URL for one of the SDK's operations.
@@ -112,7 +117,7 @@ class Client:
             url: str = client.generate_presigned_url(operation, Params=parameters, ExpiresIn=lifetime_s)
             return url
 
-        return await self._in_thread(lambda: self._guarded(sign))
+        return await self._in_thread(sign)
 
     async def close(self) -> None:
         """Close connections and threads. A later call opens them again."""
@@ -123,35 +128,10 @@ class Client:
         if client is not None:
             client.close()
 
-    def unusable(self, error: Refused) -> StoreError:
-        """What a refusal means and what to do, in one line."""
-        codes = {error.code, *error.reasons}
-        if codes & _MISSING:
-            return StoreError(
-                f"{self._where} does not exist. Check {self._setting} and TELESCOPE_AWS_REGION, or create it: "
-                f"{self._how}; `python -m function_app prepare` does."
-            )
-        if codes & _NO_RIGHTS:
-            return StoreError(
-                f"{self._where} may not be used: {_line(error)}. Check the credentials and the rights of their role."
-            )
-        if codes & _TOO_MUCH:
-            return StoreError(f"{self._where} has too much to do: {_line(error)}. Try again, or raise its limits.")
-        return StoreError(f"{self._where} cannot be used: {_line(error)}. Check its configuration.")
-
-    async def _in_thread(self, do: Callable[[], T]) -> T:
+    async def _in_thread(self, do: Callable[[Any], T]) -> T:
         if self._threads is None:
             self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=self._service)
-        return await asyncio.get_running_loop().run_in_executor(self._threads, do)
-
-    def _call(self, operation: str, parameters: dict[str, Any]) -> dict[str, Any]:
-        def ask(client: Any) -> dict[str, Any]:
-            answer: dict[str, Any] = getattr(client, operation)(**parameters)
-            if "Body" in answer:
-                answer["Body"] = answer["Body"].read()
-            return answer
-
-        return self._guarded(ask)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, self._guarded, do)
 
     def _guarded(self, do: Callable[[Any], T]) -> T:
         """Do it with the SDK's client, and say what is wrong in our own words."""
@@ -160,7 +140,7 @@ class Client:
         try:
             return do(self._open())
         except sdk.ClientError as error:
-            raise _refused(error.response, str(error)) from error
+            raise self._refusal(error) from error
         except (
             sdk.CredentialRetrievalError,
             sdk.NoCredentialsError,
@@ -177,6 +157,26 @@ class Client:
             ) from error
         except sdk.BotoCoreError as error:
             raise StoreError(f"{self._where} cannot be used: {_line(error)}. Check its configuration.") from error
+
+    def _refusal(self, error: "ClientError") -> Refused:
+        """What a refusal means and what to do."""
+        response: dict[str, Any] = error.response
+        code = str(response.get("Error", {}).get("Code", ""))
+        reasons = tuple(str(each.get("Code")) for each in response.get("CancellationReasons", ()))
+        codes = {code, *reasons}
+        if codes & _MISSING:
+            text = (
+                f"does not exist. Check {self._setting} and TELESCOPE_AWS_REGION, or create it: {self._how}; "
+                "`python -m function_app prepare` does."
+            )
+        elif codes & _NO_RIGHTS:
+            text = f"may not be used: {_line(error)}. Check the credentials and the rights of their role."
+        elif codes & _TOO_MUCH:
+            text = f"has too much to do: {_line(error)}. Try again, or raise its limits."
+        else:
+            text = f"cannot be used: {_line(error)}. Check its configuration."
+        tried_again = bool(response.get("ResponseMetadata", {}).get("RetryAttempts"))
+        return Refused(f"{self._where} {text}", code=code, reasons=reasons, tried_again=tried_again)
 
     def _open(self) -> Any:
         from botocore.config import Config  # noqa: PLC0415
@@ -203,14 +203,18 @@ class Client:
             return self._client
 
 
-def _refused(response: dict[str, Any], message: str) -> Refused:
-    return Refused(
-        message,
-        code=str(response.get("Error", {}).get("Code", "")),
-        reasons=tuple(str(each.get("Code")) for each in response.get("CancellationReasons", ())),
-        tried_again=bool(response.get("ResponseMetadata", {}).get("RetryAttempts")),
-    )
-
-
 def _line(error: Exception) -> str:
     return " ".join(str(error).split()).rstrip(".")
+
+
+def iot_data_client(region: str, endpoint: str) -> Client:
+    """Messages and connections of AWS IoT Core, at the account's address for data."""
+    return Client(
+        "iot-data",
+        what="AWS IoT Core",
+        setting="TELESCOPE_IOT_ENDPOINT",
+        how="aws iot describe-endpoint --endpoint-type iot:Data-ATS",
+        region=region,
+        endpoint=endpoint,
+        address="TELESCOPE_IOT_ENDPOINT",
+    )

@@ -21,34 +21,28 @@ _LONGEST = "arn:aws:iot:ap-southeast-1:123456789012"
 
 
 def answer(grant: Grant, *, place: str, now_s: float) -> dict[str, Any]:
-    """What the authoriser answers about a connection that is let in.
-
-    Args:
-        grant: Of the connection.
-        place: ``arn:aws:iot:<region>:<account>``.
-        now_s: The wall clock [s].
+    """The authoriser's response that admits a connection at ``place``, ``arn:aws:iot:<region>:<account>``.
 
     Raises:
-        BrokerAccessError: It names more topics than an answer may hold.
+        BrokerAccessError: The grant names more topics than a response may contain.
     """
-    left_s = max(1, int(grant.expires_at - now_s))
-    return {
-        "isAuthenticated": True,
-        "principalId": hashlib.sha256(grant.principal.encode()).hexdigest(),
-        "disconnectAfterInSeconds": max(MIN_REFRESH_S, min(left_s, MAX_DISCONNECT_S)),
-        "refreshAfterInSeconds": max(MIN_REFRESH_S, min(left_s, MAX_DISCONNECT_S)),
-        "policyDocuments": documents(grant, place=place),
-    }
+    duration_s = max(MIN_REFRESH_S, min(int(grant.expires_at - now_s), MAX_DISCONNECT_S))
+    principal = hashlib.sha256(grant.principal.encode()).hexdigest()
+    return _response(principal, duration_s, documents(grant, place=place))
 
 
 def refusal() -> dict[str, Any]:
-    """What it answers about every other: nothing is said of why."""
+    """The authoriser's response that rejects a connection, without a reason."""
+    return _response("denied", MIN_REFRESH_S, [])
+
+
+def _response(principal: str, duration_s: int, policies: list[str]) -> dict[str, Any]:
     return {
-        "isAuthenticated": False,
-        "principalId": "denied",
-        "disconnectAfterInSeconds": MIN_REFRESH_S,
-        "refreshAfterInSeconds": MIN_REFRESH_S,
-        "policyDocuments": [],
+        "isAuthenticated": bool(policies),
+        "principalId": principal,
+        "disconnectAfterInSeconds": duration_s,
+        "refreshAfterInSeconds": duration_s,
+        "policyDocuments": policies,
     }
 
 
@@ -89,12 +83,9 @@ def _deeper(pattern: str) -> list[str]:
     """The pattern with one level more at each ``+``."""
     levels = pattern.split("/")
     if levels[-1] == "#":
-        levels = levels[:-1]
-    found = []
-    for place, level in enumerate(levels):
-        if level == "+":
-            found.append(_stars("/".join([*levels[:place], "+", *levels[place:]])))
-    return list(dict.fromkeys(found)) if pattern.rpartition("/")[2] != "#" else []
+        return []
+    deeper = ([*levels[:place], "+", *levels[place:]] for place, level in enumerate(levels) if level == "+")
+    return list(dict.fromkeys(_stars("/".join(each)) for each in deeper))
 
 
 def _statement(effect: str, action: str, resources: list[str]) -> dict[str, Any]:

@@ -4,24 +4,14 @@ from collections.abc import Callable
 
 from function_app.adapters.aws.client import Client, Refused
 from function_app.adapters.shared.key_ring_keys import wall_ms
-from function_app.adapters.shared.vault_keys import AGAIN_MS, LOOK_EVERY_MS, Secret, VaultKeys
+from function_app.adapters.shared.vault_keys import Secret, VaultKeys
 
 _MISSING = "ResourceNotFoundException"
 _EXISTS = "ResourceExistsException"
 
 
 class SecretsManagerKeys(VaultKeys):
-    """``Keys`` in one secret.
-
-    Args:
-        secret: Its name.
-        region: Where it is.
-        endpoint: An emulator's address, ``None`` for Amazon's own.
-        kms_key: Id of the KMS key to make it with; empty for the account's own.
-        now_ms: The wall clock, by which overlaps end.
-        look_every_ms: How long what was read is good [ms].
-        again_ms: Least time between two looks [ms].
-    """
+    """``SigningKeys`` in one secret. An empty ``kms_key`` (an id) stands for the account's default key."""
 
     def __init__(
         self,
@@ -31,11 +21,9 @@ class SecretsManagerKeys(VaultKeys):
         endpoint: str | None = None,
         kms_key: str = "",
         now_ms: Callable[[], int] = wall_ms,
-        look_every_ms: int = LOOK_EVERY_MS,
-        again_ms: int = AGAIN_MS,
     ) -> None:
         what = f"the secret '{secret}'"
-        super().__init__(what=what, now_ms=now_ms, look_every_ms=look_every_ms, again_ms=again_ms)
+        super().__init__(what=what, now_ms=now_ms)
         self._secret = secret
         self._kms_key = kms_key
         self._client = Client(
@@ -48,7 +36,6 @@ class SecretsManagerKeys(VaultKeys):
         )
 
     async def close(self) -> None:
-        """See ``Keys``."""
         await self._client.close()
 
     async def _fetch(self) -> Secret | None:
@@ -57,7 +44,7 @@ class SecretsManagerKeys(VaultKeys):
         except Refused as error:
             if error.code == _MISSING:
                 return None
-            raise self._client.unusable(error) from error
+            raise
         return Secret(str(found.get("SecretString", "")), str(found["VersionId"]))
 
     async def _create(self, text: str) -> None:
@@ -72,10 +59,7 @@ class SecretsManagerKeys(VaultKeys):
             )
         except Refused as error:
             if error.code != _EXISTS:  # another process created it
-                raise self._client.unusable(error) from error
+                raise
 
     async def _put(self, text: str) -> None:
-        try:
-            await self._client.call("put_secret_value", SecretId=self._secret, SecretString=text)
-        except Refused as error:
-            raise self._client.unusable(error) from error
+        await self._client.call("put_secret_value", SecretId=self._secret, SecretString=text)

@@ -68,32 +68,28 @@ class DynamoTables:
             )
         except Refused as error:
             if error.code != "ResourceInUseException":
-                raise self._client.unusable(error) from error
+                raise
         end = time.monotonic() + _READY_WITHIN_S
-        while (await self._ask("describe_table", TableName=self._table))["Table"]["TableStatus"] != "ACTIVE":
+        while (await self._client.call("describe_table", TableName=self._table))["Table"]["TableStatus"] != "ACTIVE":
             if time.monotonic() > end:
                 raise StoreError(f"the DynamoDB table '{self._table}' is still being made. Try again in a minute.")
             await asyncio.sleep(_LOOK_EVERY_S)
 
     async def get(self, table: str, partition: str, key: str) -> Row | None:
-        """See ``Tables``."""
         _check_text(partition, key)
         if not key:
             return None
         place = _place(table, partition, key)
-        found = await self._ask("get_item", TableName=self._table, Key=place, ConsistentRead=True)
+        found = await self._client.call("get_item", TableName=self._table, Key=place, ConsistentRead=True)
         return _row(partition, found["Item"]) if "Item" in found else None
 
     async def create(self, table: str, row: Row) -> Row:
-        """See ``Tables``."""
         return await self._put(table, Write("create", row))
 
     async def replace(self, table: str, row: Row) -> Row:
-        """See ``Tables``."""
         return await self._put(table, Write("replace", row))
 
     async def delete(self, table: str, row: Row) -> None:
-        """See ``Tables``."""
         # As a transaction: the SDK gives it a token, so that when an answer is lost and it asks again, Amazon knows
         # the request. A plain delete would then find nothing and be taken for another's.
         await self.batch(table, [Write("delete", row)])
@@ -108,7 +104,6 @@ class DynamoTables:
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page:
-        """See ``Tables``."""
         row_codec.check_limit(limit)
         start = first if cursor is None else max(first, row_codec.read_cursor(cursor))
         _check_text(partition, start, last or "")
@@ -123,7 +118,7 @@ class DynamoTables:
         }
         found: list[Row] = []
         while True:
-            answer = await self._ask("query", **question)
+            answer = await self._client.call("query", **question)
             some = (_row(partition, item) for item in answer["Items"])
             found += (row for row in some if row.key >= start and (last is None or row.key < last))
             if "LastEvaluatedKey" not in answer or _whole(found, limit):
@@ -133,7 +128,6 @@ class DynamoTables:
         return Page(tuple(found[:limit]), row_codec.write_cursor(found[limit].key) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
-        """See ``Tables``."""
         texts = row_codec.check_batch(writes)
         written = tuple(_written(write) for write in writes)
         items = [_change(table, *each) for each in zip(writes, written, texts, strict=True)]
@@ -143,12 +137,11 @@ class DynamoTables:
         except Refused as error:
             wrong = next((row for row, why in zip(written, error.reasons, strict=False) if why in _UNFIT), None)
             if wrong is None:
-                raise self._client.unusable(error) from error
+                raise
             raise Conflict(f"{table}: '{wrong.key}' is not as the writer believed") from error
         return written
 
     async def close(self) -> None:
-        """See ``Tables``."""
         await self._client.close()
 
     async def _put(self, table: str, write: Write) -> Row:
@@ -159,7 +152,7 @@ class DynamoTables:
             await self._write("put_item", TableName=self._table, **change)
         except Refused as error:
             if error.code not in _UNFIT:
-                raise self._client.unusable(error) from error
+                raise
             if not (error.tried_again and await self._has(table, row)):
                 raise Conflict(f"{table}: '{row.key}' is not as the writer believed") from error
         return row
@@ -187,13 +180,9 @@ class DynamoTables:
             else:
                 return
             await asyncio.sleep(random.uniform(0.5, 1) * _PAUSE_S * 2**attempt)  # noqa: S311 (spreads writers)
-        raise StoreError(f"the DynamoDB table '{self._table}' has too much to do: {reason}. Try again.") from reason
-
-    async def _ask(self, operation: str, **parameters: Any) -> dict[str, Any]:
-        try:
-            return await self._client.call(operation, **parameters)
-        except Refused as error:
-            raise self._client.unusable(error) from error
+        raise StoreError(
+            f"the DynamoDB table '{self._table}' has too much to do: {reason.__cause__}. Try again."
+        ) from reason
 
 
 def _written(write: Write) -> Row:

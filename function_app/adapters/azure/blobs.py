@@ -7,20 +7,18 @@ twice, and ``put`` and ``append`` on one name would meet two kinds of blob.
 A blob's name is the code of the port's (``names``); where that is too long, the whole is in the metadata ``name``.
 """
 
-import asyncio
 import contextlib
 import itertools
-import random
 import secrets
 from datetime import UTC, datetime, timedelta
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, TypeVar
-from weakref import WeakValueDictionary
 
 from function_app.adapters.azure import names
 from function_app.adapters.azure.client import ATTEMPTS, Client, Place, Refused, code_of, credential, transport
 from function_app.adapters.azure.sas_keys import SigningKeys
-from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH, Upload, check_upload
+from function_app.adapters.shared.appending import TRIES, Appends, pause
+from function_app.ports.blobs import MAX_BYTES, Upload, check_name, check_size, check_upload
 from function_app.ports.tables import StoreError
 
 if TYPE_CHECKING:
@@ -28,16 +26,12 @@ if TYPE_CHECKING:
 
     from azure.storage.blob import BlobClient, BlobProperties, ContainerClient
 
-TRIES = 30
-"""How often an append begins anew because another instance has written to the same blob meanwhile."""
 MANY_BLOCKS = 1_000
 """From so many appends on, the early ones become one block: Azure takes 50,000, and the list is sent each time."""
 RETRY_WITHIN_S = 1
 """The SDK's pause before it tries again is up to this long."""
 KEPT_BLOCKS = 100
 """Appends that stay blocks then, to be known again should their answer have been lost."""
-_PAUSE_S = 0.01
-_LONGEST_PAUSE_S = 0.2
 _PAGE = 1_000
 _NAME = "name"
 _BLOCK_BYTES = 16
@@ -61,18 +55,16 @@ class AzureBlobs:
             what=f"the Azure container '{container}'",
             role="Storage Blob Data Contributor",
         )
-        self._appending: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        self._appends = Appends()
         self._keys = SigningKeys(place)
 
     async def put(self, name: str, content: bytes) -> None:
-        """See ``Blobs``."""
-        _check(content)
+        check_size(len(content))
         written = _written(name)
         metadata = _metadata(name)
         await self._write(lambda to: to.upload_blob(written, content, overwrite=True, metadata=metadata))
 
     async def get(self, name: str) -> bytes | None:
-        """See ``Blobs``."""
         written = _written(name)
         for attempt in range(TRIES):
             try:
@@ -81,34 +73,27 @@ class AzureBlobs:
                 if error.status == _GONE:
                     return None
                 if error.status != _CHANGED:
-                    raise self._client.unusable(error) from error
-            await _pause(attempt)  # written over between two parts of a large one
+                    raise
+            await pause(attempt)  # written over between two parts of a large one
         raise StoreError(f"the blob '{name}' is written all the time. Try again.")
 
     async def append(self, name: str, content: bytes) -> None:
-        """See ``Blobs``."""
-        _check(content)
+        check_size(len(content))
         written, metadata = _written(name), _metadata(name)
         block = secrets.token_hex(_BLOCK_BYTES)
-        # Local writers take turns; the ETag detects other instances.
-        async with self._appending.setdefault(name, asyncio.Lock()):
-            for attempt in range(TRIES):
-                if await self._write(lambda to: _append(to.get_blob_client(written), block, content, metadata)):
-                    return
-                await _pause(attempt)
-        raise StoreError(f"too many append to the blob '{name}' at once. Try again.")
+        await self._appends.run(
+            name, lambda: self._write(lambda to: _append(to.get_blob_client(written), block, content, metadata))
+        )
 
     async def delete(self, name: str) -> None:
-        """See ``Blobs``."""
         written = _written(name)
         try:
             await self._client.call(lambda container: container.delete_blob(written))
         except Refused as error:
             if error.status != _GONE:
-                raise self._client.unusable(error) from error
+                raise
 
     async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
-        """See ``Blobs``."""
         begin = names.head(names.encode(prefix), names.MAX_BLOB_NAME)
         if limit < 1:
             return ()
@@ -124,33 +109,28 @@ class AzureBlobs:
         except Refused as error:
             if error.code == _NO_CONTAINER:
                 return ()
-            raise self._client.unusable(error) from error
+            raise
 
     async def size(self, name: str) -> int | None:
-        """See ``Blobs``."""
         written = _written(name)
         try:
             found = await self._client.call(lambda container: container.get_blob_client(written).get_blob_properties())
         except Refused as error:
             if error.status == _GONE:
                 return None
-            raise self._client.unusable(error) from error
+            raise
         return int(found.size)
 
     async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
         """See ``Blobs``. Signed is the right to create this blob; what its length may be, Azure cannot say."""
         check_upload(length)
         metadata = {f"x-ms-meta-{key}": value for key, value in _metadata(name).items()}
-        try:
-            await self._client.call(_make)  # must exist before the upload
-        except Refused as error:
-            raise self._client.unusable(error) from error
+        await self._client.call(_make)  # must exist before the upload
         url = await self._presign(name, lifetime_s, permission="c")
         headers = {"Content-Length": str(length), "Content-Type": content_type, "x-ms-blob-type": "BlockBlob"}
         return Upload("PUT", url, headers | metadata | {"If-None-Match": "*"})
 
     async def presign_download(self, name: str, *, content_type: str, lifetime_s: int) -> str:
-        """See ``Blobs``."""
         return await self._presign(
             name, lifetime_s, permission="r", content_type=content_type, content_disposition="attachment"
         )
@@ -172,27 +152,20 @@ class AzureBlobs:
             )
             return f"{blob.url}?{token}"
 
-        try:
-            return await self._client.call(sign)
-        except Refused as error:
-            raise self._client.unusable(error) from error
+        return await self._client.call(sign)
 
     async def close(self) -> None:
-        """See ``Blobs``."""
         await self._client.close()
 
     async def _write(self, write: "Callable[[ContainerClient], T]") -> T:
         """Do it, and make the container for it where there is none."""
         try:
-            try:
-                return await self._client.call(write)
-            except Refused as error:
-                if error.code != _NO_CONTAINER:
-                    raise
-            await self._client.call(_make)
             return await self._client.call(write)
         except Refused as error:
-            raise self._client.unusable(error) from error
+            if error.code != _NO_CONTAINER:
+                raise
+        await self._client.call(_make)
+        return await self._client.call(write)
 
 
 def _open(place: Place, container: str, things: contextlib.ExitStack) -> "ContainerClient":
@@ -247,7 +220,7 @@ def _append(blob: "BlobClient", block: str, content: bytes, metadata: dict[str, 
             blocks = _blocks(blob, size, condition)
         if block in blocks:
             return True
-        _check_size(size + len(content))
+        check_size(size + len(content))
         if content:
             blob.stage_block(block, content)
             blocks.append(block)
@@ -274,14 +247,8 @@ def _blocks(blob: "BlobClient", size: int, condition: dict[str, Any]) -> list[st
     return blocks
 
 
-async def _pause(attempt: int) -> None:
-    pause_s = min(_PAUSE_S * 2**attempt, _LONGEST_PAUSE_S)
-    await asyncio.sleep(random.uniform(0, pause_s))  # noqa: S311 (spreads writers)
-
-
 def _written(name: str) -> str:
-    if not 1 <= len(name) <= MAX_NAME_LENGTH:
-        raise ValueError(f"a blob's name has 1 to {MAX_NAME_LENGTH} characters, not {len(name)}")
+    check_name(name)
     return names.fit(names.encode(name), names.MAX_BLOB_NAME)
 
 
@@ -296,12 +263,3 @@ def _written_of(blob: "BlobProperties") -> str:
 
 def _name_of(blob: "BlobProperties") -> str:
     return names.decode((blob.metadata or {}).get(_NAME) or str(blob.name))
-
-
-def _check(content: bytes) -> None:
-    _check_size(len(content))
-
-
-def _check_size(size: int) -> None:
-    if size > MAX_BYTES:
-        raise ValueError(f"a blob holds at most {MAX_BYTES} bytes, not {size}")

@@ -17,12 +17,12 @@ answered), "MQTT features supported" (a session is taken over by the same authen
 import asyncio
 import secrets
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from device_agent.protocol.security.grants import Grant
 from function_app.adapters.azure import topic_spaces
-from function_app.adapters.shared.grant_registry import GrantRegistry, each
+from function_app.adapters.shared.webhook_access import WebhookBrokerAccess
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials
 from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import StoreError, Tables
@@ -37,53 +37,25 @@ Take = Callable[[str, Credentials], Awaitable[None]]
 """Connects with a client id and credentials, and disconnects; raises ``BrokerAccessError`` where it is not let in."""
 
 
-class EventGridBrokerAccess:
+class EventGridBrokerAccess(WebhookBrokerAccess):
     """``BrokerAccess`` in an Event Grid namespace, and its webhook's judgement.
 
     Args:
-        keys: Sign, and check.
-        tables: Remember what was issued and taken back.
+        keys: Sign and check grants.
+        tables: Store issued and revoked grants.
         take: Takes a session over and ends it.
         known: Whether a token is of the namespace's own identity, which alone may ask.
     """
 
+    ends_expired = False
+
     def __init__(
         self, *, keys: SigningKeys, tables: Tables, take: Take, known: Callable[[str], Awaitable[bool]]
     ) -> None:
+        super().__init__(keys=keys, tables=tables)
         self.known = known
-        self._rights = GrantRegistry(keys=keys, tables=tables)
         self._take = take
         self._cuts = asyncio.Semaphore(CUTS_AT_ONCE)
-
-    async def issue(self, grant: Grant) -> Credentials:
-        """As the port says."""
-        topic_spaces.attributes(grant)  # whether there is room for it
-        return await self._rights.issue(grant)
-
-    def accepts(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:
-        """As the port says, of a person: whether the topic spaces have room for it."""
-        grant = Grant(
-            principal="account:",
-            client_id="",
-            publish=tuple(publish),
-            subscribe=tuple(subscribe),
-            token_id="",
-            expires_at=0,
-        )
-        try:
-            topic_spaces.attributes(grant)
-        except BrokerAccessError:
-            return False
-        return True
-
-    async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
-        """As the port says: refused from now on, then cut."""
-        connected = await self._rights.revoke(client_id=client_id, principal=principal)
-        await each(connected, self._cut)
-
-    async def expire(self, now_s: float) -> None:
-        """As the port says."""
-        await self._rights.expire(now_s, self._cut, run_out=True)
 
     def service_credentials(self) -> ServiceCredentials:
         """None: the functions publish over HTTPS, and hear by the namespace's routing."""
@@ -91,11 +63,6 @@ class EventGridBrokerAccess:
 
     async def admit(self, *, username: str, password: str, client_id: str) -> dict[str, Any]:
         """What the webhook answers about a connection.
-
-        Args:
-            username: The principal.
-            password: The signed grant.
-            client_id: As the client gives it.
 
         Raises:
             StoreError: The revocation state cannot be read; the client is not admitted.
@@ -116,6 +83,9 @@ class EventGridBrokerAccess:
 
     async def close(self) -> None:
         """As the port says: nothing is kept open."""
+
+    def _check_room(self, grant: Grant) -> None:
+        topic_spaces.attributes(grant)
 
     async def _cut(self, client_id: str) -> None:
         grant = Grant(

@@ -9,9 +9,12 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from function_app.ports.tables import StoreError
+
+if TYPE_CHECKING:
+    from azure.core.exceptions import HttpResponseError
 
 THREADS = 16
 """Calls under way at once; more wait for one of them."""
@@ -41,8 +44,8 @@ class Place:
     identity: str = ""
 
 
-class Refused(Exception):  # noqa: N818 (an answer, not always a fault)
-    """Azure's answer is no."""
+class Refused(StoreError):  # noqa: N818 (an outcome that callers look at)
+    """Azure refused a request. The text says what it means and what to do, in one line."""
 
     def __init__(self, message: str, *, status: int, code: str) -> None:
         super().__init__(message)
@@ -92,8 +95,8 @@ class Client(Generic[Sdk]):
         """What ``operation`` returns, which runs in a thread and may use all of the SDK.
 
         Raises:
-            Refused: The answer is no; ``unusable`` words what the caller did not expect.
-            StoreError: There is no answer.
+            Refused: Azure refused the request.
+            StoreError: The service cannot be used.
         """
         if self._threads is None:
             self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="azure")
@@ -107,26 +110,13 @@ class Client(Generic[Sdk]):
         self._sdk = None
         self._open_things.close()
 
-    def unusable(self, error: Refused) -> StoreError:
-        """What a refusal means and what to do, in one line."""
-        said = _line(error)
-        if error.status != _NO_ANSWER:
-            said += f" ({error.status}{' ' if error.code else ''}{error.code})"
-        if error.status in _NO_RIGHTS:
-            return StoreError(f"{self._what} may not be used: {said}. {self._right}.")
-        if error.status in _TOO_MUCH:
-            return StoreError(f"{self._what} has too much to do: {said}. Try again.")
-        return StoreError(f"{self._what} cannot be used: {said}. Check {self._service}.")
-
     def _call(self, operation: Callable[[Sdk], T]) -> T:
         from azure.core import exceptions as sdk  # noqa: PLC0415 (see this page's first lines)
 
         try:
             return operation(self._opened())
         except sdk.HttpResponseError as error:
-            said = str(error.message).split("\nErrorCode:")[0].split("\nRequestId:")[0]
-            # Without an answer, it is the credentials that the SDK itself finds wrong, or cannot get.
-            raise Refused(said, status=error.status_code or _NO_ANSWER, code=code_of(error)) from error
+            raise self._refusal(error) from error
         except (sdk.ServiceRequestError, sdk.ServiceResponseError) as error:
             raise StoreError(
                 f"{self._what} cannot be reached: {_reason(error)}. Check {self._settings} and the network."
@@ -138,6 +128,21 @@ class Client(Generic[Sdk]):
             raise StoreError(
                 f"{self._what} gives answers that are not Azure's ({_line(error)}). Check {self._settings}."
             ) from error
+
+    def _refusal(self, error: "HttpResponseError") -> Refused:
+        """What a refusal means and what to do."""
+        # Without a status, it is the credentials that the SDK itself finds wrong, or cannot get.
+        status, code = error.status_code or _NO_ANSWER, code_of(error)
+        text = _line(str(error.message).split("\nErrorCode:")[0].split("\nRequestId:")[0])
+        if status != _NO_ANSWER:
+            text += f" ({status}{' ' if code else ''}{code})"
+        if status in _NO_RIGHTS:
+            text = f"{self._what} may not be used: {text}. {self._right}."
+        elif status in _TOO_MUCH:
+            text = f"{self._what} has too much to do: {text}. Try again."
+        else:
+            text = f"{self._what} cannot be used: {text}. Check {self._service}."
+        return Refused(text, status=status, code=code)
 
     def _opened(self) -> Sdk:
         with self._lock:

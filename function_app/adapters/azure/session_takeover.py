@@ -15,20 +15,12 @@ _KEEP_ALIVE_S = 30
 
 
 class SessionTakeover:
-    """Connects and goes, each time anew.
+    """Connects and disconnects, with a new connection each time."""
 
-    Args:
-        host: The broker's address.
-        port: Its MQTT port.
-        tls: How the connection is kept from others.
-        within_s: How long it may take [s].
-    """
-
-    def __init__(self, *, host: str, port: int, tls: ssl.SSLContext | None, within_s: float = WITHIN_S) -> None:
+    def __init__(self, *, host: str, port: int, tls: ssl.SSLContext | None) -> None:
         self._host = host
         self._port = port
         self._tls = tls
-        self._within_s = within_s
 
     async def __call__(self, client_id: str, credentials: Credentials) -> None:
         """Take over a client id's session and end it.
@@ -46,7 +38,7 @@ class SessionTakeover:
             reconnect_on_failure=False,
         )
         client.username_pw_set(*credentials)
-        client.connect_timeout = self._within_s
+        client.connect_timeout = WITHIN_S
         if self._tls is not None:
             client.tls_set_context(self._tls)
 
@@ -63,12 +55,12 @@ class SessionTakeover:
         client.on_connect, client.on_disconnect = connected, disconnected
         where = f"the broker at {self._host}:{self._port}"
         try:
-            async with asyncio.timeout(self._within_s):
+            async with asyncio.timeout(WITHIN_S):
                 await asyncio.to_thread(client.connect, self._host, self._port, _KEEP_ALIVE_S)
                 client.loop_start()
                 trouble = await answered
         except TimeoutError as error:
-            raise BrokerAccessError(f"{where} did not answer in {self._within_s:.0f} s") from error
+            raise BrokerAccessError(f"{where} did not answer in {WITHIN_S:.0f} s") from error
         except OSError as error:
             raise BrokerAccessError(f"{where} cannot be reached: {error}") from error
         finally:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from function_app.adapters.azure.client import ATTEMPTS, Client, Place, Refused, credential, transport
 from function_app.adapters.shared.key_ring_keys import wall_ms
-from function_app.adapters.shared.vault_keys import AGAIN_MS, LOOK_EVERY_MS, Secret, VaultKeys
+from function_app.adapters.shared.vault_keys import Secret, VaultKeys
 
 if TYPE_CHECKING:
     from azure.keyvault.secrets import SecretClient
@@ -16,27 +16,11 @@ _TYPE = "application/json"
 
 
 class KeyVaultKeys(VaultKeys):
-    """``Keys`` in one secret.
+    """``SigningKeys`` in one secret of the vault at ``place``."""
 
-    Args:
-        secret: Its name.
-        place: The vault's address, and the identity to show there.
-        now_ms: The wall clock, by which overlaps end.
-        look_every_ms: How long what was read is good [ms].
-        again_ms: Least time between two looks [ms].
-    """
-
-    def __init__(
-        self,
-        *,
-        secret: str,
-        place: Place,
-        now_ms: Callable[[], int] = wall_ms,
-        look_every_ms: int = LOOK_EVERY_MS,
-        again_ms: int = AGAIN_MS,
-    ) -> None:
+    def __init__(self, *, secret: str, place: Place, now_ms: Callable[[], int] = wall_ms) -> None:
         what = f"the secret '{secret}'"
-        super().__init__(what=what, now_ms=now_ms, look_every_ms=look_every_ms, again_ms=again_ms)
+        super().__init__(what=what, now_ms=now_ms)
         self._secret = secret
 
         def open_(things: contextlib.ExitStack) -> "SecretClient":
@@ -62,7 +46,6 @@ class KeyVaultKeys(VaultKeys):
         )
 
     async def close(self) -> None:
-        """See ``Keys``."""
         await self._client.close()
 
     async def _fetch(self) -> Secret | None:
@@ -71,14 +54,11 @@ class KeyVaultKeys(VaultKeys):
         except Refused as error:
             if error.status == _MISSING:
                 return None
-            raise self._client.unusable(error) from error
+            raise
         return Secret(found.value or "", found.properties.version or "")
 
     async def _create(self, text: str) -> None:
         await self._put(text)
 
     async def _put(self, text: str) -> None:
-        try:
-            await self._client.call(lambda sdk: sdk.set_secret(self._secret, text, content_type=_TYPE))
-        except Refused as error:
-            raise self._client.unusable(error) from error
+        await self._client.call(lambda sdk: sdk.set_secret(self._secret, text, content_type=_TYPE))

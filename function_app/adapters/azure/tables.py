@@ -15,6 +15,7 @@ import itertools
 import re
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from function_app.adapters.azure import names
@@ -58,7 +59,6 @@ class AzureTables:
         )
 
     async def get(self, table: str, partition: str, key: str) -> Row | None:
-        """See ``Tables``."""
         place = _place(partition, key)
         if not partition or not key:
             return None
@@ -66,13 +66,11 @@ class AzureTables:
         return None if found is None else _row(partition, found)
 
     async def create(self, table: str, row: Row) -> Row:
-        """See ``Tables``."""
         row_codec.check(row)
         entity = _entity(row, row_codec.encode(row.data))
         return await self._put(table, row, entity, lambda to: to.create_entity(entity, retry_on_methods=_ALWAYS))
 
     async def replace(self, table: str, row: Row) -> Row:
-        """See ``Tables``."""
         row_codec.check(row)
         _check_etag(table, row)
         entity = _entity(row, row_codec.encode(row.data))
@@ -81,7 +79,6 @@ class AzureTables:
         )
 
     async def delete(self, table: str, row: Row) -> None:
-        """See ``Tables``."""
         # As a transaction: for a plain delete of what is not there the SDK says nothing.
         await self.batch(table, [Write("delete", row)])
 
@@ -95,7 +92,6 @@ class AzureTables:
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page:
-        """See ``Tables``."""
         row_codec.check_limit(limit)
         start = first if cursor is None else max(first, row_codec.read_cursor(cursor))
         condition, parameters = _range(partition, start, last)
@@ -116,12 +112,11 @@ class AzureTables:
             found = await self._client.call(read)
         except Refused as error:
             if error.status != _GONE:
-                raise self._client.unusable(error) from error
+                raise
             found = []
         return Page(tuple(found[:limit]), row_codec.write_cursor(found[limit].key) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
-        """See ``Tables``."""
         entities = [
             _place(write.row.partition, write.row.key) if write.kind == "delete" else _entity(write.row, text)
             for write, text in zip(writes, row_codec.check_batch(writes), strict=True)
@@ -144,12 +139,11 @@ class AzureTables:
                 raise
             etags = known
         return tuple(
-            write.row if write.kind == "delete" else _with_etag(write.row, etag)
+            write.row if write.kind == "delete" else replace(write.row, etag=etag)
             for write, etag in zip(writes, etags, strict=True)
         )
 
     async def close(self) -> None:
-        """See ``Tables``."""
         await self._client.close()
 
     async def _put(
@@ -169,7 +163,7 @@ class AzureTables:
             if known is None:
                 raise
             (etag,) = known
-        return _with_etag(row, etag)
+        return replace(row, etag=etag)
 
     async def _write(self, table: str, write: "Callable[[TableClient], T]", *, makes: bool = True) -> T:
         """Do it, and with ``makes`` (all it does is create) make the table for it where there is none."""
@@ -177,17 +171,11 @@ class AzureTables:
             return await self._client.call(lambda service: write(service.table(self._prefix + table)))
         except Refused as error:
             if error.status == _GONE and makes:
-                await self._make(table)
+                await self._client.call(lambda service: service.make(self._prefix + table))
                 return await self._write(table, write, makes=False)
             if error.status in {_GONE, _CHANGED} or (error.status == _TAKEN and error.code in _EXISTS):
                 raise Conflict(f"{table}: a row is not as the writer believed ({error.code})") from error
-            raise self._client.unusable(error) from error
-
-    async def _make(self, table: str) -> None:
-        try:
-            await self._client.call(lambda service: service.make(self._prefix + table))
-        except Refused as error:
-            raise self._client.unusable(error) from error
+            raise
 
     async def _read(self, table: str, place: dict[str, str]) -> Mapping[str, Any] | None:
         try:
@@ -197,7 +185,7 @@ class AzureTables:
         except Refused as error:
             if error.status == _GONE:
                 return None
-            raise self._client.unusable(error) from error
+            raise
 
     async def _known(self, table: str, entities: Sequence[dict[str, str]]) -> list[str] | None:
         """ETags of what is there when it is these very writes; ``None`` when another's are there, or one to delete is.
@@ -287,10 +275,6 @@ def _key(entity: Mapping[str, Any]) -> str:
 
 def _etag(entity: Any) -> str:
     return str(entity.metadata["etag"])
-
-
-def _with_etag(row: Row, etag: str) -> Row:
-    return Row(row.partition, row.key, row.data, etag)
 
 
 def _check_etag(table: str, row: Row) -> None:

@@ -25,13 +25,9 @@ WITHIN_S = 4.0
 
 
 class EntraCallers:
-    """Knows one caller. Fetches Entra's keys at the first token.
+    """Knows one caller, by the object id of its ``identity``. Fetches Entra's keys at the first token.
 
-    Args:
-        tenant: Id of the Entra tenant.
-        audience: The application's id URI, ``api://<client id>``, or its client id.
-        identity: Object (principal) id of the namespace's managed identity.
-        authority: Where Entra is.
+    ``audience`` is the application's id URI, ``api://<client id>``, or its client id.
     """
 
     def __init__(self, *, tenant: str, audience: str, identity: str, authority: str = AUTHORITY) -> None:

@@ -14,11 +14,12 @@ from urllib.parse import quote, unquote
 import jwt
 
 from function_app.ports.blobs import (
-    MAX_BYTES,
     MAX_NAME_LENGTH,
     Download,
     TransferRefused,
     Upload,
+    check_name,
+    check_size,
     check_upload,
 )
 from function_app.ports.tables import StoreError
@@ -48,29 +49,23 @@ class FileBlobs:
         self._url = url
 
     async def put(self, name: str, content: bytes) -> None:
-        """See ``Blobs``."""
-        _check(content)
+        check_size(len(content))
         await asyncio.to_thread(self._put, self._path(name), content)
 
     async def get(self, name: str) -> bytes | None:
-        """See ``Blobs``."""
         return await asyncio.to_thread(self._get, self._path(name))
 
     async def append(self, name: str, content: bytes) -> None:
-        """See ``Blobs``."""
-        _check(content)
+        check_size(len(content))
         await asyncio.to_thread(self._append, self._path(name), content)
 
     async def delete(self, name: str) -> None:
-        """See ``Blobs``."""
         await asyncio.to_thread(self._delete, self._path(name))
 
     async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
-        """See ``Blobs``."""
         return await asyncio.to_thread(self._list, prefix, limit)
 
     async def size(self, name: str) -> int | None:
-        """See ``Blobs``."""
         path = self._path(name)
         try:
             return (await asyncio.to_thread(path.stat)).st_size
@@ -88,12 +83,10 @@ class FileBlobs:
         return Upload("PUT", self._address(claims, lifetime_s), headers)
 
     async def presign_download(self, name: str, *, content_type: str, lifetime_s: int) -> str:
-        """See ``Blobs``."""
         self._path(name)
         return self._address({"aud": _DOWNLOAD, "sub": name, "type": content_type}, lifetime_s)
 
     async def receive(self, token: str, headers: Mapping[str, str], content: AsyncIterator[bytes]) -> None:
-        """See ``Transfers``."""
         claims = self._claims(token, _UPLOAD)
         length = claims["length"]
         if headers.get("content-length", str(length)) != str(length):
@@ -117,7 +110,6 @@ class FileBlobs:
                 await asyncio.to_thread(temporary.unlink)
 
     async def send(self, token: str) -> Download:
-        """See ``Transfers``."""
         claims = self._claims(token, _DOWNLOAD)
         path = self._path(claims["sub"])
         try:
@@ -178,8 +170,7 @@ class FileBlobs:
         """See ``Blobs``."""
 
     def _path(self, name: str) -> Path:
-        if not 1 <= len(name) <= MAX_NAME_LENGTH:
-            raise ValueError(f"a blob's name has 1 to {MAX_NAME_LENGTH} characters, not {len(name)}")
+        check_name(name)
         encoded = _encode(name)
         parts = [encoded[start : start + _PART] for start in range(0, len(encoded), _PART)]
         return self._folder.joinpath(*(f"{part}+" for part in parts[:-1]), parts[-1] + _TAIL)
@@ -190,8 +181,7 @@ class FileBlobs:
             path.parent.mkdir(parents=True, exist_ok=True)
             with temporary.open("xb") as file:
                 file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
+                _flush(file)
             temporary.replace(path)
         except OSError as error:
             with contextlib.suppress(OSError):
@@ -213,7 +203,7 @@ class FileBlobs:
             path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(path, os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600)
             try:
-                _check_size(os.fstat(descriptor).st_size + len(content))
+                check_size(os.fstat(descriptor).st_size + len(content))
                 written = 0
                 while written < len(content):
                     written += os.write(descriptor, content[written:])
@@ -258,10 +248,7 @@ def _there_already() -> TransferRefused:
 
 def _encode(name: str) -> str:
     """A name in characters that every file system takes: readable where it stays short enough."""
-    try:
-        text = name.encode()
-    except UnicodeEncodeError as error:
-        raise ValueError("a blob's name is Unicode text without lone surrogates") from error
+    text = name.encode()
     readable = quote(text, safe="").replace(".", "%2E").replace(_COMPACT, "%7E")
     if len(readable) <= _READABLE:
         return readable
@@ -273,15 +260,6 @@ def _decode(encoded: str) -> str:
         return unquote(encoded)
     compact = encoded.removeprefix(_COMPACT)
     return base64.urlsafe_b64decode(compact + "=" * (-len(compact) % 4)).decode()
-
-
-def _check(content: bytes) -> None:
-    _check_size(len(content))
-
-
-def _check_size(size: int) -> None:
-    if size > MAX_BYTES:
-        raise ValueError(f"a blob holds at most {MAX_BYTES} bytes, not {size}")
 
 
 def _unusable(path: Path, error: OSError) -> StoreError:

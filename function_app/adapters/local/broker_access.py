@@ -21,7 +21,7 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.security import grants, revocation
 from device_agent.protocol.security.grants import Grant
 from device_agent.protocol.security.revocation import Control, Revoke
-from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials
+from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials, check_revocation
 
 Publish = Callable[[str, bytes], Awaitable[None]]
 """Publishes as a service at QoS 1 and returns once the broker has acknowledged; raises when it has not."""
@@ -40,19 +40,10 @@ def _service_client_id() -> str:
 class TokenBrokerAccess:
     """Rights for the embedded broker: the grant itself, signed. The broker needs the public key alone."""
 
-    def __init__(
-        self, *, signer: Callable[[], Ed25519PrivateKey], publish: Publish, service_token_s: float = _SERVICE_TOKEN_S
-    ) -> None:
-        """Prepare.
-
-        Args:
-            signer: The key to sign with now; its public half is in the broker's file of keys.
-            publish: Brings a revocation to the broker.
-            service_token_s: How long the functions' own credentials run [s].
-        """
+    def __init__(self, *, signer: Callable[[], Ed25519PrivateKey], publish: Publish) -> None:
+        """``signer`` returns the current key, which the broker knows; ``publish`` sends revocations."""
         self._signer = signer
         self._publish = publish
-        self._service_token_s = service_token_s
 
     async def issue(self, grant: Grant) -> Credentials:
         """As the port says; no broker is asked."""
@@ -65,7 +56,7 @@ class TokenBrokerAccess:
 
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
         """As the port says; tokens made until now are refused, by the clock that stamps them."""
-        _exactly_one(client_id, principal)
+        check_revocation(client_id, principal)
         message = Control(revoke=Revoke(client_id=client_id, principal=principal, before_s=time.time()))
         try:
             await self._publish(revocation.TOPIC, codec.encode(message))
@@ -76,11 +67,8 @@ class TokenBrokerAccess:
         """Nothing: the broker ends connections with their tokens."""
 
     def service_credentials(self) -> ServiceCredentials:
-        """As the port says."""
         client_id = _service_client_id()
-        grant = grants.service_grant(
-            client_id=client_id, token_id=secrets.token_hex(16), lifetime_s=self._service_token_s
-        )
+        grant = grants.service_grant(client_id=client_id, token_id=secrets.token_hex(16), lifetime_s=_SERVICE_TOKEN_S)
         return ServiceCredentials(
             client_id, grant.principal, grants.issue(grant, self._signer()), float(grant.expires_at)
         )
@@ -122,28 +110,11 @@ class MosquittoBrokerAccess:
     """
 
     def __init__(
-        self,
-        *,
-        host: str,
-        port: int,
-        username: str,
-        password_file: Path,
-        answer_s: float = _ANSWER_S,
-        tls: ssl.SSLContext | None = None,
+        self, *, host: str, port: int, username: str, password_file: Path, tls: ssl.SSLContext | None = None
     ) -> None:
-        """Prepare.
-
-        Args:
-            host: The broker's address.
-            port: Its MQTT port.
-            username: The client that the broker's configuration made for the functions.
-            password_file: Where its password is.
-            answer_s: How long the broker may take to answer [s].
-            tls: How the connection is kept from others; ``None``: not at all.
-        """
+        """``username`` is the client that the broker's configuration made for the functions."""
         self._username = username
         self._password_file = password_file
-        self._answer_s = answer_s
         self._line = _ControlLine(host, port, tls)
 
     async def issue(self, grant: Grant) -> Credentials:
@@ -173,7 +144,7 @@ class MosquittoBrokerAccess:
 
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
         """As the port says; deleting a client cuts its connection."""
-        _exactly_one(client_id, principal)
+        check_revocation(client_id, principal)
         entries = await self._entries()
         await self._delete(
             [
@@ -184,7 +155,6 @@ class MosquittoBrokerAccess:
         )
 
     async def expire(self, now_s: float) -> None:
-        """As the port says."""
         await self._delete([entry.username for entry in await self._entries() if entry.expires_at <= now_s])
 
     def service_credentials(self) -> ServiceCredentials:
@@ -199,7 +169,6 @@ class MosquittoBrokerAccess:
         return ServiceCredentials(_service_client_id(), self._username, password, math.inf)
 
     async def close(self) -> None:
-        """As the port says."""
         await self._line.close()
 
     async def _entries(self) -> list[_Entry]:
@@ -228,7 +197,7 @@ class MosquittoBrokerAccess:
                     raise BrokerAccessError(f"mosquitto refused to {answer.command}: {answer.error}")
 
     async def _ask(self, commands: Sequence[Mapping[str, Any]]) -> list[_Answer]:
-        return await self._line.ask(self.service_credentials, commands, self._answer_s)
+        return await self._line.ask(self.service_credentials, commands)
 
 
 class _ControlLine:
@@ -243,28 +212,30 @@ class _ControlLine:
         self._waiting: dict[str, asyncio.Future[_Answers]] = {}
 
     async def ask(
-        self, service: Callable[[], ServiceCredentials], commands: Sequence[Mapping[str, Any]], answer_s: float
+        self, service: Callable[[], ServiceCredentials], commands: Sequence[Mapping[str, Any]]
     ) -> list[_Answer]:
         """The answers to some commands, in their order.
 
         Raises:
-            BrokerAccessError: No connection, or no answer within ``answer_s`` [s]; what was asked may have been done.
+            BrokerAccessError: No connection, or no answer in time; the commands may have been executed.
         """
         loop = asyncio.get_running_loop()
         question = secrets.token_hex(8)
         payload = msgspec.json.encode({"commands": [{**each, "correlationData": question} for each in commands]})
         try:
-            async with asyncio.timeout(answer_s):
+            async with asyncio.timeout(_ANSWER_S):
                 async with self._opening:
                     if self._client is None or not self._client.is_connected():
-                        await self._open(service(), answer_s)
+                        await self._open(service())
                 self._waiting[question] = loop.create_future()
                 if self._client is not None:
                     self._client.publish(_SECURITY, payload, qos=1)
                 answers = (await self._waiting[question]).responses
         except TimeoutError as error:
             await self.close()
-            raise BrokerAccessError(f"mosquitto at {self._host}:{self._port} did not answer in {answer_s} s") from error
+            raise BrokerAccessError(
+                f"mosquitto at {self._host}:{self._port} did not answer in {_ANSWER_S} s"
+            ) from error
         finally:
             self._waiting.pop(question, None)
         if len(answers) != len(commands):
@@ -278,20 +249,17 @@ class _ControlLine:
             client.disconnect()
             await asyncio.to_thread(client.loop_stop)
 
-    async def _open(self, service: ServiceCredentials, answer_s: float) -> None:
+    async def _open(self, service: ServiceCredentials) -> None:
         await self.close()
         loop = asyncio.get_running_loop()
         ready: asyncio.Future[None] = loop.create_future()
         client = paho.Client(
-            CallbackAPIVersion.VERSION2,
-            client_id=service.client_id,
-            protocol=paho.MQTTv5,
-            reconnect_on_failure=False,
+            CallbackAPIVersion.VERSION2, client_id=service.client_id, protocol=paho.MQTTv5, reconnect_on_failure=False
         )
         client.username_pw_set(service.username, service.password)
         if self._tls is not None:
             client.tls_set_context(self._tls)
-        client.connect_timeout = answer_s
+        client.connect_timeout = _ANSWER_S
 
         def connected(_: Any, __: Any, ___: Any, reason: ReasonCode, ____: Any) -> None:
             if reason.is_failure:
@@ -332,11 +300,6 @@ class _ControlLine:
         _fail(ready, why)
         for future in self._waiting.values():
             _fail(future, why)
-
-
-def _exactly_one(client_id: str | None, principal: str | None) -> None:
-    if (client_id is None) == (principal is None):
-        raise ValueError("revoke takes exactly one of client_id and principal")
 
 
 def _acls(grant: Grant) -> list[dict[str, Any]]:

@@ -52,14 +52,12 @@ class FileCertificates:
         self._folder = folder
 
     async def issue(self, agent: str, request: str) -> Issued:
-        """See ``Certificates``."""
         return await asyncio.to_thread(self._issue, agent, request)
 
     async def place(self, agent: str, space: str) -> None:
         """Nothing: at mosquitto credentials say which space."""
 
     async def revoke(self, agent: str) -> None:
-        """See ``Certificates``."""
         await asyncio.to_thread(self._revoke, agent)
 
     async def close(self) -> None:

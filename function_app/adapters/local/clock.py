@@ -7,5 +7,4 @@ class SystemClock:
     """``Clock`` of the operating system."""
 
     def now_ms(self) -> int:
-        """See ``Clock``."""
         return time.time_ns() // 1_000_000

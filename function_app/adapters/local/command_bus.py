@@ -25,16 +25,13 @@ class MqttCommandBus:
         self._waiting: dict[str, dict[str, set[asyncio.Queue[Ack]]]] = {}
 
     async def start(self) -> None:
-        """See ``CommandBus``."""
         await self._connection.ready(_READY_S)
 
     async def publish(self, topic: str, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
-        """See ``CommandBus``."""
         await self._connection.publish(topic, payload, qos, retain=retain)
 
     @contextlib.asynccontextmanager
     async def acks(self, device_topic: str, command: str) -> AsyncGenerator[AsyncIterator[Ack] | None]:
-        """See ``CommandBus``."""
         if not await self._connection.ready(_READY_S):
             yield None
             return
@@ -53,12 +50,10 @@ class MqttCommandBus:
                 del self._waiting[topic]
 
     async def status(self) -> str:
-        """See ``CommandBus``."""
         await self._connection.attempted(_READY_S)
         return self._connection.trouble or "ok"
 
     async def close(self) -> None:
-        """See ``CommandBus``."""
         await self._connection.close()
 
     def _dispatch(self, message: MQTTMessage) -> None:

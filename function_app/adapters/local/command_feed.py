@@ -18,7 +18,7 @@ LIFETIME_S = 24 * 3600.0
 
 
 class MqttCommandFeed:
-    """``Orders`` over MQTT, by a connection with rights of its own."""
+    """``CommandFeed`` over MQTT, by a connection with rights of its own."""
 
     def __init__(self, *, host: str, port: int, access: BrokerAccess, tls: ssl.SSLContext | None = None) -> None:
         self._hear: OnMessage | None = None
@@ -29,11 +29,9 @@ class MqttCommandFeed:
 
     @property
     def up(self) -> bool:
-        """See ``Orders``."""
         return not self._connection.trouble
 
     async def run(self, hear: OnMessage) -> None:
-        """See ``Orders``."""
         self._hear = hear
         self._connection.start()
         try:
@@ -42,7 +40,6 @@ class MqttCommandFeed:
             await self._connection.close()
 
     async def add(self, space: str, agent: str, listen: Sequence[str] = ()) -> None:
-        """See ``Orders``."""
         self.drop(space, agent)
         wanted = (*_patterns(space, agent), *listen)
         fresh = [pattern for pattern in dict.fromkeys(wanted) if not self._heard(pattern)]
@@ -50,7 +47,6 @@ class MqttCommandFeed:
         await self._connection.subscribe(fresh)
 
     def drop(self, space: str, agent: str) -> None:
-        """See ``Orders``."""
         gone = self._wanted.pop((space, agent), ())
         self._connection.unsubscribe([pattern for pattern in gone if not self._heard(pattern)])
 

@@ -80,7 +80,6 @@ class MqttDeviceFeed:
         )
 
     async def run(self, handler: Handler) -> None:
-        """See ``DeviceFeed``."""
         self._connection.start()
         loop = asyncio.get_running_loop()
         pauses_s = [FIRST_PAUSE_S * 2**number for number in range(TRIES)]
@@ -129,7 +128,6 @@ class MqttTelemetryFeed:
         )
 
     async def run(self, handler: BatchHandler) -> None:
-        """See ``TelemetryFeed``."""
         self._connection.start()
         try:
             while True:

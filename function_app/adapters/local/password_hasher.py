@@ -19,7 +19,7 @@ AT_ONCE: Final = 4
 
 
 class Argon2Hashes:
-    """``PasswordHashes`` by argon2-cffi, whose work is done in threads, without Python's lock."""
+    """``PasswordHasher`` by argon2-cffi, whose work is done in threads, without Python's lock."""
 
     def __init__(self) -> None:
         self._made: PasswordHasher | None = None
@@ -27,12 +27,10 @@ class Argon2Hashes:
         self._gate = asyncio.Semaphore(AT_ONCE)
 
     async def make(self, password: str) -> str:
-        """See ``PasswordHashes``."""
         async with self._gate:
             return await asyncio.to_thread(self._hasher().hash, password)
 
     async def check(self, stored: str | None, password: str) -> bool:
-        """See ``PasswordHashes``."""
         from argon2.exceptions import InvalidHashError, VerificationError  # noqa: PLC0415 (only where it is in use)
 
         if not self._dummy_hash:
@@ -45,7 +43,6 @@ class Argon2Hashes:
         return right and bool(stored)
 
     def outdated(self, stored: str) -> bool:
-        """See ``PasswordHashes``."""
         return self._hasher().check_needs_rehash(stored)
 
     def _hasher(self) -> "PasswordHasher":

@@ -18,7 +18,7 @@ _SUFFIXES = frozenset({".toml", ".xml", ".stl", ".obj", ".png", ".md", ".py"})
 
 
 class FolderCatalogue:
-    """``Catalogue`` of ``folder``: one robot type in each folder that has a manifest."""
+    """``RobotCatalogue`` of ``folder``: one robot type in each folder that has a manifest."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -27,7 +27,6 @@ class FolderCatalogue:
         self._movements: dict[str, dict[str, BuiltInMovement]] = {}
 
     async def types(self) -> Mapping[str, RobotType]:
-        """See ``Catalogue``."""
         if self._types is None:
             try:
                 folders = sorted(path.parent for path in self._folder.glob(f"*/{manifest.MANIFEST}"))
@@ -37,7 +36,6 @@ class FolderCatalogue:
         return self._types
 
     async def files(self, robot_type: str) -> Mapping[str, bytes]:
-        """See ``Catalogue``."""
         if robot_type not in await self.types():
             return {}
         if robot_type not in self._files:
@@ -50,7 +48,6 @@ class FolderCatalogue:
         return self._files[robot_type]
 
     async def movements(self, robot_type: str) -> Mapping[str, BuiltInMovement]:
-        """See ``Catalogue``."""
         known = (await self.types()).get(robot_type)
         if known is None:
             return {}
@@ -60,7 +57,6 @@ class FolderCatalogue:
         return self._movements[robot_type]
 
     async def drawing(self, robot_type: str) -> bytes | None:
-        """See ``Catalogue``."""
         if robot_type not in await self.types():
             return None
         try:

@@ -33,12 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 class FileKeys(RingKeys):
-    """``Keys`` in ``folder``; made at first use.
-
-    Args:
-        folder: Of the keys alone.
-        now_ms: The wall clock, by which overlaps end.
-    """
+    """``SigningKeys`` in ``folder``, which contains nothing else; made at first use."""
 
     def __init__(self, folder: Path, *, now_ms: Callable[[], int] = wall_ms) -> None:
         super().__init__(now_ms=now_ms)

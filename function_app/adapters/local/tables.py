@@ -42,20 +42,16 @@ class SqliteTables:
         self._db: sqlite3.Connection | None = None
 
     async def get(self, table: str, partition: str, key: str) -> Row | None:
-        """See ``Tables``."""
         found = self._run(_GET, (table, partition, key)).fetchone()
         return None if found is None else Row(partition, key, row_codec.decode(found[1]), found[0])
 
     async def create(self, table: str, row: Row) -> Row:
-        """See ``Tables``."""
         return self._write_one(table, Write("create", row))
 
     async def replace(self, table: str, row: Row) -> Row:
-        """See ``Tables``."""
         return self._write_one(table, Write("replace", row))
 
     async def delete(self, table: str, row: Row) -> None:
-        """See ``Tables``."""
         self._write_one(table, Write("delete", row))
 
     async def query(
@@ -68,7 +64,6 @@ class SqliteTables:
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page:
-        """See ``Tables``."""
         row_codec.check_limit(limit)
         start = first if cursor is None else max(first, row_codec.read_cursor(cursor))
         if last is None:
@@ -79,7 +74,6 @@ class SqliteTables:
         return Page(page, row_codec.write_cursor(found[limit][0]) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
-        """See ``Tables``."""
         texts = row_codec.check_batch(writes)
         self._run("BEGIN IMMEDIATE")
         try:
@@ -91,7 +85,6 @@ class SqliteTables:
         return written
 
     async def close(self) -> None:
-        """See ``Tables``."""
         if self._db is not None:
             self._db.close()
             self._db = None

@@ -41,14 +41,12 @@ class MujocoCompiler:
         self._wall_s = wall_s
 
     def require(self) -> None:
-        """See ``ModelCompiler``."""
         if importlib.util.find_spec("mujoco") is None:
             raise CompilerMissingError(_MISSING)
 
     async def check(
         self, robot_type: RobotType, files: Mapping[str, bytes], missing: Sequence[str] = ()
     ) -> ModelReport:
-        """See ``ModelCompiler``."""
         self.require()
         folder = await asyncio.to_thread(_write, files)
         try:

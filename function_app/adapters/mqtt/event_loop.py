@@ -30,14 +30,10 @@ def prepare(client: mqtt.Client) -> None:
 
 
 def listen(client: mqtt.Client, *, every_s: float = 0.0) -> None:
-    """Read received packets, once connected.
-
-    Args:
-        client: It.
-        every_s: Read at most so often, all that has come meanwhile [s]; 0: each message when it comes.
+    """Read the packets of a connected client: each at once, or with ``every_s`` [s] in rounds.
 
     Raises:
-        BusUnavailable: It is connected no longer.
+        BusUnavailable: The client is not connected any more.
     """
     sock = client.socket()
     if sock is None:
@@ -49,13 +45,7 @@ def listen(client: mqtt.Client, *, every_s: float = 0.0) -> None:
 
 
 class _Unhurried:
-    """Reads periodically. Waking for each message would take processor time from commands and responses.
-
-    Args:
-        client: Connected.
-        sock: Its socket now.
-        every_s: Between two rounds [s].
-    """
+    """Reads periodically. Waking for each message would take processor time from commands and responses."""
 
     def __init__(self, client: mqtt.Client, sock: Any, every_s: float) -> None:
         self._client = client

@@ -40,14 +40,7 @@ _ADDRESSES: Final = ("authorization_endpoint", "token_endpoint", "jwks_uri")
 
 
 class HttpOidcProvider:
-    """``OpenId``.
-
-    Args:
-        issuer: As the provider writes it; its document is below it.
-        client_id: Ours, there.
-        client_secret: Ours, there; empty: we are a public client.
-        clock: Judges what has expired.
-    """
+    """``OidcProvider`` of one issuer, whose document is below its URL. Without a secret this is a public client."""
 
     def __init__(self, *, issuer: str, client_id: str, client_secret: str, clock: Clock) -> None:
         self._issuer = issuer
@@ -60,7 +53,6 @@ class HttpOidcProvider:
         self._keys_ms = -KEPT_MS
 
     async def address(self, *, state: str, nonce: str, challenge: str, redirect: str) -> str:
-        """See ``OpenId``."""
         place = str((await self._provider())["authorization_endpoint"])
         asked = {
             "response_type": "code",
@@ -75,7 +67,6 @@ class HttpOidcProvider:
         return f"{place}{'&' if urlsplit(place).query else '?'}{urlencode(asked)}"
 
     async def redeem(self, *, code: str, verifier: str, nonce: str, redirect: str, issuer: str | None) -> Subject:
-        """See ``OpenId``."""
         provider = await self._provider()
         says_issuer = provider.get("authorization_response_iss_parameter_supported") is True
         if issuer != self._issuer and (issuer is not None or says_issuer):

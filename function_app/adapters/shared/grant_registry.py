@@ -15,7 +15,7 @@ import msgspec
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import grants
 from device_agent.protocol.security.grants import Grant
-from function_app.ports.broker_access import BrokerAccessError, Credentials
+from function_app.ports.broker_access import BrokerAccessError, Credentials, check_revocation
 from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import Conflict, Row, StoreError, Tables
 
@@ -49,12 +49,7 @@ class _Issued(msgspec.Struct, frozen=True):
 
 
 class GrantRegistry:
-    """What was given and taken, in the tables.
-
-    Args:
-        keys: Sign, and check.
-        tables: Remember.
-    """
+    """Issued and revoked grants, in the tables."""
 
     def __init__(self, *, keys: SigningKeys, tables: Tables) -> None:
         self._keys = keys
@@ -92,8 +87,7 @@ class GrantRegistry:
             ValueError: Not exactly one of the two was given.
             BrokerAccessError: It could not be written down: the rights may still stand.
         """
-        if (client_id is None) == (principal is None):
-            raise ValueError("revoke takes exactly one of client_id and principal")
+        check_revocation(client_id, principal)
         who = f"client:{client_id}" if principal is None else f"principal:{principal}"
         try:
             await self._write(_REVOKED, who, msgspec.to_builtins(_Revoked(time.time())))

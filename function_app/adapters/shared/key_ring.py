@@ -134,11 +134,7 @@ class Ring(Struct, frozen=True):
         statement = signing.sign(codec.encode(new), private(before), context=keys.KEYS_CONTEXT).decode()
         former = tuple(replace(each, until_ms=_sooner(each.until_ms, ends_ms)) for each in self.keys)
         added = RingKey(
-            serial=new.serial,
-            public=new.key,
-            private=pem(key),
-            devices_from_ms=now_ms + learn_ms,
-            statement=statement,
+            serial=new.serial, public=new.key, private=pem(key), devices_from_ms=now_ms + learn_ms, statement=statement
         )
         return Ring((*former, added)[-MAX_KEYS:]).pruned(now_ms)
 

@@ -1,4 +1,4 @@
-"""``Keys`` of a ring, wherever it is stored: what all adapters have in common."""
+"""``SigningKeys`` of a ring, wherever it is stored: what all adapters have in common."""
 
 import time
 from abc import ABC, abstractmethod
@@ -18,43 +18,33 @@ def wall_ms() -> int:
 
 
 class RingKeys(ABC):
-    """``Keys`` of a ring.
-
-    Args:
-        now_ms: The wall clock, by which overlaps end.
-    """
+    """``SigningKeys`` of a ring. Overlaps end by the wall clock ``now_ms``."""
 
     def __init__(self, *, now_ms: Callable[[], int] = wall_ms) -> None:
         self._now_ms = now_ms
         self._privates: dict[str, Ed25519PrivateKey] = {}
 
     async def current(self) -> Ed25519PrivateKey:
-        """See ``Keys``."""
         return self._private((await self._ring()).newest)
 
     async def for_devices(self) -> Ed25519PrivateKey:
-        """See ``Keys``."""
         return self._private((await self._ring()).for_devices(self._now_ms()))
 
     async def public(self, wanted: str = "") -> Mapping[str, Ed25519PublicKey]:
-        """See ``Keys``."""
         found = key_ring.public((await self._ring()).live(self._now_ms()))
         if wanted and wanted not in found:
             found = key_ring.public((await self._ring(fresh=True)).live(self._now_ms()))
         return found
 
     async def archive(self) -> Mapping[str, Ed25519PublicKey]:
-        """See ``Keys``."""
         return key_ring.public(tuple(key for key in (await self._ring()).keys if not key.leaked))
 
     async def news(self) -> KeyAnnouncement:
-        """See ``Keys``."""
         return self._told(await self._ring())
 
     async def rotate(
         self, *, learn_ms: int = LEARN_MS, overlap_ms: int = OVERLAP_MS, leaked: bool = False
     ) -> KeyAnnouncement:
-        """See ``Keys``."""
         new, now_ms = signing.generate(), self._now_ms()
 
         def change(ring: Ring) -> Ring:
@@ -65,7 +55,7 @@ class RingKeys(ABC):
         return self._told(await self._change(change))
 
     async def close(self) -> None:  # noqa: B027 (who has nothing open need not say so)
-        """See ``Keys``."""
+        """See ``SigningKeys``."""
 
     def signer(self) -> Ed25519PrivateKey:
         """``current``, for who cannot wait.

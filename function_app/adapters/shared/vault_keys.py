@@ -1,4 +1,4 @@
-"""``Keys`` of a ring that is one secret of a cloud's vault.
+"""``SigningKeys`` of a ring that is one secret of a cloud's vault.
 
 Why a secret and no key of the vault's own: Azure's Key Vault has no Ed25519 among its key types (P-256, P-256K, P-384,
 P-521, RSA). Amazon's KMS has it since 2025, but signs at most 4,096 bytes, where an order with a script has 64 KB, and
@@ -34,27 +34,11 @@ class Secret(NamedTuple):
 
 
 class VaultKeys(RingKeys):
-    """``Keys`` in a vault.
+    """``SigningKeys`` in a vault; errors name the secret as ``what``."""
 
-    Args:
-        what: The secret, for errors.
-        now_ms: The wall clock, by which overlaps end.
-        look_every_ms: How long what was read is good [ms].
-        again_ms: Least time between two looks [ms].
-    """
-
-    def __init__(
-        self,
-        *,
-        what: str,
-        now_ms: Callable[[], int] = wall_ms,
-        look_every_ms: int = LOOK_EVERY_MS,
-        again_ms: int = AGAIN_MS,
-    ) -> None:
+    def __init__(self, *, what: str, now_ms: Callable[[], int] = wall_ms) -> None:
         super().__init__(now_ms=now_ms)
         self._what = what
-        self._look_every_ms = look_every_ms
-        self._again_ms = again_ms
         self._read: Ring | None = None
         self._read_ms = 0
         self._turn = asyncio.Lock()
@@ -92,7 +76,7 @@ class VaultKeys(RingKeys):
     async def _ring(self, *, fresh: bool = False) -> Ring:
         async with self._turn:
             age_ms = self._now_ms() - self._read_ms
-            if self._read is None or not 0 <= age_ms < (self._again_ms if fresh else self._look_every_ms):
+            if self._read is None or not 0 <= age_ms < (AGAIN_MS if fresh else LOOK_EVERY_MS):
                 await self._look()
             return self._known()
 

@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 class SlixmppConnection:
-    """``XmppLine`` to one server, each connection with a new password and a place (resource) of its own."""
+    """``XmppConnection`` to one server, each connection with a new password and a place (resource) of its own."""
 
     def __init__(self, *, host: str, port: int, domain: str, password: Callable[[], Awaitable[str]]) -> None:
         self._host = host
@@ -32,11 +32,9 @@ class SlixmppConnection:
 
     @property
     def domain(self) -> str:
-        """See ``XmppLine``."""
         return self._domain
 
     async def run(self, listener: Listener) -> None:
-        """See ``XmppLine``."""
         pause_s = FIRST_RETRY_S
         while True:
             try:
@@ -68,9 +66,7 @@ class SlixmppConnection:
         return stream
 
     def send(self, stanza: str) -> bool:
-        """See ``XmppLine``."""
         return self._stream is not None and self._stream.send(stanza)
 
     def congested(self) -> bool:
-        """See ``XmppLine``."""
         return self._stream is not None and self._stream.unsent_bytes > MOST_UNSENT_BYTES

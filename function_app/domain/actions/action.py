@@ -127,10 +127,7 @@ class AckReport:
 
 
 def apply_report(action: Action, report: AckReport) -> Action:
-    """The action after an ack; the same object if the ack changes nothing.
-
-    Idempotent and monotonic: duplicate, late and reordered acks never revert a step.
-    """
+    """The action after an ack. Duplicate, late and reordered acks never revert a step."""
     if action.status.terminal or action.status is Status.QUEUED:
         return action  # a queued action was never sent, so this ack is not genuine
     times = action.times if report.status.value in action.times else {**action.times, report.status.value: report.at_ms}
@@ -175,10 +172,7 @@ def end(action: Action, status: Status, code: str, message: str, now_ms: int) ->
     if action.status.terminal:
         return action
     return replace(
-        action,
-        status=status,
-        times={**action.times, status.value: now_ms},
-        reason={"code": code, "message": message},
+        action, status=status, times={**action.times, status.value: now_ms}, reason={"code": code, "message": message}
     )
 
 

@@ -70,11 +70,7 @@ class ActionQueue:
         return self.actions.index(action) + 1 if action in self.actions else None
 
     def with_last(self, action: str) -> "ActionQueue":
-        """The queue with ``action`` at the end.
-
-        Raises:
-            Problem: ``queue-full``.
-        """
+        """The queue with ``action`` at the end. Raises ``queue-full``."""
         if len(self.actions) >= MAX_QUEUED:
             detail = f"{MAX_QUEUED} actions wait for this device. Wait until one has ended, or cancel one."
             raise Problem("queue-full", 409, "The queue is full", detail)

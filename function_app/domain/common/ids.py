@@ -27,8 +27,7 @@ def new_id(length: int = 16) -> str:
 def agent_id(key_id: str) -> str:
     """The id of the agent that owns a key: the first 50 bits of the key's hash.
 
-    A key always has the same agent id, so a replayed enrolment changes nothing. The agent's row contains the whole key,
-    so a second key with the same 50 bits is rejected.
+    The agent's row contains the whole key, so a second key with the same 50 bits is rejected.
     """
     bits = int(key_id[:16], 16) >> 14
     return "".join(_BASE32[(bits >> shift) & 31] for shift in range(45, -5, -5))

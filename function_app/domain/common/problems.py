@@ -67,3 +67,8 @@ def broker_unavailable(detail: str) -> Problem:
 def store_unavailable(detail: str) -> Problem:
     """The tables are not available."""
     return Problem("store-unavailable", 503, "The store cannot be used", detail, retry_after_s=5)
+
+
+def invalid_cursor() -> Problem:
+    """A cursor that does not belong to the list."""
+    return invalid("The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid")

@@ -69,14 +69,7 @@ def timed_out(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
 
 
 def lease_changes(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
-    """The events that one write of the lease causes.
-
-    Args:
-        before: The lease before the write.
-        after: The lease after the write.
-        by: Name of the account that changed it.
-        now_ms: Current time.
-    """
+    """The events that one write of the lease causes; ``by`` is the name of the account that changed it."""
     if before is not None and (after.epoch != before.epoch or not after.account):
         yield from timed_out(before, now_ms)
     elif (

@@ -17,8 +17,7 @@ def request_control(
 ) -> Lease:
     """The lease with a request of ``caller``; unchanged if the caller's request is already open.
 
-    Raises:
-        Problem: ``lease-free``, ``lease-yours``, or ``lease-requested``: another request is open.
+    Raises ``lease-free``, ``lease-already-held``, or ``lease-requested``: another request is open.
     """
     if lease is None or not lease.is_live(now_ms):
         detail = "No session controls this device. Acquire the lease; no request is needed."
@@ -53,8 +52,7 @@ def request_control(
 def accept(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
     """The lease of the requester with the next epoch; unchanged if already accepted.
 
-    Raises:
-        Problem: ``request-unknown``, ``forbidden``, ``request-over``.
+    Raises ``request-unknown``, ``forbidden`` or ``control-request-closed``.
     """
     current, asked = _to_answer(lease, caller, request)
     if not _still(current, asked, "accepted", now_ms):
@@ -74,8 +72,7 @@ def accept(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) 
 def refuse(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
     """The lease with the request rejected; unchanged if already rejected.
 
-    Raises:
-        Problem: ``request-unknown``, ``forbidden``, ``request-over``.
+    Raises ``request-unknown``, ``forbidden`` or ``control-request-closed``.
     """
     current, asked = _to_answer(lease, caller, request)
     if not _still(current, asked, "rejected", now_ms):
@@ -86,8 +83,7 @@ def refuse(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) 
 def withdraw(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
     """The lease with the request withdrawn; unchanged if the request is over, unless it was accepted.
 
-    Raises:
-        Problem: ``request-unknown``, ``forbidden``, ``request-over``.
+    Raises ``request-unknown``, ``forbidden`` or ``control-request-closed``.
     """
     current, asked = find(lease, request)
     if not asked.requested_by(caller):
@@ -103,8 +99,7 @@ def withdraw(lease: Lease | None, caller: Identity, *, request: str, now_ms: int
 def find(lease: Lease | None, request: str) -> tuple[Lease, ControlRequest]:
     """The lease and the request with this id. The last request stays available after it is over.
 
-    Raises:
-        Problem: ``request-unknown``.
+    Raises ``request-unknown``.
     """
     if lease is None or lease.request is None or lease.request.id != request:
         raise not_found("request", request)

@@ -115,22 +115,11 @@ def acquire(
     action: str = "",
     over: str = "",
 ) -> Lease:
-    """A lease for ``caller`` with the next epoch.
+    """A lease for ``caller`` with the next epoch. Raises ``lease-held``: another session is the holder.
 
     The current holder also gets a new epoch. This way a holder acquires control again after the device ended the lease
-    (hold, Stop, restart), which the cloud may not know.
-
-    Args:
-        lease: Current lease.
-        caller: New holder.
-        lease_ms: Duration.
-        now_ms: Current time.
-        pairing: Pairing of the device's agent.
-        action: The only action that the lease is for; empty: any.
-        over: Reason for a takeover, which only owners may request; empty: no takeover.
-
-    Raises:
-        Problem: ``lease-held``: another session is the holder.
+    (hold, Stop, restart), which the cloud may not know. ``action`` is the only action that the lease is for; ``over``
+    the reason for a takeover, which only owners may request.
     """
     taken = lease is not None and lease.held_by_other(caller, now_ms)
     if lease is not None and taken and not over:
@@ -150,21 +139,13 @@ def acquire(
 
 
 def renew(lease: Lease | None, caller: Identity, *, epoch: int, lease_ms: int, now_ms: int) -> Lease:
-    """The same lease with a later expiry time.
-
-    Raises:
-        Problem: ``lease-lost``: it expired or has another holder.
-    """
+    """The same lease with a later expiry time. Raises ``lease-lost``: it expired or has another holder."""
     current = require_held(lease, caller, epoch=epoch, now_ms=now_ms)
     return replace(current, expires_ms=now_ms + lease_ms, lease_ms=lease_ms, action="")
 
 
 def require_held(lease: Lease | None, caller: Identity, *, epoch: int, now_ms: int) -> Lease:
-    """The lease, if ``caller`` holds this epoch now.
-
-    Raises:
-        Problem: ``lease-lost``.
-    """
+    """The lease, if ``caller`` holds this epoch now. Raises ``lease-lost``."""
     if lease is None or lease.epoch != epoch or not lease.held_by(caller) or not lease.is_live(now_ms):
         extras = {"epoch": epoch, "current_epoch": lease.epoch if lease else 0}
         detail = f"This session no longer holds epoch {epoch} of the lease. Acquire the lease again."

@@ -77,12 +77,7 @@ OWNER_PERMISSIONS: Final = Permissions(Role.OWNER, space=Role.OWNER)
 def permissions(caller: Identity, agent: Agent, name: str, shares: Iterable[Share], now_ms: int) -> Permissions | None:
     """The permissions of ``caller`` on a device; ``None``: the device is not visible to the caller.
 
-    Args:
-        caller: Limited to the role ``caller.most`` and to the targets in ``caller.only``.
-        agent: Agent of the device.
-        name: Device name at the agent.
-        shares: The caller's shares of this device and its space.
-        now_ms: Current time.
+    ``shares`` are the caller's shares of this device and its space. An API key limits role and devices.
     """
     if agent.account is None:
         return None
@@ -135,11 +130,7 @@ def expiry_ms(for_s: int | None, now_ms: int) -> int:
 
 
 def require_shareable(role: Role) -> Role:
-    """The role, if it can be shared.
-
-    Raises:
-        Problem: ``invalid``.
-    """
+    """The role, if it can be shared. Raises ``invalid``."""
     if role is Role.OWNER:
         raise invalid("A role is operator or viewer. To change the owner, transfer the agent or the space.")
     return role

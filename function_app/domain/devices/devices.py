@@ -144,10 +144,7 @@ def unpair(agent: Agent) -> Agent:
 
 
 def transfer(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:
-    """The agent, transferred to another account in one step.
-
-    The agent gets a new pairing, so no data or shares of the previous owner remain visible.
-    """
+    """The agent of another account, with a new pairing: no data or shares of the previous owner remain visible."""
     return claim(unpair(agent), account=account, space=space, pairing=pairing, now_ms=now_ms)
 
 

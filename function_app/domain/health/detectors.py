@@ -201,14 +201,7 @@ def scale(previous: DetectorState, limits: Limits) -> float:
 
 
 def update(previous: DetectorState, limits: Limits, at_ms: int, value: float) -> DetectorState:
-    """The state after one more window; the same object for an old window.
-
-    Args:
-        previous: State before.
-        limits: Limits of the field.
-        at_ms: Start of the window [ms since 1970].
-        value: Mean of the window; finite.
-    """
+    """The state after one more window with its start [ms since 1970] and mean; the same object for an old window."""
     if at_ms <= previous.seen_ms:
         return previous
     value = max(-LARGEST, min(LARGEST, value))

@@ -36,11 +36,7 @@ class PageHinkley:
 def page_hinkley(previous: PageHinkley, value: float, *, delta: float, threshold: float) -> tuple[PageHinkley, bool]:
     """Add one value; return the new state and whether the mean has changed. After a change start with an empty state.
 
-    Args:
-        previous: State before.
-        value: New value.
-        delta: Shifts below this are ignored.
-        threshold: Limit of the cumulative sum beyond ``delta``.
+    Shifts below ``delta`` are ignored; ``threshold`` limits the cumulative sum beyond it.
     """
     count = min(previous.count + 1, DAY)
     mean = previous.mean + (value - previous.mean) / count
@@ -53,9 +49,7 @@ def page_hinkley(previous: PageHinkley, value: float, *, delta: float, threshold
 class Baseline:
     """Exponentially weighted mean and mean absolute deviation, robust against single outliers.
 
-    Attributes:
-        count: Number of values in the mean, at most ``MEMORY``.
-        varied: Number of values in the deviation: those that differ from their predecessor.
+    ``count`` values are in the mean (at most ``MEMORY``), ``varied`` in the deviation: those unlike their predecessor.
     """
 
     count: int = 0
@@ -76,11 +70,8 @@ CLIP = 3.0
 def learn(previous: Baseline, value: float, *, scale: float, repeated: bool) -> Baseline:
     """The baseline after one more value.
 
-    Args:
-        previous: Baseline before.
-        value: New value.
-        scale: Lower bound of the standard deviation.
-        repeated: The value equals its predecessor: a stuck sensor is not a sensor without noise.
+    ``scale`` is the lower bound of the standard deviation. ``repeated``: the value equals its predecessor; a stuck
+    sensor is not a sensor without noise.
     """
     count = min(previous.count + 1, MEMORY)
     shift = value - previous.mean

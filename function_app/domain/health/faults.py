@@ -101,10 +101,7 @@ def raised(report: Report, *, fault: str, now_ms: int, count: int) -> Fault:
 
 
 def reported(fault: Fault, report: Report) -> Fault:
-    """The fault after another report; the same object unless the severity increased.
-
-    A higher severity removes the acknowledgement.
-    """
+    """The fault after another report; a higher severity removes the acknowledgement, else it is the same object."""
     if report.severity.rank <= fault.severity.rank:
         return fault
     return replace(

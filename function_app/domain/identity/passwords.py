@@ -47,12 +47,7 @@ def normalize(password: str) -> str:
 
 
 def weakness(password: str, *, name: str) -> str:
-    """Why a password is too weak, as a sentence; empty: it is accepted.
-
-    Args:
-        password: In normal form.
-        name: Name of the account.
-    """
+    """Why a password, in normal form, is too weak for the account ``name``, as a sentence; empty: it is accepted."""
     if len(password) < LEAST:
         return f"A password has at least {LEAST} characters; a sentence of a few words is a good one."
     if len(password) > MOST:

@@ -33,12 +33,7 @@ class _Asked(msgspec.Struct, frozen=True, rename="camel"):
 
 
 async def admit(functions: Functions, authorization: str, body: bytes) -> tuple[int, dict[str, Any]]:
-    """Status and answer to one question of the namespace's.
-
-    Args:
-        functions: Know who may.
-        authorization: The header of that name.
-        body: As the namespace asks.
+    """Status and body of the response to one request of the namespace.
 
     Raises:
         StoreError: The state cannot be read; the namespace then admits no client.

@@ -18,12 +18,7 @@ class _Admits(Protocol):
 
 
 async def authorise(functions: Functions, event: Mapping[str, Any], function_arn: str) -> dict[str, Any]:
-    """The answer to one question of IoT Core's.
-
-    Args:
-        functions: Whose broker is AWS IoT Core.
-        event: As IoT Core asks.
-        function_arn: Of this function: in the same region and account as the broker.
+    """The response to one request of IoT Core, which is in the region and account of this function (``function_arn``).
 
     Raises:
         ValueError: The functions use another broker.

@@ -32,13 +32,14 @@ from function_app.entrypoints.http.framework.routing import (
     KEY_SCHEME,
     PREFIX,
     VERSION,
+    Routes,
     schemas,
 )
 from function_app.entrypoints.http.health import diagnostics, faults, health_check
 from function_app.entrypoints.http.messaging import polling, xmpp
 from function_app.entrypoints.http.pairing import agents
 from function_app.entrypoints.http.robot_types import device_library, movements, previews, robot_types, script_editor
-from function_app.entrypoints.http.sharing import invitations, shares
+from function_app.entrypoints.http.sharing import routes as sharing
 from function_app.entrypoints.http.telemetry import blob_transfers, events, latency, series, uploads
 from function_app.ports.clock import Clock
 from function_app.ports.tables import StoreError
@@ -46,6 +47,12 @@ from function_app.services.identity.rate_limiter import RateLimiter
 
 _SECURE_FOR = b"max-age=31536000"
 """One year [s]: browsers that used TLS once use only TLS."""
+_MODULES = (
+    auth, me, oidc, api_keys, agents, polling, audit, devices, device_library, sharing, lease, stop, actions, many,
+    robot_types, previews, movements, script_editor, mqtt_credentials, xmpp, latency, faults, events, diagnostics,
+    series, uploads, health_check,
+)  # fmt: skip
+"""In the order of the API's description."""
 _log = logging.getLogger(__name__)
 _WRONG_METHOD = 405
 _TITLES = {404: "Nothing here", _WRONG_METHOD: "Not this method"}
@@ -72,36 +79,7 @@ def create_app(functions: Functions) -> FastAPI:
         redirect_slashes=False,
     )
     authenticator = RequestAuthenticator(functions.authenticator, functions.api_keys, functions.rate_limiter)
-    resources = (
-        auth.router(functions, authenticator),
-        me.router(functions, authenticator),
-        oidc.router(functions),
-        api_keys.router(functions, authenticator),
-        agents.router(functions, authenticator),
-        polling.router(functions, authenticator),
-        audit.router(functions, authenticator),
-        devices.router(functions, authenticator),
-        device_library.router(functions, authenticator),
-        shares.router(functions, authenticator),
-        invitations.router(functions, authenticator),
-        lease.router(functions, authenticator),
-        stop.router(functions, authenticator),
-        actions.router(functions, authenticator),
-        many.router(functions, authenticator),
-        robot_types.router(functions, authenticator),
-        previews.router(functions, authenticator),
-        movements.router(functions, authenticator),
-        script_editor.router(functions, authenticator),
-        mqtt_credentials.router(functions, authenticator),
-        xmpp.router(functions, authenticator),
-        latency.router(functions, authenticator),
-        faults.router(functions, authenticator),
-        events.router(functions, authenticator),
-        diagnostics.router(functions, authenticator),
-        series.router(functions, authenticator),
-        uploads.router(functions, authenticator),
-        health_check.router(functions),
-    )
+    resources: list[Routes] = [module.router(functions, authenticator) for module in _MODULES]
     routers = [*(routes.router for routes in resources), blob_transfers.router(functions.transfers)]
     index = RouteIndex(route for router in routers for route in router.routes if isinstance(route, APIRoute))
     app.router.routes.insert(0, index)

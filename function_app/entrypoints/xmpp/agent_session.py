@@ -37,19 +37,19 @@ _log = logging.getLogger(__name__)
 
 
 class AgentSession:
-    """An agent at its place.
+    """The session of one agent.
 
     Args:
-        functions: The cloud.
-        line: The connection to the XMPP server.
-        agent: As its row was when it greeted.
-        jid: Its whole JID.
-        greeting: Its own presence message, and
-        greeted: the same as it came.
-        listen: Topics of its space's other agents that it wants to hear.
-        broker_up: Whether orders come by the broker now.
-        measured: Given each measurement that was passed on.
-        told: Given each other message once it is stored.
+        functions: Services of the cloud.
+        line: Connection to the XMPP server.
+        agent: The agent's row at the start of the session.
+        jid: Full JID.
+        greeting: The presence message that started the session, decoded.
+        greeted: The same message as received.
+        listen: Topics of other agents in its space to which it subscribes.
+        broker_up: Returns whether the broker delivers commands now.
+        measured: Called with each measurement that was published.
+        told: Called with each other message once it is stored.
     """
 
     def __init__(
@@ -238,8 +238,7 @@ class AgentSession:
         return row is not None and records.read(row, Link).session > self.greeting.session
 
     async def _still_ours(self) -> bool:
-        row = await self._functions.tables.get(records.AGENTS, self.agent.id, "agent")
-        now = None if row is None else records.read(row, Agent)
+        _, now = await records.find(self._functions.tables, records.AGENTS, self.agent.id, "agent", Agent)
         if now is None or not now.claimed or now.transport != "xmpp":
             return False
         if (now.pairing, now.space) != (self.agent.pairing, self.agent.space):

@@ -33,13 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 class XmppGateway:
-    """``XmppConnection``'s listener.
-
-    Args:
-        functions: The cloud.
-        line: The connection to the XMPP server.
-        orders: What the broker brings.
-    """
+    """Listener of an ``XmppConnection``; also passes on the commands of the broker."""
 
     def __init__(self, functions: Functions, line: XmppConnection, orders: CommandFeed) -> None:
         self._functions = functions

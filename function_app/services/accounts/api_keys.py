@@ -1,6 +1,5 @@
 """Creates, lists, revokes and authenticates API keys of an account."""
 
-import contextlib
 import logging
 from collections import OrderedDict
 from dataclasses import dataclass, replace
@@ -31,7 +30,8 @@ SHOWN_MS: Final = 30 * DAY_MS
 USED_EVERY_MS: Final = 3_600_000
 _KNOWN: Final = 4096
 _INDEX: Final = "api-key:"
-_EXPIRES: Final = "key-expires:"
+REMINDER: Final = "key-expires"
+"""Kind of the reminders that a key expires."""
 _REFUSED: Final = "This API key is unknown, revoked or expired. Create a new one."
 
 _log = logging.getLogger(__name__)
@@ -109,7 +109,7 @@ class ApiKeys:
         due_ms = key.expires_ms + SHOWN_MS
         await self._retention.delete_row_at(records.API_KEYS, key.id, API_KEY, due_ms=due_ms)
         await self._retention.delete_row_at(records.MEMBERS, caller.account, _INDEX + key.id, due_ms=due_ms)
-        await self._reminders.schedule(_EXPIRES + key.id, key.expires_ms)
+        await self._reminders.schedule(f"{REMINDER}:{key.id}", key.expires_ms)
         about = {"name": key.label, "role": key.most.value, "only": list(only), "expires_ms": key.expires_ms}
         async with self._audit_log.change(
             caller.account, AccountEvent.API_KEY_MADE, caller, on=f"key:{key.id}", **about
@@ -126,13 +126,8 @@ class ApiKeys:
         return tuple(sorted((key for key in result if key.account == account), key=lambda key: -key.created_ms))
 
     async def revoke(self, caller: Identity, key_id: str) -> None:
-        """Revoke a key: immediately in this process, within seconds in others. Ends its sessions and actions.
-
-        Raises:
-            Problem: ``api-key-unknown``.
-        """
-        row = await self._tables.get(records.API_KEYS, key_id, API_KEY)
-        key = records.read(row, ApiKey) if row else None
+        """Revoke a key, at once here and within seconds elsewhere, with its sessions. Raises ``api-key-unknown``."""
+        row, key = await records.find(self._tables, records.API_KEYS, key_id, API_KEY, ApiKey)
         if row is None or key is None or key.account != caller.account:
             raise not_found("api-key", key_id)
         async with self._audit_log.change(
@@ -148,25 +143,17 @@ class ApiKeys:
             return
         self._known.pop(key_id, None)
         await self._sign_out.end(key.identity)
-        index = await self._tables.get(records.MEMBERS, caller.account, _INDEX + key_id)
-        if index is not None:
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(records.MEMBERS, index)
+        await records.remove(self._tables, records.MEMBERS, caller.account, _INDEX + key_id)
 
-    async def look(self, what: str, note: Row) -> None:
+    async def look(self, key_id: str, note: Row) -> None:
         """Called by the timer: end the sessions and actions of an expired key."""
-        row = await self._tables.get(records.API_KEYS, what.removeprefix(_EXPIRES), API_KEY)
-        key = records.read(row, ApiKey) if row else None
+        _, key = await records.find(self._tables, records.API_KEYS, key_id, API_KEY, ApiKey)
         if key is not None and self._clock.now_ms() >= key.expires_ms:
             await self._sign_out.end(key.identity)
         await self._reminders.cancel(note)
 
     async def identify(self, token: str) -> Identity:
-        """The identity behind a token.
-
-        Raises:
-            Problem: ``unauthorized``: unknown, revoked or expired; the response is the same.
-        """
+        """The identity behind a token. Raises ``unauthorized``, with the same response for every reason."""
         parts = rules.split(token)
         if parts is None:
             raise unauthorized(_REFUSED)
@@ -221,8 +208,3 @@ class ApiKeys:
     async def _ids(self, account: str) -> list[str]:
         page = await self._tables.query(records.MEMBERS, account, first=_INDEX, last="api-key;", limit=1000)
         return [row.key.removeprefix(_INDEX) for row in page.rows]
-
-
-def about_key(note: str) -> bool:
-    """Whether a reminder is about an API key."""
-    return note.startswith(_EXPIRES)

@@ -40,13 +40,7 @@ class OidcRedirect:
 
 @dataclass(frozen=True, slots=True)
 class OidcCallback:
-    """Parameters of the callback; empty if missing.
-
-    Attributes:
-        secret: Secret from the cookie.
-        issuer: ``iss`` parameter; ``None`` if missing.
-        error: Error code of the provider.
-    """
+    """Parameters of the callback; empty if missing. ``secret`` comes from the cookie."""
 
     state: str = ""
     code: str = ""
@@ -56,10 +50,7 @@ class OidcCallback:
 
 
 class OidcSignIn:
-    """Signs in through the configured provider.
-
-    Creates an account for a person with an invitation; for others only if ``anyone`` is set.
-    """
+    """Signs in through the provider. Creates accounts for invited persons; for others only if ``anyone`` is set."""
 
     def __init__(
         self,
@@ -85,10 +76,7 @@ class OidcSignIn:
         self._clock = clock
 
     async def begin(self, invitation: str = "") -> OidcRedirect:
-        """Start a sign-in in one browser.
-
-        Args:
-            invitation: Secret of an invitation, for new accounts.
+        """Start a sign-in in one browser; ``invitation`` is the secret of an invitation, for new accounts.
 
         Raises:
             Problem: ``oidc-unknown``: no provider is configured; ``oidc-unavailable``; ``invitation-unknown``.

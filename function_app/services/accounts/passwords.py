@@ -61,11 +61,7 @@ class Passwords:
         self._clock = clock
 
     async def sign_in(self, name: str, password: str, whence: SignInOrigin) -> SignedIn:
-        """Sign in with name and password. Unknown names take the same time and give the same response.
-
-        Raises:
-            Problem: ``unauthorized``; ``too-many-tries`` for this name or address.
-        """
+        """Sign in. Unknown names take the same time and response. Raises ``unauthorized`` or ``too-many-tries``."""
         # Count by address first: after its limit, invented names create no rows.
         counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(name): WRONG_TRIES}
         try:
@@ -75,8 +71,7 @@ class Passwords:
             raise
         named = await self._sign_in.known(name)
         account = named.id if named else ""
-        row = await self._tables.get(records.ACCOUNTS, account or _NOBODY, _PASSWORD)
-        stored = records.read(row, _Stored) if row else None
+        row, stored = await records.find(self._tables, records.ACCOUNTS, account or _NOBODY, _PASSWORD, _Stored)
         right = await self._hasher.check(stored.hash if stored else None, normalize(password))
         if named is None or row is None or stored is None or not right:
             await self._refused(account, whence, WRONG)
@@ -97,9 +92,7 @@ class Passwords:
 
         Requires the old password, except in the first minutes after a sign-in by one-time link. An open page alone is
         not sufficient to take over the account.
-
-        Raises:
-            Problem: ``password-not-managed-here``, ``forbidden``, ``password-weak``, ``too-many-tries``.
+        Raises ``password-not-managed-here``, ``forbidden``, ``password-weak`` or ``too-many-tries``.
         """
         named = await self._sign_in.known(caller.name)
         if named is None or named.id != caller.account:
@@ -125,8 +118,7 @@ class Passwords:
     async def register(self, name: str, password: str) -> Account:
         """Create a local account. The password is written before the name, so that no name exists without a password.
 
-        Raises:
-            Problem: ``name-taken``, ``password-weak``.
+        Raises ``name-taken`` or ``password-weak``.
         """
         taken = Problem("name-taken", 409, "The name is taken", "Another account has this name. Choose another name.")
         if await self._sign_in.known(name) is not None:
@@ -148,10 +140,7 @@ class Passwords:
         return await self._sign_in.account(name)
 
     async def _refused(self, account: str, whence: SignInOrigin, code: str) -> None:
-        """Record the failure in the account's audit log, or in the cloud's log for an unknown name.
-
-        Every failure is recorded, so that unknown and known names take the same time.
-        """
+        """Record each failure, also of unknown names, so that they take the same time."""
         wrong = code == WRONG
         data = {"code": code, "address": whence.address}
         await self._audit_log.record_rejection(account or CLOUD, AccountEvent.SIGN_IN_REFUSED, None, each=wrong, **data)

@@ -50,8 +50,7 @@ class SignOut:
     async def end(self, caller: Identity) -> None:
         """End the session of ``caller``: first its tokens, then its broker connections, then its leases.
 
-        If broker or device are not reachable, credentials expire within 15 minutes and leases at their expiry time.
-        Neither can be renewed.
+        Without broker or device, credentials expire within 15 minutes and leases in their time; neither can be renewed.
         """
         async with self._audit_log.change(caller.account, AccountEvent.SIGNED_OUT, caller) as change:
             await change.noted()
@@ -64,11 +63,7 @@ class SignOut:
         await self._release(caller)
 
     async def one(self, caller: Identity, session: str) -> None:
-        """End one session of the account.
-
-        Raises:
-            Problem: ``session-unknown``.
-        """
+        """End one session of the account. Raises ``session-unknown``."""
         if session not in {existing.id for existing in await self._sessions.list(caller.account)}:
             raise not_found("session", session)
         await self.end(Identity(caller.account, caller.name, session))

@@ -80,14 +80,9 @@ class ActionAcks:
     ) -> Action:
         """Wait until the action reaches ``wanted`` or ends, at most ``wait_ms``.
 
-        Acks are collected and written once before this returns, so later requests read at least this state.
-
-        Args:
-            stored: The action as last read or written.
-            acks: Its acks since before it was published; ``None``: poll the row.
-            wanted: Status to wait for.
-            wait_ms: Time limit.
-            published: Whether to record that the command was published.
+        Acks are collected and written once before this returns, so later requests read at least this state. ``acks``
+        are those since before the command was published; ``None``: poll the row. ``published``: record the publication
+        too.
         """
         end = asyncio.get_running_loop().time() + wait_ms / 1000
         published_ms = self._clock.now_ms() if published else None

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from function_app.domain.actions.action import Action, Status
 from function_app.domain.actions.queue import FAILED_BEFORE
 from function_app.domain.common.ids import split_command
-from function_app.domain.common.problems import invalid
 from function_app.domain.control.lease import release
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
@@ -55,19 +54,10 @@ class ActionStore:
         return None if row is None else StoredAction(records.read(row, Action), row)
 
     async def list(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Action], str | None]:
-        """Actions of a device since its pairing, newest first.
-
-        Raises:
-            Problem: ``cursor-invalid``.
-        """
-        try:
-            page = await self._tables.query(
-                records.CONTROL, device.id, first=_PREFIX, last=_END, limit=limit, cursor=cursor
-            )
-        except ValueError as error:
-            raise invalid(
-                "The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid"
-            ) from error
+        """Actions of a device since its pairing, newest first. Raises ``cursor-invalid``."""
+        page = await records.page(
+            self._tables, records.CONTROL, device.id, first=_PREFIX, last=_END, limit=limit, cursor=cursor
+        )
         actions = [action for row in page.rows if (action := records.read(row, Action)).pairing == device.pairing]
         # All further rows are older than the pairing, so the list ends here.
         return actions, page.cursor if len(actions) == len(page.rows) else None
@@ -78,17 +68,8 @@ class ActionStore:
         """Change an action by ETag. If it ends, its slot, lease and place in the queue are freed in the same batch.
 
         If the result is ``waited_for``, the caller must advance the queue; ``ActionQueues.change`` does both.
-
-        Args:
-            action: Action id.
-            change: Returns the same object for no change; may be called several times.
-            existing: The action as last read; saves one read, and costs one if outdated.
-
-        Returns:
-            The action after the change, or ``None`` if it does not exist.
-
-        Raises:
-            Problem: ``busy``.
+        ``change`` returns the same object for no change, and may be called several times. ``existing`` saves a read
+        unless outdated. Returns ``None`` if the action does not exist. Raises ``busy``.
         """
         stale = False
 

@@ -45,19 +45,11 @@ class Actions:
     async def list(
         self, caller: Identity, device: str, *, cursor: str | None, limit: int
     ) -> tuple[list[Action], str | None]:
-        """A device's actions, newest first.
-
-        Raises:
-            Problem: ``device-unknown``, ``cursor-invalid``.
-        """
+        """A device's actions, newest first. Raises ``device-unknown`` or ``cursor-invalid``."""
         return await self._action_store.list(await self._devices.get(caller, device), cursor=cursor, limit=limit)
 
     async def get(self, caller: Identity, action: str, *, wait_ms: int, wait_for: Literal["started", "done"]) -> Action:
-        """One action, after it reached ``wait_for`` or after ``wait_ms``.
-
-        Raises:
-            Problem: ``action-unknown``.
-        """
+        """One action, after it reached ``wait_for`` or after ``wait_ms``. Raises ``action-unknown``."""
         device, stored = await self._find(caller, action)
         if not wait_ms or stored.action.status.terminal:
             return stored.action
@@ -68,8 +60,7 @@ class Actions:
     async def cancel(self, caller: Identity, action: str) -> Action:
         """Request the device to cancel an action. A queued action ends at once; others end when the device reports it.
 
-        Raises:
-            Problem: ``action-unknown``, ``forbidden``, ``broker-unavailable``, ``busy``.
+        Raises ``action-unknown``, ``forbidden``, ``broker-unavailable`` or ``busy``.
         """
         device, stored = await self._find(caller, action)
         require_operator(device)

@@ -30,7 +30,8 @@ from function_app.services.storage.reminders import Reminders
 
 LOOK_MS: Final = 2_000
 """Interval of queue checks, in case a process was killed after it freed the slot."""
-_NOTE: Final = "queue:"
+REMINDER: Final = "queue"
+"""Kind of the reminders to check a queue."""
 TIMEOUT: Final = "It was queued longer than queue_ms. Start it again, with a larger queue_ms if needed."
 
 _log = logging.getLogger(__name__)
@@ -61,11 +62,7 @@ class ActionQueues:
     async def change(
         self, action: str, change: Callable[[Action], Action], *, existing: StoredAction | None = None
     ) -> StoredAction | None:
-        """Change an action as ``ActionStore.change`` does, then advance the queue if other actions waited for it.
-
-        Raises:
-            Problem: ``busy``.
-        """
+        """As ``ActionStore.change``; then advance the queue if other actions waited for it. Raises ``busy``."""
         stored = await self._action_store.change(action, change, existing=existing)
         if stored is not None and stored.waited_for:
             await self.advance(stored.action.device)
@@ -73,7 +70,7 @@ class ActionQueues:
 
     async def schedule_check(self, device: str) -> None:
         """Schedule a check of a device's queue; call it before the queue is written."""
-        await self._reminders.schedule(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
+        await self._reminders.schedule(f"{REMINDER}:{device}", self._clock.now_ms() + LOOK_MS)
 
     async def check(self, device: str) -> bool:
         """Advance a device's queue; return whether it is not empty."""
@@ -81,10 +78,7 @@ class ActionQueues:
         return not (await read_control_rows(self._tables, device)).queue.empty
 
     async def advance(self, device: str) -> None:
-        """End dropped actions, and start the next one if the slot is free.
-
-        Errors are logged; the timer retries.
-        """
+        """End dropped actions, and start the next one if the slot is free. Errors are logged; the timer retries."""
         try:
             while await records.retry(lambda: self._step(device)):
                 pass
@@ -92,19 +86,11 @@ class ActionQueues:
             _log.warning("queue of %s: %s", device, error)
 
     async def cancel_all(self, device: str, why: str) -> None:
-        """Cancel all queued actions.
-
-        Raises:
-            Problem: ``busy``.
-        """
+        """Cancel all queued actions. Raises ``busy``."""
         await self._lose(device, lambda queue: queue.with_all_cancelled(why))
 
     async def cancel(self, device: str, actions: Collection[str], why: str) -> None:
-        """Cancel some of the queued actions.
-
-        Raises:
-            Problem: ``busy``.
-        """
+        """Cancel some of the queued actions. Raises ``busy``."""
         await self._lose(device, lambda queue: queue.with_cancelled(actions, why))
 
     async def _lose(self, device: str, change: Callable[[ActionQueue], ActionQueue]) -> None:
@@ -182,10 +168,7 @@ class ActionQueues:
         return False
 
     async def _start(self, stored: StoredAction, device: Device, caller: Identity) -> StoredAction | None:
-        """Write slot, lease, queue and action in one batch; ``None``: another process was first.
-
-        The reminder is written before, as for every action.
-        """
+        """Write slot, lease, queue and action in one batch; ``None``: another process was first."""
         await self._reminders.schedule(stored.action.id, self._clock.now_ms() + RETRY_MS)
         control = await read_control(self._tables, device)
         if control.action or control.queue.position(stored.action.id) != 1:
@@ -220,25 +203,12 @@ class ActionQueues:
         )
 
 
-def device_of_reminder(note: str) -> str | None:
-    """The device of a queue reminder; ``None`` for other reminders."""
-    return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None
-
-
 def action_lease(
-    lease: Lease | None,
-    caller: Identity,
-    *,
-    epoch: int | None,
-    action: str,
-    lease_ms: int,
-    now_ms: int,
-    pairing: str,
+    lease: Lease | None, caller: Identity, *, epoch: int | None, action: str, lease_ms: int, now_ms: int, pairing: str
 ) -> Lease:
     """The lease of an action: the caller's own, or one for the duration of the action.
 
-    Raises:
-        Problem: ``lease-lost``, ``lease-held``.
+    Raises ``lease-lost`` or ``lease-held``.
     """
     if epoch is not None:
         return rules.require_held(lease, caller, epoch=epoch, now_ms=now_ms)

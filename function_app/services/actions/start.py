@@ -180,8 +180,7 @@ class StartAction:
     async def _require_still(self, caller: Identity, device: Device, stored: StoredAction) -> None:
         """End the action if the caller lost access to the device while it was written.
 
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``.
+        Raises ``device-unknown`` or ``forbidden``.
         """
         try:
             await self._devices.require_still_allowed(caller, device)
@@ -296,9 +295,7 @@ def _lease(  # noqa: PLR0917 (the inputs of one decision)
     """The lease of the action; ``None``: it is queued behind ``before`` and gets a lease when it starts.
 
     An action may queue behind another action's own lease, but not behind a lease that a person holds.
-
-    Raises:
-        Problem: ``device-busy``, ``lease-lost``, ``lease-held``.
+    Raises ``device-busy``, ``lease-lost`` or ``lease-held``.
     """
     queued = bool(before) and request.policy == "queue"
     if queued and request.epoch is None:

@@ -105,9 +105,7 @@ class StopDevices:
 
         The reset takes the next epoch. Commands from before the reset are fenced by their older epoch, and a late or
         repeated reset is older than a newer latch.
-
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``busy``, ``broker-unavailable``.
+        Raises ``device-unknown``, ``forbidden``, ``busy`` or ``broker-unavailable``.
         """
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "reset Stop"):

@@ -49,8 +49,10 @@ _AT_ONCE: Final = 30
 _TRIES: Final = 60
 _PAUSE_S: Final = 0.1
 _KNOWN: Final = 4096
-_NOTE: Final = "audit:"
-_ANCHOR: Final = "anchor:"
+REMINDER: Final = "audit"
+"""Kind of the reminders to check a chain for pending changes."""
+ANCHOR_REMINDER: Final = "anchor"
+"""Kind of the reminders to anchor the head of a chain."""
 _WAIT: Final = "wait:"
 _ONCE: Final = "once:"
 _RECORD: Final = "record:"
@@ -83,11 +85,7 @@ class Change:
         self.came_to_nothing = False
 
     async def noted(self) -> None:
-        """Store the pending change before the deciding write; may be called several times.
-
-        Raises:
-            StoreError: The tables are not available; the change must not be made.
-        """
+        """Store the pending change before the deciding write, which must not follow a ``StoreError``. Idempotent."""
         if self._row is None:
             self._row = await self._chain.open(self._owner, replace(self._entry, outcome="unknown"))
 
@@ -127,20 +125,10 @@ class AuditLog:
     async def change(
         self, owner: str, what: str, caller: Identity | None, *, on: str = "", **data: Any
     ) -> AsyncGenerator[Change]:
-        """Record a change: call ``noted`` in the context before the deciding write.
+        """Record a change: call ``noted`` in the context before the deciding write, else nothing is recorded.
 
-        Without a call of ``noted`` nothing is recorded. A ``Problem`` after it is recorded as refused; after other
-        exceptions the timer records ``unknown``.
-
-        Args:
-            owner: Account of the chain, or ``CLOUD``.
-            what: An ``AccountEvent`` or ``Fact``.
-            caller: Who makes the change.
-            on: Target.
-            data: Further data without secrets.
-
-        Raises:
-            StoreError: The pending change cannot be stored.
+        A ``Problem`` after it is recorded as refused; after other exceptions the timer records ``unknown``. ``what`` is
+        an ``AccountEvent`` or ``Fact``, ``on`` its target; ``data`` must not contain secrets.
         """
         at_ms = self._clock.now_ms()
         change = Change(self, owner, rules.entry(what, caller, entry_id=new_id(), at_ms=at_ms, on=on, **data))
@@ -155,11 +143,7 @@ class AuditLog:
     async def record(
         self, owner: str, what: str, caller: Identity | None, *, on: str = "", outcome: Outcome = "done", **data: Any
     ) -> None:
-        """Record an event.
-
-        Raises:
-            StoreError: The tables are not available.
-        """
+        """Record an event."""
         at_ms = self._clock.now_ms()
         await self.append(
             owner, rules.entry(what, caller, entry_id=new_id(), at_ms=at_ms, on=on, outcome=outcome, **data)
@@ -182,11 +166,7 @@ class AuditLog:
             _log.warning("audit of a refusal: %s", error)
 
     async def append(self, owner: str, entry: Entry) -> None:
-        """Record ``entry``; under contention the timer writes it.
-
-        Raises:
-            StoreError: The tables are not available.
-        """
+        """Record ``entry``; under contention the timer writes it."""
         try:
             await self._batches.add(owner, [_Job(entry.fields())])
         except Problem:
@@ -211,26 +191,17 @@ class AuditLog:
         await self._batches.add(owner, jobs)
 
     async def check(self, owner: str) -> None:
-        """Called by the timer: record interrupted changes.
-
-        Raises:
-            Problem: ``busy``.
-            StoreError: The tables are not available.
-        """
+        """Called by the timer: record interrupted changes. Raises ``busy``."""
         page = await self._tables.query(records.AUDIT, owner, first=_WAIT, last="wait;", limit=1000)
         now_ms = self._clock.now_ms()
         since_ms = now_ms - ABANDON_MS
         left = [row for row in page.rows if row.data["outcome"] != "unknown" or row.data["at_ms"] <= since_ms]
         await self._batches.add(owner, [_Job(dict(row.data), waiting=row) for row in left])
         if len(left) < len(page.rows) or page.cursor is not None:
-            await self._reminders.schedule(f"{_NOTE}{owner}", now_ms + LOOK_MS)
+            await self._reminders.schedule(f"{REMINDER}:{owner}", now_ms + LOOK_MS)
 
     async def anchor(self, owner: str) -> None:
-        """Store the head in the blob store, which other credentials may protect.
-
-        Raises:
-            StoreError: The stores are not available.
-        """
+        """Store the head in the blob store, which other credentials may protect."""
         row = await self._tables.get(records.AUDIT, owner, _HEAD)
         if row is None:
             return
@@ -239,15 +210,11 @@ class AuditLog:
         _log.info("audit head of %s: %s:%s", owner, row.data["seq"], row.data["hash"])
 
     async def open(self, owner: str, entry: Entry) -> Row:
-        """Store a pending entry for the timer.
-
-        Raises:
-            StoreError: The tables are not available.
-        """
+        """Store a pending entry for the timer."""
         now_ms = self._clock.now_ms()
         due_ms = (now_ms // LOOK_MS + 2) * LOOK_MS
-        if self._new(_NOTE, owner, due_ms):
-            await self._reminders.schedule(f"{_NOTE}{owner}", due_ms)
+        if self._new(REMINDER, owner, due_ms):
+            await self._reminders.schedule(f"{REMINDER}:{owner}", due_ms)
         return await self._tables.create(records.AUDIT, Row(owner, f"{_WAIT}{entry.id}", entry.fields()))
 
     async def close(self, owner: str, entry: Entry, waiting: Row) -> None:
@@ -262,8 +229,7 @@ class AuditLog:
 
     async def drop(self, waiting: Row) -> None:
         """Delete a pending entry without a record."""
-        with contextlib.suppress(Conflict):
-            await self._tables.delete(records.AUDIT, waiting)
+        await records.discard(self._tables, records.AUDIT, waiting)
 
     def _new(self, what: str, owner: str, when: int) -> bool:
         """Whether this process has not scheduled a check yet."""
@@ -339,10 +305,10 @@ class AuditLog:
     async def _note_anchor(self, owner: str) -> None:
         """Schedule the anchor of the head before the write, and list the chain."""
         due_ms = (self._clock.now_ms() // ANCHOR_MS + 1) * ANCHOR_MS
-        if self._new(_ANCHOR, owner, due_ms):
+        if self._new(ANCHOR_REMINDER, owner, due_ms):
             with contextlib.suppress(Conflict):
                 await self._tables.create(records.AUDIT, Row(_CHAINS, owner, {}))
-            await self._reminders.schedule(f"{_ANCHOR}{owner}", due_ms)
+            await self._reminders.schedule(f"{ANCHOR_REMINDER}:{owner}", due_ms)
 
 
 def record_key(seq: int) -> str:
@@ -353,16 +319,6 @@ def record_key(seq: int) -> str:
 def anchors(owner: str) -> str:
     """The blob with the heads of a chain, one per line."""
     return f"audit/{owner}/heads.jsonl"
-
-
-def chain_of(note: str) -> str | None:
-    """The chain that a reminder is about; ``None`` for other reminders."""
-    return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None
-
-
-def anchor_of(note: str) -> str | None:
-    """The chain whose head must be anchored; ``None`` for other reminders."""
-    return note.removeprefix(_ANCHOR) if note.startswith(_ANCHOR) else None
 
 
 def _each_once(jobs: list[_Job]) -> list[_Job]:

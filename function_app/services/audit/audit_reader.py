@@ -3,7 +3,7 @@
 import base64
 import binascii
 import json
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -11,7 +11,7 @@ from cryptography.exceptions import InvalidSignature
 
 from function_app.domain.audit import hash_chain as rules
 from function_app.domain.audit.hash_chain import FIRST, Head
-from function_app.domain.common.problems import forbidden, invalid
+from function_app.domain.common.problems import forbidden, invalid_cursor
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.blobs import Blobs
 from function_app.ports.signing_keys import SigningKeys
@@ -80,7 +80,7 @@ class AuditReader:
         elif cursor.isdecimal() and cursor.isascii() and len(cursor) <= _CURSOR_DIGITS:
             newest = int(cursor)
         else:
-            raise invalid("The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid")
+            raise invalid_cursor()
         oldest = max(FIRST, newest - LOOKED_AT + 1)
         result: list[Mapping[str, Any]] = []
         while newest >= oldest and len(result) < limit:
@@ -100,7 +100,7 @@ class AuditReader:
 
     async def chains(self) -> list[str]:
         """All chains, including deleted ones whose heads are still in the blob store."""
-        named = {row.key async for row in self._rows("chains", "", None)}
+        named = {row.key async for row in records.all_rows(self._tables, records.AUDIT, "chains")}
         for prefix in ("cloud", *_LETTERS):
             named |= {name.split("/")[1] for name in await self._noted(f"audit/{prefix}")}
         return sorted(named)
@@ -111,12 +111,7 @@ class AuditReader:
         return None if row is None else Head(int(row.data["seq"]), str(row.data["hash"]))
 
     async def verify(self, chain: str, *, expected: tuple[Head, ...] = ()) -> VerificationResult:
-        """Verify a chain.
-
-        Args:
-            chain: Account id, or ``cloud``.
-            expected: Externally stored heads; those in the blob store are always checked.
-        """
+        """Verify a chain against its anchors in the blob store, and against ``expected``: heads stored elsewhere."""
         noted = await self._anchors(chain)
         if isinstance(noted, str):
             return VerificationResult(chain, rules.genesis(chain), noted)
@@ -136,7 +131,8 @@ class AuditReader:
         """Verify the chain up to ``end``; return the last valid head and the first error."""
         head = rules.genesis(chain)
         last = _number(end.data.get("seq")) if end is not None else 0
-        async for row in self._rows(chain, record_key(0), record_key(last + 1)):
+        span = {"first": record_key(0), "last": record_key(last + 1)}
+        async for row in records.all_rows(self._tables, records.AUDIT, chain, **span):
             wrong = rules.record_error(head, row.data)
             if not wrong and row.key != record_key(head.seq + 1):
                 wrong = "it stands in another place"
@@ -202,16 +198,6 @@ class AuditReader:
             for letter in _LETTERS:
                 names |= await self._noted(prefix + letter)
         return names
-
-    async def _rows(self, partition: str, first: str, last: str | None) -> AsyncIterator[Row]:
-        cursor = None
-        while True:
-            page = await self._tables.query(records.AUDIT, partition, first=first, last=last, limit=1000, cursor=cursor)
-            for row in page.rows:
-                yield row
-            cursor = page.cursor
-            if cursor is None:
-                return
 
 
 def _number(value: Any) -> int:

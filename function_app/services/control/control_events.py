@@ -19,7 +19,7 @@ from function_app.domain.control.lease import Lease
 from function_app.domain.devices.devices import Agent, Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Conflict, Row, StoreError, Tables, Write
+from function_app.ports.tables import Row, StoreError, Tables, Write
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.control_rows import read_control_rows
 from function_app.services.storage import records
@@ -32,7 +32,8 @@ QUIET_MS: Final = 10_000
 """A process records the same rejection of the same person at most once in this time."""
 REFUSALS: Final = frozenset({"forbidden", "lease-held", "lease-lost", "lease-requested"})
 """Recorded rejections: a missing role or lease."""
-_NOTE: Final = "lease:"
+REMINDER: Final = "lease"
+"""Kind of the reminders to check a lease."""
 _EVENT: Final = "event:"
 _KNOWN: Final = 1_000
 
@@ -54,15 +55,10 @@ class ControlEvents:
 
     async def schedule_check(self, device: str) -> None:
         """Schedule a check of a device's lease; call it before the lease is written."""
-        await self._reminders.schedule(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
+        await self._reminders.schedule(f"{REMINDER}:{device}", self._clock.now_ms() + LOOK_MS)
 
     async def check(self, device: str) -> None:
-        """Called by the timer: publish stored events and timeouts, and schedule the next check.
-
-        Raises:
-            Problem: ``busy``.
-            StoreError: The tables are not available.
-        """
+        """Called by the timer: publish stored events and timeouts, and schedule the next check. Raises ``busy``."""
         await self._move(device)
         lease = (await read_control_rows(self._tables, device)).lease
         now_ms = self._clock.now_ms()
@@ -79,13 +75,10 @@ class ControlEvents:
             if lease.request is not None and lease.request.current_outcome(lease, now_ms) == "open":
                 ends.append(lease.request.expires_ms)
             if ends:
-                await self._reminders.schedule(f"{_NOTE}{device}", min(ends))
+                await self._reminders.schedule(f"{REMINDER}:{device}", min(ends))
 
     async def publish(self, device: str) -> None:
-        """Move stored events to the device's events and the audit log. Idempotent, safe to run concurrently.
-
-        Under contention the timer does it later.
-        """
+        """Move stored events to the device's events and the audit log. Under contention the timer does it later."""
         try:
             await self._move(device)
         except Problem as problem:
@@ -101,14 +94,12 @@ class ControlEvents:
         for owner, entries in owned.items():
             await self._audit_log.append_all(owner, entries)
         for row in page.rows:
-            with contextlib.suppress(Conflict):  # another process publishes the same event
-                await self._tables.delete(records.CONTROL, row)
+            await records.discard(self._tables, records.CONTROL, row)
 
     async def _owner(self, device: str, pairing: str) -> str:
         """The account whose audit log contains the events of a pairing."""
         agent_id, _ = split_device(device) or (device, "")
-        row = await self._tables.get(records.AGENTS, agent_id, "agent")
-        agent = None if row is None else records.read(row, Agent)
+        _, agent = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
         if agent is None:
             return CLOUD
         if agent.account is not None and pairing in {"", agent.pairing}:
@@ -126,35 +117,21 @@ class ControlEvents:
         outcome: Outcome = "done",
         data: Mapping[str, Any],
     ) -> None:
-        """Record an event that does not change a lease.
-
-        Raises:
-            StoreError: The tables are not available.
-        """
+        """Record an event that does not change a lease."""
         event = await self.add_event(device, fact, message, severity=severity, data=data)
         await self._audit_log.append(device.owner or CLOUD, _entry(device.id, event, _by(caller), outcome))
 
     async def add_event(
         self, device: Device, fact: Fact, message: str, *, severity: Any = "info", data: Mapping[str, Any]
     ) -> Mapping[str, Any]:
-        """Add an event to the device's events only, for facts with an audit record of their own; return the event.
-
-        Raises:
-            StoreError: The tables are not available.
-        """
+        """Add an event to the device's events only, for facts with an audit record of their own; return the event."""
         event = ControlEvent(new_id(), fact, self._clock.now_ms(), message, dict(data), severity).event(device.name)
         await self._events.add(device.id, device.pairing, event)
         return event
 
     @contextlib.asynccontextmanager
     async def recording_rejections(self, device: Device, caller: Identity, what: str) -> AsyncGenerator[None]:
-        """Record a rejection inside the context that is due to a missing role or lease.
-
-        Args:
-            device: Target device.
-            caller: The rejected caller.
-            what: The operation, as in "was refused to …".
-        """
+        """Record a rejection inside the context that is due to a missing role or lease. ``what`` is an infinitive."""
         try:
             yield
         except Problem as problem:
@@ -190,15 +167,7 @@ class ControlEvents:
 def event_writes(
     device: str, pairing: str, facts: Iterable[ControlEvent], *, owner: str = "", caller: Identity | None = None
 ) -> list[Write]:
-    """The writes that store events, for the batch of the change that causes them.
-
-    Args:
-        device: Device id.
-        pairing: Pairing of the agent.
-        facts: The events.
-        owner: Owner of the device, if known.
-        caller: The account that caused the events, if any.
-    """
+    """The writes that store events, for the batch of the change that causes them."""
     more = ({"owner": owner} if owner else {}) | ({"by": _by(caller)} if caller else {})
     return [
         Write(
@@ -207,11 +176,6 @@ def event_writes(
         )
         for fact in facts
     ]
-
-
-def lease_of(note: str) -> str | None:
-    """The device of a lease reminder; ``None`` for other reminders."""
-    return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None
 
 
 def lease_change(

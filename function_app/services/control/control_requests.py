@@ -13,9 +13,9 @@ from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.identity.api_keys import key_of
 from function_app.ports.clock import Clock
-from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
 from function_app.services.control.control_events import ControlEvents
+from function_app.services.control.fencing import ControlRevocation
 from function_app.services.control.lease_store import LeaseStore
 from function_app.services.control.leases import Leases
 from function_app.services.devices.control_rows import read_lease
@@ -34,6 +34,7 @@ class ControlRequests:
         tables: Tables,
         devices: DeviceAccess,
         leases: Leases,
+        revocation: ControlRevocation,
         lease_store: LeaseStore,
         command_sender: CommandSender,
         control_events: ControlEvents,
@@ -42,34 +43,24 @@ class ControlRequests:
         self._tables = tables
         self._devices = devices
         self._leases = leases
+        self._revocation = revocation
         self._lease_store = lease_store
         self._command_sender = command_sender
         self._control_events = control_events
         self._clock = clock
 
     async def get(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
-        """The last request for control of a device, and its lease.
-
-        Raises:
-            Problem: ``device-unknown``, ``request-unknown``.
-        """
+        """The last request for control of a device, and its lease. Raises ``device-unknown`` or ``request-unknown``."""
         device = await self._devices.get(caller, device_id)
         return rules.find(await read_lease(self._tables, device), request)
 
     async def create(
         self, caller: Identity, device_id: str, *, within_ms: int, lease_ms: int, wait_ms: int
     ) -> tuple[Lease, ControlRequest, bool, bool]:
-        """Request control from the holder.
-
-        Args:
-            caller: The requester.
-            device_id: The device.
-            within_ms: Time for the answer.
-            lease_ms: Duration of the requested lease.
-            wait_ms: Time to wait until the device shows the request.
+        """Request control from the holder, who has ``within_ms`` to answer.
 
         Returns:
-            The lease, the request, whether it is new, and whether the device shows it.
+            The lease, the request, whether it is new, and whether the device shows it after at most ``wait_ms``.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``lease-free``, ``lease-already-held``, ``lease-requested``,
@@ -124,15 +115,14 @@ class ControlRequests:
             return lease, asked, False
         confirmed, _ = await asyncio.gather(
             self._leases.grant(device, lease, by=caller.name, wait_ms=wait_ms),
-            self._leases.revoke(device, before.epoch),
+            self._revocation.cut(device, before.epoch),
         )
         return lease, asked, confirmed
 
     async def reject(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
         """Reject the request.
 
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed``, ``busy``.
+        Raises ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed`` or ``busy``.
         """
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "refuse control"):
@@ -145,8 +135,7 @@ class ControlRequests:
     async def withdraw(self, caller: Identity, device_id: str, request: str) -> None:
         """Withdraw the request.
 
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed``, ``busy``.
+        Raises ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed`` or ``busy``.
         """
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "withdraw a request for control"):
@@ -180,12 +169,8 @@ class ControlRequests:
 
     async def _drop(self, caller: Identity, device: Device, lease: Lease, request: str) -> None:
         """Remove the request from the device's state, best effort: it also expires there."""
-        try:
-            await self._command_sender.send(
-                device, WithdrawRequest(request=request), caller=caller.name, epoch=lease.epoch
-            )
-        except BusUnavailable as error:
-            _log.warning("request for %s: %s", device.id, error)
+        order = WithdrawRequest(request=request)
+        await self._command_sender.try_send(device, order, caller=caller.name, epoch=lease.epoch)
 
 
 def _asker_gone(by: str, then: str) -> Problem:

@@ -9,7 +9,6 @@ from function_app.domain.control.lease import Lease
 from function_app.domain.devices.devices import Device
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
-from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
 from function_app.services.control.control_events import event_writes
 from function_app.services.devices.control_rows import read_control_rows
@@ -44,9 +43,6 @@ class ControlRevocation:
 
         Returns:
             Whether broker and device were notified. The lease has ended in any case.
-
-        Raises:
-            Problem: ``busy``.
         """
 
         async def attempt() -> Lease | None:
@@ -89,24 +85,18 @@ class ControlRevocation:
         """Cut the setpoint connection of the previous epoch and notify the device, concurrently."""
         try:
             async with asyncio.timeout_at(until_s):
-                return all(await asyncio.gather(self._cut(device, lease.epoch - 1), self._release(device, lease.epoch)))
+                release = self._command_sender.try_send(device, ReleaseLease(), caller="telescope", epoch=lease.epoch)
+                return all(await asyncio.gather(self.cut(device, lease.epoch - 1), release))
         except TimeoutError:
             _log.warning("end of control of %s: the broker did not answer in time", device.id)
             return False
 
-    async def _cut(self, device: Device, epoch: int) -> bool:
+    async def cut(self, device: Device, epoch: int) -> bool:
+        """Revoke the broker credentials for the setpoints of an epoch, best effort: fencing without the device."""
         try:
             await self._access.revoke(client_id=control_client(device.id, epoch))
         except BrokerAccessError as error:
             _log.warning("setpoints of lease %d of %s: %s", epoch, device.id, error)
-            return False
-        return True
-
-    async def _release(self, device: Device, epoch: int) -> bool:
-        try:
-            await self._command_sender.send(device, ReleaseLease(), caller="telescope", epoch=epoch)
-        except BusUnavailable as error:
-            _log.warning("end of control of %s: %s", device.id, error)
             return False
         return True
 

@@ -23,16 +23,10 @@ class LeaseStore:
     async def change(
         self, caller: Identity, device: Device, change: Callable[[Lease | None, int], Lease]
     ) -> tuple[Lease | None, Lease]:
-        """Apply ``change`` to the lease by ETag; return the lease before and after.
+        """Apply ``change`` (of the lease, at a time) by ETag; return the lease before and after.
 
-        Args:
-            caller: The account that changes it.
-            device: The device.
-            change: Maps lease and time to the new lease; returns the same object for no change. May be called several
-                times.
-
-        Raises:
-            Problem: ``busy``, and the problems of ``change``.
+        ``change`` returns the same object for no change, and may be called several times. Raises ``busy``, and the
+        problems of ``change``.
         """
         watched = False
 

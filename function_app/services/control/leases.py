@@ -9,12 +9,10 @@ from function_app.domain.control import lease as rules
 from function_app.domain.control.lease import Lease
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
-from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
-from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
 from function_app.services.control.control_events import ControlEvents
-from function_app.services.control.fencing import ControlRevocation, control_client
+from function_app.services.control.fencing import ControlRevocation
 from function_app.services.control.lease_store import LeaseStore
 from function_app.services.devices.control_rows import ended_by_device, read_lease
 from function_app.services.devices.device_access import DeviceAccess, require_operator, require_owner
@@ -34,7 +32,6 @@ class Leases:
         lease_store: LeaseStore,
         revocation: ControlRevocation,
         command_sender: CommandSender,
-        access: BrokerAccess,
         control_events: ControlEvents,
         clock: Clock,
     ) -> None:
@@ -43,16 +40,11 @@ class Leases:
         self._lease_store = lease_store
         self._revocation = revocation
         self._command_sender = command_sender
-        self._access = access
         self._control_events = control_events
         self._clock = clock
 
     async def get(self, caller: Identity, device_id: str) -> Lease | None:
-        """The live lease of a device, unless the device has ended it.
-
-        Raises:
-            Problem: ``device-unknown``.
-        """
+        """The live lease of a device, unless the device has ended it. Raises ``device-unknown``."""
         device = await self._devices.get(caller, device_id)
         lease = await read_lease(self._tables, device)
         if lease is None or not lease.is_live(self._clock.now_ms()):
@@ -60,27 +52,12 @@ class Leases:
         return None if await ended_by_device(self._tables, device, lease) else lease
 
     async def acquire(
-        self,
-        caller: Identity,
-        device_id: str,
-        *,
-        epoch: int | None,
-        lease_ms: int,
-        wait_ms: int,
-        over: str = "",
+        self, caller: Identity, device_id: str, *, epoch: int | None, lease_ms: int, wait_ms: int, over: str = ""
     ) -> tuple[Lease, bool]:
         """Acquire the lease, or renew ``epoch``; also return whether the device confirmed within ``wait_ms``.
 
-        Args:
-            caller: The new holder.
-            device_id: The device.
-            epoch: Epoch to renew; ``None``: acquire.
-            lease_ms: Duration, limited by the caller's permission on the device.
-            wait_ms: Time to wait for the device.
-            over: Reason for a takeover, which requires the role owner; empty: no takeover.
-
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``lease-held``, ``lease-lost``, ``busy``.
+        ``over`` is the reason for a takeover, which requires the role owner. The caller's permission on the device
+        limits ``lease_ms``. Raises ``device-unknown``, ``forbidden``, ``lease-held``, ``lease-lost`` or ``busy``.
         """
         device = await self._devices.get(caller, device_id)
         what = "take control over" if over else "take control" if epoch is None else "renew control"
@@ -99,14 +76,13 @@ class Leases:
             await self.require_still_allowed(caller, device)
         confirmed = await self.grant(device, lease, by=caller.name, wait_ms=wait_ms)
         if before is not None and lease.reason and epoch is None:
-            await self.revoke(device, before.epoch)
+            await self._revocation.cut(device, before.epoch)
         return lease, confirmed
 
     async def release(self, caller: Identity, device_id: str, *, epoch: int) -> None:
         """Release the lease. The device holds, and the credentials for its setpoints are revoked.
 
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``lease-lost``, ``busy``.
+        Raises ``device-unknown``, ``forbidden``, ``lease-lost`` or ``busy``.
         """
         device = await self._devices.get(caller, device_id)
 
@@ -117,17 +93,13 @@ class Leases:
             require_operator(device)
             await self._lease_store.change(caller, device, changed)
         # The lease is released even if the device is not reachable: its grant expires there.
-        try:
-            await self._command_sender.send(device, ReleaseLease(), caller=caller.name, epoch=epoch)
-        except BusUnavailable as error:
-            _log.warning("release of %s: %s", device.id, error)
-        await self.revoke(device, epoch)
+        await self._command_sender.try_send(device, ReleaseLease(), caller=caller.name, epoch=epoch)
+        await self._revocation.cut(device, epoch)
 
     async def require_still_allowed(self, caller: Identity, device: Device) -> None:
         """Check that the new holder still has permission; otherwise revoke the lease before the device gets it.
 
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``.
+        Raises ``device-unknown`` or ``forbidden``.
         """
         try:
             await self._devices.require_still_allowed(caller, device)
@@ -145,10 +117,3 @@ class Leases:
         except Problem as problem:
             _log.warning("lease of %s: %s", device.id, problem.detail)
             return False
-
-    async def revoke(self, device: Device, epoch: int) -> None:
-        """Revoke the broker credentials for the setpoints of an epoch: fencing without the device."""
-        try:
-            await self._access.revoke(client_id=control_client(device.id, epoch))
-        except BrokerAccessError as error:
-            _log.warning("setpoints of lease %d of %s: %s", epoch, device.id, error)

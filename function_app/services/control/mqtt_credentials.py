@@ -62,10 +62,7 @@ class MqttCredentials:
 
         For shared spaces the grant contains wildcard filters for the space, so its size does not depend on the number
         of devices. Devices shared individually are listed by topic. The response lists each topic. The credentials
-        expire with the first share, session or API key that they depend on.
-
-        Raises:
-            Problem: ``broker-unavailable``, ``busy``.
+        expire with the first share, session or API key that they depend on. Raises ``broker-unavailable`` or ``busy``.
         """
         devices = await self._devices.all(caller)
         issued = await self._watch(caller, devices)
@@ -106,8 +103,7 @@ class MqttCredentials:
     async def control(self, caller: Identity, device_id: str, epoch: int) -> IssuedCredentials:
         """Credentials to send setpoints in one epoch.
 
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``lease-lost``, ``broker-unavailable``.
+        Raises ``device-unknown``, ``forbidden``, ``lease-lost`` or ``broker-unavailable``.
         """
         device = await self._devices.get(caller, device_id)
         now_ms = self._clock.now_ms()
@@ -141,9 +137,7 @@ class MqttCredentials:
         """Credentials of an agent: publish for its devices and receive their commands.
 
         They also allow reading the measurements of its space; its configuration selects which.
-
-        Raises:
-            Problem: ``agent-unclaimed``, ``broker-unavailable``.
+        Raises ``agent-unclaimed`` or ``broker-unavailable``.
         """
         space = require_claimed(agent)
         grant = grants.agent_grant(space, agent.id, token_id=new_id(), lifetime_s=AGENT_S)

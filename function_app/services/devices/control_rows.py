@@ -42,10 +42,7 @@ class ControlRows:
 
 
 async def read_control(tables: Tables, device: Device) -> ControlRows:
-    """Lease, slot and queue in one read.
-
-    Rows of an earlier pairing are ignored, so an interrupted unpairing does not block the device.
-    """
+    """Lease, slot and queue in one read, without those of an earlier pairing."""
     rows = await _rows(tables, device.id)
     lease = _lease(rows, device)
     slot = rows.get(SLOT)
@@ -89,8 +86,7 @@ async def apply_ended_epoch(
 
 async def ended_by_device(tables: Tables, device: Device, lease: Lease) -> bool:
     """Whether the device has ended this lease."""
-    row = await tables.get(records.AGENTS, device.agent, f"state:{device.name}")
-    last = records.read(row, LastState) if row else None
+    _, last = await records.find(tables, records.AGENTS, device.agent, f"state:{device.name}", LastState)
     return last is not None and last.pairing == device.pairing and last.ended_epoch >= lease.epoch
 
 

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from device_agent.protocol import topics
 from function_app.domain.common.ids import device_id, split_device
-from function_app.domain.common.problems import Problem, forbidden, invalid, not_found
+from function_app.domain.common.problems import Problem, forbidden, not_found
 from function_app.domain.control.lease import Lease
 from function_app.domain.devices import access, devices
 from function_app.domain.devices.access import OWNER_PERMISSIONS, Permissions, Share, device_target, space_target
@@ -45,20 +45,12 @@ class DeviceAccess:
         self._clock = clock
 
     async def get(self, caller: Identity, device: str) -> Device:
-        """One device.
-
-        Raises:
-            Problem: ``device-unknown``.
-        """
+        """One device. Raises ``device-unknown``."""
         result, _ = await self.get_with_link(caller, device)
         return result
 
     async def get_with_link(self, caller: Identity, device: str) -> tuple[Device, Link | None]:
-        """One device and the last connection state of its agent, in one read.
-
-        Raises:
-            Problem: ``device-unknown``.
-        """
+        """One device and the last connection state of its agent, in one read. Raises ``device-unknown``."""
         result, link = await self.find_with_link(caller, device)
         if result is None:
             raise not_found("device", device)
@@ -85,10 +77,7 @@ class DeviceAccess:
 
         Removing a share deletes the share first and then ends what depends on it. Using a share writes first and then
         calls this. So at least one of both sees the other. Changes of ownership change the pairing. API keys are
-        checked in the same way.
-
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``.
+        checked in the same way. Raises ``device-unknown`` or ``forbidden``.
         """
         if caller.key:
             caller = await self.require_key(caller)
@@ -96,11 +85,7 @@ class DeviceAccess:
             require_operator(await self.get(caller, device.id))
 
     async def require_key(self, caller: Identity) -> Identity:
-        """``caller`` with the current permissions of the API key; unchanged for a person.
-
-        Raises:
-            Problem: ``forbidden``.
-        """
+        """``caller`` with the current permissions of the API key; unchanged for a person. Raises ``forbidden``."""
         now = await self.current_identity(caller) if caller.key else caller
         if now is None:
             raise forbidden("This API key was revoked or has expired. Create a new one.")
@@ -111,11 +96,7 @@ class DeviceAccess:
         return await current_identity(self._tables, caller, self._clock.now_ms())
 
     async def view(self, caller: Identity, device: str) -> DeviceView:
-        """One device with its current state.
-
-        Raises:
-            Problem: ``device-unknown``.
-        """
+        """One device with its current state. Raises ``device-unknown``."""
         parts = split_device(device)
         if parts is not None:
             for view in await self.of_agent(caller, parts[0], only=parts[1]):
@@ -123,32 +104,19 @@ class DeviceAccess:
         raise not_found("device", device)
 
     async def views(self, caller: Identity, *, cursor: str | None, limit: int) -> tuple[list[DeviceView], str | None]:
-        """All visible devices, in pages of up to ``limit`` agents.
-
-        Raises:
-            Problem: ``cursor-invalid``.
-        """
+        """All visible devices, in pages of up to ``limit`` agents. Raises ``cursor-invalid``."""
         ids, following = await self._agent_ids(caller, cursor, limit)
         result = await asyncio.gather(*(self.of_agent(caller, agent) for agent in ids))
         return [view for views in result for view in views], following
 
     async def all(self, caller: Identity) -> list[Device]:
         """All visible devices, without their current state."""
-        result: list[Device] = []
-        cursor: str | None = None
-        while True:
-            ids, cursor = await self._agent_ids(caller, cursor, 1000)
-            for devices_ in await asyncio.gather(*(self._seen_of(caller, agent) for agent in ids)):
-                result += devices_
-            if cursor is None:
-                return result
+        ids = [*await self._all_agent_ids(caller.account), *await self._shared_agent_ids(caller.account)]
+        visible = await asyncio.gather(*(self._seen_of(caller, agent) for agent in ids))
+        return [device for devices_ in visible for device in devices_]
 
     async def agents(self, caller: Identity, *, cursor: str | None, limit: int) -> tuple[list[Agent], str | None]:
-        """The account's own agents with at least one device visible to ``caller``.
-
-        Raises:
-            Problem: ``cursor-invalid``.
-        """
+        """The account's own agents with at least one device visible to ``caller``. Raises ``cursor-invalid``."""
         ids, following = await self._own_agent_ids(caller.account, cursor, limit)
         rows = await asyncio.gather(*(self._tables.get(records.AGENTS, agent, "agent") for agent in ids))
         agents = [records.read(row, Agent) for row in rows if row is not None]
@@ -179,42 +147,25 @@ class DeviceAccess:
         return own + chosen, f"{_SHARED}{last}" if len(shared) > len(chosen) else None
 
     async def _own_agent_ids(self, account: str, cursor: str | None, limit: int) -> tuple[list[str], str | None]:
-        try:
-            page = await self._tables.query(
-                records.MEMBERS, account, first="agent:", last="agent;", limit=limit, cursor=cursor
-            )
-        except ValueError as error:
-            raise invalid(
-                "The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid"
-            ) from error
+        page = await records.page(
+            self._tables, records.MEMBERS, account, first="agent:", last="agent;", limit=limit, cursor=cursor
+        )
         return [row.key.removeprefix("agent:") for row in page.rows], page.cursor
 
     async def _shared_agent_ids(self, account: str) -> list[str]:
         """Agents that may have shared devices. The shares themselves decide."""
         result: set[str] = set()
-        cursor: str | None = None
-        while True:
-            page = await self._tables.query(
-                records.MEMBERS, account, first="share:", last="share;", limit=1000, cursor=cursor
-            )
-            for row in page.rows:
-                kind, name = access.split_target(row.key.removeprefix("share:"))
-                if kind == "space":
-                    result |= set(await self._all_agent_ids(str(row.data["owner"])))
-                elif (parts := split_device(name)) is not None:
-                    result.add(parts[0])
-            cursor = page.cursor
-            if cursor is None:
-                return sorted(result)
+        async for row in records.all_rows(self._tables, records.MEMBERS, account, first="share:", last="share;"):
+            kind, name = access.split_target(row.key.removeprefix("share:"))
+            if kind == "space":
+                result |= set(await self._all_agent_ids(str(row.data["owner"])))
+            elif (parts := split_device(name)) is not None:
+                result.add(parts[0])
+        return sorted(result)
 
     async def _all_agent_ids(self, account: str) -> list[str]:
-        result: list[str] = []
-        cursor: str | None = None
-        while True:
-            ids, cursor = await self._own_agent_ids(account, cursor, 1000)
-            result += ids
-            if cursor is None:
-                return result
+        rows = records.all_rows(self._tables, records.MEMBERS, account, first="agent:", last="agent;")
+        return [row.key.removeprefix("agent:") async for row in rows]
 
     async def get_as_owner(self, device: str) -> Device | None:
         """A device with the permissions of its owner."""
@@ -239,10 +190,7 @@ class DeviceAccess:
     async def _standings(
         self, caller: Identity, agent: Agent, names: Iterable[str] | None = None
     ) -> dict[str, Permissions]:
-        """Permissions of ``caller`` on the devices of an agent, without devices that are not visible.
-
-        For the owner no share is read.
-        """
+        """Permissions of ``caller`` on the visible devices of an agent."""
         wanted = [spec.name for spec in agent.devices] if names is None else list(names)
         shares: list[Share] = []
         if agent.account is not None and agent.account != caller.account:
@@ -296,33 +244,21 @@ class DeviceAccess:
 
 
 def require_operator(device: Device) -> Device:
-    """The device, if its role may operate.
-
-    Raises:
-        Problem: ``forbidden``.
-    """
+    """The device, if its role may operate. Raises ``forbidden``."""
     if not device.role.may_operate:
         raise forbidden("You may watch this device, but not operate it. Ask its owner.")
     return device
 
 
 def require_owner(device: Device) -> Device:
-    """The device, if its role is owner.
-
-    Raises:
-        Problem: ``forbidden``.
-    """
+    """The device, if its role is owner. Raises ``forbidden``."""
     if not device.role.may_own:
         raise forbidden("Only the owner of this device may do that. Request control at lease/requests.")
     return device
 
 
 def require_claimed(agent: Agent) -> str:
-    """The space of an agent, if it is claimed.
-
-    Raises:
-        Problem: ``agent-unclaimed``.
-    """
+    """The space of an agent, if it is claimed. Raises ``agent-unclaimed``."""
     if agent.space is None:
         detail = "This agent is not claimed yet. Wait until GET /agents/enrollment reports it."
         raise Problem("agent-unclaimed", 409, "The agent is not claimed", detail)
@@ -330,11 +266,7 @@ def require_claimed(agent: Agent) -> str:
 
 
 def require_online(link: Link | None, now_ms: int) -> None:
-    """Reject commands to an offline device.
-
-    Raises:
-        Problem: ``device-offline``: the agent reported "offline", or stopped polling.
-    """
+    """Reject commands to a device whose agent reported "offline" or stopped polling: ``device-offline``."""
     if link is not None and not (devices.online(link, link.seen_ms, now_ms) if link.polled else link.online):
         detail = "The device's agent is offline. Check that it is running and connected."
         raise Problem("device-offline", 409, "The device is offline", detail)

@@ -22,8 +22,7 @@ class DeviceRename:
     async def rename(self, caller: Identity, device_id: str, label: str | None) -> None:
         """Set the label of a device; ``None`` restores the agent's label.
 
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``busy``.
+        Raises ``device-unknown``, ``forbidden`` or ``busy``.
         """
         device = require_owner(await self._devices.get(caller, device_id))
         async with self._audit_log.change(
@@ -31,8 +30,7 @@ class DeviceRename:
         ) as change:
 
             async def attempt() -> None:
-                row = await self._tables.get(records.AGENTS, device.agent, "agent")
-                agent = records.read(row, Agent) if row else None
+                row, agent = await records.find(self._tables, records.AGENTS, device.agent, "agent", Agent)
                 if row is None or agent is None or agent.pairing != device.pairing:
                     raise not_found("device", device.id)
                 changed = rules.rename(agent, device.name, label)

@@ -45,11 +45,7 @@ class Spaces:
         return tuple(view for each in result if (view := _seen(caller, each)) is not None)
 
     async def get(self, caller: Identity, space: str) -> SpaceView:
-        """One space.
-
-        Raises:
-            Problem: ``space-unknown``.
-        """
+        """One space. Raises ``space-unknown``."""
         row = await self._tables.get(records.ACCOUNTS, caller.account, f"space:{space}")
         view: SpaceView | None
         if row is not None:
@@ -63,19 +59,16 @@ class Spaces:
         return seen
 
     async def own(self, caller: Identity, space: str) -> SpaceView:
-        """One space of the account itself.
-
-        Raises:
-            Problem: ``space-unknown``, ``forbidden``.
-        """
+        """One space of the account itself. Raises ``space-unknown`` or ``forbidden``."""
         view = await self.get(caller, space)
         if not view.role.may_own:
             raise forbidden("Only the owner of this space may do that.")
         return view
 
     async def _shared(self, caller: Identity, space: str) -> SpaceView | None:
-        row = await self._tables.get(records.SHARES, space_target(space), share_key(caller.account))
-        share = records.read(row, Share) if row else None
+        _, share = await records.find(
+            self._tables, records.SHARES, space_target(space), share_key(caller.account), Share
+        )
         if share is None or not share.is_live(self._clock.now_ms()):
             return None
         result = await self._tables.get(records.ACCOUNTS, share.owner, f"space:{space}")

@@ -27,13 +27,7 @@ _FORGOTTEN_MS: Final = 3_600_000
 
 @dataclass(frozen=True, slots=True)
 class Viewer:
-    """A sign-in session that views a device.
-
-    Attributes:
-        since_ms: Start of viewing without interruption [ms since 1970].
-        said_ms: Last report [ms since 1970].
-        pairing: Pairing of the device's agent.
-    """
+    """A sign-in session that views a device: since when without interruption, and its last report."""
 
     account: str
     session: str
@@ -55,14 +49,7 @@ class Viewers:
         self._clock = clock
 
     async def mark(self, caller: Identity, device_id: str) -> list[Viewer]:
-        """Report that ``caller`` views a device.
-
-        Returns:
-            The other viewers, longest first.
-
-        Raises:
-            Problem: ``device-unknown``.
-        """
+        """Report that ``caller`` views a device; return the other viewers, longest first. Raises ``device-unknown``."""
         device = await self._devices.get(caller, device_id)
         now_ms = self._clock.now_ms()
         page = await self._tables.query(records.WATCHERS, device.id, limit=2 * MOST)
@@ -81,16 +68,9 @@ class Viewers:
         return sorted(others, key=lambda existing: existing.since_ms)
 
     async def leave(self, caller: Identity, device_id: str) -> None:
-        """Report that ``caller`` stopped viewing.
-
-        Raises:
-            Problem: ``device-unknown``.
-        """
+        """Report that ``caller`` stopped viewing. Raises ``device-unknown``."""
         device = await self._devices.get(caller, device_id)
-        row = await self._tables.get(records.WATCHERS, device.id, caller.session)
-        if row is not None:
-            with contextlib.suppress(Conflict):  # another tab has just reported
-                await self._tables.delete(records.WATCHERS, row)
+        await records.remove(self._tables, records.WATCHERS, device.id, caller.session)
 
     async def _note(self, device: Device, caller: Identity, now_ms: int) -> None:
         # One deletion per hour, scheduled before the row is written.

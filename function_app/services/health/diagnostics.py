@@ -94,8 +94,7 @@ class Diagnostics:
     async def observe(self, device: Device, stream: str, means: Sequence[tuple[int, Values]]) -> None:
         """Process new measurements of a stream: time and mean over at most ten seconds. Late values are ignored.
 
-        Raises:
-            Problem: ``busy``.
+        Raises ``busy``.
         """
         listed = await self._listed(device)
         names = {name for _, values in means for name in values}
@@ -128,11 +127,7 @@ class Diagnostics:
         await records.retry(attempt)
 
     async def of_device(self, caller: Identity, device_id: str) -> tuple[Summary, list[FieldView]]:
-        """Health of a device and of each monitored field.
-
-        Raises:
-            Problem: ``device-unknown``.
-        """
+        """Health of a device and of each monitored field. Raises ``device-unknown``."""
         view = await self._devices.view(caller, device_id)
         summary = await self._summary(view)
         listed = await self._listed(view.device)
@@ -151,8 +146,7 @@ class Diagnostics:
     ) -> tuple[list[Summary], str | None]:
         """Devices with their health, worst first, in pages of up to ``limit`` agents.
 
-        Raises:
-            Problem: ``space-unknown``, ``cursor-invalid``.
+        Raises ``space-unknown`` or ``cursor-invalid``.
         """
         if space is not None:
             await self._spaces.get(caller, space)
@@ -183,8 +177,7 @@ class Diagnostics:
         return result
 
     async def _of_type(self, device: Device) -> tuple[Diagnostic, ...]:
-        row = await self._tables.get(records.AGENTS, device.agent, "agent")
-        agent = None if row is None else records.read(row, Agent)
+        _, agent = await records.find(self._tables, records.AGENTS, device.agent, "agent", Agent)
         if agent is None or agent.account is None:
             return ()
         try:

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from function_app.domain.common.ids import new_suffix
-from function_app.domain.common.problems import Problem, invalid, not_found
+from function_app.domain.common.problems import Problem, not_found
 from function_app.domain.devices.devices import Device
 from function_app.domain.health import faults as rules
 from function_app.domain.health.faults import Fault, Report, Severity
@@ -38,17 +38,9 @@ class Faults:
         self._clock = clock
 
     async def settle(self, device: Device, scope: str, reports: Sequence[Report]) -> None:
-        """Make the open faults of a scope equal to ``reports``: raise new ones, clear missing ones.
+        """Make the open faults of a scope equal to ``reports``: raise new ones, clear missing ones. Idempotent.
 
-        Idempotent and safe to run concurrently.
-
-        Args:
-            device: The device.
-            scope: Reporter; its reports are complete.
-            reports: All current faults of the reporter.
-
-        Raises:
-            Problem: ``busy``.
+        ``reports`` are all current faults of one reporter, the ``scope``. Raises ``busy``.
         """
         wanted = {_key(scope, report.code): report for report in list(reports)[:MAX_OPEN]}
 
@@ -74,26 +66,16 @@ class Faults:
         return sorted(result, key=lambda fault: (-fault.severity.rank, fault.id))
 
     async def past(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Fault], str | None]:
-        """Cleared faults, newest first.
-
-        Raises:
-            Problem: ``cursor-invalid``.
-        """
-        try:
-            page = await self._tables.query(
-                records.FAULTS, _partition(device), first=_PAST, last="past;", limit=limit, cursor=cursor
-            )
-        except ValueError as error:
-            raise invalid(
-                "The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid"
-            ) from error
+        """Cleared faults, newest first. Raises ``cursor-invalid``."""
+        page = await records.page(
+            self._tables, records.FAULTS, _partition(device), first=_PAST, last="past;", limit=limit, cursor=cursor
+        )
         return [records.read(row, Fault) for row in page.rows], page.cursor
 
     async def acknowledge(self, device: Device, fault: str, *, by: str) -> Fault:
         """Acknowledge a fault; it stays open until it is cleared.
 
-        Raises:
-            Problem: ``fault-unknown``, ``fault-cleared``, ``busy``.
+        Raises ``fault-unknown``, ``fault-cleared`` or ``busy``.
         """
 
         async def attempt() -> Fault:

@@ -33,11 +33,7 @@ class ReportedFaults:
         self._clock = clock
 
     async def on_connected(self, agent: Agent, session: int) -> None:
-        """Called when an agent connects, before the link is stored.
-
-        Raises:
-            Problem: ``busy``.
-        """
+        """Called when an agent connects, before the link is stored. Raises ``busy``."""
         row = await self._tables.get(records.AGENTS, agent.id, "link")
         if row is not None and records.read(row, Link).session >= session:
             return
@@ -46,14 +42,9 @@ class ReportedFaults:
             await self._faults.settle(device, _CLOUD, [])
 
     async def on_state(self, agent: Agent, name: str, state: State) -> None:
-        """Called with a device state, before it is stored.
-
-        Raises:
-            Problem: ``busy``.
-        """
+        """Called with a device state, before it is stored. Raises ``busy``."""
         device = next(result for result in devices_of(agent) if result.name == name)
-        row = await self._tables.get(records.AGENTS, agent.id, f"state:{name}")
-        existing = None if row is None else records.read(row, LastState)
+        _, existing = await records.find(self._tables, records.AGENTS, agent.id, f"state:{name}", LastState)
         if existing is not None and msgspec.convert(existing.state, State, strict=False) == state:
             return  # redelivered: not a sign of life
         now_ms = self._clock.now_ms()
@@ -64,12 +55,7 @@ class ReportedFaults:
             await self._faults.settle(device, _DEVICE, [_reported(fault.code, fault.message) for fault in state.faults])
 
     async def check_silent(self, now_ms: int) -> None:
-        """Check the agents that are due. Idempotent and safe to run concurrently.
-
-        Raises:
-            Problem: ``busy``.
-            StoreError: The tables are not available.
-        """
+        """Check the agents that are due. Idempotent and safe to run concurrently. Raises ``busy``."""
         await asyncio.gather(*(self._shard(str(shard), now_ms) for shard in range(SHARDS)))
 
     async def _shard(self, shard: str, now_ms: int) -> None:

@@ -59,14 +59,7 @@ class Authenticator:
         self._known: OrderedDict[tuple[str, str], _Known] = OrderedDict()
 
     async def issue(self, caller: Identity, audience: Audience, lifetime_s: int, *, csrf: str | None = None) -> str:
-        """Issue a token for a sign-in session; it does not outlive the session.
-
-        Args:
-            caller: Account, session and its end.
-            audience: Purpose of the token.
-            lifetime_s: Maximum lifetime [s].
-            csrf: CSRF token for a cookie.
-        """
+        """Issue a token for a sign-in session, which it does not outlive. ``csrf`` belongs to a cookie."""
         key = await self._keys.current()
         now_ms = self._clock.now_ms()
         claims = {
@@ -85,19 +78,11 @@ class Authenticator:
         return jwt.encode(claims, key, ALGORITHM, headers={"kid": signing.key_id(key.public_key())})
 
     async def person(self, token: str, audience: Audience) -> Identity:
-        """The identity behind an access token.
-
-        Raises:
-            Problem: ``unauthorized``: forged, expired, for another purpose, or signed out.
-        """
+        """The identity behind an access token. Raises ``unauthorized``: forged, expired, or signed out."""
         return (await self._find(token, audience)).identity
 
     async def page(self, cookie: str) -> tuple[Identity, str]:
-        """The identity behind a page's cookie, and its CSRF token.
-
-        Raises:
-            Problem: ``unauthorized``, as ``person``.
-        """
+        """The identity behind a page's cookie, and its CSRF token. Raises ``unauthorized``."""
         existing = await self._find(cookie, SESSION)
         return existing.identity, existing.csrf
 
@@ -138,11 +123,7 @@ class Authenticator:
                 del self._known[name]
 
     async def enrolling(self, token: str, public_key: str) -> str:
-        """The id of the agent with this ``public_key``, which must have signed ``token``.
-
-        Raises:
-            Problem: ``unauthorized``.
-        """
+        """The id of the agent with this ``public_key``, which must have signed ``token``. Raises ``unauthorized``."""
         try:
             key = signing.public_key(public_key)
         except ProtocolError as error:
@@ -151,11 +132,7 @@ class Authenticator:
         return agent_id(signing.key_id(key))
 
     async def agent(self, token: str) -> Agent:
-        """The enrolled agent that signed ``token``.
-
-        Raises:
-            Problem: ``unauthorized``: unknown key, forged, expired, or lifetime too long.
-        """
+        """The enrolled agent that signed ``token``. Raises ``unauthorized``."""
         try:
             kid = str(jwt.get_unverified_header(token).get("kid", ""))
             agent = agent_id(kid)

@@ -12,13 +12,7 @@ from function_app.services.storage.retention import Retention
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """A kind of guessable secret.
-
-    Attributes:
-        what: Name in the rows.
-        window_ms: Time for which a failure counts.
-        refusal: Sentence before "Try again in …".
-    """
+    """A guessable secret: its name in rows, how long a failure counts, and the text before "Try again in …"."""
 
     what: str
     window_ms: int
@@ -43,12 +37,8 @@ class GuessLimiter:
     async def add_failure(self, guess: Guess, counters: Mapping[str, int]) -> None:
         """Count an attempt before it is checked, so that parallel attempts cannot bypass the limit.
 
-        Args:
-            guess: Kind of secret.
-            counters: Counters, and the number of failures that each allows per window.
-
-        Raises:
-            Problem: ``too-many-tries``; such an attempt is not counted.
+        ``counters`` maps each counter to the failures that it allows per window. Raises ``too-many-tries``; such an
+        attempt is not counted.
         """
         done: dict[str, int] = {}
         for counter, most in counters.items():

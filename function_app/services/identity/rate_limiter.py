@@ -29,11 +29,7 @@ class RateLimiter:
         self._arrivals: OrderedDict[tuple[Kind, str], float] = OrderedDict()
 
     def admit(self, kind: Kind, name: str) -> None:
-        """Count one request.
-
-        Raises:
-            Problem: ``too-many-requests``.
-        """
+        """Count one request. Raises ``too-many-requests``."""
         key = (kind, name)
         arrival_ms, wait_ms = request(self._rates[kind], self._arrivals.get(key, 0.0), self._clock.now_ms())
         self._arrivals[key] = arrival_ms

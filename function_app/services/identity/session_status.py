@@ -13,17 +13,14 @@ API_KEY: Final = "key"
 
 
 async def current_identity(tables: Tables, caller: Identity, now_ms: int) -> Identity | None:
-    """``caller`` with current permissions; those of an API key are read from the tables.
+    """``caller`` with current permissions; ``None`` if the key has ended or the session was signed out.
 
-    Returns:
-        ``None`` if the key was revoked or expired, or the session was ended explicitly. An expired session is still
-            valid here: its actions continue.
+    An expired session is still valid here: its actions continue.
     """
     key_id = caller.key or key_of(caller.session)
     if not key_id:
         return None if await tables.get(records.ACCOUNTS, caller.account, signed_out_key(caller.session)) else caller
-    row = await tables.get(records.API_KEYS, key_id, API_KEY)
-    key = records.read(row, ApiKey) if row else None
+    _, key = await records.find(tables, records.API_KEYS, key_id, API_KEY, ApiKey)
     if key is None or key.account != caller.account or now_ms >= key.expires_ms:
         return None
     return replace(key.identity, name=caller.name)

@@ -37,12 +37,7 @@ class SignInOrigin:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A sign-in as visible to its account.
-
-    Attributes:
-        how: Sign-in method.
-        program: User agent of the browser or program.
-    """
+    """A sign-in as visible to its account; ``program`` is the user agent."""
 
     id: str
     how: How
@@ -58,12 +53,7 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class SignedIn:
-    """A new sign-in session.
-
-    Attributes:
-        cookie: HTTP-only cookie for the page.
-        csrf: CSRF token that the page must send with the cookie.
-    """
+    """A new sign-in session. A page sends the ``csrf`` token with its HTTP-only ``cookie``."""
 
     account: Account
     session: str
@@ -116,23 +106,15 @@ class Sessions:
     async def list(self, account: str) -> tuple[Session, ...]:
         """Open sessions of an account, newest first."""
         now_ms = self._clock.now_ms()
-        result: list[Session] = []
-        cursor: str | None = None
-        while True:
-            page = await self._tables.query(
-                records.ACCOUNTS, account, first=_ROW, last="session;", limit=1000, cursor=cursor
-            )
-            result += [records.read(row, Session) for row in page.rows]
-            cursor = page.cursor
-            if cursor is None:
-                break
-        live = [session for session in result if now_ms < session.expires_ms]
+        rows = records.all_rows(self._tables, records.ACCOUNTS, account, first=_ROW, last="session;")
+        sessions = [records.read(row, Session) async for row in rows]
+        live = [session for session in sessions if now_ms < session.expires_ms]
         return tuple(sorted(live, key=lambda session: -session.since_ms))
 
     async def get(self, caller: Identity) -> Session | None:
         """The caller's own session."""
-        row = await self._tables.get(records.ACCOUNTS, caller.account, _ROW + caller.session)
-        return records.read(row, Session) if row else None
+        _, session = await records.find(self._tables, records.ACCOUNTS, caller.account, _ROW + caller.session, Session)
+        return session
 
     async def drop(self, account: str, session: str) -> bool:
         """Remove a session from the list; return whether it existed."""

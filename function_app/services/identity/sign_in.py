@@ -35,10 +35,7 @@ class SignIn:
         return await self._account(row.partition if row else named_partition(name), name, keep=True)
 
     async def account_elsewhere(self, issuer: str, subject: str, name: str) -> Account:
-        """The account of a person at an OIDC provider, identified by issuer and subject, never by name.
-
-        Names and e-mail addresses may be reassigned, and not every provider verifies them.
-        """
+        """The account of a person at an OIDC provider, identified by issuer and subject: names may be reassigned."""
         account = await self._account(_elsewhere(issuer, subject), name, keep=False)
         await records.upsert(
             self._tables,
@@ -55,13 +52,7 @@ class SignIn:
         return await self._tables.get(records.ACCOUNTS, _elsewhere(issuer, subject), "account") is not None
 
     async def _account(self, partition: str, name: str, *, keep: bool) -> Account:
-        """Create or complete an account; an interrupted creation is completed by the next call.
-
-        Args:
-            partition: Partition of the row that maps to the account.
-            name: Display name.
-            keep: Keep an existing display name.
-        """
+        """Create or complete an account; ``keep`` its display name. The next call completes an interrupted creation."""
         row = await self._tables.get(records.ACCOUNTS, partition, "account")
         if row is None:
             ids = new_name(new_id(12), name)
@@ -84,11 +75,7 @@ class SignIn:
         return tuple(sorted((records.read(row, Space) for row in page.rows), key=lambda space: space.created_ms))
 
     async def add_space(self, caller: Identity, name: str) -> Space:
-        """Create a space.
-
-        Raises:
-            Problem: ``too-many-spaces``.
-        """
+        """Create a space. Raises ``too-many-spaces``."""
         if len(await self.spaces(caller.account)) >= MOST_SPACES:
             detail = f"An account has at most {MOST_SPACES} spaces. Use one of them."
             raise Problem("too-many-spaces", 409, "Too many spaces", detail)

@@ -31,9 +31,5 @@ class ReadinessCheck:
         return Health(tables="ok", broker=await self._bus.status())
 
     async def require_tables(self) -> None:
-        """Read a row.
-
-        Raises:
-            StoreError: The tables are not available.
-        """
+        """Read a row."""
         await self._tables.get(records.ACCOUNTS, "health", "health")

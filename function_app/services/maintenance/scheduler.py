@@ -13,14 +13,18 @@ from function_app.domain.common.problems import Problem
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
-from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.accounts.api_keys import ApiKeys, about_key
+from function_app.ports.tables import Row, Tables
+from function_app.services.accounts import api_keys as api_keys_
+from function_app.services.accounts.api_keys import ApiKeys
+from function_app.services.actions import queue
 from function_app.services.actions.action_store import ActionStore, StoredAction, row_location
 from function_app.services.actions.dispatcher import ActionDispatcher, MovementUnavailable, PermissionEnded
-from function_app.services.actions.queue import TIMEOUT, ActionQueues, device_of_reminder
+from function_app.services.actions.queue import TIMEOUT, ActionQueues
 from function_app.services.actions.start import ABANDON_MS
-from function_app.services.audit.audit_log import AuditLog, anchor_of, chain_of
-from function_app.services.control.control_events import ControlEvents, lease_of
+from function_app.services.audit import audit_log as audit_log_
+from function_app.services.audit.audit_log import AuditLog
+from function_app.services.control import control_events as control_events_
+from function_app.services.control.control_events import ControlEvents
 from function_app.services.health.reported_faults import ReportedFaults
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.pairing.offboarding import Offboarding, offboarding_of
@@ -81,7 +85,6 @@ class Scheduler:
         self._invitations = invitations
         self._api_keys = api_keys
         self._control_events = control_events
-        self._audit_log = audit_log
         self._access = access
         self._retention = retention
         self._reported_faults = reported_faults
@@ -91,13 +94,14 @@ class Scheduler:
         self._keep_actions_ms = keep_actions_ms
         self._clock = clock
         self._turn = 0
+        self._checks = {
+            control_events_.REMINDER: control_events.check,
+            audit_log_.REMINDER: audit_log.check,
+            audit_log_.ANCHOR_REMINDER: audit_log.anchor,
+        }
 
     async def run_due_jobs(self) -> None:
-        """Run all due jobs once. Failed jobs are logged and retried in the next run.
-
-        Raises:
-            StoreError: The tables are not available.
-        """
+        """Run all due jobs once. Failed jobs are logged and retried in the next run."""
         for shard in range(SHARDS):
             for action, note in await self._reminders.due(shard, self._clock.now_ms()):
                 try:
@@ -119,24 +123,19 @@ class Scheduler:
             _log.warning("broker access: %s", error)
 
     async def _look(self, what: str, note: Row) -> None:
-        if device := device_of_reminder(what):
-            await self._look_at_queue(device, note)
+        kind, _, target = what.partition(":")
+        if kind == queue.REMINDER:
+            await self._look_at_queue(target, note)
         elif agent := offboarding_of(what):
             await self._look_at_leaver(agent, note)
         elif about_share(what):
             await self._sharing.look(what, note)
-        elif about_key(what):
-            await self._api_keys.look(what, note)
+        elif kind == api_keys_.REMINDER:
+            await self._api_keys.look(target, note)
         elif about_transfer(what):
             await self._invitations.go_on(what, note)
-        elif device := lease_of(what):
-            await self._control_events.check(device)
-            await self._reminders.cancel(note)
-        elif owner := chain_of(what):
-            await self._audit_log.check(owner)
-            await self._reminders.cancel(note)
-        elif owner := anchor_of(what):
-            await self._audit_log.anchor(owner)
+        elif kind in self._checks:
+            await self._checks[kind](target)
             await self._reminders.cancel(note)
         else:
             await self._look_at_action(what, note)
@@ -237,14 +236,9 @@ class Scheduler:
 
     async def _cancel(self, action: Action) -> None:
         device = await self._dispatcher.device(action)
-        if device is None:
-            return
-        try:
-            await self._command_sender.send(
-                device, CancelAction(action=action.id), caller=action.who, epoch=action.epoch
-            )
-        except BusUnavailable as error:
-            _log.warning("cancel of %s: %s", action.id, error)
+        if device is not None:
+            order = CancelAction(action=action.id)
+            await self._command_sender.try_send(device, order, caller=action.who, epoch=action.epoch)
 
     async def _forget_expired(self) -> None:
         """Delete expired claim codes and sign-in links, a limited number per run."""
@@ -254,7 +248,4 @@ class Scheduler:
             page = await self._tables.query(table, shards[self._turn % len(shards)], limit=1000)
             for row in page.rows:
                 if now_ms >= row.data["expires_ms"]:
-                    try:
-                        await self._tables.delete(table, row)
-                    except Conflict:
-                        continue
+                    await records.discard(self._tables, table, row)

@@ -1,5 +1,7 @@
 """Builds, signs and sends commands to devices."""
 
+import logging
+
 from msgspec.structs import replace
 
 from device_agent.protocol import CancelAction, Command, Request, RunMovement, StopDevice, codec
@@ -20,6 +22,8 @@ STOP_KEPT_MS = 60_000
 """A polling agent can fetch a Stop for this long: a late Stop is still valid."""
 _ENVELOPE_BYTES = 512
 """Upper bound of what signature, key, epoch and times add to a validated command."""
+
+_log = logging.getLogger(__name__)
 
 
 class CommandSender:
@@ -87,6 +91,15 @@ class CommandSender:
         signed = await self._sign_short_lived(device, request, caller=caller, epoch=epoch)
         await self._delivery.send(device, signed)
         return signed.command
+
+    async def try_send(self, device: Device, request: Request, *, caller: str, epoch: int) -> bool:
+        """As ``send``, best effort; return whether the broker confirmed the command."""
+        try:
+            await self.send(device, request, caller=caller, epoch=epoch)
+        except BusUnavailable as error:
+            _log.warning("%s for %s: %s", type(request).__name__, device.id, error)
+            return False
+        return True
 
     async def send_confirmed(self, device: Device, request: Request, *, caller: str, epoch: int, wait_ms: int) -> bool:
         """Sign and send a short-lived command; return whether the device accepted it within ``wait_ms``.

@@ -57,15 +57,9 @@ class Mailbox:
     async def put(
         self, device: Device, command: str, *, topic: str, payload: bytes, expires_ms: int, first: bool
     ) -> None:
-        """Store a command for the device's agent. Idempotent by command id.
+        """Store a command for the device's agent until ``expires_ms`` [ms since 1970]. Idempotent by command id.
 
-        Args:
-            device: The device.
-            command: Command id.
-            topic: Topic for MQTT.
-            payload: JSON.
-            expires_ms: Expiry time [ms since 1970].
-            first: Return it before all others: a Stop.
+        ``first``: returned before all others, as a Stop.
         """
         letter = MailboxEntry(command, topic, payload, expires_ms, device.pairing)
         await self._tidy_later(device.agent, expires_ms)
@@ -76,13 +70,7 @@ class Mailbox:
         self._ring(device.agent)
 
     async def pending(self, agent: Agent, *, limit: int, have: Collection[str] = ()) -> list[MailboxEntry]:
-        """Unacknowledged commands, Stop first, then oldest first.
-
-        Args:
-            agent: The agent; commands of earlier pairings are skipped.
-            limit: Maximum number.
-            have: Ids of commands to skip.
-        """
+        """Unacknowledged commands of this pairing, Stop first, then oldest first; without the ids in ``have``."""
         result: list[MailboxEntry] = []
         now_ms, size = self._clock.now_ms(), 0
         cursor: str | None = None
@@ -109,8 +97,7 @@ class Mailbox:
         for first in (False, True):
             row = await self._tables.get(records.MAILBOX, agent, _key(command, first=first))
             if row is not None:
-                with contextlib.suppress(Conflict):
-                    await self._tables.delete(records.MAILBOX, row)
+                await records.discard(self._tables, records.MAILBOX, row)
                 return
 
     async def expect_answer(self, device: Device, command: str, *, expires_ms: int) -> None:

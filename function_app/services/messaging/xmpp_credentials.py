@@ -62,17 +62,7 @@ class Admitted:
 
 
 class XmppCredentials:
-    """Creates and verifies passwords.
-
-    Args:
-        tables: Agents.
-        keys: Signing keys.
-        authenticator: Tokens of people.
-        sign_in: Names of accounts.
-        devices: Agents of an account.
-        clock: Cloud clock.
-        domain: Domain part of every JID; empty: no XMPP server.
-    """
+    """Creates and verifies passwords. ``domain``: domain part of every JID; empty: there is no XMPP server."""
 
     def __init__(
         self,
@@ -142,11 +132,10 @@ class XmppCredentials:
 
     async def _verify_agent(self, user: str, password: str) -> Admitted:
         claims = await self._claims(password)
-        row = await self._tables.get(records.AGENTS, user, "agent")
-        agent = None if row is None else records.read(row, Agent)
-        if claims.get("sub") != f"agent:{user}" or agent is None or agent.account is None:
+        _, agent = await records.find(self._tables, records.AGENTS, user, "agent", Agent)
+        if agent is None or agent.account is None:
             raise _refused()
-        if claims.get("pairing") != agent.pairing:
+        if (claims.get("sub"), claims.get("pairing")) != (f"agent:{user}", agent.pairing):
             raise _refused()
         owner = await self._sign_in.named(agent.account)
         contacts = (Contact(jids.CLOUD, CLOUD_NAME), Contact(agent.account, owner))
@@ -174,15 +163,8 @@ class XmppCredentials:
         key = await self._keys.current()
         now_s = self._clock.now_ms() // 1000
         expires_s = now_s + lifetime_s
-        claims = {
-            "iss": "telescope",
-            "aud": XMPP,
-            "sub": subject,
-            "iat": now_s,
-            "exp": expires_s,
-            "jti": new_id(),
-            **more,
-        }
+        claims = {"iss": "telescope", "aud": XMPP, "sub": subject, "iat": now_s, "exp": expires_s, "jti": new_id()}
+        claims |= more
         token = jwt.encode(claims, key, ALGORITHM, headers={"kid": signing.key_id(key.public_key())})
         return Password(user, token, expires_s * 1000, lifetime_s)
 

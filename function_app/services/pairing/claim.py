@@ -1,6 +1,5 @@
 """Claiming an agent with the code that it displays."""
 
-import contextlib
 from dataclasses import dataclass
 
 from function_app.domain.audit.hash_chain import AccountEvent
@@ -10,7 +9,7 @@ from function_app.domain.devices import devices
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Conflict, Row, Tables
+from function_app.ports.tables import Row, Tables
 from function_app.services.audit.audit_log import AuditLog, Change
 from function_app.services.identity.guess_limiter import Guess, GuessLimiter, by_address
 from function_app.services.identity.sign_in import SignIn
@@ -92,8 +91,7 @@ class Claim:
             if claimed is None:
                 change.came_to_nothing = True
         if claimed is not None:
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(records.CLAIMS, result)
+            await records.discard(self._tables, records.CLAIMS, result)
         return claimed
 
     async def _take(self, caller: Identity, code: str, agent_id: str, space: str, change: Change) -> Agent | None:

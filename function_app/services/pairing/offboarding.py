@@ -83,8 +83,7 @@ class Offboarding:
         Raises:
             Problem: ``busy``.
         """
-        row = await self._tables.get(records.AGENTS, agent_id, "agent")
-        agent = records.read(row, Agent) if row else None
+        _, agent = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
         if agent is None:
             return True
         done = set()
@@ -149,13 +148,11 @@ class Offboarding:
         """Delete a row of the former pairing, unless it was rewritten."""
         row = await self._tables.get(table, partition, key)
         if row is not None and row.data.get("pairing", "") in {"", leaving.pairing}:
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(table, row)
+            await records.discard(self._tables, table, row)
 
     async def _tell_broker(self, agent_id: str, leaving: Departure) -> None:
         """Disconnect the agent, then clear its retained messages, including its will, but not new ones."""
-        result = await self._tables.get(records.AGENTS, agent_id, "agent")
-        now = records.read(result, Agent) if result else None
+        _, now = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
         if leaving.why != "removed":
             if leaving.why == "unpaired":
                 await self._certificates.revoke(agent_id)
@@ -165,8 +162,7 @@ class Offboarding:
         if leaving.why == "unpaired":
             for name in leaving.devices:
                 await self._end_shares(device_id(agent_id, name), leaving.pairing)
-        row = await self._tables.get(records.AGENTS, agent_id, "agent")
-        agent = records.read(row, Agent) if row else None
+        _, agent = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
         back = agent if agent is not None and agent.space == leaving.space else None
         if back is None:
             await self._bus.publish(topics.conn(leaving.space, agent_id), b"", retain=True)
@@ -189,11 +185,9 @@ class Offboarding:
             if share.pairing != pairing:
                 continue
             await self._access.revoke(principal=all_viewers(share.account))
-            with contextlib.suppress(Conflict):
+            with contextlib.suppress(Conflict):  # a renewed share keeps its index
                 await self._tables.delete(records.SHARES, row)
-                index = await self._tables.get(records.MEMBERS, share.account, f"share:{on}")
-                if index is not None:
-                    await self._tables.delete(records.MEMBERS, index)
+                await records.remove(self._tables, records.MEMBERS, share.account, f"share:{on}")
 
     async def _strike(self, agent_id: str, done: Iterable[Departure]) -> None:
         gone = set(done)

@@ -60,8 +60,7 @@ class Unpair:
 
         async def attempt() -> Agent:
             nonlocal watched
-            row = await self._tables.get(records.AGENTS, agent_id, "agent")
-            agent = records.read(row, Agent) if row else None
+            row, agent = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
             if row is None or agent is None or agent.account != caller.account:
                 raise not_found("agent", agent_id)
             changed = rule(agent)

@@ -1,6 +1,5 @@
 """Periodic cleanup of robot types: unvalidated uploads, unused versions and files."""
 
-import contextlib
 import logging
 from collections.abc import Sequence
 
@@ -8,7 +7,7 @@ from function_app.domain.common.problems import Problem
 from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Conflict, Row, Tables
+from function_app.ports.tables import Row, Tables
 from function_app.services.robot_types.model_validation import drop_files, store_verdict
 from function_app.services.robot_types.rows import (
     CHECKS,
@@ -59,8 +58,7 @@ class RobotTypeCleanup:
             except Problem as problem:
                 _log.warning("robot types: %s", problem.detail)
                 continue
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(records.MODEL_CHECKS, note)
+            await records.discard(self._tables, records.MODEL_CHECKS, note)
 
     async def _look(self, where: Place) -> None:
         _, head = await read_head(self._tables, where)
@@ -89,17 +87,12 @@ class RobotTypeCleanup:
         for row, version in zip(rows, versions, strict=True):
             await self._drop(where, row, version)
         last, _ = await read_head(self._tables, where)
-        if last is not None:
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(records.ROBOT_TYPES, last)
+        await records.discard(self._tables, records.ROBOT_TYPES, last)
         await self._forget(where)
 
     async def _forget(self, where: Place) -> None:
         """Remove a preview from its account's list."""
-        row = await self._tables.get(records.MEMBERS, where.account, preview_index(where))
-        if row is not None:
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(records.MEMBERS, row)
+        await records.remove(self._tables, records.MEMBERS, where.account, preview_index(where))
 
     async def _look_at(self, where: Place, head: TypeHead, row: Row) -> None:
         version = records.read(row, TypeVersion)
@@ -134,5 +127,4 @@ class RobotTypeCleanup:
     async def _drop(self, where: Place, row: Row, version: TypeVersion) -> None:
         """Delete the files first: rows without files are deleted again, files without rows would be lost."""
         await drop_files(self._blobs, where, version.version)
-        with contextlib.suppress(Conflict):
-            await self._tables.delete(records.ROBOT_TYPES, row)
+        await records.discard(self._tables, records.ROBOT_TYPES, row)

@@ -1,6 +1,5 @@
 """Deletion of unused robot types."""
 
-import contextlib
 from dataclasses import replace
 
 from function_app.domain.audit.hash_chain import AccountEvent
@@ -8,7 +7,7 @@ from function_app.domain.common.problems import Problem, not_found
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.robot_catalogue import RobotCatalogue
-from function_app.ports.tables import Conflict, Row, Tables
+from function_app.ports.tables import Tables
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.robot_types.movements import Movements
@@ -62,17 +61,13 @@ class RobotTypeDeletion:
             await schedule_check(self._tables, where, self._clock.now_ms() + AFTER_MS)
             await change.noted()
             gone = replace(head, deleted=True, ready=0, manifest={})
-            await self._tables.replace(
-                records.ROBOT_TYPES, Row(row.partition, row.key, records.to_data(gone), row.etag)
-            )
+            await records.update(self._tables, records.ROBOT_TYPES, row, gone)
 
         async with self._audit_log.change(
             caller.account, AccountEvent.ROBOT_TYPE_DELETED, caller, on=robot_type
         ) as change:
             await records.retry(attempt)
-        if index is not None:
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(records.MEMBERS, index)
+        await records.discard(self._tables, records.MEMBERS, index)
 
     async def _require_unused(self, caller: Identity, robot_type: str) -> None:
         own = [device for device in await self._devices.all(caller) if device.owner == caller.account]

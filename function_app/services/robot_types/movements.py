@@ -223,7 +223,7 @@ class Movements:
                 raise not_found("movement", name)
             gone = replace(old, deleted=True, updated_ms=self._clock.now_ms())
             await change.noted()
-            await self._tables.replace(records.MOVEMENTS, Row(row.partition, row.key, records.to_data(gone), row.etag))
+            await records.update(self._tables, records.MOVEMENTS, row, gone)
             return gone
 
         async with self._audit_log.change(

@@ -27,13 +27,7 @@ _Whole = Annotated[int, Meta(ge=-(2**53), le=2**53)]
 
 
 class _Value(
-    Struct,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-    omit_defaults=True,
-    rename="camel",
-    tag_field="type",
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True, rename="camel", tag_field="type"
 ):
     """Common fields of all values. ``unit`` is for display."""
 

@@ -10,7 +10,6 @@ timer retries.
 """
 
 import asyncio
-import contextlib
 import logging
 from typing import Final
 
@@ -23,7 +22,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
-from function_app.ports.tables import Conflict, Tables
+from function_app.ports.tables import Tables
 from function_app.services.actions.action_store import ActionStore
 from function_app.services.actions.queue import ActionQueues
 from function_app.services.control.fencing import ControlRevocation
@@ -148,10 +147,7 @@ class AccessRevocation:
         return str(row.data["owner"]) if row else ""
 
     async def _unindex(self, share: Share) -> None:
-        row = await self._tables.get(records.MEMBERS, share.account, INDEX + share.on)
-        if row is not None:
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(records.MEMBERS, row)
+        await records.remove(self._tables, records.MEMBERS, share.account, INDEX + share.on)
         if await self._tables.get(records.SHARES, share.on, share_key(share.account)) is not None:
             # Shared again concurrently: the index follows the share.
             await index(self._tables, share)

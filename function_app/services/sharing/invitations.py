@@ -4,7 +4,6 @@ Only the hash of the secret is stored, as row key. Concurrent redemptions are se
 when its target changes owner.
 """
 
-import contextlib
 import hashlib
 from dataclasses import dataclass
 from typing import Final
@@ -13,17 +12,17 @@ from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.ids import ID, new_id
 from function_app.domain.common.problems import Problem, forbidden, not_found
 from function_app.domain.devices import invitations as rules
-from function_app.domain.devices.access import split_target
+from function_app.domain.devices.access import Kind, split_target
 from function_app.domain.devices.devices import Agent
 from function_app.domain.devices.invitations import Invitation
 from function_app.domain.identity.accounts import Account, Identity, Role
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Conflict, Row, Tables
+from function_app.ports.tables import Row, Tables
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.authenticator import new_secret
 from function_app.services.identity.sign_in import SignIn
-from function_app.services.sharing.ownership_transfer import OwnershipTransfer, invalidate
-from function_app.services.sharing.shares import NewShare, Sharing, own_share_error, require_person
+from function_app.services.sharing.ownership_transfer import OwnershipTransfer
+from function_app.services.sharing.shares import Sharing, Target, own_share_error, require_person
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import Retention
@@ -85,35 +84,18 @@ class Invitations:
         self._audit_log = audit_log
         self._clock = clock
 
-    # ------------------------------------------------------------ the owner's side
-
-    async def agent(self, caller: Identity, agent_id: str) -> NewShare:
-        """An agent of the caller, for a transfer.
+    async def transferable(self, caller: Identity, kind: Kind, name: str) -> Target:
+        """An agent or a space of the caller, for a transfer.
 
         Raises:
-            Problem: ``agent-unknown``, ``forbidden``.
+            Problem: ``agent-unknown``, ``space-unknown``, ``forbidden``, ``last-space``.
         """
-        row = await self._tables.get(records.AGENTS, agent_id, "agent")
-        agent = records.read(row, Agent) if row else None
-        if agent is None or agent.account != caller.account:
-            raise not_found("agent", agent_id)
-        require_person(caller)
-        owner = Account(caller.account, await self._sign_in.named(caller.account))
-        return NewShare(f"agent:{agent_id}", owner, agent.name, agent.pairing)
-
-    async def space(self, caller: Identity, space: str) -> NewShare:
-        """A space of the caller, for a transfer.
-
-        Raises:
-            Problem: ``space-unknown``, ``forbidden``, ``last-space``.
-        """
-        shared = await self._sharing.of(caller, "space", space)
-        require_person(caller)
-        if len(await self._sign_in.spaces(caller.account)) == 1:
+        target = await self._sharing.of(caller, kind, name)
+        if kind == "space" and len(await self._sign_in.spaces(caller.account)) == 1:
             raise _last_space("It is this account's only space. Create another one first.")
-        return shared
+        return target
 
-    async def make(self, caller: Identity, shared: NewShare, offer: Offer) -> tuple[str, Known]:
+    async def make(self, caller: Identity, shared: Target, offer: Offer) -> tuple[str, Known]:
         """A new invitation and its secret, which cannot be read again.
 
         Raises:
@@ -156,22 +138,18 @@ class Invitations:
             await self._tables.create(records.INVITATIONS, Row(existing.id[0], existing.id, records.to_data(created)))
         return secret, existing
 
-    async def open(self, shared: NewShare) -> list[Known]:
+    async def open(self, shared: Target) -> list[Known]:
         """Open invitations to a target, oldest first."""
         page = await self._tables.query(records.SHARES, shared.on, first=_INDEX, last="invitation;", limit=1000)
-        result = [await self._get(row.key.removeprefix(_INDEX)) for row in page.rows]
-        now_ms = self._clock.now_ms()
-        existing = [
+        listed = [await self._open(row.key.removeprefix(_INDEX)) for row in page.rows]
+        result = [
             Known(row.key, invitation)
-            for row, invitation in result
-            if row is not None
-            and invitation is not None
-            and invitation.is_open(now_ms)
-            and (invitation.owner, invitation.pairing) == (shared.owner.id, shared.pairing)
+            for row, invitation in filter(None, listed)
+            if (invitation.owner, invitation.pairing) == (shared.owner.id, shared.pairing)
         ]
-        return sorted(existing, key=lambda each: each.invitation.created_ms)
+        return sorted(result, key=lambda each: each.invitation.created_ms)
 
-    async def withdraw(self, caller: Identity, shared: NewShare, invitation: str) -> None:
+    async def withdraw(self, caller: Identity, shared: Target, invitation: str) -> None:
         """Withdraw an invitation. Existing shares remain.
 
         Raises:
@@ -179,16 +157,11 @@ class Invitations:
         """
 
         async def attempt() -> None:
-            row, existing = await self._get(invitation)
-            if (
-                row is None
-                or existing is None
-                or existing.on != shared.on
-                or not existing.is_open(self._clock.now_ms())
-            ):
+            existing = await self._open(invitation)
+            if existing is None or existing[1].on != shared.on:
                 raise not_found("invitation", invitation)
             await change.noted()
-            await self._tables.delete(records.INVITATIONS, row)
+            await self._tables.delete(records.INVITATIONS, existing[0])
 
         named = {"invitation": invitation[:12]}
         async with self._audit_log.change(
@@ -196,8 +169,6 @@ class Invitations:
         ) as change:
             await records.retry(attempt)
         await self._unlist(shared.on, invitation)
-
-    # ------------------------------------------------------------ the other side
 
     async def look(self, secret: str) -> Known:
         """The invitation with this secret.
@@ -213,23 +184,15 @@ class Invitations:
         Raises:
             Problem: ``invitation-unknown``.
         """
-        row, existing = await self._get(invitation)
-        if (
-            row is None
-            or existing is None
-            or not existing.is_open(self._clock.now_ms())
-            or not await self._good(existing)
-        ):
+        existing = await self._open(invitation)
+        if existing is None or not await self._good(existing[1]):
             raise _unknown()
-        return Known(row.key, existing)
+        return Known(invitation, existing[1])
 
     async def redeem(self, caller: Identity, existing: Known, *, space: str | None = None) -> None:
-        """Redeem an invitation.
+        """Redeem an invitation, whose secret the caller has presented.
 
-        Args:
-            caller: The account that redeems it.
-            existing: The invitation, whose secret the caller has presented.
-            space: Space of the caller for a transferred agent; ``None``: the first one.
+        ``space``: space of the caller for a transferred agent; ``None``: the first one.
 
         Raises:
             Problem: ``invitation-unknown``; ``forbidden``: for another account, or called with an API key;
@@ -247,17 +210,17 @@ class Invitations:
         else:
             await self._use(caller, existing)
             owner = Account(offered.owner, offered.by)
-            shared = NewShare(offered.on, owner, offered.label, offered.pairing)
+            shared = Target(offered.on, owner, offered.label, offered.pairing)
             giver = Identity(offered.owner, offered.by, "")
             ends_ms = offered.ends_ms(self._clock.now_ms())
             await self._sharing.give(giver, shared, Account(caller.account, caller.name), offered.role, ends_ms)
 
     async def go_on(self, what: str, note: Row) -> None:
         """Called by the timer: continue an accepted transfer."""
-        row, existing = await self._get(what.removeprefix(_NOTE))
+        invitation = what.removeprefix(_NOTE)
+        row, existing = await self._get(invitation)
         if row is not None and existing is not None and existing.taken_by:
-            with contextlib.suppress(_Void):
-                await self._carry_out(row.key, existing)
+            await self._carry_out(invitation, existing)
         await self._reminders.cancel(note)
 
     async def _take(self, caller: Identity, existing: Known, space: str | None) -> None:
@@ -276,15 +239,14 @@ class Invitations:
         note = await self._reminders.schedule(f"{_NOTE}{existing.id}", self._clock.now_ms() + LOOK_MS)
 
         async def attempt() -> Invitation:
-            row, created = await self._get(existing.id)
-            if row is None or created is None or not created.is_open(self._clock.now_ms()):
+            found = await self._open(existing.id)
+            if found is None:
                 raise _unknown()
-            taken = created.accepted(caller.account, goal)
+            row, offered = found
+            taken = offered.accepted(caller.account, goal)
             await given.noted()
             await got.noted()
-            await self._tables.replace(
-                records.INVITATIONS, Row(row.partition, row.key, records.to_data(taken), row.etag)
-            )
+            await records.update(self._tables, records.INVITATIONS, row, taken)
             return taken
 
         owner, on, to = existing.invitation.owner, existing.invitation.on, {"to": caller.account}
@@ -293,41 +255,33 @@ class Invitations:
             self._audit_log.change(caller.account, AccountEvent.TRANSFERRED, caller, on=on, **to) as got,
         ):
             taken = await records.retry(attempt)
-        try:
-            await self._carry_out(existing.id, taken)
-        except _Void as nothing:
-            raise invalidate() from nothing
+        if not await self._carry_out(existing.id, taken):
+            detail = (
+                "It was transferred or unpaired after the invitation was created. Ask its owner for a new invitation."
+            )
+            raise Problem("transfer-impossible", 409, "It cannot be transferred", detail)
         if note is not None:
             await self._reminders.cancel(note)
 
-    async def _carry_out(self, invitation: str, taken: Invitation) -> None:
-        try:
-            await self._ownership_transfer.carry_out(taken)
-        except Problem as problem:
-            if problem.code != "transfer-impossible":
-                raise
-            await self._delete(invitation, taken)
-            raise _Void from problem
-        await self._delete(invitation, taken)
+    async def _carry_out(self, invitation: str, taken: Invitation) -> bool:
+        """Complete an accepted transfer and delete its invitation; False: the target has another owner."""
+        done = await self._ownership_transfer.carry_out(taken)
+        row, _ = await self._get(invitation)
+        await records.discard(self._tables, records.INVITATIONS, row)
+        await self._unlist(taken.on, invitation)
+        return done
 
     async def _use(self, caller: Identity, existing: Known) -> None:
         """Count one use; fails if another account was first."""
 
         async def attempt() -> None:
-            row, created = await self._get(existing.id)
-            if (
-                row is None
-                or created is None
-                or not created.is_open(self._clock.now_ms())
-                or caller.account in created.takers
-            ):
+            found = await self._open(existing.id)
+            if found is None or caller.account in found[1].takers:
                 raise _unknown()
-            left = created.redeemed(caller.account)
+            row, left = found[0], found[1].redeemed(caller.account)
             await change.noted()
             if left.uses:
-                await self._tables.replace(
-                    records.INVITATIONS, Row(row.partition, row.key, records.to_data(left), row.etag)
-                )
+                await records.update(self._tables, records.INVITATIONS, row, left)
             else:
                 await self._tables.delete(records.INVITATIONS, row)
                 await self._unlist(left.on, existing.id)
@@ -341,8 +295,7 @@ class Invitations:
         kind, name = split_target(existing.on)
         if kind == "space":
             return await self._tables.get(records.ACCOUNTS, existing.owner, f"space:{name}") is not None
-        row = await self._tables.get(records.AGENTS, name.partition("-")[0], "agent")
-        agent = records.read(row, Agent) if row else None
+        _, agent = await records.find(self._tables, records.AGENTS, name.partition("-")[0], "agent", Agent)
         return agent is not None and (agent.account, agent.pairing) == (existing.owner, existing.pairing)
 
     async def _get(self, invitation: str) -> tuple[Row | None, Invitation | None]:
@@ -351,22 +304,14 @@ class Invitations:
         row = await self._tables.get(records.INVITATIONS, invitation[0], invitation)
         return row, records.read(row, Invitation) if row else None
 
-    async def _delete(self, invitation: str, existing: Invitation) -> None:
-        row, _ = await self._get(invitation)
-        if row is not None:
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(records.INVITATIONS, row)
-        await self._unlist(existing.on, invitation)
+    async def _open(self, invitation: str) -> tuple[Row, Invitation] | None:
+        row, existing = await self._get(invitation)
+        if row is None or existing is None or not existing.is_open(self._clock.now_ms()):
+            return None
+        return row, existing
 
     async def _unlist(self, on: str, invitation: str) -> None:
-        row = await self._tables.get(records.SHARES, on, _INDEX + invitation)
-        if row is not None:
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(records.SHARES, row)
-
-
-class _Void(Exception):  # noqa: N818 (an outcome)
-    """The target has another owner."""
+        await records.remove(self._tables, records.SHARES, on, _INDEX + invitation)
 
 
 def about_transfer(note: str) -> bool:

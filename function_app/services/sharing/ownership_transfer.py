@@ -11,7 +11,6 @@ import contextlib
 from dataclasses import dataclass
 
 from function_app.domain.common.ids import new_id
-from function_app.domain.common.problems import Problem
 from function_app.domain.devices import devices as rules
 from function_app.domain.devices.access import space_target, split_target
 from function_app.domain.devices.devices import Agent
@@ -42,18 +41,17 @@ class OwnershipTransfer:
         self._offboarding = offboarding
         self._clock = clock
 
-    async def carry_out(self, taken: Invitation) -> None:
-        """Execute the remaining steps.
+    async def carry_out(self, taken: Invitation) -> bool:
+        """Execute the remaining steps; return False if the agent has another owner than the offering account.
 
         Raises:
-            Problem: ``busy``; ``transfer-impossible``: the agent has another owner than the offering account.
+            Problem: ``busy``.
         """
         kind, name = split_target(taken.on)
         if kind == "agent":
-            if not await self._hand_over(name, taken, pairing=taken.pairing):
-                raise invalidate()
-            return
+            return await self._hand_over(name, taken, pairing=taken.pairing)
         await self._carry_space(name, taken)
+        return True
 
     async def _carry_space(self, name: str, taken: Invitation) -> None:
         """Create the new space, close the former one, then move its agents."""
@@ -64,10 +62,7 @@ class OwnershipTransfer:
         )
         with contextlib.suppress(Conflict):
             await self._tables.create(records.ACCOUNTS, row)
-        former = await self._tables.get(records.ACCOUNTS, taken.owner, f"space:{name}")
-        if former is not None:
-            with contextlib.suppress(Conflict):
-                await self._tables.delete(records.ACCOUNTS, former)
+        await records.remove(self._tables, records.ACCOUNTS, taken.owner, f"space:{name}")
         for agent in sorted({device.agent for device in await self._devices.in_space(taken.owner, name)}):
             await self._hand_over(agent, taken, space=name)
         await self._sharing.end_all(space_target(name))
@@ -77,13 +72,11 @@ class OwnershipTransfer:
         await self._offboarding.watch(agent_id)
 
         async def attempt() -> Agent | None:
-            row = await self._tables.get(records.AGENTS, agent_id, "agent")
-            agent = records.read(row, Agent) if row else None
+            row, agent = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
             if row is None or agent is None:
                 return None
-            if agent.account != taken.owner or (pairing or agent.pairing) != agent.pairing:
-                return agent
-            if space and agent.space != space:
+            offered = (taken.owner, pairing or agent.pairing, space or agent.space)
+            if (agent.account, agent.pairing, agent.space) != offered:
                 return agent
             now_ms = self._clock.now_ms()
             changed = rules.transfer(
@@ -100,9 +93,3 @@ class OwnershipTransfer:
         if agent is not None and agent.leaving:
             await self._offboarding.finish(agent_id)
         return agent is not None and agent.account == taken.taken_by
-
-
-def invalidate() -> Problem:
-    """Mark an invitation as void because its target has another owner."""
-    detail = "It was transferred or unpaired after the invitation was created. Ask its owner for a new invitation."
-    return Problem("transfer-impossible", 409, "It cannot be transferred", detail)

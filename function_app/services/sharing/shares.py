@@ -6,8 +6,8 @@ reminder, written first, continues this if the process is killed.
 
 import asyncio
 import logging
-from dataclasses import dataclass, replace
-from typing import Final, Literal
+from dataclasses import dataclass
+from typing import Final
 
 from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.problems import Problem, forbidden, invalid, not_found
@@ -15,6 +15,7 @@ from function_app.domain.common.timestamps import NEVER_MS
 from function_app.domain.control.control_events import Fact
 from function_app.domain.devices.access import (
     MAX_SHARES,
+    Kind,
     Share,
     device_target,
     expiry_ms,
@@ -23,6 +24,7 @@ from function_app.domain.devices.access import (
     space_target,
     split_target,
 )
+from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Account, Identity, Role
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
@@ -46,7 +48,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class NewShare:
+class Target:
     """A target that the caller owns and may share or transfer."""
 
     on: str
@@ -81,27 +83,32 @@ class Sharing:
         self._audit_log = audit_log
         self._clock = clock
 
-    # ------------------------------------------------------------ what people ask for
-
-    async def of(self, caller: Identity, kind: Literal["device", "space"], name: str) -> NewShare:
-        """A device or space of the caller, to share it.
+    async def of(self, caller: Identity, kind: Kind, name: str) -> Target:
+        """A device, space or agent of the caller, to share or transfer it.
 
         Raises:
-            Problem: ``device-unknown``, ``space-unknown``, ``forbidden``; always for an API key, because shares outlive
-                keys.
+            Problem: ``device-unknown``, ``space-unknown``, ``agent-unknown``, ``forbidden``; always for an API key,
+                because shares outlive keys.
         """
+        if kind == "agent":
+            _, agent = await records.find(self._tables, records.AGENTS, name, "agent", Agent)
+            if agent is None or agent.account != caller.account:
+                raise not_found("agent", name)
+            require_person(caller)
+            owner = Account(caller.account, await self._sign_in.named(caller.account))
+            return Target(f"agent:{name}", owner, agent.name, agent.pairing)
         if kind == "space":
             view = await self._spaces.own(caller, name)
             require_person(caller)
-            return NewShare(space_target(name), view.owner, view.space.name)
+            return Target(space_target(name), view.owner, view.space.name)
         device = await self._devices.get(caller, name)
         async with self._control_events.recording_rejections(device, caller, "share it"):
             require_owner(device)
         require_person(caller)
         owner = Account(device.owner, await self._sign_in.named(device.owner))
-        return NewShare(device_target(name), owner, device.label, device.pairing)
+        return Target(device_target(name), owner, device.label, device.pairing)
 
-    async def shares(self, shared: NewShare) -> list[tuple[Share, str]]:
+    async def shares(self, shared: Target) -> list[tuple[Share, str]]:
         """Current shares of a target, with account names."""
         page = await self._tables.query(records.SHARES, shared.on, first="account:", last="account;", limit=1000)
         now_ms = self._clock.now_ms()
@@ -110,7 +117,7 @@ class Sharing:
         return sorted(zip(result, names, strict=True), key=lambda each: each[0].created_ms)
 
     async def put(
-        self, caller: Identity, shared: NewShare, account: Account, role: Role, for_s: int | None
+        self, caller: Identity, shared: Target, account: Account, role: Role, for_s: int | None
     ) -> tuple[Share, bool, bool]:
         """Create or change the share of an account.
 
@@ -125,12 +132,12 @@ class Sharing:
         share = self._share(shared, account.id, require_shareable(role), caller.name, expires_ms)
         return await self._write(caller, shared, account, share, keep_more=False)
 
-    async def give(self, caller: Identity, shared: NewShare, account: Account, role: Role, expires_ms: int) -> Share:
+    async def give(self, caller: Identity, shared: Target, account: Account, role: Role, expires_ms: int) -> Share:
         """Create or extend a share by invitation; never reduces an existing one."""
         share = self._share(shared, account.id, role, caller.name, expires_ms)
         return (await self._write(caller, shared, account, share, keep_more=True))[0]
 
-    async def end(self, caller: Identity, shared: NewShare, account: str) -> bool:
+    async def end(self, caller: Identity, shared: Target, account: str) -> bool:
         """End a share; return whether broker and devices were notified. If not, the timer retries.
 
         Raises:
@@ -184,9 +191,7 @@ class Sharing:
         device, _ = await self._devices.find_with_link(caller, name)
         return device is not None and device.owner == caller.account
 
-    # ------------------------------------------------------------ writing
-
-    def _share(self, shared: NewShare, account: str, role: Role, by: str, expires_ms: int) -> Share:
+    def _share(self, shared: Target, account: str, role: Role, by: str, expires_ms: int) -> Share:
         if account == shared.owner.id:
             raise invalid("This account is the owner and cannot get a share. Transfer it instead.")
         return Share(
@@ -201,7 +206,7 @@ class Sharing:
         )
 
     async def _write(
-        self, caller: Identity, shared: NewShare, account: Account, share: Share, *, keep_more: bool
+        self, caller: Identity, shared: Target, account: Account, share: Share, *, keep_more: bool
     ) -> tuple[Share, bool, bool]:
         note = await self._reminders.schedule(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
         if share.expires_ms < NEVER_MS:
@@ -212,8 +217,7 @@ class Sharing:
 
         async def attempt() -> tuple[Share, bool]:
             nonlocal lowered
-            row = await self._tables.get(records.SHARES, share.on, share_key(share.account))
-            existing = records.read(row, Share) if row else None
+            row, existing = await records.find(self._tables, records.SHARES, share.on, share_key(share.account), Share)
             before = existing if existing is not None and _holds(existing, shared, self._clock.now_ms()) else None
             if before is not None and keep_more and not _more(share, before):
                 return before, False
@@ -226,7 +230,7 @@ class Sharing:
                     records.SHARES, Row(share.on, share_key(share.account), records.to_data(share))
                 )
             else:
-                await self._tables.replace(records.SHARES, replace(row, data=records.to_data(share)))
+                await records.update(self._tables, records.SHARES, row, share)
             return share, before is None
 
         terms = {"with": account.id, "name": account.name, "role": share.role.value, "expires_ms": share.expires_ms}
@@ -292,8 +296,7 @@ class Sharing:
         """Called by the timer for a changed or expiring share."""
         expired = what.startswith(_EXPIRES)
         on, _, account = what.removeprefix(_EXPIRES if expired else _CHANGED).rpartition("|")
-        row = await self._tables.get(records.SHARES, on, share_key(account))
-        share = records.read(row, Share) if row else None
+        row, share = await records.find(self._tables, records.SHARES, on, share_key(account), Share)
         if row is not None and share is not None and not share.is_live(self._clock.now_ms()):
             await self._end(None, row)
         elif not expired:
@@ -327,7 +330,7 @@ def _note(kind: str, share: Share) -> str:
     return f"{kind}{share.on}|{share.account}"
 
 
-def _holds(share: Share, shared: NewShare, now_ms: int) -> bool:
+def _holds(share: Share, shared: Target, now_ms: int) -> bool:
     return share.is_live(now_ms) and share.owner == shared.owner.id and share.pairing == shared.pairing
 
 

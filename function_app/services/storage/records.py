@@ -1,14 +1,15 @@
 """Names of tables and keys, conversion of records, and optimistic concurrency."""
 
 import asyncio
+import contextlib
 import random
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any, TypeVar
 
 import msgspec
 
-from function_app.domain.common.problems import busy_store
-from function_app.ports.tables import Conflict, Row, Tables
+from function_app.domain.common.problems import busy_store, invalid_cursor
+from function_app.ports.tables import Conflict, Page, Row, Tables
 
 ACCOUNTS = "Accounts"
 """Partition: account id (or ``name:<name>``, ``open-id:<hash>``); keys ``account``, ``space:<id>``, ``session:<id>``,
@@ -90,6 +91,33 @@ def to_data(record: Any) -> dict[str, Any]:
     return data
 
 
+async def find(tables: Tables, table: str, partition: str, key: str, kind: type[T]) -> tuple[Row | None, T | None]:
+    """The row and its record; ``None`` twice if there is no such row."""
+    row = await tables.get(table, partition, key)
+    return row, None if row is None else read(row, kind)
+
+
+async def update(tables: Tables, table: str, row: Row, record: Any) -> None:
+    """Replace the record of a row.
+
+    Raises:
+        Conflict: The row was changed concurrently.
+    """
+    await tables.replace(table, Row(row.partition, row.key, to_data(record), row.etag))
+
+
+async def discard(tables: Tables, table: str, row: Row | None) -> None:
+    """Delete a row, unless there is none or it was changed concurrently."""
+    if row is not None:
+        with contextlib.suppress(Conflict):
+            await tables.delete(table, row)
+
+
+async def remove(tables: Tables, table: str, partition: str, key: str) -> None:
+    """Delete the row at a place, as ``discard`` does."""
+    await discard(tables, table, await tables.get(table, partition, key))
+
+
 async def retry(change: Callable[[], Awaitable[T]]) -> T:
     """Run ``change`` (read, decide, write by ETag) again after conflicts.
 
@@ -123,3 +151,25 @@ async def upsert(  # noqa: PLR0917 (a place, a change, a type: read best in this
         return record
 
     return await retry(attempt)
+
+
+async def page(tables: Tables, table: str, partition: str, **options: Any) -> Page:
+    """A page of rows for a list of the API; options as for ``Tables.query``. Raises ``cursor-invalid``."""
+    try:
+        return await tables.query(table, partition, **options)
+    except ValueError as error:
+        raise invalid_cursor() from error
+
+
+async def all_rows(
+    tables: Tables, table: str, partition: str, *, first: str = "", last: str | None = None
+) -> AsyncIterator[Row]:
+    """Every row of a key range, read page by page."""
+    cursor = None
+    while True:
+        rows = await tables.query(table, partition, first=first, last=last, limit=1000, cursor=cursor)
+        for row in rows.rows:
+            yield row
+        cursor = rows.cursor
+        if cursor is None:
+            return

@@ -34,14 +34,9 @@ class Retention:
         self._blobs = blobs
 
     async def delete_rows_at(self, table: str, partition: str, *, first: str, last: str | None, due_ms: int) -> None:
-        """Delete the rows with ``first`` ≤ key < ``last`` at ``due_ms``. Idempotent.
+        """Delete the rows with ``first`` ≤ key < ``last`` (``None``: all from ``first``) at ``due_ms`` [ms since 1970].
 
-        Args:
-            table: Table.
-            partition: Partition.
-            first: First key.
-            last: End of the range (exclusive); ``None``: end of the partition.
-            due_ms: Time of deletion [ms since 1970]. Rows with a later ``expires_ms`` are kept.
+        Rows with a later ``expires_ms`` are kept. Idempotent.
         """
         await self._note({"table": table, "partition": partition, "first": first, "last": last}, due_ms)
 

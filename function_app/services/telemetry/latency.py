@@ -26,12 +26,7 @@ from function_app.services.storage.retention import DAY_MS, Retention
 Transport = Literal["mqtt", "websocket", "http", "http-poll", "xmpp"]
 """Transport of the message: ``http`` is long polling, ``http-poll`` plain polling at an interval."""
 Path = Literal[
-    "operator-device",
-    "operator-cloud",
-    "device-cloud",
-    "command-answered",
-    "command-started",
-    "received-started",
+    "operator-device", "operator-cloud", "device-cloud", "command-answered", "command-started", "received-started"
 ]
 """Measured path; each uses one clock. Round trips use the clock of the operator (``operator-device``,
 ``operator-cloud``) or the agent (``device-cloud``). ``command-answered`` and ``command-started`` use the cloud
@@ -103,13 +98,7 @@ class LatencyStore:
         self._clock = clock
 
     async def add(self, device: Device, given: Samples, *, caller: str, once: str = "") -> None:
-        """Add samples. Idempotent by ``once``, or by equality of the samples.
-
-        Args:
-            device: The device.
-            given: The samples.
-            caller: Who measured them.
-            once: Idempotency key of the batch.
+        """Add samples. Idempotent by ``once``, the idempotency key of the batch, or by equality of the samples.
 
         Raises:
             Problem: ``invalid``: an impossible time; ``idempotency-key-reused``; ``busy``.
@@ -143,12 +132,7 @@ class LatencyStore:
             _log.warning("times of action %s: %s", action.id, error)
 
     async def find(
-        self,
-        device: Device,
-        span: Span,
-        *,
-        transport: Transport | None = None,
-        path: Path | None = None,
+        self, device: Device, span: Span, *, transport: Transport | None = None, path: Path | None = None
     ) -> list[LatencySeries]:
         """Latencies in ``span`` for each transport and path with samples, sorted by name."""
         partition = _partition(device.id, device.pairing)

@@ -1,13 +1,7 @@
 """Greet: raise the brows, smile, and bow the head a little to one side."""
 
 PARAMETERS = {
-    "strength": {
-        "type": "number",
-        "minimum": 0,
-        "maximum": 1,
-        "default": 1,
-        "description": "Strength of the smile",
-    },
+    "strength": {"type": "number", "minimum": 0, "maximum": 1, "default": 1, "description": "Strength of the smile"}
 }
 
 SMILE_RAD = {

@@ -1,7 +1,7 @@
 """Knee bends with the arms held out in front, as a warm-up."""
 
 PARAMETERS = {
-    "times": {"type": "integer", "minimum": 1, "maximum": 10, "default": 2, "description": "How many knee bends"},
+    "times": {"type": "integer", "minimum": 1, "maximum": 10, "default": 2, "description": "How many knee bends"}
 }
 
 LEGS = ("HipPitch", "KneePitch", "AnklePitch")

@@ -8,7 +8,7 @@ PARAMETERS = {
         "default": 2,
         "unit": "s",
         "description": "How long to sit",
-    },
+    }
 }
 
 rest_s = min(60.0, max(0.0, float(parameters.get("rest_s", 2))))

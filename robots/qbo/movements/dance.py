@@ -2,9 +2,7 @@
 
 import math
 
-PARAMETERS = {
-    "times": {"type": "integer", "minimum": 1, "maximum": 10, "default": 2, "description": "Repetitions"},
-}
+PARAMETERS = {"times": {"type": "integer", "minimum": 1, "maximum": 10, "default": 2, "description": "Repetitions"}}
 
 times = min(10, max(1, int(parameters.get("times", 2))))
 

@@ -7,7 +7,7 @@ PARAMETERS = {
         "maximum": 1,
         "default": 0.4,
         "description": "Share of the joints' velocity limits",
-    },
+    }
 }
 
 robot.home(speed=float(parameters.get("speed", 0.4)))

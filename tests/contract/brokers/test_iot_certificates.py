@@ -1,7 +1,5 @@
 """Agent certificates of AWS IoT Core, emulated by moto."""
 
-import asyncio
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -13,65 +11,50 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from function_app.adapters.aws.certificates import IotCertificates
 from function_app.ports.broker_access import BrokerAccessError
 from function_app.ports.certificates import CertificateRefused
-from tests.harness.stores.aws import REGION, start_moto, use_credentials
+from tests.contract.conftest import Closing
+from tests.harness.stores.aws import REGION
 
 POLICY, AGENT = "telescope-agents", "agentaaaaa"
 
-
-def client(endpoint: str) -> Any:
-    return Session().create_client("iot", region_name=REGION, endpoint_url=endpoint)
-
-
-@pytest.fixture(scope="module")
-def endpoint() -> Iterator[str]:
-    with start_moto() as endpoint, pytest.MonkeyPatch.context() as environment:
-        use_credentials(environment)
-        yield endpoint
+pytestmark = pytest.mark.anyio
 
 
 def request() -> str:
     key = ec.generate_private_key(ec.SECP256R1())
-    made = x509.CertificateSigningRequestBuilder().subject_name(x509.Name([])).sign(key, hashes.SHA256())
-    return made.public_bytes(serialization.Encoding.PEM).decode()
+    request = x509.CertificateSigningRequestBuilder().subject_name(x509.Name([])).sign(key, hashes.SHA256())
+    return request.public_bytes(serialization.Encoding.PEM).decode()
 
 
-def statuses(endpoint: str) -> list[str]:
-    iot = client(endpoint)
+def statuses(iot: Any) -> list[str]:
+    """Of the agent's certificates, each of which has a policy."""
     principals = iot.list_thing_principals(thingName=AGENT)["principals"]
-    ids = [arn.rpartition("/")[2] for arn in principals]
     assert all(iot.list_attached_policies(target=arn)["policies"] for arn in principals)
+    ids = [arn.rpartition("/")[2] for arn in principals]
     return [iot.describe_certificate(certificateId=each)["certificateDescription"]["status"] for each in ids]
 
 
-def test_each_belongs_to_its_agents_thing_and_ends_with_the_pairing(endpoint: str) -> None:
-    async def live() -> None:
-        authority = IotCertificates(region=REGION, policy=POLICY, endpoint=endpoint)
+async def test_certificates_belong_to_the_agents_thing_and_end_with_the_pairing(moto: str, closing: Closing) -> None:
+    iot = Session().create_client("iot", region_name=REGION, endpoint_url=moto)
+    authority = closing(IotCertificates(region=REGION, policy=POLICY, endpoint=moto))
+    for _ in range(2):
         await authority.prepare()
-        await authority.prepare()
-        await authority.place(AGENT, "spaceone")
-        await authority.place(AGENT, "spacetwo")
-        assert client(endpoint).describe_thing(thingName=AGENT)["attributes"] == {"space": "spacetwo"}
+    for space in ("spaceone", "spacetwo"):
+        await authority.place(AGENT, space)
+    assert iot.describe_thing(thingName=AGENT)["attributes"] == {"space": "spacetwo"}
+    for _ in range(2):
         issued = await authority.issue(AGENT, request())
         assert issued.chain.startswith("-----BEGIN CERTIFICATE-----")
-        await authority.issue(AGENT, request())
-        assert statuses(endpoint) == ["ACTIVE", "ACTIVE"]
-        await authority.revoke(AGENT)
-        await authority.revoke(AGENT)
-        await authority.revoke("agentbbbbb")
-        assert statuses(endpoint) == ["REVOKED", "REVOKED"]
-        with pytest.raises(CertificateRefused):
-            await authority.issue(AGENT, "no request")
-        await authority.close()
-
-    asyncio.run(live())
+    assert statuses(iot) == ["ACTIVE", "ACTIVE"]
+    for agent in (AGENT, AGENT, "agentbbbbb"):
+        await authority.revoke(agent)
+    assert statuses(iot) == ["REVOKED", "REVOKED"]
+    with pytest.raises(CertificateRefused):
+        await authority.issue(AGENT, "no request")
+    iot.close()
 
 
-def test_a_missing_policy_is_reported(endpoint: str) -> None:
-    async def live() -> None:
-        authority = IotCertificates(region=REGION, policy="missing", endpoint=endpoint)
-        await authority.place("agentccccc", "space")
-        with pytest.raises(BrokerAccessError, match="TELESCOPE_IOT_POLICY"):
-            await authority.issue("agentccccc", request())
-        await authority.close()
-
-    asyncio.run(live())
+async def test_a_missing_policy_is_reported(moto: str, closing: Closing) -> None:
+    authority = closing(IotCertificates(region=REGION, policy="missing", endpoint=moto))
+    await authority.place("agentccccc", "space")
+    with pytest.raises(BrokerAccessError, match="TELESCOPE_IOT_POLICY"):
+        await authority.issue("agentccccc", request())

@@ -2,72 +2,62 @@
 
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
-from itertools import count
+from collections.abc import Iterator
 from urllib.parse import parse_qs, unquote, urlsplit
 
 import pytest
+from moto.iotdata.models import iotdata_backends
 
-from function_app.adapters.aws import command_bus as adapter
 from function_app.adapters.aws.command_bus import IotCommandBus
+from function_app.adapters.shared import publishing_bus
 from function_app.ports.command_bus import BusUnavailable
-from tests.contract.bus.suite import BEATS, WAITS_IN_VAIN_S, BusContract, Heard, Stage, beats_until
+from tests.contract.bus.suite import MAX_BLOCKED_S, BusContract, Sent, Stage, assert_loop_is_free
+from tests.contract.conftest import Closing
 from tests.harness.network.brokers import PATIENCE_S
-from tests.harness.stores.aws import REGION, Refusal, Wire, start_moto, start_wire, use_credentials
+from tests.harness.stores.aws import REGION, Refusal, Wire, start_wire
 
-_spaces = count()
 ACCOUNT = "123456789012"
 
 
-@pytest.fixture(scope="module")
-def moto() -> Iterator[str]:
-    with start_moto() as endpoint:
-        yield endpoint
-
-
 @pytest.fixture
-def wire(moto: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
-    use_credentials(monkeypatch)
+def wire(moto: str) -> Iterator[Wire]:
     with start_wire(moto) as wire:
         yield wire
 
 
 class TestIot(BusContract):
     @pytest.fixture
-    async def stage(self, wire: Wire, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Stage]:
-        from moto.iotdata.models import iotdata_backends
-
-        monkeypatch.setattr(adapter, "GIVE_UP_S", PATIENCE_S)
-        space = f"bus{next(_spaces)}"
+    def stage(self, wire: Wire, space: str, closing: Closing, monkeypatch: pytest.MonkeyPatch) -> Stage:
+        monkeypatch.setattr(publishing_bus, "GIVE_UP_S", PATIENCE_S)
         taken = iotdata_backends[ACCOUNT][REGION].published_payloads
 
-        def heard() -> list[Heard]:
-            return [Heard(topic, payload) for topic, payload in taken if f"/{space}/" in topic]
+        def sent() -> list[Sent]:
+            return [Sent(topic, payload) for topic, payload in taken if f"/{space}/" in topic]
 
-        def kept(topic: str) -> bytes | None:
+        def retained(topic: str) -> bytes | None:
             # moto does not retain: what Amazon is asked to is seen on the wire.
             found = None
             for asked in wire.asked:
-                where = urlsplit(asked.path)
-                if unquote(where.path) == f"/topics/{topic}" and parse_qs(where.query)["retain"] == ["true"]:
+                url = urlsplit(asked.path)
+                if unquote(url.path) == f"/topics/{topic}" and parse_qs(url.query)["retain"] == ["true"]:
                     found = asked.body
             return found
 
-        bus = IotCommandBus(region=REGION, endpoint=wire.endpoint)
-        away = IotCommandBus(region=REGION, endpoint="http://127.0.0.1:1")
-        yield Stage(bus, space, heard, kept, away)
-        await bus.close()
-        await away.close()
+        bus, away = (
+            closing(IotCommandBus(region=REGION, endpoint=endpoint))
+            for endpoint in (wire.endpoint, "http://127.0.0.1:1")
+        )
+        return Stage(bus, space, sent, retained, away)
 
     async def test_qos_is_passed_on(self, stage: Stage, wire: Wire) -> None:
         for qos in (0, 1):
             await stage.bus.publish(stage.topic, b"x", qos=qos)
         assert [parse_qs(urlsplit(asked.path).query)["qos"] for asked in wire.asked] == [["0"], ["1"]]
 
-    async def test_a_lost_answer_is_asked_for_again_for_a_device_drops_doubles(self, stage: Stage, wire: Wire) -> None:
-        wire.spoil("lose answer")
+    async def test_a_message_without_response_is_sent_again(self, stage: Stage, wire: Wire) -> None:
+        wire.spoil("lose answer")  # a device drops duplicates
         await stage.bus.publish(stage.topic, b"x")
-        assert set(await stage.until(1)) == {Heard(stage.topic, b"x")}
+        assert set(await stage.until(1)) == {Sent(stage.topic, b"x")}
         assert len(wire.asked) == 2
 
     @pytest.mark.parametrize(
@@ -79,7 +69,7 @@ class TestIot(BusContract):
         ],
         ids=["rights", "throttled", "invalid"],
     )
-    async def test_a_refusal_is_said_in_a_sentence(
+    async def test_a_refusal_is_reported_in_one_sentence(
         self, stage: Stage, wire: Wire, refusal: Refusal, words: str
     ) -> None:
         wire.spoil(*[refusal] * 3)
@@ -96,10 +86,10 @@ class TestIot(BusContract):
         self, stage: Stage, wire: Wire, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         await stage.bus.publish(stage.topic, b"x")
-        enough = threading.Event()
-        wire.spoil(lambda: enough.wait(WAITS_IN_VAIN_S))
-        assert await beats_until(stage.bus.publish(stage.topic, b"x"), enough) >= BEATS
-        monkeypatch.setattr(adapter, "GIVE_UP_S", 0.2)
+        release = threading.Event()
+        wire.spoil(lambda: release.wait(MAX_BLOCKED_S))
+        await assert_loop_is_free(stage.bus.publish(stage.topic, b"x"), release)
+        monkeypatch.setattr(publishing_bus, "GIVE_UP_S", 0.2)
         wire.spoil(lambda: time.sleep(1.0))
         with pytest.raises(BusUnavailable, match="did not answer"):
             await stage.bus.publish(stage.topic, b"x")

@@ -1,16 +1,15 @@
 """The command bus over Event Grid. A local server checks the HTTP publish against the documentation of Microsoft.
 
-That is what this shows, and no more: the request is the documented one, over TLS, with a token of the host's identity
-for the documented audience; and each documented answer is read as what it means.
+These tests show that requests are as documented, over TLS, with a token of the host's identity for the documented
+audience, and that every documented response is understood.
 """
 
 import ssl
 import threading
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from itertools import count
+from collections.abc import Callable, Iterator
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -19,27 +18,29 @@ import pytest
 
 from function_app.adapters.azure import command_bus as adapter
 from function_app.adapters.azure.command_bus import EventGridCommandBus
+from function_app.adapters.shared import publishing_bus
 from function_app.ports.command_bus import BusUnavailable
-from tests.contract.bus.suite import BEATS, WAITS_IN_VAIN_S, BusContract, Heard, Stage, beats_until
+from tests.contract.bus.suite import MAX_BLOCKED_S, BusContract, Sent, Stage, assert_loop_is_free
+from tests.contract.conftest import Closing
 from tests.harness.cloud.identity import HOST, Host, make_certificate, start_host
 from tests.harness.network.brokers import PATIENCE_S
+from tests.harness.network.http_server import QuietHandler, running
 
-_spaces = count()
 AUDIENCE = "https://eventgrid.azure.net"
 
 Fault = int | str | Callable[[], object]
-"""A status; ``lost``: the request is taken and the connection cut; or what happens before the answer."""
+"""A status; ``lost``: the request is taken and the connection cut; or a function to call before the response."""
 
 
 class Namespace(ThreadingHTTPServer):
-    """Takes messages as the namespace does. ``wrong`` says what was not as documented."""
+    """Takes messages as the namespace does. ``wrong`` lists deviations from the documentation."""
 
     def __init__(self, certificate: Path) -> None:
         super().__init__((HOST, 0), _Publish)
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.load_cert_chain(certificate, certificate.with_name("key.pem"))
         self.socket = context.wrap_socket(self.socket, server_side=True)
-        self.taken: list[tuple[Heard, int, bool]] = []
+        self.taken: list[tuple[Sent, int, bool]] = []
         self.wrong: list[str] = []
         self.asked = 0
         self.faults: deque[Fault] = deque()
@@ -50,12 +51,11 @@ class Namespace(ThreadingHTTPServer):
         return f"https://{HOST}:{self.server_port}"
 
 
-class _Publish(BaseHTTPRequestHandler):
+class _Publish(QuietHandler):
     protocol_version = "HTTP/1.1"
-    disable_nagle_algorithm = True
     server: Namespace
 
-    def do_POST(self) -> None:
+    def handle_any(self) -> None:
         body = self.rfile.read(int(self.headers["Content-Length"]))
         with self.server.guard:
             self.server.asked += 1
@@ -64,47 +64,37 @@ class _Publish(BaseHTTPRequestHandler):
             fault()
             fault = 202
         if isinstance(fault, int) and fault >= 400:
-            self._answer(fault, b'{"error": {"code": "No",\n "message": "not now"}}')
+            self.respond(fault, [], b'{"error": {"code": "No",\n "message": "not now"}}')
             return
         status = self._take(body)
         if fault == "lost":
             self.close_connection = True
             return
-        self._answer(fault if status is None and isinstance(fault, int) else status or 204)
+        self.respond(fault if status is None and isinstance(fault, int) else status or 204, [], b"")
 
     def _take(self, body: bytes) -> int | None:
         """Check the request; the status that refuses it."""
-        where = urlsplit(self.path)
-        query = parse_qs(where.query, strict_parsing=True)
+        url = urlsplit(self.path)
+        query = parse_qs(url.query, strict_parsing=True)
         scheme, _, token = self.headers.get("Authorization", "").partition(" ")
         claims = jwt.decode(token, options={"verify_signature": False}) if token else {}
-        for good, what in (
-            (where.path == "/mqtt/messages", self.path),
+        for valid, deviation in (
+            (url.path == "/mqtt/messages", self.path),
             (set(query) == {"topic", "api-version"}, self.path),
             (query.get("api-version") == ["2025-08-01-preview"], self.path),
-            ("/" not in where.query and "+" not in where.query, "the topic is percent-encoded"),
+            ("/" not in url.query and "+" not in url.query, "the topic is percent-encoded"),
             (scheme == "Bearer" and claims.get("aud") == AUDIENCE, f"token for {claims.get('aud')}"),
             (self.headers.get("mqtt-qos") in {"0", "1"}, "mqtt-qos"),
             (self.headers.get("mqtt-retain") in {"0", "1"}, "mqtt-retain"),
             (bool(self.headers.get("Content-Type")), "content-type"),
         ):
-            if not good:
-                self.server.wrong.append(what)
+            if not valid:
+                self.server.wrong.append(deviation)
                 return 400
-        heard = Heard(query["topic"][0], body)
+        message = Sent(query["topic"][0], body)
         with self.server.guard:
-            self.server.taken.append((heard, int(self.headers["mqtt-qos"]), self.headers["mqtt-retain"] == "1"))
+            self.server.taken.append((message, int(self.headers["mqtt-qos"]), self.headers["mqtt-retain"] == "1"))
         return None
-
-    def _answer(self, status: int, content: bytes = b"") -> None:
-        self.send_response_only(status)
-        if status != 204:
-            self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)
-
-    def log_message(self, *_: object) -> None:
-        """Nothing."""
 
 
 @pytest.fixture(scope="module")
@@ -120,32 +110,28 @@ def host(monkeypatch: pytest.MonkeyPatch, certificate: Path) -> Iterator[Host]:
 
 @pytest.fixture
 def namespace(certificate: Path) -> Iterator[Namespace]:
-    server = Namespace(certificate)
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-    thread.start()
-    yield server
-    server.shutdown()
-    thread.join()
-    server.server_close()
-    assert server.wrong == []
+    namespace = Namespace(certificate)
+    with running(namespace):
+        yield namespace
+    assert namespace.wrong == []
 
 
 class TestEventGrid(BusContract):
     @pytest.fixture
-    async def stage(self, namespace: Namespace, host: Host, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Stage]:
+    def stage(
+        self, namespace: Namespace, host: Host, space: str, closing: Closing, monkeypatch: pytest.MonkeyPatch
+    ) -> Stage:
         assert host
-        monkeypatch.setattr(adapter, "GIVE_UP_S", PATIENCE_S)
-        space = f"bus{next(_spaces)}"
+        monkeypatch.setattr(publishing_bus, "GIVE_UP_S", PATIENCE_S)
 
-        def kept(topic: str) -> bytes | None:
-            found = [heard.payload for heard, _, retain in namespace.taken if retain and heard.topic == topic]
-            return found[-1] if found else None
+        def retained(topic: str) -> bytes | None:
+            payloads = [sent.payload for sent, _, retain in namespace.taken if retain and sent.topic == topic]
+            return payloads[-1] if payloads else None
 
-        bus = EventGridCommandBus(endpoint=namespace.address)
-        away = EventGridCommandBus(endpoint="https://127.0.0.1:1")
-        yield Stage(bus, space, lambda: [heard for heard, _, _ in namespace.taken], kept, away)
-        await bus.close()
-        await away.close()
+        bus, away = (
+            closing(EventGridCommandBus(endpoint=endpoint)) for endpoint in (namespace.address, "https://127.0.0.1:1")
+        )
+        return Stage(bus, space, lambda: [sent for sent, _, _ in namespace.taken], retained, away)
 
     async def test_qos_is_passed_on(self, stage: Stage, namespace: Namespace) -> None:
         for qos in (0, 1):
@@ -157,19 +143,17 @@ class TestEventGrid(BusContract):
             await stage.bus.publish(stage.topic, b"x")
         assert [asked["resource"] for asked in host.asked] == [[AUDIENCE]]
 
-    async def test_another_identity_is_asked_for_by_its_id(self, namespace: Namespace, host: Host) -> None:
+    async def test_another_identity_is_requested_by_its_id(
+        self, namespace: Namespace, host: Host, closing: Closing
+    ) -> None:
         client_id = "11059fcc-5514-4800-b5f8-49808b9cfab6"
-        bus = EventGridCommandBus(endpoint=f"{namespace.address}/", identity=client_id)
-        await bus.publish("t", b"x")
-        await bus.close()
+        await closing(EventGridCommandBus(endpoint=f"{namespace.address}/", identity=client_id)).publish("t", b"x")
         assert [asked["client_id"] for asked in host.asked] == [[client_id]]
 
-    async def test_a_lost_answer_is_asked_for_again_for_a_device_drops_doubles(
-        self, stage: Stage, namespace: Namespace
-    ) -> None:
-        namespace.faults.append("lost")
+    async def test_a_message_without_response_is_sent_again(self, stage: Stage, namespace: Namespace) -> None:
+        namespace.faults.append("lost")  # a device drops duplicates
         await stage.bus.publish(stage.topic, b"x")
-        assert stage.heard() == [Heard(stage.topic, b"x")] * 2
+        assert stage.sent() == [Sent(stage.topic, b"x")] * 2
 
     @pytest.mark.parametrize(
         ("status", "words"),
@@ -180,7 +164,7 @@ class TestEventGrid(BusContract):
             (500, "refused a message: 500 .*not now"),
         ],
     )
-    async def test_a_refusal_is_said_in_a_sentence(
+    async def test_a_refusal_is_reported_in_one_sentence(
         self, stage: Stage, namespace: Namespace, status: int, words: str
     ) -> None:
         namespace.faults.extend([status] * 3)
@@ -193,26 +177,25 @@ class TestEventGrid(BusContract):
         await stage.bus.publish(stage.topic, b"x")
         assert await stage.bus.status() == "ok"
 
-    async def test_a_machine_without_an_identity_is_told_so(
-        self, namespace: Namespace, monkeypatch: pytest.MonkeyPatch, certificate: Path
+    async def test_a_machine_without_identity_is_reported(
+        self, namespace: Namespace, closing: Closing, monkeypatch: pytest.MonkeyPatch, certificate: Path
     ) -> None:
         monkeypatch.setenv("REQUESTS_CA_BUNDLE", str(certificate))
         monkeypatch.setenv("IDENTITY_ENDPOINT", f"http://{HOST}:1/msi/token")
         monkeypatch.setenv("IDENTITY_HEADER", "x")
-        bus = EventGridCommandBus(endpoint=namespace.address)
+        bus = closing(EventGridCommandBus(endpoint=namespace.address))
         with pytest.raises(BusUnavailable, match=r"managed identity|cannot be reached") as caught:
             await bus.publish("t", b"x")
         assert "\n" not in str(caught.value)
-        await bus.close()
 
     async def test_a_slow_response_delays_no_other_call_and_times_out(
         self, stage: Stage, namespace: Namespace, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         await stage.bus.publish(stage.topic, b"x")
-        enough = threading.Event()
-        namespace.faults.append(lambda: enough.wait(WAITS_IN_VAIN_S))
-        assert await beats_until(stage.bus.publish(stage.topic, b"x"), enough) >= BEATS
-        monkeypatch.setattr(adapter, "GIVE_UP_S", 0.2)
+        release = threading.Event()
+        namespace.faults.append(lambda: release.wait(MAX_BLOCKED_S))
+        await assert_loop_is_free(stage.bus.publish(stage.topic, b"x"), release)
+        monkeypatch.setattr(publishing_bus, "GIVE_UP_S", 0.2)
         namespace.faults.append(lambda: time.sleep(1.0))
         with pytest.raises(BusUnavailable, match="did not answer"):
             await stage.bus.publish(stage.topic, b"x")

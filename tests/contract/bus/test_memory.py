@@ -2,16 +2,14 @@
 
 import asyncio
 import contextlib
-import secrets
 from collections.abc import AsyncIterator, Awaitable, Sequence
 
 import pytest
 
-from device_agent.protocol.security.grants import Grant
 from function_app.domain.common.problems import Problem
 from function_app.ports.broker_access import BrokerAccessError, Credentials
 from function_app.ports.tables import StoreError
-from tests.contract.bus.suite import BusContract, Heard, Stage
+from tests.contract.bus.suite import BusContract, Sent, Stage
 from tests.fakes.broker import MemoryBroker, MemoryConnection
 from tests.fakes.broker_ports import MemoryBrokerAccess, MemoryCommandBus, MemoryFeed, MemoryTelemetry
 from tests.harness.network.brokers import Message
@@ -27,14 +25,14 @@ class TestMemoryBus(BusContract):
     def stage(self) -> Stage:
         broker, away = MemoryBroker(), MemoryBroker()
         away.reachable = False
-        received: list[Heard] = []
+        received: list[Sent] = []
 
         class Listener:
             def matches(self, topic: str) -> bool:
                 return topic.startswith(SPACE)
 
             def deliver(self, message: Message) -> None:
-                received.append(Heard(message.topic, message.payload))
+                received.append(Sent(message.topic, message.payload))
 
         broker.attach(Listener())
 
@@ -44,92 +42,63 @@ class TestMemoryBus(BusContract):
         return Stage(MemoryCommandBus(broker), "space", lambda: received, retained, MemoryCommandBus(away))
 
 
-class TestMemoryBrokerAccess:
-    @pytest.fixture
-    def now_s(self) -> list[float]:
-        return [1000.0]
+async def connect(broker: MemoryBroker, client_id: str = "viewer") -> MemoryConnection:
+    grant = broker.grant(client_id, publish=(f"{SPACE}/+/+/ctl/+",), subscribe=(f"{SPACE}/#",))
+    return MemoryConnection(broker, client_id, await MemoryBrokerAccess(broker).issue(grant)).open()
 
-    @pytest.fixture
-    def broker(self, now_s: list[float]) -> MemoryBroker:
-        return MemoryBroker(now_s=lambda: now_s[0])
 
-    async def connect(self, broker: MemoryBroker, client_id: str = "viewer") -> MemoryConnection:
-        grant = Grant(
-            principal=f"account:{client_id}",
-            client_id=client_id,
-            publish=(f"{SPACE}/+/+/ctl/+",),
-            subscribe=(f"{SPACE}/#",),
-            token_id=secrets.token_hex(8),
-            expires_at=1300,
-        )
-        return MemoryConnection(broker, client_id, await MemoryBrokerAccess(broker).issue(grant)).open()
+def accepts(broker: MemoryBroker, client_id: str, credentials: Credentials | None) -> bool:
+    return MemoryConnection(broker, client_id, credentials).open().connected.is_set()
 
-    async def test_a_connection_may_do_what_its_grant_says_and_no_more(self, broker: MemoryBroker) -> None:
-        viewer, other = await self.connect(broker), await self.connect(broker, "other")
-        assert viewer.subscribe(f"{SPACE}/+/+/state", "ts/v1/elsewhere/#", "#") == [1, 128, 128]
-        other.subscribe(f"{SPACE}/#")
-        viewer.publish(f"{SPACE}/agent/arm/ctl/1", b"setpoint")
-        viewer.publish(f"{SPACE}/agent/arm/cmd", b"forbidden")
-        assert [message.payload for message in other.pending()] == [b"setpoint"]
-        assert viewer.pending() == []
 
-    async def test_wrong_credentials_and_a_foreign_client_id_are_refused(self, broker: MemoryBroker) -> None:
-        credentials = (await self.connect(broker))._credentials
-        for client_id, given in (("x", credentials), ("viewer", None), ("viewer", Credentials("account:viewer", "?"))):
-            assert not MemoryConnection(broker, client_id, given).open().connected.is_set()
+async def test_a_connection_has_the_rights_of_its_grant_only() -> None:
+    broker = MemoryBroker()
+    viewer, other = await connect(broker), await connect(broker, "other")
+    for payload in (b"old", b"new"):
+        broker.publish(STATE, payload, retain=True)
+    assert viewer.subscribe(f"{SPACE}/+/+/state", "ts/v1/elsewhere/#", "#") == [1, 128, 128]
+    assert [(message.payload, message.retain) for message in viewer.pending()] == [(b"new", True)]
+    other.subscribe(f"{SPACE}/+/+/ctl/+", f"{SPACE}/+/+/cmd")
+    viewer.publish(f"{SPACE}/agent/arm/ctl/1", b"setpoint")
+    viewer.publish(f"{SPACE}/agent/arm/cmd", b"forbidden")
+    assert [message.payload for message in other.pending()] == [b"setpoint"]
+    credentials = viewer._credentials
+    for client_id, given in (("x", credentials), ("viewer", None), ("viewer", Credentials("account:viewer", "?"))):
+        assert not accepts(broker, client_id, given)
+    second = await connect(broker)
+    assert (viewer.disconnected.is_set(), second.disconnected.is_set()) == (True, False)
 
-    async def test_a_subscriber_receives_retained_messages_once(self, broker: MemoryBroker) -> None:
-        broker.publish(STATE, b"old", retain=True)
-        broker.publish(STATE, b"new", retain=True)
-        viewer = await self.connect(broker)
-        viewer.subscribe(f"{SPACE}/+/+/state")
-        assert [(message.payload, message.retain) for message in viewer.pending()] == [(b"new", True)]
 
-    async def test_a_second_connection_with_a_client_id_replaces_the_first(self, broker: MemoryBroker) -> None:
-        first, second = await self.connect(broker), await self.connect(broker)
-        assert first.disconnected.is_set()
-        assert not second.disconnected.is_set()
+@pytest.mark.parametrize("names", [{"client_id": "viewer"}, {"principal": "account:viewer"}, {"principal": "account"}])
+async def test_a_revocation_ends_connections_and_credentials(names: dict[str, str]) -> None:
+    broker = MemoryBroker()
+    viewer = await connect(broker)
+    viewer.will = Message(f"{SPACE}/agent/conn", b"gone", 1, retain=True)
+    await MemoryBrokerAccess(broker).revoke(**names)
+    assert viewer.disconnected.is_set()
+    assert not accepts(broker, "viewer", viewer._credentials)
+    assert [message.payload for message in broker.retained(f"{SPACE}/agent/conn")] == [b"gone"]
+    assert (await connect(broker)).connected.is_set()
 
-    @pytest.mark.parametrize(
-        "revoked", [{"client_id": "viewer"}, {"principal": "account:viewer"}, {"principal": "account"}]
-    )
-    async def test_a_revocation_ends_connections_and_credentials(
-        self, broker: MemoryBroker, revoked: dict[str, str]
-    ) -> None:
-        access, viewer = MemoryBrokerAccess(broker), await self.connect(broker)
-        viewer.will = Message(f"{SPACE}/agent/conn", b"gone", 1, retain=True)
-        await access.revoke(**revoked)
-        assert viewer.disconnected.is_set()
-        assert not MemoryConnection(broker, "viewer", viewer._credentials).open().connected.is_set()
-        assert [message.payload for message in broker.retained(f"{SPACE}/agent/conn")] == [b"gone"]
-        assert (await self.connect(broker)).connected.is_set()
 
-    async def test_credentials_expire_by_the_clock_of_the_broker(
-        self, broker: MemoryBroker, now_s: list[float]
-    ) -> None:
-        access, viewer = MemoryBrokerAccess(broker), await self.connect(broker)
-        await access.expire(now_s[0])
-        assert not viewer.disconnected.is_set()
-        now_s[0] = 1300
-        await access.expire(now_s[0])
-        assert viewer.disconnected.is_set()
+async def test_credentials_expire_by_the_clock_of_the_broker() -> None:
+    now_s = [1000.0]
+    broker = MemoryBroker(now_s=lambda: now_s[0])
+    viewer = await connect(broker)
+    for now_s[0], ended in ((1299.0, False), (1300.0, True)):
+        await MemoryBrokerAccess(broker).expire(now_s[0])
+        assert viewer.disconnected.is_set() == ended
 
-    async def test_an_unreachable_broker_is_an_error(self, broker: MemoryBroker) -> None:
-        broker.reachable = False
+
+async def test_an_unreachable_broker_and_a_wrong_number_of_names_are_errors() -> None:
+    broker = MemoryBroker()
+    for names in ({}, {"client_id": "a", "principal": "b"}):
+        with pytest.raises(ValueError, match="exactly one"):
+            await MemoryBrokerAccess(broker).revoke(**names)
+    broker.reachable = False
+    for call in (MemoryBrokerAccess(broker).revoke(client_id="viewer"), connect(broker)):
         with pytest.raises(BrokerAccessError):
-            await MemoryBrokerAccess(broker).revoke(client_id="viewer")
-        with pytest.raises(BrokerAccessError):
-            await self.connect(broker)
-
-    async def test_revoke_takes_exactly_one_name(self, broker: MemoryBroker) -> None:
-        for names in ({}, {"client_id": "a", "principal": "b"}):
-            with pytest.raises(ValueError, match="exactly one"):
-                await MemoryBrokerAccess(broker).revoke(**names)
-
-
-@pytest.fixture
-def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tests.fakes.broker_ports.RETRY_S", 0)
+            await call
 
 
 class TestMemoryFeeds:
@@ -148,8 +117,10 @@ class TestMemoryFeeds:
             await broker.idle()
         assert stored == [(STATE, payload) for payload in (b"retained", b"1", b"2")]
 
-    @pytest.mark.usefixtures("no_pause")
-    async def test_a_message_that_cannot_be_stored_is_tried_again_and_then_dropped(self) -> None:
+    async def test_a_message_that_cannot_be_stored_is_retried_and_then_dropped(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("tests.fakes.broker_ports.RETRY_S", 0)
         broker, tried = MemoryBroker(), []
 
         async def handle(_: str, payload: bytes) -> None:

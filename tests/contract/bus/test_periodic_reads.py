@@ -1,4 +1,4 @@
-"""What is stored is read in rounds: everything arrives, in order, and the process wakes seldom for it."""
+"""Connections that store messages read in rounds: all arrive in order, and the process seldom wakes up."""
 
 import asyncio
 import time
@@ -18,66 +18,65 @@ COUNT = 300
 
 
 @pytest.fixture
-def begun(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """When each round began."""
-    moments: list[float] = []
+def rounds_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The start of each round [s]."""
+    starts: list[float] = []
     begin = event_loop._Unhurried._begin
 
-    def watched(reader: event_loop._Unhurried) -> None:
-        moments.append(time.monotonic())
+    def observed(reader: event_loop._Unhurried) -> None:
+        starts.append(time.monotonic())
         begin(reader)
 
-    monkeypatch.setattr(event_loop._Unhurried, "_begin", watched)
-    return moments
+    monkeypatch.setattr(event_loop._Unhurried, "_begin", observed)
+    return starts
 
 
 @pytest.mark.anyio
-async def test_all_of_it_comes_in_order_and_in_few_rounds(broker: RunningBroker, begun: list[float]) -> None:
-    heard: list[int] = []
+async def test_all_messages_arrive_in_order_and_in_few_rounds(broker: RunningBroker, rounds_s: list[float]) -> None:
+    received: list[int] = []
     at = Broker(host=HOST, port=broker.tcp_port, credentials=broker.access.service_credentials)
     link = MqttConnection(
-        at, subscriptions=(TOPIC,), receive=lambda message: heard.append(int(message.payload)), every_s=EVERY_S
+        at, subscriptions=(TOPIC,), receive=lambda message: received.append(int(message.payload)), every_s=EVERY_S
     )
     try:
         assert await link.ready(PATIENCE_S), link.trouble
-        began_s, before = time.monotonic(), len(begun)
+        began_s, before = time.monotonic(), len(rounds_s)
         with await asyncio.to_thread(broker.client, "rounds", publish=(TOPIC,)) as robot:
             for number in range(COUNT):
                 robot.publish(TOPIC, str(number).encode(), qos=1)
                 await asyncio.sleep(0.003)
             async with asyncio.timeout(PATIENCE_S):
-                while len(heard) < COUNT:  # noqa: ASYNC110 (any of them may be the last)
+                while len(received) < COUNT:  # noqa: ASYNC110 (any may be the last)
                     await asyncio.sleep(EVERY_S / 10)
-        rounds, took_s = len(begun) - before, time.monotonic() - began_s
-        assert heard == list(range(COUNT))
+        rounds, took_s = len(rounds_s) - before, time.monotonic() - began_s
+        assert received == list(range(COUNT))
         assert 1 <= rounds <= took_s / EVERY_S + 2
-        assert min(later - earlier for earlier, later in pairwise(begun)) >= 0.9 * EVERY_S
+        assert min(later - earlier for earlier, later in pairwise(rounds_s)) >= 0.9 * EVERY_S
     finally:
         await link.close()
 
 
 @pytest.fixture
-def mortal(tmp_path: Path) -> Iterator[RunningBroker]:
-    """A broker that the test may end."""
+def stoppable(tmp_path: Path) -> Iterator[RunningBroker]:
     with start_broker("mosquitto", tmp_path) as broker:
         yield broker
 
 
 @pytest.mark.anyio
-async def test_between_messages_it_sleeps_and_a_lost_broker_is_noticed(
-    mortal: RunningBroker, begun: list[float]
+async def test_it_sleeps_between_messages_and_detects_a_lost_broker(
+    stoppable: RunningBroker, rounds_s: list[float]
 ) -> None:
-    at = Broker(host=HOST, port=mortal.tcp_port, credentials=mortal.access.service_credentials)
+    at = Broker(host=HOST, port=stoppable.tcp_port, credentials=stoppable.access.service_credentials)
     link = MqttConnection(at, subscriptions=(TOPIC,), every_s=EVERY_S)
     try:
         assert await link.ready(PATIENCE_S), link.trouble
         await asyncio.sleep(3 * EVERY_S)
-        before = len(begun)
+        before = len(rounds_s)
         await asyncio.sleep(5 * EVERY_S)
-        assert len(begun) == before, "nothing has come"
-        await asyncio.to_thread(mortal.stop)
+        assert len(rounds_s) == before
+        await asyncio.to_thread(stoppable.stop)
         async with asyncio.timeout(PATIENCE_S):
-            while not link.trouble:  # noqa: ASYNC110 (nothing tells of it)
+            while not link.trouble:  # noqa: ASYNC110 (there is no event for it)
                 await asyncio.sleep(EVERY_S / 10)
     finally:
         await link.close()

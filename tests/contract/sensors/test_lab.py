@@ -8,6 +8,7 @@ from device_agent.ports.sensor import RoomDriver
 from device_agent.protocol.manifests import room
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.perception import driver as perception
+from device_agent.simulation import renderer
 from tests.contract.sensors.suite import RoomDriverContract
 from tests.harness.agent.rooms import LAB, StillWorld
 
@@ -21,7 +22,7 @@ def world() -> StillWorld:
 
 @pytest.fixture(scope="module")
 def neighbours(world: StillWorld) -> Iterator[dict[str, RoomDriver]]:
-    """What others look with, connected."""
+    """The sensors of perception, connected."""
     found = {name: world.driver(name) for name, device in DEVICES.items() if device.driver != "perception"}
     for driver in found.values():
         driver.connect()
@@ -45,6 +46,7 @@ class TestLab(RoomDriverContract):
         monkeypatch: pytest.MonkeyPatch,
     ) -> Iterator[RoomDriver]:
         monkeypatch.setattr(perception, "SURVEY_EVERY_S", 0.0)
+        monkeypatch.setattr(renderer, "TIMEOUT_S", 60.0)
         world.go_on(0.02)
         driver = world.driver(entry, neighbours)
         yield driver

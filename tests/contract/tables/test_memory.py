@@ -7,23 +7,11 @@ from tests.contract.tables.suite import Again, TablesSuite
 from tests.fakes.tables import MemoryTables
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
-
-
-@pytest.fixture
-def tables() -> Tables:
-    return MemoryTables()
-
-
-@pytest.fixture
-def again(tables: MemoryTables) -> Again:
-    async def open_() -> Tables:
-        return MemoryTables(tables)
-
-    return open_
-
-
 class TestMemoryTables(TablesSuite):
-    pass
+    @pytest.fixture
+    def tables(self) -> Tables:
+        return MemoryTables()
+
+    @pytest.fixture
+    def again(self, tables: MemoryTables) -> Again:
+        return lambda: MemoryTables(tables)

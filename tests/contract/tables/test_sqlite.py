@@ -1,10 +1,11 @@
 """``SqliteTables`` keeps the port's promises, and says clearly what is wrong with its file."""
 
+import asyncio
 import multiprocessing
 import os
 import sqlite3
 import tempfile
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,15 +13,13 @@ import pytest
 from function_app.adapters.local import tables as adapter
 from function_app.adapters.local.tables import SqliteTables
 from function_app.ports.tables import Conflict, Row, StoreError, Tables
+from tests.contract.conftest import Closing
 from tests.contract.tables.suite import Again, TablesSuite
 
 _FORK = multiprocessing.get_context("fork")
 _UNPRIVILEGED_UID = 65_534
 
-
-@pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
+pytestmark = pytest.mark.anyio
 
 
 @pytest.fixture
@@ -29,83 +28,55 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-async def tables(path: Path) -> AsyncIterator[Tables]:
-    tables = SqliteTables(path)
-    yield tables
-    await tables.close()
+def tables(path: Path, closing: Closing) -> Tables:
+    return closing(SqliteTables(path))
 
 
 @pytest.fixture
-async def again(path: Path) -> AsyncIterator[Again]:
-    opened: list[SqliteTables] = []
-
-    async def open_() -> Tables:
-        opened.append(SqliteTables(path))
-        return opened[-1]
-
-    yield open_
-    for each in opened:
-        await each.close()
+def again(path: Path, closing: Closing) -> Again:
+    return lambda: closing(SqliteTables(path))
 
 
 class TestSqliteTables(TablesSuite):
     pass
 
 
-pytestmark = pytest.mark.anyio
-
-
-async def test_the_file_is_for_its_owner_only(tables: Tables, path: Path) -> None:
-    await tables.create("T", Row("p", "k"))
+async def test_the_first_call_makes_a_file_for_its_owner_only(tables: Tables, path: Path) -> None:
+    assert not path.parent.exists()
+    assert await tables.get("T", "p", "k") is None
     assert path.stat().st_mode & 0o077 == 0
 
 
-async def test_nothing_is_opened_before_the_first_call(tables: Tables, path: Path) -> None:
-    assert not path.parent.exists()
-    assert await tables.get("T", "p", "k") is None
-    assert path.exists()
-
-
-@pytest.mark.parametrize("content", [b"no database at all\n" * 300, b"SQLite format 3\0" + b"\xff" * 5000])
-async def test_a_damaged_file_is_named_and_left_as_it_is(tables: Tables, path: Path, content: bytes) -> None:
-    path.parent.mkdir()
+@pytest.mark.parametrize(
+    "content",
+    [b"no database at all\n" * 300, b"SQLite format 3\0" + b"\xff" * 5000, None],
+    ids=["text", "head", "page"],
+)
+async def test_a_damaged_file_is_named_and_left_as_it_is(tables: Tables, path: Path, content: bytes | None) -> None:
+    if content is None:
+        for number in range(50):
+            await tables.create("T", Row("p", str(number), {"text": "x" * 2000}))
+        await tables.close()
+        whole = path.read_bytes()
+        content = whole[:4096] + b"\xee" * (len(whole) - 4096)
+    path.parent.mkdir(exist_ok=True)
     path.write_bytes(content)
-    for _ in range(2):
+    for call in (tables.query("T", "p"), tables.create("T", Row("p", "k"))):
         with pytest.raises(StoreError, match="are damaged") as caught:
-            await tables.create("T", Row("p", "k"))
+            await call
         assert str(path) in str(caught.value)
         assert "nothing was deleted" in str(caught.value)
         assert "\n" not in str(caught.value)
+    await tables.close()
     assert path.read_bytes() == content
 
 
-async def test_a_file_that_lost_pages_is_named_and_left_as_it_is(tables: Tables, path: Path) -> None:
-    for number in range(50):
-        await tables.create("T", Row("p", str(number), {"text": "x" * 2000}))
-    await tables.close()
-    whole = path.read_bytes()
-    damaged = whole[:4096] + b"\xee" * (len(whole) - 4096)
-    path.write_bytes(damaged)
-    with pytest.raises(StoreError, match="are damaged") as caught:
-        await tables.query("T", "p")
-    assert str(path) in str(caught.value)
-    with pytest.raises(StoreError, match="are damaged"):
-        await tables.create("T", Row("p", "k"))
-    await tables.close()
-    assert path.read_bytes() == damaged
-
-
-@pytest.mark.parametrize("what", ["folder", "file"])
-async def test_a_place_that_cannot_be_a_file_is_named(tmp_path: Path, what: str) -> None:
-    if what == "folder":
-        path = tmp_path / "tables.sqlite"
-        path.mkdir()
-    else:
-        (tmp_path / "home").write_text("a file")
-        path = tmp_path / "home" / "tables.sqlite"
-    with pytest.raises(StoreError, match="cannot be used") as caught:
-        await SqliteTables(path).get("T", "p", "k")
-    assert str(path) in str(caught.value)
+async def test_a_path_that_cannot_be_a_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("a file")
+    for path in (tmp_path, tmp_path / "file" / "tables.sqlite"):
+        with pytest.raises(StoreError, match="cannot be used") as caught:
+            await SqliteTables(path).get("T", "p", "k")
+        assert str(path) in str(caught.value)
 
 
 async def test_a_locked_file_is_reported_and_usable_afterwards(
@@ -126,7 +97,7 @@ async def test_a_locked_file_is_reported_and_usable_afterwards(
 
 
 @pytest.fixture
-def foreign() -> Iterator[Path]:
+def read_only_folder() -> Iterator[Path]:
     """A folder that all users may enter and that only root, or no user, may write."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -135,50 +106,41 @@ def foreign() -> Iterator[Path]:
         folder.chmod(0o755)
 
 
-@pytest.mark.parametrize("kept", [False, True])
-def test_a_folder_that_may_not_be_written_is_said_to_be(foreign: Path, kept: bool) -> None:
-    path = foreign / "tables.sqlite"
-    if kept:
-        foreign.chmod(0o755)
+@pytest.mark.parametrize("with_file", [False, True])
+def test_a_folder_without_write_permission_is_reported(read_only_folder: Path, with_file: bool) -> None:
+    path = read_only_folder / "tables.sqlite"
+    if with_file:
+        read_only_folder.chmod(0o755)
         sqlite3.connect(path).close()
         path.chmod(0o444)
-        foreign.chmod(0o555)
-    assert _as_unprivileged(path).startswith(f"StoreError: the tables in {path} cannot be used: ")
-
-
-def _as_unprivileged(path: Path) -> str:
-    """What a process without rights gets; root may write everywhere."""
-    here, there = _FORK.Pipe()
-    child = _FORK.Process(target=_try, args=(path, there))
+        read_only_folder.chmod(0o555)
+    result, sender = _FORK.Pipe()
+    child = _FORK.Process(target=_write_unprivileged, args=(path, sender))
     child.start()
-    said: str = here.recv()
+    assert result.recv().startswith(f"StoreError: the tables in {path} cannot be used: ")
     child.join()
-    return said
 
 
-def _try(path: Path, there: "multiprocessing.connection.Connection") -> None:
-    if os.getuid() == 0:
+def _write_unprivileged(path: Path, sender: "multiprocessing.connection.Connection") -> None:
+    if os.getuid() == 0:  # who may write everywhere
         os.setgroups([])
         os.setgid(_UNPRIVILEGED_UID)
         os.setuid(_UNPRIVILEGED_UID)
     try:
         SqliteTables(path)._run("INSERT INTO rows VALUES ('T','p','k','e','{}')")
-        there.send("written")
+        sender.send("written")
     except StoreError as error:
-        there.send(f"StoreError: {error}")
+        sender.send(f"StoreError: {error}")
 
 
-def test_many_processes_make_one_file_together(path: Path) -> None:
-    for round_ in range(5):
-        home = path.parent / str(round_)
-        with _FORK.Pool(4) as pool:
-            made = pool.starmap(_create, [(home / "tables.sqlite", number) for number in range(8)], chunksize=1)
-        assert sorted(made) == ["T"] * 8
+def test_many_processes_make_one_file_together(tmp_path: Path) -> None:
+    with _FORK.Pool(4) as pool:
+        for round_ in range(5):
+            path = tmp_path / str(round_) / "tables.sqlite"
+            assert pool.starmap(_create, [(path, number) for number in range(8)], chunksize=1) == [""] * 8
 
 
 def _create(path: Path, number: int) -> str:
-    import asyncio
-
     async def create() -> str:
         tables = SqliteTables(path)
         try:
@@ -187,6 +149,6 @@ def _create(path: Path, number: int) -> str:
             return str(error)
         finally:
             await tables.close()
-        return "T"
+        return ""
 
     return asyncio.run(create())

@@ -4,13 +4,7 @@ from typing import Any
 import pytest
 
 from tests.contract.transports.suite import Spoken
-from tests.harness.cloud.cloud_processes import Ground, Link, shared_grounds
-
-
-@pytest.fixture(scope="module")
-def grounds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Any], Ground]]:
-    with shared_grounds(tmp_path_factory.mktemp) as start:
-        yield start
+from tests.harness.cloud.cloud_processes import Ground, Link
 
 
 @pytest.fixture
@@ -34,6 +28,6 @@ def link(ground: Ground, spoken: Spoken) -> Iterator[Link]:
 
 @pytest.fixture
 def fragile(ground: Ground, spoken: Spoken) -> Iterator[Link]:
-    """As ``link``, through a proxy before what its connection ends at."""
+    """Like ``link``, through a proxy in front of its endpoint."""
     with Link(ground, spoken.configuration, through=spoken.endpoint) as link:
         yield link

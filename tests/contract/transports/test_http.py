@@ -1,4 +1,4 @@
-"""HTTP, with long and with plain polls."""
+"""The HTTP transport with long and with plain polls."""
 
 import pytest
 

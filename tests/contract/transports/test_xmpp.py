@@ -1,6 +1,4 @@
-"""XMPP, over Prosody, with a program beside it that speaks for the cloud."""
-
-from collections.abc import Iterator
+"""The XMPP transport over Prosody, with a gateway to the cloud."""
 
 import pytest
 
@@ -8,13 +6,6 @@ from device_agent.transports.xmpp.transport import SILENCE_TIMEOUT_S
 from tests.contract.transports.agent_suite import AgentSuite
 from tests.contract.transports.suite import Spoken, TransportSuite
 from tests.harness.cloud.cloud_processes import Ground
-from tests.harness.network.xmpp import start_xmpp_ground
-
-
-@pytest.fixture(scope="module")
-def xmpp_ground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
-    with start_xmpp_ground(tmp_path_factory.mktemp("xmpp")) as ground:
-        yield ground
 
 
 class TestXmpp(TransportSuite):

@@ -2,18 +2,13 @@
 
 from playwright.sync_api import Browser, Page, expect
 
-from tests.harness.browser.browser import PATIENCE_MS
+from tests.harness.browser.browser import person
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
 
 
 def test_a_new_user_sees_the_first_steps(browser: Browser, machine: Machine) -> None:
-    with browser.new_context(viewport={"width": 1440, "height": 900}) as context:
-        page = context.new_page()
-        page.set_default_timeout(PATIENCE_MS)
-        errors: list[str] = []
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(machine.url)
+    with person(browser, machine.url) as page:
         expect(page.get_by_role("heading", name="Sign in")).to_be_visible()
         assert_good_page(page, "sign-in")
 
@@ -31,7 +26,6 @@ def test_a_new_user_sees_the_first_steps(browser: Browser, machine: Machine) -> 
         page.goto(f"{machine.url}/#/account")
         expect(page.get_by_role("heading", level=1)).to_be_visible()
         assert_good_page(page, "account")
-        assert errors == []
 
 
 def command(page: Page, name: str) -> str:

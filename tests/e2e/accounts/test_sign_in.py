@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.harness.browser.browser import PATIENCE_MS
+from tests.harness.browser.browser import person
 from tests.harness.cloud.oidc_provider import CLIENT_ID, CLIENT_SECRET, new_key, start_provider
 from tests.harness.cloud.people import sign_in_link
 from tests.harness.hosts.host import environment_of, start_program
@@ -40,69 +40,60 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
             yield settings
 
 
-def page_of(browser: Browser) -> Page:
-    page = browser.new_context().new_page()
-    page.set_default_timeout(PATIENCE_MS)
-    return page
-
-
 def signed_in(page: Page, name: str) -> None:
-    expect(page.get_by_test_id("signed-in")).to_have_text(name, timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("signed-in")).to_have_text(name)
+
+
+def sign_in_at_the_provider(page: Page, name: str) -> None:
+    page.get_by_test_id("sign-in-elsewhere").click()
+    page.locator("input[name=login]").fill(name)
+    page.locator("input[name=password]").fill("any")
+    page.locator("button[type=submit]").click()
+    page.locator("button[type=submit]").click()
+    signed_in(page, f"Name of {name}")
 
 
 def test_a_password_is_set_after_a_link_and_signs_in(browser: Browser, environment: dict[str, str]) -> None:
     url = environment["TELESCOPE_PUBLIC_URL"]
-    page = page_of(browser)
-    page.goto(f"{url}/#sign-in={sign_in_link(environment, 'ann')}")
-    signed_in(page, "ann")
-    page.get_by_test_id("signed-in").click()
-    page.get_by_label("New password").fill(PASSWORD)
-    page.get_by_role("button", name="Set password").click()
-    expect(page.get_by_text("Password set.")).to_be_visible(timeout=PATIENCE_MS)
-    page = page_of(browser)
-    page.goto(url)
-    page.get_by_test_id("sign-in-name").fill("ann")
-    page.get_by_test_id("sign-in-password").fill("another one")
-    page.get_by_test_id("sign-in").click()
-    expect(page.get_by_text("Name or password is wrong")).to_be_visible(timeout=PATIENCE_MS)
-    page.get_by_test_id("sign-in-password").fill(PASSWORD)
-    page.get_by_test_id("sign-in").click()
-    signed_in(page, "ann")
+    with person(browser, f"{url}/#sign-in={sign_in_link(environment, 'ann')}") as page:
+        signed_in(page, "ann")
+        page.get_by_test_id("signed-in").click()
+        page.get_by_label("New password").fill(PASSWORD)
+        page.get_by_role("button", name="Set password").click()
+        expect(page.get_by_text("Password set.")).to_be_visible()
+    with person(browser, url) as page:
+        page.get_by_test_id("sign-in-name").fill("ann")
+        page.get_by_test_id("sign-in-password").fill("another one")
+        page.get_by_test_id("sign-in").click()
+        expect(page.get_by_text("Name or password is wrong")).to_be_visible()
+        page.get_by_test_id("sign-in-password").fill(PASSWORD)
+        page.get_by_test_id("sign-in").click()
+        signed_in(page, "ann")
 
 
 def test_sign_in_at_a_provider_returns_with_a_lasting_session(browser: Browser, environment: dict[str, str]) -> None:
     """Only a browser can show that the strict cookie set by the redirect is kept."""
-    page = page_of(browser)
-    page.goto(environment["TELESCOPE_PUBLIC_URL"])
-    page.get_by_test_id("sign-in-elsewhere").click()
-    page.locator("input[name=login]").fill("bob")
-    page.locator("input[name=password]").fill("any")
-    page.locator("button[type=submit]").click()
-    page.locator("button[type=submit]").click()
-    signed_in(page, "Name of bob")
-    page.reload()
-    signed_in(page, "Name of bob")
-    cookies = {each["name"]: each for each in page.context.cookies(f"{environment['TELESCOPE_PUBLIC_URL']}/api/v1")}
-    assert cookies["telescope_session"]["sameSite"] == "Strict"
-    assert cookies["telescope_session"]["httpOnly"] is True
+    with person(browser, environment["TELESCOPE_PUBLIC_URL"]) as page:
+        sign_in_at_the_provider(page, "bob")
+        page.reload()
+        signed_in(page, "Name of bob")
+        cookies = {each["name"]: each for each in page.context.cookies(f"{environment['TELESCOPE_PUBLIC_URL']}/api/v1")}
+        assert cookies["telescope_session"]["sameSite"] == "Strict"
+        assert cookies["telescope_session"]["httpOnly"] is True
 
 
 def test_sign_in_at_a_provider_returns_to_the_invitation(browser: Browser, environment: dict[str, str]) -> None:
     url = environment["TELESCOPE_PUBLIC_URL"]
-    owner = page_of(browser)
-    owner.goto(f"{url}/#sign-in={sign_in_link(environment, 'dora')}")
-    owner.get_by_test_id("space-link").click()
-    owner.get_by_test_id("invite").click()
-    owner.get_by_test_id("invite-send").click()
-    page = page_of(browser)
-    page.goto(owner.get_by_test_id("invitation-link").input_value())
-    page.get_by_test_id("sign-in-elsewhere").click()
-    page.locator("input[name=login]").fill("eve")
-    page.locator("input[name=password]").fill("any")
-    page.locator("button[type=submit]").click()
-    page.locator("button[type=submit]").click()
-    signed_in(page, "Name of eve")
-    expect(page.get_by_test_id("shared-with-me")).to_contain_text("Home", timeout=PATIENCE_MS)
-    page.reload()
-    signed_in(page, "Name of eve")
-    expect(page.get_by_test_id("shared-with-me")).to_have_count(0)  # the accepted invitation is not shown again
+    with (
+        person(browser, f"{url}/#sign-in={sign_in_link(environment, 'dora')}") as owner,
+        person(browser, "about:blank") as page,
+    ):
+        owner.get_by_test_id("space-link").click()
+        owner.get_by_test_id("invite").click()
+        owner.get_by_test_id("invite-send").click()
+        page.goto(owner.get_by_test_id("invitation-link").input_value())
+        sign_in_at_the_provider(page, "eve")
+        expect(page.get_by_test_id("shared-with-me")).to_contain_text("Home")
+        page.reload()
+        signed_in(page, "Name of eve")
+        expect(page.get_by_test_id("shared-with-me")).to_have_count(0)  # the accepted invitation is not shown again

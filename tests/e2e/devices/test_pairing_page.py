@@ -16,7 +16,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from device_agent.cli import claim_prompt
-from tests.harness.browser.browser import PATIENCE_MS, person
+from tests.harness.browser.browser import person
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
 from tests.harness.network.brokers import wait_until
@@ -83,10 +83,10 @@ def test_a_robot_is_paired_by_the_link_in_the_terminal(browser: Browser, machine
     with machine.api() as api, person(browser, link) as page:
         known = {device["id"] for device in api.get("/devices")["items"]}
         # Without a session the code is removed from the address and restored after sign-in. Claiming needs a click.
-        expect(page.get_by_text("You followed a pairing link. Sign in to continue")).to_be_visible(timeout=PATIENCE_MS)
+        expect(page.get_by_text("You followed a pairing link. Sign in to continue")).to_be_visible()
         assert "pair=" not in page.url
         page.goto(machine.sign_in_link())
-        expect(page.get_by_test_id("claim-code")).to_have_value(link.partition("=")[2], timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("claim-code")).to_have_value(link.partition("=")[2])
         assert {device["id"] for device in api.get("/devices")["items"]} == known
         assert_good_page(page, "pairing")
 
@@ -99,14 +99,14 @@ def test_a_robot_is_paired_by_the_link_in_the_terminal(browser: Browser, machine
         page.get_by_test_id("claim-space").select_option("new")
         page.get_by_label("Space name").fill("Guest room")
         page.get_by_test_id("claim").press("Enter")
-        expect(page.get_by_role("alert")).to_contain_text("Pairing failed", timeout=PATIENCE_MS)
+        expect(page.get_by_role("alert")).to_contain_text("Pairing failed")
         assert field(page) == "zzzz zzzz"
         assert page.get_by_test_id("claim-space").locator("option:checked").inner_text() == "Guest room"
         assert_good_page(page, "pairing-wrong")
 
         page.get_by_test_id("claim-code").fill(right)
         page.get_by_test_id("claim").press("Enter")
-        expect(page.get_by_test_id("paired")).to_be_visible(timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("paired")).to_be_visible()
         assert terminal.process.wait(30) == 0
         assert "paired with demo" in terminal.text
         row = page.get_by_test_id("paired-device")
@@ -121,14 +121,14 @@ def test_a_robot_is_paired_by_the_link_in_the_terminal(browser: Browser, machine
         row.get_by_test_id("name").fill("Visitor")
         assert_good_page(page, "paired")
         row.get_by_test_id("save-name").press("Enter")
-        expect(row.get_by_role("link")).to_have_text("Visitor", timeout=PATIENCE_MS)
+        expect(row.get_by_role("link")).to_have_text("Visitor")
         row.get_by_test_id("undo-name").press("Enter")
-        expect(row.get_by_role("link")).to_have_text(before, timeout=PATIENCE_MS)
+        expect(row.get_by_role("link")).to_have_text(before)
 
         # A used code is invalid.
         page.get_by_role("button", name="Pair another").click()
         page.get_by_test_id("claim-code").fill(right)
         page.get_by_test_id("claim").click()
-        expect(page.get_by_role("alert")).to_contain_text("already used", timeout=PATIENCE_MS)
+        expect(page.get_by_role("alert")).to_contain_text("already used")
         (paired,) = [device for device in api.get("/devices")["items"] if device["id"] not in known]
         api.http.delete(f"/agents/{paired['agent']}").raise_for_status()

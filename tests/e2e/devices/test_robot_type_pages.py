@@ -7,7 +7,7 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, FilePayload, Locator, Page, expect
 
-from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.browser import pages
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
 from tests.harness.network.brokers import wait_until
@@ -97,7 +97,7 @@ def archive(files: Mapping[str, str]) -> FilePayload:
 
 
 def at_step(page: Page, step: str) -> None:
-    expect(page.locator(f"[data-testid=add-type][data-step={step}]")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.locator(f"[data-testid=add-type][data-step={step}]")).to_be_visible()
 
 
 def replace(page: Page, folder: Path, name: str, text: str) -> None:
@@ -159,7 +159,7 @@ def is_mended(page: Page, folder: Path) -> None:
     """The selected files remain and can be replaced one by one."""
     replace(page, folder, "scene.xml", SCENE)
     replace(page, folder, "robot.toml", MANIFEST)
-    expect(page.get_by_test_id("error")).to_have_count(1, timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("error")).to_have_count(1)
     expect(finding(page, "missing")).to_be_visible()
     replace(page, folder, "reacher.xml", MODEL)
     at_step(page, "good")
@@ -185,7 +185,7 @@ def is_looked_at(page: Page, machine: Machine) -> None:
 def is_saved(page: Page, machine: Machine) -> None:
     """The saved type has a page and is in the list."""
     page.get_by_test_id("save-type").click()
-    expect(page.get_by_test_id("type-saved")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("type-saved")).to_be_visible()
     expect(page.locator("[data-testid=saved-movements] [data-accepted=true]")).to_have_text("bow accepted")
     expect(page.get_by_test_id("command-enroll")).to_have_value(enrolment(machine))
     assert_good_page(page, "robot-type-saved")

@@ -54,13 +54,13 @@ def test_a_fault_is_raised_shown_and_ended_and_a_trend_shows_measurements(
 def raised(page: Page, machine: Machine, device: str) -> None:
     """The device list, the health page and the device page show the fault without a reload."""
     row = page.locator(f"[data-testid=device-row][data-device='{device}']")
-    expect(row.get_by_text("1 fault")).to_be_visible(timeout=PATIENCE_MS)
+    expect(row.get_by_text("1 fault")).to_be_visible()
     row.get_by_role("link").first.click()
     chip = page.get_by_test_id("health-chip")
-    expect(chip).to_have_attribute("data-count", "1", timeout=PATIENCE_MS)
+    expect(chip).to_have_attribute("data-count", "1")
     page.get_by_role("link", name="Health", exact=True).click()
     line = page.locator(f"[data-testid=health-row][data-device='{device}']")
-    expect(line).to_have_attribute("data-health", "fault", timeout=PATIENCE_MS)
+    expect(line).to_have_attribute("data-health", "fault")
     expect(line).to_contain_text("does not respond")
     assert page.get_by_test_id("health-row").first.get_attribute("data-health") == "fault", "the worst device is first"
     assert_good_page(page, "health")
@@ -70,23 +70,23 @@ def raised(page: Page, machine: Machine, device: str) -> None:
 def seen_and_ended(page: Page, cause: Path) -> None:
     """Acknowledge by keyboard; the fault ends with its cause."""
     fault = page.get_by_test_id("fault")
-    expect(fault).to_have_attribute("data-state", "raised", timeout=PATIENCE_MS)
+    expect(fault).to_have_attribute("data-state", "raised")
     button = page.get_by_test_id("acknowledge")
     button.focus()
     page.keyboard.press("Enter")
-    expect(fault).to_have_attribute("data-state", "acknowledged", timeout=PATIENCE_MS)
+    expect(fault).to_have_attribute("data-state", "acknowledged")
     expect(fault).to_contain_text("Acknowledged by demo")
     assert page.evaluate("() => document.activeElement.closest('[data-testid=fault]') !== null"), "the focus is lost"
     assert_good_page(page, "health-fault")
     cause.unlink()
-    expect(page.get_by_test_id("open-faults")).to_have_attribute("data-count", "0", timeout=PATIENCE_MS)
-    expect(fault).to_have_count(0, timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("open-faults")).to_have_attribute("data-count", "0")
+    expect(fault).to_have_count(0)
     page.get_by_text("Past", exact=True).click()
     past = page.get_by_test_id("faults-past").get_by_test_id("fault").first
-    expect(past).to_have_attribute("data-state", "cleared", timeout=PATIENCE_MS)
+    expect(past).to_have_attribute("data-state", "cleared")
     expect(past).to_contain_text("Acknowledged by demo")
     past.locator("summary").click()
-    expect(past.locator(".event-list")).to_contain_text("Fault acknowledged", timeout=PATIENCE_MS)
+    expect(past.locator(".event-list")).to_contain_text("Fault acknowledged")
 
 
 def trend(page: Page, machine: Machine, device: str) -> None:
@@ -152,7 +152,7 @@ def test_latencies_are_measured_plotted_with_reference_values_and_saved(browser:
             assert len(rows) - 1 == drawn >= 3 * MEASURED
             assert_good_page(ann, "times-device")
             go(ann, laboratory, "#/latency")
-            expect(ann.get_by_test_id("times-line").first).to_be_visible(timeout=PATIENCE_MS)
+            expect(ann.get_by_test_id("times-line").first).to_be_visible()
             assert_good_page(ann, "times")
 
 

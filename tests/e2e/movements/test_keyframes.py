@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.harness.browser.browser import PATIENCE_MS, pages, person
+from tests.harness.browser.browser import pages, person
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
 from tests.harness.network.brokers import wait_until
@@ -18,7 +18,7 @@ def open_editor(page: Page, laboratory: Machine, name: str) -> None:
         device = api.device(name)["id"]
     page.goto(f"{laboratory.url}/#/devices/{device}")
     page.get_by_test_id("to-keyframes").click()
-    expect(page.get_by_test_id("kf-track")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("kf-track")).to_be_visible()
     wait_until(lambda: number(page, "kf-view", "frames") > 0, "the twin to be drawn")
 
 
@@ -46,7 +46,7 @@ def keyframes(page: Page) -> list[dict[str, Any]]:
 def save(page: Page, name: str) -> None:
     page.get_by_test_id("kf-name").fill(name)
     page.get_by_test_id("kf-save").click()
-    expect(page.get_by_test_id("kf-said")).to_contain_text("Saved as version", timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("kf-said")).to_contain_text("Saved as version")
 
 
 def run(page: Page) -> None:
@@ -72,11 +72,10 @@ def test_keyframes_of_an_arm_are_edited_saved_and_run(drawing_browser: Browser, 
         page.get_by_test_id("kf-lasts").fill("0.3")
         page.get_by_test_id("kf-lasts").press("Enter")
         problem = page.get_by_test_id("kf-problem-too-fast")
-        expect(problem).to_contain_text("would exceed its", timeout=PATIENCE_MS)
+        expect(problem).to_contain_text("would exceed its")
         expect(page.get_by_test_id("kf-run")).to_be_disabled()
         page.get_by_test_id("kf-name").fill("kf-turn")
         assert_good_page(page, "keyframes-too-fast")
-        page.set_viewport_size({"width": 1440, "height": 900})
         problem.get_by_test_id("kf-mend").click()
         expect(page.get_by_test_id("kf-problems")).to_have_attribute("data-count", "0")
         assert number(page, "kf-marker-2", "time") > 0.6
@@ -91,13 +90,13 @@ def test_keyframes_of_an_arm_are_edited_saved_and_run(drawing_browser: Browser, 
         before = laboratory.trace().now()["qpos"]["shoulder_pan"]
         frames = number(page, "kf-view", "frames")
         page.get_by_test_id("kf-play").click()
-        expect(page.get_by_test_id("kf-play")).to_have_attribute("aria-pressed", "false", timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("kf-play")).to_have_attribute("aria-pressed", "false")
         assert number(page, "kf-view", "frames") > frames + 3
         assert abs(laboratory.trace().now()["qpos"]["shoulder_pan"] - before) < 1e-3
 
         # A draft survives a reload.
         page.reload()
-        expect(page.get_by_test_id("kf-restored")).to_be_visible(timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("kf-restored")).to_be_visible()
         made = keyframes(page)
         assert [len(made), made[0]["position_rad"]] == [3, start]
         page.get_by_test_id("kf-description").fill("Turns and looks around.")
@@ -105,7 +104,6 @@ def test_keyframes_of_an_arm_are_edited_saved_and_run(drawing_browser: Browser, 
         page.get_by_test_id("kf-marker-2").focus()
         wait_until(lambda: number(page, "kf-view", "frames") > 0, "the twin to be drawn")
         assert_good_page(page, "keyframes")
-        page.set_viewport_size({"width": 1440, "height": 900})
 
         # The robot reaches the poses in order.
         run(page)
@@ -133,7 +131,7 @@ def undone_and_done_again(page: Page) -> None:
 def opened_again(page: Page, laboratory: Machine, made: list[dict[str, Any]]) -> None:
     """Saved keyframes open again; a script that was edited by hand does not open as keyframes."""
     page.reload()
-    expect(page.get_by_test_id("kf-track")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("kf-track")).to_be_visible()
     assert keyframes(page) == made
     with laboratory.api() as api:
         path = "/robot-types/ur5/movements/kf-turn"
@@ -141,7 +139,7 @@ def opened_again(page: Page, laboratory: Machine, made: list[dict[str, Any]]) ->
         changed = {"source": saved["source"] + "robot.home()\n"}
         assert api.http.put(path, json=changed).is_success
     page.reload()
-    expect(page.get_by_test_id("kf-by-hand")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("kf-by-hand")).to_be_visible()
     with laboratory.api() as api:
         assert api.http.delete("/robot-types/ur5/movements/kf-turn").is_success
 
@@ -159,9 +157,8 @@ def test_a_recorded_motion_is_trimmed_and_becomes_keyframes(drawing_browser: Bro
                 assert done["status"] == "done", done
         page.get_by_test_id("kf-record").click()
         assert number(page, "kf-recorded", "samples") > 10
-        expect(page.get_by_test_id("kf-use")).to_be_enabled(timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("kf-use")).to_be_enabled()
         assert_good_page(page, "keyframes-record")
-        page.set_viewport_size({"width": 1440, "height": 900})
         lasts = page.get_by_test_id("kf-to").evaluate("e => Number(e.max)")
         page.get_by_test_id("kf-from").focus()
         for _ in range(6):
@@ -205,7 +202,6 @@ def test_the_same_editor_serves_every_robot(
         assert len(keyframes(page)) == 2
         if name != "qbo":
             assert_good_page(page, f"keyframes-{name}")
-            page.set_viewport_size({"width": 1440, "height": 900})
         if name == "hanson":
             run(page)
             turned = page.get_by_test_id(f"measured-{joint}")
@@ -221,7 +217,7 @@ def test_the_same_editor_serves_every_robot(
 
 def test_keyframes_are_made_for_a_robot_type_without_a_robot(browser: Browser, laboratory: Machine) -> None:
     with person(browser, laboratory.sign_in_link()) as ann:
-        expect(ann.get_by_test_id("signed-in")).to_be_visible(timeout=PATIENCE_MS)
+        expect(ann.get_by_test_id("signed-in")).to_be_visible()
         ann.goto(f"{laboratory.url}/#/movements")
         ann.get_by_test_id("new-type").select_option("nao")
         ann.get_by_test_id("new-keyframes").click()
@@ -230,10 +226,10 @@ def test_keyframes_are_made_for_a_robot_type_without_a_robot(browser: Browser, l
         for part in ("kf-run", "kf-record", "stop"):
             assert ann.get_by_test_id(part).count() == 0, f"{part}: there is no robot"
         ann.get_by_test_id("kf-save").click()
-        expect(ann.get_by_test_id("kf-said")).to_have_attribute("data-version", "1", timeout=PATIENCE_MS)
+        expect(ann.get_by_test_id("kf-said")).to_have_attribute("data-version", "1")
         assert_good_page(ann, "keyframes-type")
         # The movement's page opens it as keyframes again; no robot has moved.
         ann.goto(f"{laboratory.url}/#/movements/nao/at_ease")
         ann.get_by_test_id("as-keyframes").click()
-        expect(ann.get_by_test_id("kf-name")).to_have_value("at_ease", timeout=PATIENCE_MS)
+        expect(ann.get_by_test_id("kf-name")).to_have_value("at_ease")
         expect(ann.get_by_test_id("kf-save")).to_be_disabled()

@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
-from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.browser import pages
 from tests.harness.browser.pages import assert_good_page
-from tests.harness.browser.product import Api, Machine, Trace
+from tests.harness.browser.product import Api, Machine, Trace, enroll
+from tests.harness.browser.steering import open_robot, reset_stop
 from tests.harness.network.brokers import wait_until
 from tests.harness.paths import ROOT
 
@@ -40,15 +41,12 @@ def api(machine: Machine) -> Iterator[Api]:
 def second(machine: Machine, api: Api) -> Iterator[Trace]:
     """A second UR5 with its own agent for one test."""
     home = machine.home / "agents" / SECOND
-    program = [sys.executable, "-m", "device_agent"]
-    told = ["--home", str(home), "--server", machine.url, "--name", SECOND, "--device", f"{SECOND}=ur5", "--no-wait"]
-    said = subprocess.run(
-        [*program, "enroll", *told], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.split()
-    agent = api.post("/agents/claim", {"code": said[said.index("code") + 1]})["agent"]
+    agent = enroll(machine, api, home, f"{SECOND}=ur5", "--name", SECOND)
     with (home / "log").open("w") as log:
         trace = ["--trace", str(home / "trace")]
-        process = subprocess.Popen([*program, "run", "--home", str(home), *trace], cwd=ROOT, stdout=log, stderr=log)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "device_agent", "run", "--home", str(home), *trace], cwd=ROOT, stdout=log, stderr=log
+        )
     try:
         api.device(SECOND)
         yield Trace(home / "trace" / f"{SECOND}.ndjson")
@@ -80,7 +78,7 @@ def written(page: Page) -> str:
 
 def open_script(page: Page, machine: Machine, name: str) -> None:
     page.goto(f"{machine.url}/#/movements/ur5/{name}")
-    expect(script(page)).to_be_visible(timeout=PATIENCE_MS)
+    expect(script(page)).to_be_visible()
 
 
 def write(page: Page, text: str) -> None:
@@ -93,7 +91,7 @@ def write(page: Page, text: str) -> None:
 
 def save(page: Page, version: int) -> None:
     page.get_by_test_id("save-movement").click()
-    expect(page.get_by_test_id("save-state")).to_have_attribute("data-version", str(version), timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("save-state")).to_have_attribute("data-version", str(version))
     expect(page.get_by_test_id("save-state")).to_have_attribute("data-changed", "false")
 
 
@@ -104,7 +102,7 @@ def wrist(trace: Trace) -> float:
 def test_a_movement_is_written_corrected_and_saved(browser: Browser, machine: Machine, name: str) -> None:
     with pages(browser, machine) as (page,):
         page.get_by_role("link", name="Movements").click()
-        expect(page.get_by_test_id("shelf-ur5-wave")).to_be_visible(timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("shelf-ur5-wave")).to_be_visible()
         page.get_by_test_id("movement-search").fill("square air")
         expect(page.get_by_test_id("shelf-ur5-slow_square")).to_be_visible()
         expect(page.get_by_test_id("shelf-ur5-wave")).to_have_count(0)
@@ -121,12 +119,12 @@ def test_a_movement_is_written_corrected_and_saved(browser: Browser, machine: Ma
         # The error is marked in its line; the text stays unsaved.
         write(page, BROKEN)
         problem = page.get_by_test_id("problem")
-        expect(problem).to_have_count(1, timeout=PATIENCE_MS)
+        expect(problem).to_have_count(1)
         line = BROKEN[: BROKEN.index(LEFT_OUT[:4] + "(")].count("\n") + 1
         assert int(problem.get_attribute("data-line") or 0) == line, problem.text_content()
         expect(page.get_by_test_id("code").locator(".cm-lintRange-error").first).to_be_visible()
         page.get_by_test_id("save-movement").click()
-        expect(page.get_by_test_id("save-refused")).to_contain_text(f"Line {line}", timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("save-refused")).to_contain_text(f"Line {line}")
         assert written(page) == BROKEN
         assert_good_page(page, "movement-wrong")
 
@@ -134,13 +132,13 @@ def test_a_movement_is_written_corrected_and_saved(browser: Browser, machine: Ma
         write(page, "robot.mo")
         offered = page.get_by_test_id("code").locator(".cm-completionLabel")
         page.keyboard.press("Control+Space")
-        expect(offered.filter(has_text="move_joints")).to_be_visible(timeout=PATIENCE_MS)
+        expect(offered.filter(has_text="move_joints")).to_be_visible()
         page.wait_for_timeout(200)  # the completion list ignores keys right after it opens
         page.keyboard.press("Enter")
         assert written(page) == "robot.move_joints"
         page.keyboard.insert_text("({'el")
         page.keyboard.press("Control+Space")
-        expect(offered.filter(has_text="elbow")).to_be_visible(timeout=PATIENCE_MS)
+        expect(offered.filter(has_text="elbow")).to_be_visible()
         page.keyboard.press("Escape")
 
         # Tab moves the focus.
@@ -148,7 +146,7 @@ def test_a_movement_is_written_corrected_and_saved(browser: Browser, machine: Ma
         assert page.evaluate("() => document.activeElement.dataset.testid") == "save-movement"
 
         write(page, SCRIPT)
-        expect(page.get_by_test_id("problem-count")).to_have_attribute("data-count", "0", timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("problem-count")).to_have_attribute("data-count", "0")
         save(page, 1)
 
 
@@ -177,14 +175,14 @@ def test_a_movement_runs_with_parameters_from_a_form_and_its_failure_is_marked(
         # A failed run is marked in its line too.
         write(page, SCRIPT.replace('print("turned"', 'print(1 / 0, "turned"'))
         page.get_by_test_id("run-many").click()
-        expect(row).to_have_attribute("data-status", "failed", timeout=PATIENCE_MS)
+        expect(row).to_have_attribute("data-status", "failed")
         failed = SCRIPT[: SCRIPT.index("print(")].count("\n") + 1
         marked = page.get_by_test_id("problem").filter(has_text="ZeroDivisionError")
-        expect(marked).to_have_attribute("data-line", str(failed), timeout=PATIENCE_MS)
+        expect(marked).to_have_attribute("data-line", str(failed))
 
         # The last values are restored, also on the robot's page.
         page.goto(f"{machine.url}/#/")
-        page.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()
+        open_robot(page)
         page.get_by_test_id(f"parameters-{name}").click()
         expect(page.get_by_test_id("parameter-angle_rad")).to_have_value("40")
         page.get_by_test_id("parameter-angle_rad").fill("-30")
@@ -207,7 +205,7 @@ def test_unsaved_text_is_kept_and_versions_can_be_restored(
         write(mine, SCRIPT + "# mine\n")
         expect(mine.get_by_test_id("save-state")).to_have_attribute("data-changed", "true")
         mine.reload()
-        expect(mine.get_by_test_id("restored")).to_be_visible(timeout=PATIENCE_MS)
+        expect(mine.get_by_test_id("restored")).to_be_visible()
         assert written(mine) == SCRIPT + "# mine\n"
 
         # The other tab saves first: its version is not overwritten, and both are shown.
@@ -215,19 +213,19 @@ def test_unsaved_text_is_kept_and_versions_can_be_restored(
         save(other, 2)
         mine.get_by_test_id("save-movement").click()
         conflict = mine.get_by_test_id("conflict")
-        expect(conflict).to_be_visible(timeout=PATIENCE_MS)
+        expect(conflict).to_be_visible()
         expect(conflict.get_by_test_id("difference")).to_contain_text("# theirs")
         expect(conflict.get_by_test_id("difference")).to_contain_text("# mine")
         assert_good_page(mine, "movement-conflict")
         mine.get_by_test_id("save-over").click()
-        expect(mine.get_by_test_id("save-state")).to_have_attribute("data-version", "3", timeout=PATIENCE_MS)
+        expect(mine.get_by_test_id("save-state")).to_have_attribute("data-version", "3")
 
         # An older version is opened and saved as the newest.
         mine.get_by_test_id("version-2").get_by_role("button").click()
-        expect(mine.get_by_test_id("restore-version")).to_be_visible(timeout=PATIENCE_MS)
+        expect(mine.get_by_test_id("restore-version")).to_be_visible()
         assert_good_page(mine, "movement-version")
         mine.get_by_test_id("restore-version").click()
-        expect(mine.get_by_test_id("save-state")).to_have_attribute("data-version", "4", timeout=PATIENCE_MS)
+        expect(mine.get_by_test_id("save-state")).to_have_attribute("data-version", "4")
         wait_until(lambda: written(mine) == SCRIPT + "# theirs\n", "the older text")
         assert api.get(f"/robot-types/ur5/movements/{name}")["source"] == SCRIPT + "# theirs\n"
 
@@ -243,7 +241,7 @@ def test_unsaved_text_is_kept_and_versions_can_be_restored(
         mine.goto(f"{machine.url}/#/movements")
         mine.get_by_test_id(f"remove-{name}").click()
         mine.get_by_test_id("confirm-yes").click()
-        expect(mine.get_by_test_id(f"shelf-ur5-{name}")).to_have_count(0, timeout=PATIENCE_MS)
+        expect(mine.get_by_test_id(f"shelf-ur5-{name}")).to_have_count(0)
 
 
 def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(
@@ -253,12 +251,12 @@ def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(
     with pages(browser, machine) as (page,):
         open_script(page, machine, name)
         page.get_by_role("button", name="Select all").click()
-        expect(page.get_by_test_id("many-state")).to_be_visible(timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("many-state")).to_be_visible()
         page.get_by_test_id("parameter-angle_rad").fill("20")
         page.get_by_test_id("run-many").click()
         rows = [page.get_by_test_id(f"run-{robot}") for robot in ("ur5", SECOND)]
         for row in rows:
-            expect(row).to_have_attribute("data-status", "done", timeout=PATIENCE_MS)
+            expect(row).to_have_attribute("data-status", "done")
         for trace in (machine.trace(), second):
             wait_until(lambda trace=trace: abs(wrist(trace) - 0.349) < 0.01, "the wrist to be turned by 20°")  # type: ignore[misc]
 
@@ -266,27 +264,21 @@ def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(
         page.get_by_test_id("parameter-wait_s").fill("30")
         page.get_by_test_id("run-many").click()
         for row in rows:
-            expect(row).to_have_attribute("data-status", "started", timeout=PATIENCE_MS)
+            expect(row).to_have_attribute("data-status", "started")
         assert_good_page(page, "movement-many")
         page.get_by_role("button", name="Cancel on").last.click()
         wait_until(lambda: "cancelled" in [row.get_attribute("data-status") for row in rows], "one to be cancelled")
         script(page).click()
         page.keyboard.press("Escape")
-        expect(page.get_by_test_id("stop-banner")).to_have_count(2, timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("stop-banner")).to_have_count(2)
         for banner in page.get_by_test_id("stop-banner").all():
-            expect(banner).to_have_attribute("data-state", "latched", timeout=PATIENCE_MS)
+            expect(banner).to_have_attribute("data-state", "latched")
 
         # A robot that cannot run the movement gives the reason; the other robot runs it.
         page.get_by_test_id("reset-stop").first.click()
         page.get_by_test_id("confirm-reset").click()
-        expect(page.get_by_test_id("stop-banner")).to_have_count(1, timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("stop-banner")).to_have_count(1)
         page.get_by_test_id("parameter-wait_s").fill("0")
         page.get_by_test_id("run-many").click()
-        wait_until(
-            lambda: min(str(row.get_attribute("data-status")) for row in rows) == "done",
-            "one to be done",
-            20,
-        )
-        page.get_by_test_id("reset-stop").click()
-        page.get_by_test_id("confirm-reset").click()
-        expect(page.get_by_test_id("stop-banner")).to_have_count(0, timeout=PATIENCE_MS)
+        wait_until(lambda: min(str(row.get_attribute("data-status")) for row in rows) == "done", "one to be done", 20)
+        reset_stop(page)

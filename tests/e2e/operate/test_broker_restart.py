@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.harness.agent.arm import drive, elbow, end_in_mid_motion, operator, release, stopped_in_time
 from tests.harness.browser.product import Api, Machine, start_machine
+from tests.harness.browser.steering import drive, elbow, end_in_mid_motion, operator, release_control, stopped_in_time
 from tests.harness.network.brokers import BROKERS, MODULES, wait_until
 
 NOTE = """() => {
-    window.saidOfTheLink = [];
+    window.bannerTexts = [];
     const look = () => {
         const banner = document.querySelector("[data-testid=link-banner]");
-        if (banner !== null) window.saidOfTheLink.push(banner.textContent);
+        if (banner !== null) window.bannerTexts.push(banner.textContent);
     };
     new MutationObserver(look).observe(document.body, {subtree: true, childList: true, characterData: true});
 }"""
@@ -39,7 +39,7 @@ def kill(machine: Machine, program: str) -> None:
     os.killpg(machine.pid(program), signal.SIGKILL)
 
 
-def in_control(page: Page, api: Api, device: str) -> list[bool]:
+def control_views(page: Page, api: Api, device: str) -> list[bool]:
     """Whether an operator has control according to the page, the cloud and the robot."""
     cloud = api.get(f"/devices/{device}")
     shown = page.get_by_test_id("control-state").get_attribute("data-state")
@@ -63,15 +63,15 @@ def test_a_broker_failure_ends_only_the_running_motion(browser: Browser, site: t
             return moved_on_ms
 
         assert stopped_in_time(attempt)
-        assert any("No connection to the broker" in said for said in page.evaluate("() => window.saidOfTheLink"))
+        assert any("No connection to the broker" in said for said in page.evaluate("() => window.bannerTexts"))
 
         # The robot held, which ended control: page, cloud and robot agree.
-        wait_until(lambda: not any(in_control(page, api, device)), "page, cloud and robot to agree on control")
+        wait_until(lambda: not any(control_views(page, api, device)), "page, cloud and robot to agree on control")
         expect(page.get_by_test_id("slider-elbow")).to_be_disabled()
 
         rest = elbow(trace)
         share = 0.75 if rest < 0.5 else 0.25
         drive(page, share, lambda: abs(elbow(trace) - rest) > 0.1, "the elbow following the slider again")
-        wait_until(lambda: len(set(in_control(page, api, device))) == 1, "page, cloud and robot to agree on control")
+        wait_until(lambda: len(set(control_views(page, api, device))) == 1, "page, cloud and robot to agree on control")
         assert page.get_by_test_id("pose-2").input_value() == TYPED
-        release(page)
+        release_control(page)

@@ -1,14 +1,14 @@
 """Control handover of a moving simulated arm with the real agent: the arm holds at once."""
 
 import contextlib
-import time
 from collections.abc import Iterator
 from typing import Any
 
 import httpx
 import pytest
 
-from tests.harness.browser.product import Api, Machine, Trace
+from tests.harness.browser.product import Api, Machine
+from tests.harness.browser.steering import assert_at_rest, commanded_speed
 from tests.harness.network.brokers import wait_until
 
 FAR, NEAR = {"shoulder_pan": 2.0}, {"shoulder_pan": -2.0}
@@ -24,13 +24,6 @@ def two(machine: Machine) -> Iterator[tuple[Api, Api, str]]:
         yield ann, bob, device
         with contextlib.suppress(AssertionError):
             ann.post(f"/devices/{device}/stop/reset")
-
-
-def commanded_speed(trace: Trace) -> float:
-    first, *_, last = trace.rows(20)
-    passed_s: float = (last["at_ms"] - first["at_ms"]) / 1000
-    moved_rad: float = max(abs(last["target"][name] - first["target"][name]) for name in last["target"])
-    return moved_rad / passed_s
 
 
 def move(api: Api, device: str, epoch: int, target: dict[str, float]) -> str:
@@ -109,8 +102,7 @@ def test_after_stop_all_motion_needs_new_control(machine: Machine, two: tuple[Ap
     wait_until(lambda: ann.post(f"/devices/{device}/stop/reset")["confirmed"], "the reset")
     request_body = {"request": {"kind": "move_joints", "position_rad": NEAR}, "epoch": other}
     assert refused(bob, f"/devices/{device}/actions", request_body) == "lease-lost"
-    time.sleep(0.5)
-    assert commanded_speed(trace) == 0, "the reset resumes nothing"
+    assert_at_rest(trace)  # the reset resumes nothing
     fresh = bob.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
     again = move(bob, device, fresh, NEAR)
     wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion")

@@ -1,17 +1,16 @@
 """Two users with one arm in two browsers: control handover and the list of viewers."""
 
-import contextlib
 import json
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Error, Page, Route, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.harness.browser.browser import PATIENCE_MS, person
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
-from tests.harness.network.brokers import wait_until
+from tests.harness.browser.steering import move_the_elbow, open_robot, take_control
 
 SILENCE_MS = 12_000
 
@@ -28,58 +27,20 @@ def two(browser: Browser, machine: Machine) -> Iterator[tuple[Page, Page]]:
             person(browser, machine.sign_in_link("carol")) as carol_page,
         ):
             for page in (demo_page, carol_page):
-                open_arm(page)
+                open_robot(page)
             yield demo_page, carol_page
         owner.http.delete(f"/devices/{device}/shares/{account}").raise_for_status()
 
 
-def open_arm(page: Page) -> None:
-    page.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()
-    expect(page.get_by_test_id("slider-elbow")).to_be_attached(timeout=PATIENCE_MS)
-
-
 def expect_state(page: Page, state: str) -> None:
-    expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", state, timeout=PATIENCE_MS)
-
-
-def take(page: Page) -> None:
-    """Take control again if the robot ended it because setpoints were late on a busy machine."""
-    slider, button = page.get_by_test_id("slider-elbow"), page.get_by_test_id("take-control")
-
-    def in_hand() -> bool:
-        if page.get_by_test_id("control-state").get_attribute("data-state") != "mine" and button.is_visible():
-            with contextlib.suppress(Error):  # the button disappeared before the click
-                button.click(timeout=1000)
-        return slider.is_enabled()
-
-    wait_until(in_hand, "control")
-    expect_state(page, "mine")
+    expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", state)
 
 
 def ask(asker: Page, holder: Page) -> None:
-    take(holder)
+    take_control(holder)
     asker.get_by_test_id("ask-control").click()
-    expect(holder.get_by_test_id("asks")).to_contain_text("requests control", timeout=PATIENCE_MS)
-    expect(asker.get_by_test_id("asked")).to_contain_text("You requested control from demo", timeout=PATIENCE_MS)
-
-
-def elbow(machine: Machine) -> float:
-    """Measured position in the simulation [rad]."""
-    return float(machine.trace().now()["qpos"]["elbow"])
-
-
-def move_the_elbow(page: Page, machine: Machine) -> None:
-    before = elbow(machine)
-
-    def moved() -> bool:
-        if page.get_by_test_id("control-state").get_attribute("data-state") == "mine":
-            page.get_by_test_id("slider-elbow").press("Shift+ArrowLeft")
-        elif page.get_by_test_id("take-control").is_visible():
-            page.get_by_test_id("take-control").click()
-        page.wait_for_timeout(200)
-        return abs(elbow(machine) - before) > 0.1
-
-    wait_until(moved, "the elbow moving")
+    expect(holder.get_by_test_id("asks")).to_contain_text("requests control")
+    expect(asker.get_by_test_id("asked")).to_contain_text("You requested control from demo")
 
 
 def test_control_is_handed_over_and_viewers_are_listed(two: tuple[Page, Page], machine: Machine) -> None:
@@ -87,7 +48,7 @@ def test_control_is_handed_over_and_viewers_are_listed(two: tuple[Page, Page], m
     # Each page lists the other viewer.
     for page, name in ((demo, "carol"), (carol, "demo")):
         button = page.get_by_test_id("watchers")
-        expect(button).to_be_visible(timeout=PATIENCE_MS)
+        expect(button).to_be_visible()
         button.click()
         expect(page.get_by_test_id("watcher-names")).to_contain_text(name)
     assert_good_page(demo, "watchers")
@@ -98,14 +59,14 @@ def test_control_is_handed_over_and_viewers_are_listed(two: tuple[Page, Page], m
     assert_good_page(demo, "asked-for-control")
     assert_good_page(carol, "asking-for-control")
     demo.get_by_test_id("refuse-request").press("Enter")
-    expect(carol.get_by_test_id("asked")).to_contain_text("demo keeps control", timeout=PATIENCE_MS)
+    expect(carol.get_by_test_id("asked")).to_contain_text("demo keeps control")
     expect(demo.get_by_test_id("answered")).to_contain_text("You keep control")
 
     # Requested and withdrawn.
     ask(carol, demo)
     carol.get_by_test_id("withdraw-request").press("Enter")
-    expect(demo.get_by_test_id("accept-request")).to_have_count(0, timeout=PATIENCE_MS)
-    expect(carol.get_by_test_id("asked")).to_contain_text("You withdrew your request", timeout=PATIENCE_MS)
+    expect(demo.get_by_test_id("accept-request")).to_have_count(0)
+    expect(carol.get_by_test_id("asked")).to_contain_text("You withdrew your request")
 
     # Requested and granted: the former holder's sliders are disabled, the new holder's move the arm.
     ask(carol, demo)
@@ -118,14 +79,14 @@ def test_control_is_handed_over_and_viewers_are_listed(two: tuple[Page, Page], m
     expect(demo.get_by_test_id("slider-elbow")).to_be_disabled()
 
     # The owner takes control; Carol cannot and sees the reason.
-    take(carol)
+    take_control(carol)
     expect(carol.get_by_test_id("take-over")).to_have_count(0)
     demo.get_by_test_id("take-over").click()
     demo.get_by_test_id("take-over-reason").fill("the arm is needed here")
     assert_good_page(demo, "taking-over")
     demo.get_by_test_id("take-over-reason").press("Enter")
     expect_state(demo, "mine")
-    expect(carol.get_by_test_id("control-state")).to_contain_text("the arm is needed here", timeout=PATIENCE_MS)
+    expect(carol.get_by_test_id("control-state")).to_contain_text("the arm is needed here")
     expect(carol.get_by_test_id("slider-elbow")).to_be_disabled()
     demo.get_by_test_id("release-control").click()
     expect_state(demo, "free")
@@ -144,6 +105,6 @@ def test_an_unanswered_request_does_not_take_control(two: tuple[Page, Page]) -> 
     demo, carol = two
     carol.route("**/lease/requests", shorter)
     ask(carol, demo)
-    expect(carol.get_by_test_id("asked")).to_contain_text("did not respond in time", timeout=PATIENCE_MS)
-    expect(demo.get_by_test_id("accept-request")).to_have_count(0, timeout=PATIENCE_MS)
+    expect(carol.get_by_test_id("asked")).to_contain_text("did not respond in time")
+    expect(demo.get_by_test_id("accept-request")).to_have_count(0)
     demo.get_by_test_id("release-control").click()

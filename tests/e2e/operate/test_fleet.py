@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Page, expect
 from benchmarks.console.frames import ROBOTS, memory_samples, open_together
 from benchmarks.console.kinematic_arms import start_kinematic_arms
 from benchmarks.console.minimal_agents import pair_minimal_agents
-from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.browser import pages
 from tests.harness.browser.product import Machine, start_machine
 from tests.harness.network.brokers import wait_until
 
@@ -36,7 +36,7 @@ def pans(page: Page) -> list[str]:
 def shows_nothing_of_who_says_nothing(page: Page, machine: Machine, silent: str, arm: str) -> None:
     page.goto(f"{machine.url}/#/operate/{silent},{arm}")
     station = page.locator(f"[data-testid=robot-panel][data-device='{silent}']")
-    expect(station).to_be_visible(timeout=PATIENCE_MS)
+    expect(station).to_be_visible()
     wait_until(lambda: len(pans(page)) == 1 and pans(page)[0] != "", "the other's joints")
     expect(station.get_by_test_id("view-3d")).to_have_attribute("data-frames", "0")
     expect(station.locator(".joint")).to_have_count(0)

@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.browser import pages
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
 from tests.harness.network.brokers import wait_until
@@ -19,21 +19,21 @@ def open_robot(page: Page, machine: Machine, name: str) -> None:
     with machine.api() as api:
         device = api.device(name)["id"]
     page.goto(f"{machine.url}/#/devices/{device}")
-    expect(page.get_by_test_id("online")).to_have_attribute("data-status", "online", timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("online")).to_have_attribute("data-status", "online")
 
 
 def ask(page: Page, button: str) -> None:
     """Press a button once it is enabled, after the previous action ended."""
-    expect(page.get_by_test_id(button)).to_be_enabled(timeout=PATIENCE_MS)
+    expect(page.get_by_test_id(button)).to_be_enabled()
     page.get_by_test_id(button).click()
 
 
 def assert_done(page: Page, kind: str, *, seen: str = "motion", nth: int = 0) -> None:
     """Assert that the newest command is done and its row shows every step in order."""
     row = page.get_by_test_id("command-trace-row").nth(nth)
-    expect(row).to_have_attribute("data-kind", kind, timeout=PATIENCE_MS)
-    expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "done", timeout=PATIENCE_MS)
-    expect(row).to_have_attribute("data-seen", seen, timeout=PATIENCE_MS)
+    expect(row).to_have_attribute("data-kind", kind)
+    expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "done")
+    expect(row).to_have_attribute("data-seen", seen)
     times = {step: float(row.get_attribute(f"data-{step}") or "nan") for step in STEPS}
     assert times["accepted"] > 0
     # Without motion the robot's state counts, which may arrive before the acknowledgement.
@@ -70,7 +70,6 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
         assert frame(page, 1) == pytest.approx(told, abs=0.002)
         assert_good_page(page, "arm")
         assert_good_page(page, "latency", part="command-trace")
-        page.set_viewport_size({"width": 1440, "height": 900})
 
         ask(page, "back")
         assert_done(page, "move_joints")
@@ -81,7 +80,7 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
         height.fill("3")
         ask(page, "pose-go")
         status = page.get_by_test_id("action-status")
-        expect(status).to_have_attribute("data-status", "failed", timeout=PATIENCE_MS)
+        expect(status).to_have_attribute("data-status", "failed")
         expect(status.locator(".field-error")).not_to_be_empty()
         assert height.input_value() == "3"
 
@@ -101,25 +100,25 @@ def test_the_humanoid_takes_a_posture_shows_a_behaviour_and_softens_a_joint(
         assert joint(laboratory, "nao", "LKneePitch") == pytest.approx(knee, abs=0.1)
 
         ask(page, "behaviour-Hello")
-        expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "started", timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "started")
         page.get_by_test_id("cancel-action").click()
-        expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "cancelled", timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "cancelled")
 
         page.get_by_test_id("stiffness-joint").select_option("LHand")
         page.get_by_test_id("stiffness-value").fill("0.5")
         ask(page, "stiffness-set")
         assert_done(page, "set_stiffness", seen="state")
-        expect(page.get_by_test_id("stiffness-told")).to_have_attribute("data-less", "1", timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("stiffness-told")).to_have_attribute("data-less", "1")
         assert_good_page(page, "humanoid")
         ask(page, "back")
-        expect(page.get_by_test_id("stiffness-told")).to_have_attribute("data-less", "0", timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("stiffness-told")).to_have_attribute("data-less", "0")
 
 
 def test_the_robot_on_wheels_goes_to_a_place_on_the_plan(browser: Browser, laboratory: Machine) -> None:
     with pages(browser, laboratory) as (page,):
         open_robot(page, laboratory, "qbo")
         mark = page.get_by_test_id("place-qbo")
-        expect(mark).to_be_visible(timeout=PATIENCE_MS)
+        expect(mark).to_be_visible()
         was = tuple(float(mark.get_attribute(f"data-{axis}") or "nan") for axis in "xy")
         box, at = page.get_by_test_id("pick").bounding_box(), mark.bounding_box()
         assert box is not None
@@ -171,12 +170,11 @@ def test_the_head_shows_an_expression_and_says_a_sentence(browser: Browser, labo
         assert page.get_by_test_id("say-text").input_value() == ""
         expect(page.get_by_test_id("action-status")).to_contain_text("Good morning.")
         assert_good_page(page, "head")
-        page.set_viewport_size({"width": 1440, "height": 900})
 
         # A user with control in another tab needs no request here, and the input stays.
         page.get_by_test_id("take-control").click()
-        expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", "mine", timeout=PATIENCE_MS)
-        expect(other.get_by_test_id("say")).to_be_disabled(timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", "mine")
+        expect(other.get_by_test_id("say")).to_be_disabled()
         assert other.get_by_test_id("say").get_attribute("title")
         assert other.get_by_test_id("say-text").input_value() == "This waits."
         page.get_by_test_id("release-control").click()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness.browser.product import Api, Machine
+from tests.harness.browser.product import Api, Machine, run_module
 from tests.harness.documents import SERVER, block
 from tests.harness.network.brokers import wait_until
 from tests.harness.paths import ROOT
@@ -80,19 +80,11 @@ def api(machine: Machine) -> Iterator[Api]:
 def run_example(machine: Machine, api: Api, *arguments: str) -> str:
     """Run a program of ``examples/`` with an API key of an operator; returns its output."""
     del api  # signed in, so the account exists
-    environment = os.environ | {"TELESCOPE_HOME": str(machine.home)}
-    key = subprocess.run(
-        [sys.executable, "-m", "function_app", "api-key", "--name", "examples", "--role", "operator"],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.strip()
+    named = ("--name", "examples", "--role", "operator")
+    key = run_module("function_app", "api-key", *named, TELESCOPE_HOME=str(machine.home)).stdout.strip()
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / arguments[0]), *arguments[1:]],
-        cwd=ROOT,
-        env=environment | {"TELESCOPE_URL": machine.url, "TELESCOPE_TOKEN": key},
+        env=os.environ | {"TELESCOPE_URL": machine.url, "TELESCOPE_TOKEN": key},
         capture_output=True,
         text=True,
         timeout=110,

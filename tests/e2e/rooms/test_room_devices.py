@@ -3,10 +3,6 @@
 import contextlib
 import hashlib
 import json
-import os
-import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,9 +13,7 @@ import pytest
 
 from device_agent.protocol import Measurements, camera_frames, codec, topics
 from device_agent.protocol.manifests import room as rooms
-from function_app.ports.broker_access import Credentials
-from infra.mosquitto.configuration import binary
-from tests.harness.browser.product import Api, Machine, moves
+from tests.harness.browser.product import Api, Machine, home_assistant, moves, mqtt_client
 from tests.harness.network.brokers import Client, wait_until
 from tests.harness.paths import ROOT
 
@@ -35,15 +29,10 @@ def api(laboratory: Machine) -> Iterator[Api]:
 @contextlib.contextmanager
 def watching(api: Api, device: dict[str, Any], *names: str) -> Iterator[Client]:
     """A client with the account's read credentials, subscribed to one channel of a device."""
-    given = api.post("/mqtt/credentials", {"purpose": "view"})
-    login = Credentials(given["username"], given["password"])
-    client = Client(given["client_id"], login, port=given["tcp"]["port"]).open()
-    try:
+    with mqtt_client(api, purpose="view") as (client, given):
         wanted = [pattern for pattern in given["subscribe"] if f"/{device['name']}/" in pattern]
         assert client.subscribe(*(each for each in wanted if each.split("/")[-2] in names), qos=0)
         yield client
-    finally:
-        client.close()
 
 
 def act(api: Api, device: dict[str, Any], wait_for: str = "done", **request: Any) -> dict[str, Any]:
@@ -187,59 +176,26 @@ def test_a_collection_longer_than_its_action_is_rejected(api: Api) -> None:
     assert "timeout_ms" in answer.json()["detail"]
 
 
-@pytest.fixture
-def home_assistants_broker(tmp_path: Path) -> Iterator[int]:
-    """An external broker, such as the one of Home Assistant. Returns its port."""
-    with contextlib.closing(socket.socket()) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port: int = taken.getsockname()[1]
-    configuration = tmp_path / "mosquitto.conf"
-    configuration.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
-    broker = subprocess.Popen([binary(), "-c", str(configuration)])
-    try:
-        yield port
-    finally:
-        broker.terminate()
-        broker.wait(20)
-
-
-def test_home_assistant_shows_the_room_and_moves_its_door(
-    laboratory: Machine, api: Api, home_assistants_broker: int
-) -> None:
+def test_home_assistant_shows_the_room_and_moves_its_door(laboratory: Machine, api: Api, tmp_path: Path) -> None:
     door = api.device("door")
-    key = api.post("/api-keys", {"name": "Home Assistant", "role": "operator", "only": [f"space:{door['space']}"]})[
-        "token"
-    ]
-    command = [sys.executable, "-m", "infra.home_assistant", "--server", laboratory.url]
-    bridge = subprocess.Popen(
-        [*command, "--port", str(home_assistants_broker)],
-        cwd=ROOT,
-        env=os.environ | {"TELESCOPE_KEY": key},
-    )
+    body = {"name": "Home Assistant", "role": "operator", "only": [f"space:{door['space']}"]}
     shown: dict[str, bytes] = {}
-    try:
-        client = Client("home", None, port=home_assistants_broker)
-        wait_until(lambda: bool(client.open().connected.is_set()), "the other broker")
+    with (
+        home_assistant(laboratory, tmp_path, api.post("/api-keys", body)["token"]) as (bridge, port),
+        Client("home", None, port=port).open() as client,
+    ):
         client.subscribe("homeassistant/#", "telescope/#")
 
-        def there(topic: str) -> bool:
+        def arrived(topic: str) -> bool:
             shown.update((each.topic, each.payload) for each in client.pending())
             return topic in shown
 
         slider = f"homeassistant/number/{door['id']}/set-opening/config"
-        wait_until(lambda: there(slider), "the door's slider")
-        content = json.loads(shown[slider])
-        client.publish(content["command_topic"], b"0.5")
-
-        def opens() -> bool:
-            return (
-                there(content["state_topic"]) and json.loads(shown[content["state_topic"]])["values"]["opening"] > 0.3
-            )
-
-        wait_until(opens, "the door to open")
-        wait_until(lambda: there(f"telescope/{api.device('camera')['id']}/cam/colour"), "a picture")
-        client.close()
-    finally:
-        bridge.terminate()
-        assert bridge.wait(30) == 0
-        act(api, door, kind="set_control", control="opening", value=0.0)
+        wait_until(lambda: arrived(slider), "the door's slider")
+        topics_of_slider = json.loads(shown[slider])
+        client.publish(topics_of_slider["command_topic"], b"0.5")
+        state = topics_of_slider["state_topic"]
+        wait_until(lambda: arrived(state) and json.loads(shown[state])["values"]["opening"] > 0.3, "the door to open")
+        wait_until(lambda: arrived(f"telescope/{api.device('camera')['id']}/cam/colour"), "a picture")
+    assert bridge.wait(30) == 0
+    act(api, door, kind="set_control", control="opening", value=0.0)

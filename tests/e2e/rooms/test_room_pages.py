@@ -5,7 +5,7 @@ import math
 from playwright.sync_api import Browser, Page, expect
 
 from device_agent.protocol.manifests import room as rooms
-from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.browser import pages
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
 from tests.harness.network.brokers import wait_until
@@ -18,7 +18,7 @@ FIXED = ("ur5", "hanson")
 def place(page: Page, who: str) -> tuple[float, float]:
     """Position of a robot on the plan [m]."""
     mark = page.get_by_test_id(f"place-{who}")
-    expect(mark).to_be_visible(timeout=PATIENCE_MS)
+    expect(mark).to_be_visible()
     x_m, y_m = (float(mark.get_attribute(f"data-{axis}") or "nan") for axis in "xy")
     return x_m, y_m
 
@@ -29,13 +29,20 @@ def picture(page: Page) -> str:
     return shown
 
 
+def no_new_frame(page: Page) -> bool:
+    canvas = page.get_by_test_id("camera-picture")
+    last = canvas.get_attribute("data-sequence")
+    page.wait_for_timeout(700)
+    return canvas.get_attribute("data-sequence") == last
+
+
 def lux(page: Page) -> float:
     return float(page.get_by_test_id("value-light_lux").get_attribute("data-value") or "nan")
 
 
 def open_device(page: Page, name: str) -> None:
     page.get_by_test_id("device-row").filter(has_text=name).get_by_role("link").first.click()
-    expect(page.locator(".desk.room")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.locator(".desk.room")).to_be_visible()
 
 
 def test_plan_camera_and_lamp_of_the_room(browser: Browser, laboratory: Machine) -> None:
@@ -63,25 +70,21 @@ def test_plan_camera_and_lamp_of_the_room(browser: Browser, laboratory: Machine)
         wait_until(lambda: picture(ann) != first, "another picture")
         ann.get_by_test_id("camera-live").click()
         expect(ann.get_by_test_id("camera-live")).to_have_attribute("aria-pressed", "false")
-        ann.wait_for_timeout(300)  # one frame may be in flight
-        last = canvas.get_attribute("data-sequence")
-        ann.wait_for_timeout(700)
-        assert canvas.get_attribute("data-sequence") == last, "frames still arrive without a viewer"
+        wait_until(lambda: no_new_frame(ann), "the stream to end without a viewer")
 
         # One page collects light values, the other switches the lamp.
         open_light(bob)
         ann.goto(f"{laboratory.url}/#/")
         open_device(ann, "Lamps on the ceiling")
+        before = lux(bob)
         ann.get_by_test_id("level-most").click()
-        expect(ann.get_by_test_id("applied-level")).to_have_attribute("data-value", "1", timeout=PATIENCE_MS)
-        bob.wait_for_timeout(1500)  # lag of the light meter
-        bright = lux(bob)
+        wait_until(lambda: lux(bob) > before + 20, f"more light than {before} lx")
         ann.get_by_test_id("level-least").click()
-        expect(ann.get_by_test_id("applied-level")).to_have_attribute("data-value", "0", timeout=PATIENCE_MS)
-        wait_until(lambda: lux(bob) < bright - 100, f"less light than {bright} lx")
+        expect(ann.get_by_test_id("applied-level")).to_have_attribute("data-value", "0")
+        wait_until(lambda: lux(bob) < before - 100, f"less light than {before} lx")
         assert_good_page(bob, "light")
         bob.get_by_test_id("gather").click()
-        expect(bob.get_by_test_id("gather-state")).to_have_attribute("data-running", "false", timeout=PATIENCE_MS)
+        expect(bob.get_by_test_id("gather-state")).to_have_attribute("data-running", "false")
 
         # Restore the state for other tests, by keyboard.
         slider = ann.get_by_test_id("set-level")
@@ -102,5 +105,5 @@ def open_light(page: Page) -> None:
     open_device(page, "Light")
     page.get_by_test_id("gather-rate").fill("5")
     page.get_by_test_id("gather").click()
-    expect(page.get_by_test_id("gather-state")).to_have_attribute("data-running", "true", timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("gather-state")).to_have_attribute("data-running", "true")
     wait_until(lambda: lux(page) > 0, "light")

@@ -2,20 +2,24 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from itertools import pairwise
 
 import pytest
 
 from device_agent.ports.geometry import Clearance, RobotGeometry, Sweep, never
-from device_agent.protocol import JointTarget, Mode, Pose, Setpoint, StopLatch
+from device_agent.protocol import DriveTarget, JogTarget, JointTarget, Mode, Pose, Setpoint, StopLatch
 from device_agent.protocol.manifests.robot_type import Base
 from device_agent.runtime.authority.authority import Reservation
 from device_agent.runtime.authority.lease_gate import LeaseGate
+from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.control.goals import JointGoal
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S, robot_type
 
 WALL_RAD = 1.0
+Target = JointTarget | JogTarget | DriveTarget
 
 
 class ControllerFixture:
@@ -28,27 +32,47 @@ class ControllerFixture:
         self.now_s = 100.0
         self.sequence = 0
         self.velocities: list[float] = []
+        self.outputs = list[ControlOutput]()
+        self.revocations: list[Refused] = []
 
-    def reserve(self) -> Reservation:
-        """Reserve the device for an action with lease 1."""
-        return self.controller.reserve(epoch=1, on_revoked=ignore_revocation)
+    def reserve(self, epoch: int = 1) -> Reservation:
+        """Reserve the device for an action."""
+        return self.controller.reserve(epoch=epoch, on_revoked=self.revocations.append)
+
+    @cached_property
+    def reservation(self) -> Reservation:
+        """The reservation of the action that ``move`` belongs to."""
+        return self.reserve()
+
+    def move(self, speed: float = 1.0, /, **position_rad: float) -> JointGoal:
+        """Start a joint goal of an action with lease 1."""
+        return self.controller.start_joint_goal(self.reservation, position_rad, speed=speed)
+
+    def stop(self, caller: str = "bob") -> None:
+        self.controller.stop(StopLatch(caller=caller, reason="", at_ms=1))
+
+    @property
+    def lease_epoch(self) -> int | None:
+        lease = self.controller.lease(self.now_s)
+        return None if lease is None else lease.epoch
 
     @property
     def tick_ms(self) -> int:
         return round(self.now_s * 1000)
 
-    def take(self, epoch: int, lease_s: float = 30.0) -> None:
+    def grant(self, epoch: int, lease_s: float = 30.0) -> None:
         self.controller.grant(epoch=epoch, holder="ann", lease_s=lease_s, now_s=self.now_s)
         self.sequence = 0
 
-    def offer(self, epoch: int, elbow: float = 2.0, *, age_ms: int = 20, sequence: int | None = None) -> None:
+    def offer(self, epoch: int, target: float | Target = 2.0, *, age_ms: int = 20, sequence: int | None = None) -> None:
+        """Send a setpoint: a target, or the position of the elbow [rad]."""
         self.sequence += 1
         setpoint = Setpoint(
             epoch=epoch,
             sequence=self.sequence if sequence is None else sequence,
             echo_tick_ms=self.tick_ms - age_ms,
             sent_ms=1.0,
-            target=JointTarget(position_rad={"elbow": elbow}),
+            target=JointTarget(position_rad={"elbow": target}) if isinstance(target, float | int) else target,
         )
         self.controller.accept_setpoint(setpoint, now_s=self.now_s, tick_ms=self.tick_ms)
 
@@ -56,16 +80,17 @@ class ControllerFixture:
         before = self.elbow
         for _ in range(round(seconds / PERIOD_S)):
             self.now_s += PERIOD_S
-            tick = self.controller.update(self.now_s)
-            self.limited |= set(tick.limited)
-            self.elbow = tick.position_rad[1]
+            output = self.controller.update(self.now_s)
+            self.outputs.append(output)
+            self.limited |= set(output.limited)
+            self.elbow = output.position_rad[1]
             self.velocities.append((self.elbow - before) / PERIOD_S)
             before = self.elbow
         return self.controller.mode
 
     elbow = 0.0
 
-    def stream(self, epoch: int, seconds: float, elbow: float = 2.0, *, age_ms: int = 20) -> Mode:
+    def stream(self, epoch: int, seconds: float, elbow: float | Target = 2.0, *, age_ms: int = 20) -> Mode:
         mode = self.controller.mode
         for _ in range(round(seconds / 0.024)):
             self.offer(epoch, elbow, age_ms=age_ms)
@@ -81,10 +106,10 @@ class ControllerFixture:
         pytest.fail(f"still moving after {limit_s} s")
 
 
-def leased() -> ControllerFixture:
+def leased(geometry: RobotGeometry | None = None) -> ControllerFixture:
     """A controller whose operator has lease 1."""
-    fixture = ControllerFixture()
-    fixture.take(1)
+    fixture = ControllerFixture(geometry=geometry)
+    fixture.grant(1)
     return fixture
 
 
@@ -100,11 +125,11 @@ def ignore_revocation(_: Refused) -> None:
     pass
 
 
-def interruptions() -> dict[str, object]:
+def interruptions() -> dict[str, Callable[[ControllerFixture], object]]:
     return {
-        "stop": lambda fixture: fixture.controller.stop(StopLatch(caller="bob", reason="", at_ms=1)),
+        "stop": lambda fixture: fixture.stop(),
         "link": lambda fixture: fixture.controller.interrupt(Refused("link_lost", "the link is gone")),
-        "takeover": lambda fixture: fixture.take(2),
+        "takeover": lambda fixture: fixture.grant(2),
         "release": lambda fixture: fixture.controller.release(epoch=1),
         "expiry": lambda fixture: fixture.run(6.0),
         "fault": lambda fixture: fixture.controller.set_fault("no answer"),

@@ -144,13 +144,13 @@ class OwnAgent:
         self.line.publish(self.topic(topics.CMD), signing.sign(codec.encode(command), self.key))
         return command.id
 
-    def obey(self, request: Request, *, epoch: int = 0) -> Ack:
+    def execute(self, request: Request, *, epoch: int = 0) -> Ack:
         """A command that ends at once; its last answer."""
         return self.ended(self.command(request, epoch=epoch))
 
     def move(self, target_rad: float, *, epoch: int, speed: float = 0.3) -> str:
         """Take control and turn the base; the action's id once it moves."""
-        self.obey(GrantLease(holder="ann", lease_ms=60_000), epoch=epoch)
+        self.execute(GrantLease(holder="ann", lease_ms=60_000), epoch=epoch)
         command = self.command(MoveJoints(position_rad={"shoulder_pan": target_rad}, speed=speed), epoch=epoch)
         wait_until(lambda: self.speeds()[-3:] and min(self.speeds()[-3:]) > 0.05, "the arm to move")
         return command

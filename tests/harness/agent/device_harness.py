@@ -19,12 +19,16 @@ from device_agent.ports.uploads import Uploads
 from device_agent.protocol import (
     SHIPPED,
     Ack,
+    AckStatus,
     Command,
+    Event,
     JointTarget,
     JointTelemetry,
+    Reason,
     RunMovement,
     Setpoint,
     State,
+    Stop,
     codec,
     topics,
 )
@@ -105,13 +109,7 @@ class DeviceHarness:
         self.journal.close()
 
     def publish(
-        self,
-        topic: str,
-        payload: bytes,
-        *,
-        qos: int,
-        retain: bool = False,
-        delivered: Callable[[], None] | None = None,
+        self, topic: str, payload: bytes, *, qos: int, retain: bool = False, delivered: Callable[[], None] | None = None
     ) -> bool:
         assert qos in {0, 1}
         assert retain == (topics.parse(topic).kind in {topics.DESC, topics.STATE})
@@ -148,12 +146,12 @@ class DeviceHarness:
         setpoint = Setpoint(epoch=epoch, sequence=sequence, echo_tick_ms=tick_ms(), sent_ms=0.5, target=target)
         self.receive(topics.CTL, codec.encode(setpoint), str(epoch))
 
-    def heard(self, kind: str, message: type[Any], name: str = "") -> list[Any]:
+    def published(self, kind: str, message: type[Any], name: str = "") -> list[Any]:
         wanted = topics.device("s", "a", "arm", kind, name)
         return [codec.decode(payload, message) for topic, payload in list(self.said) if topic == wanted]
 
     def acks(self, command: str) -> list[Ack]:
-        return [ack for ack in self.heard(topics.ACK, Ack) if ack.id == command]
+        return [ack for ack in self.published(topics.ACK, Ack) if ack.id == command]
 
     def end(self, command: str) -> Ack:
         ended: Ack = eventually(lambda: next((ack for ack in self.acks(command) if ack.status.terminal), None))
@@ -165,8 +163,34 @@ class DeviceHarness:
         assert reason is not None
         return reason.code
 
+    def done(self, request: Any, **fields: Any) -> Ack:
+        """Send a command, which must succeed; returns its last ack."""
+        ack = self.end(self.command(request, **fields))
+        assert ack.status is AckStatus.DONE, ack.reason
+        return ack
+
+    def failed(self, request: Any, **fields: Any) -> Reason:
+        """Send a command, which must fail; returns the reason."""
+        ack = self.end(self.command(request, **fields))
+        assert ack.status is AckStatus.FAILED
+        assert ack.reason is not None
+        return ack.reason
+
+    def running(self, request: Any, **fields: Any) -> str:
+        """Send a command; returns its id when it has started."""
+        command = self.command(request, **fields)
+        eventually(lambda: any(ack.status is AckStatus.STARTED for ack in self.acks(command)))
+        return command
+
+    def receive_stop(self) -> None:
+        """Receive a Stop of another operator."""
+        self.receive(topics.STOP, codec.encode(Stop(id="s1", caller="bob", reason="smoke")))
+
+    def events(self, kind: str) -> list[Event]:
+        return [event for event in self.published(topics.EVENT, Event) if event.kind == kind]
+
     def telemetry(self) -> JointTelemetry:
-        seen: JointTelemetry = eventually(lambda: self.heard(topics.TELE, JointTelemetry, "joints")[-1:])[0]
+        seen: JointTelemetry = eventually(lambda: self.published(topics.TELE, JointTelemetry, "joints")[-1:])[0]
         return seen
 
 
@@ -198,5 +222,5 @@ def eventually(probe: Callable[[], Any]) -> Any:
 
 
 def shown(harness: DeviceHarness, wanted: Callable[[State], Any]) -> State:
-    found: State = eventually(lambda: [s for s in harness.heard(topics.STATE, State)[-1:] if wanted(s)])[0]
+    found: State = eventually(lambda: [s for s in harness.published(topics.STATE, State)[-1:] if wanted(s)])[0]
     return found

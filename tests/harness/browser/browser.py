@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
-from playwright.sync_api import Browser, Page, Playwright, expect
+from playwright.sync_api import Browser, Error, Page, Playwright, expect
 
 from tests.harness.browser.product import Machine
 
@@ -35,25 +35,8 @@ def chromium(playwright: Playwright, flags: list[str] = FLAGS) -> Iterator[Brows
 
 
 @contextlib.contextmanager
-def person(browser: Browser, address: str) -> Iterator[Page]:
-    """A user with a separate browser context. Fails on script errors and policy violations."""
-    context = browser.new_context(viewport={"width": 1440, "height": 900})
-    context.set_default_timeout(PATIENCE_MS)
-    page = context.new_page()
-    errors: list[str] = []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if "Content Security" in message.text else None)
-    page.goto(address)
-    try:
-        yield page
-    finally:
-        context.close()
-    assert errors == []
-
-
-@contextlib.contextmanager
-def pages(browser: Browser, machine: Machine, count: int = 1) -> Iterator[list[Page]]:
-    """Tabs of one session, on the device list."""
+def tabs(browser: Browser, count: int = 1) -> Iterator[list[Page]]:
+    """Empty tabs of one browser context. Fails on script errors and policy violations."""
     context = browser.new_context(viewport={"width": 1440, "height": 900})
     context.set_default_timeout(PATIENCE_MS)
     errors: list[str] = []
@@ -61,10 +44,27 @@ def pages(browser: Browser, machine: Machine, count: int = 1) -> Iterator[list[P
     for page in opened:
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda message: errors.append(message.text) if "Content Security" in message.text else None)
-        page.goto(machine.sign_in_link() if page is opened[0] else machine.url)
-        expect(page.get_by_test_id("signed-in")).to_be_visible(timeout=PATIENCE_MS)
     try:
         yield opened
     finally:
-        context.close()
+        with contextlib.suppress(Error):  # a test may have killed the browser
+            context.close()
     assert errors == [], errors
+
+
+@contextlib.contextmanager
+def person(browser: Browser, address: str) -> Iterator[Page]:
+    """A user with a separate browser context at an address."""
+    with tabs(browser) as (page,):
+        page.goto(address)
+        yield page
+
+
+@contextlib.contextmanager
+def pages(browser: Browser, machine: Machine, count: int = 1) -> Iterator[list[Page]]:
+    """Tabs of one session, on the device list."""
+    with tabs(browser, count) as opened:
+        for page in opened:
+            page.goto(machine.sign_in_link() if page is opened[0] else machine.url)
+            expect(page.get_by_test_id("signed-in")).to_be_visible()
+        yield opened

@@ -18,11 +18,14 @@ from typing import Any, Self
 
 import httpx
 
+from function_app.ports.broker_access import Credentials
+from infra.local.__main__ import port_in_use
+from infra.mosquitto.configuration import binary
 from tests.harness.cloud.people import sign_in_link
-from tests.harness.network.brokers import wait_until
+from tests.harness.network.brokers import Client, wait_until
 from tests.harness.paths import ROOT
 
-START_WITHIN_S = 90.0
+START_WITHIN_S = 300.0
 _ROW_BYTES = 500
 _COLUMNS = (("qpos", "joints"), ("qvel", "joints"), ("target", "actuators"), ("ctrl", "actuators"))
 
@@ -148,6 +151,15 @@ def moves(api: Api, device: str) -> bool:
         return False
 
 
+@contextlib.contextmanager
+def mqtt_client(api: Api, **request: Any) -> Iterator[tuple[Client, dict[str, Any]]]:
+    """A connected MQTT client with credentials of the API, and the response that granted them."""
+    given = api.post("/mqtt/credentials", request)
+    credentials = Credentials(given["username"], given["password"])
+    with Client(given["client_id"], credentials, port=given["tcp"]["port"]).open() as client:
+        yield client, given
+
+
 class Trace:
     """Reader of a simulation trace."""
 
@@ -225,6 +237,48 @@ def start_program(program: str, home: Path, port: int, settings: Mapping[str, st
         reader.join(10)
         process.wait()
         output.close()
+
+
+@contextlib.contextmanager
+def home_assistant(
+    machine: Machine, folder: Path, key: str, *arguments: str
+) -> Iterator[tuple["subprocess.Popen[str]", int]]:
+    """The bridge to Home Assistant with an external mosquitto, and the port of that broker."""
+    with contextlib.closing(socket.socket()) as reserved:
+        reserved.bind(("127.0.0.1", 0))
+        port: int = reserved.getsockname()[1]
+    (folder / "mosquitto.conf").write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
+    command = [sys.executable, "-m", "infra.home_assistant", "--server", machine.url, "--port", str(port), *arguments]
+    output = {"cwd": ROOT, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen([binary(), "-c", str(folder / "mosquitto.conf")], stderr=subprocess.DEVNULL) as broker:
+        wait_until(lambda: port_in_use("127.0.0.1", port), "Home Assistant's broker")
+        with subprocess.Popen(command, env=os.environ | {"TELESCOPE_KEY": key}, **output) as process:  # type: ignore[call-overload]
+            try:
+                yield process, port
+            finally:
+                process.terminate()
+        broker.terminate()
+
+
+def run_module(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[str]":
+    """Run a program of the product to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", *arguments],
+        cwd=ROOT,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )
+
+
+def enroll(machine: Machine, api: Api, home: Path, device: str, *more: str) -> str:
+    """Enroll and claim an agent with one device ``NAME=TYPE``. Returns the agent's id."""
+    where = ("--home", str(home), "--server", machine.url, "--device", device, "--no-wait")
+    output = run_module("device_agent", "enroll", *where, *more).stdout.split()
+    agent: str = api.post("/agents/claim", {"code": output[output.index("code") + 1]})["agent"]
+    return agent
 
 
 def ready_link(line: str) -> str:

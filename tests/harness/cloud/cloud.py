@@ -117,7 +117,7 @@ class Cloud:
         self._clients.append(client)
         return client
 
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Send a request without credentials."""
         client = self.client()
         return self.run(client.request(method, path, **options))
@@ -132,7 +132,7 @@ class Cloud:
 
     def sign_in(self, name: str, *, address: str = "127.0.0.1") -> "Person":
         """Returns a person in a new sign-in session whose requests come from ``address``."""
-        answer = self.ask("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
+        answer = self.request("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
         assert answer.status_code == 200, answer.text
         return Person(self, answer.json(), address=address)
 
@@ -219,7 +219,7 @@ class Person:
             self._given_ms = now_ms
             self._client.headers["Authorization"] = f"Bearer {self.token}"
 
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         self._stay()
         return self.cloud.run(self._client.request(method, API + path, **options))
 
@@ -230,23 +230,41 @@ class Person:
         return self.cloud.begin(call)
 
     def get(self, path: str, **options: Any) -> httpx.Response:
-        return self.ask("GET", path, **options)
+        return self.request("GET", path, **options)
+
+    def each_page(self, path: str, **query: Any) -> list[list[dict[str, Any]]]:
+        """All pages of a list."""
+        found: list[list[dict[str, Any]]] = []
+        while True:
+            page = self.get(path, params=query).json()
+            found.append(page["items"])
+            if page["cursor"] is None:
+                return found
+            query["cursor"] = page["cursor"]
+
+    def pages(self, path: str, **query: Any) -> list[dict[str, Any]]:
+        """The items of all pages of a list."""
+        return [item for page in self.each_page(path, **query) for item in page]
 
     def post(self, path: str, body: Any = None, **options: Any) -> httpx.Response:
-        return self.ask("POST", path, json=body, **options) if body is not None else self.ask("POST", path, **options)
+        return (
+            self.request("POST", path, json=body, **options)
+            if body is not None
+            else self.request("POST", path, **options)
+        )
 
     def put(self, path: str, body: Any) -> httpx.Response:
-        return self.ask("PUT", path, json=body)
+        return self.request("PUT", path, json=body)
 
     def delete(self, path: str) -> httpx.Response:
-        return self.ask("DELETE", path)
+        return self.request("DELETE", path)
 
     def start(self, device: str, **options: Any) -> httpx.Response:
         """Start an action; ``MOVE`` where no ``request`` is given. ``once`` is the idempotency key."""
         headers = {"Idempotency-Key": options.pop("once")} if "once" in options else {}
         return self.post(f"/devices/{device}/actions", {"request": MOVE, **options}, headers=headers)
 
-    def take(self, device: str, **options: Any) -> httpx.Response:
+    def take_lease(self, device: str, **options: Any) -> httpx.Response:
         return self.post(f"/devices/{device}/lease", options)
 
     def action(self, action: str, **query: Any) -> dict[str, Any]:

@@ -20,8 +20,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from device_agent.config.agent_config import AgentConfig, DeviceEntry
 from device_agent.config.client_certificate import ClientCertificate
 from device_agent.config.identity_store import Pairing
-from device_agent.ports.clock import CloudClock
-from device_agent.protocol import Command, Presence, Request, codec, topics
+from device_agent.ports.clock import CloudClock, wall_ms
+from device_agent.protocol import Command, Measurements, Presence, Request, codec, topics
 from device_agent.protocol.security import signing
 from device_agent.transports import factory, pairing_monitor
 from device_agent.transports.http.client import CloudClient
@@ -116,10 +116,7 @@ class Ground:
             "TELESCOPE_MQTT_PORT": str(self.broker.port),
             **(more or {}),
         }
-        self.endpoints: dict[str, Endpoint] = {
-            "broker": self.broker,
-            "server": Server(self.environment, stack),
-        }
+        self.endpoints: dict[str, Endpoint] = {"broker": self.broker, "server": Server(self.environment, stack)}
         self.url = f"http://{HOST}:{self.endpoints['server'].port}"
         self.home = home
         self._last_ms = 0
@@ -247,6 +244,13 @@ class Link:
     def topic(self, kind: str, name: str = "") -> str:
         return topics.device(self.robot.space, self.robot.id, "arm", kind, name)
 
+    def publish(self, kind: str, payload: bytes, delivered: Callable[[], None] | None = None) -> bool:
+        return self.transport.publish(self.topic(kind), payload, qos=1, delivered=delivered)
+
+    def publish_measurement(self, sequence: int) -> None:
+        message = Measurements(tick_ms=1, at_ms=wall_ms(), sequence=sequence, values={"temperature_c": 20.0 + sequence})
+        self.transport.publish(self.topic(topics.TELE, "load"), codec.encode(message), qos=0)
+
     def heard(self, kind: str) -> list[bytes]:
         """Payloads of a class that the broker's subscribers have heard of this agent so far."""
         self._heard += self.ear.pending()
@@ -311,17 +315,3 @@ def _free_port() -> int:
 def _listens(port: int) -> bool:
     with socket.socket() as caller:
         return caller.connect_ex((HOST, port)) == 0
-
-
-@contextlib.contextmanager
-def shared_grounds(folder: Callable[[str], Path]) -> Iterator[Callable[[BrokerKind], Ground]]:
-    """One server and one broker of a kind for all tests of a module, started when the first one needs them."""
-    running: dict[str, Ground] = {}
-    with contextlib.ExitStack() as stack:
-
-        def start(kind: BrokerKind) -> Ground:
-            if kind not in running:
-                running[kind] = stack.enter_context(start_ground(kind, folder(kind)))
-            return running[kind]
-
-        yield start

@@ -3,11 +3,9 @@
 import contextlib
 import datetime as dt
 import ipaddress
-import json
-import threading
 import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -18,16 +16,19 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
+from tests.harness.network.http_server import QuietHandler, running
+
 HOST = "127.0.0.1"
 OBJECT_ID = "5a3c8c8e-0e0c-4b43-9d53-0d0f1a6e4c11"
 TENANT_ID = "b0e1f7d4-21e8-4a35-8c4e-6a0b7c2d9f10"
 SECRET = "the host's own"
 
 
-def make_certificate(folder: Path) -> Path:
-    """Certificate of the loopback address in a file, and its key beside it in ``key.pem``."""
+def make_certificate(folder: Path, host: str = HOST) -> Path:
+    """A self-signed certificate of a host or the loopback address, and its key next to it in ``key.pem``."""
     key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, HOST)])
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, host)])
+    alternative = x509.IPAddress(ipaddress.ip_address(HOST)) if host == HOST else x509.DNSName(host)
     now = dt.datetime.now(dt.UTC)
     made = (
         x509.CertificateBuilder()
@@ -37,7 +38,7 @@ def make_certificate(folder: Path) -> Path:
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - dt.timedelta(days=1))
         .not_valid_after(now + dt.timedelta(days=1))
-        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(HOST))]), critical=False)
+        .add_extension(x509.SubjectAlternativeName([alternative]), critical=False)
         .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
         .sign(key, hashes.SHA256())
     )
@@ -58,10 +59,10 @@ class Host(ThreadingHTTPServer):
         self.lifetime_s = 3600
 
 
-class _Answer(BaseHTTPRequestHandler):
+class _Answer(QuietHandler):
     server: Host
 
-    def do_GET(self) -> None:
+    def handle_any(self) -> None:
         assert self.headers["X-IDENTITY-HEADER"] == SECRET
         asked = parse_qs(urlsplit(self.path).query)
         self.server.asked.append(asked)
@@ -72,27 +73,15 @@ class _Answer(BaseHTTPRequestHandler):
         claims = {"aud": audience, "iss": "https://sts.windows.net/telescope/", **who, **times}
         token = jwt.encode(claims, "not verified by the server under test", "HS256")
         answer = {"access_token": token, "expires_on": str(now + 3600), "resource": audience, "token_type": "Bearer"}
-        body = json.dumps(answer).encode()
-        self.send_response_only(200)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, *_: object) -> None:
-        """Nothing."""
+        self.respond_json(answer)
 
 
 @contextlib.contextmanager
 def start_host(monkeypatch: pytest.MonkeyPatch, certificate: Path) -> Iterator[Host]:
     """A host in whose environment the functions run."""
     host = Host()
-    thread = threading.Thread(target=host.serve_forever, args=(0.02,))
-    thread.start()
     monkeypatch.setenv("IDENTITY_ENDPOINT", f"http://{HOST}:{host.server_port}/msi/token")
     monkeypatch.setenv("IDENTITY_HEADER", SECRET)
     monkeypatch.setenv("REQUESTS_CA_BUNDLE", str(certificate))
-    yield host
-    host.shutdown()
-    thread.join()
-    host.server_close()
+    with running(host):
+        yield host

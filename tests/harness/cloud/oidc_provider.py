@@ -5,27 +5,22 @@ with start_provider([new_key()]) as provider: ...
 
 import contextlib
 import json
-import os
 import re
-import shutil
-import subprocess
-import sys
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Timer
 from typing import Any
 
 import httpx
 import jwt
 from cryptography.hazmat.primitives.asymmetric import rsa
 
+from tests.harness.network.http_server import QuietHandler, serve
+from tests.harness.node import start_node
+
 FOLDER = Path(__file__).resolve().parents[1] / "identity_provider"
 CLIENT_ID, CLIENT_SECRET = "telescope", "a secret of + and % and 32 letters"
 REDIRECT = "http://telescope.test/api/v1/auth/oidc/callback"
-START_WITHIN_S = 60
 _LISTENS = re.compile(r"listening at (http://127\.0\.0\.1:(\d+))\n")
 _ACTION = re.compile(r'action="([^"]+)"')
 _FIELD = re.compile(r'name="(\w+)" value="(\w*)"')
@@ -51,42 +46,12 @@ def new_key(name: str = "one") -> SigningKey:
 
 @contextlib.contextmanager
 def start_provider(keys: Sequence[SigningKey], port: int = 0, *, redirect: str = REDIRECT) -> Iterator[str]:
-    """``oidc-provider`` with one client, us; gives its address. What it has given out it forgets with its end."""
-    program = FOLDER / "node_modules" / "oidc-provider"
-    assert program.exists(), f"oidc-provider is not installed; run `npm ci --prefix {FOLDER}`, as `make test` does"
-    places = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
-    node = shutil.which("node", path=places)
-    assert node, "Node.js is not installed; `make test` installs it"
+    """``oidc-provider`` with one client; yields its address. It stores nothing beyond its end."""
     client = {"client_id": CLIENT_ID, "client_secret": CLIENT_SECRET, "redirect_uris": [redirect]}
-    wanted = {"port": port, "client": client, "keys": [key.shown(private=True) for key in keys]}
-    with subprocess.Popen(
-        [node, str(FOLDER / "server.mjs")],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    ) as process:
-        patience = Timer(START_WITHIN_S, process.kill)
-        patience.start()
-        assert process.stdin is not None
-        assert process.stdout is not None
-        process.stdin.write(json.dumps(wanted) + "\n")
-        process.stdin.flush()
-        said = ""
-        try:
-            found = None
-            while found is None:
-                line = process.stdout.readline()
-                assert line, f"the provider did not start: {said}"
-                said += line
-                found = _LISTENS.match(line)
-        finally:
-            patience.cancel()
-            patience.join()
-        try:
-            yield found[1]
-        finally:
-            process.communicate(timeout=START_WITHIN_S)  # closes its standard input, which ends it
+    options = {"port": port, "client": client, "keys": [key.shown(private=True) for key in keys]}
+    arguments = [str(FOLDER / "server.mjs")]
+    with start_node(FOLDER, "oidc-provider", arguments, _LISTENS, line=json.dumps(options) + "\n") as (found,):
+        yield found[1]
 
 
 def sign_in_there(address: str, name: str, browser: httpx.Client | None = None) -> httpx.URL:
@@ -137,38 +102,21 @@ def start_liar() -> Iterator[Liar]:
     """A provider that returns the configured documents and keys."""
     liar = Liar()
 
-    class Answer(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            liar.fetched.append(self.path)
-            self._say(liar.document if self.path.startswith("/.well-known/") else {"keys": liar.keys}, 200)
+    class Handler(QuietHandler):
+        def handle_any(self) -> None:
+            if self.command == "POST":
+                liar.asked.append(self.rfile.read(int(self.headers["Content-Length"])).decode())
+                tokens = {"access_token": "x", "token_type": "Bearer", "id_token": liar.token}
+                self.respond_json(tokens, liar.status)
+            else:
+                liar.fetched.append(self.path)
+                self.respond_json(liar.document if self.path.startswith("/.well-known/") else {"keys": liar.keys})
 
-        def do_POST(self) -> None:
-            liar.asked.append(self.rfile.read(int(self.headers["Content-Length"])).decode())
-            self._say({"access_token": "x", "token_type": "Bearer", "id_token": liar.token}, liar.status)
-
-        def _say(self, what: Any, status: int) -> None:
-            body = json.dumps(what).encode()
-            self.send_response_only(status)
-            self.send_header("Content-Type", "application/json")
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, *_: object) -> None:
-            """Nothing."""
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Answer) as server:
-        liar.issuer = f"http://127.0.0.1:{server.server_port}"
+    with serve(Handler) as liar.issuer:
         liar.document = {
             "issuer": liar.issuer,
             "authorization_endpoint": f"{liar.issuer}/authorize",
             "token_endpoint": f"{liar.issuer}/token",
             "jwks_uri": f"{liar.issuer}/keys",
         }
-        thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-        thread.start()
-        try:
-            yield liar
-        finally:
-            server.shutdown()
-            thread.join()
+        yield liar

@@ -26,9 +26,9 @@ class Visitor(Person):
         self.session: str = signed_in["session"]
         self.page = {"cookie": signed_in.get("cookie", ""), "csrf_token": signed_in["csrf_token"]}
 
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         headers = {"Authorization": f"Bearer {self.token}", **options.pop("headers", {})}
-        return self.site.ask(method, API + path, headers=headers, **options)
+        return self.site.request(method, API + path, headers=headers, **options)
 
 
 def sign_in_link(environment: Mapping[str, str], name: str) -> str:
@@ -54,6 +54,6 @@ def sign_in_links(environment: Mapping[str, str], *names: str) -> list[str]:
 def sign_in(host: Host, site: Site, home: Path, name: str, environment: Mapping[str, str] | None = None) -> Visitor:
     """Returns a person in a new sign-in session at this host."""
     link = sign_in_link({"TELESCOPE_HOME": str(home), **(environment or {})}, name)
-    answer = site.ask("POST", f"{API}/auth/sign-in", json={"link": link})
+    answer = site.request("POST", f"{API}/auth/sign-in", json={"link": link})
     assert answer.status_code == 200, f"{host.url}: {answer.text}"
     return Visitor(site, {**answer.json(), "cookie": answer.headers["set-cookie"].partition(";")[0]})

@@ -1,13 +1,13 @@
-"""A toy robot that speaks nothing but HTTP: it asks for its commands and tells its acks. Works against any host.
+"""A fake robot that uses HTTP only: it polls for commands and sends its messages. Works with any host.
 
 with PollingRobot(cloud) as robot:                  # or PollingRobot(Site("http://127.0.0.1:8080"))
     robot.pair(anna)
-    robot.connect()                                 # begins to ask
+    robot.connect()                                 # polls in a thread; or ``open_link`` and ``step``
 """
 
 import threading
 import time
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import httpx
 
@@ -18,14 +18,6 @@ from tests.harness.cloud.cloud import API
 from tests.harness.network.brokers import PATIENCE_S, Message
 
 
-class Place(Protocol):
-    """Where the functions are: a ``Cloud``, or a ``Site``."""
-
-    clock: MovingClock
-
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response: ...
-
-
 class Site:
     """The functions at an address."""
 
@@ -33,7 +25,7 @@ class Site:
         self.clock = clock or MovingClock()
         self._client = httpx.Client(base_url=base, timeout=2 * PATIENCE_S)
 
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         return self._client.request(method, path, **options)
 
     def close(self) -> None:
@@ -41,36 +33,52 @@ class Site:
 
 
 class PollingRobot(Robot):
-    """As ``Robot``, without a broker.
+    """``Robot`` without a broker.
 
-    Attributes:
-        wait_ms: How long it lets the functions wait for a command; 0: plain polls, one every ``pause_s``.
+    Args:
+        place: The functions: a ``Cloud``, or a ``Site``.
+        names: Names of its devices.
+        wait_ms: Duration of a long poll; 0 selects plain polls, one every ``pause_s``.
     """
 
-    def __init__(self, place: Place, *names: str, wait_ms: int = 500, pause_s: float = 0.02) -> None:
-        cloud: Any = place
-        super().__init__(cloud, names or ("arm",))
+    def __init__(self, place: Any, *names: str, wait_ms: int = 500, pause_s: float = 0.02) -> None:
+        super().__init__(place, names or ("arm",))
         self.wait_ms = wait_ms
         self.pause_s = pause_s
 
     def introduction(self, **changes: Any) -> dict[str, Any]:
         return super().introduction(**{"transport": "http", **changes})
 
-    def connect(self) -> Self:
-        """Say that it is there, and begin to ask, in a thread of its own."""
+    def open_link(self) -> Self:
+        """Report that it is online."""
         self.session += 1
-        line: Any = _Line(self)
-        self.link = line
-        self.say_presence(online=True)
-        line.start()
+        link: Any = _PollingLink(self)
+        self.link = link
+        self.publish_presence(online=True)
         return self
 
+    def connect(self) -> Self:
+        """Report that it is online, and poll in a thread of its own."""
+        self.open_link()
+        link: Any = self.link
+        link.start()
+        return self
+
+    def step(self, wait_ms: int = 0) -> None:
+        """Poll once, execute the commands, and send the acknowledgements."""
+        link: Any = self.link
+        for item in self.fetch(wait_ms=wait_ms):
+            self.handle(Message(item["topic"], item["payload"].encode(), 1, retain=False))
+        messages, link.unsent = link.unsent, []
+        if messages:
+            answer = self.post_raw(*messages)
+            assert answer.status_code == 200, answer.text
+
     def poll(self, **query: Any) -> httpx.Response:
-        """Ask once."""
-        return self.ask("GET", f"/agents/{self.id}/commands", params=query)
+        return self.request("GET", f"/agents/{self.id}/commands", params=query)
 
     def fetch(self, **query: Any) -> list[dict[str, Any]]:
-        """The commands that one asking gives."""
+        """The commands that one poll returns."""
         answer = self.poll(**query)
         assert answer.status_code == 200, answer.text
         found: list[dict[str, Any]] = answer.json()["items"]
@@ -81,45 +89,42 @@ class PollingRobot(Robot):
         self.silent = True
         before = len(self.commands)
         for item in items:
-            self.obey(Message(item["topic"], item["payload"].encode(), 1, retain=False))
+            self.handle(Message(item["topic"], item["payload"].encode(), 1, retain=False))
         return [command.request for command in self.commands[before:]]
 
-    def tell_ack(self, command: str, status: AckStatus, **more: Any) -> dict[str, Any]:
-        """Tell one ack; its result."""
-        answer = self.tell_raw((self.topic(topics.ACK), codec.encode(self.ack(command, status, **more))))
+    def post_ack(self, command: str, status: AckStatus, **more: Any) -> dict[str, Any]:
+        """Send one acknowledgement; returns its result."""
+        answer = self.post_raw((self.topic(topics.ACK), codec.encode(self.ack(command, status, **more))))
         assert answer.status_code == 200, answer.text
         (result,) = answer.json()["results"]
         found: dict[str, Any] = result
         return found
 
-    def tell(self, *messages: tuple[str, Any]) -> httpx.Response:
-        """Tell messages: topic and what JSON makes of the payload."""
+    def post(self, *messages: tuple[str, Any]) -> httpx.Response:
+        """Send messages: topic, and payload before encoding as JSON."""
         body = {"messages": [{"topic": topic, "payload": payload} for topic, payload in messages]}
-        return self.ask("POST", f"/agents/{self.id}/messages", json=body)
+        return self.request("POST", f"/agents/{self.id}/messages", json=body)
 
-    def tell_raw(self, *messages: tuple[str, bytes]) -> httpx.Response:
-        """Tell messages whose payload is JSON already."""
+    def post_raw(self, *messages: tuple[str, bytes]) -> httpx.Response:
+        """Send messages whose payload is JSON already."""
         parts = b",".join(b'{"topic":"%s","payload":%s}' % (topic.encode(), payload) for topic, payload in messages)
         content = b'{"messages":[%s]}' % parts
-        return self.ask(
-            "POST", f"/agents/{self.id}/messages", content=content, headers={"Content-Type": "application/json"}
-        )
+        headers = {"Content-Type": "application/json"}
+        return self.request("POST", f"/agents/{self.id}/messages", content=content, headers=headers)
 
-    def ask(self, method: str, path: str, *, token: str = "", **options: Any) -> httpx.Response:
+    def request(self, method: str, path: str, *, token: str = "", **options: Any) -> httpx.Response:
         headers = {"Authorization": f"Bearer {token or self.token()}", **options.pop("headers", {})}
-        return self.cloud.ask(method, API + path, headers=headers, **options)
+        return self.cloud.request(method, API + path, headers=headers, **options)
 
 
-class _Line:
-    """In the place of the toy robot's MQTT connection."""
+class _PollingLink:
+    """Replaces the fake robot's MQTT connection."""
 
     def __init__(self, robot: PollingRobot) -> None:
         self._robot = robot
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="polling robot")
-        self._said: list[tuple[str, bytes]] = []
-        self.trouble: list[str] = []
-        """What did not go well, for a test that fails to show."""
+        self.unsent: list[tuple[str, bytes]] = []
 
     def start(self) -> None:
         self._thread.start()
@@ -130,11 +135,12 @@ class _Line:
             self._thread.join()
 
     def publish(self, topic: str, payload: bytes) -> None:
-        """Told together with what else follows from the commands of one poll."""
-        self._said.append((topic, payload))
+        """Sent with all other messages of one poll."""
+        self.unsent.append((topic, payload))
 
-    def publish_acknowledged(self, topic: str, payload: bytes, *, retain: bool = False) -> None:  # noqa: ARG002 (the functions know)
-        answer = self._robot.tell_raw((topic, payload))
+    def publish_acknowledged(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
+        del retain  # the functions select the retained messages
+        answer = self._robot.post_raw((topic, payload))
         assert answer.status_code == 200, answer.text
         assert answer.json()["results"] == [{"status": "stored", "detail": None}], answer.text
 
@@ -142,20 +148,9 @@ class _Line:
         robot = self._robot
         while not self._ending.is_set():
             try:
-                answer = robot.poll(wait_ms=robot.wait_ms)
-                if answer.status_code != 200:
-                    raise httpx.HTTPError(answer.text)  # noqa: TRY301 (one way for all that goes wrong)
-                for item in answer.json()["items"]:
-                    assert topics.parse(item["topic"])
-                    robot.obey(Message(item["topic"], item["payload"].encode(), 1, retain=False))
-                if self._said:
-                    told, self._said = self._said, []
-                    answer = robot.tell_raw(*told)
-                    if answer.status_code != 200:
-                        raise httpx.HTTPError(answer.text)  # noqa: TRY301
-            except (httpx.HTTPError, TimeoutError) as error:
+                robot.step(robot.wait_ms)
+            except (httpx.HTTPError, TimeoutError, AssertionError):
                 # Unsent acknowledgements are sent when the command arrives again.
-                self.trouble.append(str(error))
                 time.sleep(robot.pause_s)
             if not robot.wait_ms:
                 time.sleep(robot.pause_s)

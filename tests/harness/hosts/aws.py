@@ -6,7 +6,6 @@ two, by ``SIGSTOP``, as Amazon does.
 
 import base64
 import contextlib
-import http.client
 import json
 import os
 import queue
@@ -16,20 +15,12 @@ import threading
 import time
 import uuid
 from collections.abc import Iterator, Mapping
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, ClassVar
 from urllib.parse import unquote_to_bytes
 
-from tests.harness.hosts.host import (
-    LOOPBACK,
-    PATIENCE_S,
-    HostFailed,
-    Program,
-    environment_of,
-    only,
-    start_program,
-)
+from tests.harness.hosts.host import PATIENCE_S, HostFailed, Program, environment_of, only, start_program
+from tests.harness.network.http_server import QuietHandler, serve
 from tests.harness.paths import ROOT
 
 MAX_INSTANCES = 8
@@ -49,7 +40,7 @@ def start_lambda(
     with contextlib.ExitStack() as stack:
         instances = stack.enter_context(contextlib.ExitStack())
         host = Lambda(environment, instances, freeze=freeze, package=package)
-        host.url = stack.enter_context(_serve(_gateway(host)))
+        host.url = stack.enter_context(serve(_gateway(host)))
         stack.callback(host.thaw)
         yield host
 
@@ -114,7 +105,7 @@ class Lambda:
     def _start(self) -> "_Instance":
         assert len(self.instances) < MAX_INSTANCES, "more requests at once than instances may run"
         instance = _Instance(freeze=self._freeze)
-        address = self._stack.enter_context(_serve(_runtime_api(instance))).removeprefix("http://")
+        address = self._stack.enter_context(serve(_runtime_api(instance))).removeprefix("http://")
         given = environment_of(
             {
                 "AWS_REGION": "eu-west-1",
@@ -172,9 +163,8 @@ class _Instance:
                 os.kill(self.program.process.pid, number)
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(QuietHandler):
     protocol_version = "HTTP/1.1"
-    disable_nagle_algorithm = True
 
     def read(self) -> bytes:
         if self.headers.get("transfer-encoding", "").lower() != "chunked":
@@ -186,23 +176,15 @@ class _Handler(BaseHTTPRequestHandler):
         self.rfile.readline()
         return b"".join(parts)
 
-    def answer(self, status: int, headers: list[tuple[str, str]], content: bytes) -> None:
-        self.send_response_only(status)
-        for name, value in headers:
-            self.send_header(name, value)
-        if status not in {http.client.NO_CONTENT, http.client.NOT_MODIFIED}:
-            self.send_header("content-length", str(len(content)))
-        self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(content)
-
-    def log_message(self, *_: object) -> None:
-        """Nothing."""
-
 
 def _runtime_api(instance: _Instance) -> type[_Handler]:
     class RuntimeApi(_Handler):
-        def do_GET(self) -> None:
+        def handle_any(self) -> None:
+            if self.command == "POST":
+                outcome = "answer" if self.path.endswith("/response") else "error"
+                instance.outcomes.put({outcome: json.loads(self.read())})
+                self.respond(202, [], b"{}")
+                return
             assert self.path == f"{_RUNTIME}/invocation/next", self.path
             event = instance.next()
             deadline_ms = time.time_ns() // 1_000_000 + 30_000
@@ -212,15 +194,7 @@ def _runtime_api(instance: _Instance) -> type[_Handler]:
                 "Lambda-Runtime-Invoked-Function-Arn": _ARN,
                 "Content-Type": "application/json",
             }
-            self.answer(200, list(headers.items()), json.dumps(event).encode())
-
-        def do_POST(self) -> None:
-            body = json.loads(self.read())
-            if self.path.endswith("/response"):
-                instance.outcomes.put({"answer": body})
-            else:
-                instance.outcomes.put({"error": body})
-            self.answer(202, [], b"{}")
+            self.respond(200, list(headers.items()), json.dumps(event).encode())
 
     return RuntimeApi
 
@@ -234,21 +208,19 @@ def _gateway(service: Lambda) -> type[_Handler]:
         def handle_any(self) -> None:
             event = self._event(self.read())
             if len(json.dumps(event)) > MAX_EVENT_BYTES:
-                self.answer(413, [("content-type", "application/json")], b'{"message":"Request Too Long"}')
+                self.respond_json({"message": "Request Too Long"}, 413)
                 return
             try:
                 answer = service.invoke(event)
             except HostFailed:
-                self.answer(500, [("content-type", "application/json")], b'{"message":"Internal Server Error"}')
+                self.respond_json({"message": "Internal Server Error"}, 500)
                 return
             assert len(json.dumps(answer)) <= MAX_EVENT_BYTES
             content = answer.get("body", "")
             body = base64.b64decode(content) if answer.get("isBase64Encoded") else content.encode()
             headers = [(name, value) for name, value in answer["headers"].items() if name not in self.hop_by_hop]
             headers += [("set-cookie", cookie) for cookie in answer.get("cookies", ())]
-            self.answer(answer["statusCode"], headers, body)
-
-        do_GET = do_PUT = do_POST = do_PATCH = do_DELETE = do_HEAD = do_OPTIONS = handle_any  # noqa: N815
+            self.respond(answer["statusCode"], headers, body)
 
         def _event(self, body: bytes) -> dict[str, Any]:
             path, _, query = self.path.partition("?")
@@ -294,17 +266,3 @@ def _body(body: bytes, kind: str) -> dict[str, Any]:
         with contextlib.suppress(UnicodeDecodeError):
             return {"body": body.decode(), "isBase64Encoded": False}
     return {"body": base64.b64encode(body).decode(), "isBase64Encoded": True}
-
-
-@contextlib.contextmanager
-def _serve(handler: type[BaseHTTPRequestHandler]) -> Iterator[str]:
-    server = ThreadingHTTPServer((LOOPBACK, 0), handler)
-    server.daemon_threads = True
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-    thread.start()
-    try:
-        yield f"http://{LOOPBACK}:{server.server_port}"
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()

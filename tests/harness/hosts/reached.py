@@ -23,7 +23,7 @@ class Reached:
         self._environment = environment
         self.connect = connect_to_broker
 
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         return httpx.request(method, self.host.url + path, timeout=PATIENCE_S, **options)
 
     def link(self, name: str) -> str:
@@ -38,7 +38,7 @@ class Reached:
         return asyncio.run(made())
 
     def sign_in(self, name: str) -> httpx.Client:
-        answer = self.ask("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
+        answer = self.request("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
         assert answer.status_code == 200, answer.text
         token = {"Authorization": f"Bearer {answer.json()['access_token']}"}
         return httpx.Client(base_url=self.host.url + API, headers=token, timeout=PATIENCE_S)

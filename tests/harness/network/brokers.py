@@ -1,10 +1,4 @@
-"""Real brokers for tests: one process each on free loopback ports, with credentials issued like the functions' own.
-
-with start_broker("amqtt", tmp_path) as broker:
-    credentials = broker.issue(broker.grant(client_id="arm", publish=("ts/v1/lab/arm/#",)))
-    with broker.connect("arm", credentials) as client:
-        client.publish("ts/v1/lab/arm/conn", b"{}")
-"""
+"""Real brokers for tests: one process each on free loopback ports, with credentials like those of the functions."""
 
 import asyncio
 import contextlib
@@ -20,9 +14,10 @@ import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar, cast
 
 import paho.mqtt.client as paho
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from paho.mqtt.enums import CallbackAPIVersion
 
 from device_agent.protocol.security import signing
@@ -143,6 +138,13 @@ class Client:
         except queue.Empty:
             raise AssertionError(f"{self.client_id} received nothing in {timeout_s} s") from None
 
+    def payloads(self, count: int) -> list[bytes]:
+        return [self.receive().payload for _ in range(count)]
+
+    def ended(self) -> bool:
+        """Whether the connection ends in time."""
+        return self.disconnected.wait(PATIENCE_S)
+
     def pending(self) -> list[Message]:
         messages = []
         with contextlib.suppress(queue.Empty):
@@ -198,9 +200,9 @@ class RunningBroker:
     process: "subprocess.Popen[str]"
     tcp_port: int
     websocket_port: int
-    access: BrokerAccess
     loop: asyncio.AbstractEventLoop
     key: Any = None
+    access: BrokerAccess = field(default=cast("BrokerAccess", None))
     closers: list[Callable[[], None]] = field(default_factory=list)
 
     def port(self, transport: Transport) -> int:
@@ -253,6 +255,11 @@ class RunningBroker:
         transport: Transport = options.pop("transport", "tcp")
         return Client(client_id, credentials, port=self.port(transport), transport=transport, **options).open()
 
+    def accepts(self, client_id: str, credentials: Credentials | None, **options: Any) -> bool:
+        """Whether a client can connect; it disconnects at once."""
+        with self.connect(client_id, credentials, **options) as client:
+            return client.connected.is_set()
+
     def client(
         self, client_id: str, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = (), **options: Any
     ) -> Client:
@@ -299,8 +306,7 @@ def start_broker(
     Args:
         kind: The broker.
         home: Its folder; a second start with the same folder reuses its files.
-        tcp_port: 0 selects a free port.
-        websocket_port: 0 selects a free port.
+        tcp_port, websocket_port: 0 selects a free port.
         keys: For amqtt: public keys of the functions under test; ``access`` cannot issue grants then.
         more: Additional arguments of the program.
         tls: TLS context of the functions' own clients, if ``more`` enables TLS.
@@ -321,7 +327,7 @@ def start_broker(
             broker = None
             try:
                 tcp, websocket = _ready(process, home)
-                broker = RunningBroker(kind, home, process, tcp, websocket, _NO_ACCESS, loop, key)
+                broker = RunningBroker(kind, home, process, tcp, websocket, loop, key)
                 broker.access = _access(broker, tls)
                 yield broker
             finally:
@@ -336,21 +342,16 @@ def start_broker(
 
 def _ready(process: "subprocess.Popen[str]", home: Path) -> tuple[int, int]:
     assert process.stdout is not None
-    connections = process.stdout.readline()
-    ports_by_name = (
-        dict(part.split("=") for part in connections.split()[1:]) if connections.startswith("ready ") else {}
-    )
-    assert {"tcp", "websocket"} <= set(ports_by_name), (
-        f"broker did not start: {connections!r} {(home / 'broker.stderr').read_text()}"
-    )
-    return int(ports_by_name["tcp"]), int(ports_by_name["websocket"])
+    line = process.stdout.readline()
+    ports = dict(part.split("=") for part in line.split()[1:]) if line.startswith("ready ") else {}
+    errors = (home / "broker.stderr").read_text()
+    assert {"tcp", "websocket"} <= set(ports), f"broker did not start: {line!r} {errors}"
+    return int(ports["tcp"]), int(ports["websocket"])
 
 
 def _keys(home: Path) -> tuple[Any, Path]:
     """A signing key that stays the same for one home."""
     path, private = home / "public.json", home / "private.bin"
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
     if private.exists():
         key = Ed25519PrivateKey.from_private_bytes(private.read_bytes())
     else:
@@ -377,9 +378,6 @@ def _access(broker: RunningBroker, tls: ssl.SSLContext | None) -> BrokerAccess:
         await asyncio.to_thread(send)
 
     return TokenBrokerAccess(signer=lambda: broker.key, publish=publish)
-
-
-_NO_ACCESS: Any = None
 
 
 @contextlib.contextmanager

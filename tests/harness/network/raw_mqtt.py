@@ -2,17 +2,19 @@
 
 import contextlib
 import socket
-from typing import Self
+from typing import Any, Self
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from function_app.ports.broker_access import Credentials
-from tests.harness.network.brokers import HOST, PATIENCE_S, Transport
+from tests.harness.network.brokers import HOST, PATIENCE_S, RunningBroker, Transport
 
 CONNACK, PUBLISH, PUBACK, SUBACK, PINGRESP = 2, 3, 4, 9, 13
 PINGREQ = b"\xc0\x00"
+ACCEPTED = (CONNACK, 0, b"\0\0")
+"""The response to a CONNECT that is accepted, without an earlier session."""
 
 
 def text(value: str | bytes) -> bytes:
@@ -149,3 +151,13 @@ class RawConnection:
                 del self._buffer[: at + length]
                 return first >> 4, first & 0x0F, body
         return None
+
+
+def open_session(
+    broker: RunningBroker, client_id: str, credentials: Credentials, transport: Transport = "tcp", **options: Any
+) -> RawConnection:
+    """A connection after its CONNECT was accepted; ``options``: see ``connect_packet``."""
+    raw = RawConnection(broker.port(transport), transport)
+    raw.send(connect_packet(client_id, credentials, **options))
+    assert raw.read() == ACCEPTED
+    return raw

@@ -223,7 +223,7 @@ class XmppRobot(Robot):
         return super().introduction(**{"transport": "xmpp", **changes})
 
     def access(self) -> XmppAccess:
-        answer = self.ask("POST", "/xmpp/credentials", json={"purpose": "agent"})
+        answer = self.request("POST", "/xmpp/credentials", json={"purpose": "agent"})
         if answer.status_code != 200:
             self.refused.append(answer.text)
             raise ValueError(answer.text)
@@ -242,12 +242,12 @@ class XmppRobot(Robot):
         wait_until(lambda: self.changes[-1:] == [True], "the link over XMPP")
         return self
 
-    def obey(self, message: Message) -> None:
+    def handle(self, message: Message) -> None:
         if "/ctl/" in message.topic:
             self.setpoints.append((message.topic, message.payload))
         if "/tele/" in message.topic:
             self.overheard.append((message.topic, message.payload))
-        super().obey(message)
+        super().handle(message)
 
 
 class _Line:
@@ -262,7 +262,7 @@ class _Line:
             listen=robot.listen,
         )
         self.transport.start(
-            lambda topic, payload: robot.obey(Message(topic, payload, 1, retain=False)), robot.changes.append
+            lambda topic, payload: robot.handle(Message(topic, payload, 1, retain=False)), robot.changes.append
         )
 
     def publish(self, topic: str, payload: bytes) -> None:
@@ -304,7 +304,7 @@ class XmppClient:
     def ended(self) -> bool:
         return not self.opened or self._staying.done()
 
-    def say(self, stanza: str) -> None:
+    def send(self, stanza: str) -> None:
         self._loop.call_soon_threadsafe(self.stream.send, stanza)
 
     def there(self, user: str) -> bool:

@@ -13,13 +13,14 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
 import pytest
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, MotoRequestHandler, create_backend_app
 from werkzeug.serving import make_server
+
+from tests.harness.network.http_server import QuietHandler, running, serve
 
 HOST = "127.0.0.1"
 REGION = "eu-west-1"
@@ -38,14 +39,8 @@ def start_moto() -> Iterator[str]:
     logging.getLogger("werkzeug").setLevel(logging.WARNING)
     app = _OneAtATime(DomainDispatcherApplication(create_backend_app))
     server = make_server(HOST, 0, app, threaded=True, request_handler=MotoRequestHandler)
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-    thread.start()
-    try:
+    with running(server):
         yield f"http://{HOST}:{server.server_port}"
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
 
 
 def reset(endpoint: str) -> None:
@@ -136,21 +131,12 @@ def start_wire(endpoint: str) -> Iterator[Wire]:
     class Handler(_Handler):
         between = wire
 
-    server = ThreadingHTTPServer((HOST, 0), Handler)
-    wire.endpoint = f"http://{HOST}:{server.server_port}"
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-    thread.start()
-    try:
+    with serve(Handler) as wire.endpoint:
         yield wire
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(QuietHandler):
     protocol_version = "HTTP/1.1"
-    disable_nagle_algorithm = True
     between: Wire
 
     def handle_any(self) -> None:
@@ -175,8 +161,6 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(status, headers, content, sent=len(content) // 2)
             return
         self._answer(*answer)
-
-    do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = handle_any  # noqa: N815 (the base class's names)
 
     def _forward(self, body: bytes) -> tuple[int, list[tuple[str, str]], bytes]:
         behind = http.client.HTTPConnection(self.between.behind.hostname or HOST, self.between.behind.port)
@@ -215,6 +199,3 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         if self.command != "HEAD":
             self.wfile.write(content[:sent])
-
-    def log_message(self, *_: object) -> None:
-        """Nothing: the tests read ``asked``."""

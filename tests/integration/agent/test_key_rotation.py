@@ -1,4 +1,4 @@
-"""A whole agent with the simulated UR5 goes on through a rotation of the cloud's keys, and the old one ends."""
+"""A whole agent with the simulated UR5 keeps working during a rotation of the cloud's keys, and the old key expires."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,13 +11,12 @@ from device_agent.protocol import GrantLease
 from device_agent.protocol.security import signing
 from function_app.adapters.local.signing_keys import FileKeys
 from function_app.adapters.shared.key_ring import Ring
-from tests.contract.transports.agent_suite import Resident
+from tests.contract.transports.agent_suite import PairedAgent
 from tests.contract.transports.suite import Spoken
 from tests.harness.cloud.cloud_processes import Ground, start_ground
 from tests.harness.network.brokers import wait_until
 
 LEARN_MS, OVERLAP_MS = 3_600_000, 7_200_000
-MOVEMENT = "/robot-types/ur5/movements/nod"
 SOURCE = '"""Nod."""\nrobot.move_joints({"wrist_1": -1.5})\n'
 
 
@@ -28,73 +27,64 @@ def ground(tmp_path: Path) -> Iterator[Ground]:
 
 
 @pytest.fixture
-def resident(ground: Ground, tmp_path: Path) -> Iterator[Resident]:
-    resident = Resident(ground, Spoken(endpoint="broker", notices_s=10.0), tmp_path / "agent")
-    yield resident
-    resident.stop()
+def agent(ground: Ground, tmp_path: Path) -> Iterator[PairedAgent]:
+    agent = PairedAgent(ground, Spoken(endpoint="broker", notices_s=10.0), tmp_path / "agent")
+    yield agent
+    agent.stop()
 
 
-def work(ground: Ground, resident: Resident) -> None:
-    """A lease, a command and a movement, with a token: nothing of it is refused."""
-    epoch = resident.take()
-    moved = resident.move({"shoulder_pan": 0.1}, epoch=epoch, wait_for="done")
+def require_operation(ground: Ground, agent: PairedAgent) -> None:
+    """Takes a lease, moves, and runs a movement."""
+    epoch = agent.take()
+    moved = agent.move({"shoulder_pan": 0.1}, epoch=epoch, wait_for="done")
     assert moved["status"] == "done", moved
     request = {"kind": "run_movement", "name": "nod"}
-    ran = ground.anna.start(resident.id, request=request, epoch=epoch, wait_for="done", wait_ms=30_000).json()
+    ran = ground.anna.start(agent.id, request=request, epoch=epoch, wait_for="done", wait_ms=30_000).json()
     assert ran["status"] == "done", ran
 
 
-def learned(keys: FileKeys) -> None:
-    """As if the time that devices have to learn were over."""
-
-    def change(ring: Ring) -> Ring:
-        return Ring((*ring.keys[:-1], replace(ring.newest, devices_from_ms=0)))
-
-    ring = change(keys._parse())
-    keys._write(ring)
+def rejections(agent: PairedAgent) -> dict[str, int]:
+    """Number of rejected commands by reason."""
+    return dict(agent.device.publisher.rejections)
 
 
-def test_a_live_agent_goes_on_and_the_old_key_ends(ground: Ground, resident: Resident) -> None:
+def rejections_of(ground: Ground, agent: PairedAgent, key: Any) -> dict[str, int]:
+    """Sends a lease that is signed with this key, and returns the new rejections."""
+    epoch = agent.device._controller.epochs[0] + 1
+    lease = GrantLease(holder="anna", lease_ms=30_000)
+    before = rejections(agent)
+    ground.deliver(agent.agent, ground.order(agent.agent, lease, epoch=epoch, key=key))
+    wait_until(lambda: rejections(agent) != before or agent.device._controller.epochs[0] == epoch, "a response")
+    return {code: count - before.get(code, 0) for code, count in rejections(agent).items()}
+
+
+def test_a_running_agent_follows_a_rotation_and_rejects_the_old_key_afterwards(
+    ground: Ground, agent: PairedAgent
+) -> None:
     keys = FileKeys(ground.home / "keys")
     old = keys.load()
-    pins: Any = resident.device._commands._keys
-    assert ground.anna.put(MOVEMENT, {"source": SOURCE}).status_code == 201
-    work(ground, resident)
+    pins: Any = agent.device._commands._keys
+    assert ground.anna.put("/robot-types/ur5/movements/nod", {"source": SOURCE}).status_code == 201
+    require_operation(ground, agent)
 
-    news = ground.cloud.run(ground.cloud.functions.keys.rotate(learn_ms=LEARN_MS, overlap_ms=OVERLAP_MS))
-    new = news.pins[-1].id
-    work(ground, resident)
-    wait_until(lambda: pins.serial == 2, "the agent to learn of the new key, while it works")
+    rotation = ground.cloud.run(ground.cloud.functions.keys.rotate(learn_ms=LEARN_MS, overlap_ms=OVERLAP_MS))
+    new = rotation.pins[-1].id
+    require_operation(ground, agent)
+    wait_until(lambda: pins.serial == 2, "the agent to pin the new key")
     assert new in pins
-    pairing = resident.store.pairing()
+    pairing = agent.store.pairing()
     assert pairing is not None
     assert new in pairing.keys
-    assert news.signing == signing.key_id(old.public_key())
+    assert rotation.signing == signing.key_id(old.public_key())
 
-    learned(keys)
+    ring = keys._parse()
+    keys._write(Ring((*ring.keys[:-1], replace(ring.newest, devices_from_ms=0))))  # as after LEARN_MS
     assert signing.key_id(ground.cloud.run(ground.cloud.functions.keys.for_devices()).public_key()) == new
-    work(ground, resident)
-    assert refusals(resident) == {}
+    require_operation(ground, agent)
+    assert rejections(agent) == {}
 
-    assert send(ground, resident, old) == {}, "while the overlap lasts the old key counts"
+    assert rejections_of(ground, agent, old) == {}, "the old key is valid during the overlap"
     now_ms = pins._now_ms
     pins._now_ms = lambda: (now_ms() or 0) + OVERLAP_MS
-    assert send(ground, resident, old) == {"bad_signature": 1}
+    assert rejections_of(ground, agent, old) == {"bad_signature": 1}
     pins._now_ms = now_ms
-
-
-def refusals(resident: Resident) -> dict[str, int]:
-    """How many commands the device has refused, and why."""
-    found: dict[str, int] = dict(resident.device.publisher.rejections)
-    return found
-
-
-def send(ground: Ground, resident: Resident, key: Any) -> dict[str, int]:
-    """Have the device hear a lease order signed with this key; what it has refused since."""
-    epoch = resident.device._controller.epochs[0] + 1
-    lease = GrantLease(holder="anna", lease_ms=30_000)
-    order = ground.order(resident.agent, lease, epoch=epoch, key=key)
-    before = refusals(resident)
-    ground.deliver(resident.agent, order)
-    wait_until(lambda: refusals(resident) != before or resident.device._controller.epochs[0] == epoch, "an answer")
-    return {code: count - before.get(code, 0) for code, count in refusals(resident).items()}

@@ -1,4 +1,4 @@
-"""A swarm as its command runs it, against the real functions and both brokers: real agents on the wire."""
+"""The load test against the real functions and both brokers: simulated agents that speak the real protocol."""
 
 import json
 import os
@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from device_agent.__main__ import main
 from tests.harness.cloud.cloud_processes import Ground, start_ground
 from tests.harness.network.brokers import BrokerKind, wait_until
 from tests.harness.paths import ROOT
@@ -16,12 +17,11 @@ from tests.harness.paths import ROOT
 COUNT = 20
 
 
-def command(*options: str, token: str = "", link: str = "") -> "subprocess.Popen[str]":
-    environment = {**os.environ, "TELESCOPE_TOKEN": token, "TELESCOPE_SIGN_IN": link}
+def start(*options: str, token: str = "", link: str = "") -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [sys.executable, "-m", "device_agent", "load-test", *options],
         cwd=ROOT,
-        env=environment,
+        env={**os.environ, "TELESCOPE_TOKEN": token, "TELESCOPE_SIGN_IN": link},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -29,18 +29,17 @@ def command(*options: str, token: str = "", link: str = "") -> "subprocess.Popen
 
 
 def devices(ground: Ground) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = []
-    cursor: str | None = None
+    items: list[dict[str, Any]] = []
+    query: dict[str, str] = {}
     while True:
-        page = ground.anna.get("/devices", params={"cursor": cursor} if cursor else {}).json()
-        found += page["items"]
-        cursor = page["cursor"]
-        if cursor is None:
-            return found
+        page = ground.anna.get("/devices", params=query).json()
+        items += page["items"]
+        if page["cursor"] is None:
+            return items
+        query = {"cursor": page["cursor"]}
 
 
-def obeys(ground: Ground, device: str) -> None:
-    """A simulated robot moves, stops, and reports both."""
+def require_motion_and_stop(ground: Ground, device: str) -> None:
     move = {"request": {"kind": "move_joints", "position_rad": {"joint_1": 0.2}}, "wait_for": "done", "wait_ms": 20_000}
     done = ground.anna.post(f"/devices/{device}/actions", move).json()
     assert done["status"] == "done", done
@@ -53,37 +52,38 @@ def obeys(ground: Ground, device: str) -> None:
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("kind", ["amqtt", "mosquitto"])
-def test_twenty_agents_are_claimed_come_on_line_obey_and_leave(kind: BrokerKind, tmp_path: Path) -> None:
+def test_twenty_agents_are_claimed_operated_and_reused(kind: BrokerKind, tmp_path: Path) -> None:
     with start_ground(kind, tmp_path / "ground") as ground:
-        plan = ["--cloud", ground.url, "--home", str(tmp_path / "home"), "--count", str(COUNT), "--joints", "2"]
-        timing = ["--rate-hz", "2", "--seconds", "60", "--spread-s", "1", "--every-s", "1"]
+        common = ["--cloud", ground.url, "--home", str(tmp_path / "home"), "--count", str(COUNT), "--joints", "2"]
+        common += ["--rate-hz", "2", "--spread-s", "1"]
         figures = tmp_path / "figures.json"
-        who = {"token": ground.anna.token} if kind == "amqtt" else {"link": ground.cloud.link("anna")}
-        with command(*plan, *timing, "--json", str(figures), **who) as swarm:
-            wait_until(lambda: sum(each["online"] for each in devices(ground)) == COUNT, "all on line", 120)
-            one = devices(ground)[0]
-            assert one["robot_type"] == "load-test-arm"
-            obeys(ground, one["id"])
-            swarm.terminate()
-            said, _ = swarm.communicate(timeout=60)
-        assert swarm.returncode == 0, said
-        assert f"{COUNT} of {COUNT} connected" in said
-        told = json.loads(figures.read_text())
-        assert json.loads(said.splitlines()[-1]) == told
-        assert (told["agents"], told["most_connected"], told["unconfirmed"], told["troubles"]) == (COUNT, COUNT, 0, {})
-        assert told["counts"]["heard"] >= 3
-        assert told["counts"]["lost_links"] == 0
-        wait_until(lambda: not any(each["online"] for each in devices(ground)), "all to have said goodbye")
+        sign_in = {"token": ground.anna.token} if kind == "amqtt" else {"link": ground.cloud.link("anna")}
+        with start(*common, "--seconds", "60", "--every-s", "1", "--json", str(figures), **sign_in) as load:
+            wait_until(lambda: sum(each["online"] for each in devices(ground)) == COUNT, "all to be online", 120)
+            device = devices(ground)[0]
+            assert device["robot_type"] == "load-test-arm"
+            require_motion_and_stop(ground, device["id"])
+            load.terminate()
+            output, _ = load.communicate(timeout=60)
+        assert load.returncode == 0, output
+        assert f" of {COUNT} connected" in output
+        summary = json.loads(figures.read_text())
+        assert json.loads(output.splitlines()[-1]) == summary
+        assert [summary[name] for name in ("agents", "most_connected", "unconfirmed")] == [COUNT, COUNT, 0]
+        assert summary["troubles"] == {}
+        assert summary["counts"]["heard"] >= 3
+        assert summary["counts"]["lost_links"] == 0
+        wait_until(lambda: not any(each["online"] for each in devices(ground)), "all to be offline")
 
         # The next run reuses the agents, so no claim is necessary.
-        again = command(*plan, "--rate-hz", "2", "--seconds", "4", "--spread-s", "1")
-        said, _ = again.communicate(timeout=120)
-        assert again.returncode == 0, said
+        again = start(*common, "--seconds", "4")
+        output, _ = again.communicate(timeout=120)
+        assert again.returncode == 0, output
         assert len(devices(ground)) == COUNT
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         (("--cloud", "nowhere"), "--cloud: 'nowhere' is not an address"),
         (("--cloud", "http://127.0.0.1:1", "--count", "0"), "--count: 0 is not between 1 and 20000"),
@@ -91,10 +91,10 @@ def test_twenty_agents_are_claimed_come_on_line_obey_and_leave(kind: BrokerKind,
         (("--cloud", "http://127.0.0.1:1", "--count", "1"), "cannot be reached"),
     ],
 )
-def test_what_cannot_be_run_is_said_in_one_line(tmp_path: Path, options: tuple[str, ...], told: str) -> None:
-    swarm = command(*options, "--home", str(tmp_path))
-    said, _ = swarm.communicate(timeout=60)
-    assert swarm.returncode == 1
-    (line,) = said.splitlines()
+def test_errors_are_reported_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], message: str
+) -> None:
+    assert main(["load-test", *options, "--home", str(tmp_path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("telescope agent: ")
-    assert told in line
+    assert message in line

@@ -1,4 +1,4 @@
-"""What is the MQTT transport's own, over real brokers. What all promise is in ``tests/contract/transports``."""
+"""The MQTT transport over real brokers; ``tests/contract/transports`` has the contract of all transports."""
 
 import os
 import signal
@@ -6,62 +6,74 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 
 from device_agent.protocol import Presence, codec, topics
 from device_agent.protocol.security import grants
 from device_agent.transports.mqtt import BrokerAccess, MqttTransport
-from tests.harness.network.brokers import BROKERS, HOST, Client, RunningBroker, start_broker, wait_until
-from tests.harness.network.proxy import start_proxy
+from tests.harness.network.brokers import BROKERS, HOST, RunningBroker, start_broker, wait_until
+from tests.harness.network.proxy import Proxy, start_proxy
 from tests.harness.paths import ROOT
 
 CONN = topics.conn("lab", "arm1")
 ACK = topics.device("lab", "arm1", "arm", topics.ACK)
+MODULE = "device_agent.transports.mqtt.transport"
 
 
 @pytest.fixture(params=BROKERS)
 def broker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[RunningBroker]:
     with start_broker(request.param, tmp_path / "broker") as broker:
         yield broker
-        for link in Link.started:
-            link.transport.stop()
-        Link.started.clear()
+
+
+@pytest.fixture
+def proxy(broker: RunningBroker) -> Iterator[Proxy]:
+    with start_proxy(broker.tcp_port) as proxy:
+        yield proxy
 
 
 class Link:
-    """A started transport and what it told. The fixture ends it."""
+    """A transport, the messages that it has received, and the changes of its link."""
 
-    started: ClassVar[list["Link"]] = []
-
-    def __init__(
-        self, broker: RunningBroker, *, port: int = 0, lifetime_s: float = 300, quiet: Callable[[], bool] = lambda: True
-    ):
+    def __init__(self, broker: RunningBroker) -> None:
         self.received: list[tuple[str, bytes]] = []
         self.changes: list[bool] = []
-        self.sessions = 0
-        self.asked = 0
-        self.refused = 0
-        self.cloud_away = False
-        self.broker = broker
-        self.port = port or broker.tcp_port
-        self.lifetime_s = lifetime_s
+        self.sessions = self.requests = self.failed_requests = 0
+        self.quiet = False
+        self.cloud_reachable = True
+        self.lifetime_s = 300
+        self.port = broker.tcp_port
+        self._broker = broker
         self.transport = MqttTransport(
-            access=self.access, presence_topic=CONN, next_session=self.next_session, software="test", quiet=quiet
+            access=self._access,
+            presence_topic=CONN,
+            next_session=self._next_session,
+            software="test",
+            quiet=lambda: self.quiet,
         )
-        self.started.append(self)
-        self.transport.start(lambda topic, payload: self.received.append((topic, payload)), self.changes.append)
 
-    def access(self) -> BrokerAccess:
-        if self.cloud_away:
-            self.refused += 1
-            raise OSError("the cloud is away")
-        self.asked += 1
+    def start(self) -> "Link":
+        self.transport.start(lambda *message: self.received.append(message), self.changes.append)
+        return self.up()
+
+    def up(self, times: int = 1) -> "Link":
+        wait_until(lambda: self.changes.count(True) >= times, f"link number {times}")
+        return self
+
+    def publish(self, payload: bytes, **options: Any) -> bool:
+        return self.transport.publish(ACK, payload, **{"qos": 1, **options})
+
+    def _access(self) -> BrokerAccess:
+        if not self.cloud_reachable:
+            self.failed_requests += 1
+            raise OSError("the cloud cannot be reached")
+        self.requests += 1
         grant = grants.agent_grant("lab", "arm1", token_id=os.urandom(8).hex(), lifetime_s=self.lifetime_s)
-        credentials = self.broker.issue(grant)
+        credentials = self._broker.issue(grant)
         return BrokerAccess(
             host=HOST,
             port=self.port,
@@ -72,18 +84,24 @@ class Link:
             lifetime_s=self.lifetime_s,
         )
 
-    def next_session(self) -> int:
+    def _next_session(self) -> int:
         self.sessions += 1
         return self.sessions
 
-    def up(self, times: int = 1) -> None:
-        wait_until(lambda: self.changes.count(True) >= times, f"link number {times}")
+
+@pytest.fixture
+def link(broker: RunningBroker) -> Iterator[Link]:
+    """A transport that is not yet started."""
+    link = Link(broker)
+    yield link
+    link.transport.stop()
 
 
-def watcher(broker: RunningBroker) -> Client:
-    client = broker.service()
-    client.subscribe(CONN, ACK)
-    return client
+@pytest.fixture
+def fragile(link: Link, proxy: Proxy) -> Link:
+    """A started transport whose connection goes through the proxy."""
+    link.port = proxy.port
+    return link.start()
 
 
 def test_a_killed_agent_is_declared_offline_by_its_will(broker: RunningBroker) -> None:
@@ -95,14 +113,14 @@ def test_a_killed_agent_is_declared_offline_by_its_will(broker: RunningBroker) -
         stdout=subprocess.PIPE,
         text=True,
     )
-    with child:
+    with child, broker.service() as observer:
         assert child.stdout is not None
         assert child.stdout.readline() == "up\n"
-        with watcher(broker) as other:
-            assert codec.decode(other.receive().payload, Presence).online
-            child.send_signal(signal.SIGKILL)
-            last = codec.decode(other.receive().payload, Presence)
-            assert (last.online, last.session) == (False, 7)
+        observer.subscribe(CONN)
+        assert codec.decode(observer.receive().payload, Presence).online
+        child.send_signal(signal.SIGKILL)
+        last = codec.decode(observer.receive().payload, Presence)
+        assert (last.online, last.session) == (False, 7)
 
 
 _CHILD = f"""
@@ -117,141 +135,117 @@ time.sleep(60)
 """
 
 
-def test_it_renews_its_credentials_before_they_end_but_not_while_something_moves(
-    broker: RunningBroker, monkeypatch: pytest.MonkeyPatch
+def test_credentials_are_renewed_before_they_expire_but_not_during_motion(
+    link: Link, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # From its first second on, so that a slow machine comes nowhere near the share at which it no longer waits.
-    monkeypatch.setattr("device_agent.transports.mqtt.transport._REFRESH_AT", 1 / 120)
-    still_for: list[int] = []
-    link = Link(broker, lifetime_s=120, quiet=lambda: link.asked in still_for)
-    link.up()
-    asked = link.asked
+    # From the first second on, so that a slow machine does not reach the share at which renewal no longer waits.
+    monkeypatch.setattr(f"{MODULE}._REFRESH_AT", 1 / 120)
+    link.lifetime_s = 120
+    link.start()
+    requests = link.requests
     time.sleep(2)
-    assert link.asked == asked
-    still_for.append(asked)
+    assert link.requests == requests
+    link.transport._quiet = lambda: link.requests == requests
     link.up(2)
-    assert link.asked == asked + 1
-    assert link.changes == [True, True], "so short a break is no loss of the link"
+    assert link.requests == requests + 1
+    assert link.changes == [True, True], "a short interruption is not reported as a lost link"
     link.transport.stop()
     assert link.changes == [True, True, False]
 
 
 @pytest.fixture
-def renewing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Credentials are renewed as soon as it is quiet."""
-    monkeypatch.setattr("device_agent.transports.mqtt.transport._REFRESH_AT", 0.0)
+def renewal_when_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{MODULE}._REFRESH_AT", 0.0)
 
 
-@pytest.mark.usefixtures("renewing")
-def test_a_renewal_that_takes_longer_is_a_loss_until_it_has_come_to_its_end(broker: RunningBroker) -> None:
-    with start_proxy(broker.tcp_port) as proxy:
-        still: list[bool] = []
-        link = Link(broker, port=proxy.port, quiet=lambda: bool(still))
-        link.up()
-        proxy.refuse()
-        still.append(True)
-        wait_until(lambda: link.changes == [True, False], "the loss")
-        still.clear()
-        proxy.admit()
-        link.up(2)
-        assert link.changes == [True, False, True]
+@pytest.mark.usefixtures("renewal_when_quiet")
+def test_a_long_renewal_is_a_lost_link_until_it_ends(fragile: Link, proxy: Proxy) -> None:
+    proxy.refuse()
+    fragile.quiet = True
+    wait_until(lambda: fragile.changes == [True, False], "the loss")
+    fragile.quiet = False
+    proxy.admit()
+    fragile.up(2)
+    assert fragile.changes == [True, False, True]
 
 
-@pytest.mark.usefixtures("renewing")
-def test_where_something_is_not_confirmed_a_renewal_is_a_loss(broker: RunningBroker) -> None:
-    with start_proxy(broker.tcp_port) as proxy:
-        still: list[bool] = []
-        link = Link(broker, port=proxy.port, quiet=lambda: bool(still))
-        link.up()
-        proxy.freeze()
-        confirmed: list[bool] = []
-        assert link.transport.publish(ACK, b"{}", qos=1, delivered=lambda: confirmed.append(True))
-        still.append(True)
-        wait_until(lambda: link.changes == [True, False], "the loss")
-        assert not confirmed
-        still.clear()
-        proxy.thaw()
-        link.up(2)
+@pytest.mark.usefixtures("renewal_when_quiet")
+def test_a_renewal_with_unacknowledged_messages_is_a_lost_link(fragile: Link, proxy: Proxy) -> None:
+    proxy.freeze()
+    acknowledged: list[bool] = []
+    assert fragile.publish(b"{}", delivered=lambda: acknowledged.append(True))
+    fragile.quiet = True
+    wait_until(lambda: fragile.changes == [True, False], "the loss")
+    assert not acknowledged
+    fragile.quiet = False
+    proxy.thaw()
+    fragile.up(2)
 
 
-def test_nothing_more_is_told_by_a_connection_that_waits_for_what_was(broker: RunningBroker) -> None:
-    link = Link(broker)
-    link.up()
-    connection: Any = link.transport._connection
-    assert link.transport.publish(ACK, b"{}", qos=1)
-    connection.settle(0.0)
-    assert not link.transport.publish(ACK, b"{}", qos=1, delivered=lambda: None)
-    assert not connection._delivered
-
-
-@pytest.mark.usefixtures("renewing")
-def test_without_new_credentials_the_old_ones_serve_on(broker: RunningBroker, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("device_agent.transports.mqtt.transport._RENEWAL_RETRY_S", 0.1)
-    still: list[bool] = []
-    link = Link(broker, quiet=lambda: bool(still))
-    link.up()
-    link.cloud_away = True
-    still.append(True)
-    wait_until(lambda: link.refused >= 3, "tries")
+@pytest.mark.usefixtures("renewal_when_quiet")
+def test_without_new_credentials_the_old_ones_stay_in_use(link: Link, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{MODULE}._RENEWAL_RETRY_S", 0.1)
+    link.start()
+    link.cloud_reachable = False
+    link.quiet = True
+    wait_until(lambda: link.failed_requests >= 3, "attempts")
     assert link.changes == [True]
-    assert link.transport.publish(ACK, b"{}", qos=0)
-    link.cloud_away = False
+    assert link.publish(b"{}", qos=0)
+    link.cloud_reachable = True
     link.up(2)
-    still.clear()
+    link.quiet = False
     assert False not in link.changes
 
 
-def test_who_was_too_busy_to_listen_does_not_take_the_broker_for_silent(
-    broker: RunningBroker, monkeypatch: pytest.MonkeyPatch
+def test_a_connection_that_waits_for_acknowledgements_accepts_no_messages(link: Link) -> None:
+    connection: Any = link.start().transport._connection
+    assert link.publish(b"{}")
+    connection.settle(0.0)
+    assert not link.publish(b"{}", delivered=lambda: None)
+    assert not connection._delivered
+
+
+def test_an_agent_too_busy_to_receive_does_not_treat_the_broker_as_silent(
+    broker: RunningBroker, link: Link, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("device_agent.transports.mqtt.transport.KEEP_ALIVE_S", 2)
-    monkeypatch.setattr("device_agent.transports.mqtt.transport.SILENCE_TIMEOUT_S", 3.0)
-    link = Link(broker)
-    link.received = Tedious()
-    link.up()
+    class SlowList(list[Any]):
+        def append(self, message: Any) -> None:
+            super().append(message)
+            time.sleep(4)
+
+    monkeypatch.setattr(f"{MODULE}.KEEP_ALIVE_S", 2)
+    monkeypatch.setattr(f"{MODULE}.SILENCE_TIMEOUT_S", 3.0)
+    link.received = SlowList()
+    link.start()
     with broker.service() as cloud:
         cloud.publish(topics.device("lab", "arm1", "arm", topics.CMD), b"{}")
-        wait_until(lambda: link.received, "the order")
-        until_s = time.monotonic() + 5
-        while time.monotonic() < until_s:
-            assert link.transport.publish(ACK, b"{}", qos=0), "what it says keeps the connection alive"
+        wait_until(lambda: link.received, "the command")
+        end_s = time.monotonic() + 5
+        while time.monotonic() < end_s:
+            assert link.publish(b"{}", qos=0), "its own messages keep the connection alive"
             time.sleep(0.1)
     assert link.changes == [True]
 
 
-class Tedious(list[tuple[str, bytes]]):
-    """Takes four seconds for a message."""
-
-    def append(self, message: tuple[str, bytes]) -> None:
-        super().append(message)
-        time.sleep(4)
-
-
-def test_small_messages_never_wait_for_nagle(broker: RunningBroker) -> None:
-    link = Link(broker)
-    link.up()
-    connection: Any = link.transport._connection
+def test_connections_have_tcp_nodelay(link: Link) -> None:
+    connection: Any = link.start().transport._connection
     assert connection._client.socket().getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
-    link.transport.stop()
 
 
-def test_on_a_link_that_takes_nothing_one_picture_waits_and_no_queue_of_them(broker: RunningBroker) -> None:
-    picture, other = (topics.device("lab", "arm1", "eye", topics.CAM, name) for name in ("left", "right"))
-    with start_proxy(broker.tcp_port) as proxy:
-        link = Link(broker, port=proxy.port)
-        link.up()
-        wait_until(lambda: link.transport.publish(picture, bytes(1000), qos=0), "a first picture to be taken")
-        wait_until(lambda: link.transport.publish(picture, bytes(1000), qos=0), "a second one")
-        proxy.freeze()
-        taken = 0
-        for _ in range(400):  # 40 MB: more than the sockets hold
-            taken += link.transport.publish(picture, bytes(100_000), qos=0)
-            time.sleep(0.001)
-        assert taken < 350
-        before = taken
-        for _ in range(20):
-            taken += link.transport.publish(picture, bytes(100_000), qos=0)
-        assert taken == before, "a picture waits already"
-        assert link.transport.publish(other, bytes(1000), qos=0), "another camera is another matter"
-        proxy.thaw()
-        wait_until(lambda: link.transport.publish(picture, bytes(1000), qos=0), "pictures to go on")
+def test_on_a_blocked_link_one_frame_of_each_camera_waits(fragile: Link, proxy: Proxy) -> None:
+    def publish(camera: str, size: int) -> bool:
+        topic = topics.device("lab", "arm1", "eye", topics.CAM, camera)
+        return fragile.transport.publish(topic, bytes(size), qos=0)
+
+    for _ in range(2):
+        wait_until(lambda: publish("left", 1000), "a frame to be accepted")
+    proxy.freeze()
+    accepted = 0
+    for _ in range(400):  # 40 MB: more than the sockets hold
+        accepted += publish("left", 100_000)
+        time.sleep(0.001)
+    assert accepted < 350
+    assert not any(publish("left", 100_000) for _ in range(20)), "a frame waits already"
+    assert publish("right", 1000), "frames of another camera are independent"
+    proxy.thaw()
+    wait_until(lambda: publish("left", 1000), "frames to be accepted again")

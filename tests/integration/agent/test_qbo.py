@@ -1,6 +1,5 @@
-"""A whole device: Qbo's driver in real time, its scripts in the sandbox, its sonars' readings on the way to both."""
+"""A whole device: Qbo's driver in real time, a script in the sandbox, and sonar measurements for both."""
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,20 +27,19 @@ def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
     harness.stop()
 
 
-def test_it_comes_forward_until_its_sonars_say_near(harness: DeviceHarness) -> None:
+def test_it_approaches_until_its_sonars_measure_an_obstacle(harness: DeviceHarness) -> None:
     source = (FOLDER / "movements" / "come_near.py").read_text(encoding="utf-8")
-    eventually(lambda: harness.heard(topics.TELE, Measurements, "sonar"))
-    ack = harness.end(
-        harness.command(harness.script("parameters = {'near_m': 1.65, 'speed_m_s': 0.2}\n" + source), epoch=1)
-    )
+    eventually(lambda: harness.published(topics.TELE, Measurements, "sonar"))
+    script = harness.script("parameters = {'near_m': 1.65, 'speed_m_s': 0.2}\n" + source)
+    ack = harness.end(harness.command(script, epoch=1))
     assert ack.status is AckStatus.DONE, ack.reason
     assert ack.output.startswith("stopped 1.")
-    sonar = harness.heard(topics.TELE, Measurements, "sonar")
-    nearest_m = min(float(told.values["distance_m.left"]) for told in sonar)
+    sonar = harness.published(topics.TELE, Measurements, "sonar")
+    nearest_m = min(float(measured.values["distance_m.left"]) for measured in sonar)
     assert 1.4 < nearest_m <= 1.65
-    odometry = harness.heard(topics.TELE, Measurements, "odometry")
-    farthest_m = max(float(told.values["x_m"]) for told in odometry)
-    assert farthest_m == pytest.approx(2.0 - 0.156 - nearest_m, abs=0.06)
-    assert float(odometry[-1].values["x_m"]) < farthest_m, "it went back a little"
-    assert math.isclose(float(odometry[-1].values["y_m"]), 0.0, abs_tol=0.01)
-    assert harness.heard(topics.TELE, Measurements, "health")
+    odometry = [measured.values for measured in harness.published(topics.TELE, Measurements, "odometry")]
+    furthest_m = max(float(values["x_m"]) for values in odometry)
+    assert furthest_m == pytest.approx(2.0 - 0.156 - nearest_m, abs=0.06)
+    assert float(odometry[-1]["x_m"]) < furthest_m, "it moved back a little"
+    assert float(odometry[-1]["y_m"]) == pytest.approx(0.0, abs=0.01)
+    assert harness.published(topics.TELE, Measurements, "health")

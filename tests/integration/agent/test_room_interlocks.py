@@ -1,15 +1,12 @@
-"""Over a real broker a sensor of the room slows and holds a moving arm, and so does its silence."""
+"""Over a real broker, measurements of a room sensor slow and hold a moving arm, and so does their absence."""
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
-
-import pytest
 
 from device_agent.protocol import AckStatus
 from device_agent.protocol.events import EventKind
 from tests.harness.agent.custom_agent import OwnAgent, Sensor
-from tests.harness.network.brokers import RunningBroker, start_broker, wait_until
+from tests.harness.network.brokers import start_broker, wait_until
 
 STALE_S = 2.5
 SLOW = 0.2
@@ -41,13 +38,7 @@ FREE, NEAR, TOO_NEAR = 5.0, 1.5, 0.5
 FULL_RAD_S = 0.3 * 3.14
 
 
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[RunningBroker]:
-    with start_broker("amqtt", tmp_path / "broker") as broker:
-        yield broker
-
-
-def acted(agent: OwnAgent) -> list[str]:
+def reasons(agent: OwnAgent) -> list[str]:
     return [event.data["reason"] for event in agent.events(EventKind.INTERLOCK_ENGAGED)]
 
 
@@ -55,11 +46,17 @@ def restrictions(agent: OwnAgent) -> dict[str, float]:
     return {each.source.rpartition(" < ")[2]: each.speed for each in agent.state().restrictions}
 
 
-def test_presence_slows_then_holds_and_silence_holds(broker: RunningBroker, tmp_path: Path) -> None:
-    with OwnAgent(tmp_path / "home", broker, TOML) as agent:
+def end(agent: OwnAgent, action: str) -> tuple[AckStatus, str]:
+    ack = agent.ended(action)
+    return ack.status, "" if ack.reason is None else ack.reason.code
+
+
+def test_presence_slows_then_holds_and_silence_holds(tmp_path: Path) -> None:
+    failed = (AckStatus.FAILED, "interlock")
+    with start_broker("amqtt", tmp_path / "broker") as broker, OwnAgent(tmp_path / "home", broker, TOML) as agent:
         agent.start()
         agent.ready()
-        wait_until(lambda: restrictions(agent) == {"2": SLOW, "1": 0.0}, "the holds of a room that is not known yet")
+        wait_until(lambda: restrictions(agent) == {"2": SLOW, "1": 0.0}, "holds without measurements")
         with Sensor(broker, "sensors", "zone", "presence", distance_m=FREE) as sensor:
             wait_until(lambda: restrictions(agent) == {}, "a free room")
 
@@ -71,23 +68,21 @@ def test_presence_slows_then_holds_and_silence_holds(broker: RunningBroker, tmp_
 
             sensor.values = {"distance_m": TOO_NEAR}
             wait_until(lambda: agent.speeds()[-1] == 0, "the hold")
-            ack = agent.ended(first)
-            assert (ack.status, ack.reason and ack.reason.code) == (AckStatus.FAILED, "interlock")
-            wait_until(lambda: restrictions(agent).get("1") == 0.0, "the hold to be shown")
+            assert end(agent, first) == failed
+            wait_until(lambda: restrictions(agent).get("1") == 0.0, "the restriction in the state")
 
             sensor.values = {"distance_m": FREE}
             wait_until(lambda: restrictions(agent) == {}, "a free room again")
-            rested = len(agent.telemetry())
-            wait_until(lambda: len(agent.telemetry()) > rested + 20, "a while")
-            assert max(agent.speeds(since=rested)) == 0, "nothing resumes by itself"
+            count = len(agent.telemetry())
+            wait_until(lambda: len(agent.telemetry()) > count + 20, "more telemetry")
+            assert max(agent.speeds(since=count)) == 0, "nothing resumes by itself"
 
             second = agent.move(-6.0, epoch=2)
             sensor.values = None
             silent_s = time.monotonic()
-            ack = agent.ended(second)
-            assert (ack.status, ack.reason and ack.reason.code) == (AckStatus.FAILED, "interlock")
-            assert time.monotonic() - silent_s >= STALE_S - 0.5, "not before it was stale"
-            wait_until(lambda: agent.speeds()[-1] == 0, "the hold for silence")
-        told = ("no measurement of", "distance_m < 2", "distance_m < 1", "is silent")
-        wait_until(lambda: all(any(why in each for each in acted(agent)) for why in told), "events that say each of it")
-        wait_until(lambda: agent.events(EventKind.INTERLOCK_CLEARED), "one that says that the room is free")
+            assert end(agent, second) == failed
+            assert time.monotonic() - silent_s >= STALE_S - 0.5, "not before the measurement was stale"
+            wait_until(lambda: agent.speeds()[-1] == 0, "the hold without measurements")
+        expected = ("no measurement of", "distance_m < 2", "distance_m < 1", "is silent")
+        wait_until(lambda: all(any(text in each for each in reasons(agent)) for text in expected), "events")
+        wait_until(lambda: agent.events(EventKind.INTERLOCK_CLEARED), "the event of a free room")

@@ -15,33 +15,32 @@ import sys
 import sysconfig
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.harness.cloud.cloud_processes import Ground, start_ground
-from tests.harness.network.brokers import wait_until
+from tests.harness.network.brokers import PATIENCE_S, wait_until
 from tests.harness.paths import ROOT
 
 USER = 65_534
-PATIENCE_S = 60.0
-MINE = "/robot-types/ur5/movements/mine"
 MOVE = {"kind": "move_joints", "position_rad": {"shoulder_pan": 0.1}, "speed": 1.0}
+ENVIRONMENT = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
 SCRIPT = {"kind": "run_movement", "name": "mine"}
 
 
 @pytest.fixture(scope="module")
 def ground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
     with start_ground("amqtt", tmp_path_factory.mktemp("service")) as ground:
-        ground.anna.put(MINE, {"source": "print('here')"})
+        ground.anna.put("/robot-types/ur5/movements/mine", {"source": "print('here')"})
         yield ground
 
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """A place that an unprivileged user can reach, and owns."""
+    """A folder that the unprivileged user owns and can reach."""
     made = Path(tempfile.mkdtemp(prefix="telescope-"))
     if os.geteuid() == 0:
         os.chown(made, USER, USER)
@@ -59,7 +58,7 @@ def unprivileged(*arguments: str) -> list[str]:
 
 @functools.cache
 def _reachable_python() -> Path:
-    """This Python; where it lives in root's own folder, the system's of the same version with these packages."""
+    """This Python; if only root can run it, the system's of the same version with these packages."""
     real = Path(sys.executable).resolve()
     if all(folder.stat().st_mode & 0o005 == 0o005 for folder in real.parents):
         return Path(sys.executable)
@@ -78,32 +77,25 @@ def _reachable_python() -> Path:
 
 
 def program(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(
-        unprivileged("-m", "device_agent", *arguments, "--home", str(folder / "agent")),
-        cwd=ROOT,
-        env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = unprivileged(*arguments, "--home", str(folder / "agent"))
+    return subprocess.run(command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, check=False)
 
 
-def claimed(ground: Ground, folder: Path, *more: str) -> str:
-    """Enroll and be claimed by Anna; the device's id."""
-    done = program(folder, "enroll", "--server", ground.url, "--device", "arm=ur5", "--no-wait", *more)
-    found = re.search(r"claim code (\S+)  ", done.stdout)
-    assert found is not None, done
-    answer = ground.anna.post("/agents/claim", {"code": found[1]})
-    device: str = answer.json()["devices"][0]["id"]
+def enroll(ground: Ground, folder: Path, *options: str) -> str:
+    """Enroll the agent and claim it for Anna; returns the device's id."""
+    enroll = ("-m", "device_agent", "enroll", "--server", ground.url, "--device", "arm=ur5", "--no-wait", *options)
+    done = program(folder, *enroll)
+    code = re.search(r"claim code (\S+)  ", done.stdout)
+    assert code is not None, done
+    device: str = ground.anna.post("/agents/claim", {"code": code[1]}).json()["devices"][0]["id"]
     return device
 
 
 @contextlib.contextmanager
-def running(command: list[str], folder: Path, environment: Mapping[str, str]) -> Iterator["subprocess.Popen[bytes]"]:
+def running(folder: Path, *arguments: str, **environment: str) -> Iterator["subprocess.Popen[bytes]"]:
+    command = unprivileged(*arguments, "run", "--home", str(folder / "agent"))
     with (folder / "log").open("wb") as log:
-        process = subprocess.Popen(
-            command, cwd=ROOT, env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1", **environment}, stdout=log, stderr=log
-        )
+        process = subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT | environment, stdout=log, stderr=log)
         try:
             yield process
         finally:
@@ -111,27 +103,32 @@ def running(command: list[str], folder: Path, environment: Mapping[str, str]) ->
             process.wait()
 
 
-def does(ground: Ground, device: str, request: Any) -> dict[str, Any]:
+def online(ground: Ground, device: str) -> bool:
+    state: bool = ground.anna.get(f"/devices/{device}").json()["online"]
+    return state
+
+
+def end_of(ground: Ground, device: str, request: Any) -> dict[str, Any]:
     """Start an action and wait for its end."""
-    answer = ground.anna.start(device, request=request, wait_ms=30_000, wait_for="done")
-    found: dict[str, Any] = answer.json()
-    return found
+    action: dict[str, Any] = ground.anna.start(device, request=request, wait_ms=30_000, wait_for="done").json()
+    return action
 
 
-def findings(folder: Path) -> tuple[int, dict[str, str]]:
-    """What the doctor says: its exit code, and each check's worst level with its words."""
-    done = program(folder, "doctor", "--json")
+def findings(folder: Path) -> dict[str, str]:
+    """Findings of ``doctor`` by check; none of them is a problem."""
+    done = program(folder, "-m", "device_agent", "doctor", "--json")
     assert "Traceback" not in done.stdout + done.stderr, done.stderr
-    found = json.loads(done.stdout)
-    assert found["ok"] == (done.returncode == 0), found
-    return done.returncode, {each["check"]: f"{each['level']}: {each['message']}" for each in found["findings"]}
+    assert done.returncode == 0, done.stdout
+    report = json.loads(done.stdout)
+    assert report["ok"]
+    return {each["check"]: f"{each['level']}: {each['message']}" for each in report["findings"]}
 
 
-class Manager:
-    """What a service manager hears."""
+class ServiceManager:
+    """Receives notifications, as systemd does."""
 
     def __init__(self, path: Path) -> None:
-        self.heard: list[str] = []
+        self.notifications: list[str] = []
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(path))
         path.chmod(0o666)
@@ -140,51 +137,48 @@ class Manager:
         self._path = path
 
     def _run(self) -> None:
-        while word := self._socket.recv(1000).decode():
-            self.heard.append(word)
+        while text := self._socket.recv(1000).decode():
+            self.notifications.append(text)
 
     def close(self) -> None:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
-            end.sendto(b"", str(self._path))
+        self._socket.shutdown(socket.SHUT_RDWR)
         self._thread.join()
         self._socket.close()
 
 
 def test_it_runs_unprivileged_and_ends_on_a_signal(ground: Ground, folder: Path) -> None:
-    device = claimed(ground, folder, "--transport", "http")
-    manager = Manager(folder / "notify")
-    run = unprivileged("-m", "device_agent", "run", "--home", str(folder / "agent"))
-    with contextlib.closing(manager), running(run, folder, {"NOTIFY_SOCKET": str(folder / "notify")}) as process:
-        wait_until(lambda: any("STATUS=running" in word for word in manager.heard), "it to be ready", PATIENCE_S)
-        wait_until(lambda: "WATCHDOG=1" in manager.heard[-1], "a sign of life")
-        wait_until(lambda: ground.anna.get(f"/devices/{device}").json()["online"], "it to be online", PATIENCE_S)
-        assert does(ground, device, MOVE)["status"] == "done"
-        script = does(ground, device, SCRIPT)
+    device = enroll(ground, folder, "--transport", "http")
+    home, notify = folder / "agent", folder / "notify"
+    with (
+        contextlib.closing(ServiceManager(notify)) as manager,
+        running(folder, "-m", "device_agent", NOTIFY_SOCKET=str(notify)) as process,
+    ):
+        wait_until(lambda: any("STATUS=running" in text for text in manager.notifications), "it to be ready")
+        wait_until(lambda: "WATCHDOG=1" in manager.notifications[-1], "the watchdog")
+        wait_until(lambda: online(ground, device), "it to be online")
+        assert end_of(ground, device, MOVE)["status"] == "done"
+        script = end_of(ground, device, SCRIPT)
         assert (script["status"], script["output"].strip()) == ("done", "here"), script
 
-        second = program(folder, "run")
+        second = program(folder, "-m", "device_agent", "run")
         assert (second.returncode, "already" in second.stderr) == (1, True), second.stderr
-        code, said = findings(folder)
-        assert code == 0, said
-        assert said["user"].startswith("ok")
-        assert said["scripts"].startswith(("ok", "warning"))
-        assert "not tested" in said["link"]
+        report = findings(folder)
+        assert report["user"].startswith("ok")
+        assert report["scripts"].startswith(("ok", "warning"))
+        assert "not tested" in report["link"]
 
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 0
-    wait_until(lambda: not ground.anna.get(f"/devices/{device}").json()["online"], "its goodbye")
-    home = folder / "agent"
+    wait_until(lambda: not online(ground, device), "it to be offline")
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in home.iterdir()}
     assert stat.S_IMODE(home.stat().st_mode) == 0o700
     assert {"identity.pem", "agent.toml", "pairing.json", "journal.db"} <= modes.keys()
     assert set(modes.values()) == {0o600}, modes
-    code, said = findings(folder)
-    assert code == 0, said
-    assert "connected" in said["link"], said
+    assert "connected" in findings(folder)["link"]
 
 
 ELSEWHERE = """
-import asyncio, json, multiprocessing, ssl, subprocess, sys, tempfile, zoneinfo
+import asyncio, json, multiprocessing.connection, ssl, subprocess, sys, tempfile, zoneinfo
 import cryptography.hazmat.primitives.asymmetric.ed25519, jwt, msgspec, mujoco, numpy, paho.mqtt.client, requests
 import ruckig, cryptography.hazmat.primitives.serialization, requests.adapters, urllib3.connectionpool, requests.auth
 import os, signal, socket
@@ -202,33 +196,22 @@ sys.platform = PLATFORM
 from device_agent.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """
-"""The agent's program, on a system that has nothing of Unix's own. Libraries are imported before it becomes one."""
+"""The agent's program without the features of Unix; libraries are imported before these are removed."""
 
 
 @pytest.mark.parametrize("platform", ["win32", pytest.param("darwin", marks=pytest.mark.long)])
 def test_without_a_sandbox_it_runs_without_scripts(ground: Ground, folder: Path, platform: str) -> None:
-    device = claimed(ground, folder, "--transport", "http" if platform == "win32" else "mqtt")
+    device = enroll(ground, folder, "--transport", "http" if platform == "win32" else "mqtt")
     source = ELSEWHERE.replace("PLATFORM", repr(platform))
-    run = unprivileged("-c", source, "run", "--home", str(folder / "agent"))
-    with running(run, folder, {}) as process:
-        wait_until(
-            lambda: ground.anna.get(f"/devices/{device}").json()["online"] or process.poll() is not None,
-            "it to be online",
-            PATIENCE_S,
-        )
+    with running(folder, "-c", source) as process:
+        wait_until(lambda: online(ground, device) or process.poll() is not None, "it to be online")
         assert process.poll() is None, (folder / "log").read_text()
-        assert does(ground, device, MOVE)["status"] == "done"
-        script = does(ground, device, SCRIPT)
+        assert end_of(ground, device, MOVE)["status"] == "done"
+        script = end_of(ground, device, SCRIPT)
         assert script["status"] == "failed"
         assert "scripts run on Linux only" in script["reason"]["message"]
-        assert does(ground, device, MOVE)["status"] == "done", "all else goes on"
-    done = subprocess.run(
-        unprivileged("-c", source, "doctor", "--home", str(folder / "agent")),
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+        assert end_of(ground, device, MOVE)["status"] == "done"
+    done = program(folder, "-c", source, "doctor")
     assert done.returncode == 0, done
     assert "warning  scripts: scripts run on Linux only" in done.stdout
     assert "Traceback" not in done.stderr

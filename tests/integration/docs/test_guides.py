@@ -1,22 +1,22 @@
 """The commands and files of the guides, executed from top to bottom."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.cloud.cloud_processes import Ground
 from tests.harness.documents import follow
+from tests.harness.network.brokers import BrokerKind
 from tests.harness.paths import ROOT
 
 GUIDES = ROOT / "docs" / "guides"
 
 
-@pytest.fixture(scope="module")
-def ground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
-    with start_ground("amqtt", tmp_path_factory.mktemp("page")) as ground:
-        yield ground
+@pytest.fixture
+def ground(grounds: Callable[[BrokerKind], Ground]) -> Ground:
+    return grounds("amqtt")
 
 
 @pytest.mark.timeout(300)
@@ -29,16 +29,12 @@ def test_add_a_robot_creates_a_robot_type_and_a_driver(ground: Ground, tmp_path:
     assert (tmp_path / "lever.png").read_bytes()[:4] == b"\x89PNG"
     assert len(re.findall(r"^\d+ passed", output, re.MULTILINE)) == 2, output
     assert "deselected" in output
-    assert ground.anna.ask("GET", "/robot-types/lever").json()["label"] == "A lever"
+    assert ground.anna.request("GET", "/robot-types/lever").json()["label"] == "A lever"
 
 
 @pytest.mark.parametrize(
     ("page", "expected"),
-    [
-        ("install-an-agent", "ur5"),
-        ("operate-a-site", "#sign-in="),
-        ("security-on-a-site", "site.example"),
-    ],
+    [("install-an-agent", "ur5"), ("operate-a-site", "#sign-in="), ("security-on-a-site", "site.example")],
 )
 def test_administration_commands_run_as_written(page: str, expected: str, tmp_path: Path) -> None:
     assert expected in follow(GUIDES / f"{page}.md", tmp_path, {})

@@ -1,4 +1,4 @@
-"""The same functions under each host: requests, the timer, and what devices say."""
+"""The same functions under each host: requests, the timer, and messages of devices."""
 
 import json
 from collections.abc import Iterator
@@ -39,52 +39,41 @@ def test_a_person_signs_in_with_a_cookie_and_out_again(there: Reached) -> None:
         fields = {part.strip().lower().partition("=")[0] for part in cookie.split(";")}
         assert fields >= {"path", "max-age", "httponly", "samesite"}
         assert anna.get("/accounts/me").json()["name"] == "anna"
-        gone = anna.post("/auth/sign-out", headers={CSRF_HEADER: answer.json()["csrf_token"]})
-        assert (gone.status_code, gone.content) == (204, b"")
+        signed_out = anna.post("/auth/sign-out", headers={CSRF_HEADER: answer.json()["csrf_token"]})
+        assert (signed_out.status_code, signed_out.content) == (204, b"")
         assert list(anna.cookies.jar) == []
         problem(anna.get("/accounts/me"), 401, "unauthorized")
 
 
-def test_bodies_come_and_go_whole(there: Reached) -> None:
-    document = there.ask("GET", f"{API}/openapi.json")
+def test_bodies_are_transferred_completely(there: Reached) -> None:
+    document = there.request("GET", f"{API}/openapi.json")
     assert len(document.content) == int(document.headers["content-length"]) > 50_000
     assert document.json()["openapi"].startswith("3.")
     sign_in = f"{API}/auth/sign-in"
-    problem(there.ask("POST", sign_in, content=b" " * (MAX_BODY + 1)), 413, "too-large")
-    problem(there.ask("POST", sign_in, content=b" " * MAX_BODY), 422, "invalid")
-    problem(there.ask("POST", sign_in, content=b"\x00\xff\xfe"), 422, "invalid")
-    problem(there.ask("POST", sign_in, content='{"link": "grüß 🤖"}'.encode()), 401, "unauthorized")
-    assert there.ask("HEAD", f"{API}/health").content == b""
+    problem(there.request("POST", sign_in, content=b" " * (MAX_BODY + 1)), 413, "too-large")
+    problem(there.request("POST", sign_in, content=b" " * MAX_BODY), 422, "invalid")
+    problem(there.request("POST", sign_in, content=b"\x00\xff\xfe"), 422, "invalid")
+    problem(there.request("POST", sign_in, content='{"link": "grüß 🤖"}'.encode()), 401, "unauthorized")
+    assert there.request("HEAD", f"{API}/health").content == b""
 
 
-@pytest.mark.parametrize(
-    "path",
-    ["/devices/%ff", "/devices/a%2Fb", "/devices/a+b%20c", "/devices/gr%C3%BC%C3%9F", "/devices/%25", "/devices/a;b=c"],
-)
-def test_an_odd_path_is_not_found(there: Reached, path: str) -> None:
+def test_invalid_paths_and_queries_are_problems(there: Reached) -> None:
     with there.sign_in("anna") as anna:
-        answer = anna.get(path)
-    assert answer.status_code in {404, 422}, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-
-
-def test_a_query_comes_as_it_was_sent(there: Reached) -> None:
-    with there.sign_in("anna") as anna:
+        for path in ("%ff", "a%2Fb", "a+b%20c", "gr%C3%BC%C3%9F", "%25", "a;b=c"):
+            answer = anna.get(f"/devices/{path}")
+            assert answer.status_code in {404, 422}, answer.text
+            assert answer.headers["content-type"] == "application/problem+json"
         problem(anna.get("/devices?cursor=%F0%9F%A4%96%20%26%3D%2B"), 422, "cursor-invalid")
         problem(anna.get("/devices?limit=5&limit=x"), 422, "invalid")
         problem(anna.get("/devices?cursor=%ff"), 422, "cursor-invalid")
-        assert anna.get("/devices?limit=5&cursor=").status_code in {200, 422}
-        assert anna.get("/devices?limit=1&limit=2").status_code in {200, 422}
-
-
-def test_no_route_and_no_method_are_problems_too(there: Reached) -> None:
-    with there.sign_in("anna") as anna:
+        for query in ("limit=5&cursor=", "limit=1&limit=2"):
+            assert anna.get(f"/devices?{query}").status_code in {200, 422}
         problem(anna.get("/nothing"), 404, "http")
         problem(anna.post("/devices"), 405, "http")
-    assert int(there.ask("GET", f"{API}/health").headers["x-telescope-time-ms"]) > 0
+    assert int(there.request("GET", f"{API}/health").headers["x-telescope-time-ms"]) > 0
 
 
-def test_what_a_device_says_is_taken_in_and_the_timer_ends_what_ran_out(there: Reached) -> None:
+def test_messages_of_devices_are_stored_and_the_timer_expires_actions(there: Reached) -> None:
     with there.sign_in("bert") as bert, there.robot() as robot:
         there.pair(bert, robot)
         assert bert.get(f"/devices/{robot.device}").json()["online"] is False
@@ -104,7 +93,7 @@ def test_what_a_device_says_is_taken_in_and_the_timer_ends_what_ran_out(there: R
         wait_until(ended, "the timer to end the action", PATIENCE_S)
 
 
-def test_an_error_reaches_the_host_so_that_it_delivers_again(kind: HostKind, tmp_path: Path) -> None:
+def test_an_error_reaches_the_host_which_delivers_again(kind: HostKind, tmp_path: Path) -> None:
     with start_host(kind, {"TELESCOPE_HOME": str(tmp_path)}) as host:
         for file in tmp_path.glob("tables.sqlite*"):
             file.unlink()
@@ -116,8 +105,8 @@ def test_an_error_reaches_the_host_so_that_it_delivers_again(kind: HostKind, tmp
         problem(httpx.post(f"{host.url}{API}/auth/sign-in", json={"link": "x"}), 503, "store-unavailable")
 
 
-def test_a_robot_that_polls_does_what_it_is_asked(there: Reached) -> None:
-    """Without a broker anywhere: all that it needs is HTTP."""
+def test_a_polling_robot_executes_actions(there: Reached) -> None:
+    """It needs no broker, only HTTP."""
     with there.sign_in("anna") as anna, PollingRobot(there, wait_ms=0, pause_s=0.1) as robot:
         there.pair(anna, robot)
         robot.connect()
@@ -128,4 +117,4 @@ def test_a_robot_that_polls_does_what_it_is_asked(there: Reached) -> None:
         robot.report(action, AckStatus.DONE)
         assert anna.get(f"/actions/{action}").json()["status"] == "done"
         assert len(robot.payloads[action]) >= 1
-        assert [command.id for command in robot.heard(MoveJoints)] == [action]
+        assert [command.id for command in robot.received(MoveJoints)] == [action]

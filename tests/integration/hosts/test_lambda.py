@@ -1,4 +1,4 @@
-"""What only Lambda does: one request for each instance at a time, events in batches, and frost between two."""
+"""Only Lambda: one request per instance at a time, events in batches, and frozen instances between them."""
 
 import base64
 import json
@@ -23,9 +23,8 @@ def host(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lambda]:
     console.mkdir()
     (console / "index.html").write_text("<p>grüß</p>", encoding="utf-8")
     (console / "picture.png").write_bytes(bytes(range(256)))
-    with start_lambda(
-        {"TELESCOPE_HOME": str(home), "TELESCOPE_MQTT_PORT": "1", "TELESCOPE_CONSOLE": str(console)}
-    ) as running:
+    environment = {"TELESCOPE_HOME": str(home), "TELESCOPE_MQTT_PORT": "1", "TELESCOPE_CONSOLE": str(console)}
+    with start_lambda(environment) as running:
         yield running
 
 
@@ -33,7 +32,7 @@ def record(number: int, **body: object) -> dict[str, object]:
     return {"messageId": str(number), "eventSource": "aws:sqs", "body": json.dumps(body)}
 
 
-def test_of_a_batch_only_what_was_not_stored_stays_in_the_queue(host: Lambda, tmp_path: Path) -> None:
+def test_only_unstored_messages_of_a_batch_stay_in_the_queue(host: Lambda, tmp_path: Path) -> None:
     presence = base64.b64encode(b'{"online":true,"session":1,"at_ms":1}').decode()
     batch = {"Records": [record(1, topic="ts/v1/s/a/conn", payload=presence), record(2, nonsense=1)]}
     assert host.invoke(batch) == {"batchItemFailures": []}
@@ -48,26 +47,23 @@ def test_an_unknown_event_is_an_error_and_the_instance_continues(host: Lambda) -
     host.tick()
 
 
-def test_instances_serve_requests_at_once_and_stay_warm(host: Lambda) -> None:
+def test_instances_serve_requests_at_once_stay_warm_and_are_frozen_between_requests(host: Lambda) -> None:
     with ThreadPoolExecutor(3) as callers:
         answers = list(callers.map(lambda _: httpx.get(f"{host.url}{API}/health", timeout=PATIENCE_S), range(3)))
     assert [answer.status_code for answer in answers] == [200] * 3
     instances = list(host.instances)
+    assert len(instances) <= 3
     for _ in range(20):
         assert httpx.get(f"{host.url}{API}/nothing", timeout=PATIENCE_S).status_code == 404
-    assert host.instances == instances
-    assert len(instances) <= 3
-
-
-def test_an_instance_is_frozen_between_two_requests(host: Lambda) -> None:
     host.tick()
-    for instance in host.instances:
+    assert host.instances == instances
+    for instance in instances:
         assert instance.program is not None
         state = Path(f"/proc/{instance.program.process.pid}/stat")
-        wait_until(lambda path=state: path.read_text().rpartition(")")[2].split()[0] == "T", "frost")  # type: ignore[misc]
+        wait_until(lambda path=state: path.read_text().rpartition(")")[2].split()[0] == "T", "the freeze")  # type: ignore[misc]
 
 
-def test_what_is_no_text_comes_out_byte_by_byte(host: Lambda) -> None:
+def test_binary_files_are_sent_unchanged(host: Lambda) -> None:
     answer = httpx.get(f"{host.url}/picture.png", timeout=PATIENCE_S)
     assert (answer.content, answer.headers["content-type"]) == (bytes(range(256)), "image/png")
     assert httpx.get(host.url, timeout=PATIENCE_S).content == "<p>grüß</p>".encode()

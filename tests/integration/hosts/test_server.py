@@ -1,5 +1,6 @@
-"""The functions as programs: a real server over real sockets, and what its terminal says."""
+"""The server on one machine: a real process over real sockets, its commands, and their output in a terminal."""
 
+import asyncio
 import json
 import os
 import socket
@@ -11,43 +12,45 @@ from pathlib import Path
 import httpx
 import pytest
 
+from function_app.entrypoints.hosts.uvicorn import listen
 from function_app.entrypoints.http.framework.responses import MAX_BODY
+from tests.conftest import Emulators
 from tests.harness.cloud.cloud import API, problem
 from tests.harness.network.brokers import PATIENCE_S, wait_until
 from tests.harness.paths import ROOT
+from tests.harness.stores.aws import use_credentials
+from tests.harness.stores.emulators import empty_store
+from tests.harness.terminal import RunCommand, command_runner
+
+LOOPBACK = "127.0.0.1"
 
 
-def environment(home: Path, port: int) -> dict[str, str]:
-    return {**os.environ, "TELESCOPE_HOME": str(home), "TELESCOPE_PORT": str(port), "TELESCOPE_MQTT_PORT": "1"}
-
-
-def start(home: Path, port: int, *command: str) -> "subprocess.Popen[str]":
+def start(home: Path, port: int, command: str) -> "subprocess.Popen[str]":
+    variables = {"TELESCOPE_HOME": str(home), "TELESCOPE_PORT": str(port), "TELESCOPE_MQTT_PORT": "1"}
     return subprocess.Popen(
-        [sys.executable, "-m", "function_app", *command],
+        [sys.executable, "-m", "function_app", command],
         cwd=ROOT,
-        env=environment(home, port),
+        env={**os.environ, **variables},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
 
 
-def run(home: Path, port: int, *command: str) -> tuple[int, str, str]:
-    with start(home, port, *command) as process:
-        out, err = process.communicate(timeout=3 * PATIENCE_S)
-        return process.returncode, out, err
-
-
 def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
+    with socket.create_server((LOOPBACK, 0)) as found:
         port: int = found.getsockname()[1]
         return port
 
 
-def answers(port: int) -> bool:
+def accepts_connections(port: int) -> bool:
     with socket.socket() as caller:
-        return caller.connect_ex(("127.0.0.1", port)) == 0
+        return caller.connect_ex((LOOPBACK, port)) == 0
+
+
+@pytest.fixture
+def run_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> RunCommand:
+    return command_runner(monkeypatch, capsys)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +64,7 @@ def server(home: Path) -> Iterator[int]:
     port = free_port()
     with start(home, port, "serve") as process:
         try:
-            wait_until(lambda: answers(port) or process.poll() is not None, "the server")
+            wait_until(lambda: accepts_connections(port) or process.poll() is not None, "the server")
             assert process.poll() is None
             yield port
         finally:
@@ -72,47 +75,38 @@ def server(home: Path) -> Iterator[int]:
         assert "Traceback" not in process.stderr.read()
 
 
-UPGRADE = (
-    b"GET /mqtt HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-)
-
-
 def raw(port: int, request: bytes) -> bytes:
-    """Bytes to the server, and all that comes back."""
-    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as caller:
+    """Send bytes to the server; returns the whole response."""
+    with socket.create_connection((LOOPBACK, port), timeout=PATIENCE_S) as caller:
         caller.sendall(request)
         caller.shutdown(socket.SHUT_WR)
-        parts = []
-        while part := caller.recv(65_536):
-            parts.append(part)
-    return b"".join(parts)
+        return b"".join(iter(lambda: caller.recv(65_536), b""))
 
 
-def test_a_link_from_the_terminal_signs_in(home: Path, server: int) -> None:
-    code, out, err = run(home, server, "sign-in-link", "--account", "anna")
-    assert (code, err) == (0, "")
-    address, _, link = out.strip().partition("/#sign-in=")
-    assert address == f"http://127.0.0.1:{server}"
-    answer = httpx.post(f"{address}{API}/auth/sign-in", json={"link": link})
-    assert answer.json()["account"]["name"] == "anna"
-    assert "server" not in answer.headers
-    assert int(answer.headers["x-telescope-time-ms"]) > 0
-    token = {"Authorization": f"Bearer {answer.json()['access_token']}"}
+def test_a_link_from_the_terminal_signs_in(home: Path, server: int, run_command: RunCommand) -> None:
+    arguments = ("sign-in-link", "--account", "anna")
+    ended = run_command(*arguments, TELESCOPE_HOME=str(home), TELESCOPE_PORT=str(server))
+    assert (ended.code, ended.err) == (0, "")
+    address, _, link = ended.out.strip().partition("/#sign-in=")
+    assert address == f"http://{LOOPBACK}:{server}"
+    response = httpx.post(f"{address}{API}/auth/sign-in", json={"link": link})
+    assert response.json()["account"]["name"] == "anna"
+    assert "server" not in response.headers
+    token = {"Authorization": f"Bearer {response.json()['access_token']}"}
     with httpx.Client(base_url=address + API, headers=token) as anna:
         assert anna.get("/devices").json() == {"items": [], "cursor": None}
-        problem(anna.get("/nothing"), 404, "http")
-        problem(anna.post("/devices"), 405, "http")
         health = anna.get("/health").json()
         assert (health["status"], health["tables"]) == ("degraded", "ok")
+    for name in ("keys", "keys/ring.json", "tables.sqlite"):
+        assert (home / name).stat().st_mode & 0o077 == 0, name
+    assert len(json.loads((home / "keys" / "public.json").read_text())) == 1
 
 
-def test_too_long_a_body_is_refused_over_a_socket_too(server: int) -> None:
-    url = f"http://127.0.0.1:{server}{API}/auth/sign-in"
-    body = b"x" * (MAX_BODY + 1)
-    problem(httpx.post(url, content=body), 413, "too-large")
-    problem(httpx.post(url, content=iter([body[:700_000], body[700_000:]])), 413, "too-large")
-    problem(httpx.post(url, content=b" " * MAX_BODY), 422, "invalid")
+def test_a_body_of_unknown_length_may_not_be_too_long(server: int) -> None:
+    url = f"http://{LOOPBACK}:{server}{API}/auth/sign-in"
+    parts = [bytes(MAX_BODY), b"x"]
+    problem(httpx.post(url, content=iter(parts)), 413, "too-large")
+    problem(httpx.post(url, content=iter(parts[:1])), 422, "invalid")
 
 
 @pytest.mark.parametrize(
@@ -125,57 +119,93 @@ def test_too_long_a_body_is_refused_over_a_socket_too(server: int) -> None:
         b"GET /\xff\xfe HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n",
         b"GET /api/v1/devices/%ff%00%ed%a0%80 HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n",
         b"GET /api/v1/devices?cursor=%ff%00 HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer \xff\r\n\r\n",
-        UPGRADE,
+        (
+            b"GET /mqtt HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+        ),
     ],
     ids=["no http", "version", "length", "half", "path", "device", "query", "websocket"],
 )
-def test_nonsense_does_not_disturb_it(server: int, request_: bytes) -> None:
-    said = raw(server, request_)
-    assert b" 500 " not in said.partition(b"\r\n")[0]
-    assert httpx.get(f"http://127.0.0.1:{server}{API}/health").status_code == 200
+def test_an_invalid_request_does_not_disturb_the_server(server: int, request_: bytes) -> None:
+    assert b" 500 " not in raw(server, request_).partition(b"\r\n")[0]
+    assert httpx.get(f"http://{LOOPBACK}:{server}{API}/health").status_code == 200
 
 
-def test_a_taken_port_is_one_line_and_exit_code_3(tmp_path: Path, server: int) -> None:
-    code, out, err = run(tmp_path, server, "serve")
-    assert (code, out) == (3, "")
+def test_responses_are_sent_at_once_on_every_accepted_connection() -> None:
+    """Nagle's algorithm and the client's delayed acknowledgement together cost 40 ms per response."""
+
+    async def nodelay_of_accepted() -> int:
+        option: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+
+        async def serve(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            accepted = writer.get_extra_info("socket")
+            option.set_result(accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+            writer.close()
+
+        async with await asyncio.start_server(serve, sock=listen(LOOPBACK, 0)) as server:
+            _, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+            try:
+                return await asyncio.wait_for(option, PATIENCE_S)
+            finally:
+                writer.close()
+                await writer.wait_closed()
+
+    assert asyncio.run(nodelay_of_accepted())
+
+
+# ---------------------------------------------------------------- errors in the terminal
+
+
+def test_a_port_in_use_is_one_line_and_exit_code_3(tmp_path: Path, server: int) -> None:
+    with start(tmp_path, server, "serve") as process:
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, out) == (3, "")
     assert err == (
-        f"telescope-server: 127.0.0.1:{server} cannot be used (Address already in use); "
+        f"telescope-server: {LOOPBACK}:{server} cannot be used (Address already in use); "
         "set TELESCOPE_PORT to a free port\n"
     )
 
 
-@pytest.mark.parametrize("command", ["serve", "sign-in-link"])
-def test_a_damaged_file_of_tables_is_one_line_and_left_as_it_is(tmp_path: Path, command: str) -> None:
-    damaged = tmp_path / "tables.sqlite"
-    damaged.write_bytes(b"no database " * 1000)
-    code, out, err = run(tmp_path, free_port(), command)
-    assert (code, out, err.count("\n")) == (1, "", 1)
-    assert err.startswith(f"telescope-server: the tables in {damaged} are damaged")
-    assert damaged.read_bytes() == b"no database " * 1000
+@pytest.mark.parametrize(
+    ("command", "file", "expected"),
+    [
+        ("serve", "tables.sqlite", "the tables in {file} are damaged"),
+        ("sign-in-link", "tables.sqlite", "the tables in {file} are damaged"),
+        ("serve", "keys/ring.json", "the signing keys in {file.parent} cannot be used"),
+    ],
+)
+def test_a_damaged_file_is_one_line_and_left_as_it_is(
+    tmp_path: Path, run_command: RunCommand, command: str, file: str, expected: str
+) -> None:
+    damaged = tmp_path / file
+    damaged.parent.mkdir(exist_ok=True)
+    damaged.write_bytes(b"no data " * 1000)
+    ended = run_command(command, TELESCOPE_HOME=str(tmp_path), TELESCOPE_PORT=str(free_port()))
+    assert (ended.code, ended.out, ended.err.count("\n")) == (1, "", 1)
+    assert ended.err.startswith("telescope-server: " + expected.format(file=damaged))
+    assert damaged.read_bytes() == b"no data " * 1000
 
 
-def test_damaged_keys_are_one_line_and_left_as_they_are(tmp_path: Path) -> None:
-    damaged = tmp_path / "keys" / "ring.json"
-    damaged.parent.mkdir()
-    damaged.write_text("no key")
-    code, out, err = run(tmp_path, free_port(), "serve")
-    assert (code, out, err.count("\n")) == (1, "", 1)
-    assert err.startswith(f"telescope-server: the signing keys in {damaged.parent} cannot be used")
-    assert damaged.read_text() == "no key"
+def test_a_missing_table_is_one_line_and_prepare_makes_it(
+    tmp_path: Path, emulators: Emulators, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_credentials(monkeypatch)
+    store = {"TELESCOPE_HOME": str(tmp_path), **empty_store("aws", emulators("aws"))}
+    for command in ("serve", "work", "sign-in-link"):
+        ended = run_command(command, environment=store)
+        assert (ended.code, ended.out, ended.err.count("\n")) == (1, "", 1), ended.err
+        assert f"the DynamoDB table '{store['TELESCOPE_AWS_TABLE']}' in eu-west-1" in ended.err
+        assert "`python -m function_app prepare`" in ended.err
+    assert [run_command("prepare", environment=store) for _ in range(2)] == [(0, "", "")] * 2
+    ended = run_command("sign-in-link", environment=store)
+    assert (ended.code, ended.err) == (0, "")
+    assert "#sign-in=" in ended.out
 
 
-def test_the_worker_ends_when_it_is_told_to(tmp_path: Path) -> None:
+def test_the_worker_ends_on_sigterm(tmp_path: Path) -> None:
     with start(tmp_path, free_port(), "work") as process:
         wait_until((tmp_path / "tables.sqlite").exists, "the worker")
         process.terminate()
         _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     assert "Traceback" not in err
-
-
-def test_private_files_are_for_their_owner_only(home: Path, server: int) -> None:
-    assert server
-    assert (home / "keys" / "ring.json").stat().st_mode & 0o077 == 0
-    assert (home / "keys").stat().st_mode & 0o077 == 0
-    assert (home / "tables.sqlite").stat().st_mode & 0o077 == 0
-    assert len(json.loads((home / "keys" / "public.json").read_text())) == 1

@@ -14,19 +14,11 @@ from function_app.services.actions.requests import ActionRequest
 from function_app.services.maintenance.scheduler import ORPHAN_MS
 from function_app.services.storage import records
 from function_app.services.storage.reminders import SHARDS
-from tests.harness.processes import (
-    Place,
-    SetClock,
-    Work,
-    commands_sent,
-    new_public_key,
-    show_code,
-)
+from tests.harness.processes import Place, SetClock, Work, commands_sent, new_public_key, show_code
 
 TTL_S, TIMEOUT_S, QUEUE_S = 2, 6, 10
 MOVE = MoveJoints(position_rad={"elbow": 1.0})
 TERMINAL = {"done", "failed", "expired", "cancelled"}
-MOST_STEPS = 60
 
 
 def asked(**more: Any) -> ActionRequest:
@@ -127,6 +119,10 @@ async def report_done(functions: Functions, scene: Scene) -> None:
     await report(functions, scene.action, AckStatus.DONE)
 
 
+async def report_failed(functions: Functions, scene: Scene) -> None:
+    await report(functions, scene.action, AckStatus.FAILED)
+
+
 async def take(functions: Functions, scene: Scene) -> None:
     await functions.leases.acquire(scene.who, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
 
@@ -178,6 +174,7 @@ CASES: dict[str, tuple[Callable[[Functions], Awaitable[Scene]], Work, int]] = {
     "cancel": (running, cancel, 2),
     "the end, reported": (running, report_done, 1),
     "the end before a queue": (queued, report_done, 4),
+    "the failure before a queue": (queued, report_failed, 4),
     "take": (idle, take, 2),
     "take again": (running, take, 2),
     "release": (running, release, 2),

@@ -19,19 +19,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folders = {}
     for name, source in DISTRIBUTIONS.items():
         folders[name] = tmp_path_factory.mktemp(name)
-        command = [
-            sys.executable,
-            "-m",
-            "pip",
-            "install",
-            "--quiet",
-            "--disable-pip-version-check",
-            "--no-deps",
-            "--no-build-isolation",
-        ]
-        done = subprocess.run(
-            [*command, "--target", folders[name], source], capture_output=True, text=True, check=False
-        )
+        command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"]
+        options = ["--no-deps", "--no-build-isolation", "--target", str(folders[name]), str(source)]
+        done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
     return folders
 

@@ -1,26 +1,23 @@
-"""Everything that may become of a request for control, done by as many processes in one moment: one thing happens."""
+"""All ways to end a request for control, tried by as many processes at the same moment: one succeeds."""
 
-import contextlib
 import json
-import queue
 from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 from unittest import mock
 
 import pytest
 
 from function_app.bootstrap import Functions
-from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
 from function_app.services.actions import stop
 from function_app.services.storage import records
-from tests.harness.processes import PATIENCE_S, PROCESSES, Place, begin, commands_sent, killed, run_here, show_code
+from tests.harness.processes import Place, claimed_devices, commands_sent, race, run_here
 
 RACERS = ("accept", "refuse", "withdraw", "release", "take over", "reset")
 RAISES = {"accept", "take over", "reset"}
-"""What gives the next epoch."""
-DEVICES_OF_AGENT = 20
+"""Operations that give the next epoch."""
 ENDS = {
     "control-handed-over": "accepted",
     "control-request-refused": "rejected",
@@ -30,7 +27,7 @@ ENDS = {
 
 @dataclass(frozen=True)
 class Scene:
-    """Devices whose holder is asked for control."""
+    """Devices of which another session requests control."""
 
     account: str
     devices: list[str]
@@ -40,26 +37,22 @@ class Scene:
         return Identity(self.account, session, session)
 
 
-def prepare(place: Place, rounds: int) -> Scene:
-    async def work(functions: Functions) -> Scene:
-        account = (await functions.sign_in.account("owner")).id
-        holder, asker = Identity(account, "holder", "holder"), Identity(account, "asker", "asker")
-        devices: list[str] = []
-        while len(devices) < rounds:
-            names = [f"d{number}" for number in range(DEVICES_OF_AGENT)]
-            agent, code = await show_code(functions, names)
-            await functions.claim.claim(holder, code, None)
-            devices += [f"{agent}-{name}" for name in names]
-        requests = []
-        for device in devices[:rounds]:
-            await functions.leases.acquire(holder, device, epoch=None, lease_ms=600_000, wait_ms=0)
-            _, asked, _, _ = await functions.control_requests.create(
-                asker, device, within_ms=60_000, lease_ms=600_000, wait_ms=0
-            )
-            requests.append(asked.id)
-        return Scene(account, devices[:rounds], requests)
+async def prepare(functions: Functions, rounds: int) -> Scene:
+    account = (await functions.sign_in.account("owner")).id
+    holder, asker = Identity(account, "holder", "holder"), Identity(account, "asker", "asker")
+    devices = await claimed_devices(functions, holder, rounds)
+    requests = []
+    for device in devices:
+        await functions.leases.acquire(holder, device, epoch=None, lease_ms=600_000, wait_ms=0)
+        _, request, _, _ = await functions.control_requests.create(
+            asker, device, within_ms=60_000, lease_ms=600_000, wait_ms=0
+        )
+        requests.append(request.id)
+    return Scene(account, devices, requests)
 
-    return run_here(place, work)
+
+def attempts(functions: Functions, scene: Scene, racer: str) -> Iterator[Callable[[], Awaitable[object]]]:
+    return (partial(act, functions, racer, scene, number) for number in range(len(scene.devices)))
 
 
 async def act(functions: Functions, what: str, scene: Scene, number: int) -> None:
@@ -81,21 +74,8 @@ async def act(functions: Functions, what: str, scene: Scene, number: int) -> Non
                 await functions.stop.reset(third, device)
 
 
-async def race(functions: Functions, scene: Scene, what: str, barrier: Any, results: Any) -> None:
-    """One process: does its thing to each device as soon as all others are ready to."""
-    found = []
-    for number in range(len(scene.devices)):
-        barrier.wait(PATIENCE_S)
-        try:
-            await act(functions, what, scene, number)
-            found.append("done")
-        except Problem as problem:
-            found.append(problem.code)
-    results.put((what, found))
-
-
 async def look(functions: Functions, scene: Scene, number: int, did: dict[str, str]) -> str:
-    """That rows, answers, events and orders tell of one and the same course; gives what became of the request."""
+    """Check that rows, responses and events agree; returns the outcome of the request."""
     device = scene.devices[number]
     row = await functions.tables.get(records.CONTROL, device, "now:lease")
     assert row is not None
@@ -115,7 +95,7 @@ async def look(functions: Functions, scene: Scene, number: int, did: dict[str, s
 
 
 def orders(place: Place) -> dict[tuple[str, int], Counter[str]]:
-    """Kinds of orders by device and epoch."""
+    """Kinds of commands by device and epoch."""
     found: dict[tuple[str, int], Counter[str]] = {}
     for payloads in commands_sent(place).values():
         for payload in payloads:
@@ -125,38 +105,26 @@ def orders(place: Place) -> dict[tuple[str, int], Counter[str]]:
     return found
 
 
-@pytest.mark.parametrize(("place", "rounds"), [("local", 120)], indirect=["place"])
-def test_of_all_that_may_become_of_a_request_one_thing_does(place: Place, rounds: int) -> None:
-    see_one_outcome(place, rounds)
+def check_one_outcome(place: Place, rounds: int) -> None:
+    scene = run_here(place, partial(prepare, rounds=rounds))
+    found = race(place, attempts, scene, RACERS)
+
+    async def look_at_all(functions: Functions) -> set[str]:
+        return {await look(functions, scene, n, {what: found[what][n] for what in RACERS}) for n in range(rounds)}
+
+    outcomes = run_here(place, look_at_all)
+    assert len(outcomes) > 1, f"no race occurred: {outcomes}"
+    for (device, epoch), kinds in orders(place).items():
+        assert kinds["grant_lease"] + kinds["reset_stop"] <= 1, f"epoch {epoch} of {device} was given twice"
+
+
+@pytest.mark.parametrize("place", ["local"], indirect=True)
+def test_a_request_for_control_has_one_outcome(place: Place) -> None:
+    check_one_outcome(place, 60)
 
 
 @pytest.mark.long
 @pytest.mark.timeout(1_800)
 @pytest.mark.parametrize(("place", "rounds"), [("local", 3_000), ("azure", 200), ("aws", 100)], indirect=["place"])
-def test_so_it_is_thousands_of_times_and_over_the_clouds_stores(place: Place, rounds: int) -> None:
-    see_one_outcome(place, rounds)
-
-
-def see_one_outcome(place: Place, rounds: int) -> None:
-    scene = prepare(place, rounds)
-    barrier, results = PROCESSES.Barrier(len(RACERS)), PROCESSES.Queue()
-    racing = [begin(place, race, scene, what, barrier, results) for what in RACERS]
-    found: dict[str, list[str]] = {}
-    while len(found) < len(RACERS):
-        with contextlib.suppress(queue.Empty):
-            what, answers = results.get(timeout=1)
-            found[what] = answers
-        assert not any(process.exitcode for process in racing), "one of them failed: its traceback is above"
-    for process in racing:
-        assert not killed(process)
-
-    async def whole(functions: Functions) -> Counter[str]:
-        return Counter(
-            [await look(functions, scene, n, {what: found[what][n] for what in RACERS}) for n in range(rounds)]
-        )
-
-    outcomes = run_here(place, whole)
-    assert len(outcomes) > 1, f"no race occurred: {outcomes}"
-    for (device, epoch), kinds in orders(place).items():
-        granted = kinds["grant_lease"] + kinds["reset_stop"]
-        assert granted <= 1, f"epoch {epoch} of {device} was given twice"
+def test_a_request_for_control_has_one_outcome_again_and_again(place: Place, rounds: int) -> None:
+    check_one_outcome(place, rounds)

@@ -5,8 +5,8 @@ import random
 import statistics
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
 
 import pytest
 
@@ -38,7 +38,7 @@ class Gate:
     late: int = 0
 
     def watch(self) -> None:
-        obey = self.robot.obey
+        obey = self.robot.handle
 
         def hear(message: Message) -> None:
             topic = topics.parse(message.topic)
@@ -54,7 +54,7 @@ class Gate:
                     self._judge(command.epoch, 0.0)
                     self.ordered.append(command.id)
 
-        self.robot.obey = hear  # type: ignore[method-assign]
+        self.robot.handle = hear  # type: ignore[method-assign]
 
     def _judge(self, epoch: int, sent_s: float) -> None:
         if epoch < self.epoch:
@@ -63,33 +63,18 @@ class Gate:
             self.done.append(sent_s)
 
 
-class Meddler(threading.Thread):
-    """Streams setpoints until its connection ends; a second one starts actions until it is refused."""
-
-    def __init__(self, work: Any) -> None:
-        super().__init__(daemon=True)
-        self._work = work
-        self.failed: list[BaseException] = []
-
-    def run(self) -> None:
-        try:
-            self._work()
-        except BaseException as error:  # noqa: BLE001 (shown by the test)
-            self.failed.append(error)
-
-
 def one_round(broker: RunningBroker, anna: Person, bert: Person, gate: Gate, chance: random.Random) -> float:
     """Share, operate, un-share in the middle of it; how long the last of both sessions lived after it was asked [s]."""
     robot, at = gate.robot, f"/devices/{gate.robot.device}/shares"
     assert anna.post(at, {"account": bert.name, "role": "operator"}).status_code == 201
-    epoch = bert.take(robot.device, lease_ms=600_000).json()["epoch"]
+    epoch = bert.take_lease(robot.device, lease_ms=600_000).json()["epoch"]
     page = connect(broker, bert, purpose="view")
     stick = connect(broker, bert, purpose="control", device=robot.device, epoch=epoch)
     topic = f"{topics.ROOT}/{robot.space}/{robot.id}/{robot.names[0]}/{topics.CTL}/{epoch}"
     ended = threading.Event()
 
     def stream() -> None:
-        while not stick.disconnected.is_set():
+        while not (stick.disconnected.is_set() or ended.is_set()):
             stick.publish(topic, repr(time.monotonic()), qos=0)
             time.sleep(STREAM_S)
 
@@ -100,26 +85,26 @@ def one_round(broker: RunningBroker, anna: Person, bert: Person, gate: Gate, cha
                 return
             assert answer.status_code in {202, 409}, answer.text
 
-    meddlers = [Meddler(stream), Meddler(order)]
-    for meddler in meddlers:
-        meddler.start()
     before = len(gate.done)
-    wait_until(lambda: len(gate.done) > before + 3, "setpoints at the robot")
-    time.sleep(chance.uniform(0.0, 0.05))
-    asked_s = time.monotonic()
-    assert anna.delete(f"{at}/{bert.account}").status_code == 204
-    answered_s = time.monotonic()
-    wait_until(lambda: page.disconnected.is_set() and stick.disconnected.is_set(), "the cut of both sessions")
-    cut_s = time.monotonic() - asked_s
-    ended.set()
-    for meddler in meddlers:
-        meddler.join(20)
-        assert not meddler.failed, meddler.failed
+    with ThreadPoolExecutor() as pool:
+        running = [pool.submit(stream), pool.submit(order)]
+        try:
+            wait_until(lambda: len(gate.done) > before + 3, "setpoints at the robot")
+            time.sleep(chance.uniform(0.0, 0.05))
+            asked_s = time.monotonic()
+            assert anna.delete(f"{at}/{bert.account}").status_code == 204
+            answered_s = time.monotonic()
+            wait_until(lambda: page.disconnected.is_set() and stick.disconnected.is_set(), "the cut of both sessions")
+            cut_s = time.monotonic() - asked_s
+        finally:
+            ended.set()
+        for each in running:
+            each.result(20)
     for client in (page, stick):
         client.close()
     wait_until(lambda: gate.epoch > epoch, "the burned epoch at the robot")
     problem(bert.start(robot.device, epoch=epoch), 404, "device-unknown")
-    problem(bert.take(robot.device, epoch=epoch), 404, "device-unknown")
+    problem(bert.take_lease(robot.device, epoch=epoch), 404, "device-unknown")
     assert [sent_s for sent_s in gate.done if sent_s > answered_s] == [], "carried out although sent after the end"
     for action in gate.ordered:
         assert anna.action(action)["status"] in {"failed", "done"}
@@ -128,30 +113,18 @@ def one_round(broker: RunningBroker, anna: Person, bert: Person, gate: Gate, cha
     return cut_s
 
 
-def rounds(cloud: Cloud, broker: RunningBroker, pair: tuple[Person, Robot], number: int) -> list[float]:
+@pytest.mark.parametrize("broker", BROKERS, indirect=True)
+@pytest.mark.parametrize("number", [3, pytest.param(200, marks=[pytest.mark.long, pytest.mark.timeout(1_800)])])
+def test_an_operator_is_cut_off_at_the_end_of_a_share_and_nothing_sent_later_is_carried_out(
+    cloud: Cloud, broker: RunningBroker, pair: tuple[Person, Robot], number: int
+) -> None:
     anna, robot = pair
     bert, gate, chance = cloud.sign_in("bert"), Gate(robot), random.Random(number)  # noqa: S311 (the same each time)
     gate.watch()
-    return [one_round(broker, anna, bert, gate, chance) for _ in range(number)]
-
-
-@pytest.mark.parametrize("broker", BROKERS, indirect=True)
-def test_who_is_unshared_while_operating_is_cut_off_and_nothing_is_carried_out_after_it(
-    cloud: Cloud, broker: RunningBroker, pair: tuple[Person, Robot]
-) -> None:
-    assert len(rounds(cloud, broker, pair, 3)) == 3
-
-
-@pytest.mark.long
-@pytest.mark.timeout(1_800)
-@pytest.mark.parametrize("broker", BROKERS, indirect=True)
-def test_live_sessions_are_cut_within_a_second_in_hundreds_of_rounds(
-    cloud: Cloud, broker: RunningBroker, pair: tuple[Person, Robot]
-) -> None:
-    took = sorted(rounds(cloud, broker, pair, 200))
+    took = sorted(one_round(broker, anna, bert, gate, chance) for _ in range(number))
     p99_s = took[int(0.99 * len(took))]
     _log.warning(
         "%s: %d rounds, cut after %.0f ms in the median, %.0f ms p99, %.0f ms at most; 0 carried out after it",
         broker.kind, len(took), 1000 * statistics.median(took), 1000 * p99_s, 1000 * took[-1],
     )  # fmt: skip
-    assert p99_s <= CUT_S
+    assert number < 100 or p99_s <= CUT_S

@@ -61,7 +61,7 @@ def test_who_unshares_while_the_broker_is_away_is_told_so_at_once_and_nothing_is
         bert = cloud.sign_in("bert")
         at = f"/devices/{robot.device}/shares"
         anna.post(at, {"account": "bert", "role": "operator"})
-        epoch = bert.take(robot.device, lease_ms=600_000).json()["epoch"]
+        epoch = bert.take_lease(robot.device, lease_ms=600_000).json()["epoch"]
         running = bert.start(robot.device, epoch=epoch, wait_ms=10_000).json()["id"]
         held = [
             request_credentials(bert, purpose="view"),
@@ -77,7 +77,7 @@ def test_who_unshares_while_the_broker_is_away_is_told_so_at_once_and_nothing_is
         assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
         assert anna.action(running)["reason"]["code"] == "unshared"
         if then == "owner":
-            assert anna.take(robot.device).json()["epoch"] == epoch + 2
+            assert anna.take_lease(robot.device).json()["epoch"] == epoch + 2
         site.come_back()
         if then == "offline":
             robot.connect()
@@ -85,20 +85,16 @@ def test_who_unshares_while_the_broker_is_away_is_told_so_at_once_and_nothing_is
         def seen_to() -> bool:
             cloud.clock.advance(1)
             cloud.sweep()
-            notes = [row.key for shard in range(SHARDS) for row in cloud.run(pending(cloud, shard)).rows]
-            return not any("share-changed" in key for key in notes)
+            pages = (cloud.run(cloud.functions.tables.query(records.PENDING, str(n))) for n in range(SHARDS))
+            return not any("share-changed" in row.key for page in pages for row in page.rows)
 
         wait_until(seen_to, "the timer to have told the broker")
         for client_id, credentials in held:
             with site.broker.connect(client_id, credentials) as late:
                 assert not late.connected.is_set(), "revoked credentials"
         if then == "offline":
-            wait_until(lambda: robot.heard(ReleaseLease), "the end of control at the robot")
-            assert robot.heard(ReleaseLease)[-1].epoch == epoch + 1
-
-
-def pending(cloud: Cloud, shard: int) -> Any:
-    return cloud.functions.tables.query(records.PENDING, str(shard))
+            wait_until(lambda: robot.received(ReleaseLease), "the end of control at the robot")
+            assert robot.received(ReleaseLease)[-1].epoch == epoch + 1
 
 
 def test_an_unresponsive_broker_does_not_delay_requests(
@@ -106,7 +102,7 @@ def test_an_unresponsive_broker_does_not_delay_requests(
 ) -> None:
     anna, bert, robot = operator
     at = f"/devices/{robot.device}/shares"
-    epoch = bert.take(robot.device, lease_ms=600_000).json()["epoch"]
+    epoch = bert.take_lease(robot.device, lease_ms=600_000).json()["epoch"]
     bert.start(robot.device, epoch=epoch, wait_ms=10_000)
     page = connect(broker, bert, purpose="view")
 

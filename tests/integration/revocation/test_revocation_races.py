@@ -48,7 +48,7 @@ def test_an_action_that_starts_while_its_device_is_unshared_never_reaches_it(
     problem(bert.start(robot.device, wait_ms=1_000), 404, "device-unknown")
     (action,) = anna.get(f"/devices/{robot.device}/actions").json()["items"]
     assert (action["status"], action["reason"]["code"]) == ("failed", "unshared")
-    assert robot.heard(MoveJoints) == []
+    assert robot.received(MoveJoints) == []
     assert anna.start(robot.device, wait_ms=10_000).json()["status"] == "started"
 
 
@@ -57,24 +57,24 @@ def test_a_lease_acquired_while_the_share_ends_is_not_granted(
 ) -> None:
     anna, bert, robot = operator
     unshare_at(monkeypatch, operator, "written")
-    problem(bert.take(robot.device), 404, "device-unknown")
+    problem(bert.take_lease(robot.device), 404, "device-unknown")
     assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
-    wait_until(lambda: [command.epoch for command in robot.heard(ReleaseLease)] == [2], "the end of it at the robot")
-    assert robot.heard(GrantLease) == []
-    assert anna.take(robot.device).json()["epoch"] == 3
+    wait_until(lambda: [command.epoch for command in robot.received(ReleaseLease)] == [2], "the end of it at the robot")
+    assert robot.received(GrantLease) == []
+    assert anna.take_lease(robot.device).json()["epoch"] == 3
 
 
 def test_control_is_not_passed_to_an_operator_whose_share_ends(
     monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot]
 ) -> None:
     anna, bert, robot = operator
-    anna.take(robot.device)
+    anna.take_lease(robot.device)
     at = f"/devices/{robot.device}/lease/requests"
     request = bert.post(at, {}).json()["request"]["id"]
     unshare_at(monkeypatch, operator, "written")
     problem(anna.post(f"{at}/{request}/accept"), 409, "requester-offline")
     assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
-    assert [command.request.holder for command in robot.heard(GrantLease)] == ["anna"]  # type: ignore[union-attr]
+    assert [command.request.holder for command in robot.received(GrantLease)] == ["anna"]  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("broker", BROKERS, indirect=True)
@@ -118,4 +118,4 @@ def test_an_action_of_a_former_operator_is_not_resent(
     cloud.sweep()
     ended = anna.action(action["id"])
     assert (ended["status"], ended["reason"]["code"]) == ("failed", "unshared")
-    assert robot.heard(MoveJoints) == []
+    assert robot.received(MoveJoints) == []

@@ -1,21 +1,13 @@
 """Signing out, seen from the broker."""
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
-from function_app.ports.broker_access import Credentials
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person
-from tests.harness.network.brokers import BROKERS, Client, RunningBroker, wait_until
-
-
-def watching(broker: RunningBroker, person: Person) -> Client:
-    issued: dict[str, Any] = person.post("/mqtt/credentials", {"purpose": "view"}).json()
-    client = broker.connect(issued["client_id"], Credentials(issued["username"], issued["password"]))
-    assert client.connected.is_set(), client.answer
-    return client
+from tests.harness.network.brokers import BROKERS, RunningBroker, wait_until
+from tests.integration.revocation.connections import connect
 
 
 @pytest.mark.parametrize("broker", BROKERS, indirect=True)
@@ -24,7 +16,7 @@ def test_signing_out_ends_only_the_sessions_own_connections(
 ) -> None:
     anna, _ = pair
     elsewhere = cloud.sign_in("anna")
-    with watching(broker, anna) as here, watching(broker, elsewhere) as there:
+    with connect(broker, anna, purpose="view") as here, connect(broker, elsewhere, purpose="view") as there:
         assert anna.post("/auth/sign-out").status_code == 204
         wait_until(here.disconnected.is_set, "the end of the connection")
         assert not there.disconnected.is_set()

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from function_app.adapters.model_compiler.compiler import MujocoCompiler
 from function_app.entrypoints.hosts.worker import check_models
 from tests.harness.cloud.cloud import Cloud, Person
 
@@ -126,16 +125,9 @@ def dies_in(cloud: Cloud) -> Iterator[None]:
     async def killed(*_: object) -> tuple[str, ...]:
         raise KilledError
 
-    checks = cloud.functions.model_checks
-    known = checks._compiler
-    dying = MujocoCompiler()
-    dying.check = killed  # type: ignore[assignment, method-assign]
-    checks._compiler = dying
-    try:
-        with contextlib.suppress(KilledError):
-            yield
-    finally:
-        checks._compiler = known
+    with pytest.MonkeyPatch.context() as patch, contextlib.suppress(KilledError):
+        patch.setattr(cloud.functions.model_checks._compiler, "check", killed)
+        yield
 
 
 def stop_after(cloud: Cloud, patch: pytest.MonkeyPatch, writes: int) -> None:

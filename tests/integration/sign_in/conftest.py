@@ -2,10 +2,7 @@
 
 import pytest
 
-from tests.harness.cloud.oidc_provider import (
-    SigningKey,
-    new_key,
-)
+from tests.harness.cloud.oidc_provider import SigningKey, new_key
 
 
 @pytest.fixture(scope="module")

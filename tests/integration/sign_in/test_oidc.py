@@ -2,7 +2,7 @@
 
 import contextlib
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ def opened(home: Path, issuer: str, *, anyone: bool = True) -> Cloud:
 
 @pytest.fixture
 def here(home: Path, provider: str) -> Iterator[Cloud]:
-    """The functions, at which one may sign in at the real provider."""
+    """The functions with sign-in at the real provider."""
     with opened(home, provider) as cloud:
         yield cloud
 
@@ -161,23 +161,20 @@ class TestWhoMayCome:
         problem(closed.run(other.page.post(START, json={"invitation": secret})), 404, "invitation-unknown")
         failed(other.sign_in("mallory"), "uninvited")
 
-    def test_an_invitation_that_expires_during_sign_in_is_refused(self, closed: Cloud) -> None:
-        owner = closed.sign_in("anna")
-        browser = Browser(closed)
-        place = sign_in_there(browser.start_with(self.invite(owner, expires_in_s=300)), "bert")
-        closed.clock.advance(301)
-        failed(browser.back(place), "uninvited")
-
-    def test_an_invitation_for_an_existing_account_admits_no_other_user(self, closed: Cloud) -> None:
+    @pytest.mark.parametrize(("limits", "later_s"), [({"expires_in_s": 300}, 301), ({"account": "carl"}, 0)])
+    def test_an_invitation_that_expires_meanwhile_or_is_for_another_account_admits_no_user(
+        self, closed: Cloud, limits: dict[str, Any], later_s: float
+    ) -> None:
         owner, _ = closed.sign_in("anna"), closed.sign_in("carl")
         browser = Browser(closed)
-        place = sign_in_there(browser.start_with(self.invite(owner, account="carl")), "bert")
+        place = sign_in_there(browser.start_with(self.invite(owner, **limits)), "bert")
+        closed.clock.advance(later_s)
         failed(browser.back(place), "uninvited")
 
     def test_another_sites_page_begins_nothing_with_an_invitation(self, closed: Cloud) -> None:
         secret = self.invite(closed.sign_in("anna"))
         headers = {"Sec-Fetch-Site": "cross-site"}
-        problem(closed.ask("POST", START, json={"invitation": secret}, headers=headers), 403, "forbidden")
+        problem(closed.request("POST", START, json={"invitation": secret}, headers=headers), 403, "forbidden")
 
     def test_where_anyone_may_come_a_stranger_has_an_empty_account(self, here: Cloud) -> None:
         browser = Browser(here)
@@ -186,7 +183,7 @@ class TestWhoMayCome:
 
 
 def test_the_browser_is_sent_with_what_makes_the_way_back_its_own(here: Cloud, provider: str) -> None:
-    answer = here.ask("GET", START)
+    answer = here.request("GET", START)
     asked = {name: value for name, (value,) in parse_qs(urlsplit(answer.headers["location"]).query).items()}
     assert answer.headers["location"].startswith(f"{provider}/auth?")
     assert (asked["response_type"], asked["code_challenge_method"], asked["redirect_uri"]) == ("code", "S256", REDIRECT)
@@ -198,10 +195,10 @@ def test_the_browser_is_sent_with_what_makes_the_way_back_its_own(here: Cloud, p
 
 def test_the_page_is_told_how_one_may_sign_in(here: Cloud, cloud: Cloud) -> None:
     elsewhere = {"name": "The lab's", "url": START}
-    assert here.ask("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "oidc": elsewhere}
-    assert cloud.ask("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "oidc": None}
+    assert here.request("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "oidc": elsewhere}
+    assert cloud.request("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "oidc": None}
     for path in (START, f"{CALLBACK}?code=x&state=y"):
-        problem(cloud.ask("GET", path), 404, "oidc-unknown")
+        problem(cloud.request("GET", path), 404, "oidc-unknown")
 
 
 def test_a_way_back_is_good_once_and_in_the_browser_that_began(here: Cloud) -> None:
@@ -210,52 +207,43 @@ def test_a_way_back_is_good_once_and_in_the_browser_that_began(here: Cloud) -> N
     failed(mallory.back(place), "expired")
     mallory.start()
     failed(mallory.back(place), "expired")
-    failed(anna.back(place.copy_set_param("state", "x" * 43)), "expired")
-    failed(anna.back(place.copy_remove_param("state")), "expired")
-    assert anna.me().status_code == 401
     assert anna.back(place).headers["location"] == f"{BASE}/#/"
     failed(anna.back(place), "expired")
     assert anna.me().status_code == 200
 
 
-def test_a_stolen_code_is_refused(here: Cloud) -> None:
+def test_a_code_of_another_sign_in_is_refused(here: Cloud) -> None:
     """The PKCE verifier does not match, so the provider rejects the code."""
     anna, mallory = Browser(here), Browser(here)
-    stolen = sign_in_there(anna.start(), "anna").params["code"]
-    own = sign_in_there(mallory.start(), "mallory")
-    failed(mallory.back(own.copy_set_param("code", stolen)), "rejected")
-    assert mallory.me().status_code == 401
-
-
-def test_a_code_is_used_once(here: Cloud) -> None:
-    anna = Browser(here)
     first = sign_in_there(anna.start(), "anna")
+    stolen = sign_in_there(mallory.start(), "mallory").copy_set_param("code", first.params["code"])
+    failed(mallory.back(stolen), "rejected")
+    assert mallory.me().status_code == 401
     anna.back(first)
-    second = sign_in_there(anna.start(), "anna")
-    failed(anna.back(second.copy_set_param("code", first.params["code"])), "rejected")
+    used = sign_in_there(anna.start(), "anna").copy_set_param("code", first.params["code"])
+    failed(anna.back(used), "rejected")
 
 
-def test_a_way_back_from_another_provider_is_refused(here: Cloud) -> None:
-    for change in (
-        lambda url: url.copy_set_param("iss", "https://evil.example"),
-        lambda url: url.copy_remove_param("iss"),
-    ):
-        browser = Browser(here)
-        failed(browser.back(change(sign_in_there(browser.start(), "anna"))), "rejected")
-        assert browser.me().status_code == 401
-
-
-def test_who_takes_too_long_begins_again(here: Cloud) -> None:
+@pytest.mark.parametrize(
+    ("change", "later_s", "why"),
+    [
+        (lambda url: url.copy_set_param("iss", "https://evil.example"), 0, "rejected"),
+        (lambda url: url.copy_remove_param("iss"), 0, "rejected"),
+        (lambda url: httpx.URL(f"{REDIRECT}?error=access_denied&state={url.params['state']}"), 0, "rejected"),
+        (lambda url: url.copy_set_param("state", "x" * 43), 0, "expired"),
+        (lambda url: url.copy_remove_param("state"), 0, "expired"),
+        (lambda url: url, 601, "expired"),
+    ],
+    ids=["another issuer", "no issuer", "refused", "another state", "no state", "late"],
+)
+def test_a_wrong_way_back_is_refused(
+    here: Cloud, change: Callable[[httpx.URL], httpx.URL], later_s: float, why: str
+) -> None:
     browser = Browser(here)
     place = sign_in_there(browser.start(), "anna")
-    here.clock.advance(601)
-    failed(browser.back(place), "expired")
-
-
-def test_whom_the_provider_refuses_is_told(here: Cloud) -> None:
-    browser = Browser(here)
-    state = parse_qs(urlsplit(browser.start()).query)["state"][0]
-    failed(browser.back(httpx.URL(f"{REDIRECT}?error=access_denied&state={state}")), "rejected")
+    here.clock.advance(later_s)
+    failed(browser.back(change(place)), why)
+    assert browser.me().status_code == 401
 
 
 def test_a_provider_with_new_keys_is_believed_at_once(home: Path, key: SigningKey) -> None:
@@ -265,7 +253,7 @@ def test_a_provider_with_new_keys_is_believed_at_once(home: Path, key: SigningKe
         cloud = stack.enter_context(opened(home, issuer))
         Browser(cloud).sign_in("anna")
         first.close()
-        failed_start = cloud.ask("GET", START)
+        failed_start = cloud.request("GET", START)
         assert failed_start.status_code == 303, "what is known of a provider is kept for a while"
         stack.enter_context(start_provider([new_key("two"), key], port=urlsplit(issuer).port or 0))
         cloud.clock.advance(11)
@@ -276,6 +264,6 @@ def test_a_provider_with_new_keys_is_believed_at_once(home: Path, key: SigningKe
 
 def test_a_provider_that_is_away_is_no_fault_of_the_caller(home: Path) -> None:
     with opened(home, "http://127.0.0.1:1") as cloud:
-        answer = cloud.ask("GET", START)
+        answer = cloud.request("GET", START)
         problem(answer, 503, "oidc-unavailable")
         assert answer.headers["retry-after"] == "30"

@@ -14,15 +14,7 @@ import pytest
 from function_app.adapters.oidc.provider import HttpOidcProvider
 from function_app.ports.oidc_provider import OidcError, Subject
 from tests.fakes.clock import MovingClock
-from tests.harness.cloud.oidc_provider import (
-    CLIENT_ID,
-    CLIENT_SECRET,
-    REDIRECT,
-    Liar,
-    SigningKey,
-    new_key,
-    start_liar,
-)
+from tests.harness.cloud.oidc_provider import CLIENT_ID, CLIENT_SECRET, REDIRECT, Liar, SigningKey, new_key, start_liar
 
 NONCE = "of this sign-in"
 STARTED_S = int(time.time())

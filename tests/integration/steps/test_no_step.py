@@ -1,8 +1,8 @@
 """No connection holds a small message back for the 40 ms of a delayed acknowledgement (TCP_NODELAY missing).
 
 Before each end stands a proxy that acknowledges as late as a kernel may. Two small messages go one after the other:
-with Nagle's algorithm the second cannot come before the first is acknowledged, so no pair is ever quick. A busy machine
-can slow any pair down, but not all of them. What a browser sends is Chromium's business, which always sets TCP_NODELAY.
+with Nagle's algorithm the second cannot arrive before the first is acknowledged, so no pair is ever quick. A busy
+machine can delay any pair, but not all of them. Chromium always sets TCP_NODELAY.
 """
 
 import contextlib
@@ -18,10 +18,9 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import topics
-from tests.harness.cloud.cloud_processes import Ground, Link, shared_grounds
+from tests.harness.cloud.cloud_processes import Ground, Link
 from tests.harness.network.brokers import BROKERS, HOST, TRANSPORTS, BrokerKind, Client, Transport, wait_until
 from tests.harness.network.proxy import Proxy, start_proxy
-from tests.harness.network.xmpp import start_xmpp_ground
 
 PAIRS = 40
 APART_S = 0.003
@@ -33,23 +32,6 @@ BAND_MS = 10.0
 SPIKE_SHARE = 0.2
 
 Send = Callable[[bytes], object]
-
-
-@pytest.fixture(scope="module")
-def grounds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Any], Ground]]:
-    with shared_grounds(tmp_path_factory.mktemp) as start:
-        yield start
-
-
-@pytest.fixture(params=BROKERS)
-def ground(request: pytest.FixtureRequest, grounds: Callable[[Any], Ground]) -> Ground:
-    return grounds(request.param)
-
-
-@pytest.fixture(scope="module")
-def xmpp_ground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
-    with start_xmpp_ground(tmp_path_factory.mktemp("xmpp")) as ground:
-        yield ground
 
 
 def gaps_ms(proxy: Proxy, send: Send, *, from_server: bool) -> list[float]:
@@ -87,9 +69,6 @@ def stepped(gaps: list[float]) -> bool:
     return share(0, QUICK_MS) < QUICK_SHARE or heap - max(before, behind) > SPIKE_SHARE
 
 
-# ------------------------------------------------------------ the measure
-
-
 @pytest.mark.parametrize("at_once", [False, True], ids=["Nagle", "TCP_NODELAY"])
 def test_the_measure_tells_a_step_from_none(at_once: bool) -> None:
     with socket.create_server((HOST, 0)) as listener, start_proxy(listener.getsockname()[1]) as proxy:
@@ -123,31 +102,39 @@ def client(ground: Ground, name: str, *, publish: str = "#", subscribe: str = "#
         yield found
 
 
-# ------------------------------------------------------------ MQTT
+@pytest.fixture(params=["mqtt", "xmpp"])
+def link(request: pytest.FixtureRequest, grounds: Callable[[Any], Ground]) -> Iterator[Link]:
+    """An agent's transport behind a proxy."""
+    if request.param == "mqtt":
+        ground, endpoint = grounds("amqtt"), "broker"
+    else:
+        ground, endpoint = request.getfixturevalue("xmpp_ground"), "xmpp"
+    with Link(ground, {"transport": request.param}, through=endpoint).start() as link:
+        yield link.up()
 
 
-def test_what_an_agent_publishes(ground: Ground) -> None:
-    with Link(ground, {}, through="broker").start() as link:
-        link.up()
-        assert link.proxy is not None
-        topic = link.topic(topics.TELE, "joints")
-        gaps = gaps_ms(link.proxy, lambda mark: link.transport.publish(topic, mark, qos=0), from_server=False)
+def test_an_agent_publishes_at_once(link: Link) -> None:
+    assert link.proxy is not None
+    topic = link.topic(topics.TELE, "joints")
+    gaps = gaps_ms(link.proxy, lambda mark: link.transport.publish(topic, mark, qos=0), from_server=False)
     assert not stepped(gaps), gaps
 
 
-def test_what_the_broker_tells_an_agent(ground: Ground) -> None:
-    with Link(ground, {}, through="broker").start() as link, client(ground, "operator") as operator:
-        link.up()
-        assert link.proxy is not None
-        topic = f"{link.topic(topics.CTL)}/1"
-        wait_until(lambda: operator.publish(topic, b"{}", qos=0) and link.received, "the way to be open")
+def test_an_agent_gets_setpoints_at_once(link: Link) -> None:
+    assert link.proxy is not None
+    topic = f"{link.topic(topics.CTL)}/1"
+    with client(link.ground, "operator") as operator:
+        wait_until(lambda: operator.publish(topic, b"{}", qos=0) and link.received, "the first setpoint")
         gaps = gaps_ms(link.proxy, lambda mark: operator.publish(topic, mark, qos=0), from_server=True)
     assert not stepped(gaps), gaps
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
-def test_what_the_broker_tells_an_operator(ground: Ground, transport: Transport) -> None:
-    topic = "ts/v1/lab/robot/arm/tele/joints"
+@pytest.mark.parametrize("kind", BROKERS)
+def test_a_broker_delivers_at_once(
+    grounds: Callable[[BrokerKind], Ground], kind: BrokerKind, transport: Transport
+) -> None:
+    ground, topic = grounds(kind), "ts/v1/lab/robot/arm/tele/joints"
     with (
         start_proxy(ground.broker.now.port(transport)) as proxy,
         client(ground, "page", subscribe=topic, port=proxy.port, transport=transport) as page,
@@ -158,30 +145,17 @@ def test_what_the_broker_tells_an_operator(ground: Ground, transport: Transport)
     assert not stepped(gaps), gaps
 
 
-@pytest.mark.parametrize("transport", TRANSPORTS)
-def test_what_an_operator_sends_comes_through_the_broker(ground: Ground, transport: Transport) -> None:
-    """The client is a test's own, as a program of an operator may be; what the broker does with it is ours."""
-    topic = "ts/v1/lab/robot/arm/ctl/1"
-    with (
-        start_proxy(ground.broker.now.tcp_port) as proxy,
-        client(ground, "robot", subscribe=topic, port=proxy.port) as robot,
-        client(ground, "page", publish=topic, transport=transport) as page,
-    ):
-        robot.subscribe(topic, qos=0)
-        gaps = gaps_ms(proxy, lambda mark: page.publish(topic, mark, qos=0), from_server=True)
-    assert not stepped(gaps), gaps
-
-
-def test_the_functions_send_to_the_broker_at_once(ground: Ground) -> None:
-    """Their messages are acknowledged one by one, which hides a step; so their sockets are asked."""
+def test_the_functions_send_to_the_broker_at_once(grounds: Callable[[BrokerKind], Ground]) -> None:
+    """Their messages are acknowledged one by one, which hides a step; so the options of their sockets are read."""
+    ground = grounds("amqtt")
     ground.keep("ts/v1/lab/robot/arm/state", b"{}")
-    asked = at_once(ground.broker.port)
-    assert asked
-    assert all(asked), asked
+    options = no_delay_options(ground.broker.port)
+    assert options
+    assert all(options), options
 
 
-def at_once(port: int) -> list[bool]:
-    """Of this process's connections to a port, whether each sets TCP_NODELAY."""
+def no_delay_options(port: int) -> list[bool]:
+    """Of each connection of this process to a port, whether it sets TCP_NODELAY."""
     found = []
     for entry in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):  # no socket, not connected, or closed meanwhile
@@ -193,26 +167,23 @@ def at_once(port: int) -> list[bool]:
     return found
 
 
-# ------------------------------------------------------------ HTTP
-
-
-def test_what_the_functions_answer_over_http(grounds: Callable[[BrokerKind], Ground]) -> None:
-    """Head and body of an answer are two writes."""
+def test_the_functions_answer_over_http_at_once(grounds: Callable[[BrokerKind], Ground]) -> None:
+    """Head and body of a response are two writes."""
     with start_proxy(grounds("amqtt").endpoints["server"].port) as proxy:
         proxy.acknowledge_late()
-        asked = http.client.HTTPConnection(HOST, proxy.port, timeout=60)
+        connection = http.client.HTTPConnection(HOST, proxy.port, timeout=60)
         gaps = []
         for _ in range(PAIRS):
             proxy.arrivals.clear()
-            asked.request("GET", "/api/v1/health")
-            assert asked.getresponse().read()
+            connection.request("GET", "/api/v1/health")
+            assert connection.getresponse().read()
             came_s = [at_s for at_s, back, _ in proxy.arrivals if back]
             gaps.append((came_s[-1] - came_s[0]) * 1000)
-        asked.close()
+        connection.close()
     assert not stepped(gaps), gaps
 
 
-def test_what_an_agent_tells_over_http(grounds: Callable[[BrokerKind], Ground]) -> None:
+def test_an_agent_sends_over_http_at_once(grounds: Callable[[BrokerKind], Ground]) -> None:
     """Head and body of a request are two writes."""
     with Link(grounds("amqtt"), {"transport": "http"}, through="server").start() as link:
         link.up()
@@ -225,30 +196,4 @@ def test_what_an_agent_tells_over_http(grounds: Callable[[BrokerKind], Ground]) 
             body_s = arrival_s(link.proxy, mark, from_server=False)
             heads_s = [at_s for at_s, back, content in link.proxy.arrivals if not back and content.startswith(b"POST ")]
             gaps.append((body_s - max(at_s for at_s in heads_s if at_s <= body_s)) * 1000)
-    assert not stepped(gaps), gaps
-
-
-# ------------------------------------------------------------ XMPP
-
-
-def test_what_an_agent_says_over_xmpp(xmpp_ground: Ground) -> None:
-    with Link(xmpp_ground, {"transport": "xmpp"}, through="xmpp").start() as link:
-        link.up()
-        assert link.proxy is not None
-        topic = link.topic(topics.TELE, "joints")
-        gaps = gaps_ms(link.proxy, lambda mark: link.transport.publish(topic, mark, qos=0), from_server=False)
-    assert not stepped(gaps), gaps
-
-
-def test_what_the_xmpp_server_tells_an_agent(xmpp_ground: Ground) -> None:
-    """By way of the broker and of the program that speaks for the cloud."""
-    with (
-        Link(xmpp_ground, {"transport": "xmpp"}, through="xmpp").start() as link,
-        client(xmpp_ground, "op") as operator,
-    ):
-        link.up()
-        assert link.proxy is not None
-        topic = f"{link.topic(topics.CTL)}/1"
-        wait_until(lambda: operator.publish(topic, b"{}", qos=0) and link.received, "the way to be open")
-        gaps = gaps_ms(link.proxy, lambda mark: operator.publish(topic, mark, qos=0), from_server=True)
     assert not stepped(gaps), gaps

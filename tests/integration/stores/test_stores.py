@@ -1,8 +1,7 @@
-"""Over each store the functions do the same: two instances of them, and what one writes the other knows."""
+"""Two instances of the functions over each store: each reads what the other writes."""
 
 import asyncio
 import contextlib
-import secrets
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -10,46 +9,32 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import AckStatus, Fault, Measurements, Mode, RunMovement, State, StopDevice, codec, topics
+from device_agent.protocol import AckStatus, Fault, Measurements, Mode, RunMovement, State, codec, topics
 from function_app.adapters import factory
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from function_app.services.robot_types.delete import AFTER_MS
 from function_app.services.storage.records import CONTROL
-from function_app.settings import AwsStore, AzureStore
+from function_app.settings import AwsStore, AzureStore, read
+from tests.conftest import Emulators
 from tests.harness.cloud.cloud import MOVE, Cloud, Person, paired, problem, settings
-from tests.harness.cloud.polling import PollingRobot
-from tests.harness.network.brokers import RunningBroker, wait_until
+from tests.harness.network.brokers import RunningBroker
 from tests.harness.paths import UR5
-from tests.harness.stores.aws import REGION, start_moto, use_credentials
-from tests.harness.stores.azure import start_azurite
+from tests.harness.stores.aws import use_credentials
+from tests.harness.stores.emulators import STORES, StoreKind, empty_store
 
 MINE = "/robot-types/ur5/movements/mine"
 SOURCE = '"""Wave."""\nrobot.home()\n'
-STORES = ("local", "azure", "aws")
-
-
-@pytest.fixture(scope="module")
-def azurite() -> Iterator[str]:
-    with start_azurite() as connection:
-        yield connection
-
-
-@pytest.fixture(scope="module")
-def moto() -> Iterator[str]:
-    with start_moto() as endpoint:
-        yield endpoint
 
 
 @pytest.fixture(params=STORES)
-def store(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> AzureStore | AwsStore | None:
+def store(
+    request: pytest.FixtureRequest, emulators: Emulators, monkeypatch: pytest.MonkeyPatch
+) -> AzureStore | AwsStore | None:
     """An empty one."""
-    name = f"test{secrets.token_hex(8)}"
-    if request.param == "azure":
-        return AzureStore(connection=request.getfixturevalue("azurite"), prefix=name, container=name)
-    if request.param == "aws":
+    kind: StoreKind = request.param
+    if kind == "aws":
         use_credentials(monkeypatch)
-        return AwsStore(region=REGION, bucket=name, table=name, endpoint=request.getfixturevalue("moto"))
-    return None
+    return read(empty_store(kind, emulators(kind))).store
 
 
 @pytest.fixture
@@ -63,7 +48,7 @@ def clouds(home: Path, broker: RunningBroker, store: AzureStore | AwsStore | Non
         yield one, other
 
 
-def test_from_pairing_to_a_movement_that_was_run(clouds: tuple[Cloud, Cloud]) -> None:
+def test_a_robot_is_paired_leased_and_runs_a_movement(clouds: tuple[Cloud, Cloud]) -> None:
     one, other = clouds
     with paired(one) as (anna, robot):
         again = other.sign_in("anna")
@@ -73,17 +58,17 @@ def test_from_pairing_to_a_movement_that_was_run(clouds: tuple[Cloud, Cloud]) ->
         assert again.put(MINE, {"source": SOURCE + "#"}).json()["version"] == 2
         assert anna.get(MINE).json()["source"] == SOURCE + "#"
 
-        epoch = anna.take(robot.device).json()["epoch"]
-        problem(again.take(robot.device), 409, "lease-held")
+        epoch = anna.take_lease(robot.device).json()["epoch"]
+        problem(again.take_lease(robot.device), 409, "lease-held")
         assert again.get(f"/devices/{robot.device}/lease").json()["lease"]["epoch"] == epoch
 
         request = {"kind": "run_movement", "name": "mine", "parameters": {"note": "grüß 🤖"}}
-        asked: dict[str, Any] = {"request": request, "epoch": epoch, "wait_ms": 10_000, "once": "a/b#c?"}
-        action = anna.start(robot.device, **asked).json()
+        options: dict[str, Any] = {"request": request, "epoch": epoch, "wait_ms": 10_000, "once": "a/b#c?"}
+        action = anna.start(robot.device, **options).json()
         assert action["status"] == "started"
-        assert anna.start(robot.device, **asked).json()["id"] == action["id"]
+        assert anna.start(robot.device, **options).json()["id"] == action["id"]
         problem(anna.start(robot.device, epoch=epoch), 409, "device-busy")
-        (command,) = robot.heard(RunMovement)
+        (command,) = robot.received(RunMovement)
         assert isinstance(command.request, RunMovement)
         assert command.request.source == SOURCE + "#"
 
@@ -99,7 +84,7 @@ def test_from_pairing_to_a_movement_that_was_run(clouds: tuple[Cloud, Cloud]) ->
         problem(bert.get(MINE), 404, "movement-unknown")
 
 
-def test_a_robot_type_is_uploaded_to_one_checked_by_the_other_and_deleted(clouds: tuple[Cloud, Cloud]) -> None:
+def test_a_robot_type_is_uploaded_checked_by_the_other_instance_and_deleted(clouds: tuple[Cloud, Cloud]) -> None:
     one, other = clouds
     anna, again = one.sign_in("anna"), other.sign_in("anna")
     text = (UR5 / "robot.toml").read_text().replace('type = "ur5"', 'type = "mine"')
@@ -124,36 +109,23 @@ def test_a_robot_type_is_uploaded_to_one_checked_by_the_other_and_deleted(clouds
     assert one.run(one.functions.blobs.list("robot-types/")) == ()
 
 
-def test_of_many_callers_of_two_instances_one_gets_the_slot(clouds: tuple[Cloud, Cloud]) -> None:
-    one, other = clouds
-    with paired(one) as (anna, robot):
-        epoch = anna.take(robot.device).json()["epoch"]
-        account = {"id": anna.account, "name": anna.name}
-        there = Person(other, {"access_token": anna.token, "session": anna.session, "account": account})
-        for _ in range(3):
-            calls = [
-                person.begin("POST", f"/devices/{robot.device}/actions", json={"request": MOVE, "epoch": epoch})
-                for person in (anna, there) * 4
-            ]
-            answers = [call() for call in calls]
-            (started,) = [answer.json() for answer in answers if answer.status_code == 202]
-            assert sorted(answer.status_code for answer in answers) == [202] + [409] * 7
-            robot.report(started["id"], AckStatus.DONE)
-            assert there.action(started["id"], wait_ms=10_000, wait_for="done")["status"] == "done"
+def at(cloud: Cloud, person: Person) -> Person:
+    """The same session at another instance."""
+    account = {"id": person.account, "name": person.name}
+    return Person(cloud, {"access_token": person.token, "session": person.session, "account": account})
 
 
-def test_the_queue_of_one_device_over_two_instances_and_what_leaving_ends(clouds: tuple[Cloud, Cloud]) -> None:
+def test_a_queue_is_shared_and_ends_with_the_pairing(clouds: tuple[Cloud, Cloud]) -> None:
     one, other = clouds
     with paired(one) as (anna, robot):
-        account = {"id": anna.account, "name": anna.name}
-        there = Person(other, {"access_token": anna.token, "session": anna.session, "account": account})
+        there = at(other, anna)
         running = anna.start(robot.device, wait_ms=10_000).json()["id"]
         calls = [
             person.begin("POST", f"/devices/{robot.device}/actions", json={"request": MOVE, "policy": "queue"})
             for person in (anna, there) * 2
         ]
-        asked = {call().json()["id"] for call in calls}
-        places = {anna.action(action)["queue_position"]: action for action in asked}
+        queued = {call().json()["id"] for call in calls}
+        places = {anna.action(action)["queue_position"]: action for action in queued}
         assert sorted(places) == [1, 2, 3, 4]
         assert there.post(f"/actions/{places[3]}/cancel").json()["status"] == "cancelled"
         for before, action in ((running, places[1]), (places[1], places[2])):
@@ -179,37 +151,19 @@ def test_the_queue_of_one_device_over_two_instances_and_what_leaving_ends(clouds
         assert left.rows == ()
 
 
-def test_a_robot_that_asks_one_instance_obeys_the_other(clouds: tuple[Cloud, Cloud]) -> None:
-    one, other = clouds
-    anna = other.sign_in("anna")
-    with PollingRobot(one) as robot:
-        robot.pair(one.sign_in("anna"))
-        robot.connect()
-        lease = anna.take(robot.device, wait_ms=20_000).json()
-        assert lease["confirmed"]
-        action = anna.start(robot.device, epoch=lease["epoch"], wait_ms=20_000).json()
-        assert action["status"] == "started"
-        robot.report(action["id"], AckStatus.DONE, result={"reached": True})
-        assert anna.action(action["id"], wait_ms=20_000, wait_for="done")["result"] == {"reached": True}
-        assert anna.post(f"/devices/{robot.device}/stop").status_code == 200
-        wait_until(lambda: robot.heard(StopDevice), "the stop")
-        wait_until(lambda: robot.fetch() == [], "every command to be answered")
-
-
-def test_faults_and_times_are_the_same_wherever_they_are_written(clouds: tuple[Cloud, Cloud]) -> None:
+def test_faults_and_latencies_are_shared(clouds: tuple[Cloud, Cloud]) -> None:
     one, other = clouds
     with paired(one) as (anna, robot):
-        account = {"id": anna.account, "name": anna.name}
-        there = Person(other, {"access_token": anna.token, "session": anna.session, "account": account})
+        there = at(other, anna)
         now_ms = one.clock.now_ms()
 
-        def hears(cloud: Cloud, *codes: str, at_ms: int) -> None:
-            found = tuple(Fault(code=code, message="Look.", since_ms=1) for code in codes)
-            state = State(device="arm", at_ms=at_ms, tick_ms=at_ms, mode=Mode.IDLE, epoch=0, faults=found)
+        def ingest_state(cloud: Cloud, *codes: str, at_ms: int) -> None:
+            faults = tuple(Fault(code=code, message="Look.", since_ms=1) for code in codes)
+            state = State(device="arm", at_ms=at_ms, tick_ms=at_ms, mode=Mode.IDLE, epoch=0, faults=faults)
             cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), codec.encode(state)))
 
-        hears(one, "a/b#c?", at_ms=now_ms)
-        hears(other, "a/b#c?", at_ms=now_ms)
+        ingest_state(one, "a/b#c?", at_ms=now_ms)
+        ingest_state(other, "a/b#c?", at_ms=now_ms)
         measured = [
             Measurements(
                 tick_ms=1, at_ms=now_ms - 60_000 + 10_000 * number, sequence=1, values={"temperature_c.x": 90.0}
@@ -226,14 +180,14 @@ def test_faults_and_times_are_the_same_wherever_they_are_written(clouds: tuple[C
             assert there.post(f"{faults}/{fault['id']}/acknowledge").status_code == 200
         assert [fault["state"] for fault in anna.get(faults).json()["items"]] == ["acknowledged"] * 2
         assert anna.get("/diagnostics").json() == there.get("/diagnostics").json()
-        hears(other, at_ms=now_ms + 1)
+        ingest_state(other, at_ms=now_ms + 1)
         assert [fault["state"] for fault in anna.get(faults).json()["items"]] == ["acknowledged", "cleared"]
 
         samples = [{"at_ms": now_ms - number, "ms": 1.5 * number} for number in range(300)]
         latency = {"transport": "mqtt", "path": "operator-device", "samples": samples}
         for person in (anna, there):
             assert person.post(f"/devices/{robot.device}/latency", latency).status_code == 204
-        (kept,) = there.get(f"/devices/{robot.device}/latency").json()["items"]
-        assert (kept["count"], kept["max_ms"], len(kept["ms"])) == (300, 448.5, 300)
+        (stored,) = there.get(f"/devices/{robot.device}/latency").json()["items"]
+        assert (stored["count"], stored["max_ms"], len(stored["ms"])) == (300, 448.5, 300)
         for cloud in clouds:
             cloud.sweep()

@@ -1,35 +1,27 @@
 import contextlib
+import shutil
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
-from function_app.adapters.local.signing_keys import FileKeys
 from function_app.settings import Settings
+from tests.fixtures.brokers import Brokers
 from tests.harness.cloud.cloud import Cloud, Person, settings
-from tests.harness.network.brokers import BrokerKind, RunningBroker, start_broker
+from tests.harness.network.brokers import RunningBroker
 from tests.harness.network.xmpp import XmppRobot, XmppSite, open_site
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-
-@pytest.fixture(scope="module", params=["amqtt"])
-def broker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningBroker]:
-    """One broker for the tests of a file."""
-    kind: BrokerKind = request.param
-    folder = tmp_path_factory.mktemp("home")
-    FileKeys(folder / "keys").load()
-    home = folder / "mosquitto" if kind == "mosquitto" else folder / "broker"
-    with start_broker(kind, home, keys=folder / "keys" / "public.json") as broker:
-        broker.folder = folder  # type: ignore[attr-defined]
-        yield broker
 
 
 @pytest.fixture(scope="module")
-def site(broker: RunningBroker) -> Iterator[XmppSite]:
-    """Functions with their ingest, Prosody, and one who speaks for the cloud: for the tests of a file."""
-    folder: Path = broker.folder  # type: ignore[attr-defined]
+def broker(brokers: Brokers) -> RunningBroker:
+    return brokers("amqtt")
+
+
+@pytest.fixture(scope="module")
+def site(broker: RunningBroker, keys: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[XmppSite]:
+    """Functions with their ingest, Prosody and a gateway for the tests of a module."""
+    folder = tmp_path_factory.mktemp("home")
+    shutil.copytree(keys, folder / "keys")
     with contextlib.ExitStack() as stack:
 
         def opened(known: Settings) -> Cloud:
@@ -48,7 +40,7 @@ def anna(site: XmppSite) -> Person:
 
 @pytest.fixture
 def robot(site: XmppSite, anna: Person) -> Iterator[XmppRobot]:
-    """Anna's, and there."""
+    """A robot of Anna's that is online."""
     with site.robot() as robot:
         robot.pair(anna)
         yield robot.connect()

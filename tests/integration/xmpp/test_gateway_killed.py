@@ -24,7 +24,7 @@ def test_of_two_who_speak_one_may_go_and_no_agent_is_served_twice(
         wait_until(lambda: all(second.serves(each.id) for each in robots), "all at the second")
         for each in robots:
             wait_until(lambda each=each: each.changes[-1], "its link")  # type: ignore[misc]
-            assert anna.take(each.device, wait_ms=10_000).json()["confirmed"]
+            assert anna.take_lease(each.device, wait_ms=10_000).json()["confirmed"]
             assert all(len(payloads) == 1 for payloads in each.payloads.values()), "each command once"
     finally:
         for each in robots[1:]:
@@ -38,14 +38,14 @@ def test_a_stop_without_a_gateway_is_delivered_later(site: XmppSite, anna: Perso
     assert anna.post(f"/devices/{robot.device}/stop").json() == {"confirmed": False}
     site.speak()
     wait_until(lambda: robot.changes[-1] is True, "the way back")
-    wait_until(lambda: robot.heard(StopDevice), "the Stop that waited")
+    wait_until(lambda: robot.received(StopDevice), "the Stop that waited")
     assert robot.session >= 2
 
 
 def test_after_a_killed_server_all_find_together_and_go_on(site: XmppSite, anna: Person, robot: XmppRobot) -> None:
     robot.silent = True
     action = anna.start(robot.device).json()["id"]
-    wait_until(lambda: robot.heard(MoveJoints), "the command")
+    wait_until(lambda: robot.received(MoveJoints), "the command")
     site.prosody.kill()
     wait_until(lambda: robot.changes[-1] is False, "the loss")
     waiting = anna.begin("POST", f"/devices/{robot.device}/stop")
@@ -54,10 +54,10 @@ def test_after_a_killed_server_all_find_together_and_go_on(site: XmppSite, anna:
         site.prosody.process = again.process
         wait_until(lambda: robot.changes[-1] is True, "the way back")
         assert waiting().status_code == 200
-        wait_until(lambda: robot.heard(StopDevice), "the Stop")
+        wait_until(lambda: robot.received(StopDevice), "the Stop")
         wait_until(lambda: anna.get(f"/devices/{robot.device}").json()["online"], "online again")
         robot.report(action, AckStatus.STARTED)
         robot.report(action, AckStatus.DONE)
         assert anna.action(action, wait_ms=10_000, wait_for="done")["status"] == "done"
-        assert len(robot.heard(MoveJoints)) == 1, "once, however often it came"
+        assert len(robot.received(MoveJoints)) == 1, "once, however often it came"
         assert len(set(robot.payloads[action])) == 1

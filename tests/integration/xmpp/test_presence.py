@@ -21,14 +21,6 @@ def vanish(robot: XmppRobot) -> None:
     inner._loop.call_soon_threadsafe(inner.stream._client.transport.abort)
 
 
-def test_a_clean_end_is_known_at_once(anna: Person, robot: XmppRobot) -> None:
-    assert online(anna, robot)
-    assert robot.link is not None
-    robot.link.close()
-    wait_until(lambda: not online(anna, robot), "offline")
-    assert robot.changes == [True, False]
-
-
 def test_an_agent_that_breaks_off_is_told_to_be_gone_and_comes_back_in_a_new_session(
     site: XmppSite, broker: RunningBroker, anna: Person, robot: XmppRobot
 ) -> None:
@@ -70,7 +62,7 @@ def test_a_person_sees_their_agents_and_how_they_are_and_no_others(site: XmppSit
         robot.pair(anna)
         robot.connect()
         wait_until(lambda: hers.there(robot.id), "the agent to be seen")
-        robot.say_state(State(device="arm", at_ms=1, tick_ms=1, mode=Mode.STREAMING, epoch=3))
+        robot.publish_state(State(device="arm", at_ms=1, tick_ms=1, mode=Mode.STREAMING, epoch=3))
         wait_until(lambda: hers.messages, "the state")
         told = stanzas.parse(hers.messages[0])
         assert told is not None

@@ -1,56 +1,28 @@
 """Connections beyond this machine use TLS, and only with a server that a trusted certificate names."""
 
 import asyncio
-import datetime as dt
 import ssl
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import NameOID
 
 from device_agent.protocol.xmpp import stream as xmpp_stream
 from device_agent.protocol.xmpp.stream import Login, Stream, StreamError
+from tests.harness.cloud.identity import make_certificate
 from tests.harness.network.brokers import HOST
 from tests.harness.network.xmpp import DOMAIN, Prosody, start_prosody
 
 NOWHERE = "http://127.0.0.1:9/verify"
 
 
-def certificate(folder: Path, name: str) -> tuple[Path, Path]:
-    """A certificate that signs itself, and its key."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    now = dt.datetime.now(dt.UTC)
-    made = (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(subject)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - dt.timedelta(days=1))
-        .not_valid_after(now + dt.timedelta(days=1))
-        .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    paths = folder / f"{name}.pem", folder / f"{name}.key"
-    paths[0].write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    paths[1].write_bytes(
-        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    )
-    return paths
-
-
 @pytest.fixture(params=[DOMAIN])
 def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Prosody, Path]]:
     """Prosody with a certificate of this name."""
-    pem, key = certificate(tmp_path, request.param)
-    with start_prosody(tmp_path / "prosody", NOWHERE, more=("--certificate", str(pem), "--key", str(key))) as prosody:
+    pem = make_certificate(tmp_path, request.param)
+    options = ("--certificate", str(pem), "--key", str(tmp_path / "key.pem"))
+    with start_prosody(tmp_path / "prosody", NOWHERE, more=options) as prosody:
         yield prosody, pem
 
 

@@ -19,7 +19,7 @@ QUIET_S = 0.3
 
 
 def password_of(robot: XmppRobot) -> str:
-    given: str = robot.ask("POST", "/xmpp/credentials", json={"purpose": "agent"}).json()["password"]
+    given: str = robot.request("POST", "/xmpp/credentials", json={"purpose": "agent"}).json()["password"]
     return given
 
 
@@ -77,7 +77,7 @@ class TestLogin:
         for token in (mine, hers):
             headers = {"Authorization": f"Bearer {token}"}
             for method, path in (("GET", "/devices"), ("GET", "/agents/enrollment"), ("POST", "/xmpp/credentials")):
-                answer = site.cloud.ask(method, f"/api/v1{path}", headers=headers, json={"purpose": "view"})
+                answer = site.cloud.request(method, f"/api/v1{path}", headers=headers, json={"purpose": "view"})
                 assert answer.status_code == 401, path
 
     def test_a_password_of_an_earlier_pairing_is_refused(self, site: XmppSite, anna: Person) -> None:
@@ -134,9 +134,9 @@ class TestTenants:
                     for to in (f"{user}@{DOMAIN}", f"{user}@{DOMAIN}/test", f"{user}@elsewhere.example"):
                         if own == user and to.endswith((DOMAIN, "/test")):
                             continue
-                        sender.say(stanzas.message(to, unheard.topic(topics.STATE), b"{}", receipt="1"))
-                        sender.say(f"<presence to='{to}' type='subscribe'/>")
-                        sender.say(f"<iq to='{to}' type='get' id='2'><ping xmlns='urn:xmpp:ping'/></iq>")
+                        sender.send(stanzas.message(to, unheard.topic(topics.STATE), b"{}", receipt="1"))
+                        sender.send(f"<presence to='{to}' type='subscribe'/>")
+                        sender.send(f"<iq to='{to}' type='get' id='2'><ping xmlns='urn:xmpp:ping'/></iq>")
             time.sleep(QUIET_S)
             for client in users:
                 assert not [each for each in client.messages if each.get("type") != "error"]
@@ -149,9 +149,9 @@ class TestTenants:
     def test_a_roster_is_the_clouds_to_write(self, site: XmppSite, unheard: XmppRobot) -> None:
         with as_agent(site, unheard) as client:
             item = "<item jid='zzzzzzzzzz@telescope.localhost' subscription='both'/>"
-            client.say(f"<iq type='set' id='3'><query xmlns='jabber:iq:roster'>{item}</query></iq>")
-            client.say("<presence to='zzzzzzzzzz@telescope.localhost'/>")
-            client.say(stanzas.revoke_user(DOMAIN, unheard.id))
+            client.send(f"<iq type='set' id='3'><query xmlns='jabber:iq:roster'>{item}</query></iq>")
+            client.send("<presence to='zzzzzzzzzz@telescope.localhost'/>")
+            client.send(stanzas.revoke_user(DOMAIN, unheard.id))
             time.sleep(QUIET_S)
             assert not client.ended
 
@@ -161,14 +161,14 @@ class TestTenants:
             other.connect()
             to = cloud_jid(client)
             greeting = codec.encode(Presence(online=True, session=99, at_ms=1))
-            client.say(stanzas.message(to, topics.conn(other.space, other.id), greeting, receipt="1"))
-            client.say(stanzas.message(to, topics.conn(other.space, unheard.id), greeting, receipt="2"))
-            client.say(stanzas.message(to, topics.conn(unheard.space, unheard.id), greeting, receipt="3"))
+            client.send(stanzas.message(to, topics.conn(other.space, other.id), greeting, receipt="1"))
+            client.send(stanzas.message(to, topics.conn(other.space, unheard.id), greeting, receipt="2"))
+            client.send(stanzas.message(to, topics.conn(unheard.space, unheard.id), greeting, receipt="3"))
             wait_until(lambda: any(stanzas.receipt_id(each) == "3" for each in client.messages), "the receipt")
             foreign = other.ack("0" * 31, "done")  # type: ignore[arg-type]
-            client.say(stanzas.message(to, other.topic(topics.ACK), codec.encode(foreign), receipt="4"))
-            client.say(stanzas.message(to, unheard.topic(topics.CMD), b"{}", receipt="5"))
-            client.say(stanzas.message(to, unheard.topic(topics.STATE, "another"), b"{}", receipt="6"))
+            client.send(stanzas.message(to, other.topic(topics.ACK), codec.encode(foreign), receipt="4"))
+            client.send(stanzas.message(to, unheard.topic(topics.CMD), b"{}", receipt="5"))
+            client.send(stanzas.message(to, unheard.topic(topics.STATE, "another"), b"{}", receipt="6"))
             wait_until(lambda: len(refusals(client)) >= 4, "four refusals")
             assert {number for number, _, final in refusals(client) if final} == {"2", "4", "5", "6"}
             assert other.changes == [True]
@@ -200,26 +200,26 @@ def test_nothing_that_an_agent_sends_ends_the_one_who_speaks(
     with as_agent(site, unheard) as client:
         to = cloud_jid(client)
         greeting = codec.encode(Presence(online=True, session=1, at_ms=1))
-        client.say(stanzas.message(to, topics.conn(unheard.space, unheard.id), greeting, receipt="0"))
+        client.send(stanzas.message(to, topics.conn(unheard.space, unheard.id), greeting, receipt="0"))
         for kind in (topics.STATE, topics.ACK, topics.EVENT, topics.DESC, "tele/joints"):
             for number, inside in enumerate(HOSTILE):
                 wanted = "" if number % 2 else "<request xmlns='urn:xmpp:receipts'/>"
                 body = inside.replace("TOPIC", unheard.topic(kind))
-                client.say(f"<message to='{to}' id='{kind[:4]}{number}'>{wanted}{body}</message>")
+                client.send(f"<message to='{to}' id='{kind[:4]}{number}'>{wanted}{body}</message>")
         for deep in (json.dumps({"a": 1}), "nonsense", '{"online": 7}', "[]"):
-            client.say(stanzas.message(to, topics.conn(unheard.space, unheard.id), deep.encode(), receipt="9"))
-        client.say(f"<presence to='{to}' type='unavailable'/><presence to='{to}'><priority>x</priority></presence>")
-        client.say(f"<iq to='{to}' type='set' id='8'><query xmlns='jabber:iq:roster'/></iq>")
+            client.send(stanzas.message(to, topics.conn(unheard.space, unheard.id), deep.encode(), receipt="9"))
+        client.send(f"<presence to='{to}' type='unavailable'/><presence to='{to}'><priority>x</priority></presence>")
+        client.send(f"<iq to='{to}' type='set' id='8'><query xmlns='jabber:iq:roster'/></iq>")
         wait_until(lambda: len(refusals(client)) >= 10, "refusals")
     assert site.speaking[0].serves(robot.id)
     assert robot.changes == [True]
-    assert anna.take(robot.device, wait_ms=10_000).json()["confirmed"]
+    assert anna.take_lease(robot.device, wait_ms=10_000).json()["confirmed"]
 
 
 def test_a_stanza_that_is_too_long_ends_its_senders_connection_alone(
     site: XmppSite, unheard: XmppRobot, robot: XmppRobot
 ) -> None:
     with as_agent(site, unheard) as client:
-        client.say(f"<message to='{cloud_jid(client)}'><body>{'x' * (2 * stanzas.MAX_STANZA_BYTES)}</body></message>")
+        client.send(f"<message to='{cloud_jid(client)}'><body>{'x' * (2 * stanzas.MAX_STANZA_BYTES)}</body></message>")
         wait_until(lambda: client.ended, "the end of the connection")
     assert robot.changes == [True]

@@ -10,6 +10,7 @@ from msgspec import inspect
 from device_agent import protocol
 from device_agent.ports import script_calls
 from device_agent.protocol.security.revocation import Control
+from function_app.entrypoints import http  # noqa: F401 (defines all request bodies)
 from function_app.entrypoints.http.framework.schemas import Request
 from tests.harness.network import raw_mqtt
 
@@ -81,21 +82,16 @@ def seeds(kinds: tuple[Any, ...]) -> tuple[bytes, ...]:
     return tuple(dict.fromkeys(found))
 
 
-def _bodies() -> tuple[Any, ...]:
-    """Types of the API's request bodies."""
-    from function_app.entrypoints import http  # noqa: F401 (all that there are)
-
-    found, look = [], [Request]
-    while look:
-        kind = look.pop()
-        look += kind.__subclasses__()
-        if not kind.__name__.startswith("_") and kind is not Request:
-            found.append(kind)
-    return tuple(sorted(found, key=lambda kind: (kind.__module__, kind.__name__)))
+def _request_types(base: type[Any]) -> Iterator[type[Any]]:
+    for kind in base.__subclasses__():
+        yield from _request_types(kind)
+        if not kind.__name__.startswith("_"):
+            yield kind
 
 
 MESSAGES = seeds(KINDS)
-API_KINDS = _bodies()
+API_KINDS = tuple(sorted(set(_request_types(Request)), key=lambda kind: (kind.__module__, kind.__name__)))
+"""Types of the API's request bodies."""
 API_BODIES = seeds(API_KINDS)
 BODIES = tuple(json.dumps(value).encode() for value in variants(protocol.Command))[:8]
 LINES = tuple(json.dumps(value).encode() for value in variants(script_calls.Message))
@@ -115,7 +111,7 @@ _ACCESS = {
     "client_id": "a", "username": "u", "password": "p", "lifetime_s": 60, "subscribe": ["ts/v1/s/a/+/cmd"],
     "tcp": {"host": "127.0.0.1", "port": 1883}, "server_time_ms": 1, "jid": "a@site", "host": "h", "port": 5222,
 }  # fmt: skip
-ANSWERS = tuple(
+RESPONSES = tuple(
     bytes([status, call]) + json.dumps(body).encode()
     for status, call, body in (
         (0, 0, _ENROLLED), (0, 1, _ENROLLED), (0, 2, _ACCESS), (0, 3, _LETTER), (0, 4, _RESULTS), (5, 3, _PROBLEM),
@@ -152,12 +148,7 @@ label = "Arm"
 [devices.options]
 scene = "scene.xml"
 """,
-    b"""server = "https://site"
-name = "lab"
-[[devices]]
-name = "arm"
-type = "ur5"
-""",
+    b'server = "https://site"\nname = "lab"\n[[devices]]\nname = "arm"\ntype = "ur5"\n',
     json.dumps({"agent": "a", "space": "s", "account": "ann", "keys": {"k": "A" * 43}, "owner": "o"}).encode(),
 )
 PACKETS = (

@@ -47,15 +47,15 @@ def fuzz(names: Sequence[str], *options: str) -> Iterator[Session]:
             cwd=ROOT, capture_output=True, text=True, errors="replace", check=False,
         )  # fmt: skip
         for name in names:
-            said = [_said(Path(folder) / file) for file in (f"{name}-empty", name)]
-            if any(_DONE.search(text) is None for text in said):
-                raise Crashed(f"{name}: {done.stderr[-2000:]}{''.join(said)[-4000:]}")
-            empty, reached = (dict(_REACHED.findall(text)) for text in said)
-            runs = re.findall(_DONE, said[1])[-1]
+            outputs = [_output(Path(folder) / file) for file in (f"{name}-empty", name)]
+            if any(_DONE.search(text) is None for text in outputs):
+                raise Crashed(f"{name}: {done.stderr[-2000:]}{''.join(outputs)[-4000:]}")
+            empty, reached = (dict(_REACHED.findall(text)) for text in outputs)
+            runs = re.findall(_DONE, outputs[1])[-1]
             yield Session(name, int(runs), int(empty["INITED"]), int(reached["INITED"]), int(reached["DONE"]))
         if done.returncode:
             raise Crashed(done.stderr[-2000:])
 
 
-def _said(path: Path) -> str:
+def _output(path: Path) -> str:
     return path.read_text(errors="replace") if path.exists() else ""

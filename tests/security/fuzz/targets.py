@@ -5,7 +5,6 @@ finite and that a round trip through the serializer is stable.
 """
 
 import atexit
-import contextlib
 import math
 import shutil
 import tempfile
@@ -61,49 +60,49 @@ class Target:
     seeds: tuple[bytes, ...]
 
 
+def _parse(
+    parse: Callable[..., Any],
+    *arguments: Any,
+    documented: type[Exception] | tuple[type[Exception], ...] = ProtocolError,
+) -> Any:
+    """The result of a parser, whose numbers are finite; ``None`` if it raised a documented exception."""
+    try:
+        result = parse(*arguments)
+    except documented:
+        return None
+    _check_finite(result)
+    return result
+
+
 def _message(data: bytes) -> None:
     """The first byte selects the type."""
     if not data:
         return
     kind = examples.KINDS[data[0] % len(examples.KINDS)]
-    try:
-        found = codec.decode(data[1:], kind)
-    except ProtocolError:
+    message = _parse(codec.decode, data[1:], kind)
+    if message is None:
         return
-    _check_finite(found)
-    written = _written(found)
-    if written is not None and (
-        codec.decode(written, kind) != found or codec.encode(codec.decode(written, kind)) != written
-    ):
-        raise Found(f"{kind.__name__} is another one when it is written and read again")
-
-
-def _written(found: Any) -> bytes | None:
     try:
-        return codec.encode(found)
+        encoded = codec.encode(message)
     except ProtocolError as error:
         if "is the most" in str(error):  # serialized, it is longer than the input
-            return None
+            return
         raise Found(str(error)) from error
+    again = codec.decode(encoded, kind)
+    if again != message or codec.encode(again) != encoded:
+        raise Found(f"{kind.__name__} changes when it is written and read again")
 
 
 def _signed(data: bytes) -> None:
-    try:
-        body = signing.verify(data, _KEYS)
-    except ProtocolError:
-        return
-    if body not in examples.BODIES:
+    body = _parse(signing.verify, data, _KEYS)
+    if body is not None and body not in examples.BODIES:
         raise Found("an accepted body without a valid signature")
 
 
 def _topic(data: bytes) -> None:
-    text = data.decode(errors="replace")
-    pattern, _, topic = text.partition(" ")
-    try:
-        parsed = topics.parse(topic)
-    except ProtocolError:
-        pass
-    else:
+    pattern, _, topic = data.decode(errors="replace").partition(" ")
+    parsed = _parse(topics.parse, topic)
+    if parsed is not None:
         again = (
             topics.conn(parsed.space, parsed.agent)
             if parsed.kind == topics.CONN
@@ -119,84 +118,62 @@ def _topic(data: bytes) -> None:
     )
     grant.may_publish(topic)
     grant.may_subscribe(topic)
-    try:
-        grants.check(grant)
-    except ProtocolError:
-        return
+    _parse(grants.check, grant)
 
 
 def _manifest(data: bytes) -> None:
-    try:
-        found = robot_type.parse(data.decode(errors="replace"))
-    except ProtocolError:
-        return
-    _check_finite(found)
+    _parse(robot_type.parse, data.decode(errors="replace"))
 
 
 def _token(data: bytes) -> None:
     token = data.decode(errors="replace")
-    try:
-        found = grants.read(token, _KEYS)
-    except ProtocolError:
-        return
-    _check_finite(found)
-    grants.issued_at(token)
+    if _parse(grants.read, token, _KEYS) is not None:
+        grants.issued_at(token)
 
 
-def _line_of_a_script(data: bytes) -> None:
-    try:
-        found = script_calls.parse(data)
-    except ProtocolError:
-        return
-    _check_finite(found)
+def _script_line(data: bytes) -> None:
+    _parse(script_calls.parse, data)
 
 
-def _answer(data: bytes) -> None:
-    """A server response to an agent: one byte for the status, one for the call, then the body."""
+def _response(data: bytes) -> None:
+    """A server's response to an agent: one byte for the status, one for the call, then the body."""
     if len(data) < 2:
         return
     clock = CloudClock()
     api = CloudClient("http://server", _KEY, clock)
-    answer = requests.Response()
-    answer.status_code = (200, 201, 202, 204, 302, 400, 404, 409, 429, 500, 503)[data[0] % 11]
-    answer._content = data[2:]
-    answer.headers["X-Telescope-Time-Ms"] = data[2:16].decode("latin-1")
-    api._http.request = lambda *_arguments, **_options: answer  # type: ignore[method-assign]
-    asked: tuple[Callable[[], Any], ...] = (
+    response = requests.Response()
+    response.status_code = (200, 201, 202, 204, 302, 400, 404, 409, 429, 500, 503)[data[0] % 11]
+    response._content = data[2:]
+    response.headers["X-Telescope-Time-Ms"] = data[2:16].decode("latin-1")
+    api._http.request = lambda *_arguments, **_options: response  # type: ignore[method-assign]
+    calls: tuple[Callable[[], Any], ...] = (
         lambda: api.enroll(name="n", software="s", transport="http", devices=[]),
         api.enrollment,
         api.credentials,
         lambda: api.commands("a", wait_s=0, limit=1, have=()),
         lambda: api.send("a", [("t", b"{}")]),
     )
-    try:
-        found = asked[data[1] % len(asked)]()
-        _check_finite(found)
-        if isinstance(found, dict):
-            for kind in (responses.MqttCredentials, responses.XmppCredentials, responses.Claimed):
-                with contextlib.suppress(CloudError):
-                    _check_finite(responses.read(found, kind))
-    except (CloudError, OSError):
-        return
+    result = _parse(calls[data[1] % len(calls)], documented=(CloudError, OSError))
+    if isinstance(result, dict):
+        for kind in (responses.MqttCredentials, responses.XmppCredentials, responses.Claimed):
+            _parse(responses.read, result, kind, documented=CloudError)
     _check_finite(clock.now_ms())
 
 
 def _stanza(data: bytes) -> None:
     try:
-        stanza = fromstring(data)  # noqa: S314 (what slixmpp does with what arrives)
+        stanza = fromstring(data)  # noqa: S314 (slixmpp does the same with received data)
     except (ParseError, ValueError, LookupError):
         return
     stanzas.receipt_id(stanza)
     stanzas.parse_rejection(stanza)
     stanzas.user_at(stanza.get("from", ""), "site")
-    try:
-        told = stanzas.parse(stanza)
-    except ProtocolError:
-        return
-    if told is not None:
-        again = stanzas.parse(fromstring(stanzas.message("a@site", told.topic, told.payload, receipt=told.id)))  # noqa: S314
-        if again != told:
-            raise Found(f"{told} is another one when it is written and read again: {again}")
+    delivery = _parse(stanzas.parse, stanza)
+    if delivery is not None:
+        text = stanzas.message("a@site", delivery.topic, delivery.payload, receipt=delivery.id)
+        again = stanzas.parse(fromstring(text))  # noqa: S314
+        if again != delivery:
+            raise Found(f"{delivery} changes when it is written and read again: {again}")
 
 
 _FOLDER = Path(tempfile.mkdtemp(prefix="ts-fuzz-"))
@@ -208,19 +185,15 @@ def _home(data: bytes) -> None:
     store = IdentityStore(_FOLDER)
     (_FOLDER / "agent.toml").write_bytes(data)
     (_FOLDER / "pairing.json").write_bytes(data)
-    with contextlib.suppress(ConfigError):
-        _check_finite(store.pairing())
-    try:
-        found = AgentConfig.load(store.folder)
-    except ConfigError:
-        return
-    _check_finite(found)
-    found.save(store.folder)
-    if AgentConfig.load(store.folder) != found:
-        raise Found("the configuration is another one when it is written and read again")
+    _parse(store.pairing, documented=ConfigError)
+    config = _parse(AgentConfig.load, store.folder, documented=ConfigError)
+    if config is not None:
+        config.save(store.folder)
+        if AgentConfig.load(store.folder) != config:
+            raise Found("the configuration changes when it is written and read again")
 
 
-class _Asked:
+class _Request:
     """A request as the API's reader sees it."""
 
     def __init__(self, body: bytes) -> None:
@@ -236,8 +209,8 @@ def _body(data: bytes) -> None:
     """A request body; the first byte selects the type."""
     if not data:
         return
-    asked: Any = _Asked(data[1:])
-    reading = read(asked, examples.API_KINDS[data[0] % len(examples.API_KINDS)])
+    request: Any = _Request(data[1:])
+    reading = read(request, examples.API_KINDS[data[0] % len(examples.API_KINDS)])
     try:
         reading.send(None)
     except StopIteration as done:
@@ -248,31 +221,23 @@ def _body(data: bytes) -> None:
 
 def _packet(data: bytes) -> None:
     """Packets at the broker: the first one, and those of an accepted client."""
-    limits = Limits()
-    accepted = Framer(limits)
+    accepted = Framer(Limits())
     accepted.accept_all()
-    for framer in (Framer(limits), accepted):
-        try:
-            frames = list(framer.feed(data))
-        except MalformedPacket:
-            continue
-        for frame in frames:
+    for framer in (Framer(Limits()), accepted):
+        for frame in _parse(lambda framer=framer: list(framer.feed(data)), documented=MalformedPacket) or ():
             _read_frame(frame)
 
 
 def _read_frame(frame: packets.Frame) -> None:
     readers: dict[int, Callable[[packets.Frame], Any]] = {
-        CONNECT: lambda found: packets.read_connect(found.body),
+        CONNECT: lambda frame: packets.read_connect(frame.body),
         PUBLISH: packets.read_publish,
         SUBSCRIBE: packets.read_subscribe,
         UNSUBSCRIBE: packets.read_unsubscribe,
         PUBACK: packets.read_puback,
     }
     if frame.kind in readers:
-        try:
-            readers[frame.kind](frame)
-        except (MalformedPacket, UnacceptableProtocol):
-            return
+        _parse(readers[frame.kind], frame, documented=(MalformedPacket, UnacceptableProtocol))
 
 
 def _check_finite(value: Any) -> None:
@@ -289,23 +254,16 @@ def _check_finite(value: Any) -> None:
             _check_finite([getattr(value, field) for field in value.__struct_fields__])
 
 
-def _manifests() -> tuple[bytes, ...]:
-    return tuple(path.read_bytes() for path in sorted(ROBOTS.glob(f"*/{robot_type.MANIFEST}")))
-
-
-def _tokens() -> tuple[bytes, ...]:
-    grant = grants.agent_grant("s", "a", token_id="t", lifetime_s=1e8)
-    return (grants.issue(grant, _KEY).encode(),)
-
-
+_MANIFESTS = tuple(path.read_bytes() for path in sorted(ROBOTS.glob(f"*/{robot_type.MANIFEST}")))
+_TOKEN = grants.issue(grants.agent_grant("s", "a", token_id="t", lifetime_s=1e8), _KEY).encode()
 TARGETS: dict[str, Target] = {
     "messages": Target(_message, examples.MESSAGES),
     "signing": Target(_signed, tuple(signing.sign(body, _KEY) for body in examples.BODIES)),
     "topics": Target(_topic, examples.TOPICS),
-    "robot_type": Target(_manifest, _manifests()),
-    "grants": Target(_token, _tokens()),
-    "script": Target(_line_of_a_script, examples.LINES),
-    "http": Target(_answer, examples.ANSWERS),
+    "robot_type": Target(_manifest, _MANIFESTS),
+    "grants": Target(_token, (_TOKEN,)),
+    "script": Target(_script_line, examples.LINES),
+    "http": Target(_response, examples.RESPONSES),
     "stanzas": Target(_stanza, examples.STANZAS),
     "home": Target(_home, examples.HOMES),
     "bodies": Target(_body, examples.API_BODIES),

@@ -1,8 +1,7 @@
 """Agent side of an attack: a process with secrets, victims and open ports, which runs hostile scripts.
 
-``python -m tests.security.sandbox.attack_host LAYERS``: each line that it reads is a JSON ``[name, source,
-untrusted]``, each line that it writes what came of it (``Result``). LAYERS are the sandbox's, comma-separated; none:
-no sandbox at all.
+``python -m tests.security.sandbox.attack_host LAYERS`` reads lines of JSON, ``[name, source, untrusted]``, and writes a
+``Result`` for each. LAYERS are those of the sandbox, separated by commas; none: no sandbox at all.
 """
 
 import contextlib
@@ -44,10 +43,10 @@ class Result(msgspec.Struct):
 
     Attributes:
         tried: Whether the attack was executed.
-        breaches: What succeeded, as reported by the attack and as observed from outside.
+        breaches: Successes that the attack reports or that are observed from outside.
         message: The error of the script, as the operator reads it.
         moves: Calls that reached the robot.
-        killed_ms: Time from the kill to the end of the process [ms]; 0 if it ended by itself.
+        killed: Whether the process was killed, so that it did not end by itself.
         messages: Number of processed messages.
         cpu_s: Processor time of the host during the attack [s].
         wall_s: Duration [s].
@@ -57,7 +56,7 @@ class Result(msgspec.Struct):
     breaches: list[str]
     message: str
     moves: list[Any]
-    killed_ms: float
+    killed: bool
     messages: int
     cpu_s: float
     wall_s: float
@@ -158,7 +157,7 @@ class Surroundings:
             "contacts": len(self.contacts),
             "the victim": stat[0] in "SR",
             "the agent's memory": self.memory.value.decode(),
-            "the agent's importance": os.getpriority(os.PRIO_PROCESS, os.getpid()),
+            "the agent's priority": os.getpriority(os.PRIO_PROCESS, os.getpid()),
             "the machine's name": platform.node(),
         }
 
@@ -235,21 +234,20 @@ def attack(sandbox: SandboxHost, around: Surroundings, name: str, source: str, *
         parameters=around.parameters(zygotes()),
     )  # fmt: skip
     script = ScriptAction(order, robot, report, sandbox=ScriptSandbox(sandbox, untrusted, LIMITS), on_exit=lambda: None)
-    killed_at_s = 0.0
+    killed = threading.Event()
 
-    def stop() -> None:
-        nonlocal killed_at_s
-        killed_at_s = time.perf_counter()
+    def kill() -> None:
+        killed.set()
         script.kill()
 
-    alarm = threading.Timer(TIME_LIMIT_S, stop)  # starts with its first output
+    alarm = threading.Timer(TIME_LIMIT_S, kill)  # starts with its first output
     message = ""
     cpu_s, wall_s = time.process_time(), time.perf_counter()
     try:
         script.run()
     except ScriptFailed as failed:
         message = str(failed)
-    ended_s = time.perf_counter()
+    wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
     alarm.cancel()
     breaches = [line for line in printed[0].splitlines() if line.startswith("BREACH")]
     breaches += around.breaches()
@@ -261,10 +259,10 @@ def attack(sandbox: SandboxHost, around: Surroundings, name: str, source: str, *
         breaches=breaches,
         message=message,
         moves=robot.moves,
-        killed_ms=(ended_s - killed_at_s) * 1000 if killed_at_s else 0.0,
+        killed=killed.is_set(),
         messages=robot.messages,
-        cpu_s=time.process_time() - cpu_s,
-        wall_s=ended_s - wall_s,
+        cpu_s=cpu_s,
+        wall_s=wall_s,
     )
 
 

@@ -6,14 +6,14 @@
 
 from textwrap import dedent
 
-from tests.security.sandbox.resource_and_protocol_attacks import EXHAUSTION, LIES
-
 PRELUDE = """
-import ctypes, os, sys
+import ctypes, os, signal, socket, sys
 from ctypes import byref, c_char_p, c_long, c_uint64, c_void_p, create_string_buffer
 P = parameters
 libc = ctypes.CDLL(None, use_errno=True)
 libc.syscall.restype = c_long
+libc.mmap.restype = c_void_p
+libc.mmap.argtypes = [c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, c_long]
 def call(name, *arguments):
     kinds = {int: c_long, bytes: c_char_p}
     given = [kinds.get(type(each), lambda known: known)(each) for each in arguments]
@@ -27,7 +27,13 @@ def tries(what, *arguments):
     except OSError: return None
     breach(result)
     return result
+buffer = create_string_buffer(64)
+def transfer():
+    parts = [(c_uint64 * 2)(each, 64) for each in (ctypes.addressof(buffer), P["secret_address"])]
+    return P["agent"], byref(parts[0]), 1, byref(parts[1]), 1, 0
+def map_memory(size, rights): return libc.mmap(None, size, rights, 0x22, -1, 0)
 AT_FDCWD = -100
+NOT_MAPPED = (None, 2**64 - 1)
 print("TRIED", flush=True)
 # ---- the attack
 """
@@ -85,35 +91,15 @@ FILES = {
 }
 
 NETWORK = {
-    "connects_by_tcp": """
-        import socket
-        def attack():
-            link = socket.socket()
-            link.connect(('127.0.0.1', P['port']))
-            return link.send(b'x')
-        tries(attack)""",
+    "connects_by_tcp": "tries(lambda: socket.socket().connect(('127.0.0.1', P['port'])))",
     "listens_by_tcp": """
-        import socket
-        def attack():
-            link = socket.socket()
-            link.bind(('127.0.0.1', 0))
-            return link.listen()
-        tries(attack)""",
-    "sends_by_udp": """
-        import socket
-        tries(lambda: socket.socket(type=socket.SOCK_DGRAM).sendto(b'x', ('127.0.0.1', P['port'])))""",
-    "connects_to_a_socket_file": """
-        import socket
-        def attack():
-            link = socket.socket(socket.AF_UNIX)
-            link.connect(P['home'] + '/socket')
-        tries(attack)""",
+        link = socket.socket()
+        tries(link.bind, ('127.0.0.1', 0))
+        tries(link.listen)""",
+    "sends_by_udp": "tries(lambda: socket.socket(type=socket.SOCK_DGRAM).sendto(b'x', ('127.0.0.1', P['port'])))",
+    "connects_to_a_socket_file": "tries(lambda: socket.socket(socket.AF_UNIX).connect(P['home'] + '/socket'))",
     "connects_to_an_abstract_socket": """
-        import socket
-        def attack():
-            link = socket.socket(socket.AF_UNIX)
-            link.connect(b'\\0' + P['abstract'].encode())
-        tries(attack)""",
+        tries(lambda: socket.socket(socket.AF_UNIX).connect(b'\\0' + P['abstract'].encode()))""",
     "listens_to_all_packets": "worked(call('socket', 17, 3, 0x300))",
     "talks_to_the_kernel_by_netlink": "worked(call('socket', 16, 3, 0))",
     "makes_a_socket_pair": "worked(call('socketpair', 1, 1, 0, (ctypes.c_int * 2)()))",
@@ -168,16 +154,8 @@ PROCESSES = {
         worked(call('fcntl', 3, 4, 0o20000))""",
     "traces_a_process": "worked(call('ptrace', 16, P['victim'], 0, 0))",
     "seizes_the_agent": "worked(call('ptrace', 0x4206, P['agent'], 0, 0))",
-    "reads_the_agents_memory_by_system_call": """
-        room = create_string_buffer(64)
-        part = (c_uint64 * 2)(ctypes.addressof(room), 64)
-        far = (c_uint64 * 2)(P['secret_address'], 64)
-        worked(call('process_vm_readv', P['agent'], byref(part), 1, byref(far), 1, 0))""",
-    "writes_the_agents_memory_by_system_call": """
-        room = create_string_buffer(64)
-        part = (c_uint64 * 2)(ctypes.addressof(room), 64)
-        far = (c_uint64 * 2)(P['secret_address'], 64)
-        worked(call('process_vm_writev', P['agent'], byref(part), 1, byref(far), 1, 0))""",
+    "reads_the_agents_memory_by_system_call": "worked(call('process_vm_readv', *transfer()))",
+    "writes_the_agents_memory_by_system_call": "worked(call('process_vm_writev', *transfer()))",
     "takes_a_descriptor_of_the_agent": """
         process = call('pidfd_open', P['agent'], 0)
         worked(call('pidfd_getfd', process, 0, 0))""",
@@ -260,11 +238,7 @@ DESCRIPTORS = {
     "doubles_its_socket": """
         tries(os.dup, 3)
         worked(call('fcntl', 3, 0, 10))""",
-    "sends_a_descriptor_to_the_agent": """
-        import array, socket
-        link = socket.socket.__new__(socket.socket)
-        header = create_string_buffer(56)
-        worked(call('sendmsg', 3, header, 0))""",
+    "sends_a_descriptor_to_the_agent": "worked(call('sendmsg', 3, create_string_buffer(56), 0))",
     "receives_a_descriptor": "worked(call('recvmsg', 3, create_string_buffer(56), 0x40))",
     "opens_its_socket_again": "tries(lambda: open('/proc/self/fd/3', 'rb'))",
     "asks_who_is_at_the_other_end": """
@@ -275,20 +249,15 @@ DESCRIPTORS = {
 
 CODE = {
     "runs_machine_code_of_its_own": """
-        libc.mmap.restype = c_void_p
-        libc.mmap.argtypes = [c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, c_long]
-        place = libc.mmap(None, 4096, 7, 0x22, -1, 0)
-        if place not in (None, 2**64 - 1): breach('written and run')
-        place = libc.mmap(None, 4096, 3, 0x22, -1, 0)
+        if map_memory(4096, 7) not in NOT_MAPPED: breach('written and run')
+        place = map_memory(4096, 3)
         worked(call('mprotect', c_void_p(place), 4096, 5))""",
     "calls_the_kernel_as_a_32_bit_program": """
         if P['machine'] != 'x86_64': raise SystemExit
         # mov eax, 20 (getpid); int 0x80; ret: in memory that an earlier mapping of libffi may have left open to run.
-        libc.mmap.restype = c_void_p
-        libc.mmap.argtypes = [c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, c_long]
-        place = libc.mmap(None, 4096, 7, 0x22, -1, 0)
-        if place in (None, 2**64 - 1): raise SystemExit
-        code = bytes.fromhex('b8140000 00cd80c3'.replace(' ', ''))
+        place = map_memory(4096, 7)
+        if place in NOT_MAPPED: raise SystemExit
+        code = bytes.fromhex('b814000000cd80c3')
         ctypes.memmove(place, code, len(code))
         if ctypes.CFUNCTYPE(c_long)(place)() > 0: breach()""",
     "calls_the_kernel_by_x32_numbers": """
@@ -322,12 +291,66 @@ CODE = {
         os.environ['SURPRISE'] = '1'""",
 }
 
-GROUPS = {
-    "files": FILES, "network": NETWORK, "processes": PROCESSES, "privileges": PRIVILEGES,
-    "kernel": KERNEL,
-    "descriptors": DESCRIPTORS,
-    "code": CODE,
-    "exhaustion": EXHAUSTION,
-    "lies": LIES,
-}  # fmt: skip
-ATTACKS = {name: PRELUDE + dedent(source) for group in GROUPS.values() for name, source in group.items()}
+EXHAUSTION = {
+    "takes_all_memory": """
+        rest = []
+        try:
+            while True: rest.append(bytearray(16 * 2**20))
+        except MemoryError:
+            if len(rest) > 40: breach(len(rest))""",
+    "takes_memory_past_python": "if map_memory(2**31, 3) not in NOT_MAPPED: breach()",
+    "grows_its_stack": """
+        sys.setrecursionlimit(10**9)
+        def deeper(): return deeper()
+        deeper()""",
+    "computes_for_ever": "while True: pass",
+    "computes_for_ever_inside_of_c": "x = 9 ** 9 ** 8",
+    "sleeps_for_ever": "wait(10**6)",
+    "ignores_every_signal": """
+        for number in range(1, 65):
+            try: signal.signal(number, signal.SIG_IGN)
+            except (OSError, ValueError): pass
+        signal.pthread_sigmask(signal.SIG_BLOCK, range(1, 65))
+        while True: pass""",
+    "never_reads_its_answers": """
+        line = b'{"kind": "state"}\\n'
+        while True: os.write(3, line)""",
+    "prints_for_ever": "while True: print('x' * 1000)",
+    "prints_one_endless_line": "while True: os.write(3, b'x' * 65536)",
+    "asks_for_ever": "while True: robot.state()",
+    "says_progress_for_ever": "while True: progress(0.5)",
+    "leaves_a_time_bomb": """
+        signal.signal(signal.SIGALRM, lambda *_: breach('later'))
+        signal.alarm(1)
+        signal.setitimer(signal.ITIMER_REAL, 0.2)""",
+}
+
+LIES = {
+    "moves_without_the_api": """
+        for speed in ('0.5', '1e9', 'NaN', '1e999', '-1'):
+            os.write(3, b'{"kind": "move_joints", "position_rad": {"elbow": 1}, "speed": %s}\\n' % speed.encode())
+        for value in ('NaN', 'Infinity', '1e999', 'null', '"1"', 'true'):
+            os.write(3, b'{"kind": "move_joints", "position_rad": {"elbow": %s}, "speed": 0.5}\\n' % value.encode())""",
+    "moves_after_it_has_ended": """
+        os.write(3, b'{"kind": "ended", "error": ""}\\n')
+        os.write(3, b'{"kind": "home", "speed": 0.123}\\n' * 50)
+        while True: pass""",
+    "says_progress_that_is_none": """
+        for share in ('NaN', '-1', '2', '1e999', '"1"', '[]'):
+            os.write(3, b'{"kind": "progress", "share": %s}\\n' % share.encode())""",
+    "sends_nested_json": "os.write(3, b'[' * 60000 + b'\\n')",
+    "sends_garbage": "for _ in range(50): os.write(3, os.urandom(500) + b'\\n')",
+    "sends_a_number_of_endless_digits": """
+        os.write(3, b'{"kind": "progress", "share": 0.' + b'1' * 60000 + b'}\\n')""",
+    "sends_names_of_other_kinds": """
+        for kind in ('ready', 'unfit', '__class__', 'stop', 'reset_stop', 'grant_lease'):
+            os.write(3, b'{"kind": "%s"}\\n' % kind.encode())""",
+    "claims_that_the_sandbox_is_broken": 'os.write(3, b\'{"kind": "unfit", "reason": "x"}\\n\')',
+    "ends_without_a_word": "os._exit(0)",
+    "closes_its_socket": """
+        os.close(3)
+        while True: pass""",
+}
+
+GROUPS = (FILES, NETWORK, PROCESSES, PRIVILEGES, KERNEL, DESCRIPTORS, CODE, EXHAUSTION, LIES)
+ATTACKS = {name: PRELUDE + dedent(source) for group in GROUPS for name, source in group.items()}

@@ -17,9 +17,8 @@ from tests.harness.agent.device_harness import DeviceHarness
 from tests.harness.paths import ROOT
 
 UR5 = ROBOTS / "ur5"
-WRITTEN = ROOT / "web" / "tests" / "fixtures" / "keyframes.py"
-"""What the page's tests hold it to."""
-TELLS = "\nimport json\nprint(json.dumps(robot.state()['position_rad']))\n"
+KEYFRAMES = ROOT / "web" / "tests" / "fixtures" / "keyframes.py"
+"""Output of the keyframe editor; the web tests compare with it too."""
 
 
 @pytest.fixture
@@ -40,22 +39,22 @@ def test_a_frame_reaches_its_pose(arm: DeviceHarness) -> None:
         "down = robot.state()['frames']['flange']\n"
         "robot.move_to((down[0], down[1] + 0.1, down[2] + 0.05), speed=1)\n"
         "wait(0.5)\n"
-        "there = robot.state()['frames']['flange']\n"
+        "raised = robot.state()['frames']['flange']\n"
         "robot.move_to(down[:3], quaternion=down[3:], frame='flange', speed=1)\n"
         "wait(0.5)\n"
-        "print(json.dumps([down, there, robot.state()['frames']['flange']]))\n"
+        "print(json.dumps([down, raised, robot.state()['frames']['flange']]))\n"
     )
     ack = arm.end(arm.command(arm.script(source), epoch=1))
     assert ack.status is AckStatus.DONE, ack.reason
-    down, there, again = json.loads(ack.output)
+    down, raised, again = json.loads(ack.output)
     wanted = (down[0], down[1] + 0.1, down[2] + 0.05)
-    assert math.dist(there[:3], wanted) < 2e-3
+    assert math.dist(raised[:3], wanted) < 2e-3
     assert math.dist(again[:3], down[:3]) < 2e-3
-    assert abs(sum(a * b for a, b in zip(there[3:], down[3:], strict=True))) > 0.9999, "it keeps its orientation"
+    assert abs(sum(a * b for a, b in zip(raised[3:], down[3:], strict=True))) > 0.9999, "it keeps its orientation"
 
 
 @pytest.mark.parametrize(
-    ("call", "says"),
+    ("call", "message"),
     [
         ("robot.move_to((5, 0, 0))", "line 1: RobotError"),
         ("robot.move_to((-0.4, 0.0, -0.2))", "line 1: RobotError"),
@@ -64,18 +63,17 @@ def test_a_frame_reaches_its_pose(arm: DeviceHarness) -> None:
         ("robot.look((1, 0, 0))", "this robot has no look"),
     ],
 )
-def test_motions_outside_the_limits_are_rejected(arm: DeviceHarness, call: str, says: str) -> None:
+def test_motions_outside_the_limits_are_rejected(arm: DeviceHarness, call: str, message: str) -> None:
     reason = arm.end(arm.command(arm.script(call), epoch=1)).reason
     assert reason is not None
-    assert says in reason.message
+    assert message in reason.message
 
 
 def test_a_script_of_the_keyframe_editor_is_played(arm: DeviceHarness) -> None:
-    source = WRITTEN.read_text()
+    source = KEYFRAMES.read_text()
     assert check_script(source, TYPES.load("ur5")).marks == ()
-    order = msgspec.structs.replace(arm.script(source + TELLS), parameters={"speed": 2})
-    ack = arm.end(arm.command(order, epoch=1))
+    source += "\nimport json\nprint(json.dumps(robot.state()['position_rad']))\n"
+    ack = arm.end(arm.command(msgspec.structs.replace(arm.script(source), parameters={"speed": 2}), epoch=1))
     assert ack.status is AckStatus.DONE, ack.reason
-    there = json.loads(ack.output)
-    assert there["shoulder_pan"] == pytest.approx(0.5, abs=0.02)
-    assert there["elbow"] == pytest.approx(1.57, abs=0.02)
+    position_rad = json.loads(ack.output)
+    assert (position_rad["shoulder_pan"], position_rad["elbow"]) == pytest.approx((0.5, 1.57), abs=0.02)

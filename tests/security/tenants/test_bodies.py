@@ -1,27 +1,19 @@
 """Every route enforces its body limit while it reads the body."""
 
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from typing import Any
 
 import httpx
-import pytest
 
 from function_app.entrypoints.http.framework.responses import MAX_BODY
 from function_app.entrypoints.http.robot_types.schemas import MAX_UPLOAD
 from tests.harness.cloud.cloud import API, problem
 from tests.security.tenants.test_routes import ask
-from tests.security.tenants.world import World, make
+from tests.security.tenants.world import World
 
 PART = 65_536
 LARGER = {"add_robot_type": MAX_UPLOAD, "add_robot_type_preview": MAX_UPLOAD}
 """Routes with a larger limit than the default."""
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    world = make(tmp_path_factory.mktemp("home"))
-    with world.cloud:
-        yield world
 
 
 class Endless:
@@ -62,7 +54,9 @@ def asked(world: World, name: str, method: str, path: str, who: str, **body: Any
 
     def send(method: str, path: str, **_: Any) -> httpx.Response:
         return (
-            world.cloud.ask(method, API + path, **body) if who == "agent" else world.callers[who](method, path, **body)
+            world.cloud.request(method, API + path, **body)
+            if who == "agent"
+            else world.callers[who](method, path, **body)
         )
 
     return ask(World(world.cloud, {who: send}, world.ids, {}), who, name, method, path)[1]

@@ -12,20 +12,12 @@ from typing import Any, Literal, NamedTuple
 import pytest
 
 from device_agent.protocol.security.grants import Grant
-from function_app.adapters.local.signing_keys import FileKeys
 from function_app.ports.broker_access import Credentials
 from tests.fakes.agent import Robot
 from tests.fakes.event_grid import event_grid_cloud
+from tests.fixtures.brokers import Brokers
 from tests.harness.cloud.cloud import Cloud, settings
-from tests.harness.network.brokers import (
-    BROKERS,
-    BrokerKind,
-    Client,
-    Message,
-    RunningBroker,
-    start_broker,
-    wait_until,
-)
+from tests.harness.network.brokers import BROKERS, BrokerKind, Client, Message, RunningBroker, wait_until
 from tests.harness.paths import ROOT
 
 TABLE = Path(__file__).with_name("topics.txt")
@@ -57,7 +49,9 @@ def channels() -> dict[str, str]:
 
 
 @pytest.fixture(params=(*BROKERS, "eventgrid"), scope="module")
-def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
+def stage(
+    request: pytest.FixtureRequest, brokers: Brokers, keys: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Stage]:
     kind: BrokerKind | Literal["eventgrid"] = request.param
     home = tmp_path_factory.mktemp(f"{kind}-home")
     if kind == "eventgrid":
@@ -66,13 +60,13 @@ def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
             with broker.connect("ear", None) as ear:
                 yield _stage(broker, cloud, ear)
         return
-    FileKeys(home / "keys").load()
-    with start_broker(kind, tmp_path_factory.mktemp(kind), keys=home / "keys" / "public.json") as broker:
-        if kind == "mosquitto":
-            (home / "mosquitto").mkdir()
-            shutil.copy(broker.home / "service.password", home / "mosquitto")
-        with Cloud(settings(home, broker)) as cloud, _ear(cloud, broker) as ear:
-            yield _stage(broker, cloud, ear)
+    shutil.copytree(keys, home / "keys")
+    broker = brokers(kind)
+    if kind == "mosquitto":
+        (home / "mosquitto").mkdir()
+        shutil.copy(broker.home / "service.password", home / "mosquitto")
+    with Cloud(settings(home, broker)) as cloud, _ear(cloud, broker) as ear:
+        yield _stage(broker, cloud, ear)
 
 
 def _stage(broker: RunningBroker, cloud: Cloud, ear: Client) -> Stage:
@@ -107,12 +101,12 @@ def _people(cloud: Cloud) -> tuple[Robot, dict[str, dict[str, Any]]]:
         people[f"space {role}"] = cloud.sign_in(f"space {role}")
         body = {"account": f"space {role}", "role": role}
         assert anna.post(f"/spaces/{robot.space}/shares", body).status_code == 201
-    epoch = anna.take(robot.device, wait_ms=0).json()["epoch"]
+    epoch = anna.take_lease(robot.device, wait_ms=0).json()["epoch"]
     steer = {"purpose": "control", "device": robot.device, "epoch": epoch}
     roles = {name: person.post("/mqtt/credentials", {"purpose": "view"}).json() for name, person in people.items()}
     roles["holder"] = anna.post("/mqtt/credentials", steer).json()
     for name, agent in (("agent", robot), ("foreign agent", foreign)):
-        roles[name] = agent.ask("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
+        roles[name] = agent.request("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
     assert epoch == 1
     return robot, roles
 

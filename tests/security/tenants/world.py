@@ -4,10 +4,10 @@ Without a broker: agents poll, and their messages go directly to the ingest. Aft
 restored, so that the cells of the matrix are independent.
 """
 
+import copy
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -16,6 +16,7 @@ from device_agent.protocol import Fault, Measurements, Mode, Presence, State, co
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import API, BASE, Cloud, Person, settings
+from tests.harness.cloud.memory import NO_FOLDER, Memory
 from tests.harness.paths import ROOT
 
 OWNER = "Anneliese Musterfrau"
@@ -44,24 +45,27 @@ class World:
     """Texts in the partition keys of Anneliese's rows."""
 
     def rows(self) -> Rows:
-        db: Any = self.cloud.functions.tables
-        found = db._run("SELECT tab, part, key, etag FROM rows", ())
-        return {(table, partition, key): etag for table, partition, key, etag in found}
+        """Etag of each row."""
+        partitions = self._partitions.items()
+        return {(*where, key): row[0] for where, found in partitions for key, row in found.rows.items()}
 
     def keep(self) -> None:
-        db: Any = self.cloud.functions.tables
-        db._run("CREATE TEMP TABLE kept AS SELECT * FROM rows", ())
+        self._kept = copy.deepcopy(self._partitions)
 
     def put_back(self) -> None:
         """Restore the saved tables."""
-        db: Any = self.cloud.functions.tables
-        db._run("DELETE FROM rows", ())
-        db._run("INSERT INTO rows SELECT * FROM kept", ())
+        self._partitions.clear()
+        self._partitions.update(copy.deepcopy(self._kept))
+
+    @property
+    def _partitions(self) -> dict[tuple[str, str], Any]:
+        assert self.cloud.memory is not None
+        return self.cloud.memory.tables._partitions
 
 
-def make(home: Path) -> World:
+def make(memory: Memory) -> World:
     """Create the world, with a mark in each text field of Anneliese's data."""
-    cloud = Cloud(settings(home))
+    cloud = Cloud(settings(NO_FOLDER), memory=memory)
     for silent, name in ((cloud.functions.bus, "publish"), (cloud.functions.access, "revoke")):
         setattr(silent, name, _nothing)
     anna, other = cloud.sign_in(OWNER), cloud.sign_in(OWNER)
@@ -84,7 +88,7 @@ def make(home: Path) -> World:
         _made(anna.post(f"/spaces/{space}/shares", {"account": f"space {role}", "role": role}))
     app = {"name": "app", "days": 1}
     keys = {role: _made(anna.post("/api-keys", {**app, "role": role})) for role in ("viewer", "operator")}
-    epoch = anna.take(device, lease_ms=600_000, wait_ms=0).json()["epoch"]
+    epoch = anna.take_lease(device, lease_ms=600_000, wait_ms=0).json()["epoch"]
     action = anna.start(device, epoch=epoch).json()["id"]
     request = _made(other.post(f"/devices/{device}/lease/requests", {"wait_ms": 0}))["request"]["id"]
     _say(cloud, robot, epoch)
@@ -113,12 +117,12 @@ def make(home: Path) -> World:
     world = World(
         cloud,
         callers={
-            "anonymous": lambda method, path, **more: cloud.ask(method, API + path, **more),
-            **{name: person.ask for name, person in people.items()},
-            "owner": anna.ask,
+            "anonymous": lambda method, path, **more: cloud.request(method, API + path, **more),
+            **{name: person.request for name, person in people.items()},
+            "owner": anna.request,
             **{f"{role} key": _by_key(cloud, key["token"]) for role, key in keys.items()},
-            "agent": robot.ask,
-            "foreign agent": foreign.ask,
+            "agent": robot.request,
+            "foreign agent": foreign.request,
         },
         ids=ids,
         bodies=_bodies(device, space, epoch, robot.introduction(transport="http")),
@@ -153,7 +157,7 @@ def _made(answer: httpx.Response) -> dict[str, Any]:
 
 
 def _by_key(cloud: Cloud, token: str) -> Ask:
-    return lambda method, path, **more: cloud.ask(
+    return lambda method, path, **more: cloud.request(
         method, API + path, headers={"Authorization": f"Bearer {token}"}, **more
     )
 
@@ -180,7 +184,7 @@ def _say(cloud: Cloud, robot: Robot, epoch: int) -> None:
         f"{top}/arm/tele/hidden": measured,
     }
     messages = [{"topic": topic, "payload": json.loads(codec.encode(message))} for topic, message in told.items()]
-    answer = robot.ask("POST", f"/agents/{robot.id}/messages", json={"messages": messages})
+    answer = robot.request("POST", f"/agents/{robot.id}/messages", json={"messages": messages})
     assert answer.status_code == 200, answer.text
     assert '"rejected"' not in answer.text, answer.text
 
@@ -200,7 +204,7 @@ def _upload(cloud: Cloud, anna: Person, device: str) -> str:
             {"stream": "camera", "length": 3, "content_type": "image/png", "name": "geheim.png"},
         )
     )
-    put = cloud.ask(begun["method"], begun["url"].removeprefix(BASE), headers=begun["headers"], content=b"abc")
+    put = cloud.request(begun["method"], begun["url"].removeprefix(BASE), headers=begun["headers"], content=b"abc")
     assert put.status_code == 201, put.text
     _made(anna.post(f"/devices/{device}/uploads/{begun['id']}/complete"))
     return str(begun["id"])

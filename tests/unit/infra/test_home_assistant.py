@@ -18,31 +18,13 @@ from tests.harness.paths import ROOT
 SCHEMA: dict[str, Any] = json.loads((Path(__file__).parent / "home_assistant.json").read_text())
 LAB = room.load(Path(ROOT) / "robots" / "rooms" / "lab")
 VALUES: dict[str, float | bool] = {
-    "temperature_c": 20.5,
-    "humidity_percent": 40.0,
-    "co2_ppm": 600.0,
-    "light_lux": 300.0,
-    "sound_db": 40.0,
-    "range_m.3": 2.0,
-    "people": 1.0,
-    "present": True,
-    "open": False,
-    "seen.door": True,
-    "taken_bits.3": 1024.0,
-}
+    "temperature_c": 20.5, "humidity_percent": 40.0, "co2_ppm": 600.0, "light_lux": 300.0, "sound_db": 40.0,
+    "range_m.3": 2.0, "people": 1.0, "present": True, "open": False, "seen.door": True, "taken_bits.3": 1024.0,
+}  # fmt: skip
 
 
-def described(device: room.RoomDeviceManifest) -> Description:
-    return Description(
-        device=device.name,
-        kind=device.kind,
-        robot_type=device.kind,
-        label=device.label,
-        streams=device.streams,
-        cameras=device.cameras,
-        captures=device.captures,
-        controls=device.controls,
-    )
+def measurements(values: dict[str, float | bool]) -> Measurements:
+    return Measurements(tick_ms=1, at_ms=1, sequence=1, values=values)
 
 
 class RecordingBridge:
@@ -63,34 +45,45 @@ class RecordingBridge:
         payload = message if isinstance(message, bytes) else codec.encode(message)
         self.target.on_device_message(topics.device("s", "a", name, kind, stream), payload)
 
+    def describe(self, device: room.RoomDeviceManifest) -> None:
+        description = Description(
+            device=device.name, kind=device.kind, robot_type=device.kind, label=device.label, streams=device.streams,
+            cameras=device.cameras, captures=device.captures, controls=device.controls,
+        )  # fmt: skip
+        self.receive(device.name, topics.DESC, description)
+
+    def disconnect(self, agent: str) -> None:
+        presence = Presence(online=False, session=1, at_ms=1)
+        self.target.on_device_message(topics.conn("s", agent), codec.encode(presence))
+
     def announced(self) -> list[tuple[str, dict[str, Any]]]:
         return [(topic, json.loads(content)) for topic, content, _ in self.published if topic.endswith("/config")]
+
+    def offline(self) -> list[str]:
+        return [topic for topic, content, _ in self.published if content == b"offline"]
 
 
 @pytest.fixture
 def bridge() -> Iterator[RecordingBridge]:
     bridge = RecordingBridge()
     for device in LAB.devices:
-        bridge.receive(device.name, topics.DESC, described(device))
+        bridge.describe(device)
     yield bridge
     bridge.target.close()
 
 
 def test_announcements_match_home_assistants_schema(bridge: RecordingBridge) -> None:
     for device in LAB.devices:
+        values = VALUES | {control.name: 0.5 for control in device.controls}
         for stream in device.streams:
-            values = VALUES | {control.name: 0.5 for control in device.controls}
-            bridge.receive(
-                device.name, topics.TELE, Measurements(tick_ms=1, at_ms=1, sequence=1, values=values), stream.name
-            )
+            bridge.receive(device.name, topics.TELE, measurements(values), stream.name)
     announced = bridge.announced()
     components = [topic.split("/")[1] for topic, _ in announced]
     assert not any("_bits" in topic for topic, _ in announced)
     assert set(components) == {"sensor", "binary_sensor", "number", "camera"}
     for component, (_, content) in zip(components, announced, strict=True):
         allowed = SCHEMA["keys"][component]
-        assert set(content) <= set(allowed)
-        assert {key for key, required in allowed.items() if required} <= set(content)
+        assert {key for key, required in allowed.items() if required} <= set(content) <= set(allowed)
         kind = content.get("device_class")
         if component == "sensor" and kind is not None:
             assert content["unit_of_measurement"] in SCHEMA["sensor_units"][kind]
@@ -104,47 +97,45 @@ def test_announcements_match_home_assistants_schema(bridge: RecordingBridge) -> 
 
 
 def test_announcements_are_retained_and_repeated_when_home_assistant_restarts(bridge: RecordingBridge) -> None:
-    count = len(bridge.announced())
+    announced = bridge.announced()
     for device in LAB.devices:
-        bridge.receive(device.name, topics.DESC, described(device))
-    assert len(bridge.announced()) == count
+        bridge.describe(device)
+    assert bridge.announced() == announced
     bridge.target.announce_all()
-    assert len(bridge.announced()) == 2 * count
+    assert len(bridge.announced()) == 2 * len(announced)
     assert all(retained for topic, _, retained in bridge.published if topic.endswith(("/config", "/available")))
 
 
 def test_a_control_is_announced_as_number_only(bridge: RecordingBridge) -> None:
-    bridge.receive(
-        "door", topics.TELE, Measurements(tick_ms=1, at_ms=1, sequence=1, values={"opening": 0.5}), "settings"
-    )
-    door_topics = [topic for topic, _ in bridge.announced() if "/a-door/" in topic]
-    assert door_topics == ["homeassistant/number/a-door/set-opening/config"]
+    bridge.receive("door", topics.TELE, measurements({"opening": 0.5}), "settings")
+    announced = [topic for topic, _ in bridge.announced() if "/a-door/" in topic]
+    assert announced == ["homeassistant/number/a-door/set-opening/config"]
 
 
 def test_measurements_and_frames_are_forwarded_unchanged(bridge: RecordingBridge) -> None:
-    measured = Measurements(tick_ms=1, at_ms=1, sequence=1, values={"temperature_c": 20.5})
+    measured = measurements({"temperature_c": 20.5})
     bridge.receive("thermometer", topics.TELE, measured, "temperature")
-    assert bridge.published[-1] == ("telescope/a-thermometer/tele/temperature", codec.encode(measured), False)
     bridge.receive("camera", topics.CAM, camera_frames.encode(CameraFrame(1, 1, 4, 3, b"JPEG")), "colour")
-    assert bridge.published[-1] == ("telescope/a-camera/cam/colour", b"JPEG", False)
+    assert bridge.published[-2:] == [
+        ("telescope/a-thermometer/tele/temperature", codec.encode(measured), False),
+        ("telescope/a-camera/cam/colour", b"JPEG", False),
+    ]
 
 
-def test_robots_and_unknown_devices_are_ignored(bridge: RecordingBridge) -> None:
-    count = len(bridge.published)
-    bridge.receive("thing", topics.TELE, Measurements(tick_ms=1, at_ms=1, sequence=1, values={"x": 1.0}), "joints")
+def test_robots_and_invalid_messages_are_ignored(bridge: RecordingBridge) -> None:
+    published = list(bridge.published)
+    bridge.receive("thing", topics.TELE, measurements({"x": 1.0}), "joints")
     bridge.receive("thing", topics.DESC, Description(device="thing", kind="arm", robot_type="ur5", label="Arm"))
     bridge.receive("camera", topics.CAM, b"no picture", "colour")
     bridge.target.on_device_message("nonsense", b"")
-    assert len(bridge.published) == count
+    assert bridge.published == published
 
 
 def test_an_offline_agent_makes_its_devices_unavailable(bridge: RecordingBridge) -> None:
-    bridge.target.on_device_message(topics.conn("s", "a"), codec.encode(Presence(online=False, session=1, at_ms=1)))
-    offline = {topic for topic, content, _ in bridge.published if content == b"offline"}
-    expected = [device for device in LAB.devices if device.streams or device.controls or device.cameras]
-    assert offline == {f"telescope/a-{device.name}/available" for device in expected}
-    bridge.target.on_device_message(topics.conn("s", "other"), codec.encode(Presence(online=False, session=1, at_ms=1)))
-    assert len([1 for _, content, _ in bridge.published if content == b"offline"]) == len(offline)
+    bridge.disconnect("a")
+    bridge.disconnect("other")
+    expected = [device.name for device in LAB.devices if device.streams or device.controls or device.cameras]
+    assert sorted(bridge.offline()) == sorted(f"telescope/a-{name}/available" for name in expected)
 
 
 @pytest.mark.parametrize(

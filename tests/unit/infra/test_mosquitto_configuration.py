@@ -1,9 +1,6 @@
 import json
 from pathlib import Path
 
-import pytest
-
-from infra import programs
 from infra.mosquitto import configuration
 
 
@@ -33,20 +30,17 @@ def test_a_second_start_keeps_rights_and_password_but_updates_ports(tmp_path: Pa
 def test_an_update_restores_the_functions_rights_and_keeps_grants(tmp_path: Path) -> None:
     write(tmp_path)
     path = tmp_path / configuration.SECURITY_FILE
-    new = json.loads(path.read_text())
-    old = json.loads(path.read_text())
-    granted = {
-        "rolename": "arm",
-        "acls": [{"acltype": "publishClientSend", "topic": "t", "priority": 0, "allow": True}],
-    }
-    old["roles"][0]["acls"] = old["roles"][0]["acls"][:2]
-    old["roles"].append(granted)
-    old["defaultACLAccess"]["unsubscribe"] = False
-    path.write_text(json.dumps(old))
+    expected, outdated = json.loads(path.read_text()), json.loads(path.read_text())
+    acl = {"acltype": "publishClientSend", "topic": "t", "priority": 0, "allow": True}
+    grant = {"rolename": "arm", "acls": [acl]}
+    del outdated["roles"][0]["acls"][2:]
+    outdated["roles"].append(grant)
+    outdated["defaultACLAccess"]["unsubscribe"] = False
+    path.write_text(json.dumps(outdated))
     write(tmp_path)
-    renewed = json.loads(path.read_text())
-    assert renewed["roles"] == [*new["roles"], granted]
-    assert renewed["defaultACLAccess"] == new["defaultACLAccess"]
+    updated = json.loads(path.read_text())
+    assert updated["roles"] == [*expected["roles"], grant]
+    assert updated["defaultACLAccess"] == expected["defaultACLAccess"]
 
 
 def test_the_password_is_only_in_its_own_file(tmp_path: Path) -> None:
@@ -56,12 +50,3 @@ def test_the_password_is_only_in_its_own_file(tmp_path: Path) -> None:
     assert password not in (tmp_path / configuration.SECURITY_FILE).read_text()
     assert password not in (tmp_path / configuration.CONFIGURATION_FILE).read_text()
     assert json.loads((tmp_path / configuration.SECURITY_FILE).read_text())["clients"][0]["username"] == "service"
-
-
-def test_a_missing_installation_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(programs, "_PATH_BESIDE", str(tmp_path))
-    monkeypatch.setattr(configuration, "_PLUGIN_FOLDERS", ("no/such/folder",))
-    for find in (configuration.binary, configuration.plugin):
-        with pytest.raises(programs.NotInstalledError, match="apt-get install mosquitto"):
-            find()

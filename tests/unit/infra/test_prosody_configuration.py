@@ -1,9 +1,11 @@
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from infra import programs
+from infra.mosquitto import configuration as mosquitto
 from infra.prosody import configuration
 from infra.prosody.configuration import ConfigurationError
 
@@ -45,8 +47,15 @@ def test_arguments_are_quoted(tmp_path: Path) -> None:
     assert 'telescope_verify_url = "http://x/\\"; os.exit() --"' in text(tmp_path, verify_url=hostile)
 
 
-def test_a_missing_installation_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("find", "package"),
+    [(mosquitto.binary, "mosquitto"), (mosquitto.plugin, "mosquitto"), (configuration.binary, "prosody")],
+)
+def test_a_missing_installation_names_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, find: Callable[[], object], package: str
+) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(programs, "_PATH_BESIDE", str(tmp_path))
-    with pytest.raises(programs.NotInstalledError, match="apt-get install prosody"):
-        configuration.binary()
+    monkeypatch.setattr(mosquitto, "_PLUGIN_FOLDERS", ("no/such/folder",))
+    with pytest.raises(programs.NotInstalledError, match=f"apt-get install {package}"):
+        find()

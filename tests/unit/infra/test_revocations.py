@@ -1,3 +1,4 @@
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,16 +22,14 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def open_file(path: Path) -> Iterator[Opener]:
-    opened: list[Revocations] = []
+    with contextlib.ExitStack() as stack:
 
-    def open_again(keep_s: float = 1_000) -> Revocations:
-        opened.append(Revocations(path, keep_s=keep_s))
-        opened[-1].open()
-        return opened[-1]
+        def open_again(keep_s: float = 1_000) -> Revocations:
+            revocations = stack.enter_context(contextlib.closing(Revocations(path, keep_s=keep_s)))
+            revocations.open()
+            return revocations
 
-    yield open_again
-    for revocations in opened:
-        revocations.close()
+        yield open_again
 
 
 @pytest.mark.parametrize("revoke", [Revoke(client_id="c"), Revoke(principal="p")])

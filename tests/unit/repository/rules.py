@@ -17,9 +17,7 @@ WIDE_FOLDERS: Final = {
     "docs/pictures": "screenshots that the browser tests write",
 }
 """Folders that may have more entries, each with the reason."""
-LONG_FILES: Final = {
-    "web/src/shared/mqtt/protocol.generated.ts": "generated from docs/asyncapi.json",
-}
+LONG_FILES: Final = {"web/src/shared/mqtt/protocol.generated.ts": "generated from docs/asyncapi.json"}
 """Files that may be longer, each with the reason."""
 FORBIDDEN_STEMS: Final = frozenset(
     word
@@ -40,43 +38,30 @@ FORBIDDEN_WORDS: Final = re.compile(rf"\b(?:{'|'.join(_WORDS)})\b", re.IGNORECAS
 
 def tracked_files(root: Path) -> list[str]:
     """Returns the paths of the files under version control, relative to ``root``."""
-    listed = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout
     return [name for name in listed.split("\0") if name and (root / name).is_file()]
 
 
-def wide_folders(files: Iterable[str]) -> list[str]:
+def wide_folders(_: Path, files: Iterable[str]) -> list[str]:
     """Returns each folder with more than ``MAX_ENTRIES`` files and sub-folders; ``__init__.py`` does not count."""
     entries: set[PurePosixPath] = set()
-    for name in files:
-        path = PurePosixPath(name)
+    for path in map(PurePosixPath, files):
         if path.name != "__init__.py":
             entries |= {path, *path.parents}
     counts = Counter(str(entry.parent) for entry in entries if entry != PurePosixPath("."))
-    return [
-        f"{folder} has {count} entries"
-        for folder, count in sorted(counts.items())
-        if count > MAX_ENTRIES and folder not in WIDE_FOLDERS
-    ]
+    wide = {folder: count for folder, count in counts.items() if count > MAX_ENTRIES and folder not in WIDE_FOLDERS}
+    return [f"{folder} has {count} entries" for folder, count in sorted(wide.items())]
 
 
 def long_files(root: Path, files: Iterable[str]) -> list[str]:
     """Returns each source file with more than ``MAX_LINES`` lines."""
-    found = []
-    for name in files:
-        if PurePosixPath(name).suffix in SOURCES and name not in LONG_FILES:
-            lines = len((root / name).read_text(encoding="utf-8").splitlines())
-            if lines > MAX_LINES:
-                found.append(f"{name} has {lines} lines")
-    return found
+    sources = [name for name in files if PurePosixPath(name).suffix in SOURCES and name not in LONG_FILES]
+    lines = {name: len((root / name).read_text(encoding="utf-8").splitlines()) for name in sources}
+    return [f"{name} has {count} lines" for name, count in lines.items() if count > MAX_LINES]
 
 
-def unclear_names(files: Iterable[str]) -> list[str]:
+def unclear_names(_: Path, files: Iterable[str]) -> list[str]:
     """Returns each source file whose name contains a term that is not standard."""
     return [
         name
@@ -87,14 +72,13 @@ def unclear_names(files: Iterable[str]) -> list[str]:
 
 def dialect(root: Path, files: Iterable[str]) -> list[str]:
     """Returns each line of code or text with a forbidden word."""
-    found = []
-    for name in files:
-        if PurePosixPath(name).suffix in TEXTS:
-            text = (root / name).read_text(encoding="utf-8")
-            if FORBIDDEN_WORDS.search(text):
-                lines = enumerate(text.splitlines(), 1)
-                found += [f"{name}:{number}: {line.strip()}" for number, line in lines if FORBIDDEN_WORDS.search(line)]
-    return found
+    return [
+        f"{name}:{number}: {line.strip()}"
+        for name in files
+        if PurePosixPath(name).suffix in TEXTS
+        for number, line in enumerate((root / name).read_text(encoding="utf-8").splitlines(), 1)
+        if FORBIDDEN_WORDS.search(line)
+    ]
 
 
 def _parts(stem: str) -> set[str]:

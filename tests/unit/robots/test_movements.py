@@ -1,77 +1,88 @@
-"""Every movement runs in its robot's scene within the limits."""
+"""Every movement runs in its robot's scene: within the limits, without contacts, and limited by no safety check."""
 
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
-from device_agent.drivers.mujoco.wheeled_driver import wheel_speeds
 from device_agent.ports.driver import Twist
-from device_agent.runtime.planning import named_poses
-from tests.harness.paths import ROBOTS
-from tests.unit.robots.balance import WalkedRobot
-from tests.unit.robots.folders import MOVEMENTS, Bench, heard, whereabouts
+from device_agent.runtime.control.goals import MotionGoal
+from device_agent.runtime.errors import Refused
+from device_agent.runtime.planning import gaze, named_poses
+from tests.harness.paths import UR5
+from tests.unit.robots.folders import MOVEMENTS, contacts
+from tests.unit.robots.simulated_robot import ControlledRobot, SimulatedRobot
 
-STEPS = 4  # of 2 ms: one control period
+pytestmark = pytest.mark.slow
+UPRIGHT = 0.9
+"""Cosine of the base's tilt."""
 
 
-class PlayedRobot:
-    """The script's ``robot``: follows minimum-jerk lines and records contacts and speeds."""
+class RobotError(Exception):
+    """The error that scripts may catch."""
 
-    def __init__(self, bench: Bench) -> None:
-        self.bench = bench
-        self.allowed = bench.touching()
-        self.target = bench.home.copy()
-        self.joints = tuple(bench.names)
+
+class ScriptedRobot(SimulatedRobot):
+    """The script's ``robot`` and ``room``.
+
+    Attributes:
+        moves: Number of motions.
+        limited: Limits that changed a motion.
+        touched: Pairs of bodies that touched but did not at the start.
+        fastest: Highest share of a joint's velocity limit.
+        tightest_m: Smallest clearance.
+    """
+
+    def __init__(self, folder: Path, *, collisions: bool = True) -> None:
+        super().__init__(folder, collisions=collisions)
+        self.joints = tuple(self.names)
         self.can = ("say",)
-        self.home_rad = bench.type.home_rad
         self.moves = 0
+        self.limited: set[str] = set()
         self.touched: set[tuple[str, str]] = set()
-        self.fastest = 0.0  # share of the velocity limits
+        self.fastest = 0.0
+        self.tightest_m = 1.0
+        self._walks = self.type.simulation is not None and self.type.simulation.walk is not None
+        self._initial_contacts = contacts(self.model, self.world._data)
+        self._velocity_limits = np.array([joint.max_velocity_rad_s for joint in self.type.joints])
 
     def move_joints(self, position_rad: Mapping[str, float] | Sequence[float], speed: float = 0.5) -> None:
-        assert 0 < speed <= 1
-        bench, start, goal = self.bench, self.target.copy(), self.target.copy()
-        if isinstance(position_rad, Mapping):
-            for name, value in position_rad.items():
-                goal[bench.names.index(name)] = value
-        else:
-            assert len(position_rad) == len(goal)
-            goal[:] = position_rad
-        assert np.all(bench.lower <= goal), "below a joint's range"
-        assert np.all(goal <= bench.upper), "above a joint's range"
-        way = np.abs(goal - start)
-        # Peaks of a minimum-jerk line: velocity 1.875 d/T, acceleration 5.774 d/T².
-        duration = max((1.875 * way / (bench.speed * speed)).max(), math.sqrt((5.774 * way / bench.acceleration).max()))
-        periods = max(1, math.ceil(duration / 0.008))
-        for period in range(1, periods + 1):
-            s = period / periods
-            self._hold(start + (goal - start) * (10 * s**3 - 15 * s**4 + 6 * s**5), 1)
-        self._hold(goal, 40)
-        self.target = goal
-        self.moves += 1
-        assert np.abs(bench.data.qpos[bench.qpos] - goal).max() < 0.005, "did not arrive"
+        if not isinstance(position_rad, Mapping):
+            position_rad = dict(zip(self.joints, position_rad, strict=True))
+        self.move(position_rad, speed=speed)
+        if not self._walks:  # the gait moves a walking robot's legs
+            self.wait(0.3)
+            error_rad = np.subtract(self.driver.observe().position_rad, self.controller.commanded_rad)
+            assert np.abs(error_rad).max() < 0.005, "did not arrive"
 
     def home(self, speed: float = 0.5) -> None:
-        self.move_joints(self.bench.home.tolist(), speed=speed)
+        self.move_joints(self.type.home_rad, speed)
 
-    def state(self) -> dict[str, Any]:
-        bench = self.bench
-        position_rad = dict(zip(bench.names, bench.data.qpos[bench.qpos].tolist(), strict=True))
-        return {"position_rad": position_rad, "streams": heard(bench.type, self.place()[2])}
+    def posture(self, name: str, speed: float = 0.5) -> None:
+        self.move_joints(self.type.postures[name], speed)
 
-    def place(self) -> tuple[float, float, float]:
-        """x, y [m], yaw [rad] of its base."""
-        base = self.bench.data.body(1)
-        return float(base.xpos[0]), float(base.xpos[1]), math.atan2(base.xmat[3], base.xmat[0])
+    def express(self, name: str, strength: float = 1.0) -> None:
+        self.move_joints(named_poses.expression(self.type, name, strength), named_poses.EXPRESSION_SPEED)
+
+    def look(self, position_m: tuple[float, float, float], speed: float = 0.5) -> None:
+        assert self.shape is not None
+        self.move_joints(gaze.solve_gaze(self.type, self.shape, self.controller.commanded_rad, position_m), speed)
+
+    def say(self, text: str, language: str = "") -> None:
+        assert text
+        assert len(language) <= 5
+
+    def drive(  # type: ignore[override]
+        self, forward_m_s: float = 0.0, left_m_s: float = 0.0, turn_rad_s: float = 0.0, *, duration_s: float = 1.0
+    ) -> None:
+        super().drive(Twist(forward_m_s, left_m_s, turn_rad_s), duration_s=duration_s)
 
     def go_to(self, x_m: float, y_m: float, yaw_rad: float | None = None) -> None:
         """Drives straight; ``test_navigation.py`` covers obstacles."""
-        x, y, yaw = self.place()
+        x, y, yaw = self.pose
         towards = math.atan2(y_m - y, x_m - x)
         self._turn(towards - yaw)
         self.drive(forward_m_s=0.2, duration_s=math.dist((x, y), (x_m, y_m)) / 0.2)
@@ -81,122 +92,102 @@ class PlayedRobot:
         angle_rad = math.remainder(angle_rad, 2 * math.pi)
         self.drive(turn_rad_s=math.copysign(0.5, angle_rad), duration_s=abs(angle_rad) / 0.5)
 
-    def look(self, position_m: Sequence[float], speed: float = 0.5) -> None:
-        assert len(position_m) == 3
-        assert self.bench.type.gaze is not None
-        self.move_joints(self.home_rad | dict.fromkeys(self.bench.type.gaze.joints, 0.0), speed=speed)
+    def state(self) -> dict[str, Any]:
+        """Joint positions, and measurements in an empty hall."""
+        measured = {"sonar": {"distance_m.left": 4.0, "distance_m.right": 4.0}, "odometry": {"yaw_rad": self.pose[2]}}
+        streams = [stream.name for stream in self.type.streams if stream.name in measured]
+        return {
+            "position_rad": dict(zip(self.joints, self.driver.observe().position_rad, strict=True)),
+            "streams": {name: {"values": measured[name], "age_s": 0.0} for name in streams},
+        }
 
-    def express(self, name: str, strength: float = 1.0) -> None:
-        self.move_joints(named_poses.expression(self.bench.type, name, strength), speed=named_poses.EXPRESSION_SPEED)
-
-    def say(self, text: str, language: str = "") -> None:
-        assert text
-        assert len(language) <= 5
-
-    def drive(
-        self, forward_m_s: float = 0.0, left_m_s: float = 0.0, turn_rad_s: float = 0.0, *, duration_s: float = 1.0
-    ) -> None:
-        bench = self.bench
-        assert bench.type.base is not None
-        assert bench.type.simulation is not None
-        assert bench.type.simulation.wheels is not None
-        assert abs(forward_m_s) <= bench.type.base.max_linear_m_s
-        assert abs(turn_rad_s) <= bench.type.base.max_angular_rad_s
-        assert left_m_s == 0
-        wheels = bench.type.simulation.wheels
-        actuators = [bench.model.actuator(name).id for name in (wheels.left, wheels.right)]
-        speeds, _ = wheel_speeds(wheels, Twist(forward_m_s, 0.0, turn_rad_s), fastest_rad_s=math.inf)
-        periods = math.ceil(duration_s / 0.008)
-        for period in range(periods):
-            bench.data.ctrl[actuators] = speeds * min(1.0, (period + 1) / 40)
-            self._hold(self.target, 1)
-        bench.data.ctrl[actuators] = 0.0
-        self._hold(self.target, 40)
-        self.moves += 1
-
-    def wait(self, seconds: float) -> None:
-        assert seconds >= 0
-        self._hold(self.target, math.ceil(seconds / 0.008))
+    def latest(self, device: str, stream: str) -> dict[str, Any]:
+        """Room data with the robot at its position and a person in front of it."""
+        assert (device, stream) == ("perception", "positions")
+        name, (x_m, y_m, yaw_rad) = self.type.type, self.pose
+        values = {"age_s.person": 0.1, "x_m.person": 1.9, "y_m.person": 0.35}
+        values |= {f"age_s.{name}": 0.1, f"x_m.{name}": x_m, f"y_m.{name}": y_m, f"yaw_rad.{name}": yaw_rad}
+        return {"values": values, "age_s": 0.1}
 
     def progress(self, share: float) -> None:
         assert 0 <= share <= 1
 
-    @property
-    def warned(self) -> bool:
-        return bool(self.bench.data.warning.number.any())
+    def follow(self, goal: MotionGoal) -> None:
+        super().follow(goal)
+        # A walking robot's driver applies the gait's leg positions.
+        self.limited |= {limit for limit in goal.limited if not limit.endswith(": driver")}
+        self.moves += 1
 
-    def _hold(self, target: Any, periods: int) -> None:
-        bench = self.bench
-        for _ in range(periods):
-            bench.data.ctrl[bench.ctrl] = target
-            mujoco.mj_step(bench.model, bench.data, nstep=STEPS)
-            self.touched |= bench.touching() - self.allowed
-            self.fastest = max(self.fastest, float((np.abs(bench.data.qvel[bench.dof]) / bench.speed).max()))
-
-
-class PlayedRoom:
-    """The script's ``room``: locates the robot and a person in front of it."""
-
-    def __init__(self, robot: PlayedRobot | WalkedRobot) -> None:
-        self.robot = robot
-
-    def latest(self, device: str, stream: str) -> dict[str, Any]:
-        assert (device, stream) == ("perception", "positions")
-        assert isinstance(self.robot, PlayedRobot)
-        return whereabouts(self.robot.bench.type, *self.robot.place())
+    def period(self) -> None:
+        super().period()
+        assert self.upright > UPRIGHT, "it fell"
+        self.touched |= contacts(self.model, self.world._data, only=self.body if self._walks else None)
+        self.touched -= self._initial_contacts
+        velocity = np.abs(self.world.snapshot().qvel[self.driver._dof]) / self._velocity_limits
+        self.fastest = max(self.fastest, float(velocity.max()))
+        if self.shape is not None and round(self.now_s * 1000) % 40 == 0:
+            self.tightest_m = min(self.tightest_m, self.shape.clearance(self.controller.commanded_rad).room_m)
 
 
-def play(path: Path, parameters: dict[str, Any]) -> PlayedRobot | WalkedRobot:
-    bench = Bench(path.parent.parent)
-    on_legs = bench.type.simulation is not None and bench.type.simulation.walk is not None
-    robot = WalkedRobot(path.parent.parent) if on_legs else PlayedRobot(bench)
-    given = {
-        "robot": robot,
-        "room": PlayedRoom(robot),
-        "wait": robot.wait,
-        "parameters": parameters,
-        "progress": robot.progress,
-        "RobotError": AssertionError,
-        "print": lambda *_: None,
-        "__name__": "__movement__",
-    }
-    exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), given)  # noqa: S102 - our own scripts
-    return robot
-
-
-def check(robot: PlayedRobot | WalkedRobot) -> None:
-    assert robot.moves > 0
-    assert robot.touched == set()
-    assert robot.fastest <= 1.02
-    assert not robot.warned
-
-
-@pytest.mark.parametrize("path", MOVEMENTS, ids=lambda path: f"{path.parent.parent.name}-{path.stem}")
-def test_movement_plays_without_contact_inside_the_limits(path: Path):
-    check(play(path, {}))
+EXTREMES: list[tuple[str, dict[str, Any]]] = [
+    ("slow_square", {"side_m": 9, "height_m": 0, "speed": 1.0}),
+    ("slow_square", {"side_m": 9, "height_m": 9}),
+    ("inspect_table", {"stops": 9, "pause_s": 0, "speed": 1.0}),
+    ("wave", {"times": 1, "speed": 1.0}),
+    ("pick_and_place", {"times": 1, "speed": 1.0}),
+]
 
 
 @pytest.mark.parametrize(
-    ("name", "parameters"),
-    [
-        ("slow_square", {"side_m": 9, "height_m": 0}),
-        ("slow_square", {"side_m": 9, "height_m": 9}),
-        ("inspect_table", {"stops": 9, "pause_s": 0, "speed": 1.0}),
-        ("wave", {"times": 1, "speed": 1.0}),
-        ("pick_and_place", {"times": 1, "speed": 1.0}),
-    ],
+    ("path", "parameters"),
+    [pytest.param(path, {}, id=f"{path.parent.parent.name}-{path.stem}") for path in MOVEMENTS]
+    + [(UR5 / "movements" / f"{name}.py", parameters) for name, parameters in EXTREMES],
 )
-def test_ur5_movement_stays_free_with_extreme_parameters(name: str, parameters: dict[str, Any]):
-    check(play(ROBOTS / "ur5" / "movements" / f"{name}.py", parameters))
+def test_movement_stays_inside_the_limits_without_contacts(path: Path, parameters: dict[str, Any]) -> None:
+    robot = ScriptedRobot(path.parent.parent)
+    script = {
+        "robot": robot,
+        "room": robot,
+        "wait": robot.wait,
+        "parameters": parameters,
+        "progress": robot.progress,
+        "RobotError": RobotError,
+        "print": lambda *_: None,
+        "__name__": "__movement__",
+    }
+    exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), script)  # noqa: S102 - our own scripts
+    assert robot.moves > 0
+    assert robot.limited == set()
+    assert robot.tightest_m >= 0
+    assert robot.touched == set()
+    assert robot.fastest <= 1.02
+    assert not robot.world._data.warning.number.any()
 
 
-def test_a_movement_into_the_table_is_detected(tmp_path: Path):
-    (tmp_path / "movements").mkdir()
-    for source in (ROBOTS / "ur5").glob("*.*"):
-        (tmp_path / source.name).write_bytes(source.read_bytes())
-    manifest = (tmp_path / "robot.toml").read_text()
-    (tmp_path / "robot.toml").write_text(manifest.replace('type = "ur5"', f'type = "{tmp_path.name}"'))
-    script = tmp_path / "movements" / "dive.py"
-    script.write_text('robot.move_joints({"shoulder_lift": -0.2, "elbow": 1.2}, speed=0.3)\n')
-    with pytest.raises(AssertionError, match="did not arrive"):
-        play(script, {})
+def test_a_movement_into_the_table_is_detected() -> None:
+    robot = ScriptedRobot(UR5, collisions=False)
+    with pytest.raises((AssertionError, Refused)):
+        robot.move_joints({"shoulder_lift": -0.2, "elbow": 1.2}, speed=0.3)
+    assert robot.touched
+
+
+def test_collisions_are_prevented() -> None:
+    robot = ControlledRobot(UR5)
+    assert robot.shape is not None
+    with pytest.raises(Refused, match="no room there: workspace: wrist_3 \u2013 lower z, 281 mm too near"):
+        robot.move({"shoulder_lift": -0.2, "elbow": 1.2}, speed=1.0)
+    with pytest.raises(Refused, match="no room there: clearance: table_top \u2013 wrist_3_link"):
+        robot.move({"shoulder_lift": -0.86}, speed=1.0)
+    random = np.random.default_rng(11)
+    lower, upper = ([getattr(joint, name) for joint in robot.type.joints] for name in ("lower_rad", "upper_rad"))
+    blocked = 0
+    while blocked < 5:  # targets with clearance, to which the straight path leads through the arm itself
+        target = np.clip(robot.home_rad + random.uniform(-3, 3, len(robot.names)), lower, upper).tolist()
+        if robot.shape.clearance(target).room_m <= 0 or robot.shape.sweep([robot.home_rad, target]).clearance is None:
+            continue
+        blocked += 1
+        with pytest.raises(Refused, match="something is in the way: clearance: ") as refused:
+            robot.move(dict(zip(robot.names, target, strict=True)), speed=1.0)
+        assert refused.value.code == "no_room"
+        assert robot.shape.clearance(robot.controller.commanded_rad).room_m >= 0
+        robot.move(robot.type.home_rad, speed=1.0)

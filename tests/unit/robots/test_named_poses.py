@@ -4,77 +4,53 @@ from pathlib import Path
 
 import pytest
 
-from device_agent import geometry
 from device_agent.protocol.manifests import robot_type
-from device_agent.runtime.authority.lease_gate import LeaseGate
-from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.planning import named_poses
 from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, SpokenLine
 from device_agent.runtime.planning.visemes import estimate_duration_s
 from tests.unit.robots.folders import FOLDERS
+from tests.unit.robots.simulated_robot import ControlledRobot
 
-LONGEST_S = 120.0
+pytestmark = pytest.mark.slow
 TEXT = "How very quickly the brown fox jumps over a lazy dog!"
 
 
-def kinds(*parts: str) -> list[Path]:
-    """Folders of types whose manifest has one of these parts."""
+def types_with(*parts: str) -> pytest.MarkDecorator:
+    """Parametrize by the types whose manifest has one of these parts."""
     types = ((folder, robot_type.load(folder)) for folder in FOLDERS)
-    return [folder for folder, kind in types if any(getattr(kind, part) for part in parts)]
+    folders = [folder for folder, kind in types if any(getattr(kind, part) for part in parts)]
+    return pytest.mark.parametrize("folder", folders, ids=lambda folder: folder.name)
 
 
-class PoseRunner:
-    """Steps a type's controller, including collision checks."""
-
-    def __init__(self, folder: Path) -> None:
-        self.kind = robot_type.load(folder)
-        self.controller = Controller(self.kind, LeaseGate(), geometry=geometry.load(self.kind, folder))
-        self.controller.start_at([self.kind.home_rad[joint.name] for joint in self.kind.joints])
-        self.reservation = self.controller.reserve(epoch=1, on_revoked=lambda _: None)
-        self.now_s = 0.0
-
-    def move(self, position_rad: dict[str, float], label: str) -> None:
-        self.follow(
-            self.controller.start_joint_goal(self.reservation, position_rad, speed=named_poses.EXPRESSION_SPEED), label
-        )
-
-    def go(self, trajectory: BehaviourTrajectory, label: str) -> None:
-        self.follow(self.controller.start_trajectory(self.reservation, trajectory.trajectory()), label)
-
-    def follow(self, goal: MotionGoal, label: str) -> None:
-        until_s = self.now_s + LONGEST_S
-        while not goal.finished.is_set() and self.now_s < until_s:
-            self.now_s += self.kind.period_ms / 1000
-            self.controller.update(self.now_s)
-        assert goal.result is GoalResult.REACHED, f"{label}: {goal.why and goal.why.message}"
-
-
-@pytest.mark.parametrize("folder", kinds("postures", "expressions"), ids=lambda folder: folder.name)
+@types_with("postures", "expressions")
 def test_every_transition_between_named_poses_succeeds(folder: Path) -> None:
-    runner = PoseRunner(folder)
-    for name in runner.kind.postures:
-        runner.move(named_poses.posture(runner.kind, name), name)
-    runner.move(runner.kind.home_rad, "home")
-    for name in runner.kind.expressions:
-        runner.move(named_poses.expression(runner.kind, name, 1.0), name)
+    robot = ControlledRobot(folder)
+    for name in robot.type.postures:
+        robot.move(named_poses.posture(robot.type, name), speed=named_poses.EXPRESSION_SPEED)
+    robot.move(robot.type.home_rad)
+    for name in robot.type.expressions:
+        robot.move(named_poses.expression(robot.type, name, 1.0), speed=named_poses.EXPRESSION_SPEED)
 
 
-@pytest.mark.parametrize("folder", kinds("behaviours"), ids=lambda folder: folder.name)
+@types_with("behaviours")
 def test_every_behaviour_is_played_from_home(folder: Path) -> None:
-    runner = PoseRunner(folder)
-    for name, keyframes in runner.kind.behaviours.items():
-        trajectory = BehaviourTrajectory(runner.kind, runner.controller.commanded_rad)
+    robot = ControlledRobot(folder)
+    for keyframes in robot.type.behaviours.values():
+        trajectory = BehaviourTrajectory(robot.type, robot.controller.commanded_rad)
         trajectory.add_keyframes(keyframes, {frame.say: estimate_duration_s(frame.say) for frame in keyframes})
-        runner.go(trajectory, name)
-        runner.move(runner.kind.home_rad, f"home after {name}")
+        robot.follow(robot.controller.start_trajectory(robot.reservation, trajectory.trajectory()))
+        robot.move(robot.type.home_rad)
 
 
-@pytest.mark.parametrize("folder", kinds("visemes"), ids=lambda folder: folder.name)
-def test_every_viseme_is_reached(folder: Path) -> None:
-    runner = PoseRunner(folder)
-    trajectory = BehaviourTrajectory(runner.kind, runner.controller.commanded_rad)
+@types_with("visemes")
+def test_every_viseme_is_reached_without_collision(folder: Path) -> None:
+    robot = ControlledRobot(folder)
+    assert robot.shape is not None
+    for pose in robot.type.visemes.values():
+        position_rad = robot.type.home_rad | pose
+        assert robot.shape.clearance([position_rad[name] for name in robot.names]).room_m >= 0
+    trajectory = BehaviourTrajectory(robot.type, robot.controller.commanded_rad)
     trajectory.add_speech(SpokenLine(0.0, TEXT, estimate_duration_s(TEXT)))
-    jaws = [place for place in trajectory.trajectory().position_rad.T if place.max() - place.min() > 0.05]
-    assert jaws, "the jaw does not move"
-    runner.go(trajectory, TEXT)
+    path = trajectory.trajectory()
+    assert max(joint.max() - joint.min() for joint in path.position_rad.T) > 0.05, "the jaw does not move"
+    robot.follow(robot.controller.start_trajectory(robot.reservation, path))

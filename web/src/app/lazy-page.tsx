@@ -3,7 +3,7 @@ import type { ComponentType } from "preact";
 import { useEffect, useState } from "preact/hooks";
 import { common } from "../shared/i18n/common";
 
-export interface LazyPage<Props> {
+interface LazyPage<Props> {
   /** Renders the page, a loading state, or an error with a retry button. */
   Page: ComponentType<Props>;
   /** Loads the code in advance. */

@@ -3,30 +3,19 @@ import { degrees, radians } from "../../src/shared/lib/angles";
 import { deviceTopics, matches } from "../../src/shared/mqtt/topics";
 import { format } from "../../src/shared/i18n/format";
 
-describe("formats and topics", () => {
-  it("converts between degrees and radians", () => {
+describe("formats", () => {
+  it("are degrees without a sign for zero, and ages in the largest fitting unit", () => {
     expect(degrees(radians(12.5))).toBeCloseTo(12.5);
+    expect([-0.04, -0.06].map(format.degrees)).toEqual(["0.0°", "-0.1°"]);
+    const ages = [0, 59_000, 61_000, 3_700_000, 200_000_000].map(format.age);
+    expect(ages).toEqual(["just now", "59 s ago", "1 min ago", "1 h ago", "2 days ago"]);
   });
+});
 
-  it("shows no sign for a value that rounds to zero", () => {
-    expect(format.degrees(-0.04)).toBe("0.0°");
-    expect(format.degrees(-0.06)).toBe("-0.1°");
-  });
-
-  it("ages use the largest fitting unit", () => {
-    expect([0, 59_000, 61_000, 3_700_000, 200_000_000].map(format.age)).toEqual([
-      "just now",
-      "59 s ago",
-      "1 min ago",
-      "1 h ago",
-      "2 days ago",
-    ]);
-  });
-
-  it("topics are those of the contract", () => {
+describe("topics", () => {
+  it("are those of the contract", () => {
     const topics = deviceTopics("ts/v1/lab/a1/arm");
-    expect(topics.conn).toBe("ts/v1/lab/a1/conn");
-    expect(topics.ctl(5)).toBe("ts/v1/lab/a1/arm/ctl/5");
+    expect([topics.conn, topics.ctl(5)]).toEqual(["ts/v1/lab/a1/conn", "ts/v1/lab/a1/arm/ctl/5"]);
   });
 
   it.each([

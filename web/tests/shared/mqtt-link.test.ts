@@ -1,56 +1,52 @@
-import { afterEach, beforeEach, describe, expect, it } from "vitest";
-import { Api } from "../../src/shared/api/client";
+import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
+import { ApiError } from "../../src/shared/api/http";
+import type { Credentials } from "../../src/shared/api/types";
 import { MqttLink, type LinkState } from "../../src/shared/mqtt/mqtt-link";
-import { Cloud, problem } from "../support/cloud";
-import { until } from "../support/until";
+import { Broker } from "../support/broker";
 
-const TOPIC = "ts/v1/lab/agent00001/arm";
-const CONN = "ts/v1/lab/agent00001/conn";
+const STATE = "ts/v1/lab/a1/arm/state";
+const STREAM = "ts/v1/lab/a1/arm/tele/joints";
+const FILTER = "ts/v1/lab/a1/arm/tele/+";
+const STOP = "ts/v1/lab/a1/arm/stop";
 
-let cloud: Cloud;
-let api: Api;
-const links: MqttLink[] = [];
+const until = (condition: () => boolean): Promise<boolean> => vi.waitUntil(condition, { timeout: 15_000, interval: 5 });
 
-function open(): MqttLink {
-  const link = new MqttLink(() => api.credentials({ purpose: "view" }));
-  links.push(link);
-  return link;
-}
+let broker: Broker;
+let links: MqttLink[];
 
-async function start(options: ConstructorParameters<typeof Cloud>[0] = {}): Promise<void> {
-  cloud = new Cloud(options);
-  await cloud.start();
-  api = new Api(`${cloud.address}/api/v1`);
-  await api.me();
-}
-
-beforeEach(() => {
-  links.length = 0;
+beforeEach(async () => {
+  links = [];
+  broker = new Broker();
+  await broker.start();
+  broker.publish(STATE, {}, true);
+  broker.stream(STREAM);
 });
 
 afterEach(async () => {
   for (const link of links) link.close();
-  await cloud.stop();
+  await broker.stop();
 });
 
+function open(credentials: () => Promise<Credentials> = broker.credentials): MqttLink {
+  const link = new MqttLink(credentials);
+  links.push(link);
+  return link;
+}
+
 describe("the link to the broker", () => {
-  it("hears retained and live messages, in subscriptions of at most eight filters", async () => {
-    const others = Array.from({ length: 20 }, (_, index) => `ts/v1/lab/other/d${index}/state`);
-    await start({ audible: others });
+  it("receives retained and live messages, in subscriptions of at most eight filters", async () => {
     const link = open();
-    const heard = new Map<string, boolean>();
-    const filters = [CONN, ...["desc", "desc/twin", "state", "tele/+", "event", "ack", "cam/+"].map((kind) => `${TOPIC}/${kind}`)];
-    for (const filter of [...filters, ...others]) link.subscribe(filter, (topic, _, retained) => heard.set(topic, retained));
-    await until(() => heard.has(`${TOPIC}/tele/joints`) && heard.has(`${TOPIC}/desc/twin`), "messages");
-    expect(heard.get(`${TOPIC}/desc`)).toBe(true);
-    expect(heard.get(`${TOPIC}/tele/joints`)).toBe(false);
-    expect(cloud.subscribes).toEqual([8, 8, 8, 4]);
+    const received = new Map<string, boolean>();
+    const others = Array.from({ length: 18 }, (_, index) => `ts/v1/lab/a2/d${index}/state`);
+    for (const filter of [STATE, FILTER, ...others]) link.subscribe(filter, (topic, _, retained) => received.set(topic, retained));
+    await until(() => received.size === 2 && broker.subscribes.length === 3);
+    expect([received.get(STATE), received.get(STREAM)]).toEqual([true, false]);
+    expect(broker.subscribes).toEqual([8, 8, 4]);
   });
 
-  it("pings the broker and hears its answer, each its own, and fails without a connection", async () => {
-    await start();
+  it("resolves each ping with its own response, and rejects it without a connection", async () => {
     const link = open();
-    await until(() => link.up.value, "the link");
+    await until(() => link.up.value);
     const order: number[] = [];
     await Promise.all([1, 2, 3].map((number) => link.ping().then(() => order.push(number))));
     expect(order).toEqual([1, 2, 3]);
@@ -60,79 +56,65 @@ describe("the link to the broker", () => {
     await expect(link.ping()).rejects.toThrow("There is no connection");
   });
 
-  it("comes back with new credentials after the connection was cut", async () => {
-    await start();
+  it("reconnects with new credentials after the connection was cut, also if the broker stays away at first", async () => {
     const link = open();
     let count = 0;
-    link.subscribe(`${TOPIC}/tele/+`, () => (count += 1));
-    await until(() => count > 0, "telemetry");
-    const [first] = cloud.clientIds;
-    cloud.cutAll();
-    await until(() => !link.up.value, "the loss");
-    count = 0;
-    await until(() => link.up.value && count > 0, "telemetry again");
-    expect(cloud.clientIds).not.toContain(first);
-    expect(cloud.callsTo("POST", "/mqtt/credentials")).toHaveLength(2);
-  });
-
-  it("keeps trying while the broker is away", async () => {
-    await start();
-    cloud.brokerDown = true;
-    const link = open();
-    await until(() => link.status.value.state === "down", "the failure");
+    link.subscribe(FILTER, () => (count += 1));
+    await until(() => count > 0);
+    const [first] = broker.clientIds;
+    broker.down = true;
+    broker.cutAll();
+    await until(() => link.status.value.state === "down" && broker.issued > 1);
     expect(link.status.value.why).not.toBe("");
-    cloud.brokerDown = false;
-    await until(() => link.up.value, "the connection");
+    broker.down = false;
+    count = 0;
+    await until(() => link.up.value && count > 0);
+    expect(broker.clientIds).not.toContain(first);
   });
 
-  it("moves to new credentials before the old ones run out, without a gap", async () => {
-    await start({ lifetimeS: 1.5 });
+  it("replaces credentials before they expire, without losing messages", async () => {
+    broker.lifetimeS = 1.5;
     const link = open();
     const states = new Set<LinkState>();
-    const ticks: number[] = [];
-    link.subscribe(`${TOPIC}/tele/+`, (_, payload) => {
-      ticks.push((JSON.parse(new TextDecoder().decode(payload)) as { sequence: number }).sequence);
-    });
-    await until(() => link.up.value, "the connection");
+    const received = new Set<number>();
+    link.subscribe(FILTER, (_, payload) => received.add((JSON.parse(new TextDecoder().decode(payload)) as { sequence: number }).sequence));
+    await until(() => link.up.value);
     link.status.subscribe((status) => states.add(status.state));
-    await until(() => cloud.callsTo("POST", "/mqtt/credentials").length >= 3, "two renewals");
-    await until(() => cloud.connections === 1, "the old connection's end");
+    await until(() => broker.issued >= 3);
+    await until(() => broker.clientIds.length === 1);
     expect([...states]).toEqual(["up"]);
-    const seen = [...new Set(ticks)].sort((a, b) => a - b);
-    expect(seen.length - 1).toBe((seen.at(-1) ?? 0) - (seen[0] ?? 0));
+    expect(received.size - 1).toBe(Math.max(...received) - Math.min(...received));
   });
 
-  it("publishes at once or not at all", async () => {
-    await start();
+  it("publishes immediately or not at all", async () => {
     const link = open();
-    await expect(link.publish(`${TOPIC}/stop`, { id: "s", caller: "me" }, 1)).rejects.toThrow(/no connection/);
-    await until(() => link.up.value, "the connection");
-    await link.publish(`${TOPIC}/stop`, { id: "s", caller: "me" }, 1);
-    expect(cloud.arm?.stops).toBe(1);
+    await expect(link.publish(STOP, {}, 1)).rejects.toThrow(/no connection/);
+    await until(() => link.up.value);
+    await link.publish(STOP, {}, 1);
+    expect(broker.published).toEqual([STOP]);
   });
 
-  it("stops asking when the server refuses credentials, and says why", async () => {
-    await start();
-    cloud.instead.set("POST /mqtt/credentials", () => problem(401, "signed-out", "You are not signed in."));
-    const link = open();
-    await until(() => link.status.value.state === "refused", "the refusal");
+  it("stays closed while the server refuses credentials, until it is renewed", async () => {
+    let signedOut = true;
+    const link = open(() => (signedOut ? Promise.reject(new ApiError(401, "signed-out", "You are not signed in.")) : broker.credentials()));
+    await until(() => link.status.value.state === "refused");
     expect(link.status.value.why).toBe("You are not signed in.");
-    cloud.instead.clear();
+    signedOut = false;
     link.renew();
-    await until(() => link.up.value, "the connection");
+    await until(() => link.up.value);
   });
 
-  it("hears nothing any more once unsubscribed or closed", async () => {
-    await start();
+  it("delivers nothing after unsubscribing or closing", async () => {
     const link = open();
-    let count = 0;
-    const end = link.subscribe(`${TOPIC}/tele/+`, () => (count += 1));
-    await until(() => count > 2, "telemetry");
+    let [ended, continued] = [0, 0];
+    const end = link.subscribe(STREAM, () => (ended += 1));
+    link.subscribe(FILTER, () => (continued += 1));
+    await until(() => ended > 2);
     end();
-    const after = count;
-    await new Promise((resolve) => setTimeout(resolve, 200));
-    expect(count).toBe(after);
+    const before = [ended, continued];
+    await until(() => continued > (before[1] ?? 0) + 5);
+    expect(ended).toBe(before[0]);
     link.close();
-    await until(() => cloud.connections === 0, "the end of the connection");
+    await until(() => broker.clientIds.length === 0);
   });
 });

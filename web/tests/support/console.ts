@@ -1,41 +1,40 @@
-/** A console on a WebSocket broker with a simulated arm. Importing it starts both before each test of the file. */
-import { afterEach, beforeEach } from "vitest";
-import { Api } from "../../src/shared/api/client";
+/** A device's page on virtual time, with a fake server and link. Importing it creates them before each test of the file. */
+import { afterEach, beforeEach, vi } from "vitest";
+import { DeviceStore } from "../../src/features/devices/model/device-store";
 import { startClock } from "../../src/shared/lib/clock";
-import { Fleet } from "../../src/features/devices/model/device-list";
-import type { DeviceStore } from "../../src/features/devices/model/device-store";
-import { Cloud, DEVICE } from "./cloud";
-import { until } from "./until";
+import { FakeLink } from "./fake-link";
+import { FakeServer } from "./fake-server";
+import { CONN, TOPIC, description, listed, telemetry } from "./messages";
 
-export const TOPIC = "ts/v1/lab/agent00001/arm";
-
-export let cloud: Cloud;
-export let api: Api;
-export let fleet: Fleet;
+export let server: FakeServer;
+export let link: FakeLink;
 export let device: DeviceStore;
+/** Called in reverse order after the test. */
 export let ends: (() => void)[];
 
 beforeEach(async () => {
-  cloud = new Cloud();
-  await cloud.start();
-  api = new Api(`${cloud.address}/api/v1`);
-  await api.me();
-  fleet = new Fleet(api);
-  ends = [startClock(), () => fleet.dispose()];
-  await until(() => fleet.devices.value?.has(DEVICE) === true, "the list");
-  const listed = fleet.devices.value?.get(DEVICE);
-  if (listed === undefined) throw new Error("no device");
-  device = listed;
-  ends.push(device.watchClosely());
-  await until(() => device.reach.value === "online" && device.description.value !== null, "the device");
+  vi.useFakeTimers();
+  server = new FakeServer();
+  link = new FakeLink();
+  device = new DeviceStore(listed(), server.api, link);
+  ends = [startClock(), device.watch(), device.watchClosely()];
+  deliver("desc", description);
+  await pass(250); // The clock's signal now follows the virtual time.
+  deliver("tele/joints", telemetry());
 });
 
-afterEach(async () => {
+afterEach(() => {
   for (const end of ends.reverse()) end();
-  await cloud.stop();
+  vi.useRealTimers();
+  vi.unstubAllGlobals();
 });
 
-export function arm(): NonNullable<Cloud["arm"]> {
-  if (cloud.arm === null) throw new Error("no arm");
-  return cloud.arm;
+/** Advances the virtual time [ms]. */
+export async function pass(ms: number): Promise<void> {
+  await vi.advanceTimersByTimeAsync(ms);
+}
+
+/** Delivers a message of the device, or of its agent for `conn`. */
+export function deliver(kind: string, message: object | string): void {
+  link.deliver(kind === "conn" ? CONN : `${TOPIC}/${kind}`, message);
 }

@@ -1,4 +1,4 @@
-/** The toy head of `tests/fakes/head_driver.py`: what the editor knows of it. */
+/** The head of `tests/fakes/head_driver.py`, as the keyframe editor reads it. */
 import type { Robot } from "../../src/features/keyframes/model/keyframes";
 
 const RANGES = { yaw: [-2, 2], pitch: [-0.7, 0.5], left: [-1, 0.5], right: [-0.25, 0.5] } as const;
@@ -6,13 +6,7 @@ const RANGES = { yaw: [-2, 2], pitch: [-0.7, 0.5], left: [-1, 0.5], right: [-0.2
 export function head(): Robot {
   return {
     joints: Object.entries(RANGES).map(([name, [lower_rad, upper_rad]]) => ({
-      name,
-      label: name,
-      lower_rad,
-      upper_rad,
-      max_velocity_rad_s: 4,
-      max_acceleration_rad_s2: 10,
-      max_jerk_rad_s3: 100,
+      name, label: name, lower_rad, upper_rad, max_velocity_rad_s: 4, max_acceleration_rad_s2: 10, max_jerk_rad_s3: 100,
       max_effort_nm: 5,
     })),
     mimic_joints: [{ joint: "right", mimics: "left", multiplier: -0.5 }],
@@ -20,12 +14,7 @@ export function head(): Robot {
       {
         joint: "pitch",
         depends_on: "yaw",
-        table: [
-          [-2, -0.4, 0.1],
-          [-0.5, -0.7, 0.5],
-          [0.5, -0.7, 0.5],
-          [2, -0.4, 0.1],
-        ],
+        table: [[-2, -0.4, 0.1], [-0.5, -0.7, 0.5], [0.5, -0.7, 0.5], [2, -0.4, 0.1]],
       },
     ],
     postures: ["Rest"],

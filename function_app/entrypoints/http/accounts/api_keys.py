@@ -17,7 +17,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes. None of them takes a key: a key makes no keys."""
     routes = Routes("accounts")
 
-    @routes.add("GET", "/api-keys", summary="List API keys", responses={200: schemas.ApiKeyList})
+    @routes.add("GET /api-keys", "List API keys", schemas.ApiKeyList)
     async def list_api_keys(request: Request) -> Response:
         """Newest first, without secrets. Expired keys stay listed for 30 days."""
         caller = await auth.account(request)
@@ -26,12 +26,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(schemas.ApiKeyList(items=items, cursor=None))
 
     @routes.add(
-        "POST",
-        "/api-keys",
-        summary="Create an API key",
-        body=schemas.ApiKeyRequest,
-        responses={201: schemas.ApiKeyCreated},
-        problems=(404, 409),
+        "POST /api-keys", "Create an API key", {201: schemas.ApiKeyCreated}, (404, 409), body=schemas.ApiKeyRequest
     )
     async def create_api_key(request: Request) -> Response:
         """The response contains ``token``, a bearer token for another program. It is returned only once.
@@ -46,7 +41,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body = schemas.ApiKeyCreated(api_key=_show(key, functions.clock.now_ms()), token=token)
         return json_response(body, 201, {"Cache-Control": "no-store"})
 
-    @routes.add("DELETE", "/api-keys/{key}", summary="Revoke an API key", responses={204: None}, problems=(404,))
+    @routes.add("DELETE /api-keys/{key}", "Revoke an API key", None, 404)
     async def revoke_api_key(request: Request, key: str) -> Response:
         """Rejects the key, closes its broker connections and releases its leases."""
         await functions.api_keys.revoke(await auth.account(request), key)

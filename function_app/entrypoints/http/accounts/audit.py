@@ -5,36 +5,24 @@ from typing import Annotated
 from fastapi import Query, Request, Response
 
 from function_app.bootstrap import Functions
-from function_app.domain.common.timestamps import LAST_MS, rfc3339
+from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.accounts import schemas
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
 from function_app.entrypoints.http.framework.responses import json_response
-from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
+from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes, Since, Until
 from function_app.services.audit.audit_reader import AuditFilter
 
 Target = Annotated[
     str | None, Query(max_length=200, description="Only records about the device, agent, … with this id.")
 ]
 Event = Annotated[str | None, Query(max_length=60, description="Only records of this event, such as `control-taken`.")]
-Since = Annotated[
-    int | None, Query(alias="from", ge=0, le=LAST_MS, description="From here [ms since 1970]; the beginning.")
-]
-Until = Annotated[
-    int | None, Query(alias="to", ge=0, le=LAST_MS, description="To before here [ms since 1970]; the end.")
-]
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("accounts")
 
-    @routes.add(
-        "GET",
-        "/accounts/me/audit",
-        summary="Read the audit log",
-        responses={200: schemas.AuditList},
-        problems=(403, 422),
-    )
+    @routes.add("GET /accounts/me/audit", "Read the audit log", schemas.AuditList, (403, 422))
     async def read_audit(  # noqa: PLR0917 (FastAPI names them)
         request: Request,
         target: Target = None,

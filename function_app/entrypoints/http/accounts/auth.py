@@ -20,12 +20,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     settings = functions.settings
 
     @routes.add(
-        "POST",
-        "/auth/sign-in",
-        summary="Sign in with a one-time link",
+        "POST /auth/sign-in",
+        "Sign in with a one-time link",
+        schemas.SignedIn,
+        (401, 403),
         body=schemas.LinkSignInRequest,
-        responses={200: schemas.SignedIn},
-        problems=(401, 403),
         caller="anonymous",
     )
     async def sign_in(request: Request) -> Response:
@@ -35,12 +34,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return signed_in(settings, await functions.sign_in.redeem(payload.link, whence(request, settings)))
 
     @routes.add(
-        "POST",
-        "/auth/password",
-        summary="Sign in with name and password",
+        "POST /auth/password",
+        "Sign in with name and password",
+        schemas.SignedIn,
+        (401, 403, 429),
         body=schemas.PasswordSignInRequest,
-        responses={200: schemas.SignedIn},
-        problems=(401, 403, 429),
         caller="anonymous",
     )
     async def sign_in_by_password(request: Request) -> Response:
@@ -51,12 +49,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return signed_in(settings, done)
 
     @routes.add(
-        "POST",
-        "/auth/accounts",
-        summary="Create an account with an invitation",
+        "POST /auth/accounts",
+        "Create an account with an invitation",
+        {201: schemas.SignedIn},
+        (403, 404, 409),
         body=schemas.AccountRequest,
-        responses={201: schemas.SignedIn},
-        problems=(403, 404, 409),
         caller="anonymous",
     )
     async def create_account(request: Request) -> Response:
@@ -74,9 +71,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         await functions.invitations.redeem(Identity(account.id, account.name, done.session), known)
         return signed_in(settings, done, 201)
 
-    @routes.add(
-        "POST", "/auth/token", summary="Renew the access token", responses={200: schemas.AccessToken}, caller="page"
-    )
+    @routes.add("POST /auth/token", "Renew the access token", schemas.AccessToken, caller="page")
     async def renew_token(request: Request) -> Response:
         """For programs that keep the cookie. An access token lasts 15 min, the session 12 h.
 
@@ -91,26 +86,19 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         )
         return json_response(body, headers={"Cache-Control": "no-store"})
 
-    @routes.add("POST", "/auth/sign-out", summary="Sign out", responses={204: None})
+    @routes.add("POST /auth/sign-out", "Sign out", None)
     async def sign_out(request: Request) -> Response:
         """Ends the session of the token or cookie, releases its leases, and clears the cookie."""
         await functions.sign_out.end(await auth.account(request))
         return empty({"Set-Cookie": clear_session(settings)})
 
-    @routes.add("GET", "/spaces", summary="List spaces", responses={200: schemas.SpaceList})
+    @routes.add("GET /spaces", "List spaces", schemas.SpaceList)
     async def list_spaces(request: Request) -> Response:
         """The account's own spaces, which accept agents, and spaces shared with it."""
         views = await functions.spaces.list(await auth.account(request))
         return json_response(schemas.SpaceList(items=tuple(_space(view) for view in views), cursor=None))
 
-    @routes.add(
-        "POST",
-        "/spaces",
-        summary="Create a space",
-        body=schemas.SpaceRequest,
-        responses={201: schemas.SpaceOut},
-        problems=(409,),
-    )
+    @routes.add("POST /spaces", "Create a space", {201: schemas.SpaceOut}, 409, body=schemas.SpaceRequest)
     async def create_space(request: Request) -> Response:
         """Agents can be claimed into it."""
         caller = await auth.account(request)

@@ -15,7 +15,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("accounts")
 
-    @routes.add("GET", "/accounts/me", summary="Get the signed-in account", responses={200: schemas.AccountOut})
+    @routes.add("GET /accounts/me", "Get the signed-in account", schemas.AccountOut)
     async def me(request: Request) -> Response:
         """The account and session of the token or cookie. With a cookie also the CSRF token."""
         caller, csrf = (await auth.account(request), None) if bearer(request) else await auth.page(request)
@@ -23,12 +23,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(body, headers={"Cache-Control": "no-store"})
 
     @routes.add(
-        "PUT",
-        "/accounts/me/password",
-        summary="Set or change the password",
-        body=schemas.PasswordRequest,
-        responses={204: None},
-        problems=(409, 429),
+        "PUT /accounts/me/password", "Set or change the password", None, (409, 429), body=schemas.PasswordRequest
     )
     async def put_password(request: Request) -> Response:
         """Ends every other session.
@@ -41,7 +36,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         await functions.passwords.put(caller, payload.password, old=payload.old_password, whence=place)
         return empty()
 
-    @routes.add("GET", "/accounts/me/sessions", summary="List sign-in sessions", responses={200: schemas.SessionList})
+    @routes.add("GET /accounts/me/sessions", "List sign-in sessions", schemas.SessionList)
     async def list_sessions(request: Request) -> Response:
         """Active sessions, newest first."""
         caller = await auth.account(request)
@@ -59,19 +54,12 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         )
         return json_response(schemas.SessionList(items=items, cursor=None))
 
-    @routes.add(
-        "DELETE",
-        "/accounts/me/sessions",
-        summary="End all other sessions",
-        responses={200: schemas.SessionsEnded},
-    )
+    @routes.add("DELETE /accounts/me/sessions", "End all other sessions", schemas.SessionsEnded)
     async def end_other_sessions(request: Request) -> Response:
         """The session of the request stays."""
         return json_response(schemas.SessionsEnded(ended=await functions.sign_out.others(await auth.account(request))))
 
-    @routes.add(
-        "DELETE", "/accounts/me/sessions/{session}", summary="End a session", responses={204: None}, problems=(404,)
-    )
+    @routes.add("DELETE /accounts/me/sessions/{session}", "End a session", None, 404)
     async def end_session(request: Request, session: str) -> Response:
         """Rejects its tokens, closes its broker connections and releases its leases."""
         await functions.sign_out.one(await auth.account(request), session)

@@ -8,7 +8,7 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem
 from function_app.entrypoints.http.accounts import schemas
 from function_app.entrypoints.http.accounts.cookies import secure, set_session, whence
-from function_app.entrypoints.http.framework.authentication import refuse_other_sites
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, refuse_other_sites
 from function_app.entrypoints.http.framework.responses import json_response, read
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
 from function_app.services.accounts.oidc_sign_in import BEGUN_S, OidcCallback, OidcRedirect
@@ -20,32 +20,19 @@ _FAILED = "/#sign-in-failed="
 Said = Annotated[str, Query(max_length=4000)]
 
 
-def router(functions: Functions) -> Routes:
+def router(functions: Functions, _auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("accounts")
     settings = functions.settings
 
-    @routes.add(
-        "GET",
-        "/auth/methods",
-        summary="List sign-in methods",
-        responses={200: schemas.SignInMethodsOut},
-        caller="anonymous",
-    )
+    @routes.add("GET /auth/methods", "List sign-in methods", schemas.SignInMethodsOut, caller="anonymous")
     async def sign_in_methods(_request: Request) -> Response:
         """For the sign-in page. A one-time link is always accepted."""
         known = settings.oidc
         elsewhere = schemas.OidcProviderOut(name=known.name, url=f"{PREFIX}{_PATH}/start") if known else None
         return json_response(schemas.SignInMethodsOut(link=True, password=True, oidc=elsewhere))
 
-    @routes.add(
-        "GET",
-        f"{_PATH}/start",
-        summary="Sign in with OpenID Connect",
-        responses={303: None},
-        problems=(404,),
-        caller="anonymous",
-    )
+    @routes.add("GET /auth/oidc/start", "Sign in with OpenID Connect", {303: None}, 404, caller="anonymous")
     async def start_oidc_sign_in(_request: Request) -> Response:
         """Redirects the browser to the OpenID Connect provider (code flow with PKCE) and sets a cookie.
 
@@ -55,12 +42,11 @@ def router(functions: Functions) -> Routes:
         return _redirect(redirect.address, _mark(settings, redirect))
 
     @routes.add(
-        "POST",
-        f"{_PATH}/start",
-        summary="Sign in with OpenID Connect and an invitation",
+        "POST /auth/oidc/start",
+        "Sign in with OpenID Connect and an invitation",
+        schemas.OidcSignInOut,
+        (403, 404),
         body=schemas.OidcSignInRequest,
-        responses={200: schemas.OidcSignInOut},
-        problems=(403, 404),
         caller="anonymous",
     )
     async def start_oidc_sign_in_with_invitation(request: Request) -> Response:
@@ -76,12 +62,7 @@ def router(functions: Functions) -> Routes:
         return json_response(schemas.OidcSignInOut(url=redirect.address), headers=headers)
 
     @routes.add(
-        "GET",
-        f"{_PATH}/callback",
-        summary="Finish the OpenID Connect sign-in",
-        responses={303: None},
-        problems=(404, 422),
-        caller="anonymous",
+        "GET /auth/oidc/callback", "Finish the OpenID Connect sign-in", {303: None}, (404, 422), caller="anonymous"
     )
     async def finish_oidc_sign_in(
         request: Request, state: Said = "", code: Said = "", iss: Said | None = None, error: Said = ""

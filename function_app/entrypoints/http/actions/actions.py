@@ -29,12 +29,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return await show_action(functions, found)
 
     @routes.add(
-        "POST",
-        "/devices/{device}/actions",
-        summary="Start an action",
+        "POST /devices/{device}/actions",
+        "Start an action",
+        {200: schemas.ActionOut, 202: schemas.ActionOut},
+        (404, 409),
         body=ActionRequest,
-        responses={200: schemas.ActionOut, 202: schemas.ActionOut},
-        problems=(404, 409),
     )
     async def start_action(request: Request, device: str, once: Key = None) -> Response:
         """200: it has reached ``wait_for`` or has ended. 202: it is queued or running; poll its URL."""
@@ -44,13 +43,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         where = {"Location": f"{PREFIX}/actions/{found.id}"}
         return json_response(await shown(found), 200 if there else 202, where)
 
-    @routes.add(
-        "GET",
-        "/devices/{device}/actions",
-        summary="List actions of a device",
-        responses={200: schemas.ActionList},
-        problems=(404, 422),
-    )
+    @routes.add("GET /devices/{device}/actions", "List actions of a device", schemas.ActionList, (404, 422))
     async def list_actions(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """Newest first, since the device was paired."""
         caller = await auth.account(request)
@@ -59,9 +52,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         items = tuple(action_out(each, positions.get(each.id)) for each in found)
         return json_response(schemas.ActionList(items=items, cursor=following))
 
-    @routes.add(
-        "GET", "/actions/{action}", summary="Get an action", responses={200: schemas.ActionOut}, problems=(404, 422)
-    )
+    @routes.add("GET /actions/{action}", "Get an action", schemas.ActionOut, (404, 422))
     async def get_action(request: Request, action: str, wait_ms: Wait = 0, wait_for: WaitFor = "done") -> Response:
         """Returns when it has reached ``wait_for``, or after ``wait_ms``."""
         caller = await auth.account(request)
@@ -69,13 +60,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             await shown(await functions.actions.get(caller, action, wait_ms=wait_ms, wait_for=wait_for))
         )
 
-    @routes.add(
-        "POST",
-        "/actions/{action}/cancel",
-        summary="Cancel an action",
-        responses={202: schemas.ActionOut},
-        problems=(404,),
-    )
+    @routes.add("POST /actions/{action}/cancel", "Cancel an action", {202: schemas.ActionOut}, 404)
     async def cancel_action(request: Request, action: str) -> Response:
         """Asks the device to end it. A queued action ends at once. The status shows when it has ended."""
         caller = await auth.account(request)

@@ -9,9 +9,8 @@ from function_app.domain.common.problems import Problem, invalid
 from function_app.entrypoints.http.actions import schemas
 from function_app.entrypoints.http.actions.actions import Key, show_action
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
-from function_app.entrypoints.http.framework.responses import json_response, problem_type, read
+from function_app.entrypoints.http.framework.responses import json_response, problem_item, read
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.entrypoints.http.framework.schemas import Problem as Refusal
 from function_app.services.actions.start_many import StartResult
 
 
@@ -20,11 +19,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     routes = Routes("actions")
 
     @routes.add(
-        "POST",
-        "/actions",
-        summary="Start an action on many devices",
+        "POST /actions",
+        "Start an action on many devices",
+        {200: schemas.BatchActionOut, 202: schemas.BatchActionOut, 207: schemas.BatchActionOut},
         body=schemas.BatchActionRequest,
-        responses={200: schemas.BatchActionOut, 202: schemas.BatchActionOut, 207: schemas.BatchActionOut},
     )
     async def start_actions(request: Request, once: Key = None) -> Response:
         """200: all have reached ``wait_for`` or have ended. 202: some have not yet. 207: some were rejected.
@@ -46,9 +44,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     async def item(found: StartResult) -> schemas.BatchActionItem:
         if isinstance(found.result, Problem):
-            why = found.result
-            told = Refusal(type=problem_type(why), title=why.title, status=why.status, detail=why.detail)
-            return schemas.BatchActionItem(device=found.device, status=why.status, action=None, problem=told)
+            refusal = problem_item(found.result)
+            return schemas.BatchActionItem(device=found.device, status=refusal.status, action=None, problem=refusal)
         status = 200 if found.reached else 202
         return schemas.BatchActionItem(
             device=found.device, status=status, action=await show_action(functions, found.result), problem=None

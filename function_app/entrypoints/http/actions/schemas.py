@@ -29,16 +29,7 @@ class ActionOut(Response, frozen=True, kw_only=True):
     device: str
     request: dict[str, Any]
     status: Literal[
-        "queued",
-        "created",
-        "published",
-        "received",
-        "accepted",
-        "started",
-        "done",
-        "failed",
-        "expired",
-        "cancelled",
+        "queued", "created", "published", "received", "accepted", "started", "done", "failed", "expired", "cancelled"
     ]
     queue_position: int | None
     epoch: int

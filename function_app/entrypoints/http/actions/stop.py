@@ -5,9 +5,8 @@ from fastapi import Request, Response
 from function_app.bootstrap import Functions
 from function_app.entrypoints.http.actions import schemas
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
-from function_app.entrypoints.http.framework.responses import json_response, problem_type, read_or
+from function_app.entrypoints.http.framework.responses import json_response, problem_item, read_or
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.entrypoints.http.framework.schemas import Problem as Refusal
 from function_app.services.actions.stop import StopResult
 
 
@@ -16,13 +15,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     routes = Routes("control")
 
     @routes.add(
-        "POST",
-        "/devices/{device}/stop",
-        summary="Stop a device",
-        body=schemas.StopRequest,
-        body_required=False,
-        responses={200: schemas.StopConfirmation},
-        problems=(404,),
+        "POST /devices/{device}/stop", "Stop a device", schemas.StopConfirmation, 404, optional_body=schemas.StopRequest
     )
     async def stop_device(request: Request, device: str) -> Response:
         """Needs no lease. The Stop latches until it is reset."""
@@ -32,26 +25,18 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             schemas.StopConfirmation(confirmed=await functions.stop.stop(caller, device, payload.reason))
         )
 
-    @routes.add(
-        "POST",
-        "/devices/{device}/stop/reset",
-        summary="Reset a Stop",
-        responses={200: schemas.StopConfirmation},
-        problems=(404,),
-    )
+    @routes.add("POST /devices/{device}/stop/reset", "Reset a Stop", schemas.StopConfirmation, 404)
     async def reset_stop(request: Request, device: str) -> Response:
         """Nothing resumes: control must be taken again. One device at a time, by a person who has inspected it."""
         caller = await auth.account(request)
         return json_response(schemas.StopConfirmation(confirmed=await functions.stop.reset(caller, device)))
 
     @routes.add(
-        "POST",
-        "/spaces/{space}/stop",
-        summary="Stop all devices in a space",
-        body=schemas.StopRequest,
-        body_required=False,
-        responses={200: schemas.StopOut, 207: schemas.StopOut},
-        problems=(404,),
+        "POST /spaces/{space}/stop",
+        "Stop all devices in a space",
+        {200: schemas.StopOut, 207: schemas.StopOut},
+        404,
+        optional_body=schemas.StopRequest,
     )
     async def stop_space(request: Request, space: str) -> Response:
         """200: all devices that the caller may operate have confirmed. 207: some have not; each item has its status."""
@@ -60,12 +45,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return _all(await functions.stop.stop_many(caller, payload.reason, space=space))
 
     @routes.add(
-        "POST",
-        "/stop",
-        summary="Stop all devices",
-        body=schemas.StopRequest,
-        body_required=False,
-        responses={200: schemas.StopOut, 207: schemas.StopOut},
+        "POST /stop",
+        "Stop all devices",
+        {200: schemas.StopOut, 207: schemas.StopOut},
+        optional_body=schemas.StopRequest,
     )
     async def stop_all(request: Request) -> Response:
         """200: all devices that the caller may operate have confirmed. 207: some have not; each item has its status."""
@@ -82,10 +65,6 @@ def _all(found: list[StopResult]) -> Response:
 
 
 def _item(found: StopResult) -> schemas.StopItem:
-    why = found.problem
-    told = None
-    if why is not None:
-        told = Refusal(type=problem_type(why), title=why.title, status=why.status, detail=why.detail)
-    return schemas.StopItem(
-        device=found.device, status=why.status if why else 200, confirmed=found.confirmed, problem=told
-    )
+    refusal = None if found.problem is None else problem_item(found.problem)
+    status = 200 if refusal is None else refusal.status
+    return schemas.StopItem(device=found.device, status=status, confirmed=found.confirmed, problem=refusal)

@@ -25,13 +25,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
 
 def _holding(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
-    @routes.add(
-        "GET",
-        "/devices/{device}/lease",
-        summary="Get the lease of a device",
-        responses={200: schemas.LeaseStatus},
-        problems=(404,),
-    )
+    @routes.add("GET /devices/{device}/lease", "Get the lease of a device", schemas.LeaseStatus, 404)
     async def get_lease(request: Request, device: str) -> Response:
         """The active lease with its open control request, or null."""
         caller = await auth.account(request)
@@ -39,13 +33,11 @@ def _holding(routes: Routes, functions: Functions, auth: RequestAuthenticator) -
         return json_response(schemas.LeaseStatus(lease=lease_out(lease, caller, functions.clock.now_ms())))
 
     @routes.add(
-        "POST",
-        "/devices/{device}/lease",
-        summary="Take, renew or take over control",
-        body=schemas.LeaseRequest,
-        body_required=False,
-        responses={200: schemas.LeaseGranted},
-        problems=(404, 409),
+        "POST /devices/{device}/lease",
+        "Take, renew or take over control",
+        schemas.LeaseGranted,
+        (404, 409),
+        optional_body=schemas.LeaseRequest,
     )
     async def take_lease(request: Request, device: str) -> Response:
         """Without ``epoch``: takes control with a new epoch. With it: renews that epoch.
@@ -70,13 +62,7 @@ def _holding(routes: Routes, functions: Functions, auth: RequestAuthenticator) -
         )
         return json_response(body)
 
-    @routes.add(
-        "DELETE",
-        "/devices/{device}/lease",
-        summary="Release control",
-        responses={204: None},
-        problems=(404, 409, 422),
-    )
+    @routes.add("DELETE /devices/{device}/lease", "Release control", None, (404, 409, 422))
     async def release_lease(request: Request, device: str, epoch: EpochQuery) -> Response:
         """The device holds position, and setpoint credentials of this epoch end. A requester may take control then."""
         await functions.leases.release(await auth.account(request), device, epoch=epoch)
@@ -85,13 +71,11 @@ def _holding(routes: Routes, functions: Functions, auth: RequestAuthenticator) -
 
 def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
     @routes.add(
-        "POST",
-        "/devices/{device}/lease/requests",
-        summary="Request control",
-        body=schemas.NewControlRequest,
-        body_required=False,
-        responses={200: schemas.ControlRequestCreated, 201: schemas.ControlRequestCreated},
-        problems=(404, 409),
+        "POST /devices/{device}/lease/requests",
+        "Request control",
+        {200: schemas.ControlRequestCreated, 201: schemas.ControlRequestCreated},
+        (404, 409),
+        optional_body=schemas.NewControlRequest,
     )
     async def request_control(request: Request, device: str) -> Response:
         """Asks the lease holder.
@@ -114,11 +98,7 @@ def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) ->
         return json_response(body, 201 if created else 200, where)
 
     @routes.add(
-        "GET",
-        "/devices/{device}/lease/requests/{request_id}",
-        summary="Get a control request",
-        responses={200: schemas.ControlRequestOut},
-        problems=(404,),
+        "GET /devices/{device}/lease/requests/{request_id}", "Get a control request", schemas.ControlRequestOut, 404
     )
     async def get_control_request(request: Request, device: str, request_id: str) -> Response:
         """The last request of a device can be read, with any outcome."""
@@ -127,13 +107,11 @@ def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) ->
         return json_response(control_request_out(control_request, lease, caller, functions.clock.now_ms()))
 
     @routes.add(
-        "POST",
-        "/devices/{device}/lease/requests/{request_id}/accept",
-        summary="Accept a control request",
-        body=schemas.AcceptControlRequest,
-        body_required=False,
-        responses={200: schemas.ControlRequestAccepted},
-        problems=(404, 409),
+        "POST /devices/{device}/lease/requests/{request_id}/accept",
+        "Accept a control request",
+        schemas.ControlRequestAccepted,
+        (404, 409),
+        optional_body=schemas.AcceptControlRequest,
     )
     async def accept_control_request(request: Request, device: str, request_id: str) -> Response:
         """Only for the lease holder. One write gives the requester the next epoch; the device holds position."""
@@ -151,11 +129,10 @@ def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) ->
         return json_response(body)
 
     @routes.add(
-        "POST",
-        "/devices/{device}/lease/requests/{request_id}/reject",
-        summary="Reject a control request",
-        responses={200: schemas.ControlRequestOut},
-        problems=(404, 409),
+        "POST /devices/{device}/lease/requests/{request_id}/reject",
+        "Reject a control request",
+        schemas.ControlRequestOut,
+        (404, 409),
     )
     async def reject_control_request(request: Request, device: str, request_id: str) -> Response:
         """Only for the lease holder."""
@@ -163,13 +140,7 @@ def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) ->
         lease, control_request = await functions.control_requests.reject(caller, device, request_id)
         return json_response(control_request_out(control_request, lease, caller, functions.clock.now_ms()))
 
-    @routes.add(
-        "DELETE",
-        "/devices/{device}/lease/requests/{request_id}",
-        summary="Withdraw a control request",
-        responses={204: None},
-        problems=(404, 409),
-    )
+    @routes.add("DELETE /devices/{device}/lease/requests/{request_id}", "Withdraw a control request", None, (404, 409))
     async def withdraw_control_request(request: Request, device: str, request_id: str) -> Response:
         """Only for the requester. 409 if it was accepted: the requester then holds the lease and must release it."""
         await functions.control_requests.withdraw(await auth.account(request), device, request_id)

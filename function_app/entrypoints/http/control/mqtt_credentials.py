@@ -19,12 +19,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     routes = Routes("broker")
 
     @routes.add(
-        "POST",
-        "/mqtt/credentials",
-        summary="Get MQTT credentials",
+        "POST /mqtt/credentials",
+        "Get MQTT credentials",
+        schemas.MqttCredentialsOut,
+        (404, 409),
         body=schemas.MqttCredentialsRequest,
-        responses={200: schemas.MqttCredentialsOut},
-        problems=(404, 409),
         caller="account or agent",
     )
     async def mqtt_credentials(request: Request) -> Response:

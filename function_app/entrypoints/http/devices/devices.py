@@ -18,7 +18,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("devices")
 
-    @routes.add("GET", "/devices", summary="List devices", responses={200: schemas.DeviceList}, problems=(422,))
+    @routes.add("GET /devices", "List devices", schemas.DeviceList, 422)
     async def list_devices(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """With presence, newest state and lease. A page holds the devices of up to ``limit`` agents."""
         caller = await auth.account(request)
@@ -26,7 +26,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         items = tuple(device_out(view, caller, functions.clock.now_ms()) for view in views)
         return json_response(schemas.DeviceList(items=items, cursor=following))
 
-    @routes.add("GET", "/devices/{device}", summary="Get a device", responses={200: schemas.DeviceOut}, problems=(404,))
+    @routes.add("GET /devices/{device}", "Get a device", schemas.DeviceOut, 404)
     async def get_device(request: Request, device: str) -> Response:
         """With presence, newest state and lease."""
         caller = await auth.account(request)
@@ -38,12 +38,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
 def _named_and_seen(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
     @routes.add(
-        "PUT",
-        "/devices/{device}/label",
-        summary="Rename a device",
+        "PUT /devices/{device}/label",
+        "Rename a device",
+        schemas.DeviceOut,
+        (403, 404),
         body=schemas.RenameDeviceRequest,
-        responses={200: schemas.DeviceOut},
-        problems=(403, 404),
     )
     async def rename_device(request: Request, device: str) -> Response:
         """Owners only. After a transfer the device has its agent's label again."""
@@ -53,13 +52,7 @@ def _named_and_seen(routes: Routes, functions: Functions, auth: RequestAuthentic
         await functions.rename.rename(caller, device, label)
         return json_response(device_out(await functions.devices.view(caller, device), caller, functions.clock.now_ms()))
 
-    @routes.add(
-        "PUT",
-        "/devices/{device}/viewers",
-        summary="Register as a viewer and list other viewers",
-        responses={200: schemas.ViewersOut},
-        problems=(404,),
-    )
+    @routes.add("PUT /devices/{device}/viewers", "Register as a viewer and list other viewers", schemas.ViewersOut, 404)
     async def add_viewer(request: Request, device: str) -> Response:
         """For every account that may see the device.
 
@@ -77,13 +70,7 @@ def _named_and_seen(routes: Routes, functions: Functions, auth: RequestAuthentic
         )
         return json_response(schemas.ViewersOut(items=others, refresh_ms=_AGAIN_MS))
 
-    @routes.add(
-        "DELETE",
-        "/devices/{device}/viewers",
-        summary="Unregister as a viewer",
-        responses={204: None},
-        problems=(404,),
-    )
+    @routes.add("DELETE /devices/{device}/viewers", "Unregister as a viewer", None, 404)
     async def remove_viewer(request: Request, device: str) -> Response:
         """For this sign-in session. A registration ends after 25 s without renewal."""
         await functions.viewers.leave(await auth.account(request), device)

@@ -7,24 +7,18 @@ from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.identity.accounts import Identity
 from function_app.entrypoints.http.control.serializers import lease_out
 from function_app.entrypoints.http.devices.schemas import DeviceOut
-from function_app.entrypoints.http.framework.schemas import AccountRef
+from function_app.entrypoints.http.framework.schemas import AccountRef, response_from
 from function_app.services.devices.device_access import DeviceView
 
 
 def device_out(view: DeviceView, caller: Identity, now_ms: int) -> DeviceOut:
     """A device with its presence, newest state and lease."""
     device = view.device
-    return DeviceOut(
-        id=device.id,
-        name=device.name,
-        label=device.label,
-        kind=device.kind,
-        robot_type=device.robot_type,
-        agent=device.agent,
-        space=device.space,
+    return response_from(
+        device,
+        DeviceOut,
         role=device.role.value,
         owner=AccountRef(id=device.owner, name=view.owner_name),
-        topic=device.topic,
         online=view.online,
         last_seen_at=None if view.last_seen_ms is None else rfc3339(view.last_seen_ms),
         state=None if view.state is None else msgspec.convert(view.state, State, strict=False),

@@ -1,29 +1,24 @@
-"""From where a request comes: what too many wrong tries are counted by."""
+"""The address of a client, by which failed attempts are counted."""
 
 import ipaddress
 
 from fastapi import Request
 
 _IPV6_NETWORK = 64
-"""Who has an IPv6 address has its whole network, 2⁶⁴ of them: they count as one."""
+"""A client controls its whole IPv6 network of 2⁶⁴ addresses: they count as one."""
 
 
 def client_address(request: Request, proxies: int) -> str:
-    """The client's address, or empty where nothing tells it.
+    """The client's address; empty if unknown.
 
-    Args:
-        request: Whose.
-        proxies: How many proxies of one's own stand in front. Each adds to ``X-Forwarded-For`` whom it was asked by, so
-            the client is the one that the first of them added; what stands left of that is written by the client.
-            A host that tells no address of the connection is a proxy itself.
+    Each of the operator's ``proxies`` appends the address of its client to ``X-Forwarded-For``. Earlier entries are
+    written by the client and not trusted. A host that states no address of the connection is a proxy itself.
     """
     peer = request.client.host if request.client is not None else ""
     if not peer:
         proxies = max(1, proxies)
-    if proxies:
-        added = [part for line in request.headers.getlist("x-forwarded-for") for part in line.split(",")]
-        return _read(added[-proxies]) if len(added) >= proxies else _read(peer)
-    return _read(peer)
+    added = [part for line in request.headers.getlist("x-forwarded-for") for part in line.split(",")]
+    return _read(added[-proxies] if 0 < proxies <= len(added) else peer)
 
 
 def _read(text: str) -> str:

@@ -7,6 +7,7 @@ import msgspec
 from fastapi import Request, Response
 
 from function_app.domain.common.problems import Problem, invalid
+from function_app.entrypoints.http.framework.schemas import Problem as ProblemOut
 
 MAX_BODY = 1_000_000
 """Bytes of a request's body."""
@@ -50,8 +51,13 @@ def problem(error: Problem) -> Response:
 
 
 def problem_type(error: Problem) -> str:
-    """What names the refusal for programs."""
+    """The URI that names the kind of problem."""
     return f"/problems/{error.code}"
+
+
+def problem_item(error: Problem) -> ProblemOut:
+    """A problem of one item of a list."""
+    return ProblemOut(type=problem_type(error), title=error.title, status=error.status, detail=error.detail)
 
 
 async def read(request: Request, kind: Any, *, limit: int = MAX_BODY) -> Any:

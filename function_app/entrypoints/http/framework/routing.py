@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from fastapi import APIRouter, Query, Response
 
+from function_app.domain.common.timestamps import LAST_MS
 from function_app.entrypoints.http.framework import schemas as common
 from function_app.entrypoints.http.framework.api_key_scopes import FOR_KEYS
 from function_app.entrypoints.http.framework.responses import JSON, PROBLEM_JSON
@@ -16,6 +17,12 @@ Caller = Literal["anonymous", "account", "page", "agent", "account or agent"]
 PREFIX = "/api/v1"
 VERSION = "0.1.0"
 Cursor = Annotated[str | None, Query(max_length=2000, description="Cursor of the previous page.")]
+Since = Annotated[
+    int | None, Query(alias="from", ge=0, le=LAST_MS, description="From here [ms since 1970]; the beginning.")
+]
+Until = Annotated[
+    int | None, Query(alias="to", ge=0, le=LAST_MS, description="To before here [ms since 1970]; the end.")
+]
 Limit = Annotated[int, Query(ge=1, le=1000, description="Maximum number of items in a page.")]
 
 REF = "#/components/schemas/{name}"
@@ -50,51 +57,51 @@ class Routes:
 
     def add(
         self,
-        method: Literal["GET", "POST", "PUT", "DELETE"],
-        path: str,
-        *,
+        route: str,
         summary: str,
-        responses: Mapping[int, Any],
-        problems: Sequence[int] = (),
+        responses: Any,
+        problems: int | Sequence[int] = (),
+        *,
         body: Any = None,
-        body_required: bool = True,
+        optional_body: Any = None,
         caller: Caller = "account",
     ) -> Callable[[Handler], Handler]:
         """Register a handler.
 
         Args:
-            method: HTTP method.
-            path: Below the API's prefix.
+            route: HTTP method and path below the API's prefix, such as ``GET /devices``.
             summary: One line.
-            responses: Status → struct of the body (``None``: no body; text: the media type of a file).
+            responses: Status → struct of the body (``None``: no body; text: the media type of a file). A struct or text
+                alone: status 200; ``None`` alone: status 204.
             problems: Error statuses in addition to 401, 413, 422, 429 and 503, which follow from the other arguments.
             body: Struct of the request's body.
-            body_required: Whether the body is required.
+            optional_body: The same, if the body may be empty.
             caller: Accepted authentication. ``page``: an account's cookie only. An API key acts for an account if the
                 handler's name is in ``FOR_KEYS``.
         """
-        refusals = {*problems, 429, 503}
+        method, path = route.split()
+        kind = optional_body if body is None else body
+        refusals = {*((problems,) if isinstance(problems, int) else problems), 429, 503}
         if caller != "anonymous":
             refusals.add(401)
         if caller not in {"anonymous", "agent"}:
             refusals.add(403)  # a missing role or CSRF token, or an operation that rejects API keys
-        if body is not None:
+        if kind is not None:
             refusals |= {413, 422}
-        documented: dict[int | str, dict[str, Any]] = {}
-        for status, kind in responses.items():
-            documented[status] = {"description": _MEANINGS[status]}
-            if isinstance(kind, str):
-                documented[status]["content"] = {kind: {"schema": {"type": "string", "format": "binary"}}}
-            elif kind is not None:
-                documented[status]["content"] = {JSON: {"schema": self._reference(kind)}}
+        if not isinstance(responses, Mapping):
+            responses = {204 if responses is None else 200: responses}
+        documented: dict[int | str, dict[str, Any]] = {
+            status: self._success(status, response) for status, response in responses.items()
+        }
         for status in sorted(refusals):
             documented[status] = {
                 "description": _MEANINGS[status],
                 "content": {PROBLEM_JSON: {"schema": _reference(common.Problem)}},
             }
         extra: dict[str, Any] = {}
-        if body is not None:
-            extra["requestBody"] = {"required": body_required, "content": {JSON: {"schema": self._reference(body)}}}
+        if kind is not None:
+            content = {JSON: {"schema": self._reference(kind)}}
+            extra["requestBody"] = {"required": body is not None, "content": content}
 
         def register(handler: Handler) -> Handler:
             extra["security"] = _security(caller, for_keys=handler.__name__ in FOR_KEYS)
@@ -114,6 +121,14 @@ class Routes:
             return handler
 
         return register
+
+    def _success(self, status: int, kind: Any) -> dict[str, Any]:
+        described: dict[str, Any] = {"description": _MEANINGS[status]}
+        if isinstance(kind, str):
+            described["content"] = {kind: {"schema": {"type": "string", "format": "binary"}}}
+        elif kind is not None:
+            described["content"] = {JSON: {"schema": self._reference(kind)}}
+        return described
 
     def _reference(self, kind: Any) -> dict[str, Any]:
         self.kinds.append(kind)

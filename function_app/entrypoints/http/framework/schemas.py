@@ -1,6 +1,6 @@
 """Base classes and types that all schemas share."""
 
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 from msgspec import Meta, Struct
 
@@ -34,3 +34,12 @@ class AccountRef(Response, frozen=True, kw_only=True):
 
     id: str
     name: str
+
+
+R = TypeVar("R", bound=Response)
+
+
+def response_from(source: object, kind: type[R], /, **more: Any) -> R:
+    """A response with the equally named attributes of ``source``, and with the fields in ``more``."""
+    names = (name for name in kind.__struct_fields__ if name not in more and hasattr(source, name))
+    return kind(**{name: getattr(source, name) for name in names}, **more)

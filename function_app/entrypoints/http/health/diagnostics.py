@@ -18,13 +18,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("diagnostics")
 
-    @routes.add(
-        "GET",
-        "/devices/{device}/diagnostics",
-        summary="Diagnose a device",
-        responses={200: schemas.DeviceDiagnostics},
-        problems=(404,),
-    )
+    @routes.add("GET /devices/{device}/diagnostics", "Diagnose a device", schemas.DeviceDiagnostics, 404)
     async def get_diagnostics(request: Request, device: str) -> Response:
         """Open faults, and each measurement with its usual range, limits and trend."""
         caller = await auth.account(request)
@@ -41,13 +35,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         )
         return json_response(body)
 
-    @routes.add(
-        "GET",
-        "/diagnostics",
-        summary="Summarize the health of all devices",
-        responses={200: schemas.DeviceHealthList},
-        problems=(422,),
-    )
+    @routes.add("GET /diagnostics", "Summarize the health of all devices", schemas.DeviceHealthList, 422)
     async def list_diagnostics(request: Request, cursor: Cursor = None, limit: Limit = 1000) -> Response:
         """Worst first, with counts."""
         caller = await auth.account(request)
@@ -55,11 +43,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(_list(found, following))
 
     @routes.add(
-        "GET",
-        "/spaces/{space}/diagnostics",
-        summary="Summarize the health of a space's devices",
-        responses={200: schemas.DeviceHealthList},
-        problems=(404, 422),
+        "GET /spaces/{space}/diagnostics",
+        "Summarize the health of a space's devices",
+        schemas.DeviceHealthList,
+        (404, 422),
     )
     async def list_space_diagnostics(
         request: Request, space: str, cursor: Cursor = None, limit: Limit = 1000

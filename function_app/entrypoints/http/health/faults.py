@@ -19,13 +19,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("diagnostics")
 
-    @routes.add(
-        "GET",
-        "/devices/{device}/faults",
-        summary="List faults",
-        responses={200: schemas.FaultList},
-        problems=(404, 422),
-    )
+    @routes.add("GET /devices/{device}/faults", "List faults", schemas.FaultList, (404, 422))
     async def list_faults(
         request: Request, device: str, only: Open = None, cursor: Cursor = None, limit: Limit = 100
     ) -> Response:
@@ -40,11 +34,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         )
 
     @routes.add(
-        "POST",
-        "/devices/{device}/faults/{fault}/acknowledge",
-        summary="Acknowledge a fault",
-        responses={200: schemas.FaultOut},
-        problems=(404, 409),
+        "POST /devices/{device}/faults/{fault}/acknowledge", "Acknowledge a fault", schemas.FaultOut, (404, 409)
     )
     async def acknowledge_fault(request: Request, device: str, fault: str) -> Response:
         """It stays open until it is cleared. The first acknowledging account stays named."""

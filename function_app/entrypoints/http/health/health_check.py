@@ -4,16 +4,17 @@ from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import store_unavailable
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
 from function_app.entrypoints.http.framework.responses import json_response
 from function_app.entrypoints.http.framework.routing import VERSION, Routes
 from function_app.entrypoints.http.health import schemas
 
 
-def router(functions: Functions) -> Routes:
+def router(functions: Functions, _auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("health")
 
-    @routes.add("GET", "/health", summary="Check the server", responses={200: schemas.HealthOut}, caller="anonymous")
+    @routes.add("GET /health", "Check the server", schemas.HealthOut, caller="anonymous")
     async def health(_request: Request) -> Response:
         """503 if the tables cannot be used. An unreachable broker is reported and recovers by itself."""
         found = await functions.health.check()

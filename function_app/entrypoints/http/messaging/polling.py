@@ -26,14 +26,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("agents")
 
-    @routes.add(
-        "GET",
-        "/agents/{agent}/commands",
-        summary="Poll commands",
-        responses={200: schemas.CommandList},
-        problems=(404, 409, 422),
-        caller="agent",
-    )
+    @routes.add("GET /agents/{agent}/commands", "Poll commands", schemas.CommandList, (404, 409, 422), caller="agent")
     async def fetch_commands(
         request: Request,
         agent: str,
@@ -56,12 +49,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(schemas.CommandList(items=items), headers={"Cache-Control": "no-store"})
 
     @routes.add(
-        "POST",
-        "/agents/{agent}/messages",
-        summary="Post messages of an agent",
+        "POST /agents/{agent}/messages",
+        "Post messages of an agent",
+        schemas.MessageResults,
+        (404, 409),
         body=schemas.MessagesRequest,
-        responses={200: schemas.MessageResults},
-        problems=(404, 409),
         caller="agent",
     )
     async def post_agent_messages(request: Request, agent: str) -> Response:

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import msgspec
 from fastapi import Request, Response
 
 from device_agent.protocol.xmpp import jids
@@ -21,12 +22,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     routes = Routes("broker")
 
     @routes.add(
-        "POST",
-        "/xmpp/credentials",
-        summary="Get XMPP credentials",
+        "POST /xmpp/credentials",
+        "Get XMPP credentials",
+        schemas.XmppCredentialsOut,
+        409,
         body=schemas.XmppCredentialsRequest,
-        responses={200: schemas.XmppCredentialsOut},
-        problems=(409,),
         caller="account or agent",
     )
     async def xmpp_credentials(request: Request) -> Response:
@@ -57,25 +57,18 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(body, headers=_NOT_KEPT)
 
     @routes.add(
-        "POST",
-        "/xmpp/verify",
-        summary="Verify an XMPP login",
+        "POST /xmpp/verify",
+        "Verify an XMPP login",
+        schemas.XmppIdentityOut,
+        (401, 409),
         body=schemas.XmppVerifyRequest,
-        responses={200: schemas.XmppIdentityOut},
-        problems=(401, 409),
         caller="anonymous",
     )
     async def xmpp_verify(request: Request) -> Response:
         """Called by the XMPP server. A caller without a valid password learns nothing."""
         payload: schemas.XmppVerifyRequest = await read(request, schemas.XmppVerifyRequest)
         found = await functions.xmpp_credentials.verify(payload.user, payload.password)
-        body = schemas.XmppIdentityOut(
-            user=found.user,
-            name=found.name,
-            kind=found.kind,
-            lifetime_s=found.lifetime_s,
-            contacts=tuple(schemas.XmppContactOut(user=each.user, name=each.name) for each in found.contacts),
-        )
+        body = msgspec.convert(found, schemas.XmppIdentityOut, from_attributes=True)
         return json_response(body, headers=_NOT_KEPT)
 
     return routes

@@ -28,12 +28,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     routes = Routes("agents")
 
     @routes.add(
-        "POST",
-        "/agents/enroll",
-        summary="Enrol an agent",
+        "POST /agents/enroll",
+        "Enrol an agent",
+        {200: schemas.EnrollmentOut, 201: schemas.EnrollmentOut},
+        409,
         body=schemas.EnrollRequest,
-        responses={200: schemas.EnrollmentOut, 201: schemas.EnrollmentOut},
-        problems=(409,),
         caller="agent",
     )
     async def enroll_agent(request: Request) -> Response:
@@ -59,14 +58,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         )
         return json_response(body, 201)
 
-    @routes.add(
-        "GET",
-        "/agents/enrollment",
-        summary="Get the enrolment state",
-        responses={200: schemas.EnrollmentState},
-        problems=(422,),
-        caller="agent",
-    )
+    @routes.add("GET /agents/enrollment", "Get the enrolment state", schemas.EnrollmentState, 422, caller="agent")
     async def enrollment(request: Request, wait_ms: Wait = 0) -> Response:
         """Called by an agent: its space, its owner, and the keys whose commands it must accept."""
         agent = await functions.enroll.wait(await auth.agent(request), wait_ms)
@@ -88,12 +80,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(body)
 
     @routes.add(
-        "POST",
-        "/agents/certificate",
-        summary="Issue a broker certificate",
+        "POST /agents/certificate",
+        "Issue a broker certificate",
+        schemas.CertificateOut,
+        409,
         body=schemas.CertificateRequest,
-        responses={200: schemas.CertificateOut},
-        problems=(409,),
         caller="agent",
     )
     async def certify(request: Request) -> Response:
@@ -104,28 +95,20 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(schemas.CertificateOut(chain=issued.chain, expires_at=rfc3339(issued.expires_ms)))
 
     @routes.add(
-        "POST",
-        "/agents/claim",
-        summary="Claim an agent by its code",
-        body=schemas.ClaimRequest,
-        responses={200: schemas.ClaimOut},
-        problems=(404, 429),
+        "POST /agents/claim", "Claim an agent by its code", schemas.ClaimOut, (404, 429), body=schemas.ClaimRequest
     )
     async def claim_agent(request: Request) -> Response:
         """Wrong, used and expired codes get the same response."""
         caller = await auth.account(request)
         payload: schemas.ClaimRequest = await read(request, schemas.ClaimRequest)
         agent = await functions.claim.claim(
-            caller,
-            payload.code,
-            payload.space,
-            address=client_address(request, functions.settings.trusted_proxies),
+            caller, payload.code, payload.space, address=client_address(request, functions.settings.trusted_proxies)
         )
         views = await functions.devices.of_agent(caller, agent.id)
         found = tuple(device_out(view, caller, functions.clock.now_ms()) for view in views)
         return json_response(schemas.ClaimOut(agent=agent.id, space=agent.space or "", devices=found))
 
-    @routes.add("GET", "/agents", summary="List agents", responses={200: schemas.AgentList}, problems=(422,))
+    @routes.add("GET /agents", "List agents", schemas.AgentList, 422)
     async def list_agents(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """Agents that the account has claimed."""
         caller = await auth.account(request)
@@ -134,12 +117,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(schemas.AgentList(items=items, cursor=following))
 
     @routes.add(
-        "PUT",
-        "/agents/{agent}/space",
-        summary="Move an agent to another space",
+        "PUT /agents/{agent}/space",
+        "Move an agent to another space",
+        schemas.AgentOut,
+        404,
         body=schemas.MoveAgentRequest,
-        responses={200: schemas.AgentOut},
-        problems=(404,),
     )
     async def move_agent(request: Request, agent: str) -> Response:
         """Its history stays. Running actions end, leases are revoked, and its broker connection is closed."""
@@ -147,7 +129,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         payload: schemas.MoveAgentRequest = await read(request, schemas.MoveAgentRequest)
         return json_response(_shown(await functions.unpair.move(caller, agent, payload.space)))
 
-    @routes.add("DELETE", "/agents/{agent}", summary="Unpair an agent", responses={204: None}, problems=(404,))
+    @routes.add("DELETE /agents/{agent}", "Unpair an agent", None, 404)
     async def unpair_agent(request: Request, agent: str) -> Response:
         """Removes its devices, closes its broker connection, and makes it claimable again."""
         await functions.unpair.unpair(await auth.account(request), agent)

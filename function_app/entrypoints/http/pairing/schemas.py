@@ -26,8 +26,7 @@ class EnrollRequest(Request, frozen=True, kw_only=True):
     software: Label
     devices: Annotated[tuple[DeviceIn, ...], Meta(min_length=1, max_length=64)]
     transport: Annotated[
-        Literal["mqtt", "http", "xmpp"],
-        Meta(description="How it hears commands: by the broker, or by asking"),
+        Literal["mqtt", "http", "xmpp"], Meta(description="How it hears commands: by the broker, or by asking")
     ] = "mqtt"
 
 

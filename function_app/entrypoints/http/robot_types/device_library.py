@@ -18,24 +18,17 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("devices")
 
-    @routes.add(
-        "GET",
-        "/devices/{device}/robot-type",
-        summary="Get a device's robot type",
-        responses={200: RobotTypeOut},
-        problems=(404,),
-    )
+    @routes.add("GET /devices/{device}/robot-type", "Get a device's robot type", RobotTypeOut, 404)
     async def get_device_robot_type(request: Request, device: str) -> Response:
         """As its owner has it. The caller's own robot type of the same name may differ."""
         found = await functions.devices.get(await auth.account(request), device)
         return json_response(robot_type_out(await functions.robot_types.view(_owner(found.owner), found.robot_type)))
 
     @routes.add(
-        "GET",
-        "/devices/{device}/robot-type/files/{name:path}",
-        summary="Get a file of a device's robot type",
-        responses={200: "application/octet-stream"},
-        problems=(404, 409),
+        "GET /devices/{device}/robot-type/files/{name:path}",
+        "Get a file of a device's robot type",
+        "application/octet-stream",
+        (404, 409),
     )
     async def get_device_robot_type_file(request: Request, device: str, name: str) -> Response:
         """Of the version in use. ``robot.toml`` is the manifest."""
@@ -44,11 +37,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return content(body, "application/octet-stream", name.rpartition("/")[2])
 
     @routes.add(
-        "GET",
-        "/devices/{device}/movements",
-        summary="List movements for a device",
-        responses={200: schemas.MovementList},
-        problems=(403, 404, 409, 422),
+        "GET /devices/{device}/movements", "List movements for a device", schemas.MovementList, (403, 404, 409, 422)
     )
     async def list_device_movements(
         request: Request, device: str, cursor: Cursor = None, limit: Limit = 100
@@ -61,11 +50,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(schemas.MovementList(items=tuple(movement_out(each) for each in items), cursor=following))
 
     @routes.add(
-        "GET",
-        "/devices/{device}/movements/{name}",
-        summary="Get a movement for a device, with its source",
-        responses={200: schemas.MovementSource},
-        problems=(403, 404, 409),
+        "GET /devices/{device}/movements/{name}",
+        "Get a movement for a device, with its source",
+        schemas.MovementSource,
+        (403, 404, 409),
     )
     async def get_device_movement(request: Request, device: str, name: str) -> Response:
         """The newest version. For accounts that may run it."""

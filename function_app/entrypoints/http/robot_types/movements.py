@@ -23,11 +23,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     routes = Routes("movements")
 
     @routes.add(
-        "GET",
-        _MOVEMENTS,
-        summary="List movements of a robot type",
-        responses={200: schemas.MovementList},
-        problems=(404, 409, 422),
+        "GET /robot-types/{robot_type}/movements",
+        "List movements of a robot type",
+        schemas.MovementList,
+        (404, 409, 422),
     )
     async def list_movements(request: Request, robot_type: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """Built-in movements and the account's own, by name."""
@@ -36,11 +35,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(schemas.MovementList(items=tuple(movement_out(each) for each in found), cursor=following))
 
     @routes.add(
-        "GET",
-        _MOVEMENTS + "/{name}",
-        summary="Get a movement with its source",
-        responses={200: schemas.MovementSource},
-        problems=(404, 409, 422),
+        "GET /robot-types/{robot_type}/movements/{name}",
+        "Get a movement with its source",
+        schemas.MovementSource,
+        (404, 409, 422),
     )
     async def get_movement(request: Request, robot_type: str, name: str, version: Version = None) -> Response:
         """The newest version, or the requested one."""
@@ -50,11 +48,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(movement_source_out(robot_type, found, source, public))
 
     @routes.add(
-        "GET",
-        _MOVEMENTS + "/{name}/versions",
-        summary="List versions of a movement",
-        responses={200: schemas.MovementList},
-        problems=(404, 409, 422),
+        "GET /robot-types/{robot_type}/movements/{name}/versions",
+        "List versions of a movement",
+        schemas.MovementList,
+        (404, 409, 422),
     )
     async def list_movement_versions(
         request: Request, robot_type: str, name: str, cursor: Cursor = None, limit: Limit = 100
@@ -65,12 +62,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(schemas.MovementList(items=tuple(movement_out(each) for each in found), cursor=following))
 
     @routes.add(
-        "PUT",
-        _MOVEMENTS + "/{name}",
-        summary="Save a movement",
+        "PUT /robot-types/{robot_type}/movements/{name}",
+        "Save a movement",
+        {200: schemas.MovementOut, 201: schemas.MovementOut},
+        (404, 409),
         body=schemas.MovementRequest,
-        responses={200: schemas.MovementOut, 201: schemas.MovementOut},
-        problems=(404, 409),
     )
     async def put_movement(request: Request, robot_type: str, name: str) -> Response:
         """Stores a new version of the account's own movement. It replaces a built-in movement of the same name."""
@@ -84,13 +80,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         found, new = await functions.movements.put(caller, robot_type, name, draft)
         return json_response(movement_out(found), 201 if new else 200)
 
-    @routes.add(
-        "DELETE",
-        _MOVEMENTS + "/{name}",
-        summary="Delete a movement",
-        responses={204: None},
-        problems=(404, 409),
-    )
+    @routes.add("DELETE /robot-types/{robot_type}/movements/{name}", "Delete a movement", None, (404, 409))
     async def delete_movement(request: Request, robot_type: str, name: str) -> Response:
         """All versions of the account's own movement.
 

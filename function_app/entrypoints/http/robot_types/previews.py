@@ -17,12 +17,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     routes = Routes("robot types")
 
     @routes.add(
-        "POST",
-        "/robot-type-previews",
-        summary="Create a robot type preview",
+        "POST /robot-type-previews",
+        "Create a robot type preview",
+        {201: schemas.RobotTypePreviewOut, 202: schemas.RobotTypePreviewOut},
+        409,
         body=schemas.RobotTypePreviewRequest,
-        responses={201: schemas.RobotTypePreviewOut, 202: schemas.RobotTypePreviewOut},
-        problems=(409,),
     )
     async def add_robot_type_preview(request: Request) -> Response:
         """Compiles the model and compares it with the manifest, like an upload. 201: validated; 202: poll it.
@@ -39,30 +38,27 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         status = 202 if found.upload.open else 201
         return json_response(preview_out(found), status, {"Location": f"{PREFIX}/robot-type-previews/{found.id}"})
 
-    @routes.add("GET", _ONE, summary="Get a preview", responses={200: schemas.RobotTypePreviewOut}, problems=(404,))
+    @routes.add("GET /robot-type-previews/{preview}", "Get a preview", schemas.RobotTypePreviewOut, 404)
     async def get_robot_type_preview(request: Request, preview: str) -> Response:
         """Only the account's own."""
         return json_response(preview_out(await functions.robot_type_preview.get(await auth.account(request), preview)))
 
     @routes.add(
-        "GET",
-        _ONE + "/twin",
-        summary="Get the geometry of a preview",
-        responses={200: schemas.RobotTypeTwin},
-        problems=(404, 409, 422),
+        "GET /robot-type-previews/{preview}/twin",
+        "Get the geometry of a preview",
+        schemas.RobotTypeTwin,
+        (404, 409, 422),
     )
     async def get_robot_type_preview_twin(request: Request, preview: str) -> Response:
         """As for a robot type."""
         return json_response(twin_out(await functions.robot_type_preview.model(await auth.account(request), preview)))
 
     @routes.add(
-        "POST",
-        _ONE + "/save",
-        summary="Save a preview as a robot type",
-        body=schemas.SaveRobotTypePreviewRequest,
-        body_required=False,
-        responses={200: schemas.RobotTypeOut, 201: schemas.RobotTypeOut, 202: schemas.RobotTypeOut},
-        problems=(404, 409),
+        "POST /robot-type-previews/{preview}/save",
+        "Save a preview as a robot type",
+        {200: schemas.RobotTypeOut, 201: schemas.RobotTypeOut, 202: schemas.RobotTypeOut},
+        (404, 409),
+        optional_body=schemas.SaveRobotTypePreviewRequest,
     )
     async def save_robot_type_preview(request: Request, preview: str) -> Response:
         """Creates a robot type, or the next version of one, like an upload. The preview ends."""
@@ -74,7 +70,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             status = 202
         return json_response(robot_type_out(found), status, {"Location": f"{PREFIX}/robot-types/{found.manifest.type}"})
 
-    @routes.add("DELETE", _ONE, summary="Delete a preview", responses={204: None}, problems=(404,))
+    @routes.add("DELETE /robot-type-previews/{preview}", "Delete a preview", None, 404)
     async def delete_robot_type_preview(request: Request, preview: str) -> Response:
         """With all stored files."""
         await functions.robot_type_preview.drop(await auth.account(request), preview)

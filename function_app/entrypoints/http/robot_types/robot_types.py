@@ -18,9 +18,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("robot types")
 
-    @routes.add(
-        "GET", "/robot-types", summary="List robot types", responses={200: schemas.RobotTypeList}, problems=(422,)
-    )
+    @routes.add("GET /robot-types", "List robot types", schemas.RobotTypeList, 422)
     async def list_robot_types(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """Built-in robot types and the account's own."""
         caller = await auth.account(request)
@@ -28,12 +26,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(schemas.RobotTypeList(items=tuple(map(robot_type_out, found)), cursor=following))
 
     @routes.add(
-        "POST",
-        "/robot-types",
-        summary="Upload a robot type",
+        "POST /robot-types",
+        "Upload a robot type",
+        {200: schemas.RobotTypeOut, 201: schemas.RobotTypeOut, 202: schemas.RobotTypeOut},
+        (404, 409),
         body=schemas.RobotTypeRequest,
-        responses={200: schemas.RobotTypeOut, 201: schemas.RobotTypeOut, 202: schemas.RobotTypeOut},
-        problems=(404, 409),
     )
     async def add_robot_type(request: Request) -> Response:
         """MuJoCo compiles it and compares it with the manifest. 201: ready and new; 200: ready, the next version.
@@ -51,31 +48,19 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         where = {"Location": f"{PREFIX}/robot-types/{found.manifest.type}"}
         return json_response(robot_type_out(found), status, where)
 
-    @routes.add("GET", _ONE, summary="Get a robot type", responses={200: schemas.RobotTypeOut}, problems=(404,))
+    @routes.add("GET /robot-types/{robot_type}", "Get a robot type", schemas.RobotTypeOut, 404)
     async def get_robot_type(request: Request, robot_type: str) -> Response:
         """Joints, limits and capabilities, and the state of its newest upload."""
         caller = await auth.account(request)
         return json_response(robot_type_out(await functions.robot_types.view(caller, robot_type)))
 
-    @routes.add(
-        "GET",
-        _ONE + "/archive",
-        summary="Get a robot type as a zip archive",
-        responses={200: _ZIP},
-        problems=(404, 409),
-    )
+    @routes.add("GET /robot-types/{robot_type}/archive", "Get a robot type as a zip archive", _ZIP, (404, 409))
     async def get_robot_type_archive(request: Request, robot_type: str) -> Response:
         """A folder as under ``robots/``, of the version in use."""
         caller = await auth.account(request)
         return content(await functions.robot_types.archive(caller, robot_type), _ZIP, f"{robot_type}.zip")
 
-    @routes.add(
-        "GET",
-        _ONE + "/files/{name:path}",
-        summary="Get a file of a robot type",
-        responses={200: _BYTES},
-        problems=(404, 409),
-    )
+    @routes.add("GET /robot-types/{robot_type}/files/{name:path}", "Get a file of a robot type", _BYTES, (404, 409))
     async def get_robot_type_file(request: Request, robot_type: str, name: str) -> Response:
         """Of the version in use. ``robot.toml`` is the manifest."""
         caller = await auth.account(request)
@@ -83,17 +68,13 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return content(body, _BYTES, name.rpartition("/")[2])
 
     @routes.add(
-        "GET",
-        _ONE + "/twin",
-        summary="Get the geometry of a robot type",
-        responses={200: schemas.RobotTypeTwin},
-        problems=(404, 409),
+        "GET /robot-types/{robot_type}/twin", "Get the geometry of a robot type", schemas.RobotTypeTwin, (404, 409)
     )
     async def get_robot_type_twin(request: Request, robot_type: str) -> Response:
         """What a page needs to draw and move the version in use without a robot."""
         return json_response(twin_out(await functions.robot_types.model(await auth.account(request), robot_type)))
 
-    @routes.add("DELETE", _ONE, summary="Delete a robot type", responses={204: None}, problems=(404, 409))
+    @routes.add("DELETE /robot-types/{robot_type}", "Delete a robot type", None, (404, 409))
     async def delete_robot_type(request: Request, robot_type: str) -> Response:
         """All versions, unless a device or a movement of the account uses it."""
         await functions.delete_robot_type.delete(await auth.account(request), robot_type)

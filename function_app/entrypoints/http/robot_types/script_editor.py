@@ -22,11 +22,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     routes = Routes("movements")
 
     @routes.add(
-        "GET",
-        _SCRIPTING,
-        summary="Get the script API for a robot type",
-        responses={200: schemas.ScriptingOut},
-        problems=(404, 409),
+        "GET /robot-types/{robot_type}/scripting",
+        "Get the script API for a robot type",
+        schemas.ScriptingOut,
+        (404, 409),
     )
     async def get_scripting(request: Request, robot_type: str) -> Response:
         """Calls with their signatures, importable modules, and the names that the robot type defines."""
@@ -34,12 +33,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return json_response(schemas.ScriptingOut(api=script_api(), names=names_of(found)))
 
     @routes.add(
-        "POST",
-        _SCRIPTING + "/check",
-        summary="Check a script",
+        "POST /robot-types/{robot_type}/scripting/check",
+        "Check a script",
+        schemas.ScriptCheckOut,
+        (404, 409),
         body=schemas.ScriptCheckRequest,
-        responses={200: schemas.ScriptCheckOut},
-        problems=(404, 409),
     )
     async def check_movement(request: Request, robot_type: str) -> Response:
         """Returns problems with their positions. Nothing is saved or run."""

@@ -8,6 +8,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.robot_types.movements import Movement
 from function_app.domain.robot_types.robot_types import TypeVersion
+from function_app.entrypoints.http.framework.schemas import R, response_from
 from function_app.entrypoints.http.robot_types import schemas
 from function_app.services.robot_types.catalogue import KnownType, Model
 from function_app.services.robot_types.parameter_schema import ObjectSchema
@@ -18,24 +19,14 @@ from function_app.services.robot_types.script_store import signed_text
 def robot_type_out(robot_type: KnownType) -> schemas.RobotTypeOut:
     """A robot type in its newest usable version, with its newest upload."""
     manifest, upload = robot_type.manifest, robot_type.upload
-    return schemas.RobotTypeOut(
-        type=manifest.type,
-        label=manifest.label,
-        kind=manifest.kind,
+    return response_from(
+        manifest,
+        schemas.RobotTypeOut,
         version=robot_type.version,
-        description=manifest.description,
-        driver=manifest.driver,
-        joints=manifest.joints,
-        frames=manifest.frames,
-        capabilities=manifest.capabilities,
-        home_rad=manifest.home_rad,
-        mimic_joints=manifest.mimic_joints,
-        position_dependent_limits=manifest.position_dependent_limits,
         postures=tuple(manifest.postures),
         expressions=tuple(manifest.expressions),
         behaviours=tuple(manifest.behaviours),
         actions=_actions(manifest),
-        streams=manifest.streams,
         built_in=robot_type.built_in,
         state="ready" if robot_type.usable or upload is None else _upload_state(upload),
         files=robot_type.files,
@@ -59,9 +50,7 @@ def _actions(manifest: RobotType) -> tuple[str, ...]:
 
 def twin_out(model: Model) -> schemas.RobotTypeTwin:
     """The geometry of a robot type, for drawing."""
-    return schemas.RobotTypeTwin(
-        device=model.twin.device, bodies=model.twin.bodies, actuators=model.actuators, cameras=model.cameras
-    )
+    return response_from(model, schemas.RobotTypeTwin, device=model.twin.device, bodies=model.twin.bodies)
 
 
 def preview_out(preview: Preview) -> schemas.RobotTypePreviewOut:
@@ -91,7 +80,7 @@ def _upload_state(upload: TypeVersion) -> schemas.State:
 
 def movement_out(movement: Movement) -> schemas.MovementOut:
     """A movement without its source."""
-    return schemas.MovementOut(**_movement(movement))
+    return _movement(movement, schemas.MovementOut)
 
 
 def movement_source_out(robot_type: str, movement: Movement, source: str, public: str) -> schemas.MovementSource:
@@ -99,17 +88,15 @@ def movement_source_out(robot_type: str, movement: Movement, source: str, public
     signature = schemas.SignatureOut(
         key=movement.key, public=public, signed=signed_text(robot_type, movement), signature=movement.signature
     )
-    return schemas.MovementSource(**_movement(movement), source=source, signature=signature)
+    return _movement(movement, schemas.MovementSource, source=source, signature=signature)
 
 
-def _movement(movement: Movement) -> dict[str, Any]:
+def _movement(movement: Movement, kind: type[R], **more: Any) -> R:
     schema = movement.parameters_schema
-    return {
-        "name": movement.name,
-        "description": movement.description,
-        "version": movement.version,
-        "sha256": movement.sha256,
-        "updated_at": rfc3339(movement.updated_ms),
-        "built_in": movement.built_in,
-        "parameters_schema": None if schema is None else msgspec.convert(schema, ObjectSchema),
-    }
+    return response_from(
+        movement,
+        kind,
+        updated_at=rfc3339(movement.updated_ms),
+        parameters_schema=None if schema is None else msgspec.convert(schema, ObjectSchema),
+        **more,
+    )

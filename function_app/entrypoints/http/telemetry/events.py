@@ -14,13 +14,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("diagnostics")
 
-    @routes.add(
-        "GET",
-        "/devices/{device}/events",
-        summary="List events",
-        responses={200: schemas.EventList},
-        problems=(404, 422),
-    )
+    @routes.add("GET /devices/{device}/events", "List events", schemas.EventList, (404, 422))
     async def list_events(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """Since the device was paired: control changes, rejected requests with reasons, faults, room events."""
         caller = await auth.account(request)

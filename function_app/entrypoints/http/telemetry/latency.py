@@ -5,13 +5,13 @@ from typing import Annotated, Any
 from fastapi import Header, Query, Request, Response
 
 from function_app.bootstrap import Functions
-from function_app.domain.common.problems import not_found
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
 from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.telemetry import schemas
-from function_app.services.devices.device_access import devices_of, require_operator
+from function_app.entrypoints.http.telemetry.uploads import own_device
+from function_app.services.devices.device_access import require_operator
 from function_app.services.telemetry.latency import LatencySeries, Path, Samples, Transport
 
 Key = Annotated[
@@ -37,12 +37,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     routes = Routes("latency")
 
     @routes.add(
-        "POST",
-        "/devices/{device}/latency",
-        summary="Add latency samples of an operator",
-        body=schemas.LatencyRequest,
-        responses={204: None},
-        problems=(404,),
+        "POST /devices/{device}/latency", "Add latency samples of an operator", None, 404, body=schemas.LatencyRequest
     )
     async def add_latency(request: Request, device: str, once: Key = None) -> Response:
         """Durations that the operator's side measured on its own clock. Viewers add none."""
@@ -53,33 +48,22 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         return empty()
 
     @routes.add(
-        "POST",
-        "/agents/{agent}/latency",
-        summary="Add latency samples of an agent",
+        "POST /agents/{agent}/latency",
+        "Add latency samples of an agent",
+        None,
+        404,
         body=schemas.AgentLatencyRequest,
-        responses={204: None},
-        problems=(404,),
         caller="agent",
     )
     async def add_agent_latency(request: Request, agent: str, once: Key = None) -> Response:
         """Called by an agent: durations that it measured for one of its devices on its own clock."""
         known = await auth.agent(request)
         payload: schemas.AgentLatencyRequest = await read(request, schemas.AgentLatencyRequest)
-        if known.id != agent or not known.claimed:
-            raise not_found("agent", agent)
-        device = next((found for found in devices_of(known) if found.name == payload.device), None)
-        if device is None:
-            raise not_found("device", payload.device)
+        device = own_device(known, agent, payload.device)
         await functions.latencies.add(device, _samples(payload), caller=f"agent:{known.id}", once=once or "")
         return empty()
 
-    @routes.add(
-        "GET",
-        "/devices/{device}/latency",
-        summary="Get latency statistics",
-        responses={200: schemas.LatencyList},
-        problems=(404, 422),
-    )
+    @routes.add("GET /devices/{device}/latency", "Get latency statistics", schemas.LatencyList, (404, 422))
     async def get_latency(  # noqa: PLR0917 (FastAPI names them)
         request: Request,
         device: str,

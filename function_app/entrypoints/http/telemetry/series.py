@@ -5,19 +5,13 @@ from typing import Annotated, cast
 from fastapi import Query, Request, Response
 
 from function_app.bootstrap import Functions
-from function_app.domain.common.timestamps import LAST_MS, rfc3339
+from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
 from function_app.entrypoints.http.framework.responses import json_response
-from function_app.entrypoints.http.framework.routing import Routes
+from function_app.entrypoints.http.framework.routing import Routes, Since, Until
 from function_app.entrypoints.http.telemetry import schemas
 from function_app.services.telemetry.series_reader import MAX_POINTS, Part, Range
 
-Since = Annotated[
-    int | None, Query(alias="from", ge=0, le=LAST_MS, description="From here [ms since 1970]; the beginning.")
-]
-Until = Annotated[
-    int | None, Query(alias="to", ge=0, le=LAST_MS, description="To before here [ms since 1970]; the end.")
-]
 Points = Annotated[int, Query(ge=1, le=MAX_POINTS, description="At most so many points in a page.")]
 Fields = Annotated[str | None, Query(max_length=4_000, description="Only these fields, with commas between.")]
 Cursor = Annotated[str | None, Query(max_length=40, description="Where the page before ended.")]
@@ -30,13 +24,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("data")
 
-    @routes.add(
-        "GET",
-        "/devices/{device}/data",
-        summary="List measurement streams",
-        responses={200: schemas.StreamList},
-        problems=(404,),
-    )
+    @routes.add("GET /devices/{device}/data", "List measurement streams", schemas.StreamList, 404)
     async def list_streams(request: Request, device: str) -> Response:
         """Since the device was paired."""
         views = await functions.series.streams(await auth.account(request), device)
@@ -52,13 +40,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         )
         return json_response(schemas.StreamList(items=items, cursor=None))
 
-    @routes.add(
-        "GET",
-        "/devices/{device}/data/{stream}",
-        summary="Read a measurement stream",
-        responses={200: schemas.DataOut},
-        problems=(404, 422),
-    )
+    @routes.add("GET /devices/{device}/data/{stream}", "Read a measurement stream", schemas.DataOut, (404, 422))
     async def read_stream(  # noqa: PLR0917 (FastAPI names them)
         request: Request,
         device: str,

@@ -18,41 +18,34 @@ class Terminal(io.StringIO):
         return True
 
 
-class Ascii(Terminal):
+class AsciiTerminal(Terminal):
     encoding = "ascii"
 
 
-def shown(out: io.StringIO, *, qr: bool = True) -> list[str]:
-    claim_prompt.show(Claim(agent="a1", code="BCDF-GHJK", expires_in_s=299.6), "http://10.0.0.7:8080/", qr=qr, out=out)
-    return out.getvalue().splitlines()
-
-
-@pytest.fixture(autouse=True)
-def columns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-
-
-def test_code_and_link_are_printed() -> None:
-    assert shown(io.StringIO()) == ["claim code BCDF-GHJK  (valid for 300 s)", f"or open    {LINK}"]
-
-
-def test_a_terminal_also_shows_the_qr_code() -> None:
-    assert len(shown(Terminal())) == 2 + len(claim_prompt.qr_lines(LINK))
-
-
 @pytest.mark.parametrize(
-    ("out", "qr", "columns"), [(io.StringIO, True, 80), (Ascii, True, 80), (Terminal, False, 80), (Terminal, True, 20)]
+    ("terminal", "qr", "columns", "shown"),
+    [
+        (Terminal, True, 80, True),
+        (io.StringIO, True, 80, False),
+        (AsciiTerminal, True, 80, False),
+        (Terminal, False, 80, False),
+        (Terminal, True, 20, False),
+    ],
 )
-def test_the_qr_code_is_omitted_if_unwanted_or_not_displayable(
-    out: type[io.StringIO], qr: bool, columns: int, monkeypatch: pytest.MonkeyPatch
+def test_the_qr_code_is_shown_if_wanted_and_displayable(
+    terminal: type[io.StringIO], qr: bool, columns: int, shown: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
-    assert len(shown(out(), qr=qr)) == 2
+    out, claim = terminal(), Claim(agent="a1", code="BCDF-GHJK", expires_in_s=299.6)
+    claim_prompt.show(claim, "http://10.0.0.7:8080/", qr=qr, out=out)
+    code, link, *rows = out.getvalue().splitlines()
+    assert (code, link) == ("claim code BCDF-GHJK  (valid for 300 s)", f"or open    {LINK}")
+    assert len(rows) == (len(claim_prompt.qr_lines(LINK)) if shown else 0)
 
 
 def test_the_qr_code_is_complete() -> None:
-    upper, lower = {"█": (0, 0), "▀": (0, 1), "▄": (1, 0), " ": (1, 1)}, claim_prompt.qr_lines(LINK)
-    modules = [[upper[mark][half] for mark in line] for line in lower for half in (0, 1)]
+    halves = {"█": (0, 0), "▀": (0, 1), "▄": (1, 0), " ": (1, 1)}
+    modules = [[halves[mark][half] for mark in line] for line in claim_prompt.qr_lines(LINK) for half in (0, 1)]
     expected = [list(row) for row in segno.make(LINK, error="m", micro=False).matrix_iter(border=2)]
     assert modules[: len(expected)] == expected
     assert all(not any(row) for row in modules[len(expected) :]), "padding is light"

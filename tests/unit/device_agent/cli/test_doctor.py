@@ -1,19 +1,19 @@
 """``doctor`` names each problem with its remedy and never fails with a traceback."""
 
+import contextlib
 import logging
 import os
 import shutil
 import socket
 import sqlite3
 import sys
-import threading
-from collections import namedtuple
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
+from msgspec.structs import replace
 
 from device_agent import __main__ as program
 from device_agent.cli import doctor
@@ -23,10 +23,11 @@ from device_agent.config.agent_config import AgentConfig, DeviceEntry
 from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.clock import CloudClock
+from tests.harness.network.http_server import QuietHandler, serve
 
 ARM = DeviceEntry(name="arm", type="ur5")
+LIDAR = DeviceEntry(name="lidar", type="lidar", room="lab")
 PAIRING = Pairing(agent="a", space="s", account="anna", keys={})
-Usage = namedtuple("Usage", "total used free")  # noqa: PYI024 (like shutil's)
 
 
 @pytest.fixture
@@ -53,10 +54,9 @@ def text(findings: Iterator[Finding]) -> str:
 
 @pytest.mark.parametrize(("uid", "level"), [(0, "warning"), (1000, "ok"), (None, "ok")])
 def test_running_as_root_is_a_warning(uid: int | None, level: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: uid)
     if uid is None:
         monkeypatch.delattr(os, "geteuid")
-    else:
-        monkeypatch.setattr(os, "geteuid", lambda: uid)
     assert levels(machine.user()) == [level]
 
 
@@ -78,7 +78,7 @@ def test_folder_must_exist_hold_an_agent_and_be_private(store: IdentityStore, tm
 def test_low_disk_space_is_reported(
     free: int, level: str, store: IdentityStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, free))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
     assert levels(machine.disk(store)) == [level]
 
 
@@ -86,40 +86,33 @@ def test_damaged_journal_is_a_problem(store: IdentityStore) -> None:
     store.journal.write_bytes(b"not a database, and long enough to be mistaken for one" * 30)
     assert f"problem: {store.journal} is damaged" in text(machine.disk(store))
     store.journal.unlink()
-    with sqlite3.connect(store.journal) as journal:
+    with contextlib.closing(sqlite3.connect(store.journal)) as journal:
         journal.execute("CREATE TABLE commands (id TEXT)")
-    journal.close()
     assert "journal.db is intact" in text(machine.disk(store))
 
 
-def test_unconfined_scripts_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_features_of_the_machine_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert levels(machine.voice()) == ["ok"]
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert "apt-get install espeak-ng" in text(machine.voice())
     monkeypatch.setattr(sys, "platform", "darwin")
     assert "scripts run on Linux only" in text(machine.scripts(allow_unconfined=False))
     assert "with this agent's rights" in text(machine.scripts(allow_unconfined=True))
     assert levels(machine.python()) == ["warning"]
 
 
-def test_missing_speech_synthesizer_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    assert levels(machine.voice()) == ["ok"]
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert "apt-get install espeak-ng" in text(machine.voice())
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("entry", "level", "named"),
     [
         (ARM, "ok", "ur5"),
-        (DeviceEntry(name="arm", type="ur50"), "problem", "ur50"),
-        (DeviceEntry(name="arm", type="ur5", driver="mojoco"), "problem", "mojoco"),
-        (DeviceEntry(name="arm", type="ur5", options={"scene": "nowhere.xml"}), "problem", "nowhere.xml"),
-        (DeviceEntry(name="arm", type="ur5", options={"sceen": "scene.xml"}), "problem", "sceen"),
+        (replace(ARM, type="ur50"), "problem", "ur50"),
+        (replace(ARM, driver="mojoco"), "problem", "mojoco"),
+        (replace(ARM, options={"scene": "nowhere.xml"}), "problem", "nowhere.xml"),
+        (replace(ARM, options={"sceen": "scene.xml"}), "problem", "sceen"),
         (DeviceEntry(name="door", type="door", room="lab"), "ok", "door, driver 'mujoco': simulated"),
-        (
-            DeviceEntry(name="lidar", type="lidar", room="lab", options={"site": "nowhere"}),
-            "problem",
-            "no site 'nowhere'",
-        ),
-        (DeviceEntry(name="lidar", type="lidar", room="lab", options={"range": 3}), "problem", "no option 'range'"),
+        (replace(LIDAR, options={"site": "nowhere"}), "problem", "no site 'nowhere'"),
+        (replace(LIDAR, options={"range": 3}), "problem", "no option 'range'"),
     ],
 )
 def test_devices_are_built(entry: DeviceEntry, level: str, named: str) -> None:
@@ -128,6 +121,7 @@ def test_devices_are_built(entry: DeviceEntry, level: str, named: str) -> None:
     assert named in finding.message
 
 
+@pytest.mark.slow
 def test_missing_renderer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     config = AgentConfig(server="http://s", name="n", devices=(ARM,))
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
@@ -141,35 +135,23 @@ def test_missing_renderer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_interlocks_without_room_measurements_are_a_problem() -> None:
     rule = InterlockRule(device="other-pir", stream="presence", field="present", equals=True)
-    entry = DeviceEntry(name="arm", type="ur5", interlocks=(rule,))
-    config = AgentConfig(server="http://s", name="n", devices=(entry,), transport="http")
-    assert "problem" in (report := text(devices.room(config)))
+    config = AgentConfig(server="http://s", name="n", devices=(replace(ARM, interlocks=(rule,)),))
+    assert levels(devices.room(config)) == []
+    report = text(devices.room(replace(config, transport="http")))
+    assert "problem" in report
     assert "other-pir/presence" in report
-    assert levels(devices.room(AgentConfig(server="http://s", name="n", devices=(entry,)))) == []
 
 
-class _OtherServer(BaseHTTPRequestHandler):
-    def do_GET(self) -> None:
-        self.send_response(200)
-        self.end_headers()
-        self.wfile.write(b"<html>a router</html>")
-
-    do_POST = do_GET  # noqa: N815 (name required by the library)
-
-    def log_message(self, *_: Any) -> None:
-        pass
+class OtherServer(QuietHandler):
+    def handle_any(self) -> None:
+        self.respond(200, [], b"<html>a router</html>")
 
 
 def test_unreachable_server_and_other_server_are_problems(store: IdentityStore) -> None:
-    assert "cannot be reached" in text(cloud.examine(store, AgentConfig.load(store.folder)))
-    with HTTPServer(("127.0.0.1", 0), _OtherServer) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        config = AgentConfig(server=f"http://127.0.0.1:{server.server_port}", name="lab", devices=(ARM,))
-        report = text(cloud.examine(store, config))
-        server.shutdown()
-        thread.join()
-    assert "is it a Telescope server?" in report
+    config = AgentConfig.load(store.folder)
+    assert "cannot be reached" in text(cloud.examine(store, config))
+    with serve(OtherServer) as url:
+        assert "is it a Telescope server?" in text(cloud.examine(store, replace(config, server=url)))
 
 
 @pytest.mark.parametrize(("offset_ms", "level"), [(0, "ok"), (-2500, "warning"), (5000, "warning")])
@@ -184,6 +166,7 @@ def test_link_of_a_running_agent_is_not_tested(store: IdentityStore) -> None:
         assert "not tested" in text(cloud._link(store, AgentConfig.load(store.folder), PAIRING, CloudClock()))
 
 
+@pytest.mark.slow
 def test_failed_link_is_reported_with_its_cause(store: IdentityStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cloud, "_LINK_S", 0.5)
     report = text(cloud._link(store, AgentConfig.load(store.folder), PAIRING, CloudClock()))
@@ -192,28 +175,31 @@ def test_failed_link_is_reported_with_its_cause(store: IdentityStore, monkeypatc
     assert logging.getLogger("device_agent.transports").handlers == []
 
 
-class TestReport:
-    @pytest.fixture(autouse=True)
-    def without_slow_checks(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(machine, "scripts", lambda **_: iter(()))
-        monkeypatch.setattr(devices, "renderer", lambda _: iter(()))
+@pytest.fixture
+def without_slow_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "scripts", lambda **_: iter(()))
+    monkeypatch.setattr(devices, "renderer", lambda _: iter(()))
 
-    def test_exit_code_is_1_for_a_problem_and_0_for_a_warning(
-        self, store: IdentityStore, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert program.main(["doctor", "--home", str(store.folder)]) == 1
-        assert "problem  server: " in capsys.readouterr().out
-        monkeypatch.setattr(cloud, "examine", lambda *_: iter([warning("server", "slow", "wait")]))
-        assert program.main(["doctor", "--home", str(store.folder)]) == 0
 
-    def test_exception_in_a_check_is_a_finding(self, store: IdentityStore, monkeypatch: pytest.MonkeyPatch) -> None:
-        def fail(*_: Any) -> Iterator[Finding]:
-            raise RuntimeError("unforeseen")
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_slow_checks")
+def test_exit_code_is_1_for_a_problem_and_0_for_a_warning(
+    store: IdentityStore, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert program.main(["doctor", "--home", str(store.folder)]) == 1
+    assert "problem  server: " in capsys.readouterr().out
+    monkeypatch.setattr(cloud, "examine", lambda *_: iter([warning("server", "slow", "wait")]))
+    assert program.main(["doctor", "--home", str(store.folder)]) == 0
 
-        monkeypatch.setattr(cloud, "examine", fail)
-        assert "RuntimeError: unforeseen" in text(doctor.examine(store))
 
-    @pytest.mark.parametrize("content", ["= 1", 'server = "http://s"', "\x00", '[[devices]]\nname = "a"'])
-    def test_invalid_configuration_is_a_finding(self, store: IdentityStore, content: str) -> None:
-        (store.folder / "agent.toml").write_text(content)
-        assert f"problem: {store.folder / 'agent.toml'}" in text(doctor.examine(store))
+@pytest.mark.usefixtures("without_slow_checks")
+def test_exception_in_a_check_is_a_finding(store: IdentityStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cloud, "examine", Mock(side_effect=RuntimeError("unforeseen")))
+    assert "RuntimeError: unforeseen" in text(doctor.examine(store))
+
+
+@pytest.mark.usefixtures("without_slow_checks")
+@pytest.mark.parametrize("content", ["= 1", 'server = "http://s"', "\x00", '[[devices]]\nname = "a"'])
+def test_invalid_configuration_is_a_finding(store: IdentityStore, content: str) -> None:
+    (store.folder / "agent.toml").write_text(content)
+    assert f"problem: {store.folder / 'agent.toml'}" in text(doctor.examine(store))

@@ -39,13 +39,15 @@ def test_unknown_room_is_one_line_of_output(tmp_path: Path, capsys: pytest.Captu
     assert "no room 'attic'; known: lab. To add your own" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_furniture_of_the_room_limits_the_arm() -> None:
     kind = catalogue.type_of(ARM)
     geometry = bootstrap.load_geometry(ARM, kind)
     assert geometry is not None
-    home = [kind.home_rad[joint.name] for joint in kind.joints]
-    down = list(home)
-    down[[joint.name for joint in kind.joints].index("shoulder_lift")] = -0.6
+    home, down = (
+        [position_rad[joint.name] for joint in kind.joints]
+        for position_rad in (kind.home_rad, kind.home_rad | {"shoulder_lift": -0.6})
+    )
     path = geometry.sweep([home, down])
     assert path.clearance is not None
     assert "table_top" in path.clearance.text

@@ -5,7 +5,6 @@ import stat
 from pathlib import Path
 
 import pytest
-from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from device_agent.config.agent_config import AgentConfig, DeviceEntry
@@ -30,34 +29,31 @@ def test_files_are_private(store: IdentityStore) -> None:
 def test_key_and_pairing_are_saved(store: IdentityStore) -> None:
     key = store.private_key(create=True)
     assert store.private_key(create=True).private_bytes_raw() == store.private_key().private_bytes_raw()
-    assert store.pairing() is None
     keys = {signing.key_id(key.public_key()): signing.public_text(key.public_key())}
-    pairing = Pairing(agent="a", space="s", account="ann", keys=keys)
-    store.save_pairing(pairing)
-    assert store.pairing() == pairing
-    assert list(pairing.public_keys()) == list(keys)
-    store.save_pairing(None)
-    assert store.pairing() is None
+    for pairing in (None, Pairing(agent="a", space="s", account="ann", keys=keys), None):
+        store.save_pairing(pairing)
+        assert store.pairing() == pairing
 
 
-def test_missing_or_damaged_files_are_named_with_the_remedy(store: IdentityStore) -> None:
-    with pytest.raises(ConfigError, match="enroll` first"):
-        store.private_key()
-    with pytest.raises(ConfigError, match="enroll` first"):
-        AgentConfig.load(store.folder)
-    with pytest.raises(ConfigError, match="enroll` first"), store.lock():
-        pytest.fail("there is no agent")
-    pem = ec.generate_private_key(ec.SECP256R1()).private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
+def test_a_missing_agent_is_named_with_the_remedy(store: IdentityStore) -> None:
+    for access in (store.private_key, lambda: AgentConfig.load(store.folder), store.lock().__enter__):
+        with pytest.raises(ConfigError, match="enroll` first"):
+            access()
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("identity.pem", b"nonsense", "cannot be read as a private key"),
+        ("identity.pem", server_ca.key_pem(ec.generate_private_key(ec.SECP256R1())), "not an Ed25519 key"),
+        ("pairing.json", b"{", "delete it and enroll again"),
+    ],
+)
+def test_damaged_files_are_named_with_the_remedy(store: IdentityStore, file: str, content: bytes, message: str) -> None:
     store.folder.mkdir()
-    for content, problem in ((b"nonsense", "cannot be read as a private key"), (pem, "not an Ed25519 key")):
-        (store.folder / "identity.pem").write_bytes(content)
-        with pytest.raises(ConfigError, match=problem):
-            store.private_key()
-    (store.folder / "pairing.json").write_bytes(b"{")
-    with pytest.raises(ConfigError, match="delete it and enroll again"):
-        store.pairing()
+    (store.folder / file).write_bytes(content)
+    with pytest.raises(ConfigError, match=message):
+        _ = store.pairing() if file == "pairing.json" else store.private_key()
 
 
 def test_unwritable_files_are_named(tmp_path: Path) -> None:

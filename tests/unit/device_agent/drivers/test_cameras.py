@@ -13,6 +13,7 @@ from device_agent.simulation import renderer
 from tests.harness.network.brokers import PATIENCE_S
 from tests.harness.paths import ROOT
 
+pytestmark = pytest.mark.slow
 QBO = ROOT / "robots" / "qbo"
 TYPE = robot_type.load(QBO)
 

@@ -12,7 +12,7 @@ from device_agent.drivers import mujoco as mujoco_driver
 from device_agent.ports import plugins
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.manifests import robot_type
-from tests.harness.paths import ROBOTS
+from tests.harness.paths import ROOT, UR5
 
 CREATE: object = mujoco_driver.create
 
@@ -23,23 +23,15 @@ def third_party(monkeypatch: pytest.MonkeyPatch, **points: str) -> None:
     monkeypatch.setattr(plugins, "entry_points", lambda *, group: offered.select(group=group))
 
 
-def test_built_in_driver_is_found():
-    assert drivers.load("mujoco") == CREATE
-
-
 def test_unknown_driver_error_lists_the_valid_names(monkeypatch: pytest.MonkeyPatch):
     third_party(monkeypatch, acme="acme:create")
     with pytest.raises(DriverError, match=r"no driver 'mujco'; there are: acme, mujoco"):
         drivers.load("mujco")
 
 
-def test_third_party_driver_is_found_by_entry_point(monkeypatch: pytest.MonkeyPatch):
-    third_party(monkeypatch, acme="device_agent.drivers.mujoco:create")
+def test_third_party_drivers_are_found_but_do_not_replace_a_built_in_one(monkeypatch: pytest.MonkeyPatch):
+    third_party(monkeypatch, acme="device_agent.drivers.mujoco:create", mujoco="pathlib:Path")
     assert drivers.load("acme") == CREATE
-
-
-def test_built_in_driver_cannot_be_replaced_by_an_entry_point(monkeypatch: pytest.MonkeyPatch):
-    third_party(monkeypatch, mujoco="pathlib:Path")
     assert drivers.load("mujoco") == CREATE
 
 
@@ -50,22 +42,21 @@ def test_a_third_party_driver_that_cannot_be_imported_is_an_error(monkeypatch: p
         drivers.load("acme")
 
 
-def test_unknown_option_error_lists_the_valid_ones():
-    folder = ROBOTS / "ur5"
-    with pytest.raises(DriverError, match=r"no option 'sceen'; it has: faults, room, scene, trace"):
-        drivers.load("mujoco")(robot_type.load(folder), folder, {"sceen": "x.xml"}, "arm")
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sceen": "x.xml"}, r"no option 'sceen'; it has: faults, room, scene, trace"),
+        *(({"trace": value}, "must be the path of a file") for value in (7, "", None, ["a"])),
+    ],
+)
+def test_invalid_options_are_rejected(options: dict[str, object], message: str):
+    with pytest.raises(DriverError, match=message):
+        drivers.load("mujoco")(robot_type.load(UR5), UR5, options, "arm")
 
 
-@pytest.mark.parametrize("value", [7, "", None, ["a"]])
-def test_an_option_of_the_wrong_type_is_rejected(value: object):
-    folder = ROBOTS / "ur5"
-    with pytest.raises(DriverError, match="must be the path of a file"):
-        drivers.load("mujoco")(robot_type.load(folder), folder, {"trace": value}, "arm")
-
-
+@pytest.mark.slow
 def test_scene_can_be_chosen():
-    folder = ROBOTS / "ur5"
-    driver = drivers.load("mujoco")(robot_type.load(folder), folder, {"scene": "ur5.xml"}, "arm")
+    driver = drivers.load("mujoco")(robot_type.load(UR5), UR5, {"scene": "ur5.xml"}, "arm")
     driver.connect()
     try:
         twin = driver.twin()
@@ -76,24 +67,23 @@ def test_scene_can_be_chosen():
 
 
 def test_a_missing_scene_is_an_error_at_connect(tmp_path: Path):
-    driver = drivers.load("mujoco")(robot_type.load(ROBOTS / "ur5"), tmp_path, {}, "arm")
+    driver = drivers.load("mujoco")(robot_type.load(UR5), tmp_path, {}, "arm")
     with pytest.raises(DriverError, match=r"scene\.xml"):
         driver.connect()
 
 
+@pytest.mark.slow
 def test_importing_a_driver_needs_no_display_and_listing_needs_no_simulator():
     script = """
 import sys
 from device_agent import drivers
-from device_agent.ports import plugins as plug_ins
 assert "mujoco" in drivers.names() and "mujoco" not in sys.modules
 drivers.load("mujoco")
 assert "mujoco" in sys.modules
 assert not [name for name in sys.modules if name.startswith(("OpenGL", "glfw"))]
 """
     environment = {"PATH": "/usr/bin:/bin"}  # no DISPLAY, no MUJOCO_GL
-    root = ROBOTS.parent
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=root, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", script], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr

@@ -1,75 +1,54 @@
 """IK and jogs with dependent and mirrored joints."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
 
-from device_agent import geometry
 from device_agent.geometry.mujoco_geometry import MujocoGeometry
 from device_agent.ports.geometry import GeometryError
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
 from tests.harness.paths import ROBOTS
 
+pytestmark = pytest.mark.slow
 STEP_S = 1e-4
 
 
-def loaded(name: str) -> tuple[RobotType, MujocoGeometry, np.ndarray]:
+@cache
+def loaded(name: str) -> tuple[RobotType, MujocoGeometry, list[str], np.ndarray]:
+    """Type, geometry, joint names and home position."""
     kind = robot_type.load(ROBOTS / name)
-    shape = geometry.load(kind, ROBOTS / name)
-    assert isinstance(shape, MujocoGeometry)
-    return kind, shape, np.array([kind.home_rad[joint.name] for joint in kind.joints])
+    names = [joint.name for joint in kind.joints]
+    return kind, MujocoGeometry(kind, ROBOTS / name / kind.scene), names, np.array([kind.home_rad[n] for n in names])
 
 
-@pytest.fixture(scope="module")
-def head() -> tuple[RobotType, MujocoGeometry, np.ndarray]:
-    """Moved by rods, except for the neck's rotation."""
-    return loaded("hanson")
-
-
-@pytest.fixture(scope="module")
-def walker() -> tuple[RobotType, MujocoGeometry, np.ndarray]:
-    """One motor turns a joint of both legs."""
-    return loaded("nao")
-
-
-def test_ik_solves_for_dependent_joints(
-    head: tuple[RobotType, MujocoGeometry, np.ndarray],
-) -> None:
-    kind, shape, home = head
+def test_ik_solves_for_joints_moved_by_rods() -> None:
+    _, shape, names, home = loaded("hanson")
     random = np.random.default_rng(3)
-    moved = [index for index, joint in enumerate(kind.joints) if "Gimbal" in joint.name or "Neck" in joint.name]
+    motors = [index for index, name in enumerate(names) if "Gimbal" in name or "Neck" in name]
     for _ in range(4):
-        there = home.copy()
-        there[moved] += random.uniform(-0.3, 0.3, len(moved))
-        wanted = shape.poses(there.tolist())["head"]
-        found = shape.poses(shape.solve("head", wanted, home.tolist()))["head"]
-        assert found[:3] == pytest.approx(wanted[:3], abs=2e-4)
-        assert abs(np.dot(found[3:], wanted[3:])) == pytest.approx(1.0, abs=1e-6)
-
-
-def test_ik_rejects_poses_that_motors_cannot_reach(
-    head: tuple[RobotType, MujocoGeometry, np.ndarray],
-) -> None:
-    _, shape, home = head
+        position = home.copy()
+        position[motors] += random.uniform(-0.3, 0.3, len(motors))
+        target = shape.poses(position.tolist())["head"]
+        pose = shape.poses(shape.solve("head", target, home.tolist()))["head"]
+        assert pose[:3] == pytest.approx(target[:3], abs=2e-4)
+        assert abs(np.dot(pose[3:], target[3:])) == pytest.approx(1.0, abs=1e-6)
     x, y, z, *turn = shape.poses(home.tolist())["head"]
     with pytest.raises(GeometryError, match="found no joint position for head: the closest one is"):
         shape.solve("head", (x, y, z + 0.05, *turn), home.tolist())  # type: ignore[arg-type]
 
 
-def test_ik_moves_mirrored_joints_together(
-    walker: tuple[RobotType, MujocoGeometry, np.ndarray],
-) -> None:
-    kind, shape, home = walker
-    names = [joint.name for joint in kind.joints]
-    there = home.copy()
-    for name in ("LHipYawPitch", "RHipYawPitch"):
-        there[names.index(name)] -= 0.12
-    wanted = shape.poses(there.tolist())["RLeg"]
-    found = shape.solve("RLeg", wanted, home.tolist())
-    assert found[names.index("RHipYawPitch")] == pytest.approx(found[names.index("LHipYawPitch")], abs=1e-12)
-    assert shape.poses(found)["RLeg"][:3] == pytest.approx(wanted[:3], abs=2e-4)
+def test_ik_moves_mirrored_joints_together() -> None:
+    _, shape, names, home = loaded("nao")
+    left, right = names.index("LHipYawPitch"), names.index("RHipYawPitch")
+    position = home.copy()
+    position[[left, right]] -= 0.12
+    target = shape.poses(position.tolist())["RLeg"]
+    solution = shape.solve("RLeg", target, home.tolist())
+    assert solution[right] == pytest.approx(solution[left], abs=1e-12)
+    assert shape.poses(solution)["RLeg"][:3] == pytest.approx(target[:3], abs=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -79,18 +58,14 @@ def test_ik_moves_mirrored_joints_together(
         ("nao", "RLeg", (0.02, 0.0, 0.0, 0.0, 0.0, 0.0)),
     ],
 )
-def test_jogs_use_motor_joints_only(
-    robot: str, frame: str, twist: tuple[float, ...], request: pytest.FixtureRequest
-) -> None:
-    kind, shape, home = request.getfixturevalue({"hanson": "head", "nao": "walker"}[robot])
+def test_jogs_use_motor_joints_only(robot: str, frame: str, twist: tuple[float, ...]) -> None:
+    kind, shape, names, home = loaded(robot)
     rates = np.array(shape.rates(frame, twist, home.tolist(), tool=False))
-    names = [joint.name for joint in kind.joints]
     for mirror in kind.mimic_joints:
         assert rates[names.index(mirror.joint)] == mirror.multiplier * rates[names.index(mirror.mimics)]
     before, after = (np.array(shape.poses((home + rates * at).tolist())[frame]) for at in (0.0, STEP_S))
-    linear = (after[:3] - before[:3]) / STEP_S
-    turned = 2 * math.acos(min(1.0, abs(float(before[3:] @ after[3:])))) / STEP_S
-    asked, does = (
-        (np.array(twist[:3]), linear) if any(twist[:3]) else (np.array([np.linalg.norm(twist)]), np.array([turned]))
-    )
-    assert np.linalg.norm(does - asked) < 0.4 * np.linalg.norm(asked), "damped near the limits"
+    if any(twist[:3]):
+        error = np.linalg.norm((after[:3] - before[:3]) / STEP_S - twist[:3])
+    else:
+        error = abs(2 * math.acos(min(1.0, abs(float(before[3:] @ after[3:])))) / STEP_S - np.linalg.norm(twist))
+    assert error < 0.4 * np.linalg.norm(twist), "damped near the limits"

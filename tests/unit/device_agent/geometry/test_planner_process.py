@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -30,30 +31,23 @@ from device_agent.runtime.planning.motion_planner import MotionPlanner
 from device_agent.runtime.readings import ReadingCache
 from tests.harness.paths import ROBOTS, ROOT, UR5
 
+pytestmark = pytest.mark.slow
 NAO = ROBOTS / "nao"
 KIND = robot_type.load(UR5)
 HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
 BEYOND = [1.6, *HOME[1:]]
 PATIENCE_S = 60.0
-ANGLE = math.atan2(-0.414, -0.249)
-"""Direction of the wall from the arm."""
-WALL = '<geom name="{}" type="box" size="0.9 0.02 1.5" pos="{} {} 1.5" euler="0 0 {}"/>'
-
-
-def walls() -> str:
-    """Two walls that separate both sides."""
-    return "".join(
-        WALL.format(name, 1.1 * math.cos(at), 1.1 * math.sin(at), at)
-        for name, at in (("before", ANGLE), ("behind", ANGLE + math.pi))
-    )
+WALL = '<geom type="box" size="0.9 0.02 1.5" pos="{} {} 1.5" euler="0 0 {}"/>'
 
 
 @pytest.fixture(scope="module")
 def divided(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The arm's scene divided by walls: planning across always times out."""
+    """The arm's scene divided by two walls: planning across always times out."""
     folder = tmp_path_factory.mktemp("ur5")
     (folder / "ur5.xml").write_bytes((UR5 / "ur5.xml").read_bytes())
-    text = (UR5 / KIND.scene).read_text(encoding="utf-8").replace("<worldbody>", f"<worldbody>{walls()}", 1)
+    angle = math.atan2(-0.414, -0.249)
+    walls = [WALL.format(1.1 * math.cos(at), 1.1 * math.sin(at), at) for at in (angle, angle + math.pi)]
+    text = (UR5 / KIND.scene).read_text(encoding="utf-8").replace("<worldbody>", f"<worldbody>{''.join(walls)}", 1)
     (folder / KIND.scene).write_text(text, encoding="utf-8")
     return folder / KIND.scene
 
@@ -77,11 +71,16 @@ def pid_of(shape: MujocoGeometry) -> int:
     return 0 if running is None else running.pid
 
 
-def alive(pid: int) -> bool:
+def stat(pid: int) -> list[str]:
+    """Fields of ``/proc/<pid>/stat`` from the state on; a zombie's if there is no such process."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     except OSError:
-        return False
+        return ["Z"]
+
+
+def alive(pid: int) -> bool:
+    return stat(pid)[0] != "Z"
 
 
 def test_the_process_plans_the_same_path() -> None:
@@ -111,45 +110,43 @@ def test_cancelling_kills_the_process(shape: MujocoGeometry) -> None:
     assert not alive(pid)
 
 
-class Arm:
-    """An action of the arm."""
-
-    def __init__(self, shape: MujocoGeometry) -> None:
-        self.controller = Controller(KIND, LeaseGate(), geometry=shape)
-        self.controller.start_at(HOME)
-        body = DeviceContext(
-            robot_type=KIND,
-            controller=self.controller,
-            observe=lambda: None,
-            geometry=shape,
-            skills=None,
-            readings=ReadingCache(space="s", agent="a", own=[]),
-        )
-        self.robot = RobotApi(body)
-        self.robot.reserve(1, lambda _: self.robot.end())
-
-    def cross(self) -> Refused:
-        """Request an impossible motion; returns the rejection."""
-        with pytest.raises(Refused) as refused:
-            self.robot.execute(MoveJoints(position_rad={KIND.joints[0].name: BEYOND[0]}, speed=0.5, plan=True))
-        return refused.value
+@pytest.fixture
+def controller(shape: MujocoGeometry) -> Controller:
+    controller = Controller(KIND, LeaseGate(), geometry=shape)
+    controller.start_at(HOME)
+    return controller
 
 
-def test_a_killed_planner_fails_the_action(shape: MujocoGeometry) -> None:
-    arm = Arm(shape)
+def cross_while(shape: MujocoGeometry, controller: Controller, event: Callable[[], None]) -> Refused:
+    """Request an impossible motion, cause the event during planning, and return the rejection."""
+    body = DeviceContext(
+        robot_type=KIND,
+        controller=controller,
+        observe=lambda: None,
+        geometry=shape,
+        skills=None,
+        readings=ReadingCache(space="s", agent="a", own=[]),
+    )
+    robot = RobotApi(body)
+    robot.reserve(1, lambda _: robot.end())
 
-    def kill() -> None:
+    def disturb() -> None:
         until(lambda: pid_of(shape) > 0)
-        os.kill(pid_of(shape), signal.SIGKILL)
+        event()
 
-    killer = threading.Thread(target=kill)
-    killer.start()
-    refused = arm.cross()
-    killer.join()
+    with ThreadPoolExecutor() as pool:
+        pool.submit(disturb)
+        with pytest.raises(Refused) as refused:
+            robot.execute(MoveJoints(position_rad={KIND.joints[0].name: BEYOND[0]}, speed=0.5, plan=True))
+    return refused.value
+
+
+def test_a_killed_planner_fails_the_action(shape: MujocoGeometry, controller: Controller) -> None:
+    refused = cross_while(shape, controller, lambda: os.kill(pid_of(shape), signal.SIGKILL))
     assert refused.code == "planner_lost"
     assert "SIGKILL" in refused.message
-    assert not arm.controller.moving
-    assert arm.controller.commanded_rad == HOME
+    assert not controller.moving
+    assert controller.commanded_rad == HOME
     assert shape.plan(HOME, HOME), "a new process starts"
 
 
@@ -163,28 +160,20 @@ def test_a_hanging_planner_times_out(shape: MujocoGeometry, monkeypatch: pytest.
     assert not alive(pid)
 
 
-def test_stop_cancels_planning(shape: MujocoGeometry) -> None:
-    arm = Arm(shape)
-
-    def stop() -> None:
-        until(lambda: pid_of(shape) > 0)
-        arm.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))
-
-    stopper = threading.Thread(target=stop)
-    stopper.start()
-    assert "cancelled" in arm.cross().message
-    stopper.join()
+def test_stop_cancels_planning(shape: MujocoGeometry, controller: Controller) -> None:
+    latch = StopLatch(caller="ann", reason="", at_ms=0)
+    assert "cancelled" in cross_while(shape, controller, lambda: controller.stop(latch)).message
     assert pid_of(shape) == 0
 
 
-def test_an_invalid_scene_is_reported(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
-    site = shape._planner_process._scene
-    monkeypatch.setattr(shape._planner_process, "_scene", type(site)(robot_type=KIND, scene="/nowhere/scene.xml"))
+def test_an_invalid_scene_and_a_failed_start_are_reported(
+    shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = shape._planner_process
+    monkeypatch.setattr(process, "_scene", type(process._scene)(robot_type=KIND, scene="/nowhere/scene.xml"))
     with pytest.raises(GeometryError, match=r"/nowhere/scene\.xml"):
         shape.plan(HOME, HOME)
-
-
-def test_a_failed_start_is_reported(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+    process._process.stop()
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(PlannerLostError, match="does not start"):
         shape.plan(HOME, HOME)
@@ -195,7 +184,6 @@ import sys, threading
 from pathlib import Path
 from device_agent.geometry.mujoco_geometry import MujocoGeometry
 from device_agent.protocol.manifests import robot_type
-from device_agent.protocol import StopLatch
 from tests.unit.device_agent.geometry import test_planner_process as t
 shape = MujocoGeometry(t.KIND, Path(sys.argv[1]))
 shape.plan(t.HOME, t.HOME)
@@ -205,18 +193,17 @@ shape.plan(t.HOME, t.BEYOND, within_s=600.0)
 
 
 def test_the_process_exits_when_the_agent_is_killed(divided: Path) -> None:
-    root = ROOT
     with subprocess.Popen(
         [sys.executable, "-c", AGENT, str(divided)],
         stdout=subprocess.PIPE,
         text=True,
-        cwd=root,
-        env=os.environ | {"PYTHONPATH": str(root)},
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
     ) as agent:
         assert agent.stdout is not None
         pid = int(agent.stdout.readline())
-        assert alive(pid)
-        time.sleep(0.5)
+        ticks = int(stat(pid)[11])
+        until(lambda: int(stat(pid)[11]) > ticks + 10)  # CPU time: it plans
         agent.kill()
     until(lambda: not alive(pid))
 
@@ -231,38 +218,36 @@ def test_planned_paths_respect_joint_couplings() -> None:
     names = [joint.name for joint in kind.joints]
     couplings = Couplings(kind)
     controller = Controller(kind, LeaseGate(), geometry=shape)
-    home = [kind.home_rad[name] for name in names]
-    controller.start_at(home)
-    tenure = controller.reserve(epoch=1, on_revoked=lambda _: None)
-    now_s, orders = 0.0, ({"HeadPitch": 0.45}, {"HeadYaw": 2.05, "HeadPitch": 0.25, "LHipYawPitch": -0.1})
-    for order in orders:
-        start, goal = controller.commanded_rad, controller.resolve_target(tenure, order)
-        way = MotionPlanner(kind, shape).plan(start, goal, speed=1.0, ended=lambda: False)
-        passage = controller.start_trajectory(tenure, way)
-        for _ in range(round(way.duration_s / (kind.period_ms / 1000)) + 50):
+    controller.start_at([kind.home_rad[name] for name in names])
+    reservation = controller.reserve(epoch=1, on_revoked=lambda _: None)
+    now_s = 0.0
+    for target in ({"HeadPitch": 0.45}, {"HeadYaw": 2.05, "HeadPitch": 0.25, "LHipYawPitch": -0.1}):
+        start, goal = controller.commanded_rad, controller.resolve_target(reservation, target)
+        path = MotionPlanner(kind, shape).plan(start, goal, speed=1.0, ended=lambda: False)
+        motion = controller.start_trajectory(reservation, path)
+        for _ in range(round(path.duration_s / (kind.period_ms / 1000)) + 50):
             now_s += kind.period_ms / 1000
             tick = controller.update(now_s)
             assert couplings.describe_violation(np.array([tick.position_rad])) == ""
-        assert passage.result is GoalResult.REACHED, passage.why
+        assert motion.result is GoalResult.REACHED, motion.why
         assert controller.commanded_rad == pytest.approx(goal, abs=1e-4)
-    assert couplings.describe_violation(np.linspace(start, goal, 50)) != "", "straight there it would not"
+    assert couplings.describe_violation(np.linspace(start, goal, 50)) != "", "the straight path violates them"
     assert goal[names.index("RHipYawPitch")] == pytest.approx(-0.1)
 
 
 def test_position_dependent_limits_are_checked_between_table_rows() -> None:
     kind = robot_type.load(NAO)
     bounds, couplings = JointBounds(kind), Couplings(kind)
-    home = np.array([kind.home_rad[joint.name] for joint in kind.joints])
     names = [joint.name for joint in kind.joints]
-    yaw, pitch = names.index("HeadYaw"), names.index("HeadPitch")
-    chance = np.random.default_rng(3)
-    kept = 0
+    home = np.array([kind.home_rad[name] for name in names])
+    head = [names.index("HeadYaw"), names.index("HeadPitch")]
+    random = np.random.default_rng(3)
+    admitted = 0
     for _ in range(400):
         start, end = home.copy(), home.copy()
-        start[[yaw, pitch]] = chance.uniform((-2, -0.5), (2, 0.4))
-        end[[yaw, pitch]] = chance.uniform((-2, -0.5), (2, 0.4))
-        keeps = bounds.admits(start, end, np.zeros(1))
-        assert keeps == (couplings.describe_violation(np.linspace(start, end, 2000)) == "")
-        kept += keeps
-    assert 50 < kept < 350
+        start[head], end[head] = random.uniform((-2, -0.5), (2, 0.4), (2, 2))
+        admits = bounds.admits(start, end, np.zeros(1))
+        assert admits == (couplings.describe_violation(np.linspace(start, end, 2000)) == "")
+        admitted += admits
+    assert 50 < admitted < 350
     assert bounds.clearance(home, home)[0] == pytest.approx(0.03)

@@ -1,5 +1,4 @@
-"""A room of primitives in MuJoCo with a person, a walking and a driving robot, and an arm on a table; a lidar and a
-depth camera that cast rays, and err as real ones do. The truth is known here, and nowhere else."""
+"""A room of primitives with a person, two mobile robots and an arm, seen by a noisy lidar and depth camera."""
 
 import math
 import random
@@ -30,44 +29,42 @@ FURNITURE = {  # name: middle and half size
     "bin": ((-2.6, -2.2, 0.2), (0.15, 0.15, 0.2)),
     "table": ((1.95, 1.6, 0.73), (0.6, 0.5, 0.02)),
 }
-_LEG = """<body name="{0}" pos="0 {1} 0.9"><joint name="{0}" axis="0 1 0"/>
-  <geom type="capsule" fromto="0 0 0 0 0 -0.82" size="0.065"/></body>"""
-_PERSON = (
-    """<geom type="capsule" fromto="0 0 0.95 0 0 1.35" size="0.15" mass="1"/>
-  <geom type="sphere" pos="0 0 1.62" size="0.11"/>"""
-    + _LEG.format("left", 0.1)
-    + _LEG.format("right", -0.1)
-)
+_PERSON = """<geom type="capsule" fromto="0 0 0.95 0 0 1.35" size="0.15" mass="1"/>
+  <geom type="sphere" pos="0 0 1.62" size="0.11"/>
+  <body pos="0 0.1 0.9"><joint name="left" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.82" size="0.065"/></body>
+  <body pos="0 -0.1 0.9"><joint name="right" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.82" size="0.065"/></body>"""
 _NAO = """<geom type="box" pos="0 0 0.38" size="0.05 0.07 0.09"/><geom type="sphere" pos="0 0 0.52" size="0.055"/>
   <geom type="box" pos="0 0.05 0.15" size="0.04 0.03 0.15"/>
   <geom type="box" pos="0 -0.05 0.15" size="0.04 0.03 0.15"/>"""
 _QBO = """<geom type="cylinder" pos="0 0 0.14" size="0.15 0.13"/><geom type="sphere" pos="0 0 0.34" size="0.12"/>"""
 
 
-def _body(name: str, inside: str) -> str:
-    return f'<body name="{name}" mocap="false"><freejoint name="{name}"/>{inside}</body>'
-
-
 def xml() -> str:
-    walls = [((3.05, 0), (0.05, 2.6)), ((-3.05, 0), (0.05, 2.6)), ((0, 2.55), (3.1, 0.05)), ((0, -2.55), (3.1, 0.05))]
-    still = "".join(f'<geom type="box" pos="{x} {y} 1.35" size="{a} {b} 1.35"/>' for (x, y), (a, b) in walls) + "".join(
-        f'<geom name="{name}" type="box" pos="{" ".join(map(str, at))}" size="{" ".join(map(str, half))}"/>'
-        for name, (at, half) in FURNITURE.items()
+    boxes = [((side * 3.05, 0.0, 1.35), (0.05, 2.6, 1.35)) for side in (1, -1)]  # walls
+    boxes += [((0.0, side * 2.55, 1.35), (3.1, 0.05, 1.35)) for side in (1, -1)]
+    static = "".join(
+        f'<geom type="box" pos="{" ".join(map(str, at))}" size="{" ".join(map(str, half))}"/>'
+        for at, half in [*boxes, *FURNITURE.values()]
+    )
+    walkers = "".join(
+        f'<body name="{name}"><freejoint name="{name}"/>{inside}</body>'
+        for name, inside in (("person", _PERSON), ("nao", _NAO), ("qbo", _QBO))
     )
     arm = """<body name="arm" pos="1.95 1.5 0.75"><geom type="cylinder" pos="0 0 0.08" size="0.075 0.08"/>
       <body pos="0 0 0.16"><joint name="turn" axis="0 0 1"/>
       <geom type="capsule" fromto="0 0 0 -0.4 0 0.25" size="0.06"/>
       <geom type="capsule" fromto="-0.4 0 0.25 -0.75 0 0.1" size="0.05"/></body></body>"""
     return f"""<mujoco><compiler angle="radian"/><option gravity="0 0 0"/><worldbody>
-      <geom type="plane" size="3.2 2.7 0.1"/>{still}
-      <body name="lidar" pos="0 -2.4 0.3"><geom type="cylinder" size="0.04 0.03"/></body>
-      {_body("person", _PERSON)}{_body("nao", _NAO)}{_body("qbo", _QBO)}{arm}
+      <geom type="plane" size="3.2 2.7 0.1"/>{static}
+      <body name="lidar" pos="0 -2.4 0.3"><geom type="cylinder" size="0.04 0.03"/></body>{walkers}{arm}
     </worldbody></mujoco>"""
 
 
 @dataclass
 class Walker:
-    """Goes from one random place to the next, straight, and rests there."""
+    """Moves straight from one random place to the next and rests there."""
 
     chance: random.Random
     speed_m_s: float
@@ -121,11 +118,11 @@ class Playground:
         )
         per_pixel = 2 * math.tan(FOVY_RAD / 2) / HEIGHT
         self.sight_lines = np.column_stack((across.ravel() * per_pixel, up.ravel() * per_pixel, -np.ones(across.size)))
-        back = np.array([-2.9, -2.3, 2.4]) - np.array([0.3, 0.2, 0.4])  # from where it looks to
+        self.camera_m = np.array([-2.9, -2.3, 2.4])
+        back = self.camera_m - (0.3, 0.2, 0.4)  # the point it looks at
         back /= np.linalg.norm(back)
         right = np.cross([0, 0, 1], back)
         right /= np.linalg.norm(right)
-        self.camera_m = np.array([-2.9, -2.3, 2.4])
         self.camera = np.column_stack((right, np.cross(back, right), back))
         self.place()
 
@@ -147,7 +144,7 @@ class Playground:
         self.place()
 
     def clear(self) -> None:
-        """All who may move leave the room."""
+        """Move all people and robots out of the room."""
         for name in self.walkers:
             self.data.joint(name).qpos[2] = 50.0
         self.model.body("arm").pos[2] = 50.0
@@ -193,7 +190,7 @@ class Playground:
 
 
 def survey(seed: int = 7) -> BackgroundModel:
-    """The empty room, as its own sensors see it."""
+    """The background model of the empty room."""
     empty, found = Playground(seed), BackgroundModel()
     empty.clear()
     for _ in range(10):
@@ -215,7 +212,7 @@ def sight(found: BackgroundModel) -> SensorFusion:
 
 
 def watch(ground: Playground, eyes: SensorFusion, seconds: float, *, period_s: float = 0.2, each=None) -> None:
-    """Let it go on, and look at it every ``period_s``; ``each(ground, eyes)`` is asked half a period later."""
+    """Look every ``period_s``; ``each(ground, eyes)`` is called half a period later."""
     for _ in range(round(seconds / period_s)):
         ground.step(period_s / 2)
         eyes.update("lidar", ground.scan())

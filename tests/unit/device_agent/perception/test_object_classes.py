@@ -1,4 +1,4 @@
-"""Who is who, by height, place and what was last seen: on the floor, and of those that are fixed to a table."""
+"""Classification by height, position and last sighting: of robots on the floor, and of robots fixed to a table."""
 
 import math
 
@@ -12,20 +12,20 @@ from device_agent.perception.tracker import Tracker
 NAO = ObjectClass(name="nao", lowest_m=0.42, highest_m=0.68, radius_m=0.07, fastest_m_s=0.3, start_m=(0.0, 0.0))
 QBO = ObjectClass(name="qbo", lowest_m=0.3, highest_m=0.56, radius_m=0.12, fastest_m_s=0.6, start_m=(-0.9, 0.4))
 LOW_M = 0.49
-"""As high is Qbo, and NAO that sits."""
+"""Height of Qbo and of a sitting NAO."""
 CAMERA_M = np.array([3.0, 0.0])
 PERIOD_S = 0.2
 NEAR_M = 0.15
 
 
 def cylinder(x_m: float, y_m: float, height_m: float = LOW_M) -> np.ndarray:
-    """What a depth camera sees of something round."""
+    """Points of a depth camera on a cylinder."""
     turn, up = np.meshgrid(np.linspace(-1.3, 1.3, 12), np.linspace(0.1, height_m, 12))
     return np.column_stack((x_m + 0.1 * np.cos(turn.ravel()), y_m + 0.1 * np.sin(turn.ravel()), up.ravel()))
 
 
 class Floor:
-    """Those on the floor, watched."""
+    """Robots on the floor, seen by a depth camera."""
 
     def __init__(self, *kinds: ObjectClass) -> None:
         self.tracks = Tracker(kinds or (NAO, QBO))
@@ -59,6 +59,12 @@ def test_the_start_position_decides_while_the_other_robot_is_hidden() -> None:
     assert floor.holds(nao=(0.1, 0.0), qbo=(-1.2, 1.0))
 
 
+def test_a_unique_height_decides_at_any_position() -> None:
+    floor = Floor()
+    floor.watch((-0.9, 0.4), for_s=2.0, height_m=0.58)
+    assert floor.holds(nao=(-0.9, 0.4))
+
+
 def test_the_last_position_takes_precedence_over_the_start() -> None:
     floor = Floor()
     floor.watch((0.0, 0.0), (-0.9, 0.4))
@@ -75,19 +81,13 @@ def test_the_last_position_takes_precedence_over_the_start() -> None:
     assert floor.holds(nao=(-0.9, 0.5), qbo=(0.1, 0.1))
 
 
-def test_a_unique_height_decides_at_any_position() -> None:
-    floor = Floor()
-    floor.watch((-0.9, 0.4), for_s=2.0, height_m=0.58)
-    assert floor.holds(nao=(-0.9, 0.4))
-
-
 # ---------------------------------------------------------------- fixed to a table
 
 ARM = Mount(name="arm", lowest_m=0.77, highest_m=0.95, radius_m=0.05, near_m=(1.0, 1.0), reach_m=0.9)
 
 
 def on_table(x_m: float, y_m: float, low_m: float = 0.8) -> np.ndarray:
-    """What a camera from above sees of a base."""
+    """Points of a camera above a robot's base."""
     across, up = np.meshgrid(np.arange(-0.09, 0.1, 0.03), np.arange(-0.09, 0.1, 0.03))
     return np.column_stack((x_m + across.ravel(), y_m + up.ravel(), np.full(across.size, low_m)))
 
@@ -101,29 +101,21 @@ def look(robot: FixedRobot, points_m: np.ndarray, *, from_s: float, for_s: float
     return now_s
 
 
-def test_a_fixed_robot_is_reported_only_if_visible() -> None:
+def test_a_fixed_robot_is_reported_when_seen_and_with_its_age_when_hidden() -> None:
     robot = FixedRobot(ARM)
     now_s = look(robot, on_table(3.0, -1.0), from_s=0.0)
     now_s = look(robot, on_table(1.7, 1.0), from_s=now_s)  # within reach of its arm, but no place for its base
     assert robot.position(now_s) is None
     now_s = look(robot, on_table(1.05, 0.95), from_s=now_s)
-    place = robot.position(now_s)
-    assert place is not None
-    assert math.dist((place.x_m, place.y_m), (1.05, 0.95)) < 0.1
-    assert place.age_s == pytest.approx(0.0)
-
-
-def test_a_hidden_fixed_robot_is_reported_with_its_age() -> None:
-    robot = FixedRobot(ARM)
-    now_s = look(robot, on_table(1.0, 1.0), from_s=0.0)
-    before = robot.position(now_s)
-    # A hand within reach is not the base.
-    now_s = look(robot, on_table(1.3, 1.0), from_s=now_s, for_s=6.0)
-    place = robot.position(now_s)
-    assert before is not None
-    assert place is not None
-    assert place.age_s == pytest.approx(6.0, abs=0.01)
-    assert (place.x_m, place.y_m) == pytest.approx((before.x_m, before.y_m), abs=0.01)
+    visible = robot.position(now_s)
+    assert visible is not None
+    assert math.dist((visible.x_m, visible.y_m), (1.05, 0.95)) < 0.1
+    assert visible.age_s == pytest.approx(0.0)
+    now_s = look(robot, on_table(1.3, 1.0), from_s=now_s, for_s=6.0)  # a hand within reach is not the base
+    hidden = robot.position(now_s)
+    assert hidden is not None
+    assert hidden.age_s == pytest.approx(6.0, abs=0.01)
+    assert (hidden.x_m, hidden.y_m) == pytest.approx((visible.x_m, visible.y_m), abs=0.01)
 
 
 def test_one_camera_suffices_for_a_fixed_robot() -> None:

@@ -1,4 +1,4 @@
-"""The occupancy grid: what it learns from looks, and what it forgets."""
+"""The occupancy grid: what it learns from measurements, and what it forgets."""
 
 import math
 
@@ -11,17 +11,17 @@ from device_agent.protocol import MAX_VALUES, Measurements, codec
 from device_agent.sandbox import api
 
 EMPTY = np.zeros((0, 2))
+PERSON = (3.0, 1.3, 3.3, 1.6)
 
 
 def room(*boxes):
-    """Rays from the middle of a room of 4 by 3 m with boxes (x0, y0, x1, y1) in it: ends, hits."""
-    angles = np.linspace(-math.pi, math.pi, 360, endpoint=False)
+    """End points of rays from the middle of a room of 4 by 3 m with boxes (x0, y0, x1, y1) in it."""
     ends = []
-    for angle in angles:
+    for angle in np.linspace(-math.pi, math.pi, 360, endpoint=False):
         along = np.arange(0, 5, 0.005)[:, None] * [math.cos(angle), math.sin(angle)] + [2.0, 1.5]
-        hit = (along <= 0).any(axis=1) | (along[:, 0] >= 4) | (along[:, 1] >= 3)
+        hit = (along <= 0).any(axis=1) | (along >= [4, 3]).any(axis=1)
         for x0, y0, x1, y1 in boxes:
-            hit |= (along[:, 0] >= x0) & (along[:, 0] <= x1) & (along[:, 1] >= y0) & (along[:, 1] <= y1)
+            hit |= ((along >= [x0, y0]) & (along <= [x1, y1])).all(axis=1)
         ends.append(along[int(np.argmax(hit))])
     return np.array(ends)
 
@@ -36,8 +36,18 @@ def cell(grid, x, y):
     return grid.blocked(0.0).cell(x, y)
 
 
-def test_walls_are_found_within_a_cell():
-    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+@pytest.fixture
+def grid():
+    return OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+
+
+@pytest.fixture
+def bare():
+    """A grid as large as the room."""
+    return OccupancyGrid((0, 0), (4, 3))
+
+
+def test_walls_are_found_within_a_cell(grid):
     look(grid, room(), times=50)
     rows, columns = np.nonzero(grid.static())
     x = -0.5 + (columns + 0.5) * 0.05
@@ -47,11 +57,9 @@ def test_walls_are_found_within_a_cell():
     assert off.max() <= 0.05
 
 
-def test_a_person_who_leaves_disappears():
-    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+def test_a_person_who_leaves_disappears(grid):
     look(grid, room(), times=100)
-    person = (3.0, 1.3, 3.3, 1.6)
-    look(grid, room(person), times=10)
+    look(grid, room(PERSON), times=10)
     at = cell(grid, 3.02, 1.45)
     assert grid.moving()[at]
     assert not grid.static()[at]
@@ -59,45 +67,35 @@ def test_a_person_who_leaves_disappears():
     assert not grid.taken()[at]
 
 
-def test_objects_that_stay_become_static():
-    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+def test_objects_that_stay_become_static_and_the_wall_behind_them_stays(grid):
     look(grid, room(), times=100)
-    look(grid, room((3.0, 1.3, 3.3, 1.6)), times=90, elapsed_s=1.0)
+    look(grid, room(PERSON), times=90, elapsed_s=1.0)
     assert grid.static()[cell(grid, 3.02, 1.45)]
-
-
-def test_a_wall_behind_a_person_stays():
-    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
-    look(grid, room(), times=100)
-    look(grid, room((3.0, 1.0, 3.3, 2.0)), times=40, elapsed_s=0.5)
     assert grid.static()[cell(grid, 4.02, 1.5)]
 
 
-def test_unseen_cells_are_forgotten():
-    grid = OccupancyGrid((0, 0), (4, 3))
-    grid.add_cells("depth", taken_m=EMPTY, clear_m=np.array([[1.0, 1.0]]))
+def test_unseen_cells_are_forgotten(bare):
+    bare.add_cells("depth", taken_m=EMPTY, clear_m=np.array([[1.0, 1.0]]))
     for _ in range(50):
-        grid.advance(0.1)
+        bare.advance(0.1)
     for _ in range(5):
-        grid.add_cells("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
-        grid.advance(0.1)
-    assert grid.taken()[cell(grid, 1.0, 1.0)]
+        bare.add_cells("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
+        bare.advance(0.1)
+    assert bare.taken()[cell(bare, 1.0, 1.0)]
     for _ in range(300):
-        grid.advance(0.1)
-    assert not grid.taken()[cell(grid, 1.0, 1.0)]
+        bare.advance(0.1)
+    assert not bare.taken()[cell(bare, 1.0, 1.0)]
 
 
-def test_a_table_above_the_lidar_plane_is_occupied():
-    grid = OccupancyGrid((0, 0), (4, 3))
+def test_a_table_above_the_lidar_plane_is_occupied(bare):
     table = np.array([[3.0, 1.5]])
     for _ in range(10):
-        look(grid, room(), times=1)
-        grid.add_cells("depth", taken_m=table, clear_m=EMPTY)
-    assert grid.taken()[cell(grid, 3.0, 1.5)]
+        look(bare, room(), times=1)
+        bare.add_cells("depth", taken_m=table, clear_m=EMPTY)
+    assert bare.taken()[cell(bare, 3.0, 1.5)]
 
 
-def test_blocked_keeps_the_radius_from_walls():
-    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+def test_blocked_keeps_the_radius_from_walls(grid):
     look(grid, room(), times=10)
     floor = grid.blocked(0.25)
     assert floor.at(3.8, 1.5)
@@ -106,36 +104,27 @@ def test_blocked_keeps_the_radius_from_walls():
     assert floor.at(9.0, 1.0), "outside of the grid"
     assert floor.at(-0.4, 1.0), "unknown behind the wall"
     assert not grid.blocked(0.1, unknown=False).at(-0.4, 1.0)
-
-
-def test_a_robot_does_not_block_itself():
-    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
     look(grid, room((2.8, 1.4, 3.0, 1.6)), times=10)
     assert grid.blocked(0.2).at(2.7, 1.5)
-    assert not grid.blocked(0.2, apart=[(2.9, 1.5, 0.3)]).at(2.7, 1.5)
+    assert not grid.blocked(0.2, apart=[(2.9, 1.5, 0.3)]).at(2.7, 1.5), "a robot does not block itself"
 
 
-def test_points_that_are_not_finite_are_ignored():
-    grid = OccupancyGrid((0, 0), (4, 3))
-    grid.add_cells("depth", taken_m=np.array([[math.nan, 1.0], [math.inf, 1.0], [1.0, 1.0]]), clear_m=EMPTY)
-    assert grid.taken().sum() == 1
-
-
-def test_a_grid_without_size_is_rejected():
+def test_invalid_points_and_sizes_are_rejected(bare):
+    bare.add_cells("depth", taken_m=np.array([[math.nan, 1.0], [math.inf, 1.0], [1.0, 1.0]]), clear_m=EMPTY)
+    assert bare.taken().sum() == 1
     with pytest.raises(ValueError, match="upper corner"):
         OccupancyGrid((0, 0), (0, 3))
 
 
-def test_people_in_front_of_hidden_floor_do_not_become_static():
-    grid = OccupancyGrid((0, 0), (4, 3))
+def test_people_in_front_of_hidden_floor_do_not_become_static(bare):
     for _ in range(10):
         for _ in range(10):  # two seconds there, eighteen not
-            grid.add_cells("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
-            grid.advance(0.2)
+            bare.add_cells("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
+            bare.advance(0.2)
         for _ in range(90):
-            grid.advance(0.2)
-        assert not grid.taken()[cell(grid, 1.0, 1.0)]
-        assert not grid.static()[cell(grid, 1.0, 1.0)]
+            bare.advance(0.2)
+        assert not bare.taken()[cell(bare, 1.0, 1.0)]
+        assert not bare.static()[cell(bare, 1.0, 1.0)]
 
 
 def test_cells_outside_the_plan_are_blocked():

@@ -1,4 +1,3 @@
-import copy
 import json
 import math
 from typing import Any
@@ -6,10 +5,8 @@ from typing import Any
 import jsonschema
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from device_agent.protocol import Command, JointTarget, JointTelemetry, MoveJoints, Setpoint, State, codec
+from device_agent.protocol import Command, JointTarget, JointTelemetry, Mode, MoveJoints, Setpoint, State, codec
 from device_agent.protocol.documents import asyncapi
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import signing
@@ -21,158 +18,109 @@ SETPOINT: dict[str, Any] = {
     "sent_ms": 1.5,
     "target": {"kind": "joints", "position_rad": {"elbow": 0.5}},
 }
-
-
-def command() -> Command:
-    return Command(
-        id="c1",
-        space="s",
-        agent="a",
-        device="d",
-        issued_at_ms=1,
-        ttl_ms=1000,
-        caller="ann",
-        epoch=1,
-        request=MoveJoints(position_rad={"elbow": 1.0}),
-    )
+MOVE = MoveJoints(position_rad={"elbow": 1.0})
+COMMAND = Command(
+    id="c1", space="s", agent="a", device="d", issued_at_ms=1, ttl_ms=1000, caller="ann", epoch=1, request=MOVE
+)
+BODY = codec.encode(COMMAND)
+KEY = signing.generate()
+KEYS = {signing.key_id(KEY.public_key()): KEY.public_key()}
 
 
 def changed(**fields: Any) -> bytes:
     return json.dumps(SETPOINT | fields).encode()
 
 
-def test_a_setpoint_is_read() -> None:
+def test_a_setpoint_is_parsed() -> None:
     assert codec.decode(changed(), Setpoint).target == JointTarget(position_rad={"elbow": 0.5})
 
 
 @pytest.mark.parametrize(
     "payload",
     [
-        b"",
-        b"null",
-        b"[]",
-        b"\xff\xfe",
-        b"{" * 100_000,
-        changed(epoch=-1),
-        changed(epoch=1.0),
-        changed(epoch="1"),
-        changed(epoch=True),
-        changed(sequence=0),
-        changed(sequence=2**60),
+        *(b"", b"null", b"[]", b"\xff\xfe", b"{" * 100_000, b" " * (codec.MAX_BYTES + 1)),
+        *(changed(epoch=epoch) for epoch in (-1, 1.0, "1", True)),
+        *(changed(sequence=sequence) for sequence in (0, 2**60)),
         changed(extra=1),
         changed(target={"kind": "joints", "position_rad": {}}),
         changed(target={"kind": "teleport", "position_rad": {"elbow": 1}}),
         changed(target={"kind": "joints", "position_rad": {"elbow": None}}),
-        changed(sent_ms=math.nan),
-        changed(sent_ms=math.inf),
-        changed().replace(b"0.5", b"1e999"),
-        changed().replace(b"0.5", b"-1e999"),
-        changed().replace(b"0.5", b"NaN"),
-        changed().replace(b"0.5", b"Infinity"),
-        b" " * (codec.MAX_BYTES + 1),
+        *(changed(sent_ms=number) for number in (math.nan, math.inf)),
+        *(changed().replace(b"0.5", number) for number in (b"1e999", b"-1e999", b"NaN", b"Infinity")),
     ],
 )
-def test_what_is_no_setpoint_is_refused(payload: bytes) -> None:
+def test_invalid_setpoints_are_rejected(payload: bytes) -> None:
     with pytest.raises(ProtocolError):
         codec.decode(payload, Setpoint)
 
 
-@given(st.binary(max_size=300))
-def test_no_bytes_raise_anything_else(payload: bytes) -> None:
-    for kind in (Setpoint, Command, State, signing.Signed):
-        try:
-            codec.decode(payload, kind)
-        except ProtocolError:
-            continue
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_number_that_is_not_finite_is_never_written(bad: float) -> None:
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_only_finite_numbers_are_written(number: float) -> None:
     with pytest.raises(ProtocolError):
-        codec.encode(MoveJoints(position_rad={"elbow": bad}))
+        codec.encode(MoveJoints(position_rad={"elbow": number}))
 
 
-def test_a_robot_may_say_more_than_an_old_page_knows_but_may_not_be_told_more() -> None:
-    state = {"device": "d", "at_ms": 1, "tick_ms": 1, "mode": "idle", "epoch": 0}
-    assert codec.decode(json.dumps(state | {"battery": 1}).encode(), State).device == "d"
-    order = msgspec.to_builtins(command()) | {"colour": "red"}
+def test_unknown_fields_are_accepted_from_a_robot_but_not_in_a_command() -> None:
+    state = {"device": "d", "at_ms": 1, "tick_ms": 1, "mode": "idle", "epoch": 0, "battery": 1}
+    assert codec.decode(json.dumps(state).encode(), State).device == "d"
     with pytest.raises(ProtocolError):
-        codec.decode(json.dumps(order).encode(), Command)
+        codec.decode(json.dumps(msgspec.to_builtins(COMMAND) | {"colour": "red"}).encode(), Command)
 
 
-# ------------------------------------------------------------ signatures
-
-
-def test_a_signed_command_is_read_with_the_pinned_key() -> None:
-    key = signing.generate()
-    keys = {signing.key_id(key.public_key()): key.public_key()}
-    payload = signing.sign(codec.encode(command()), key)
-    assert codec.decode(signing.verify(payload, keys), Command) == command()
+def test_a_signed_command_is_verified_with_the_pinned_key() -> None:
+    assert codec.decode(signing.verify(signing.sign(BODY, KEY), KEYS), Command) == COMMAND
 
 
 def test_each_byte_of_a_signed_command_counts() -> None:
-    key = signing.generate()
-    keys = {signing.key_id(key.public_key()): key.public_key()}
-    payload = signing.sign(codec.encode(command()), key)
-    passed = 0
+    payload = signing.sign(BODY, KEY)
+    accepted = []
     for index in range(len(payload)):
         forged = bytearray(payload)
         forged[index] ^= 1
         try:
-            body = signing.verify(bytes(forged), keys)
+            accepted.append(signing.verify(bytes(forged), KEYS))
         except ProtocolError:
             continue
-        passed += 1
-        assert body == codec.encode(command())  # at most the last bits of base64 padding, which carry nothing
-    assert passed <= 1
+    assert accepted in ([], [BODY]), "only the last bits of the base64 padding carry nothing"
 
 
-def test_another_key_another_purpose_and_no_key_are_refused() -> None:
-    key, other = signing.generate(), signing.generate()
-    keys = {signing.key_id(key.public_key()): key.public_key()}
-    body = codec.encode(command())
-    for payload in (signing.sign(body, other), signing.sign(body, key, context=b"other\n")):
+def test_another_key_another_purpose_and_no_key_are_rejected() -> None:
+    for payload, keys in (
+        (signing.sign(BODY, signing.generate()), KEYS),
+        (signing.sign(BODY, KEY, context=b"other\n"), KEYS),
+        (signing.sign(BODY, KEY), {}),
+    ):
         with pytest.raises(SignatureError):
             signing.verify(payload, keys)
-    with pytest.raises(SignatureError):
-        signing.verify(signing.sign(body, key), {})
 
 
-def test_a_public_key_survives_as_text() -> None:
-    key = signing.generate().public_key()
-    assert signing.public_text(signing.public_key(signing.public_text(key))) == signing.public_text(key)
-    for text in ("", "x", "A" * 44, "ä" * 43):
+def test_public_keys_are_written_and_parsed() -> None:
+    text = signing.public_text(KEY.public_key())
+    assert signing.public_text(signing.public_key(text)) == text
+    for invalid in ("", "x", "A" * 44, "ä" * 43):
         with pytest.raises(ProtocolError):
-            signing.public_key(text)
+            signing.public_key(invalid)
 
 
-# ------------------------------------------------------------ the published document
-
-
-def test_the_document_describes_what_the_code_reads() -> None:
-    published = asyncapi.document()
-    schema = {"$ref": "#/components/schemas/Setpoint", "components": published["components"]}
+def test_the_asyncapi_document_describes_what_the_code_parses() -> None:
+    schema = {"$ref": "#/components/schemas/Setpoint", "components": asyncapi.document()["components"]}
     jsonschema.validate(SETPOINT, schema)
     for fields in ({"epoch": -1}, {"extra": 1}, {"target": {"kind": "joints", "position_rad": {}}}):
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(SETPOINT | fields, schema)
 
 
-def test_every_reference_of_the_document_leads_somewhere() -> None:
-    published = asyncapi.document()
+def test_every_reference_in_the_asyncapi_document_resolves() -> None:
+    document = asyncapi.document()
 
     def references(node: Any) -> list[str]:
-        if isinstance(node, dict):
-            own = [node["$ref"]] if isinstance(node.get("$ref"), str) else []
-            return own + [found for value in node.values() for found in references(value)]
-        if isinstance(node, list):
-            return [found for value in node for found in references(value)]
-        return []
+        children = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+        own = [node["$ref"]] if isinstance(node, dict) and isinstance(node.get("$ref"), str) else []
+        return own + [reference for child in children for reference in references(child)]
 
-    found = references(published)
-    assert found
-    for reference in found:
-        node = copy.copy(published)
+    assert references(document)
+    for reference in references(document):
+        node: Any = document
         for part in reference.removeprefix("#/").split("/"):
             node = node[part]
 
@@ -180,14 +128,7 @@ def test_every_reference_of_the_document_leads_somewhere() -> None:
 def test_telemetry_of_a_six_joint_arm_is_small() -> None:
     six = (1.234567,) * 6
     telemetry = JointTelemetry(
-        tick_ms=10**9,
-        at_ms=2 * 10**12,
-        sequence=10**6,
-        mode="streaming",  # type: ignore[arg-type]
-        position_rad=six,
-        velocity_rad_s=six,
-        effort_nm=six,
-        commanded_rad=six,
-        frames=((1.234567,) * 7,) * 7,
-    )
+        tick_ms=10**9, at_ms=2 * 10**12, sequence=10**6, mode=Mode.STREAMING,
+        position_rad=six, velocity_rad_s=six, effort_nm=six, commanded_rad=six, frames=((1.234567,) * 7,) * 7,
+    )  # fmt: skip
     assert len(codec.encode(telemetry)) < 1200

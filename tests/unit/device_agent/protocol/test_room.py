@@ -1,4 +1,4 @@
-"""A room's manifest: what it takes, and what it says of what it does not."""
+"""A room's manifest is read, or rejected with the field that is wrong."""
 
 from pathlib import Path
 
@@ -6,10 +6,9 @@ import pytest
 
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import room
-from tests.harness.paths import ROOT
+from tests.harness.paths import ROBOTS
 
-ROOMS = ROOT / "robots" / "rooms"
-
+ROOMS = ROBOTS / "rooms"
 ROOM = """
 room = "attic"
 version = 1
@@ -46,20 +45,18 @@ def with_change(before: str, after: str) -> str:
 
 
 @pytest.mark.parametrize("folder", [path.parent for path in ROOMS.glob("*/room.toml")], ids=lambda path: path.name)
-def test_every_room_of_the_installation_is_read(folder: Path):
-    found = room.load(folder)
-    assert found.room == folder.name
-    assert not found.model or (folder / found.model).is_file()
+def test_every_room_of_the_installation_is_valid(folder: Path):
+    loaded = room.load(folder)
+    assert loaded.room == folder.name
+    assert not loaded.model or (folder / loaded.model).is_file()
     assert (folder / "README.md").is_file()
 
 
-def test_what_is_in_a_room_is_found_by_its_name():
+def test_robots_and_devices_are_found_by_name():
     attic = room.parse(ROOM)
     assert attic.names == ("arm", "lamp")
-    assert attic.robot("arm") == attic.robots[0]
-    assert attic.device("lamp") == attic.devices[0]
-    assert attic.robot("lamp") is None
-    assert attic.device("arm") is None
+    assert (attic.robot("arm"), attic.robot("lamp")) == (attic.robots[0], None)
+    assert (attic.device("lamp"), attic.device("arm")) == (attic.devices[0], None)
 
 
 def test_a_room_device_is_a_type_without_joints():
@@ -70,7 +67,7 @@ def test_a_room_device_is_a_type_without_joints():
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("room = ", "Invalid value"),
         (with_change("height_m = 2.2", ""), "missing required field `height_m`"),
@@ -93,23 +90,23 @@ def test_a_room_device_is_a_type_without_joints():
         (ROOM + "[colour]\n", "unknown field `colour`"),
     ],
 )
-def test_what_is_wrong_is_said(text: str, says: str):
-    with pytest.raises(ProtocolError, match=r"\A.*" + says.replace("(", r"\(")):
+def test_mistakes_are_named(text: str, message: str):
+    with pytest.raises(ProtocolError, match=r"\A.*" + message.replace("(", r"\(")):
         room.parse(text)
 
 
-def test_a_room_must_have_its_folders_name(tmp_path: Path):
-    (tmp_path / "room.toml").write_text(ROOM)
-    with pytest.raises(ProtocolError, match=f"room 'attic' must equal the folder's name '{tmp_path.name}'"):
-        room.load(tmp_path)
-
-
-def test_a_room_that_is_no_text_names_the_file(tmp_path: Path):
-    (tmp_path / "room.toml").write_bytes(b"label = '\xff'")
-    with pytest.raises(ProtocolError, match=r"room\.toml: .*utf-8"):
-        room.load(tmp_path)
-
-
-def test_a_room_that_is_not_there_names_the_file(tmp_path: Path):
-    with pytest.raises(ProtocolError, match=r"room\.toml"):
-        room.load(tmp_path / "nowhere")
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (ROOM.encode(), "room 'attic' must equal the folder's name 'loft'"),
+        (b"label = '\xff'", r"room\.toml: .*utf-8"),
+        (None, r"room\.toml"),
+    ],
+)
+def test_an_unusable_file_is_named(tmp_path: Path, content: bytes | None, message: str):
+    folder = tmp_path / "loft"
+    folder.mkdir()
+    if content is not None:
+        (folder / "room.toml").write_bytes(content)
+    with pytest.raises(ProtocolError, match=message):
+        room.load(folder)

@@ -1,17 +1,46 @@
 """Fixtures of the runtime's tests."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from device_agent.runtime.control import control_loop
+from device_agent.runtime.room import sensor_loop
+from device_agent.runtime.telemetry import device_publisher
 from tests.harness.agent.device_harness import DeviceHarness
+
+MakeDevice = Callable[..., DeviceHarness]
+
+
+@pytest.fixture(autouse=True)
+def short_periods(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reconnections and states need not wait a second each."""
+    for module, name in (
+        (control_loop, "_RECONNECT_PERIOD_S"),
+        (sensor_loop, "_RECONNECT_PERIOD_S"),
+        (device_publisher, "STATE_MIN_GAP_S"),
+    ):
+        monkeypatch.setattr(module, name, 0.05)
 
 
 @pytest.fixture
-def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
+def make_device(tmp_path: Path) -> Iterator[MakeDevice]:
+    """Starts and connects devices; the second one is the first one after a restart."""
+    made: list[DeviceHarness] = []
+
+    def make(**parts: Any) -> DeviceHarness:
+        made.append(DeviceHarness(tmp_path, **parts))
+        made[-1].start()
+        return made[-1]
+
+    yield make
+    for harness in made:
+        harness.stop()
+
+
+@pytest.fixture
+def harness(make_device: MakeDevice) -> DeviceHarness:
     """A running, connected device."""
-    harness = DeviceHarness(tmp_path)
-    harness.start()
-    yield harness
-    harness.stop()
+    return make_device()

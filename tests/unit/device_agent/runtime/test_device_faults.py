@@ -5,11 +5,12 @@ import os
 import threading
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
 from device_agent.ports.driver import DriverError, Observation
-from device_agent.protocol import Ack, AckStatus, Event, GrantLease, Mode, MoveJoints, topics
+from device_agent.protocol import Ack, AckStatus, Event, Mode, MoveJoints, topics
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.commands import command_processor
 from device_agent.runtime.commands.command_processor import CommandProcessor
@@ -23,25 +24,14 @@ def broken(*_: Any, **__: Any) -> Any:
     raise ZeroDivisionError("a bug")
 
 
-def code(harness: DeviceHarness, command: str) -> str:
-    ack = harness.end(command)
-    assert ack.status is AckStatus.FAILED
-    assert ack.reason is not None
-    return ack.reason.code
-
-
-def test_an_unexpected_error_fails_the_action_and_the_next_one_runs(
+def test_an_unexpected_error_fails_the_action_or_command_and_the_next_one_runs(
     harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(RobotApi, "move_joints", broken)
-    assert code(harness, harness.command(MOVE, epoch=1)) == "internal"
-    monkeypatch.undo()
-    assert harness.end(harness.command(MOVE, epoch=1)).status is AckStatus.DONE
-
-
-def test_an_unexpected_error_fails_the_command(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(CommandProcessor, "_apply", broken)
-    assert code(harness, harness.command(GrantLease(holder="ann", lease_ms=1000), epoch=1)) == "internal"
+    for owner, name in ((RobotApi, "move_joints"), (CommandProcessor, "_apply")):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, broken)
+            assert harness.failed(MOVE, epoch=1).code == "internal"
+        harness.done(MOVE, epoch=1)
 
 
 def test_a_command_whose_epoch_cannot_be_journalled_is_not_applied(
@@ -52,15 +42,14 @@ def test_a_command_whose_epoch_cannot_be_journalled_is_not_applied(
 
     monkeypatch.setattr(Journal, "save_epoch", full)
     command = harness.command(MOVE, epoch=7)
-    eventually(lambda: [event for event in harness.heard(topics.EVENT, Event) if "disk" in event.message])
+    eventually(lambda: [event for event in harness.published(topics.EVENT, Event) if "disk" in event.message])
     assert {ack.status for ack in harness.acks(command)} <= {AckStatus.RECEIVED}
     assert harness.driver.position == (0.0, 0.0)
     monkeypatch.undo()
 
 
-@pytest.mark.parametrize("what", ["its start cannot be journalled", "the disk does not take it"])
 def test_nothing_moves_if_the_journal_cannot_be_written(
-    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch, what: str
+    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     record = Journal.record
 
@@ -72,21 +61,18 @@ def test_nothing_moves_if_the_journal_cannot_be_written(
     def fails(_: int) -> None:
         raise OSError(errno.EIO, "I/O error")
 
-    if what.startswith("its start"):
-        monkeypatch.setattr(Journal, "record", full)
-    else:
-        monkeypatch.setattr(os, "fsync", fails)
-    assert code(harness, harness.command(MOVE, epoch=1)) == "internal"
+    changes: tuple[tuple[Any, str, Any], ...] = ((Journal, "record", full), (os, "fsync", fails))
+    for owner, name, failure in changes:
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, failure)
+            assert harness.failed(MOVE, epoch=1).code == "internal"
     assert harness.driver.position == (0.0, 0.0)
-    monkeypatch.undo()
-    assert harness.end(harness.command(MOVE, epoch=1)).status is AckStatus.DONE
+    harness.done(MOVE, epoch=1)
 
 
 def test_an_unexpected_error_in_the_control_loop_is_a_fault(harness: DeviceHarness) -> None:
-    whole = harness.driver.observe
-    harness.driver.observe = broken  # type: ignore[method-assign]
-    eventually(lambda: harness.device._controller.fault == "internal error: a bug")
-    harness.driver.observe = whole  # type: ignore[method-assign]
+    with mock.patch.object(harness.driver, "observe", broken):
+        eventually(lambda: harness.device._controller.fault == "internal error: a bug")
     eventually(lambda: harness.telemetry().mode is Mode.IDLE and harness.device._controller.fault is None)
 
 
@@ -106,24 +92,12 @@ def test_commands_beyond_the_queue_are_rejected(harness: DeviceHarness, monkeypa
     go_on.set()
 
 
-def test_shutdown_ends_the_running_action(harness: DeviceHarness) -> None:
-    running = harness.command(harness.script("wait(600)"), epoch=1)
-    eventually(lambda: harness.acks(running)[1:])
-    harness.device.stop()
-    assert code(harness, running) == "agent_stopping"
-
-
-def test_shutdown_waits_for_rest(harness: DeviceHarness) -> None:
-    harness.command(MoveJoints(position_rad={"elbow": 2.5}, speed=1.0), epoch=1)
+def test_shutdown_ends_the_running_action_and_waits_for_rest(harness: DeviceHarness) -> None:
+    running = harness.command(MoveJoints(position_rad={"elbow": 2.5}, speed=1.0), epoch=1)
     eventually(lambda: harness.device._controller.moving)
     harness.device.stop()
+    assert harness.end_code(running) == "agent_stopping"
     assert not harness.device._controller.moving
-
-
-def test_a_device_that_never_started_can_be_stopped(tmp_path: Path) -> None:
-    harness = DeviceHarness(tmp_path)
-    harness.device.stop()
-    harness.stop()
 
 
 def test_a_missing_driver_fails_the_start(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Reading cache: subscriptions, ages and restarts of senders."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from device_agent.protocol import JointTelemetry, Measurements, Mode, codec, topics
@@ -8,22 +10,15 @@ from device_agent.runtime.errors import Refused
 from device_agent.runtime.readings import RESTART_GAP_S, Reading, ReadingCache
 
 
-class Clock:
-    now_s = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
+@pytest.fixture
+def clock() -> SimpleNamespace:
+    return SimpleNamespace(now_s=100.0)
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def room(clock: Clock) -> ReadingCache:
+def room(clock: SimpleNamespace) -> ReadingCache:
     named = [("sensors-pir", "presence"), ("lamp", "light"), ("sensors-arm", "joints")]
-    return ReadingCache(space="lab", agent="own", own=["arm", "lamp"], named=named, clock_s=clock)
+    return ReadingCache(space="lab", agent="own", own=["arm", "lamp"], named=named, clock_s=lambda: clock.now_s)
 
 
 def measured(sequence: int = 1, *, tick_ms: int = 1, at_ms: int = 1, **values: float) -> Measurements:
@@ -34,7 +29,7 @@ def topic(device: str = "pir", stream: str = "presence", *, agent: str = "sensor
     return topics.Topic(space, agent, device, topics.TELE, stream)
 
 
-def hear(room: ReadingCache, message: Measurements | JointTelemetry, where: topics.Topic | None = None) -> None:
+def receive(room: ReadingCache, message: Measurements | JointTelemetry, where: topics.Topic | None = None) -> None:
     room.receive(where or topic(), codec.encode(message))
 
 
@@ -47,12 +42,12 @@ def test_sources_of_other_agents_are_subscribed_by_exact_topic(room: ReadingCach
     assert room.topics() == ("ts/v1/lab/sensors/arm/tele/joints", "ts/v1/lab/sensors/pir/tele/presence")
 
 
-def test_the_newest_reading_is_given_with_its_age_since_it_arrived(room: ReadingCache, clock: Clock) -> None:
+def test_the_newest_reading_is_given_with_its_age_since_it_arrived(room: ReadingCache, clock: SimpleNamespace) -> None:
     assert room.latest("sensors-pir", "presence") is None
-    hear(room, measured(present=1.0, at_ms=2**50))
+    receive(room, measured(present=1.0, at_ms=2**50))
     clock.now_s += 1.5
     assert room.latest("sensors-pir", "presence") == Reading({"present": 1.0}, 1.5)
-    hear(room, measured(2, present=0.0, at_ms=1))
+    receive(room, measured(2, present=0.0, at_ms=1))
     assert room.latest("sensors-pir", "presence") == Reading({"present": 0.0}, 0.0)
 
 
@@ -75,7 +70,7 @@ def test_joints_are_read_by_index(room: ReadingCache) -> None:
         effort_nm=(1.0, 2.0),
         commanded_rad=(0.5, 1.0),
     )
-    hear(room, telemetry, topic("arm", "joints"))
+    receive(room, telemetry, topic("arm", "joints"))
     reading = room.latest("sensors-arm", "joints")
     assert reading is not None
     assert (reading.values["position_rad.1"], reading.values["effort_nm.0"]) == (1.0, 1.0)
@@ -91,27 +86,29 @@ def test_unsubscribed_streams_are_rejected_with_the_subscribed_ones(room: Readin
 
 def test_unsubscribed_messages_are_not_stored(room: ReadingCache) -> None:
     for number in range(1000):
-        hear(room, measured(present=1.0), topic(f"d{number}"))
-    hear(room, measured(present=1.0), topic(space="elsewhere"))
+        receive(room, measured(present=1.0), topic(f"d{number}"))
+    receive(room, measured(present=1.0), topic(space="elsewhere"))
     room.receive(topics.Topic("lab", "sensors", "pir", topics.LATE, "presence"), codec.encode(measured(present=1.0)))
     assert room._received == {}
 
 
 @pytest.mark.parametrize("payload", [b"", b"{}", b'{"tick_ms":1,"at_ms":1,"sequence":1,"values":{"present":NaN}}'])
 def test_malformed_measurements_change_nothing(room: ReadingCache, payload: bytes) -> None:
-    hear(room, measured(present=0.0))
+    receive(room, measured(present=0.0))
     with pytest.raises(ProtocolError):
         room.receive(topic(), payload)
     assert value(room) == 0.0
 
 
-def test_overtaken_messages_are_dropped_but_a_restarted_sender_is_accepted(room: ReadingCache, clock: Clock) -> None:
-    hear(room, measured(7, tick_ms=700, present=1.0))
-    hear(room, measured(6, tick_ms=600, present=0.0))
-    hear(room, measured(7, tick_ms=700, present=0.0))
+def test_overtaken_messages_are_dropped_but_a_restarted_sender_is_accepted(
+    room: ReadingCache, clock: SimpleNamespace
+) -> None:
+    receive(room, measured(7, tick_ms=700, present=1.0))
+    receive(room, measured(6, tick_ms=600, present=0.0))
+    receive(room, measured(7, tick_ms=700, present=0.0))
     assert value(room) == 1.0
-    hear(room, measured(1, tick_ms=900, present=2.0))
+    receive(room, measured(1, tick_ms=900, present=2.0))
     assert value(room) == 2.0, "the agent there restarted"
     clock.now_s += RESTART_GAP_S
-    hear(room, measured(1, tick_ms=5, present=3.0))
+    receive(room, measured(1, tick_ms=5, present=3.0))
     assert value(room) == 3.0, "the machine there restarted"

@@ -11,7 +11,8 @@ import pytest
 from tests.harness.documents import blocks
 from tests.harness.paths import ROOT
 
-FILES = [each for each in blocks(ROOT / "docs" / "guides" / "add-a-sensor.md") if each.use == "file"]
+pytestmark = pytest.mark.slow
+FILES = [block for block in blocks(ROOT / "docs" / "guides" / "add-a-sensor.md") if block.use == "file"]
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def run(folder: Path, *arguments: str) -> str:
 
 def test_the_driver_passes_the_contract_suite(folder: Path) -> None:
     output = run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_weather_station.py")
-    assert re.search(r"\b9 passed", output), output
+    assert re.search(r"\b8 passed", output), output
 
 
 def test_the_agent_finds_the_room_and_the_driver(folder: Path) -> None:

@@ -1,7 +1,9 @@
 """Injected faults of simulated room devices."""
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -14,6 +16,8 @@ from device_agent.sensors.mujoco import fault_injection, scalar_sensors
 from device_agent.sensors.mujoco.fault_injection import NO_FAULTS, InjectedFaults, read
 from tests.harness.agent.rooms import LAB, StillWorld
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def world() -> StillWorld:
@@ -25,34 +29,26 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "faults.toml"
 
 
-class DeviceConnector:
-    """Connects devices of the laboratory with the fault file."""
-
-    def __init__(self, world: StillWorld, file: Path) -> None:
-        self._world, self._file = world, file
-        self._drivers: list[RoomDriver] = []
-
-    def __call__(self, name: str) -> RoomDriver:
-        entry = self._world.entry(name)
-        options = {**entry.options, "faults": str(self._file)}
-        driver = self._world.driver(msgspec.structs.replace(entry, options=options))
-        driver.connect()
-        self._drivers.append(driver)
-        return driver
-
-    def close(self) -> None:
-        for driver in self._drivers:
-            driver.close()
+Connect = Callable[[str], RoomDriver]
 
 
 @pytest.fixture
-def connect(world: StillWorld, file: Path) -> Iterator[DeviceConnector]:
-    connect = DeviceConnector(world, file)
-    yield connect
-    connect.close()
+def connect(world: StillWorld, file: Path) -> Iterator[Connect]:
+    """Connects a device of the laboratory with the fault file."""
+    with contextlib.ExitStack() as stack:
+
+        def connect(name: str) -> RoomDriver:
+            entry = world.entry(name)
+            options = {**entry.options, "faults": str(file)}
+            driver = world.driver(msgspec.structs.replace(entry, options=options))
+            driver.connect()
+            stack.callback(driver.close)
+            return driver
+
+        yield connect
 
 
-def test_a_device_without_fault_file_is_unchanged(connect: DeviceConnector) -> None:
+def test_a_device_without_fault_file_is_unchanged(connect: Connect) -> None:
     co2, camera, door = connect("co2"), connect("camera"), connect("door")
     assert 500 < co2.read("co2")["co2_ppm"] < 800
     assert not isinstance(co2, Camera)
@@ -63,7 +59,7 @@ def test_a_device_without_fault_file_is_unchanged(connect: DeviceConnector) -> N
     door.hold()
 
 
-def test_a_stuck_meter_repeats_its_value_until_the_file_is_removed(connect: DeviceConnector, file: Path) -> None:
+def test_a_stuck_meter_repeats_its_value_until_the_file_is_removed(connect: Connect, file: Path) -> None:
     co2 = connect("co2")
     last = co2.read("co2")
     file.write_text('stuck = ["co2"]')
@@ -72,7 +68,7 @@ def test_a_stuck_meter_repeats_its_value_until_the_file_is_removed(connect: Devi
     assert len({co2.read("co2")["co2_ppm"] for _ in range(20)}) > 3
 
 
-def test_a_silent_stream_returns_nothing_but_rejects_unknown_names(connect: DeviceConnector, file: Path) -> None:
+def test_a_silent_stream_returns_nothing_but_rejects_unknown_names(connect: Connect, file: Path) -> None:
     pir = connect("pir")
     file.write_text('silent = ["motion"]')
     assert pir.read("motion") == {}
@@ -80,9 +76,9 @@ def test_a_silent_stream_returns_nothing_but_rejects_unknown_names(connect: Devi
         pir.read("nonsense")
 
 
-def test_a_value_drifts_per_minute(connect: DeviceConnector, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_value_drifts_per_minute(connect: Connect, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [1000.0]
-    clock = type("Clock", (), {"monotonic": staticmethod(lambda: now_s[0])})
+    clock = SimpleNamespace(monotonic=lambda: now_s[0])
     monkeypatch.setattr(fault_injection, "time", clock)
     monkeypatch.setattr(scalar_sensors, "time", clock)
     co2 = connect("co2")
@@ -94,7 +90,7 @@ def test_a_value_drifts_per_minute(connect: DeviceConnector, file: Path, monkeyp
     assert after - before == pytest.approx(500.0, abs=15.0)
 
 
-def test_an_unreachable_device_fails_but_receives_hold(connect: DeviceConnector, file: Path) -> None:
+def test_an_unreachable_device_fails_but_receives_hold(connect: Connect, file: Path) -> None:
     door = connect("door")
     file.write_text("unreachable = true")
     for call in (lambda: door.read("settings"), lambda: door.set("opening", 0.5), door.connect, door.raw):
@@ -104,20 +100,19 @@ def test_an_unreachable_device_fails_but_receives_hold(connect: DeviceConnector,
     door.hold()
 
 
-def test_a_stuck_camera_repeats_its_frame_and_a_silent_one_has_none(connect: DeviceConnector, file: Path) -> None:
+def test_a_stuck_camera_repeats_its_frame_and_a_silent_one_has_none(connect: Connect, file: Path) -> None:
     camera = connect("camera")
     assert isinstance(camera, Camera)
-    moving = {frame.content for frame in (camera.frame("colour") for _ in range(3)) if frame is not None}
-    assert len(moving) == 3, "noise"
-    seen = camera.raw()
-    assert isinstance(seen, Image)
+    assert len({frame.content for _ in range(3) if (frame := camera.frame("colour"))}) == 3, "noise"
+    image = camera.raw()
     file.write_text('stuck = ["colour"]')
-    frames = [camera.frame("colour") for _ in range(3)]
-    assert len({frame.content for frame in frames if frame is not None}) == 1
-    assert len({frame.taken_s for frame in frames if frame is not None}) == 3, "timestamps are current"
-    again = camera.raw()
-    assert isinstance(again, Image)
-    assert again.rgb is seen.rgb
+    frames = [frame for _ in range(3) if (frame := camera.frame("colour"))]
+    assert len({frame.content for frame in frames}) == 1
+    assert len({frame.taken_s for frame in frames}) == 3, "timestamps are current"
+    repeated = camera.raw()
+    assert isinstance(image, Image)
+    assert isinstance(repeated, Image)
+    assert repeated.rgb is image.rgb
     file.write_text('silent = ["colour"]  # now')
     assert camera.frame("colour") is None
     with pytest.raises(SensorError, match="returns no data"):

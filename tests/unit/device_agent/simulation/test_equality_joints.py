@@ -30,12 +30,8 @@ HAND = """
 """
 
 
-def model_of(text: str = HAND):
-    return mujoco.MjModel.from_xml_string(text)
-
-
 def test_dependent_joints_match_the_physics():
-    model = model_of()
+    model = mujoco.MjModel.from_xml_string(HAND)
     model.opt.gravity[:] = 0
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     data = mujoco.MjData(model)
@@ -50,7 +46,7 @@ def test_dependent_joints_match_the_physics():
 
 
 def test_factors_refer_to_independent_joints():
-    model = model_of()
+    model = mujoco.MjModel.from_xml_string(HAND)
     equality_joints = EqualityJoints(model)
     assert [model.joint(tie.joint).name for tie in equality_joints.all] == ["twice_a", "chained", "mixed"]
     assert equality_joints.factors_of(model.joint("chained").id) == pytest.approx({model.joint("a").id: 0.1})
@@ -61,17 +57,12 @@ def test_factors_refer_to_independent_joints():
     assert equality_joints.offset(model.joint("free_one").id) == 0.0
 
 
-def test_circular_and_inactive_constraints_are_ignored():
-    ring = HAND.replace(
-        "</equality>",
-        '<joint joint1="free_one" joint2="mixed"/><joint joint1="mixed" joint2="free_one"/></equality>',
-    ).replace('<tendon tendon1="mix"', '<tendon active="false" tendon1="mix"')
-    model = model_of(ring)
-    assert [model.joint(tie.joint).name for tie in EqualityJoints(model).all] == ["twice_a", "chained"]
-
-
-def test_a_model_without_constraints_is_unchanged():
-    model = model_of("<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>")
+def test_circular_inactive_and_missing_constraints_are_ignored():
+    ring = '<joint joint1="free_one" joint2="mixed"/><joint joint1="mixed" joint2="free_one"/></equality>'
+    inactive = HAND.replace('<tendon tendon1="mix"', '<tendon active="false" tendon1="mix"')
+    model = mujoco.MjModel.from_xml_string(inactive.replace("</equality>", ring))
+    assert [model.joint(joint.joint).name for joint in EqualityJoints(model).all] == ["twice_a", "chained"]
+    single = "<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
     qpos = np.array([0.7])
-    EqualityJoints(model).apply(qpos)
+    EqualityJoints(mujoco.MjModel.from_xml_string(single)).apply(qpos)
     assert qpos.tolist() == [0.7]

@@ -7,8 +7,8 @@ import pytest
 from device_agent.simulation import renderer
 from tests.harness.agent.rooms import StillWorld
 
+pytestmark = pytest.mark.slow
 SIZE = (160, 120)
-CAMERAS = ("camera", "depth", "depth_ceiling", "pan_tilt", "nao/CameraTop")
 
 
 @pytest.fixture(scope="module")
@@ -16,38 +16,26 @@ def lab() -> StillWorld:
     return StillWorld()
 
 
-def drawn(
-    lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch, *, depth: bool
-) -> tuple[renderer.RenderedImage, ...]:
-    """An image with culling, and one without."""
-    wish = (mujoco.mj_name2id(lab.model, mujoco.mjtObj.mjOBJ_CAMERA, camera), SIZE[0], SIZE[1])
-    seen = renderer.Renderer(lab)
-    seen.open()
-    try:
-        quick = seen.render(wish[0], width=wish[1], height=wish[2], depth=depth)
-        monkeypatch.setattr(renderer, "_in_view", lambda model, *_: np.ones(model.ngeom, dtype=np.bool_))
-        return quick, seen.render(wish[0], width=wish[1], height=wish[2], depth=depth)
-    finally:
-        seen.close()
-
-
-@pytest.mark.parametrize("camera", CAMERAS)
-def test_culling_does_not_change_depth_images(lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    quick, whole = drawn(lab, camera, monkeypatch, depth=True)
-    # Geoms below a pixel may be missing: less than 1 % of 19,200 pixels.
-    assert np.mean(np.abs(quick.pixels - whole.pixels) > 0.01) < 0.01
-
-
-@pytest.mark.parametrize("camera", CAMERAS)
-def test_culling_hides_geoms(lab: StillWorld, camera: str) -> None:
+@pytest.mark.parametrize("camera", ["camera", "depth", "depth_ceiling", "pan_tilt", "nao/CameraTop"])
+def test_culling_hides_geoms_and_does_not_change_images(
+    lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(renderer, "TIMEOUT_S", 60.0)
+    index = mujoco.mj_name2id(lab.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
     data = mujoco.MjData(lab.model)
     lab.copy(data)
-    index = mujoco.mj_name2id(lab.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-    seen = renderer._in_view(lab.model, data, index, *SIZE)
-    assert 0 < seen.sum() < lab.model.ngeom
-    assert seen[lab.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE].all()
-
-
-def test_culling_does_not_change_colour_images(lab: StillWorld, monkeypatch: pytest.MonkeyPatch) -> None:
-    quick, whole = drawn(lab, "camera", monkeypatch, depth=False)
-    assert np.mean(np.abs(quick.pixels.astype(int) - whole.pixels) > 2) < 0.01
+    visible = renderer._in_view(lab.model, data, index, *SIZE)
+    assert 0 < visible.sum() < lab.model.ngeom
+    assert visible[lab.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE].all()
+    width, height = SIZE
+    drawn = renderer.Renderer(lab)
+    drawn.open()
+    try:
+        culled = [drawn.render(index, width=width, height=height, depth=depth).pixels for depth in (True, False)]
+        monkeypatch.setattr(renderer, "_in_view", lambda model, *_: np.ones(model.ngeom, dtype=np.bool_))
+        whole = [drawn.render(index, width=width, height=height, depth=depth).pixels for depth in (True, False)]
+    finally:
+        drawn.close()
+    # Geoms below a pixel may be missing: less than 1 % of 19,200 pixels.
+    assert np.mean(np.abs(culled[0] - whole[0]) > 0.01) < 0.01
+    assert np.mean(np.abs(culled[1].astype(int) - whole[1]) > 2) < 0.01

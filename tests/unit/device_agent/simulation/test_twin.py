@@ -22,15 +22,10 @@ FOLDERS = sorted(path.parent for path in ROBOTS.glob("*/robot.toml"))
 Matrix = npt.NDArray[np.float64]
 
 
-def rotation(quaternion: tuple[float, ...]) -> Matrix:
-    w, x, y, z = np.array(quaternion) / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def rotation(quaternion: Any) -> Matrix:
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, np.array(quaternion) / np.linalg.norm(quaternion))
+    return matrix.reshape(3, 3)
 
 
 def transform(turn: Matrix, position: Any = (0.0, 0.0, 0.0)) -> Matrix:
@@ -62,22 +57,13 @@ def geometry_poses(twin: Twin, position_rad: dict[str, float]) -> list[Matrix]:
     return shapes
 
 
-def simulated_poses(data: Any, base: int, geoms: list[int]) -> list[Matrix]:
-    origin = np.linalg.inv(transform(data.xmat[base].reshape(3, 3), data.xpos[base]))
-    return [origin @ transform(data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]) for geom in geoms]
-
-
-def drawn_geoms(model: Any, base: int, *, scenery: bool) -> list[int]:
-    visible = [geom for geom in range(model.ngeom) if model.geom_group[geom] <= 2]
-    own = [geom for geom in visible if model.body_rootid[model.geom_bodyid[geom]] == base]
-    still = [geom for geom in visible if model.geom_bodyid[geom] == 0]
-    return still + own if scenery else own
-
-
 def assert_same_poses(model: Any, twin: Twin, base: int, *, scenery: bool) -> None:
     data = mujoco.MjData(model)
     random, equality_joints = np.random.default_rng(11), EqualityJoints(model)
-    for _ in range(100):
+    visible = [geom for geom in range(model.ngeom) if model.geom_group[geom] <= 2]
+    geoms = [geom for geom in visible if scenery and model.geom_bodyid[geom] == 0]
+    geoms += [geom for geom in visible if model.body_rootid[model.geom_bodyid[geom]] == base]
+    for _ in range(20):
         position = {}
         for joint in range(model.njnt):
             if model.jnt_type[joint] in (2, 3):  # slide, hinge
@@ -86,10 +72,12 @@ def assert_same_poses(model: Any, twin: Twin, base: int, *, scenery: bool) -> No
                 position[model.joint(joint).name] = value
         equality_joints.apply(data.qpos)
         mujoco.mj_kinematics(model, data)
-        want = simulated_poses(data, base, drawn_geoms(model, base, scenery=scenery))
-        got = geometry_poses(twin, position)
-        assert len(got) == len(want)
-        assert max(float(np.abs(a - b).max()) for a, b in zip(got, want, strict=True)) < 1e-9
+        to_base = np.linalg.inv(transform(data.xmat[base].reshape(3, 3), data.xpos[base]))
+        poses = geometry_poses(twin, position)
+        assert len(poses) == len(geoms)
+        for pose, geom in zip(poses, geoms, strict=True):
+            simulated = to_base @ transform(data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom])
+            assert np.abs(pose - simulated).max() < 1e-9
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
@@ -184,18 +172,15 @@ def test_colours_come_from_material_or_geom():
 
 def test_the_web_fixture_is_up_to_date() -> None:
     """If it fails, run ``.venv/bin/python web/tests/fixtures/make.py``."""
+
+    def equal(one: Any, other: Any) -> bool:
+        """Equal except for rounding differences."""
+        if isinstance(one, dict):
+            return one.keys() == other.keys() and all(equal(one[name], other[name]) for name in one)
+        if isinstance(one, list | tuple):
+            return len(one) == len(other) and all(map(equal, one, other))
+        return bool(one == (pytest.approx(other, rel=1e-9, abs=1e-9) if isinstance(one, float) else other))
+
     fixtures = ROBOTS.parent / "web" / "tests" / "fixtures"
     made = runpy.run_path(str(fixtures / "make.py"))["content"]()
-    kept = json.loads((fixtures / "ur5.json").read_text(encoding="utf-8"))
-    assert alike(made, kept)
-
-
-def alike(one: Any, other: Any) -> bool:
-    """Equal except for rounding differences."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(alike(one[name], other[name]) for name in one)
-    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        return len(one) == len(other) and all(map(alike, one, other))
-    if isinstance(one, float) and isinstance(other, int | float):
-        return math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-9)
-    return bool(one == other)
+    assert equal(made, json.loads((fixtures / "ur5.json").read_text(encoding="utf-8")))

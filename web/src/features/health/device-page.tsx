@@ -87,7 +87,7 @@ interface Past {
   older: () => void;
 }
 
-/** Faults that are over; read anew when the open ones change. */
+/** Past faults, reloaded when the open ones change. */
 function usePast(api: Api, device: DeviceStore, open: string): Past {
   const [items, setItems] = useState<readonly Fault[]>([]);
   const [cursor, setCursor] = useState<string | null>(null);
@@ -159,7 +159,7 @@ interface ChartProps {
 function Chart({ api, device, at: { stream, field }, fields, faults }: ChartProps) {
   const description = device.description.value;
   const watched = fields.find((one) => one.stream === stream && one.field === field) ?? null;
-  // A new object with the same limits is no reason to build a new chart.
+  // A new object with the same limits must not rebuild the chart.
   const limits = watched === null ? "" : [watched.label, watched.unit, watched.low, watched.high, watched.warning_low, watched.warning_high].join(" ");
   const quantity = useMemo((): Quantity => {
     if (watched !== null) return watchedQuantity(watched, description);
@@ -259,12 +259,12 @@ interface OthersProps {
   choose: (chosen: Chosen) => void;
 }
 
-/** What is stored and not watched has a trend too. */
+/** Fields that are stored but not monitored. */
 function Others({ api, device, fields, at, choose }: OthersProps) {
   const [streams, setStreams] = useState<readonly StoredStream[]>([]);
   useEffect(() => {
     let wanted = true;
-    // Without the list there are the watched ones still.
+    // Without this list the monitored fields are still shown.
     api.health.streams(device.id).then((found) => wanted && setStreams(found), () => undefined);
     return () => void (wanted = false);
   }, [api, device]);

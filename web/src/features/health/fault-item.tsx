@@ -1,4 +1,4 @@
-/** One fault, from its first report to its end, and what happened around it. */
+/** One fault: its history and the events around it. */
 import type { DeviceStore } from "../devices/model";
 import { Age } from "../../shared/ui/age";
 import type { Fault, StoredEvent } from "../../shared/api/health";
@@ -15,9 +15,9 @@ interface FaultItemProps {
   api: Api;
   device: DeviceStore;
   standing: Standing;
-  /** Something was done: the cloud is to be asked again. */
+  /** Called after an action, to reload the faults. */
   changed: () => void;
-  /** Show the trend of what was measured. */
+  /** Shows the trend of the measured field. */
   show: (stream: string, field: string) => void;
 }
 
@@ -70,7 +70,7 @@ export function FaultItem({ api, device, standing, changed, show }: FaultItemPro
   );
 }
 
-/** Raised, seen, cleared: each with its time. */
+/** Raised, acknowledged and cleared, each with its time. */
 function Life({ fault }: { fault: Fault }) {
   const words = texts.health.life;
   const moment = (at: string, what: string) => (

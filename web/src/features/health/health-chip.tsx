@@ -1,4 +1,4 @@
-/** How a device is, in a word. */
+/** The health of a device as a chip. */
 import type { DeviceStore } from "../devices/model";
 import type { HealthState } from "../../shared/api/health";
 import { useEffect } from "preact/hooks";
@@ -9,7 +9,7 @@ import { usePolling, type Polled } from "../../shared/hooks/use-polling";
 import { healthAddressOf } from "../../shared/routing/routes";
 
 const EVERY_MS = 15_000;
-/** What a device says reaches the cloud's tables a moment later. */
+/** The cloud stores device reports with this delay [ms]. */
 const STORED_AFTER_MS = 1_500;
 
 const KIND: Readonly<Record<HealthState, string>> = { ok: "reach-online", unknown: "", warning: "reach-stale", fault: "bad" };
@@ -22,7 +22,7 @@ export function HealthLabel({ health }: { health: HealthState }) {
   );
 }
 
-/** Ask again when the device itself says something else about its faults: at once, and when that is stored. */
+/** Reloads when the device reports other faults: immediately, and after they are stored. */
 export function useReportedFaults(told: string, again: Polled<unknown>["again"]): void {
   useEffect(() => {
     again();
@@ -31,7 +31,7 @@ export function useReportedFaults(told: string, again: Polled<unknown>["again"])
   }, [told, again]);
 }
 
-/** The number of open faults, as the way to the health page. */
+/** The number of open faults, with a link to the health page. */
 export function HealthChip({ api, device }: { api: Api; device: DeviceStore }) {
   const told = reportedFaults(device);
   const { value, again } = usePolling(() => api.health.of(device.id), EVERY_MS, [api, device]);

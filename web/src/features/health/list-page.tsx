@@ -1,4 +1,4 @@
-/** How devices are: all of them, those of a space, or one. */
+/** Health of all devices, those of a space, or one. */
 import type { Account } from "../../shared/api/types";
 import { DevicePageFrame, LastSeenAge, ReachChip } from "../devices";
 import type { DeviceStore, Fleet } from "../devices/model";
@@ -25,9 +25,9 @@ interface HealthPageProps {
   api: Api;
   fleet: Fleet;
   account: Account;
-  /** Of one device, or empty. */
+  /** The device's id, or empty. */
   device: string;
-  /** Of one space, or empty. */
+  /** The space's id, or empty. */
   space: string;
 }
 
@@ -40,7 +40,7 @@ export function HealthPage({ device, space, ...rest }: HealthPageProps) {
   );
 }
 
-/** A line with what the page sees of the device by itself. */
+/** A device with this page's own observation. */
 interface Shown {
   line: HealthLine;
   device: DeviceStore | null;
@@ -106,7 +106,7 @@ function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: stri
 function Line({ shown: { line, device, health }, fleet }: { shown: Shown; fleet: Fleet }) {
   const told = device === null ? null : reportedFaults(device);
   const { worst, counts } = line;
-  // The list names the worst of what is stored; what the device says besides is said by it.
+  // The list contains the worst stored fault; add those that only the device reports.
   const news = (told ?? []).filter(({ code }) => code !== worst?.code);
   const stored = counts.error + counts.warning + counts.info;
   return (

@@ -22,9 +22,9 @@ interface TrendProps {
   api: Api;
   device: DeviceStore;
   quantity: Quantity;
-  /** What the detectors know of it; `null`: it is not watched. */
+  /** `null`: not monitored. */
   watched: Watched | null;
-  /** All that is and was wrong with the device. */
+  /** All open and past faults of the device. */
   faults: readonly Fault[];
 }
 
@@ -91,7 +91,7 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
   );
 }
 
-/** What the detectors have learnt of it, in words. */
+/** The learned range and trend as text. */
 function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_in_s: left }: Watched, quantity: Quantity): string {
   const text = (value: number): string => `${shown(quantity, value)} ${quantity.unit}`.trim();
   const said = [low === null || high === null ? texts.trend.learning : texts.trend.usual(text(low), text(high))];
@@ -101,7 +101,7 @@ function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_in_
   return said.join(" ");
 }
 
-/** The same in figures, the newest first. */
+/** The values as a table, newest first. */
 function Rows({ recording, quantity, spanMs }: { recording: Recording; quantity: Quantity; spanMs: number }) {
   const samples = useMemo(() => recording.samples(serverNow() - spanMs).reverse(), [recording, spanMs, Math.floor(serverNow() / 2000)]);
   return (

@@ -1,4 +1,4 @@
-/** The keyframe editor of one device: the same for an arm, a humanoid, a base and a head. */
+/** The keyframe editor of one device. */
 import type { Account } from "../../shared/api/types";
 import { ControlBar, StopBanner } from "../control";
 import { ReachChip, useDeviceSessions } from "../devices";
@@ -16,7 +16,6 @@ interface KeyframesPageProps {
   fleet: Fleet;
   account: Account;
   id: string;
-  /** Of the movement; empty: a new one. */
   name: string;
 }
 
@@ -73,7 +72,7 @@ function OfDevice({ api, fleet, account, device, name }: OfDeviceProps) {
               robot={device.description.value}
               twin={device.twin.value}
               measured={measuredPose(device)}
-              // A new movement begins where the robot is: its first word is waited for, where it is there to say one.
+              // A new movement starts at the robot's measured pose, so wait for it unless the robot is offline.
               waits={measuredPose(device) === null && device.reach.value !== "offline"}
               session={session}
               address={(saved) => keyframesAddress(device.id, saved)}

@@ -1,4 +1,4 @@
-/** What keyframes are edited with, with a robot or without. */
+/** The keyframe editor, with or without a robot. */
 import type { DeviceSession } from "../devices/model";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
@@ -16,22 +16,21 @@ import { PreviewTwin } from "./preview-twin";
 
 interface DeskProps {
   api: Api;
-  /** Of the movement; empty: a new one. */
+  /** The movement's name; empty: a new one. */
   name: string;
   source: MovementReference;
   robotType: string;
-  /** `null` until it has been heard of. */
+  /** `null` until loaded. */
   robot: Robot | null;
   twin: KnownTwin | null;
-  /** Where the robot is. */
   measured: Positions | null;
-  /** Where a new movement begins that begins nowhere else. */
+  /** The initial pose of a new movement if no pose is measured. */
   home?: Positions;
-  /** A new movement must not begin yet. */
+  /** Whether a new movement must wait for the measured pose. */
   waits: boolean;
-  /** `null`: there is no robot, and nothing can be recorded or run. */
+  /** `null`: without a robot, so recording and running are unavailable. */
   session: DeviceSession | null;
-  /** Where a movement of this name is edited. */
+  /** The address of the editor for a movement's name. */
   address: (name: string) => string;
 }
 
@@ -48,7 +47,7 @@ export function KeyframeEditor(props: DeskProps) {
   const [unkept, setUnkept] = useState(false);
   const ready = robot !== null && (!waits || source.saved !== null);
 
-  // Made once: what becomes of the robot later, or of the connection, must not touch what is being edited.
+  // Created once: later changes of the robot or the connection must not affect the edited movement.
   useEffect(() => {
     if (!ready || editor !== null) return;
     const draft = drafts.read(robotType, first);
@@ -65,7 +64,6 @@ export function KeyframeEditor(props: DeskProps) {
     setName(saved);
     setVersion(at);
     setRestored(false);
-    // The address of what it is now; the page stays as it is.
     history.replaceState(null, "", address(saved));
   };
   return (
@@ -102,7 +100,7 @@ export function KeyframeEditor(props: DeskProps) {
   );
 }
 
-/** Undo and redo by keys, but not in a field of text, which has its own. */
+/** Undo and redo by keys, except in text fields, which have their own. */
 function useKeys(editor: Editor | null): void {
   useEffect(() => {
     if (editor === null) return undefined;

@@ -74,8 +74,8 @@ interface NumberFieldProps {
   onSet: (value: number) => void;
 }
 
-/** A number that counts at Enter or when the field is left. */
-export function NumberField({ id, label, value, digits, onSet }: NumberFieldProps) {
+/** A number field that applies its value on Enter or blur. */
+function NumberField({ id, label, value, digits, onSet }: NumberFieldProps) {
   const [typed, setTyped] = useState<string | null>(null);
   const commit = (): void => {
     const wanted = Number(typed?.replace(",", "."));
@@ -130,7 +130,7 @@ interface JointOfProps {
   editor: Editor;
   index: number;
   joint: Joint;
-  /** Whether this keyframe says where it is; else it only passes here. */
+  /** Whether this keyframe sets the joint's position; otherwise it is interpolated. */
   here: boolean;
   target: number | undefined;
   measured: number | undefined;
@@ -161,7 +161,7 @@ function JointOf({ editor, index, joint, here, target, measured, wrong }: JointO
   );
 }
 
-/** What else is done there: only what the robot says that it can do. */
+/** Further steps at the keyframe, limited to the robot's capabilities. */
 function DeedFields({ editor, index, keyframe }: PartProps) {
   const { robot } = editor;
   const set = <D extends ActionKind>(deed: D, value: KeyframeActions[D] | undefined): void =>

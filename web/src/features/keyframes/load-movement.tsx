@@ -1,4 +1,4 @@
-/** A movement's keyframes, where its script has them, and what is said until they are there. */
+/** Loads a movement's keyframes from its script. */
 import type { ComponentChildren } from "preact";
 import { useEffect, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
@@ -9,7 +9,7 @@ import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { movementAddress } from "../../shared/routing/routes";
 
-/** `saved` `null`: it is yet to be made. */
+/** `saved` is `null` for a new movement. */
 export interface MovementReference {
   kind: "there";
   saved: Movement | null;
@@ -74,7 +74,6 @@ async function load(api: Api, robotType: string, name: string): Promise<Source> 
     if (read.kind !== "keyframes") return { kind: "by-hand" };
     return { kind: "there", saved: read.movement, version: found.built_in ? 0 : found.version };
   } catch (error) {
-    // A movement of this name is yet to be made.
     if (error instanceof ApiError && error.status === 404) return { kind: "there", saved: null, version: 0 };
     return { kind: "failed", why: sentence(error) };
   }

@@ -1,4 +1,4 @@
-/** The movement on the robot's twin, and the robot itself as a shadow of it. */
+/** The movement on the robot's twin, with the measured pose as a shadow. */
 import type { DeviceStore } from "../devices/model";
 import { type LiveScene, useScene } from "../twin";
 import { Card } from "../../shared/ui/card";
@@ -9,7 +9,7 @@ import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import type { Positions } from "./model/keyframes";
 import { texts } from "./texts";
 
-/** Where the robot is measured to be, while that is what it is [rad]. */
+/** The measured joint positions, if current [rad]. */
 export function measuredPose(device: DeviceStore): Positions | null {
   const message = device.telemetry.value?.message;
   const joints = device.description.value?.joints;
@@ -19,7 +19,7 @@ export function measuredPose(device: DeviceStore): Positions | null {
 
 interface TwinProps {
   twin: KnownTwin | null;
-  /** Whose measured pose is the shadow; `null`: a robot type without a robot. */
+  /** The device whose measured pose is the shadow; `null`: none. */
   device: DeviceStore | null;
   editor: Editor;
 }
@@ -41,7 +41,7 @@ export function PreviewTwin({ twin, device, editor }: TwinProps) {
     >
       {scene !== null && <Follow scene={scene} device={device} editor={editor} />}
       <div ref={box} class="canvas-box" data-testid="kf-view" data-frames="0">
-        {/* Keyed: a canvas whose context is gone cannot be drawn on again. */}
+        {/* Keyed: a canvas cannot be drawn on after its context is lost. */}
         <canvas key={twin} ref={canvas} aria-label={texts.twinLabel} role="img" />
         {twin === null && <p class="over quiet">{texts.viewWaiting}</p>}
         {said !== "" && <p class="over notice">{said}</p>}
@@ -67,7 +67,7 @@ function Follow({ scene, device, editor }: { scene: LiveScene; device: DeviceSto
   return null;
 }
 
-/** The preview goes on with each frame that the browser draws. */
+/** Advances the preview in each animation frame. */
 function usePreviewClock(editor: Editor): void {
   const playing = editor.playing.value;
   useEffect(() => {

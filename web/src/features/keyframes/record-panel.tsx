@@ -152,7 +152,7 @@ interface CurvesProps {
   editor: Editor;
 }
 
-/** Each joint over its own range, what was not heard, what is cut off, and where keyframes would be. */
+/** Each joint within its range, gaps, trimmed parts and the resulting keyframes. */
 function Curves({ take, lasts, from, to, made, editor }: CurvesProps) {
   const x = (time: number): number => (time / lasts) * WIDTH;
   const lines = useMemo(() => {

@@ -12,7 +12,6 @@ import { LoadMovement, useMovementSource } from "./load-movement";
 interface TypeKeyframesPageProps {
   api: Api;
   robotType: string;
-  /** Of the movement; empty: a new one. */
   name: string;
 }
 

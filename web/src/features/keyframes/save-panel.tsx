@@ -1,4 +1,4 @@
-/** The movement's name; saving it as a script, and running that on the robot. */
+/** Names a movement, saves it as a script and runs it on the robot. */
 import { RunStatusPanel } from "../actions";
 import { actionUnavailableReason } from "../devices";
 import type { DeviceSession } from "../devices/model";
@@ -14,13 +14,13 @@ import { texts } from "./texts";
 
 interface SaveProps {
   api: Api;
-  /** `null`: there is no robot that it could run on. */
+  /** `null`: no robot to run it on. */
   session: DeviceSession | null;
   editor: Editor;
   robotType: string;
-  /** As the cloud knows it; empty: not yet. */
+  /** The saved name; empty: not saved yet. */
   name: string;
-  /** Of the version that this was made from; 0: of none. */
+  /** The base version; 0: none. */
   version: number;
   onSaved: (name: string, version: number) => void;
 }
@@ -37,7 +37,7 @@ export function SavePanel({ api, session, editor, robotType, name, version, onSa
   const named = /^[A-Za-z0-9_-]{1,64}$/.test(wanted);
   const changed = editor.changed.value || wanted !== name;
 
-  /** Gives whether the cloud has it now. */
+  /** Returns whether it was saved. */
   const save = async (basedOn = wanted === name ? version : 0): Promise<boolean> => {
     setBusy(true);
     setSaid("");
@@ -124,7 +124,7 @@ export function SavePanel({ api, session, editor, robotType, name, version, onSa
 interface RunProps {
   session: DeviceSession;
   name: string;
-  /** It is not saved as it stands: that is done first. */
+  /** Whether it must be saved before running. */
   changed: boolean;
   blocked: boolean;
   errors: number;

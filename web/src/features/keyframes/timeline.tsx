@@ -181,7 +181,7 @@ function Marker({ editor, index, one, wrong, style, timeAt }: MarkerProps) {
       onPointerMove={(event) => {
         if (!event.currentTarget.hasPointerCapture(event.pointerId) || index === 0) return;
         const time = timeAt(event.clientX);
-        // A finger that only touches does not move it.
+        // A touch without motion does not move it.
         if (!dragged.current && Math.abs(time - one.time_s) < SHORTEST_S) return;
         dragged.current = true;
         move(time, `time-${index}`);
@@ -212,7 +212,7 @@ function Marker({ editor, index, one, wrong, style, timeAt }: MarkerProps) {
   );
 }
 
-/** Seconds that a key moves something in time; `null` for keys that are not ours. */
+/** The time step of a key [s]; `null` for other keys. */
 function stepOf(event: KeyboardEvent): number | null {
   const size = event.shiftKey ? 1 : event.altKey ? 0.01 : 0.1;
   if (event.key === "ArrowRight" || event.key === "ArrowUp") return size;
@@ -220,7 +220,7 @@ function stepOf(event: KeyboardEvent): number | null {
   return null;
 }
 
-/** What is wrong, each with what mends it. */
+/** All problems, each with its remedy. */
 export function ProblemList({ editor }: { editor: Editor }) {
   const found = editor.problems.value;
   const fast = found.filter(({ what }) => what.kind === "too-fast").length;

@@ -8,7 +8,6 @@ interface LatencyProps {
   control: Control;
 }
 
-/** The round-trip time of streamed setpoints, and the age of the telemetry. */
 export function LiveLatency({ device, control }: LatencyProps) {
   const figures = control.roundTrip.figures.value;
   const telemetry = device.telemetry.value;

@@ -30,7 +30,7 @@ interface TimesPageProps {
   api: Api;
   fleet: Fleet;
   account: Account;
-  /** Of one device, or empty. */
+  /** The device's id, or empty. */
   device: string;
 }
 
@@ -69,7 +69,7 @@ function OfDevice({ api, fleet, session }: { api: Api; fleet: Fleet; session: De
 interface Filter {
   device: string | null;
   transport: Transport | null;
-  /** `undefined`: not chosen yet. */
+  /** `undefined`: no choice yet. */
   path: Path | null | undefined;
   span: Span;
 }
@@ -141,7 +141,7 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
   );
 }
 
-/** The part of which there are most samples; `null`, which is all, while there is none. */
+/** The path with the most samples; `null`, for all, without any. */
 function mostOf(lines: readonly Line[]): Path | null {
   const counts = PATHS.map((path) => [path, lines.filter((line) => line.path === path).reduce((sum, { samples }) => sum + samples.length, 0)] as const);
   const [path, most] = counts.reduce((best, one) => (one[1] > best[1] ? one : best), ["command-started", 0]);
@@ -161,7 +161,7 @@ async function readAll(api: Api, ids: readonly string[], fromMs: number): Promis
 interface PickProps<T extends string> {
   id: string;
   label: string;
-  /** The choice that leaves nothing out. */
+  /** The label for no filter. */
   all: string;
   value: T | null;
   options: readonly (readonly [T, string])[];
@@ -240,7 +240,7 @@ function FiguresCard({ lines, name, save: press }: FiguresCardProps) {
   );
 }
 
-/** What papers have printed for this part, each with its source. */
+/** Published figures for this path, with their sources. */
 function PublishedCard({ published }: { published: readonly Published[] }) {
   const sources = [...new Set(published.map(({ source }) => source))];
   return (
@@ -267,6 +267,6 @@ function save(content: string): void {
   link.href = URL.createObjectURL(new Blob([content], { type: "text/csv" }));
   link.download = texts.csvName;
   link.click();
-  // The browser has its own hold of it once the click was taken.
+  // The browser keeps its own reference after the click.
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }

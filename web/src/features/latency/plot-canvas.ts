@@ -5,7 +5,7 @@ import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { colour } from "../../shared/ui/canvas-theme";
 
-/** One line: along x and along y, each in its own order. */
+/** One line: x and y values. */
 export interface PlotSeries {
   label: string;
   colour: string;
@@ -23,12 +23,12 @@ export interface LatencyChart {
   dispose(): void;
 }
 
-/** Along x: the number of a sample, its time [s since 1970], or how long it took [ms]. */
+/** The x axis: sample number, time [s since 1970] or duration [ms]. */
 export type Along = "order" | "time" | "ms";
 
 interface Options {
   along: Along;
-  /** Whether times are drawn by their logarithm. */
+  /** Whether durations use a logarithmic axis. */
   log: boolean;
 }
 
@@ -49,7 +49,7 @@ export function createLatencyChart(box: HTMLElement, { along, log }: Options): L
   };
   const build = (lines: readonly PlotSeries[]): uPlot => {
     const axis = { stroke: colour("--quiet"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line"), width: 1 } };
-    // The end of a logarithmic axis is no round number.
+    // The end of a logarithmic axis is not a round number.
     const inMs = (ticks: (number | null)[]): string[] =>
       ticks.map((tick) => (tick === null ? "" : `${Number(tick.toPrecision(3))} ${texts.milliseconds}`));
     const times = { ...(log ? { distr: LOG, log: 10 as const } : {}), range: (_: uPlot, low: number | null, high: number | null) => reach(low, high) };
@@ -92,7 +92,7 @@ export function createLatencyChart(box: HTMLElement, { along, log }: Options): L
   return {
     draw(lines, given) {
       references = given;
-      // uPlot takes other values of the same lines; for other lines it is built anew.
+      // uPlot accepts new values for the same lines; other lines need a new plot.
       const names = lines.map((line) => `${line.label} ${line.colour}`).join("\n");
       if (plot !== null && names === drawn) {
         plot.setData(aligned(lines));
@@ -118,7 +118,7 @@ function whole(tick: number): string {
   return Number.isInteger(tick) ? String(tick) : "";
 }
 
-/** Published figures: dashed, each with its name, which stands where there is room for it. */
+/** Published figures as dashed lines, labelled where there is space. */
 function paint(plot: uPlot, references: readonly Reference[], along: Along): void {
   const { ctx, bbox } = plot;
   const ratio = devicePixelRatio;
@@ -142,7 +142,7 @@ function paint(plot: uPlot, references: readonly Reference[], along: Along): voi
       ctx.lineTo(bbox.left + bbox.width, at);
     }
     ctx.stroke();
-    // The list beside the chart names them all; here only what does not cover the one before.
+    // The list beside the chart names all; skip labels that would overlap.
     if (upright || Math.abs(at - last) < LABEL_PX * 1.2 * ratio) continue;
     const text = `${label}: ${ms} ${texts.milliseconds}`;
     ctx.fillStyle = colour("--surface");

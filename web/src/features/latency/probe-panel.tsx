@@ -1,4 +1,4 @@
-/** Measuring here and now, by what moves nothing. */
+/** Measures latency now, without motion. */
 import type { DeviceStore } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { TIMES, probeKindsOf, type LatencyProbe } from "./model/probe";
@@ -16,7 +16,7 @@ export function ProbePanel({ device, measure }: { device: DeviceStore; measure: 
       title={texts.measure}
       aside={
         progress === null ? (
-          // What may be asked of a device is known once it has said what it is.
+          // The supported probes are known after the description has arrived.
           <button
             type="button"
             class="primary"

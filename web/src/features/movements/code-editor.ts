@@ -1,30 +1,13 @@
-/**
- * The code editor. It lives in a shadow tree: there its style sheets are adopted, not written into the page as text,
- * which the page's policy forbids.
- */
+/** The code editor, in a shadow tree with adopted style sheets: the page's policy forbids inline styles. */
 import { autocompletion, closeBrackets, closeBracketsKeymap, completionKeymap } from "@codemirror/autocomplete";
 import { defaultKeymap, history, historyKeymap } from "@codemirror/commands";
 import { python, pythonLanguage } from "@codemirror/lang-python";
-import {
-  bracketMatching,
-  HighlightStyle,
-  indentOnInput,
-  indentUnit,
-  syntaxHighlighting,
-} from "@codemirror/language";
+import { bracketMatching, HighlightStyle, indentOnInput, indentUnit, syntaxHighlighting } from "@codemirror/language";
 import { linter, lintGutter, lintKeymap, type Diagnostic } from "@codemirror/lint";
 import { unifiedMergeView } from "@codemirror/merge";
 import { highlightSelectionMatches, searchKeymap } from "@codemirror/search";
 import { EditorState, Prec, StateEffect, type Extension } from "@codemirror/state";
-import {
-  drawSelection,
-  EditorView,
-  highlightActiveLine,
-  highlightActiveLineGutter,
-  keymap,
-  lineNumbers,
-  tooltips,
-} from "@codemirror/view";
+import { drawSelection, EditorView, highlightActiveLine, highlightActiveLineGutter, keymap, lineNumbers, tooltips } from "@codemirror/view";
 import { tags } from "@lezer/highlight";
 import type { Scripting } from "../../shared/api/movement-library";
 import type { Place } from "./model/text-offsets";
@@ -62,7 +45,7 @@ const theme = EditorView.theme({
   },
   ".cm-completionInfo": { maxWidth: "min(26rem, 80vw)", padding: "0.5rem 0.7rem", whiteSpace: "pre-wrap" },
   ".cm-completionDetail": { fontStyle: "normal", opacity: "1" },
-  // In the place of pictures that the library has as text with a style of their own, which the page's policy forbids.
+  // Replaces the library's images with inline styles, which the page's policy forbids.
   ".cm-lintRange": { backgroundImage: "none !important" },
   ".cm-lintRange-error": { textDecoration: "underline wavy var(--bad)" },
   ".cm-lintRange-warning": { textDecoration: "underline wavy var(--warn)" },
@@ -95,7 +78,7 @@ const colours = HighlightStyle.define([
   { tag: tags.invalid, color: "var(--bad)" },
 ]);
 
-/** What both an editor and a comparison have. */
+/** Shared by the editor and the comparison. */
 const shared: Extension = [
   lineNumbers(),
   python(),
@@ -104,18 +87,17 @@ const shared: Extension = [
   EditorView.lineWrapping,
 ];
 
-export interface CodeEditorOptions {
+interface CodeEditorOptions {
   text: string;
   label: string;
   described: string;
-  /** What may be used; `null` while that is not known. */
+  /** The available functions and names; `null` until loaded. */
   scripting: () => Scripting | null;
   parameters: () => readonly string[];
-  /** What is wrong with a text. */
   check: (text: string) => Promise<readonly Place[]>;
   onChange: (text: string) => void;
   onSave: () => void;
-  /** Escape, where nothing else wanted it. */
+  /** Called for Escape if no other handler used it. */
   onLeave: () => void;
 }
 
@@ -162,7 +144,7 @@ export class CodeEditor {
             if (update.docChanged) options.onChange(update.state.doc.toString());
           }),
           Prec.high(keymap.of([{ key: "Mod-s", run: save, preventDefault: true }])),
-          // Tab is not among them: it leads on to the next control, as everywhere.
+          // Not Tab: it moves the focus, as on the rest of the page.
           keymap.of([
             ...closeBracketsKeymap,
             ...completionKeymap,
@@ -181,12 +163,11 @@ export class CodeEditor {
     return this.#view.state.doc.toString();
   }
 
-  /** Put another text in the place of this one; it can be undone. */
+  /** Replaces the text; can be undone. */
   replace(text: string): void {
     this.#view.dispatch({ changes: { from: 0, to: this.#view.state.doc.length, insert: text } });
   }
 
-  /** Check again, without a change of the text. */
   checkAgain(): void {
     this.#view.dispatch({ effects: checkAgain.of(null) });
   }
@@ -206,7 +187,7 @@ export class CodeEditor {
   }
 }
 
-/** One text with what has changed since another; nothing can be written. */
+/** A read-only text with the changes since another one. */
 export class Comparison {
   readonly #view: EditorView;
 

@@ -8,7 +8,7 @@ import type { ScriptCall, ScriptParameter, Scripting } from "../../shared/api/mo
 const WORD = /[\w]*$/;
 const NAME = /^[^'"\n]*$/;
 
-/** `parameters`: names that the script's own `PARAMETERS` has just now. */
+/** `parameters`: the names in the script's current `PARAMETERS`. */
 export function complete(
   scripting: Scripting,
   context: CompletionContext,
@@ -25,7 +25,7 @@ export function complete(
   const owner = /(\w+)\.$/.exec(before)?.[1];
   if (owner !== undefined) return options(from, members(scripting, owner));
   if (/(^|\n)[ \t]*(from|import)[ \t]+$/.test(before)) return options(from, scripting.api.modules.map(moduleOption));
-  // Nothing is offered at an empty place unless it is asked for.
+  // At an empty place, completions need an explicit request.
   if (from === pos && !context.explicit) return null;
   const call = calledAround(scripting, state, node);
   return options(from, [...(call === null ? [] : call.parameters.flatMap(keyword)), ...globals(scripting)]);
@@ -71,7 +71,7 @@ function keyword(parameter: ScriptParameter): Completion[] {
   return [{ label: parameter.name, apply: `${parameter.name}=`, type: "property", detail, boost: 3 }];
 }
 
-/** Names of the robot type's joints, postures …, where a call takes them; names of parameters. */
+/** Completions inside strings: joints, postures and other names, and parameter names. */
 function inString(
   scripting: Scripting,
   state: EditorState,
@@ -94,11 +94,11 @@ function inString(
 
 interface Around {
   parameters: readonly ScriptParameter[];
-  /** The one that is being written; `undefined` where that cannot be said. */
+  /** The argument at the cursor; `undefined` if unknown. */
   argument: ScriptParameter | undefined;
 }
 
-/** The call of the jail's in whose parentheses a place is. */
+/** The sandbox function whose parentheses contain a position. */
 function calledAround({ api }: Scripting, state: EditorState, node: SyntaxNode): Around | null {
   const list = within(node, "ArgList");
   const called = list?.parent?.firstChild;
@@ -135,7 +135,6 @@ function argumentAt(
 function within(node: SyntaxNode, name: string): SyntaxNode | null {
   for (let at: SyntaxNode | null = node; at !== null; at = at.parent) {
     if (at.name === name) return at;
-    // Another call, or another statement, is in between.
     if (at.name === "Body" || at.name === "Script") return null;
   }
   return null;

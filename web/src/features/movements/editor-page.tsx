@@ -1,4 +1,4 @@
-/** One movement: its script, what is wrong with it, its versions, and running it. */
+/** One movement: its script, errors, versions and runs. */
 import type { Account } from "../../shared/api/types";
 import { useDeviceSessions } from "../devices";
 import type { DeviceSession, Fleet } from "../devices/model";
@@ -82,7 +82,7 @@ export function EditorPage({ api, fleet, account, robotType, name }: EditorPageP
   );
 }
 
-/** Offered as long as its script is exactly what the keyframe editor would write. */
+/** A link to the keyframe editor, for scripts that it wrote. */
 function AsKeyframes({ script }: { script: ScriptDraft }) {
   const saved = script.base.value?.source;
   if (saved === undefined || script.changed.value || readScript(saved).kind !== "keyframes") return null;
@@ -111,7 +111,7 @@ function Desk({ api, fleet, account, script, sessions, chosen, onChoose }: DeskP
   const [checked, setChecked] = useState<{ of: string; found: Checked } | null>(null);
   const base = script.base.value;
   const unsaved = script.changed.value;
-  // While it is written its own PARAMETERS count, as far as they can be read.
+  // Use the unsaved script's PARAMETERS if they are valid.
   const schema = unsaved && checked?.found.savable === true ? checked.found.parameters_schema : (base?.parameters_schema ?? null);
   return (
     <div class="desk">
@@ -172,7 +172,7 @@ function Code({ api, fleet, script, sessions, checked, onChecked }: CodeProps) {
     let scripting: Scripting | null = null;
     void api.library.scripting(script.robotType).then((found) => {
       scripting = { ...found, names: { ...found.names, devices: deviceNames(fleet) } };
-    }, () => undefined); // Then there is no completion; the check says that the server is away.
+    }, () => undefined); // Without them there is no completion; the check reports an unreachable server.
     const made = new CodeEditor(host.current, {
       text: script.text.value,
       label: texts.editor.label(script.name),
@@ -203,7 +203,7 @@ function Code({ api, fleet, script, sessions, checked, onChecked }: CodeProps) {
     };
   }, [api, fleet, script]);
 
-  // What was put in its place from elsewhere: another version, what was saved.
+  // Text replaced by the model: another version, or the saved one.
   useSignalEffect(() => {
     const text = script.text.value;
     if (editor.current !== null && editor.current.text !== text) editor.current.replace(text);
@@ -268,7 +268,7 @@ function SaveState({ script }: { script: ScriptDraft }) {
   );
 }
 
-/** The text that this browser has kept is shown again; going back from it can be undone in turn. */
+/** A notice that unsaved text was restored, with a button to discard it. */
 function Restored({ script }: { script: ScriptDraft }) {
   const [given, setGiven] = useState<string | null>(null);
   const at = script.restored.value;

@@ -94,7 +94,7 @@ async function read(api: Api): Promise<Shelf[]> {
   return Promise.all(types.map(async (type) => ({ type, movements: await api.library.list(type.type) })));
 }
 
-/** Types one has robots of first. */
+/** Types of own robots first. */
 function sorted(shelves: readonly Shelf[], owned: ReadonlySet<string>): Shelf[] {
   const rank = ({ type }: Shelf): number => (owned.has(type.type) ? 0 : 1);
   return shelves.toSorted((a, b) => rank(a) - rank(b) || a.type.label.localeCompare(b.type.label));
@@ -153,7 +153,6 @@ function TypeShelf({ api, shelf, onRemoved }: TypeShelfProps) {
   );
 }
 
-/** Where a new movement begins: it is there once it is saved. */
 function NewMovement({ shelves }: { shelves: readonly Shelf[] }) {
   const id = useId();
   const [type, setType] = useState(shelves[0]?.type.type ?? "");

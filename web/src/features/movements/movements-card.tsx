@@ -1,4 +1,4 @@
-/** The movements that one robot can run, each with its parameters, on the robot's own page. */
+/** The movements that a robot can run, with their parameters. */
 import { type ActionRunner, ended } from "../actions/model";
 import type { Control } from "../control/model";
 import type { DeviceStore } from "../devices/model";
@@ -69,7 +69,7 @@ export function MovementsCard({ api, device, control, actions, account }: Moveme
               movement={movement}
               robotType={robotType}
               account={account}
-              // The library is its owner's.
+              // Only the owner can open the library.
               address={owner.id === account ? movementAddress(robotType, movement.name) : null}
               blocked={blocked}
               open={open === movement.name}
@@ -97,7 +97,7 @@ interface RowProps {
 function Row({ movement, robotType, account, address, blocked, open, onOpen, onRun }: RowProps) {
   const { name, description, built_in: builtIn, parameters_schema: schema } = movement;
   const takes = Object.keys(schema?.properties ?? {}).length > 0;
-  // What has to be given cannot be left to the script.
+  // Required parameters have no default.
   const must = (schema?.required ?? []).length > 0;
   return (
     <li class={open ? "open" : ""}>

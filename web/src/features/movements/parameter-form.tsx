@@ -6,18 +6,18 @@ import { fieldsOf, fill, read, type Field, type Filled, type Wrong } from "./mod
 import { texts } from "./texts";
 import { storage } from "../../shared/hooks/browser-storage";
 
-export interface ParameterValues {
+interface ParameterValues {
   fields: readonly Field[];
   filled: Filled;
   wrong: Readonly<Record<string, Wrong>>;
   set: (name: string, text: string) => void;
-  /** Back to the defaults. */
+  /** Restores the defaults. */
   reset: () => void;
-  /** What to run with, and kept for the next time; `null` where something is wrong, which is said from then on. */
+  /** Returns the values and stores them as last used; `null` if one is invalid, which is shown from then on. */
   take: () => Parameters | null;
 }
 
-/** The values for one movement, beginning with those that were used last here. */
+/** The parameter values of one movement, initially those used last. */
 export function useParameters(
   account: string,
   robotType: string,
@@ -30,7 +30,6 @@ export function useParameters(
   const [typed, setTyped] = useState<Filled>({});
   const [asked, setAsked] = useState(false);
   const start = useMemo(() => fill(fields, kept.read() ?? {}), [fields, kept]);
-  // What was typed into fields that are there no more does no harm.
   const filled = { ...start, ...typed };
   const { values, wrong } = read(fields, filled);
   return {

@@ -1,4 +1,4 @@
-/** One movement on many robots at once: who takes part, and what becomes of each. */
+/** Runs one movement on several robots, and shows each run. */
 import type { Account } from "../../shared/api/types";
 import { RunSteps } from "../actions";
 import { ended } from "../actions/model";
@@ -15,7 +15,7 @@ import { texts } from "./texts";
 import { deviceAddress } from "../../shared/routing/routes";
 import { ParameterFields, useParameters } from "./parameter-form";
 
-/** The account's robots of a type: what its library has runs on them. On others' robots their owners' movements run. */
+/** The account's own robots of a type. Shared robots run their owners' movements. */
 export function robotsOf(fleet: Fleet, robotType: string, account: string): { own: DeviceStore[]; others: DeviceStore[] } {
   const all = [...(fleet.devices.value?.values() ?? [])].filter(
     ({ info }) => info.value.robot_type === robotType && info.value.role !== "viewer",
@@ -70,9 +70,9 @@ interface RunPanelProps {
   sessions: readonly DeviceSession[];
   chosen: readonly string[];
   onChoose: (chosen: readonly string[]) => void;
-  /** Whether the text has to be saved first; it says why it cannot be run otherwise. */
+  /** Whether the text must be saved before running. */
   unsaved: boolean;
-  /** Saves what is not saved; whether it is saved now. */
+  /** Saves the text; returns whether it is saved. */
   beforeRun: () => Promise<boolean>;
 }
 
@@ -85,7 +85,7 @@ export function RunPanel(props: RunPanelProps) {
   const running = asking || sessions.some(({ actions }) => isRunning(actions.run.value));
   const here = own.map(({ id }) => id).join(" ");
 
-  // One that is gone is chosen no more. None is chosen by itself: from then on Escape is a Stop, also while one writes.
+  // Deselect removed robots. No robot is preselected: with a selection, Escape is Stop even in the editor.
   useEffect(() => {
     const ids = here.split(" ");
     const next = chosen.filter((id) => ids.includes(id));
@@ -164,7 +164,7 @@ export function RunPanel(props: RunPanelProps) {
   );
 }
 
-/** One call for all of them; each session follows its own action. */
+/** One call starts all; each session follows its own action. */
 async function start(api: Api, sessions: readonly DeviceSession[], movement: string, parameters: Parameters): Promise<void> {
   const request = { kind: "run_movement", name: movement, parameters } as const;
   const epochs = Object.fromEntries(

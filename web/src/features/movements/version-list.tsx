@@ -8,7 +8,7 @@ import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { Comparison } from "./code-editor";
 
-/** Two texts, the newer with what has changed in it. */
+/** Two texts with their differences. */
 export function ScriptDiff({ before, after, label }: { before: string; after: string; label: string }) {
   const host = useRef<HTMLDivElement>(null);
   useEffect(() => {
@@ -23,7 +23,7 @@ interface VersionsProps {
   api: Api;
   robotType: string;
   name: string;
-  /** The newest that this page knows: the list is asked for anew when it changes. */
+  /** The newest known version; the list is reloaded when it changes. */
   newest: number;
   text: string;
   onRestore: (source: string) => Promise<void>;

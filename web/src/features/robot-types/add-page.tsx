@@ -1,4 +1,4 @@
-/** Adding a robot type: choose its files, look at what they are, save. */
+/** Adds a robot type: choose files, preview, save. */
 import { Card } from "../../shared/ui/card";
 import { useEffect, useMemo } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
@@ -41,7 +41,7 @@ export function AddRobotTypePage({ api }: { api: Api }) {
   );
 }
 
-/** What is under way, with how long it has taken. */
+/** The running step and its duration. */
 function Progress({ draft }: { draft: UploadDraft }) {
   const step = draft.step.value;
   const words = texts.adding;

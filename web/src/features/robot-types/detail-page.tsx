@@ -1,4 +1,4 @@
-/** One robot type: what every robot of it has in common. */
+/** One robot type. */
 import type { Device } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";

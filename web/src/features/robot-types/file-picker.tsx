@@ -31,7 +31,7 @@ export function FilePicker({ draft }: { draft: UploadDraft }) {
   };
   const input = (event: { currentTarget: HTMLInputElement }): void => {
     void take(Promise.resolve(filesFromPicker(event.currentTarget.files)));
-    // The same file may be chosen again once it has been mended.
+    // Allows choosing the same file again after a correction.
     event.currentTarget.value = "";
   };
   return (

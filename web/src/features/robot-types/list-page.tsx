@@ -1,4 +1,4 @@
-/** All robot types that one may see. */
+/** All robot types that the account can access. */
 import type { Fleet } from "../devices/model";
 import { PageExplainer } from "../help";
 import { useCallback } from "preact/hooks";

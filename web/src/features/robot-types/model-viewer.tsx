@@ -13,7 +13,7 @@ interface ModelViewProps {
   joints: readonly Joint[];
 }
 
-/** The nearest to zero that the limits allow. */
+/** The permitted position nearest to zero. */
 function atRest(joint: Joint): number {
   return Math.min(joint.upper_rad, Math.max(joint.lower_rad, 0));
 }

@@ -7,7 +7,7 @@ export class ArchiveError extends Error {
   override name = "ArchiveError";
 }
 
-/** All files by their path; archives among them are unpacked. Throws `ArchiveError` with the archive's name. */
+/** All files by path, with archives unpacked. Throws `ArchiveError` with the archive's name. */
 export async function readFiles(chosen: readonly (readonly [string, File])[]): Promise<Map<string, Uint8Array>> {
   const found = new Map<string, Uint8Array>();
   for (const [path, file] of chosen) {
@@ -21,12 +21,12 @@ export async function readFiles(chosen: readonly (readonly [string, File])[]): P
   return found;
 }
 
-/** Of an `<input>`: a folder's files have a path. */
+/** The files of an `<input>`, with their paths. */
 export function filesFromPicker(list: FileList | null): [string, File][] {
   return [...(list ?? [])].map((file) => [file.webkitRelativePath === "" ? file.name : file.webkitRelativePath, file]);
 }
 
-/** What was dropped, folders with all that is in them. */
+/** The dropped files and folders. */
 export async function filesFromDrop(data: DataTransfer): Promise<[string, File][]> {
   const entries = [...data.items].map((item) => item.webkitGetAsEntry()).filter((entry) => entry !== null);
   if (entries.length === 0) return filesFromPicker(data.files);
@@ -42,7 +42,7 @@ async function inside(entry: FileSystemEntry): Promise<[string, File][]> {
   const reader = (entry as FileSystemDirectoryEntry).createReader();
   const found: [string, File][] = [];
   for (;;) {
-    // A reader gives some at a time, and nothing at the end.
+    // The reader returns batches, and an empty one at the end.
     const some = await new Promise<FileSystemEntry[]>((resolve, reject) => reader.readEntries(resolve, reject));
     if (some.length === 0) return found;
     found.push(...(await Promise.all(some.map((each) => inside(each)))).flat());

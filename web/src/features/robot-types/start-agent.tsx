@@ -1,4 +1,4 @@
-/** The next step after adding a robot type: start an agent with such a robot. */
+/** The next step after adding a robot type: start an agent. */
 import { AgentCommands } from "../help";
 import { Card } from "../../shared/ui/card";
 import { texts } from "./texts";

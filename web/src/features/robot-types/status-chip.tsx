@@ -1,7 +1,7 @@
 import type { RobotType } from "../../shared/api/robot-types";
 import { texts } from "./texts";
 
-/** Whether a type can be used, and how its newest upload fares. */
+/** Whether a type can be used, and the state of its newest upload. */
 export function StatusChip({ type }: { type: RobotType }) {
   const newer = type.upload !== null && type.upload.version !== type.version ? type.upload : null;
   return (

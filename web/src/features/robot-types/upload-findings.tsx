@@ -1,4 +1,4 @@
-/** What the checkers have found in an upload. */
+/** Findings of an upload. */
 import { Card } from "../../shared/ui/card";
 import { degrees } from "../../shared/lib/angles";
 import type { RobotType, TypeModel } from "../../shared/api/robot-types";

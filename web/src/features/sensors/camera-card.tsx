@@ -15,23 +15,22 @@ import "./sensors.css";
 
 /** Without a frame for this long, the image is not live [ms]; for a slow camera, three periods. */
 const STALLED_MS = 2_000;
-/** Over which the rate is counted [ms]. */
+/** Averaging time of the frame rate [ms]. */
 const RATE_OVER_MS = 3_000;
 
 interface Shown {
   kind: "live" | "still";
   width: number;
   height: number;
-  /** When it came, on the page's clock [ms]. */
+  /** Arrival time on the page's clock [ms]. */
   at: number;
 }
 
 interface CameraCardProps {
   device: DeviceStore;
   name: string;
-  /** What takes a single picture; `null` where the device cannot. */
+  /** Takes single pictures; `null` if unsupported. */
   roomAction: RoomDeviceAction | null;
-  /** Instead of the camera's name; `aside`: beside it. */
   title?: string;
   aside?: ComponentChildren;
 }

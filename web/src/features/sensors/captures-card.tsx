@@ -10,7 +10,7 @@ import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 
-/** Captures that are taken and shown by a card of their own. */
+/** Captures with a card of their own. */
 const SHOWN_ELSEWHERE = ["image", "depth", "scan"];
 
 interface FilesProps {
@@ -18,7 +18,7 @@ interface FilesProps {
   roomAction: RoomDeviceAction;
 }
 
-/** What was captured, by whomever, to take home. */
+/** Captured files, with download links. */
 export function CapturesCard({ device, roomAction }: FilesProps) {
   const uploads = roomAction.uploads.value;
   const more = (device.description.value?.captures ?? []).filter((name) => !SHOWN_ELSEWHERE.includes(name));
@@ -63,14 +63,14 @@ export function CapturesCard({ device, roomAction }: FilesProps) {
 function File({ upload, roomAction }: { upload: Upload; roomAction: RoomDeviceAction }) {
   const name = upload.name === "" ? upload.stream : upload.name;
   const download = async (): Promise<void> => {
-    // Its address lasts for an hour, so it is made when it is wanted.
+    // The address is valid for one hour, so request it on demand.
     const found = await roomAction.find(upload.id);
     if (found === null) return;
     const link = document.createElement("a");
     link.href = found.url;
     link.download = name;
     link.rel = "noopener";
-    // Where the store is on another site, `download` counts for nothing: this page must stay.
+    // For a store on another origin, browsers ignore `download`: keep this page open.
     link.target = "_blank";
     link.click();
   };

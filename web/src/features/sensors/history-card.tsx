@@ -20,7 +20,7 @@ const POINTS = 400;
 const AGAIN_MS = 30_000;
 const FAR = 10;
 
-/** What was stored in this span and what has come since. `loads` rises with each answer of the cloud. */
+/** Stored and live samples of a time span. `loads` increases with each response. */
 export function useRecording(api: Api, device: DeviceStore, { stream, field }: Quantity, spanMs: number) {
   const recording = useMemo(() => new Recording(), [device, stream, field]);
   const [trouble, setTrouble] = useState("");
@@ -44,7 +44,7 @@ export function useRecording(api: Api, device: DeviceStore, { stream, field }: Q
           setLoads((count) => count + 1);
         },
         (error: unknown) => {
-          // Nothing of this stream has been stored yet.
+          // Nothing is stored yet.
           const unknown = error instanceof ApiError && error.status === 404;
           if (wanted && !unknown) setTrouble(sentence(error));
         },
@@ -66,7 +66,7 @@ interface HistoryProps {
   spanMs: number;
   binary: boolean;
   old: boolean;
-  /** Details of a point. With it the plot can be read point by point, by keyboard or pointer. */
+  /** With these, the plot can be read point by point, by keyboard or pointer. */
   marks?: Omit<Marks, "cursor">;
 }
 
@@ -77,7 +77,7 @@ export function HistoryCard({ recording, quantity, spanMs, binary, old, marks }:
   const [failed, setFailed] = useState(false);
   const [repaint, setRepaint] = useState(0);
   const [reading, setReading] = useState("");
-  /** Where the reader is [s since 1970]; `null`: nowhere. */
+  /** Cursor position [s since 1970]; `null`: none. */
   const cursor = useRef<number | null>(null);
   const drawn = useRef<{ columns: Columns; chart: SeriesChart | null; draw: () => void }>({
     columns: [[], [], [], []],

@@ -101,7 +101,7 @@ export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAct
   );
 }
 
-/** `range_m.0`, `range_m.1` …: the nearest thing in each sector, the first beginning at the lidar's x axis. */
+/** `range_m.0`, `range_m.1` …: the nearest distance in each sector, counted from the x axis. */
 function sectorsOf(values: Values): number[] {
   const found: number[] = [];
   for (let index = 0; typeof values[`range_m.${index}`] === "number"; index += 1) found.push(Number(values[`range_m.${index}`]));
@@ -123,7 +123,7 @@ function draw(context: CanvasRenderingContext2D, width: number, height: number, 
   context.fillStyle = colour("--series-1");
   context.strokeStyle = colour("--series-1");
   sectors.forEach((m, index) => {
-    // On a canvas angles run clockwise from the right; here counter-clockwise from the top.
+    // Canvas angles run clockwise from the right; these counter-clockwise from the top.
     const [from, to] = [-Math.PI / 2 - (index + 1) * wide, -Math.PI / 2 - index * wide];
     context.globalAlpha = 0.12;
     context.beginPath();
@@ -145,7 +145,7 @@ function draw(context: CanvasRenderingContext2D, width: number, height: number, 
   context.fill();
 }
 
-/** A place to the right of and above the lidar [m]. */
+/** A point right of and above the lidar [m]. */
 function spot(angle: number, m: number): readonly [number, number] {
   return [-Math.sin(angle) * m, Math.cos(angle) * m];
 }
@@ -155,7 +155,7 @@ function paintRings(context: CanvasRenderingContext2D, x: number, y: number, rin
   context.fillStyle = colour("--quiet");
   context.lineWidth = 1;
   context.font = `${LABEL_PX}px system-ui, sans-serif`;
-  // Every metre, but for what would stand too close to be read.
+  // Every metre, unless the labels would overlap.
   const every = Math.max(1, Math.ceil(26 / scale));
   for (let ring = 1; ring <= rings; ring += 1) {
     context.globalAlpha = 0.35;

@@ -23,7 +23,7 @@ interface GatherProps {
   roomAction: RoomDeviceAction;
 }
 
-/** Measuring at another rate for a while, and measuring once. */
+/** Collects data at a chosen rate, or measures once. */
 export function CollectDataCard({ device, roomAction }: GatherProps) {
   const own = Math.max(...(device.description.value?.streams ?? []).map(({ rate_hz: rate }) => rate), LEAST_HZ);
   const [rate, setRate] = useState(String(Math.min(MOST_HZ, Math.max(1, own * 2))));
@@ -103,7 +103,7 @@ export function CollectDataCard({ device, roomAction }: GatherProps) {
   );
 }
 
-/** How often each stream really comes. */
+/** The actual rate of each stream. */
 function Paces({ device }: { device: DeviceStore }) {
   const paces = (device.description.value?.streams ?? []).flatMap(({ name }) => {
     const everyMs = device.measured(name).value?.everyMs ?? null;

@@ -14,9 +14,9 @@ import { texts } from "./texts";
 import { HistoryCard, useRecording } from "./history-card";
 import "./sensors.css";
 
-/** More values than this are a table. */
+/** More values are shown as a table. */
 const MOST_CARDS = 4;
-/** What can be set goes by the names of its controls. */
+/** The stream with the values of the controls. */
 const SETTINGS = "settings";
 
 type Span = keyof typeof texts.room.spans;
@@ -54,7 +54,7 @@ export function ReadingsCard({ api, device, stream }: ReadingsProps) {
   );
 }
 
-/** The only value of a stream is what the room calls the stream. */
+/** A stream's only value has the stream's label. */
 function named(quantities: Quantity[]): Quantity[] {
   const [only] = quantities;
   if (quantities.length !== 1 || only === undefined || only.judged === null || only.stream === SETTINGS) return quantities;
@@ -192,7 +192,7 @@ function cell(quantity: Quantity, value: number | boolean): string {
   return `${shown(quantity, value)} ${quantity.unit}`.trim();
 }
 
-/** Three figures that say something; what is whole stays whole. */
+/** Three significant digits; integers unchanged. */
 export function shown(quantity: Quantity, value: number): string {
   const converted = quantity.shown(value);
   if (Number.isInteger(converted)) return String(converted);

@@ -17,7 +17,7 @@ import { LidarCard } from "./lidar-card";
 import { SettingsCard } from "./settings-card";
 import "./sensors.css";
 
-/** What has a card of its own. */
+/** A capture with its own card. */
 const IMAGE = "image";
 const DEPTH = "depth";
 const SCAN = "scan";
@@ -30,7 +30,7 @@ interface RoomDeskProps {
   api: Api;
   fleet: Fleet;
   session: DeviceSession;
-  /** Who has access to it. */
+  /** The access list. */
   access: ComponentChildren;
 }
 
@@ -54,7 +54,7 @@ export function RoomDevicePage({ api, fleet, session, access }: RoomDeskProps) {
         {description.cameras.map(({ name }) => (
           <CameraCard key={name} device={device} name={name} roomAction={has(IMAGE) ? roomAction : null} />
         ))}
-        {/* Beside the picture that they change; without one they are what the page is for. */}
+        {/* Beside the camera image; without one, settings are the main content. */}
         {!pictured && settings}
         {has(DEPTH) && <DepthCard device={device} roomAction={roomAction} />}
         {(has(SCAN) || measures(description, RANGE)) && (

@@ -6,37 +6,37 @@ import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { colour } from "../../shared/ui/canvas-theme";
 
-/** What is drawn beside the line itself. */
+/** Additional drawings. */
 export interface Marks {
-  /** Where values usually are, in the unit shown. */
+  /** The usual range in the displayed unit. */
   usual: readonly [low: number, high: number] | null;
-  /** Faults, on the time axis [s since 1970]; `to` null: still open. */
+  /** Faults on the time axis [s since 1970]; `to` null: open. */
   faults: readonly { from: number; to: number | null; severity: "info" | "warning" | "error" }[];
-  /** Where the reader's cursor is [s since 1970]. */
+  /** Cursor position [s since 1970]. */
   cursor: number | null;
 }
 
 export interface SeriesChart {
-  /** Times [s since 1970]; columns: means, lows, highs. */
+  /** Times [s since 1970]; columns: means, minima, maxima. */
   draw(from: number, to: number, times: number[], columns: (number | null)[][], marks?: Marks): void;
-  /** The time at a place of the page [s since 1970]. */
+  /** The time at a page coordinate [s since 1970]. */
   timeAt(clientX: number): number;
   dispose(): void;
 }
 
 interface Options {
   quantity: Quantity;
-  /** A state: 1 is the first of its two words. */
+  /** A boolean state: 1 is the first of its two labels. */
   binary: boolean;
   colour: string;
 }
 
 /** Shows a limit unless it would compress the measured range too much. */
 const LIMIT_WITHIN = 12;
-/** Of the value: smaller changes are noise, and are drawn as what they are. */
+/** Smaller changes, relative to the value, are noise and drawn as a flat line. */
 const SMALLEST_SHARE = 0.02;
 const UNMARKED: Marks = { usual: null, faults: [], cursor: null };
-/** Of the strip at the bottom that shows when there was a fault [px]. */
+/** Height of the fault strip [px]. */
 const STRIP_PX = 6;
 
 export function createSeriesChart(box: HTMLElement, { quantity, binary, colour: line }: Options): SeriesChart {
@@ -96,7 +96,7 @@ export function createSeriesChart(box: HTMLElement, { quantity, binary, colour: 
   };
 }
 
-/** A state holds until it changes: the last one reaches to now. */
+/** Extends the last state to now. */
 function holding(to: number, times: number[], columns: (number | null)[][]): { times: number[]; columns: (number | null)[][] } {
   return { times: [...times, to], columns: columns.map((column) => [...column, column.at(-1) ?? null]) };
 }
@@ -178,7 +178,7 @@ function paintMarks(plot: uPlot, { usual, faults, cursor }: Marks): void {
 
 const SEVERITY_COLOUR = { info: "--accent", warning: "--warn", error: "--bad" } as const;
 
-/** Of an axis [px]: as much as its longest label takes, and as much as labels of three digits at least. */
+/** Width of an axis [px]: its longest label, and at least three digits. */
 function widest(values: readonly string[] | null): number {
   const longest = Math.max(0, ...(values ?? []).map((text) => text.length));
   return Math.max(66, 16 + longest * 7.5);

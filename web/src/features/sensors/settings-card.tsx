@@ -38,11 +38,11 @@ export function SettingsCard({ device, roomAction }: SettingsProps) {
   );
 }
 
-/** A control's value as it is read: shares in per cent, angles in degrees, with as many digits as a step deserves. */
+/** A control's value: shares in per cent, angles in degrees, with the digits of a step. */
 function textOf({ lower, upper }: Control, { unit, shown }: Quantity): (value: number) => string {
   const spread = shown(upper) - shown(lower);
   const places = spread > 50 ? 0 : spread > 5 ? 1 : 2;
-  // No minus before a nought.
+  // No negative zero.
   return (value) => `${(Number(shown(value).toFixed(places)) + 0).toFixed(places)} ${unit}`.trim();
 }
 
@@ -53,7 +53,7 @@ interface SettingProps extends SettingsProps {
 }
 
 function Setting({ device, roomAction, control, text, disabled }: SettingProps) {
-  /** While a hand is on it. */
+  /** While the slider is dragged. */
   const [held, setHeld] = useState<number | null>(null);
   const measured = device.measured(STREAM).value?.message.values[control.name];
   const late = device.late(STREAM);

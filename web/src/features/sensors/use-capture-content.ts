@@ -1,4 +1,4 @@
-/** The content of a captured file, for who draws it. */
+/** Loads the content of a captured file. */
 import type { Taken } from "./model/room-device-action";
 import { texts } from "./texts";
 

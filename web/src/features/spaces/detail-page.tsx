@@ -17,7 +17,7 @@ interface SpacePageProps {
   id: string;
 }
 
-/** One space: what stands in it, and who has access to it. */
+/** One space: its devices and its access list. */
 export function SpacePage({ api, fleet, account, id }: SpacePageProps) {
   const [space, setSpace] = useState<Space | null | undefined>(undefined);
   const [wrong, setWrong] = useState("");
@@ -35,7 +35,7 @@ export function SpacePage({ api, fleet, account, id }: SpacePageProps) {
     return () => {
       wanted = false;
     };
-    // Asked again when devices come or go: with a share that ended the space is gone too.
+    // Reload when devices change: the space may have been shared or unshared.
   }, [api, id, devices]);
 
   const inIt = [...(devices?.values() ?? [])].filter(({ info }) => info.value.space === id);

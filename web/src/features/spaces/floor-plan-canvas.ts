@@ -41,7 +41,7 @@ function paintFloor(
     for (let column = 0; column < floor.columns; column += 1) {
       context.fillStyle = fills[floor.cell(column, row)];
       const [left, top] = [x(floor.lowerXM + column * floor.sideM), y(floor.lowerYM + (row + 1) * floor.sideM)];
-      // A little more than its square: no line of the ground shines through between two.
+      // Slightly larger than the cell, to avoid visible gaps.
       context.fillRect(left, top, side + 0.6, side + 0.6);
     }
   }

@@ -1,12 +1,12 @@
-/** Puts the names on the plan where they cover nothing. Names change size with what they say, so they are measured. */
+/** Places labels on the plan without overlap. Their size depends on the text, so they are measured. */
 import type { RefObject } from "preact";
 import { useLayoutEffect, useRef } from "preact/hooks";
 import { type Box, placeLabels, type Placed } from "./model/label-placement";
 
-/** Of a mark, as of a pin [px]. */
+/** Size of a mark and of a pin [px]. */
 const MARK_PX = 24;
 
-/** `marks` and `pins`: middles in pixels of the box; the marks' elements have the class `who`, in the same order. */
+/** `marks` and `pins`: centres in pixels of the box; the marks' elements have the class `who`, in the same order. */
 export function useFloorPlanLabels(
   box: RefObject<HTMLElement | null>,
   marks: readonly (readonly [number, number])[],

@@ -68,7 +68,7 @@ export function Who({ places, devices, receivedAt, old }: WhoProps) {
   );
 }
 
-/** The numbers of the plan, with what each of them says now. */
+/** The numbered devices of the plan with their current values. */
 export function HungList({ hung }: { hung: readonly Hung[] }) {
   return (
     <>
@@ -88,7 +88,7 @@ export function HungList({ hung }: { hung: readonly Hung[] }) {
   );
 }
 
-/** What it measures: of a lidar the nearest thing, of others the first two values. */
+/** Current values: of a lidar the nearest distance, of others the first two. */
 function Says({ device }: { device: DeviceStore }) {
   const description = device.description.value;
   const stream = description?.streams[0]?.name;

@@ -1,4 +1,4 @@
-/** The floor of a room as its perception knows it: what is taken, who is where, and what hangs where. */
+/** The floor plan of a room: occupancy, robots, people and room devices. */
 import type { DeviceStore, Fleet } from "../devices/model";
 import { Age } from "../../shared/ui/age";
 import { Card } from "../../shared/ui/card";
@@ -23,7 +23,7 @@ export const RANGE = "range";
 
 const TRAIL_MS = 30_000;
 
-/** Whom no sensor has seen for this long is drawn as one whose place is old [s]. */
+/** A position that no sensor has seen for this long is shown as old [s]. */
 const UNSEEN_S = 2;
 
 const PIN_PX = 24;
@@ -31,7 +31,7 @@ const PIN_PX = 24;
 interface PlanProps {
   fleet: Fleet;
   space: string;
-  /** Whose frame it is: devices of one agent share it. */
+  /** The agent whose frame it uses: all devices of one agent share it. */
   agent: string;
 }
 
@@ -41,14 +41,14 @@ export interface Hung {
   number: number;
 }
 
-/** What one agent tells of its room now. */
-export interface Known {
+/** The current perception of one agent. */
+interface Known {
   devices: readonly DeviceStore[];
   perception: DeviceStore | null;
   hung: readonly Hung[];
   places: readonly Place[];
   floor: Floor | null;
-  /** `null` before anything has been told. */
+  /** `null` before the first data. */
   extent: Extent | null;
   old: boolean;
   receivedAt: number | null;
@@ -113,7 +113,7 @@ export function FloorPlan({ fleet, space, agent }: PlanProps) {
   );
 }
 
-/** Those that say where they are, in the order of the list. */
+/** Devices with a position, in list order. */
 function hungOf(devices: readonly DeviceStore[]): Hung[] {
   return devices
     .flatMap((device) => {
@@ -137,13 +137,12 @@ interface DrawingProps {
   places: readonly Place[];
   hung: readonly Hung[];
   devices: readonly DeviceStore[];
-  /** Whose positions leave a trail. */
+  /** The device whose positions have trails. */
   trails: DeviceStore | null;
   old: boolean;
   receivedAt: number | null;
-  /** The requested goal. */
   target?: { xM: number; yM: number; yawRad: number | null } | null;
-  /** Called with the place that was pointed at; nothing on the plan is a link then. */
+  /** Called with the selected place; disables the links on the plan. */
   onPick?: (xM: number, yM: number) => void;
 }
 
@@ -180,7 +179,7 @@ export function Drawing({ extent: room, floor, places, hung, devices, trails, ol
     const within = at.map(
       ([atX, atY]) => [Math.min(width - edge, Math.max(edge, atX)), Math.min(high * scale - edge, Math.max(edge, atY))] as const,
     );
-    // In shares of the box: at another size they are in the right place at once, and then moved apart anew.
+    // Relative to the box, so that positions stay correct after a resize.
     return apart(within, PIN_PX + 1, [width, high * scale]).map(([atX, atY]) => [atX / width, atY / (high * scale)] as const);
   }, [room, width, hung.map(({ device }) => device.id).join()]);
   const px = (share: number, of: number): number => (share * of * width) / wide;
@@ -235,7 +234,7 @@ export function Drawing({ extent: room, floor, places, hung, devices, trails, ol
         </span>
       )}
       {onPick !== undefined && (
-        // For who points. The same can be typed, so no key need find its way here.
+        // For pointer users. Keyboard users can type the position instead.
         <div
           class="plan-pick"
           aria-hidden="true"
@@ -263,7 +262,7 @@ interface MarkProps {
   receivedAt: number;
 }
 
-/** A disc with an arrow the way it goes. A robot's opens its page; a person has none. */
+/** A disc with a direction arrow. A robot's links to its page. */
 function Mark({ place, device, label, left, top, receivedAt, index }: MarkProps) {
   const ageS = place.ageS + Math.max(0, clock.value - receivedAt) / 1000;
   const unseen = ageS > UNSEEN_S;

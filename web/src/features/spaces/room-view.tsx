@@ -4,7 +4,7 @@ import { useEffect } from "preact/hooks";
 import { texts } from "./texts";
 import { FloorPlan } from "./floor-plan";
 
-/** A room: its plan, and its devices. */
+/** A room's plan and devices. */
 export function RoomView({ fleet, id }: { fleet: Fleet; id: string }) {
   const all = fleet.devices.value;
   const devices = [...(all?.values() ?? [])].filter(({ info }) => info.value.space === id);
@@ -12,10 +12,10 @@ export function RoomView({ fleet, id }: { fleet: Fleet; id: string }) {
   useEffect(() => {
     const ends = devices.map((device) => device.watchMeasurements());
     return () => ends.forEach((end) => end());
-    // By id: a new list of the same devices is no reason to ask for everything anew.
+    // By id: a new list of the same devices must not reload everything.
   }, [ids]);
   const agents = [...new Set(devices.map(({ info }) => info.value.agent))];
-  // An agent tells of a room where one of its devices says where it hangs, or who is where.
+  // Only agents with a device position or a `positions` stream have a plan.
   const drawn = agents.filter((agent) =>
     devices.some(({ info, description }) => {
       const told = description.value;

@@ -8,7 +8,7 @@ import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { spaceAddress } from "../../shared/routing/routes";
 
-/** The spaces that one may see, and making one. */
+/** The accessible spaces, and a form to create one. */
 export function SpaceList({ api, fleet }: { api: Api; fleet: Fleet }) {
   const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
   const [wrong, setWrong] = useState("");
@@ -21,7 +21,7 @@ export function SpaceList({ api, fleet }: { api: Api; fleet: Fleet }) {
       setWrong(texts.spaces.failed(sentence(error)));
     }
   };
-  // A device that came or went may have brought or taken a space.
+  // Reload when devices change: a space may have been added or removed.
   useEffect(() => void read(), [api, devices]);
   const count = (id: string): number =>
     [...(devices?.values() ?? [])].filter(({ info }) => info.value.space === id).length;

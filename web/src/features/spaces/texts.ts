@@ -19,7 +19,7 @@ export const texts = {
 
   plan: {
     title: "Floor plan",
-    /** For a robot or person on the plan whose name does not fit. */
+    /** Replaces a label that does not fit. */
     letter: (index: number): string => String.fromCharCode(65 + (index % 26)),
     empty: "No device in this room publishes positions. Add a room device of the kind “perception”.",
     waiting: "Waiting for data from the room…",

@@ -16,7 +16,7 @@ interface Frame {
   pose: Pose | undefined;
 }
 
-/** Position and rotation of every joint's frame in the robot's base, as the paper's application shows them. */
+/** Position and rotation of every joint's frame in the robot's base, as in the paper's application. */
 export function JointPoseTable({ device }: { device: DeviceStore }) {
   const [form, setForm] = useState<Form>("degrees");
   const [which, setWhich] = useState<Which>("told");
@@ -74,13 +74,13 @@ export function JointPoseTable({ device }: { device: DeviceStore }) {
   );
 }
 
-/** Those that the robot itself measures. */
+/** Frames that the robot measures. */
 function told(device: DeviceStore): Frame[] {
   const poses = device.telemetry.value?.message.frames ?? [];
   return (device.description.value?.frames ?? []).map((name, index) => ({ name, pose: poses[index] }));
 }
 
-/** Where each joint is by the robot's own drawing, with its joints as they were measured last. */
+/** Joint frames computed from the twin and the measured positions. */
 function reckoned(device: DeviceStore): Frame[] {
   const [twin, description] = [device.twin.value, device.description.value];
   const message = device.telemetry.value?.message;

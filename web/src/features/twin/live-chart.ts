@@ -1,14 +1,14 @@
-/** A line chart of the last seconds. Loaded only where one is looked at. */
+/** A line chart of the last seconds. Loaded on demand. */
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
 import { SPAN_MS } from "./model/recent-telemetry";
 import { common } from "../../shared/i18n/common";
 import { colour } from "../../shared/ui/canvas-theme";
 
-export interface Line {
+interface Line {
   label: string;
   colour: string;
-  /** What it stays within, in the plot's unit. */
+  /** The limits in the plot's unit. */
   limits: readonly [number, number];
 }
 
@@ -17,9 +17,9 @@ export interface Chart {
   dispose(): void;
 }
 
-/** A limit is shown where it does not make what is measured too small to be read: this many times its range away. */
+/** A limit is shown unless it is further away than this many times the measured range. */
 const LIMIT_WITHIN = 3;
-/** Ranges smaller than this are noise, and are drawn as what they are: a line. */
+/** Smaller ranges are noise and drawn as a flat line. */
 const SMALLEST_RANGE = 2;
 
 export function createChart(box: HTMLElement, lines: readonly Line[], unit: string): Chart {
@@ -61,7 +61,7 @@ export function createChart(box: HTMLElement, lines: readonly Line[], unit: stri
 }
 
 function padded(low: number | null, high: number | null, lines: readonly Line[]): [number, number] {
-  // Without a value there is nothing to fit; uPlot passes nulls then.
+  // Without a value uPlot passes nulls.
   const measured: [number, number] = [low ?? -1, high ?? 1];
   const reach = LIMIT_WITHIN * Math.max(SMALLEST_RANGE, measured[1] - measured[0]);
   let [from, to] = measured;
@@ -73,7 +73,7 @@ function padded(low: number | null, high: number | null, lines: readonly Line[])
   return [from - pad, to + pad];
 }
 
-/** Each joint's limits, dashed in its colour; those that several have in common once. */
+/** Each joint's limits, dashed in its colour; shared limits once. */
 function paintLimits(plot: uPlot, lines: readonly Line[]): void {
   const { ctx, bbox } = plot;
   const { min = NaN, max = NaN } = plot.scales["y"] ?? {};

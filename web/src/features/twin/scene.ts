@@ -1,27 +1,9 @@
-/** The robot in three dimensions. Loaded only where one is looked at; draws only when something has changed. */
+/** The 3D view of a robot. Loaded on demand; draws only after changes. */
 import type { Targets } from "../steering/model";
 import {
-  BoxGeometry,
-  type BufferGeometry,
-  CapsuleGeometry,
-  Color,
-  CylinderGeometry,
-  DirectionalLight,
-  Group,
-  GridHelper,
-  HemisphereLight,
-  Mesh,
-  MeshBasicMaterial,
-  MeshStandardMaterial,
-  type Material,
-  Object3D,
-  PerspectiveCamera,
-  PlaneGeometry,
-  Scene,
-  SphereGeometry,
-  SRGBColorSpace,
-  Vector3,
-  WebGLRenderer,
+  BoxGeometry, type BufferGeometry, CapsuleGeometry, Color, CylinderGeometry, DirectionalLight, Group, GridHelper,
+  HemisphereLight, Mesh, MeshBasicMaterial, MeshStandardMaterial, type Material, Object3D, PerspectiveCamera,
+  PlaneGeometry, Scene, SphereGeometry, SRGBColorSpace, Vector3, WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { radians } from "../../shared/lib/angles";
@@ -32,21 +14,20 @@ import type { Geometry } from "../../shared/mqtt/protocol.generated";
 import type { Vector3 as Vector } from "../../shared/lib/vectors";
 import { DrawSlot } from "../../shared/hooks/draw-scheduler";
 
-/** No WebGL in this browser. */
 export class NoWebglError extends Error {
   override name = "NoWebglError";
 }
 
 export interface LiveScene {
-  /** Show the measured pose, and the target's where it differs (`null`: no target). */
+  /** Shows the measured pose, and the target's if it differs (`null`: no target). */
   show(measured: Targets, target: Targets | null): void;
-  /** The page's colours have changed. */
+  /** Applies changed theme colours. */
   recolour(): void;
   resetView(): void;
   dispose(): void;
 }
 
-/** Closer to the measured pose than this the target would only hide it [rad]. */
+/** Closer to the measured pose than this, the target is not drawn [rad]. */
 const GHOST_FROM = 0.005;
 const GHOST_COLOUR = 0x2f8fe0;
 const GHOST_OPACITY = 0.28;
@@ -92,7 +73,7 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
     renderer.setSize(width, height, false);
     camera.aspect = width / height;
     camera.updateProjectionMatrix();
-    // The new size has emptied it.
+    // A resize clears the canvas.
     drawn = null;
     drawSoon();
   };
@@ -149,7 +130,7 @@ interface Shown {
   target: Targets | null;
 }
 
-/** The robot as it is, and the ghost of where it is to be. */
+/** The robot's measured pose and the ghost of its target. */
 function bothRobots(scene: Scene, twin: KnownTwin): { pose: (shown: Shown) => void } {
   const solid = build(scene, twin, solidMaterial);
   const ghostRoot = new Group();
@@ -175,12 +156,12 @@ function differs(measured: Targets, target: Targets): boolean {
   return Object.entries(target).some(([name, at]) => Math.abs(at - (measured[name] ?? at)) > GHOST_FROM);
 }
 
-/** How far the nearest part of the robot can be from the eye [m]. */
+/** Distance from the camera to the nearest part of the robot [m]. */
 function nearest(camera: PerspectiveCamera, centre: Vector3, reach: number): number {
   return Math.max(0.1, camera.position.distanceTo(centre) - reach);
 }
 
-/** Tells of another size, and of coming into sight and going. Returns what ends it. */
+/** Reports size changes and visibility. Returns a function that ends it. */
 function watchCanvas(canvas: HTMLCanvasElement, resized: () => void, sight: (seen: boolean) => void): () => void {
   const sizes = new ResizeObserver(resized);
   sizes.observe(canvas);
@@ -203,7 +184,7 @@ function solidMaterial(geometry: Geometry): Material {
   });
 }
 
-/** One object for each body, in the twin's order, parents holding their children. */
+/** One object for each body, in the twin's order, nested in its parent. */
 function build(
   root: Object3D,
   twin: KnownTwin,
@@ -229,7 +210,7 @@ function build(
   return bodies;
 }
 
-/** MuJoCo's sizes are half sizes, and its capsules and cylinders lie along z; those of three.js along y. */
+/** MuJoCo uses half sizes, and its capsules and cylinders lie along z; those of three.js along y. */
 function shape({ shape: kind, size_m: [a, b, c] }: Geometry): BufferGeometry {
   switch (kind) {
     case "box":
@@ -256,7 +237,7 @@ function pose(robot: Robot, twin: KnownTwin, positions: Targets): void {
   });
 }
 
-/** Indices of the bodies that some joint moves. */
+/** Indices of the bodies that move. */
 function moving(twin: KnownTwin): Set<number> {
   const found = new Set<number>();
   twin.bodies.forEach((body, index) => {
@@ -269,11 +250,11 @@ interface Frame {
   centre: Vector3;
   radius: number;
   floor: number;
-  /** The furthest that a part can be from a joint that carries it [m]. */
+  /** Maximum distance of a part from a joint that moves it [m]. */
   reach: number;
 }
 
-/** Where to look, so that the whole robot is in sight, also when it reaches out. */
+/** The camera position that shows the whole robot, also when stretched out. */
 function frame(twin: KnownTwin): Frame {
   const parts = moving(twin);
   const points = forward(twin, {}).flatMap(({ position_m, quaternion }, index) => {
@@ -283,19 +264,19 @@ function frame(twin: KnownTwin): Frame {
   });
   const base = points[0] ?? new Vector3();
   const reach = Math.max(0.2, ...points.map((point) => point.distanceTo(base)));
-  // A robot on legs has its base in the middle: what hangs below it is to be seen as well.
+  // A legged robot's base is in its middle: include the parts below it.
   const below = Math.min(0, ...points.map((point) => point.z - base.z));
   const planes = twin.bodies.flatMap((body) => body.geometries.filter(({ shape: kind }) => kind === "plane"));
   return {
     centre: base.clone().add(new Vector3(0, 0, reach * 0.32 + below * 0.6)),
     radius: reach * 0.95,
-    // Stretched out it is longer than it stands at home.
+    // Stretched out, it is longer than in its home pose.
     reach: 2 * reach,
     floor: planes[0]?.position_m[2] ?? 0,
   };
 }
 
-/** The two ends of a long shape, in its body; of another the middle twice. */
+/** The two ends of a long shape in its body; otherwise the centre twice. */
 function endsOf({ shape: kind, size_m, position_m, quaternion }: Geometry): Vector[] {
   const half = kind === "capsule" || kind === "cylinder" ? size_m[1] : 0;
   return [-half, half].map((along) => add(position_m, rotate(quaternion, [0, 0, along])));

@@ -12,7 +12,7 @@ import type { Chart } from "./live-chart";
 import { onColourChange, seriesColour } from "../../shared/ui/canvas-theme";
 
 const QUANTITIES: readonly Quantity[] = ["position_rad", "velocity_rad_s", "effort_nm"];
-/** Often enough to look alive, seldom enough to leave the sliders their time [ms]. */
+/** Frequent enough for live plots without slowing the sliders [ms]. */
 const DRAW_EVERY_MS = 66;
 
 export function TelemetryPlot({ device }: { device: DeviceStore }) {
@@ -62,7 +62,7 @@ export function TelemetryPlot({ device }: { device: DeviceStore }) {
       cancelAnimationFrame(asked);
       chart?.dispose();
     };
-    // `shown` is in `wanted`, by name: a new array with the same joints is no reason to build a new chart.
+    // `wanted` contains the joint names: a new array with the same joints must not rebuild the chart.
   }, [device, quantity, wanted, repaint]);
 
   const toggle = (name: string): void => {
@@ -109,7 +109,7 @@ function toDegrees(value: number | null): number | null {
   return value === null ? null : degrees(value);
 }
 
-/** What the robot keeps a joint within, by its description, in the plot's unit. */
+/** A joint's limits in the plot's unit. */
 function limitsOf(joint: Joint, quantity: Quantity): [number, number] {
   switch (quantity) {
     case "position_rad":

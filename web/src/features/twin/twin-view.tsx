@@ -33,7 +33,7 @@ export function TwinView({ device, control }: TwinViewProps) {
         data-frames="0"
         data-trouble={trouble ?? ""}
       >
-        {/* Keyed: a canvas whose context is gone cannot be drawn on again. */}
+        {/* Keyed: a canvas cannot be drawn on after its context is lost. */}
         <canvas key={twin} ref={canvas} aria-label={texts.view.label} role="img" />
         {twin === null && <p class="over quiet">{texts.view.waiting}</p>}
         {trouble !== null && <p class="over notice">{said}</p>}
@@ -44,7 +44,7 @@ export function TwinView({ device, control }: TwinViewProps) {
   );
 }
 
-/** Hands telemetry and targets to the scene, without drawing anything itself. */
+/** Passes telemetry and targets to the scene. */
 function Follow({ scene, device, control }: TwinViewProps & { scene: LiveScene }) {
   useSignalEffect(() => {
     const message = device.telemetry.value?.message;
@@ -52,7 +52,7 @@ function Follow({ scene, device, control }: TwinViewProps & { scene: LiveScene }
     if (message === undefined || joints === undefined) return;
     const measured: Record<string, number> = {};
     joints.forEach((joint, index) => (measured[joint.name] = message.position_rad[index] ?? 0));
-    // A velocity leads nowhere in particular: then there is no ghost.
+    // A velocity has no target and no ghost.
     scene.show(measured, control.streamer.value?.goal.value ?? null);
   });
   return null;

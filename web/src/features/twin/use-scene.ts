@@ -7,15 +7,15 @@ import { onColourChange } from "../../shared/ui/canvas-theme";
 
 interface SceneView {
   canvas: RefObject<HTMLCanvasElement | null>;
-  /** Told of every drawn frame: `data-frames`. */
+  /** The element with the frame counter `data-frames`. */
   box: RefObject<HTMLDivElement | null>;
   scene: LiveScene | null;
   trouble: "no-webgl" | "failed" | null;
-  /** The trouble in words; empty where there is none. */
+  /** The error, or "". */
   said: string;
 }
 
-/** A scene of a twin on a canvas, loaded when it is looked at. */
+/** A twin's scene on a canvas, loaded when visible. */
 export function useScene(twin: KnownTwin | null): SceneView {
   const canvas = useRef<HTMLCanvasElement>(null);
   const box = useRef<HTMLDivElement>(null);

@@ -1,29 +1,17 @@
 /** The union of all action requests. A device's description lists those it accepts. */
 import type {
-  CaptureRaw,
-  CollectData,
-  Drive,
-  Express,
-  GoTo,
-  LookAt,
-  MoveJoints,
-  MovePose,
-  RunBehaviour,
-  Say,
-  SetControl,
-  SetStiffness,
-  TakePicture,
-  TakePosture,
+  CaptureRaw, CollectData, Drive, Express, GoTo, LookAt, MoveJoints, MovePose, RunBehaviour, Say, SetControl,
+  SetStiffness, TakePicture, TakePosture,
 } from "../mqtt/protocol.generated";
 
 /** Runs a movement by name; the cloud adds the newest version of its script. */
-export interface RunMovementByName {
+interface RunMovementByName {
   kind: "run_movement";
   name: string;
   parameters?: Record<string, unknown>;
 }
 
-export type RobotRequest =
+type RobotRequest =
   | RunMovementByName
   | MoveJoints
   | MovePose

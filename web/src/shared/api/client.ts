@@ -6,16 +6,8 @@ import { Http, type Page } from "./http";
 import { Library, type Movement } from "./movement-library";
 import type { AnyRequest } from "./action-requests";
 import type {
-  ApiKey,
-  ApiKeyMade,
-  ApiKeyWanted,
-  AuditPage,
-  AuditQuery,
-  Invitation,
-  InvitationMade,
-  InvitationWanted,Share,
-  SharedRole,
-  Target
+  ApiKey, ApiKeyMade, ApiKeyWanted, AuditPage, AuditQuery, Invitation, InvitationMade, InvitationWanted, Share,
+  SharedRole, Target,
 } from "./sharing";
 import { RobotTypes } from "./robot-types";
 import { Transfers } from "./transfers";
@@ -302,6 +294,6 @@ function requests(device: string): string {
 }
 
 /** The path of a shared device or space. */
-export function at({ kind, id }: Target): string {
+function at({ kind, id }: Target): string {
   return `/${kind}s/${id}`;
 }

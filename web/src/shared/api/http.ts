@@ -25,7 +25,7 @@ export class ApiError extends Error {
 /** Timeout of one call, in addition to the server-side wait [ms]. */
 const TIMEOUT_MS = 10_000;
 
-export interface CallOptions {
+interface CallOptions {
   body?: unknown;
   /** Requested server-side wait [ms]. */
   waitMs?: number;

@@ -83,7 +83,7 @@ export interface ScriptCall {
   parameters?: ScriptParameter[];
 }
 
-export interface ScriptValue {
+interface ScriptValue {
   name: string;
   type: string;
   doc: string;
@@ -98,7 +98,7 @@ export interface Scripting {
 }
 
 /** The result for one device: its action, or the reason for a rejection. */
-export interface FleetItem {
+interface FleetItem {
   device: string;
   status: number;
   action: Action | null;

@@ -3,9 +3,9 @@ import type { Http } from "./http";
 import { readTwin, type KnownTwin } from "../mqtt/parse-messages";
 import type { Joint, MimicJoint, PositionDependentLimit } from "../mqtt/protocol.generated";
 
-export type TypeState = "checking" | "ready" | "rejected";
+type TypeState = "checking" | "ready" | "rejected";
 
-export interface TypeUpload {
+interface TypeUpload {
   version: number;
   state: TypeState;
   errors: string[];
@@ -53,7 +53,7 @@ export interface TypeModel {
   cameras: string[];
 }
 
-export interface TypeMovement {
+interface TypeMovement {
   name: string;
   description: string;
   version: number;

@@ -1,9 +1,6 @@
 /** Responses and parameters of the HTTP API. */
 import type { AckStatus, Reason } from "../mqtt/protocol.generated";
-import type {
-  Person,
-  Role
-} from "./sharing";
+import type { Person, Role } from "./sharing";
 
 export interface Account {
   id: string;

@@ -1,7 +1,7 @@
 /** Per-account data in this browser: unsaved text and last used values. */
 
 /** The interface of `localStorage`. If it is unavailable or full, values are not stored and no error occurs. */
-export type Store = Pick<Storage, "getItem" | "setItem" | "removeItem">;
+type Store = Pick<Storage, "getItem" | "setItem" | "removeItem">;
 
 export class StoredValue<T> {
   readonly #store: Store | null;

@@ -3,38 +3,14 @@
  * are accepted, so that the page can read messages of newer agents. The page draws validated data only.
  */
 import {
-  MAX_JOINTS, MessageError, anything, byName, count, fail, flag, list, nullable, number, numbers, object, oneOf, optional, place, text,
-  type Check,
+  MAX_JOINTS, MessageError, anything, byName, count, fail, flag, list, nullable, number, numbers, object, oneOf,
+  optional, place, text, type Check,
 } from "./checks";
 import type { Pose, Quaternion, Vector3 } from "../lib/vectors";
 import type {
-  Ack,
-  AckStatus,
-  ActionState,
-  BaseLimits,
-  Body,
-  Control,
-  Description,
-  Diagnostic,
-  Event,
-  Fault,
-  Geometry,
-  InterlockDescription,
-  Joint,
-  JointTelemetry,
-  LeaseState,
-  Measurements,
-  MimicJoint,
-  Mode,
-  PositionDependentLimit,
-  OpenRequest,
-  Presence,
-  Reason,
-  Restriction,
-  State,
-  StopLatch,
-  Stream,
-  TwinJoint,
+  Ack, AckStatus, ActionState, BaseLimits, Body, Control, Description, Diagnostic, Event, Fault, Geometry,
+  InterlockDescription, Joint, JointTelemetry, LeaseState, Measurements, MimicJoint, Mode, PositionDependentLimit,
+  OpenRequest, Presence, Reason, Restriction, State, StopLatch, Stream, TwinJoint,
 } from "./protocol.generated";
 
 /** Largest message of the contract [bytes]. */

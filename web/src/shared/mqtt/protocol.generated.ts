@@ -1,5 +1,5 @@
 // Generated from docs/asyncapi.json by `make contract`; do not edit.
-// Only types: what arrives is checked in messages.ts before anything else sees it. SI units and radians.
+// The types that the console uses. parse-messages.ts validates received messages. SI units and radians.
 
 /**
  * `conn`: whether the agent is connected to the broker. Retained, and the MQTT will.
@@ -380,88 +380,6 @@ export interface Reason {
   message: string;
 }
 
-/**
- * `cmd`: a request to a device; the body of `signing.Signed`.
- *
- * `space`, `agent` and `device` bind it to one device, `epoch` binds it to one lease. It runs at most once per
- * `id` and never after `issued_at_ms + ttl_ms` on the cloud's clock; the agent tracks the offset of that clock to
- * its own monotonic clock.
- */
-export interface Command {
-  /** letters, digits, _ and -, 1 to 64 of them */
-  id: string;
-  /** letters, digits, _ and -, 1 to 64 of them */
-  space: string;
-  /** letters, digits, _ and -, 1 to 64 of them */
-  agent: string;
-  /** letters, digits, _ and -, 1 to 64 of them */
-  device: string;
-  issued_at_ms: number;
-  ttl_ms: number;
-  caller: string;
-  epoch: number;
-  request: GrantLease | ReleaseLease | RequestControl | WithdrawRequest | RunMovement | MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo | CollectData | TakePicture | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop | RotateKey;
-}
-
-/**
- * `holder` has control for `lease_ms` from the time of arrival. Also renews a lease.
- *
- * `reason`: why control was taken from another operator; shown to that operator.
- */
-export interface GrantLease {
-  kind: "grant_lease";
-  holder: string;
-  lease_ms: number;
-  reason?: string;
-}
-
-/** Ends the lease; motion is brought to a hold. */
-export interface ReleaseLease {
-  kind: "release_lease";
-}
-
-/** Shows all viewers that `requester` asks for control. Changes nothing else and expires by itself. */
-export interface RequestControl {
-  kind: "ask_lease";
-  /** letters, digits, _ and -, 1 to 64 of them */
-  request: string;
-  requester: string;
-  answer_within_ms: number;
-}
-
-/** Removes a request for control that was refused or withdrawn. */
-export interface WithdrawRequest {
-  kind: "drop_request";
-  /** letters, digits, _ and -, 1 to 64 of them */
-  request: string;
-}
-
-/**
- * Runs one movement script. The source must hash to `sha256` (hex).
- *
- * Attributes:
- * author: Account that saved the movement, or `SHIPPED`. Versions are counted per author, and a device never
- * runs an older version than before.
- * key: Id of the cloud's key that signed the movement when it was saved.
- * signature: Signature over robot type, name, version and hash.
- * timeout_ms: The script is terminated after this time [ms].
- */
-export interface RunMovement {
-  kind: "run_movement";
-  /** letters, digits, _ and -, 1 to 64 of them */
-  robot_type: string;
-  /** letters, digits, _ and -, 1 to 64 of them */
-  name: string;
-  version: number;
-  sha256: string;
-  source: string;
-  parameters?: Record<string, unknown>;
-  author?: string;
-  key?: string;
-  signature?: string;
-  timeout_ms?: number;
-}
-
 /** Move to joint positions. `plan`: avoid obstacles. */
 export interface MoveJoints {
   kind: "move_joints";
@@ -586,39 +504,6 @@ export interface SetControl {
   value: number;
 }
 
-/** Cancel the named action; the device holds its position. */
-export interface CancelAction {
-  kind: "cancel_action";
-  /** letters, digits, _ and -, 1 to 64 of them */
-  action: string;
-}
-
-/** Latch Stop. */
-export interface StopDevice {
-  kind: "stop_device";
-  reason?: string;
-}
-
-/**
- * Reset the Stop latch. Motion does not resume.
- *
- * The command carries an epoch of its own, which ends with it. The device therefore rejects commands issued before the
- * reset, and a delayed or repeated reset is older than a newer latch.
- */
-export interface ResetStop {
-  kind: "reset_stop";
-}
-
-/**
- * Statements that lead to the cloud's newest keys, oldest first (`security.key_rotation`).
- *
- * Changes nothing else and does not affect the lease.
- */
-export interface RotateKey {
-  kind: "follow_key";
-  statements: string[];
-}
-
 /**
  * `ctl/{epoch}`: one streamed setpoint. The newest is used; `sequence` starts at 1 in each lease.
  *
@@ -669,13 +554,4 @@ export interface Stop {
   id: string;
   caller: string;
   reason?: string;
-}
-
-/** Ed25519 over `telescope/v1/command` + line feed + the exact bytes of `body`. */
-export interface Signed {
-  /** Id of the signing key. */
-  key: string;
-  /** base64url, without padding. */
-  signature: string;
-  body: Command;
 }

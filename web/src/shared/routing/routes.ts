@@ -30,7 +30,7 @@ const PATTERNS = {
 
 export type PageName = keyof typeof PATTERNS;
 
-export interface Route {
+interface Route {
   page: PageName;
   at: At;
 }

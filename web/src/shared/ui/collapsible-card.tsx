@@ -8,7 +8,7 @@ interface Fold {
 }
 
 /** The state of the enclosing collapsible card; `null` outside one. */
-export const CollapseContext = createContext<Fold | null>(null);
+const CollapseContext = createContext<Fold | null>(null);
 
 /** On a phone, optional cards are initially collapsed to save space. */
 const NARROW = "(max-width: 48rem)";

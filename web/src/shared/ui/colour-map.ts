@@ -2,7 +2,7 @@
  * Colours for values from 0 to 1. Lightness increases monotonically from blue to yellow, so that the map works with
  * colour blindness and in greyscale.
  */
-export type Colour = readonly [number, number, number];
+type Colour = readonly [number, number, number];
 
 const STEPS: readonly Colour[] = [
   [43, 16, 84],

@@ -3,7 +3,7 @@ import { common } from "../i18n/common";
 
 const LENGTHS = { hour: 3600, workday: 8 * 3600, day: 86_400, week: 7 * 86_400, month: 30 * 86_400 } as const;
 
-export interface DurationChoice {
+interface DurationChoice {
   choice: keyof typeof LENGTHS | "never" | "date" | "keep";
   /** Value of a date input, in local time. */
   date: string;

@@ -1,13 +1,25 @@
-import { describe, expect, it } from "vitest";
-import { Api } from "../../../src/shared/api/client";
-import { ApiError } from "../../../src/shared/api/http";
-import { Session } from "../../../src/features/account/model/session";
-import { DEVICE, problem } from "../../support/cloud";
-import { api, cloud } from "../../support/console";
+import { beforeEach, describe, expect, it } from "vitest";
+import { Session, signInFailure, signInToken } from "../../../src/features/account/model/session";
+import { server } from "../../support/console";
+import { none, ok, problem, unreachable } from "../../support/fake-server";
+import { DEVICE } from "../../support/messages";
+
+const STOP = `/devices/${DEVICE}/stop`;
+const CSRF = "of-this-session";
+
+let session: Session;
+
+beforeEach(() => {
+  const signedIn = ok({ account: { id: "demo", name: "Demo" }, session: "s1", csrf_token: CSRF });
+  server.on("POST /auth/sign-in", ({ body }) => (body["link"] === "good" ? signedIn : problem(401, "link-used", "This link was used before.")));
+  server.on("POST /auth/password", ({ body }) => (body["password"] === "right" ? signedIn : problem(401, "unauthorized", "Wrong password.")));
+  server.on("POST /auth/sign-out", none);
+  server.on("GET /accounts/me", ok({ id: "demo", name: "Demo", session: "s1", csrf_token: CSRF }));
+  session = new Session(server.api);
+});
 
 describe("a session", () => {
   it("starts with a sign-in link and ends at sign-out", async () => {
-    const session = new Session(api);
     await session.start("good");
     expect(session.state.value).toMatchObject({ kind: "in", account: { name: "Demo" } });
     await session.signOut();
@@ -15,50 +27,67 @@ describe("a session", () => {
   });
 
   it("signs in with a name and a password, or rejects them", async () => {
-    const session = new Session(api);
     await expect(session.enter("demo", "wrong")).rejects.toMatchObject({ status: 401 });
     expect(session.state.value.kind).not.toBe("in");
     await session.enter("demo", "right");
     expect(session.state.value).toMatchObject({ kind: "in", account: { name: "Demo" } });
   });
 
+  it("starts with a new account of an invitation, or reports why there is none", async () => {
+    server.on("POST /auth/accounts", problem(409, "name-taken", "This name is taken."));
+    await expect(session.join("secret", "Bob", "correct horse battery")).rejects.toMatchObject({ code: "name-taken" });
+    expect(session.state.value.kind).not.toBe("in");
+    server.on("POST /auth/accounts", ok({ account: { id: "bob", name: "Bob" }, session: "s1", csrf_token: CSRF }));
+    await session.join("secret", "Bob", "correct horse battery");
+    expect(session.state.value.kind).toBe("in");
+    expect(server.callsTo("POST /auth/accounts")[1]?.body).toEqual({ invitation: "secret", name: "Bob", password: "correct horse battery" });
+  });
+
   it("shows an external sign-in error only while signed out", async () => {
-    const session = new Session(api);
     await session.start(null, "Not there.");
     expect(session.state.value.kind).toBe("in");
-    cloud.instead.set("GET /accounts/me", () => problem(401, "unauthorized", "Sign in first."));
+    server.on("GET /accounts/me", problem(401, "unauthorized", "Sign in first."));
     await session.start(null, "Not there.");
     expect(session.state.value).toEqual({ kind: "out", why: "Not there." });
   });
 
   it("reports why a sign-in link failed, and shows no error on a first visit", async () => {
-    const session = new Session(api);
     await session.start("used");
-    expect(session.state.value).toMatchObject({ kind: "out", why: expect.stringContaining("used before") as string });
-    cloud.instead.set("GET /accounts/me", () => problem(401, "signed-out", "You are not signed in."));
+    expect(session.state.value).toEqual({ kind: "out", why: expect.stringContaining("used before") as string });
+    server.on("GET /accounts/me", problem(401, "signed-out", "You are not signed in."));
     await session.start(null);
     expect(session.state.value).toEqual({ kind: "out", why: "" });
   });
+});
 
-  it("sends the CSRF token with changing requests only", () => {
-    const [call] = cloud.callsTo("POST", "/mqtt/credentials");
-    expect(call?.headers["x-csrf-token"]).toBe("of-this-session");
-    expect(cloud.callsTo("GET", "/devices")[0]?.headers["x-csrf-token"]).toBeUndefined();
+describe("calls", () => {
+  it("carry the CSRF token if they change something, and are repeated once with the token of another tab's session", async () => {
+    await session.start(null);
+    let csrf = "of-another-session";
+    server.on("GET /accounts/me", () => ok({ id: "demo", name: "Demo", session: "s2", csrf_token: csrf }));
+    server.on(`POST ${STOP}`, ({ headers }) => (headers["X-CSRF-Token"] === "of-another-session" ? ok({ confirmed: false }) : problem(403, "csrf-token", "No.")));
+    expect((await server.api.stop(DEVICE, "test")).confirmed).toBe(false);
+    expect(server.callsTo(`POST ${STOP}`).map(({ headers }) => headers["X-CSRF-Token"])).toEqual([CSRF, csrf]);
+    expect(server.callsTo("GET /accounts/me")[0]?.headers).not.toHaveProperty("X-CSRF-Token");
+    csrf = "wrong";
+    server.on(`POST ${STOP}`, problem(403, "csrf-token", "No."));
+    await expect(server.api.stop(DEVICE, "test")).rejects.toMatchObject({ status: 403, code: "csrf-token" });
+    expect(server.callsTo(`POST ${STOP}`)).toHaveLength(4);
   });
 
-  it("retries once with the CSRF token of a session that another tab started", async () => {
-    cloud.csrf = "of-another-session";
-    expect((await api.stop(DEVICE, "test")).confirmed).toBe(false);
-    expect(cloud.callsTo("POST", `/devices/${DEVICE}/stop`)).toHaveLength(2);
-    cloud.instead.set(`POST /devices/${DEVICE}/stop`, () => problem(403, "csrf-token", "No."));
-    await expect(api.stop(DEVICE, "test")).rejects.toMatchObject({ status: 403, code: "csrf-token" });
-    expect(cloud.callsTo("POST", `/devices/${DEVICE}/stop`)).toHaveLength(4);
+  it("distinguish an unreachable server from a rejection", async () => {
+    server.on("POST /agents/claim", problem(404, "claim-code-unknown", "No agent waits with this code."));
+    await expect(server.api.claim("BCDF-GHJK")).rejects.toMatchObject({ name: "ApiError", status: 404, code: "claim-code-unknown" });
+    server.on("POST /agents/claim", unreachable);
+    await expect(server.api.claim("BCDF-GHJK")).rejects.toMatchObject({ name: "ApiError", status: 0, code: "unreachable" });
   });
+});
 
-  it("distinguishes an unreachable server from a rejection", async () => {
-    const away = new Api("http://127.0.0.1:9/api/v1");
-    await expect(away.me()).rejects.toMatchObject({ status: 0, code: "unreachable" });
-    await expect(api.claim("BCDF-GHJK")).rejects.toMatchObject({ status: 404, code: "claim-code-unknown" });
-    await expect(api.claim("BCDF-GHJK")).rejects.toBeInstanceOf(ApiError);
+describe("sign-in fragments", () => {
+  it("contain a well-formed error code of an external sign-in, or a sign-in token", () => {
+    expect(signInFailure("#sign-in-failed=oidc-expired")).toBe("oidc-expired");
+    for (const hash of ["", "#/", "#sign-in-failed=", "#sign-in-failed=<b>"]) expect(signInFailure(hash)).toBeNull();
+    expect(signInToken("#sign-in=abc-_%2B")).toBe("abc-_+");
+    for (const hash of ["", "#/", "#sign-in=", "#x&sign-in=abc", "#sign-in=%"]) expect(signInToken(hash)).toBeNull();
   });
 });

@@ -1,243 +1,305 @@
-/** The lease's life on a clock that the test turns, with the server's answers in the test's hands. */
-import type { Device, GrantedLease, Lease } from "../../../src/shared/api/types";
-import { signal } from "@preact/signals-core";
-import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
-import { Api } from "../../../src/shared/api/client";
-import { ApiError } from "../../../src/shared/api/http";
+import { beforeEach, describe, expect, it } from "vitest";
+import type { ControlRequestInfo, GrantedLease, Watcher } from "../../../src/shared/api/types";
 import { Control, LEASE_MS } from "../../../src/features/control/model/lease";
-import { DeviceStore } from "../../../src/features/devices/model/device-store";
-import type { Link, LinkStatus, Receiver } from "../../../src/shared/mqtt/mqtt-link";
-import { description } from "../../support/arm";
+import type { ControlRequestState } from "../../../src/features/control/model/control-request";
+import { Watchers } from "../../../src/features/control/model/watchers";
+import { deliver, device, ends, pass, server } from "../../support/console";
+import { FakeLink } from "../../support/fake-link";
+import { list, none, ok, problem, unreachable, type Answer } from "../../support/fake-server";
+import { DEVICE, TOPIC, state, telemetry } from "../../support/messages";
 
-const TOPIC = "ts/v1/lab/a1/arm";
+const LEASE = `/devices/${DEVICE}/lease`;
+const REQUEST = `${LEASE}/requests/r1`;
+const EXPIRES = "2030-01-01T00:00:00.000Z";
 
-class Wire implements Link {
-  readonly status = signal<LinkStatus>({ state: "up", why: "" });
-  readonly up = signal(true);
-  readonly receivers = new Map<string, Receiver>();
-  readonly published: { topic: string; message: object }[] = [];
-  closed = false;
-
-  subscribe(filter: string, receiver: Receiver): () => void {
-    this.receivers.set(filter, receiver);
-    return () => this.receivers.delete(filter);
-  }
-
-  publish(topic: string, message: object): Promise<void> {
-    this.published.push({ topic, message });
-    return Promise.resolve();
-  }
-
-  ping(): Promise<void> {
-    return Promise.resolve();
-  }
-
-  renew(): void {
-    throw new Error("unexpected call");
-  }
-
-  close(): void {
-    this.closed = true;
-  }
-
-  tell(kind: string, message: object): void {
-    const filter = kind === "tele/joints" ? `${TOPIC}/tele/+` : `${TOPIC}/${kind}`;
-    this.receivers.get(filter)?.(`${TOPIC}/${kind}`, new TextEncoder().encode(JSON.stringify(message)), false);
-  }
+function granted(epoch: number, confirmed = true): Answer {
+  return ok({ epoch, holder: "Ann", expires_at: EXPIRES, lease_ms: LEASE_MS, confirmed } satisfies GrantedLease);
 }
 
-/** Answers renewals as the test says. */
-class Desk extends Api {
-  renewals = 0;
-  released: number[] = [];
-  renewal: () => Promise<GrantedLease> = () => Promise.resolve(grant(5));
-  taking: () => Promise<GrantedLease> = () => Promise.resolve(grant(5));
-
-  override takeLease(): Promise<GrantedLease> {
-    return this.taking();
-  }
-
-  override renewLease(): Promise<GrantedLease> {
-    this.renewals += 1;
-    return this.renewal();
-  }
-
-  override releaseLease(_: string, epoch: number): Promise<void> {
-    this.released.push(epoch);
-    return Promise.resolve();
-  }
-
-  override lease(): Promise<Lease | null> {
-    return Promise.resolve(null);
-  }
+function request(outcome: ControlRequestInfo["outcome"] = "open"): ControlRequestInfo {
+  const [requested, expires] = [0, 30_000].map((after) => new Date(Date.now() + after).toISOString());
+  return { id: "r1", requester: "Bob", epoch: 5, mine: true, requested_at: requested ?? "", expires_at: expires ?? "", outcome };
 }
 
-function grant(epoch: number): GrantedLease {
-  return { epoch, holder: "Demo", expires_at: "2030-01-01T00:00:00.000Z", lease_ms: LEASE_MS, confirmed: true };
-}
-
-const info: Device = {
-  id: "a1-arm",
-  name: "arm",
-  label: "Arm",
-  kind: "arm",
-  robot_type: "ur5",
-  agent: "a1",
-  space: "lab",
-  role: "owner",
-  owner: { id: "account0001", name: "Ann" },
-  topic: TOPIC,
-  online: true,
-  last_seen_at: null,
-  lease: null,
-};
-
-let tick = 0;
-function telemetry(rest: object = {}): object {
-  tick += 50;
-  const zeros = description.joints.map(() => 0);
-  return {
-    tick_ms: tick,
-    at_ms: tick,
-    sequence: tick,
-    mode: "holding",
-    position_rad: zeros,
-    velocity_rad_s: zeros,
-    effort_nm: zeros,
-    commanded_rad: zeros,
-    epoch: 5,
-    ...rest,
-  };
-}
-
-let watch: Wire;
-let wire: Wire;
-let desk: Desk;
-let device: DeviceStore;
+let setpoints: FakeLink;
 let control: Control;
+let renewal: (epoch: number) => Answer | Promise<Answer>;
+let renewals: number[];
 
 beforeEach(() => {
-  vi.useFakeTimers();
-  watch = new Wire();
-  wire = new Wire();
-  desk = new Desk();
-  device = new DeviceStore(info, desk, watch);
-  device.watch();
-  device.watchClosely();
-  watch.tell("desc", description);
-  watch.tell("tele/joints", telemetry());
-  control = new Control(desk, device, () => wire);
+  setpoints = new FakeLink();
+  renewals = [];
+  renewal = (epoch) => granted(epoch);
+  server.on(`POST ${LEASE}`, ({ body }) => {
+    if (body["take_over"] === true) return granted(6);
+    if (body["epoch"] === undefined) return granted(5);
+    renewals.push(Number(body["epoch"]));
+    return renewal(Number(body["epoch"]));
+  });
+  server.on(`GET ${LEASE}`, ok({ lease: null }));
+  server.on(`DELETE ${LEASE}`, none);
+  control = new Control(server.api, device, () => setpoints);
+  ends.push(() => control.dispose());
 });
 
-afterEach(() => {
-  control.dispose();
-  vi.useRealTimers();
-});
+const released = (): (string | null)[] => server.callsTo(`DELETE ${LEASE}`).map(({ query }) => query.get("epoch"));
 
 describe("control of a device", () => {
-  it("is renewed every third of the lease, for as long as it is held", async () => {
+  it("is renewed every third of the lease, until it is released with its epoch", async () => {
     await control.take();
     expect(control.state.value).toEqual({ kind: "held", epoch: 5, confirmed: true });
-    await vi.advanceTimersByTimeAsync(LEASE_MS * 3 + 100);
-    expect(desk.renewals).toBe(9);
-    expect(control.epoch).toBe(5);
+    await pass(LEASE_MS * 3 + 100);
+    expect(renewals).toEqual(Array(9).fill(5));
+    await control.release();
+    expect(released()).toEqual(["5"]);
+    expect(control.state.value).toEqual({ kind: "none" });
+    expect(setpoints.status.value.state).toBe("closed");
+    await pass(LEASE_MS);
+    expect(renewals).toHaveLength(9);
   });
 
-  it("is lost at once when the server says so, and streams nothing more", async () => {
+  it("is lost at once when the server rejects the renewal, and the stream ends", async () => {
     await control.take();
-    // A robot on its way, so that the stream has every reason to go on.
-    const talk = setInterval(() => watch.tell("tele/joints", telemetry({ velocity_rad_s: [0, 0, 1, 0, 0, 0] })), 50);
-    await vi.advanceTimersByTimeAsync(LEASE_MS / 3 - 500);
+    await pass(LEASE_MS / 3 - 500);
     control.streamer.value?.setTarget("elbow", 1);
-    await vi.advanceTimersByTimeAsync(400);
-    expect(wire.published.length).toBeGreaterThan(10);
-    desk.renewal = () => Promise.reject(new ApiError(409, "lease-lost", "Ann has control."));
-    await vi.advanceTimersByTimeAsync(110);
+    for (let passed = 0; passed < 400; passed += 50) {
+      deliver("tele/joints", telemetry({ velocity_rad_s: [0, 0, 1, 0, 0, 0] }));
+      await pass(50);
+    }
+    expect(setpoints.published.length).toBeGreaterThan(10);
+    renewal = () => problem(409, "lease-lost", "Ann has control.");
+    await pass(110);
     expect(control.state.value).toEqual({ kind: "lost", why: "Ann has control." });
     expect(control.streamer.value).toBeNull();
-    expect(wire.closed).toBe(true);
-    const sent = wire.published.length;
-    await vi.advanceTimersByTimeAsync(1_000);
-    expect(wire.published).toHaveLength(sent);
-    clearInterval(talk);
+    expect(setpoints.status.value.state).toBe("closed");
+    const sent = setpoints.published.length;
+    await pass(1_000);
+    expect(setpoints.published).toHaveLength(sent);
   });
 
-  it("survives a server that is away for a moment", async () => {
+  it("continues after a short outage of the server", async () => {
     await control.take();
-    desk.renewal = () => Promise.reject(new ApiError(0, "unreachable", "The server cannot be reached."));
-    await vi.advanceTimersByTimeAsync(LEASE_MS / 2);
-    expect(control.epoch).toBe(5);
-    expect(desk.renewals).toBeGreaterThan(3);
-    desk.renewal = () => Promise.resolve(grant(5));
-    await vi.advanceTimersByTimeAsync(LEASE_MS * 2);
+    renewal = unreachable;
+    await pass(LEASE_MS / 2);
+    expect(renewals.length).toBeGreaterThan(3);
+    renewal = granted;
+    await pass(LEASE_MS * 2);
     expect(control.epoch).toBe(5);
   });
 
-  it("ends when it could not be renewed in time, even while a call hangs", async () => {
+  it("ends when it could not be renewed in time, even if a call hangs", async () => {
     await control.take();
-    desk.renewal = () => new Promise(() => undefined);
-    await vi.advanceTimersByTimeAsync(LEASE_MS + 10);
+    renewal = () => new Promise(() => undefined);
+    await pass(LEASE_MS + 10);
     expect(control.state.value.kind).toBe("lost");
   });
 
   it.each([
-    ["telemetry", "tele/joints", telemetry({ epoch: 6 })],
-    ["state", "state", { device: "arm", at_ms: 1, tick_ms: 1, mode: "holding", epoch: 6 }],
-  ])("is lost at once when the robot's %s names a newer lease", async (_, kind, message) => {
+    ["telemetry", "tele/joints", () => telemetry({ epoch: 6 })],
+    ["state", "state", () => state(6)],
+  ])("is lost at once when the robot's %s contains a newer epoch", async (_, kind, message) => {
     await control.take();
-    watch.tell(kind, { ...message, ...(kind === "tele/joints" ? { tick_ms: (tick += 50), at_ms: tick } : {}) });
-    await vi.advanceTimersByTimeAsync(1);
-    expect(control.state.value).toMatchObject({ kind: "lost" });
+    deliver(kind, message());
+    await pass(1);
+    expect(control.state.value.kind).toBe("lost");
   });
 
-  it("is lost when the robot has ended it by itself, and is left to others", async () => {
+  it("is lost and released when the robot has ended it", async () => {
     await control.take();
-    watch.tell("tele/joints", telemetry({ epoch: 5 }));
-    await vi.advanceTimersByTimeAsync(1);
+    deliver("tele/joints", telemetry());
+    await pass(1);
     expect(control.epoch).toBe(5);
-    watch.tell("tele/joints", telemetry({ epoch: 0, mode: "holding" }));
-    await vi.advanceTimersByTimeAsync(1);
-    expect(control.state.value).toMatchObject({ kind: "lost" });
-    expect(wire.closed).toBe(true);
-    expect(desk.released).toEqual([5]);
+    deliver("tele/joints", telemetry({ epoch: 0 }));
+    await pass(1);
+    expect(control.state.value.kind).toBe("lost");
+    expect(setpoints.status.value.state).toBe("closed");
+    expect(released()).toEqual(["5"]);
   });
 
-  it("does not take a lease that another operator holds, and names that operator", async () => {
-    desk.taking = () => Promise.reject(new ApiError(409, "lease-held", "Ann has control."));
+  it("is refused while another operator has it; the page names that operator", async () => {
+    server.on(`POST ${LEASE}`, problem(409, "lease-held", "Ann has control."));
+    server.on(`GET ${LEASE}`, ok({ lease: { holder: "Ann", epoch: 4, expires_at: EXPIRES, mine: false } }));
     await control.take();
     expect(control.state.value).toEqual({ kind: "refused", why: "Ann has control." });
     expect(control.epoch).toBeNull();
+    await pass(1);
+    expect(device.lease.value?.holder).toBe("Ann");
   });
 
-  it("is given back with the epoch it has", async () => {
-    await control.take();
-    await control.release();
-    expect(desk.released).toEqual([5]);
-    expect(control.state.value).toEqual({ kind: "none" });
-    expect(wire.closed).toBe(true);
-    await vi.advanceTimersByTimeAsync(LEASE_MS);
-    expect(desk.renewals).toBe(0);
-  });
-
-  it("is confirmed by the robot's own word where the cloud could not say", async () => {
-    desk.taking = () => Promise.resolve({ ...grant(5), confirmed: false });
-    watch.tell("tele/joints", telemetry({ epoch: 4 }));
+  it("is confirmed by the robot if the cloud could not confirm it", async () => {
+    server.on(`POST ${LEASE}`, granted(5, false));
+    deliver("tele/joints", telemetry({ epoch: 4 }));
     await control.take();
     expect(control.state.value).toMatchObject({ kind: "held", confirmed: false });
-    watch.tell("tele/joints", telemetry({ epoch: 5 }));
-    await vi.advanceTimersByTimeAsync(1);
+    deliver("tele/joints", telemetry());
+    await pass(1);
     expect(control.state.value).toMatchObject({ kind: "held", confirmed: true });
   });
 
-  it("sends setpoints to the lease's own topic, and measures the round trip on this page's clock", async () => {
+  it("publishes setpoints to the topic of its epoch and measures their round trip", async () => {
     await control.take();
     control.streamer.value?.setTarget("elbow", 1);
-    const [first] = wire.published;
+    const [first] = setpoints.published;
     expect(first?.topic).toBe(`${TOPIC}/ctl/5`);
-    const sent = first?.message as { sent_ms: number; sequence: number };
-    await vi.advanceTimersByTimeAsync(30);
-    watch.tell("tele/joints", telemetry({ setpoint_sequence: sent.sequence, setpoint_sent_ms: sent.sent_ms }));
-    await vi.advanceTimersByTimeAsync(1);
+    const { sent_ms, sequence } = first?.message as { sent_ms: number; sequence: number };
+    await pass(30);
+    deliver("tele/joints", telemetry({ setpoint_sequence: sequence, setpoint_sent_ms: sent_ms }));
+    await pass(1);
     expect(control.roundTrip.figures.value).toMatchObject({ latestMs: 30, samples: 1 });
+  });
+
+  it("is taken over with a reason", async () => {
+    await control.takeOver("the arm is needed");
+    expect(control.epoch).toBe(6);
+    expect(server.callsTo(`POST ${LEASE}`)[0]?.body).toMatchObject({ take_over: true, reason: "the arm is needed" });
+  });
+});
+
+describe("a request for control", () => {
+  let answer: Answer | (() => never);
+  const asking = (): ControlRequestState => control.asking.state.value;
+
+  beforeEach(() => {
+    device.setLease({ holder: "Ann", epoch: 5, expires_at: EXPIRES, mine: false });
+    answer = ok(request());
+    server.on(`POST ${LEASE}/requests`, () => ok({ request: request(), confirmed: true }));
+    server.on(`GET ${REQUEST}`, () => (typeof answer === "function" ? answer() : answer));
+    server.on(`DELETE ${REQUEST}`, none);
+  });
+
+  it("gives control in the new epoch after it is accepted, without another click", async () => {
+    await control.asking.ask();
+    expect(asking()).toMatchObject({ kind: "open", id: "r1", shown: true, of: "Ann" });
+    await pass(2_000);
+    expect(control.epoch).toBeNull();
+    answer = ok(request("accepted"));
+    await pass(1_000);
+    expect(control.epoch).toBe(6);
+    expect(renewals).toEqual([6]);
+    expect(asking()).toEqual({ kind: "over", how: "accepted", of: "Ann" });
+  });
+
+  it("is read at once when the robot reports the new epoch", async () => {
+    deliver("state", state(5, "Ann", { lease: { holder: "Ann", epoch: 5, expires_in_ms: 30_000, request: { id: "r1", requester: "Bob", expires_in_ms: 30_000 } } }));
+    await control.asking.ask();
+    answer = ok(request("accepted"));
+    deliver("state", state(6, "Bob"));
+    await pass(10);
+    expect(control.epoch).toBe(6);
+  });
+
+  it.each(["rejected", "expired", "ended"] as const)("reports that it was %s, and gives no control", async (how) => {
+    await control.asking.ask();
+    answer = ok(request(how));
+    await pass(1_000);
+    expect(asking()).toEqual({ kind: "over", how, of: "Ann" });
+    expect(control.state.value).toEqual({ kind: "none" });
+    control.read();
+    expect(asking()).toEqual({ kind: "none" });
+  });
+
+  it("can be withdrawn, unless it was accepted at the same moment", async () => {
+    await control.asking.ask();
+    await control.asking.withdraw();
+    expect(asking()).toMatchObject({ kind: "over", how: "withdrawn" });
+    await control.asking.ask();
+    server.on(`DELETE ${REQUEST}`, problem(409, "control-request-closed", "Accepted."));
+    answer = ok(request("accepted"));
+    await control.asking.withdraw();
+    await pass(10);
+    expect(control.epoch).toBe(6);
+  });
+
+  it("stays open during an outage of the server, until its deadline", async () => {
+    await control.asking.ask();
+    answer = unreachable;
+    await pass(29_000);
+    expect(asking().kind).toBe("open");
+    await pass(8_000);
+    expect(asking()).toMatchObject({ kind: "over", how: "expired" });
+  });
+
+  it("reports why it failed", async () => {
+    server.on(`POST ${LEASE}/requests`, problem(409, "lease-requested", "Eve asks already."));
+    await control.asking.ask();
+    expect(asking()).toEqual({ kind: "failed", why: "Eve asks already." });
+  });
+
+  it("is withdrawn when the page closes", async () => {
+    await control.asking.ask();
+    control.dispose();
+    await pass(5_000);
+    expect(server.callsTo(`DELETE ${REQUEST}`)).toHaveLength(1);
+    expect(control.epoch).toBeNull();
+  });
+});
+
+describe("the holder's response to a request", () => {
+  const requested = { id: "r1", requester: "Bob", expires_in_ms: 20_000 };
+
+  beforeEach(async () => {
+    server.on(`POST ${REQUEST}/accept`, none);
+    server.on(`POST ${REQUEST}/reject`, none);
+    await control.take();
+    deliver("state", state(5, "Ann", { lease: { holder: "Ann", epoch: 5, expires_in_ms: 30_000, request: requested } }));
+  });
+
+  it("is possible while the robot reports the request", () => {
+    expect(control.asked.value).toMatchObject({ id: "r1", by: "Bob" });
+    expect((control.asked.value?.until ?? 0) - performance.now()).toBeCloseTo(20_000, -2);
+    deliver("state", state(5, "Ann"));
+    expect(control.asked.value).toBeNull();
+  });
+
+  it("is possible for a request that only the cloud reports", () => {
+    deliver("state", state(4, "Ann"));
+    device.setLease({ holder: "Ann", epoch: 5, expires_at: EXPIRES, mine: true, request: request() });
+    expect(control.asked.value).toMatchObject({ id: "r1", by: "Bob" });
+  });
+
+  it("hands control over and ends the stream; the new operator's lease is not released", async () => {
+    const answered = control.answer(true);
+    deliver("state", state(6, "Bob")); // The robot's report arrives before the server's response.
+    await pass(0);
+    expect(control.state.value).toEqual({ kind: "handed", to: "Bob" });
+    await answered;
+    expect(control.state.value).toEqual({ kind: "handed", to: "Bob" });
+    expect(control.streamer.value).toBeNull();
+    expect(server.callsTo(`POST ${REQUEST}/accept`)).toHaveLength(1);
+    expect(released()).toEqual([]);
+  });
+
+  it("keeps control", async () => {
+    await control.answer(false);
+    expect(control.epoch).toBe(5);
+    expect(control.answered.value).toEqual({ kind: "kept", from: "Bob" });
+  });
+
+  it("keeps control if it was too late", async () => {
+    server.on(`POST ${REQUEST}/accept`, problem(409, "control-request-closed", "It was not answered in time."));
+    await control.answer(true);
+    expect(control.epoch).toBe(5);
+    expect(control.answered.value).toEqual({ kind: "failed", why: "It was not answered in time." });
+  });
+});
+
+describe("the other viewers", () => {
+  it("are read while the page is visible; unknown ones are not shown", async () => {
+    const bob: Watcher = { name: "Bob", role: "viewer", mine: false, since: "2026-01-01T00:00:00.000Z" };
+    const viewers = `/devices/${DEVICE}/viewers`;
+    server.on(`PUT ${viewers}`, ok({ ...(list(bob).body as object), refresh_ms: 10_000 }));
+    server.on(`DELETE ${viewers}`, none);
+    const watchers = new Watchers(server.api, DEVICE);
+    watchers.seen(true);
+    watchers.seen(true);
+    await pass(25_000);
+    expect(server.callsTo(`PUT ${viewers}`)).toHaveLength(3);
+    expect(watchers.others.value).toEqual([bob]);
+    server.on(`PUT ${viewers}`, unreachable);
+    await pass(10_000);
+    expect(watchers.others.value).toBeNull();
+    watchers.seen(false);
+    await pass(60_000);
+    expect(server.calls.map(({ route }) => route.split(" ")[0])).toEqual(["PUT", "PUT", "PUT", "PUT", "DELETE"]);
   });
 });

@@ -1,67 +1,54 @@
-import { plan } from "../../../src/features/keyframes/model/plan";
-import { type Problem, placeOf, problems, stretchAll } from "../../../src/features/keyframes/model/problems";
 import { readFileSync } from "node:fs";
 import { describe, expect, test } from "vitest";
 import { addAfter, duplicate, remove, setPosition, setTime, normalize, type Keyframe, type Movement } from "../../../src/features/keyframes/model/keyframes";
-import { readMovement, readScript, writeScript } from "../../../src/features/keyframes/model/script-codec";
+import { plan } from "../../../src/features/keyframes/model/plan";
+import { type Problem, placeOf, problems, stretchAll } from "../../../src/features/keyframes/model/problems";
 import { Recorder, trimmedGaps, keyframesOf, trim, type Sample } from "../../../src/features/keyframes/model/recording";
+import { readMovement, readScript, writeScript } from "../../../src/features/keyframes/model/script-codec";
 import { UndoHistory } from "../../../src/shared/lib/undo-history";
 import type { KnownTelemetry } from "../../../src/shared/mqtt/parse-messages";
 import { head } from "../../support/robots";
 
 const robot = head();
 
-function movement(...keyframes: Keyframe[]): Movement {
-  return { description: "Nods.", keyframes };
-}
-
-function frame(time_s: number, position_rad: Record<string, number>, more: Partial<Keyframe> = {}): Keyframe {
-  return { time_s, position_rad, ...more };
-}
-
-function joint(name: string) {
-  const found = robot.joints.find((one) => one.name === name);
-  if (found === undefined) throw new Error(name);
-  return found;
-}
+const movement = (...keyframes: Keyframe[]): Movement => ({ description: "Nods.", keyframes });
+const frame = (time_s: number, position_rad: Record<string, number>, more: Partial<Keyframe> = {}): Keyframe => ({ time_s, position_rad, ...more });
+const times = ({ keyframes }: Movement): number[] => keyframes.map(({ time_s }) => time_s);
 
 function kinds(found: readonly Problem[]): string[] {
-  return found.map(({ keyframe, joint: name, what }) => `${keyframe} ${name ?? "-"} ${what.kind}`);
-}
-
-function times(made: Movement): number[] {
-  return made.keyframes.map(({ time_s }) => time_s);
+  return found.map(({ keyframe, joint, what }) => `${keyframe} ${joint ?? "-"} ${what.kind}`);
 }
 
 describe("edits", () => {
   const three = movement(frame(0, { yaw: 0 }), frame(1, { yaw: 0.5 }), frame(2, { yaw: 0 }));
 
-  test("a keyframe stays between its neighbours, or takes those that follow along", () => {
-    expect(times(setTime(three, 1, 9, false))).toEqual([0, 1.95, 2]);
-    expect(times(setTime(three, 1, -9, false))).toEqual([0, 0.05, 2]);
-    expect(times(setTime(three, 1, 3, true))).toEqual([0, 3, 4]);
-    expect(times(setTime(three, 0, 3, true))).toEqual([0, 1, 2]);
-    expect(times(setTime(three, 1, 700, true))).toEqual([0, 599, 600]);
+  test.each<[string, Movement, number[]]>([
+    ["later, at most to the next keyframe", setTime(three, 1, 9, false), [0, 1.95, 2]],
+    ["earlier, at most to the previous keyframe", setTime(three, 1, -9, false), [0, 0.05, 2]],
+    ["later, with the following keyframes", setTime(three, 1, 3, true), [0, 3, 4]],
+    ["never away from the start", setTime(three, 0, 3, true), [0, 1, 2]],
+    ["at most to ten minutes", setTime(three, 1, 700, true), [0, 599, 600]],
+    ["by insertion", addAfter(three, 0, { yaw: 0.2 }), [0, 0.5, 1, 2]],
+    ["by addition at the end", addAfter(three, 2, {}), [0, 1, 2, 3]],
+    ["by duplication", duplicate(three, 0), [0, 1, 2, 3]],
+    ["by removal", remove(three, 0), [0, 1]],
+    ["never to none", remove(movement(frame(0, {})), 0), [0]],
+  ])("change the times %s", (_, made, expected) => {
+    expect(times(made)).toEqual(expected);
   });
 
-  test("added, copied, taken away", () => {
-    expect(times(addAfter(three, 0, { yaw: 0.2 }))).toEqual([0, 0.5, 1, 2]);
-    expect(times(addAfter(three, 2, {}))).toEqual([0, 1, 2, 3]);
-    expect(times(duplicate(three, 0))).toEqual([0, 1, 2, 3]);
-    expect(times(remove(three, 0))).toEqual([0, 1]);
-    expect(remove(movement(frame(0, {})), 0).keyframes).toHaveLength(1);
+  test("set positions within the range, for coupled joints those of the driving joint", () => {
+    const edited = (name: string, position: number | null): unknown => {
+      const joint = robot.joints.find((each) => each.name === name);
+      return joint && setPosition(three, 1, joint, position, robot).keyframes[1]?.position_rad;
+    };
+    expect(edited("right", 0.1)).toEqual({ yaw: 0.5, left: -0.2 });
+    expect(edited("yaw", 99)).toEqual({ yaw: 2 });
+    expect(edited("yaw", null)).toEqual({});
+    expect([normalize(2.085669, -2, 2.085669), normalize(-2.085669, -2.085669, 2)]).toEqual([2.0856, -2.0856]);
   });
 
-  test("of joints that one motor moves the one that counts is set, and positions are inside of their range", () => {
-    const made = setPosition(three, 1, joint("right"), 0.1, robot);
-    expect(made.keyframes[1]?.position_rad).toEqual({ yaw: 0.5, left: -0.2 });
-    expect(setPosition(three, 1, joint("yaw"), 99, robot).keyframes[1]?.position_rad).toEqual({ yaw: 2 });
-    expect(setPosition(three, 1, joint("yaw"), null, robot).keyframes[1]?.position_rad).toEqual({});
-    expect(normalize(2.085669, -2, 2.085669)).toBe(2.0856);
-    expect(normalize(-2.085669, -2.085669, 2)).toBe(-2.0856);
-  });
-
-  test("every change can be taken back, and a drag is one change", () => {
+  test("can be undone and redone; a drag is one edit", () => {
     const history = new UndoHistory(0);
     history.change(1, "slider");
     history.change(2, "slider");
@@ -69,8 +56,7 @@ describe("edits", () => {
     history.undo();
     expect(history.now.value).toBe(2);
     history.undo();
-    expect(history.now.value).toBe(0);
-    expect(history.canUndo.value).toBe(false);
+    expect([history.now.value, history.canUndo.value]).toEqual([0, false]);
     history.redo();
     history.change(7);
     expect(history.canRedo.value).toBe(false);
@@ -80,11 +66,8 @@ describe("edits", () => {
 });
 
 describe("checks", () => {
-  test("what is good has no problem", () => {
+  test("name keyframe and joint of each problem, and offer a remedy", () => {
     expect(problems(movement(frame(0, { yaw: 0 }), frame(1, { yaw: 0.5 }, { say: "hello" })), robot)).toEqual([]);
-  });
-
-  test("each is named at its keyframe and joint, and mended by what it offers", () => {
     const wrong = movement(
       frame(0, { yaw: 0 }),
       frame(3, { yaw: 2.5, nose: 1 }),
@@ -108,27 +91,22 @@ describe("checks", () => {
     expect(mended.keyframes[2]?.position_rad["pitch"]).toBeCloseTo(-0.4);
   });
 
-  test("what is too fast says how long it needs, and one mend is enough", () => {
+  test("state the time that a too fast stretch needs; one remedy suffices, or one for all stretches", () => {
     const fast = movement(frame(0, { yaw: 0 }), frame(0.2, { yaw: 1 }), frame(3, { yaw: 0 }));
     const [found] = problems(fast, robot);
     expect(kinds(problems(fast, robot))).toEqual(["1 yaw too-fast"]);
     const mended = found?.mend?.(fast) ?? fast;
     expect(problems(mended, robot)).toEqual([]);
     const needs = found?.what.kind === "too-fast" ? found.what.needs_s : NaN;
-    expect(mended.keyframes[1]?.time_s).toBe(needs);
-    expect(needs).toBeGreaterThan(0.7);
-    expect(needs).toBeLessThan(1);
-    expect((mended.keyframes[2]?.time_s ?? 0) - needs).toBeCloseTo(2.8);
+    expect(needs > 0.7 && needs < 1).toBe(true);
+    expect(times(mended)).toEqual([0, needs, expect.closeTo(needs + 2.8) as number]);
     // The robot itself would take as long.
     expect(plan(fast, robot).reached_s[1]).toBeCloseTo(needs, 1);
+    const faster = movement(...[0, 1, 1.8, -1, 1].map((yaw, index) => frame(index / 10, { yaw, left: yaw / 4 })));
+    expect(problems(stretchAll(faster, robot), robot)).toEqual([]);
   });
 
-  test("all that is too fast can be mended at once", () => {
-    const fast = movement(...[0, 1, 1.8, -1, 1].map((yaw, index) => frame(index / 10, { yaw, left: yaw / 4 })));
-    expect(problems(stretchAll(fast, robot), robot)).toEqual([]);
-  });
-
-  test("times that do not rise are the first thing to mend", () => {
+  test("report decreasing times first", () => {
     const wrong = movement(frame(1, { yaw: 0 }), frame(0.5, { yaw: 0.1 }), frame(9, { yaw: 0 }));
     const found = problems(wrong, robot);
     expect(kinds(found)).toEqual(["0 - times", "1 - times"]);
@@ -137,7 +115,7 @@ describe("checks", () => {
 });
 
 describe("the plan", () => {
-  test("time stands still where something is done, and joints rest there", () => {
+  test("includes the duration of other activities, during which joints rest", () => {
     const made = movement(frame(0, { yaw: 0 }), frame(1, { yaw: 0.5 }, { say: "hi" }), frame(2, { yaw: 1 }));
     const found = plan(made, robot);
     expect(found.duration_s).toBeCloseTo(2.8);
@@ -146,7 +124,7 @@ describe("the plan", () => {
     expect(found.played(1.5)).toBeGreaterThan(2);
   });
 
-  test("a joint that is not named is on its way", () => {
+  test("interpolates joints that a keyframe does not name", () => {
     const made = movement(frame(0, { yaw: 0, left: 0 }), frame(1, { left: 0.1 }), frame(2, { yaw: 1, left: 0.2 }));
     expect(placeOf(made, 1, "yaw")).toBeCloseTo(0.5);
     expect(plan(made, robot).at(1)["yaw"]).toBeCloseTo(0.5);
@@ -176,7 +154,7 @@ describe("the script", () => {
     expect(source).toBe(readFileSync(new URL("../../fixtures/keyframes.py", import.meta.url), "utf8"));
   });
 
-  test("in words that end no docstring", () => {
+  test("escapes the description", () => {
     const said = readScript(writeScript({ ...made, description: 'a """ b\nc \\' }));
     expect(said.kind === "keyframes" && said.movement.description).toBe("a ''' b c /");
   });
@@ -189,15 +167,12 @@ describe("the script", () => {
     ["an infinite time", (source: string) => source.replace("1.5", "1e999")],
     ["no keyframe", (source: string) => source.replace(/ {4}\{"time_s.*\n/gu, "")],
     ["no end", (source: string) => source.replace("\n]\n", "\n")],
-  ])("with %s belongs into the code editor", (_, change) => {
+  ])("with %s opens in the code editor", (_, change) => {
     expect(readScript(change(writeScript(made)))).toEqual({ kind: "changed" });
   });
 
-  test("written by hand is not read as keyframes", () => {
+  test("is not read from other scripts or invalid drafts", () => {
     expect(readScript('"""Wave."""\nrobot.home()\n')).toEqual({ kind: "other" });
-  });
-
-  test("what was kept and is none is nothing", () => {
     for (const value of [null, 3, {}, { description: "", keyframes: [] }, { description: "", keyframes: [{ time_s: "1" }] }]) {
       expect(readMovement(value)).toBeNull();
     }
@@ -205,46 +180,41 @@ describe("the script", () => {
 });
 
 describe("a recording", () => {
-  function heard(tick_ms: number, ...position_rad: number[]): KnownTelemetry {
-    return { tick_ms, at_ms: 1_000_000 + tick_ms, position_rad } as unknown as KnownTelemetry;
-  }
+  const sample = (tick_ms: number, yaw: number): KnownTelemetry =>
+    ({ tick_ms, at_ms: 1_000_000 + tick_ms, position_rad: [yaw, 0, 0, 0] }) as unknown as KnownTelemetry;
 
-  test("has its gaps marked, goes on after the robot's clock began again, and hears what was said", () => {
+  test("marks gaps, continues after a restart of the robot's clock, and contains speech", () => {
     const recorder = new Recorder();
-    recorder.hear(heard(0, 0, 0, 0, 0));
+    recorder.hear(sample(0, 0));
     recorder.start();
-    for (const tick of [1000, 1050, 1100, 3100, 3150]) recorder.hear(heard(tick, tick / 1000, 0, 0, 0));
+    for (const tick of [1000, 1050, 1100, 3100, 3150]) recorder.hear(sample(tick, tick / 1000));
     recorder.hearEvent({ kind: "speech-started", at_ms: 1_003_150, data: { text: "hello" } } as never);
-    recorder.hear({ ...heard(20, 4, 0, 0, 0), at_ms: 1_004_150 });
+    recorder.hear({ ...sample(20, 4), at_ms: 1_004_150 });
     recorder.stop();
-    recorder.hear(heard(5000, 9, 0, 0, 0));
+    recorder.hear(sample(5000, 9));
     const take = recorder.take.value;
     expect(take.samples.map(({ time_s }) => Number(time_s.toFixed(2)))).toEqual([0, 0.05, 0.1, 2.1, 2.15, 3.15]);
-    expect(take.gaps.map(({ from_s, to_s }) => [from_s.toFixed(2), to_s.toFixed(2)])).toEqual([
-      ["0.10", "2.10"],
-      ["2.15", "3.15"],
-    ]);
+    expect(take.gaps.map(({ from_s, to_s }) => [from_s.toFixed(2), to_s.toFixed(2)])).toEqual([["0.10", "2.10"], ["2.15", "3.15"]]);
     expect(take.said[0]?.time_s).toBeCloseTo(2.15);
     expect(trim(take, 2, 9).gaps).toHaveLength(1);
-    const made = keyframesOf(trim(take, 2, 9), 0.01, robot);
-    expect(made[0]?.time_s).toBe(0);
-    expect(made.some(({ say }) => say === "hello")).toBe(true);
+    const keyframes = keyframesOf(trim(take, 2, 9), 0.01, robot);
+    expect(keyframes[0]?.time_s).toBe(0);
+    expect(keyframes.some(({ say }) => say === "hello")).toBe(true);
   });
 
-  test("becomes as few keyframes as come near enough to it", () => {
+  test("is reduced to few keyframes within a tolerance", () => {
     const samples: Sample[] = Array.from({ length: 101 }, (_, index) => {
       const time_s = index / 20;
       return { time_s, position_rad: [Math.min(time_s, 5 - time_s) / 5, 0.3, 0, 0] };
     });
     expect(trimmedGaps(samples, 0.01, new Set())).toEqual([0, 50, 100]);
-    const made = keyframesOf({ samples, gaps: [], said: [] }, 0.01, robot);
-    expect(made.map(({ time_s }) => time_s)).toEqual([0, 2.5, 5]);
-    expect(made[0]?.position_rad).toEqual({ yaw: 0, pitch: 0.3, left: 0 });
-    expect(made[1]?.position_rad).toEqual({ yaw: 0.5 });
-    expect(problems({ description: "", keyframes: made }, robot)).toEqual([]);
-    const wobbly = samples.map((one, index) => ({ ...one, position_rad: [Math.sin(index / 8), 0, 0, 0] }));
-    const few = trimmedGaps(wobbly, 0.1, new Set()).length;
-    expect(few).toBeLessThan(trimmedGaps(wobbly, 0.01, new Set()).length);
+    const keyframes = keyframesOf({ samples, gaps: [], said: [] }, 0.01, robot);
+    expect(times(movement(...keyframes))).toEqual([0, 2.5, 5]);
+    expect(keyframes.slice(0, 2).map(({ position_rad }) => position_rad)).toEqual([{ yaw: 0, pitch: 0.3, left: 0 }, { yaw: 0.5 }]);
+    expect(problems(movement(...keyframes), robot)).toEqual([]);
+    const wobbly = samples.map((each, index) => ({ ...each, position_rad: [Math.sin(index / 8), 0, 0, 0] }));
+    const count = (tolerance: number): number => trimmedGaps(wobbly, tolerance, new Set()).length;
+    expect(count(0.1)).toBeLessThan(count(0.01));
     expect(keyframesOf({ samples: [], gaps: [], said: [] }, 0.01, robot)).toEqual([]);
   });
 });

@@ -1,6 +1,7 @@
 import { readFileSync } from "node:fs";
 import { CompletionContext } from "@codemirror/autocomplete";
 import { python } from "@codemirror/lang-python";
+import { ensureSyntaxTree } from "@codemirror/language";
 import { EditorState } from "@codemirror/state";
 import { describe, expect, test } from "vitest";
 import type { Scripting } from "../../../src/shared/api/movement-library";
@@ -11,22 +12,20 @@ const api = JSON.parse(
 ) as Scripting["api"];
 const scripting: Scripting = { api, names: { joints: ["elbow", "wrist_1"], frames: ["flange"], postures: ["Stand"] } };
 
-/** What is offered where the text has a bar. */
+/** The completions at the bar in the text. */
 function offered(text: string, explicit = false): string[] {
   const pos = text.indexOf("|");
   const state = EditorState.create({ doc: text.replace("|", ""), extensions: [python()] });
-  const found = complete(scripting, new CompletionContext(state, pos, explicit), ["speed", "times"]);
+  ensureSyntaxTree(state, state.doc.length, 10_000); // By default the parser stops after 20 ms.
+  const found = complete(scripting, new CompletionContext(state.update({}).state, pos, explicit), ["speed", "times"]);
   return (found?.options ?? []).map(({ label }) => label);
 }
 
 describe("completion", () => {
-  test("offers what a robot and a room have", () => {
+  test("offers members, names, functions and modules", () => {
     expect(offered("robot.|")).toEqual(expect.arrayContaining(["move_joints", "home", "say", "joints", "can"]));
     expect(offered("x = 1\nroom.la|")).toEqual(["latest", "taken"]);
     expect(offered("other.|")).toEqual([]);
-  });
-
-  test("offers names, functions and modules", () => {
     expect(offered("wa|")).toEqual(expect.arrayContaining(["wait", "progress", "print", "robot", "parameters", "RobotError"]));
     expect(offered("import ma|")).toContain("math");
     expect(offered("from |")).toContain("itertools");
@@ -48,12 +47,9 @@ describe("completion", () => {
     expect(offered(text)).toEqual(expected);
   });
 
-  test("offers a call's arguments by name first", () => {
+  test("offers a call's arguments by name first, and nothing at an empty place before an explicit request", () => {
     expect(offered("robot.home(s|)")[0]).toBe("speed");
     expect(offered("robot.drive(|)", true).slice(0, 4)).toEqual(["forward_m_s", "left_m_s", "turn_rad_s", "duration_s"]);
-  });
-
-  test("offers nothing at an empty place before it is asked for", () => {
     expect(offered("|")).toEqual([]);
     expect(offered("|", true)).toContain("robot");
   });

@@ -2,6 +2,7 @@ import { describe, expect, test } from "vitest";
 import { storedDraft, storedParameters } from "../../../src/shared/lib/local-storage";
 import type { ObjectSchema } from "../../../src/shared/api/movement-library";
 import { fieldsOf, fill, read } from "../../../src/features/movements/model/parameter-form";
+import { FakeStorage } from "../../support/fake-storage";
 
 const SCHEMA: ObjectSchema = {
   type: "object",
@@ -61,39 +62,28 @@ describe("a form for parameters", () => {
   test("shows what was used last, unless it does not fit any more", () => {
     const shown = fill(fields, { times: 7, angle_rad: 9, colour: "blue", loud: false, place_m: [1, 2], word: "x" });
     expect(shown).toMatchObject({ times: "7", angle_rad: "28.65", colour: "green", loud: "false", place_m: "1 2", word: "" });
-  });
-
-  test("without a schema has no fields", () => {
     expect(fieldsOf(null)).toEqual([]);
   });
 });
 
-describe("what the browser keeps", () => {
-  const store = (): Storage => {
-    const known = new Map<string, string>();
-    return {
-      getItem: (key: string) => known.get(key) ?? null,
-      setItem: (key: string, value: string) => void known.set(key, value),
-      removeItem: (key: string) => void known.delete(key),
-    } as Storage;
-  };
-
-  test("is found again by the same account and movement only", () => {
-    const there = store();
-    expect(storedDraft(there, "ann", "ur5", "wave").write({ source: "x", basedOn: 2, at: 1 })).toBe(true);
-    expect(storedDraft(there, "ann", "ur5", "wave").read()).toEqual({ source: "x", basedOn: 2, at: 1 });
-    expect(storedDraft(there, "bob", "ur5", "wave").read()).toBeNull();
-    expect(storedParameters(there, "ann", "ur5", "wave").read()).toBeNull();
-    storedDraft(there, "ann", "ur5", "wave").drop();
-    expect(storedDraft(there, "ann", "ur5", "wave").read()).toBeNull();
+describe("stored values", () => {
+  test("belong to one account and movement", () => {
+    const storage = new FakeStorage();
+    const draft = { source: "x", basedOn: 2, at: 1 };
+    expect(storedDraft(storage, "ann", "ur5", "wave").write(draft)).toBe(true);
+    expect(storedDraft(storage, "ann", "ur5", "wave").read()).toEqual(draft);
+    expect(storedDraft(storage, "bob", "ur5", "wave").read()).toBeNull();
+    expect(storedParameters(storage, "ann", "ur5", "wave").read()).toBeNull();
+    storedDraft(storage, "ann", "ur5", "wave").drop();
+    expect(storedDraft(storage, "ann", "ur5", "wave").read()).toBeNull();
   });
 
-  test("is nothing where it was written by something else, or storage is refused", () => {
-    const there = store();
-    there.setItem("telescope.draft.ann.ur5.wave", "{");
-    expect(storedDraft(there, "ann", "ur5", "wave").read()).toBeNull();
-    there.setItem("telescope.draft.ann.ur5.wave", '{"source": 1}');
-    expect(storedDraft(there, "ann", "ur5", "wave").read()).toBeNull();
+  test("are absent if they are invalid or storage is unavailable", () => {
+    const storage = new FakeStorage();
+    for (const text of ["{", '{"source": 1}']) {
+      storage.setItem("telescope.draft.ann.ur5.wave", text);
+      expect(storedDraft(storage, "ann", "ur5", "wave").read()).toBeNull();
+    }
     expect(storedDraft(null, "ann", "ur5", "wave").write({ source: "x", basedOn: 0, at: 1 })).toBe(false);
   });
 });

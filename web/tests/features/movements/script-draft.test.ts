@@ -4,13 +4,14 @@ import { StoredValue, storedDraft, type Draft } from "../../../src/shared/lib/lo
 import { Library, type MovementSource } from "../../../src/shared/api/movement-library";
 import { ScriptDraft } from "../../../src/features/movements/model/script-draft";
 import { failureMark, placed } from "../../../src/features/movements/model/text-offsets";
+import { FakeStorage } from "../../support/fake-storage";
 
-/** The movements of one account, as the back end keeps them. */
-class Shelf {
+/** The movements of one account. */
+class FakeLibrary {
   versions: string[] = [];
   broken = false;
 
-  readonly library = new Library({
+  readonly api = new Library({
     call: (method: string, path: string, options?: { body: { source: string; based_on: number } }) => {
       if (this.broken) return Promise.reject(new ApiError(0, "unreachable", "The server cannot be reached."));
       const version = this.versions.length;
@@ -27,45 +28,36 @@ class Shelf {
   } as unknown as Http);
 }
 
-let shelf: Shelf;
-let known: Map<string, string>;
+let server: FakeLibrary;
+let storage: FakeStorage;
 
-function kept(): StoredValue<Draft> {
-  return storedDraft(
-    {
-      getItem: (key) => known.get(key) ?? null,
-      setItem: (key, value) => void known.set(key, value),
-      removeItem: (key) => void known.delete(key),
-    },
-    "ann",
-    "ur5",
-    "wave",
-  );
+function stored(): StoredValue<Draft> {
+  return storedDraft(storage, "ann", "ur5", "wave");
 }
 
 async function open(): Promise<ScriptDraft> {
-  const manuscript = new ScriptDraft(shelf.library, "ur5", "wave", kept(), "template");
-  await manuscript.load();
-  return manuscript;
+  const script = new ScriptDraft(server.api, "ur5", "wave", stored(), "template");
+  await script.load();
+  return script;
 }
 
 beforeEach(() => {
-  shelf = new Shelf();
-  known = new Map();
+  server = new FakeLibrary();
+  storage = new FakeStorage();
 });
 
-describe("a script that is written", () => {
+describe("a script", () => {
   test("begins with the template, and is saved as the first version", async () => {
     const script = await open();
     expect([script.text.value, script.changed.value]).toEqual(["template", true]);
     script.edit("robot.home()");
     expect(await script.save()).toBe(true);
-    expect([shelf.versions, script.base.value?.version, script.changed.value]).toEqual([["robot.home()"], 1, false]);
-    expect(kept().read()).toBeNull();
+    expect([server.versions, script.base.value?.version, script.changed.value]).toEqual([["robot.home()"], 1, false]);
+    expect(stored().read()).toBeNull();
   });
 
-  test("is there again after a reload, and can be discarded", async () => {
-    shelf.versions = ["saved"];
+  test("is restored after a reload, and can be discarded", async () => {
+    server.versions = ["saved"];
     (await open()).edit("unsaved");
     const again = await open();
     expect(again.text.value).toBe("unsaved");
@@ -75,22 +67,22 @@ describe("a script that is written", () => {
     expect((await open()).text.value).toBe("saved");
   });
 
-  test("stays when it is refused or the server is away", async () => {
+  test("stays in the editor when it is rejected or the server is unreachable", async () => {
     const script = await open();
     script.edit("(((");
     expect(await script.save()).toBe(false);
     expect([script.text.value, script.why.value]).toEqual(["(((", "Line 1: no."]);
-    shelf.broken = true;
+    server.broken = true;
     script.edit("good");
     expect(await script.save()).toBe(false);
     expect(script.text.value).toBe("good");
-    shelf.broken = false;
+    server.broken = false;
     expect(await script.save()).toBe(true);
     expect(script.why.value).toBe("");
   });
 
-  test("is not saved over what another tab has saved, and both can be had", async () => {
-    shelf.versions = ["one"];
+  test("does not overwrite a version of another tab; either can be chosen", async () => {
+    server.versions = ["one"];
     const [mine, other] = [await open(), await open()];
     other.edit("theirs");
     await other.save();
@@ -99,17 +91,17 @@ describe("a script that is written", () => {
     expect(mine.conflict.value?.theirs).toMatchObject({ version: 2, source: "theirs" });
     expect(mine.text.value).toBe("mine");
     expect(await mine.saveOver()).toBe(true);
-    expect(shelf.versions).toEqual(["one", "theirs", "mine"]);
+    expect(server.versions).toEqual(["one", "theirs", "mine"]);
     other.edit("more");
     expect(await other.save()).toBe(false);
     expect(other.takeTheirs()).toBe("more");
     expect([other.text.value, other.changed.value, other.conflict.value]).toEqual(["mine", false, null]);
   });
 
-  test("kept from an older version is a conflict too", async () => {
-    shelf.versions = ["one"];
+  test("conflicts if it was restored and is based on an older version", async () => {
+    server.versions = ["one"];
     (await open()).edit("mine");
-    shelf.versions.push("two");
+    server.versions.push("two");
     const again = await open();
     expect(again.text.value).toBe("mine");
     expect(await again.save()).toBe(false);
@@ -117,20 +109,20 @@ describe("a script that is written", () => {
   });
 });
 
-describe("places in a text", () => {
+describe("positions in a text", () => {
   const mark = { severity: "error", message: "x" } as const;
 
-  test("are counted in characters by the server, and in units of UTF-16 here", () => {
+  test("convert from characters to UTF-16 units", () => {
     const text = "a = 1\r\n'🤖'; b\nc";
     expect(placed(text.replace("\r", ""), { ...mark, line: 2, column: 5, end_line: 2, end_column: 6 })).toMatchObject({ from: 12, to: 13 });
   });
 
-  test("are never outside of it, nor empty", () => {
+  test("are inside of it and not empty", () => {
     expect(placed("ab", { ...mark, line: 9, column: 9, end_line: 1, end_column: 0 })).toMatchObject({ from: 2, to: 2 });
     expect(placed("ab\ncd", { ...mark, line: 1, column: 0, end_line: 1, end_column: 0 })).toMatchObject({ from: 0, to: 1 });
   });
 
-  test("are found in what a run has failed with", () => {
+  test("are read from the error of a run", () => {
     expect(failureMark("line 3: RobotError: no way")).toMatchObject({ line: 3, message: "RobotError: no way" });
     expect(failureMark("the operator pressed Stop")).toBeNull();
   });

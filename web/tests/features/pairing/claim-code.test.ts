@@ -1,6 +1,6 @@
-/** Claim codes as people type them and links carry them. */
 import { describe, expect, it } from "vitest";
 import { FollowedCode, pairingCode, readCode } from "../../../src/features/pairing/model/claim-code";
+import { FakeStorage } from "../../support/fake-storage";
 
 describe("a claim code", () => {
   it.each(["BCDF-GHJK", "bcdfghjk", " bcdf ghjk ", "BCDF–GHJK"])("is read as it is typed: %s", (typed) => {
@@ -19,17 +19,12 @@ describe("a claim code", () => {
     }
   });
 
-  it("that was followed is there again after signing in elsewhere, until it is used", () => {
-    const kept = new Map<string, string>();
-    const shelf = {
-      getItem: (key: string) => kept.get(key) ?? null,
-      setItem: (key: string, value: string) => void kept.set(key, value),
-      removeItem: (key: string) => void kept.delete(key),
-    };
-    new FollowedCode(shelf).follow("BCDF-GHJK");
-    const back = new FollowedCode(shelf);
-    expect(back.code.value).toBe("BCDF-GHJK");
-    back.drop();
-    expect(new FollowedCode(shelf).code.value).toBeNull();
+  it("of a followed link survives an external sign-in, until it is used", () => {
+    const storage = new FakeStorage();
+    new FollowedCode(storage).follow("BCDF-GHJK");
+    const reloaded = new FollowedCode(storage);
+    expect(reloaded.code.value).toBe("BCDF-GHJK");
+    reloaded.drop();
+    expect(new FollowedCode(storage).code.value).toBeNull();
   });
 });

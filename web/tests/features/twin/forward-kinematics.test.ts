@@ -1,9 +1,9 @@
 import { describe, expect, it } from "vitest";
 import { forward, jointFrames, multiply, placed, rollPitchYaw, rotate, standing } from "../../../src/features/twin/model/forward-kinematics";
-import type { Quaternion, Vector3 } from "../../../src/shared/lib/vectors";
+import type { Quaternion } from "../../../src/shared/lib/vectors";
 import { readTwin, type KnownBody } from "../../../src/shared/mqtt/parse-messages";
 import fixture from "../../fixtures/ur5.json";
-import { twin as ur5 } from "../../support/arm";
+import { twin as ur5 } from "../../support/messages";
 
 const twin = readTwin(new TextEncoder().encode(JSON.stringify(ur5)));
 const HALF = Math.SQRT1_2;
@@ -43,30 +43,15 @@ describe("forward kinematics of a twin", () => {
     }
   });
 
-  it("says where each joint of the UR5 is", () => {
-    const [first] = fixture.poses;
-    if (first === undefined) throw new Error("the fixture has no pose");
-    const frames = jointFrames(twin, first.position_rad);
-    expect(frames.map(({ name }) => name)).toEqual(fixture.description.joints.map(({ name }) => name));
-    const world = forward(twin, first.position_rad);
-    frames.forEach(({ name, position_m: at }) => {
-      const index = twin.bodies.findIndex(({ joint }) => joint?.name === name);
-      near(at, world[index]?.position_m ?? []); // the UR5's anchors are its bodies' origins
-    });
-  });
-
-  it("puts a joint at its anchor, which stays where it is", () => {
-    const only = { device: "d", bodies: [body({ anchor_m: [1, 0, 0] })] };
-    for (const position of [0, 1, 2]) near(jointFrames(only, { j: position })[0]?.position_m ?? [], [1, 0, 0]);
-  });
-
-  it("turns about an anchor that stays where it is", () => {
-    const { position_m, quaternion } = placed(body({ anchor_m: [1, 0, 0] }), Math.PI / 2);
+  it("rotates a body about its joint's anchor, which stays in place", () => {
+    const only = body({ anchor_m: [1, 0, 0] });
+    for (const position of [0, 1, 2]) near(jointFrames({ device: "d", bodies: [only] }, { j: position })[0]?.position_m ?? [], [1, 0, 0]);
+    const { position_m, quaternion } = placed(only, Math.PI / 2);
     near(position_m, [1, -1, 0]);
     near(quaternion, [HALF, 0, 0, HALF]);
   });
 
-  it("counts a joint from its reference, about an axis of any length", () => {
+  it("measures a joint from its reference, about an axis of any length", () => {
     const { quaternion } = placed(body({ reference_rad: 0.5, axis: [0, 0, 3] }), 0.5 + Math.PI / 2);
     near(quaternion, [HALF, 0, 0, HALF]);
   });
@@ -76,49 +61,38 @@ describe("forward kinematics of a twin", () => {
     near(placed(turned, 0.25).position_m, [0, 0.25, 1]);
   });
 
-  it("has a joint without a motor go with those that it follows", () => {
+  it("couples a passive joint to the joints that it follows", () => {
     const { joint } = body({ follows: { left: 0.25, right: -0.5 } });
     expect(standing(joint, { left: 1, right: 2, j: 9 })).toBeCloseTo(-0.75, 12);
     expect(standing(joint, { left: 1 })).toBeCloseTo(0.25, 12);
   });
 
-  it("leaves joints without a position at their reference", () => {
-    expect(forward(twin, {})).toEqual(forward(twin, Object.fromEntries(fixture.description.joints.map(({ name }) => [name, 0]))));
-  });
 });
 
 describe("roll, pitch and yaw", () => {
-  it.each<[string, Quaternion, Vector3]>([
-    ["nothing", [1, 0, 0, 0], [0, 0, 0]],
-    ["a quarter about x", [HALF, HALF, 0, 0], [Math.PI / 2, 0, 0]],
-    ["a quarter about y", [HALF, 0, HALF, 0], [0, Math.PI / 2, 0]],
-    ["a quarter about z", [HALF, 0, 0, HALF], [0, 0, Math.PI / 2]],
-  ])("tell of %s", (_, quaternion, wanted) => {
-    near(rollPitchYaw(quaternion), wanted, 6);
-  });
-
   const about = (axis: 1 | 2 | 3, angle: number): Quaternion => {
     const q: Quaternion = [Math.cos(angle / 2), 0, 0, 0];
     q[axis] = Math.sin(angle / 2);
     return q;
   };
 
-  it("give back the rotation they came from, also where roll and yaw turn about one axis", () => {
+  it.each([1, 2, 3] as const)("are those of a quarter turn about axis %s", (axis) => {
+    near(rollPitchYaw(about(axis, Math.PI / 2)), [1, 2, 3].map((each) => (each === axis ? Math.PI / 2 : 0)), 6);
+  });
+
+  it("describe the same rotation, also where roll and yaw share an axis", () => {
     const turns = [-3, -Math.PI / 2, -0.4, 0, 1, Math.PI / 2, 2.5];
-    for (const yaw of turns) {
-      for (const pitch of [-Math.PI / 2, -0.7, 0, 0.3, Math.PI / 2]) {
-        for (const roll of turns) {
-          const q = multiply(multiply(about(3, yaw), about(2, pitch)), about(1, roll));
-          const [r, p, y] = rollPitchYaw(q);
-          const again = multiply(multiply(about(3, y), about(2, p)), about(1, r));
-          const dot = q.reduce((sum, part, index) => sum + part * (again[index] ?? 0), 0);
-          expect(Math.abs(dot)).toBeCloseTo(1, 8);
-        }
-      }
+    const angles = turns.flatMap((yaw) => [-Math.PI / 2, -0.7, 0, 0.3, Math.PI / 2].flatMap((pitch) => turns.map((roll) => [roll, pitch, yaw] as const)));
+    const rotation = ([roll, pitch, yaw]: readonly [number, number, number]): Quaternion =>
+      multiply(multiply(about(3, yaw), about(2, pitch)), about(1, roll));
+    for (const each of angles) {
+      const q = rotation(each);
+      const again = rotation(rollPitchYaw(q));
+      expect(Math.abs(q.reduce((sum, part, index) => sum + part * (again[index] ?? 0), 0))).toBeCloseTo(1, 8);
     }
   });
 
-  it("turn a vector as the rotation does", () => {
+  it("rotate a vector", () => {
     near(rotate([0.5, 0.5, -0.5, 0.5], [1, 0, 0]), [0, 0, 1]);
   });
 });

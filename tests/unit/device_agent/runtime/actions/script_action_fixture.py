@@ -2,11 +2,12 @@
 
 import hashlib
 import socket
+from collections.abc import Callable
 from typing import Any
 
 from device_agent import protocol
 from device_agent.ports import script_calls
-from device_agent.ports.sandbox import Limits, SandboxError, SandboxStatus
+from device_agent.ports.sandbox import Limits, SandboxError
 from device_agent.protocol import RunMovement
 from device_agent.runtime.actions.script_action import ScriptAction, ScriptSandbox
 from device_agent.runtime.errors import Refused
@@ -32,10 +33,6 @@ class RecordingApi:
             case _:
                 self.received.append(call)
         return None
-
-
-def ignore_exit() -> None:
-    """Ignore the exit of the process."""
 
 
 class RecordedOutput:
@@ -79,52 +76,48 @@ class FakeSandbox:
     def __init__(self, process: FakeProcess | None) -> None:
         self.process = process
 
-    def start(self) -> None:
-        pass
-
-    def status(self) -> SandboxStatus:
-        return SandboxStatus("sandboxed")
-
-    def refusal(self, *, untrusted: bool) -> str | None:
-        del untrusted
-        return None
-
     def open(self, limits: Limits, *, untrusted: bool) -> FakeProcess:
         del limits, untrusted
         if self.process is None:
             raise SandboxError("no process can be started for the script")
         return self.process
 
-    def close(self) -> None:
-        pass
 
+class Run:
+    """A script action, its calls and its output.
 
-def run_movement(source: str, parameters: dict[str, Any] | None = None) -> RunMovement:
-    digest = hashlib.sha256(source.encode()).hexdigest()
-    return RunMovement(
-        robot_type="toy", name="wave", version=1, sha256=digest, source=source, parameters=parameters or {}
-    )
+    Without ``sandbox``, a real sandbox runs the script.
+    """
+
+    def __init__(
+        self,
+        source: str = "",
+        parameters: dict[str, Any] | None = None,
+        *,
+        sandbox: Any = None,
+        on_exit: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.api, self.output = RecordingApi(), RecordedOutput()
+        digest = hashlib.sha256(source.encode()).hexdigest()
+        request = RunMovement(
+            robot_type="toy", name="wave", version=1, sha256=digest, source=source, parameters=parameters or {}
+        )
+        self.script = ScriptAction(
+            request,
+            self.api,
+            self.output,
+            sandbox=ScriptSandbox(sandbox or warm_sandbox(), untrusted=False),
+            on_exit=on_exit,
+        )
 
 
 def run(source: str, parameters: dict[str, Any] | None = None) -> tuple[RecordingApi, RecordedOutput]:
-    api, output = RecordingApi(), RecordedOutput()
-    ScriptAction(
-        run_movement(source, parameters),
-        api,
-        output,
-        sandbox=ScriptSandbox(warm_sandbox(), untrusted=False),
-        on_exit=ignore_exit,
-    ).run()
-    return api, output
+    started = Run(source, parameters)
+    started.script.run()
+    return started.api, started.output
 
 
-def run_fake(process: FakeProcess) -> RecordedOutput:
-    output = RecordedOutput()
-    ScriptAction(
-        run_movement(""),
-        RecordingApi(),
-        output,
-        sandbox=ScriptSandbox(FakeSandbox(process), untrusted=False),
-        on_exit=ignore_exit,
-    ).run()
-    return output
+def run_fake(process: FakeProcess | None) -> RecordedOutput:
+    started = Run(sandbox=FakeSandbox(process))
+    started.script.run()
+    return started.output

@@ -2,46 +2,34 @@
 
 import threading
 import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
-import msgspec
 import pytest
 
-from device_agent.ports.driver import Observation
 from device_agent.ports.skills import Skill, SkillError, Stage
 from device_agent.ports.speech import SpeechError, Spoken
 from device_agent.ports.uploads import UploadError
-from device_agent.protocol import (
-    AckStatus,
-    Event,
-    GrantLease,
-    MoveJoints,
-    RunBehaviour,
-    Say,
-    SetStiffness,
-    State,
-    Stop,
-    topics,
-)
+from device_agent.protocol import Event, GrantLease, MoveJoints, RunBehaviour, Say, SetStiffness, State, Task, topics
 from device_agent.protocol.manifests.capabilities import Keyframe
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.actions.device_context import DeviceContext
+from device_agent.runtime.actions import speech_output
 from device_agent.runtime.actions.skill_runner import SkillRunner
 from device_agent.runtime.actions.speech_output import SpeechOutput
 from device_agent.runtime.control.joint_stiffness import JointStiffness
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import FakeDriver, robot_type
 from tests.harness.agent.device_harness import DeviceHarness, eventually
-
-WAIT_S = 0.3
+from tests.unit.device_agent.runtime.actions.robot_api_fixture import device_context
+from tests.unit.device_agent.runtime.conftest import MakeDevice
 
 
 class Servos(FakeDriver):
     """A driver with stiffness; a compliant joint stays where the test moves it."""
 
-    performs = ("stiffness",)
+    performs: tuple[str, ...] = ("stiffness",)
 
     def __init__(self) -> None:
         super().__init__()
@@ -57,9 +45,6 @@ class Servos(FakeDriver):
             self.position = tuple(position_rad)
         return tuple(position_rad)
 
-    def observe(self) -> Observation:
-        return Observation(self.position, (0.0, 0.0), (0.0, 0.0), ())
-
     def perform(self, skill: Skill, stage: Stage) -> None:
         assert isinstance(skill, SetStiffness)
         assert not stage.ended
@@ -73,39 +58,37 @@ class FakeSpeech:
 
     def __init__(self, *, broken: bool = False) -> None:
         self.broken = broken
-        self.said: list[tuple[str, str]] = []
+        self.spoken: list[tuple[str, str]] = []
 
     def speak(self, text: str, language: str) -> Spoken | None:
         if self.broken:
             raise SpeechError("no speech today")
-        self.said.append((text, language))
+        self.spoken.append((text, language))
         return Spoken(b"RIFF", 0.2)
 
 
 class Store:
-    """Keeps what is uploaded, or fails to, or never ends."""
+    """Stores uploads, or fails, or hangs until ``ended``."""
 
-    def __init__(self, how: str = "") -> None:
-        self.how = how
-        self.kept: list[dict[str, Any]] = []
+    def __init__(self, mode: str = "") -> None:
+        self.mode = mode
+        self.stored: list[dict[str, Any]] = []
         self.ended = threading.Event()
 
     def store(self, device: str, **file: Any) -> str:
-        if self.how == "fails":
+        if self.mode == "fails":
             raise UploadError("no network")
-        if self.how == "hangs":
+        if self.mode == "hangs":
             self.ended.wait(30)
-        self.kept.append({"device": device, **file})
+        self.stored.append({"device": device, **file})
         return "u1"
 
 
-def actor() -> RobotType:
-    kind = robot_type()
-    return msgspec.structs.replace(
-        kind,
-        capabilities=("speech", "stiffness", "behaviours"),
-        visemes={"aa": {"elbow": 0.2}, "PP": {"elbow": 0.0}},
-        behaviours={
+def actor(**changes: Any) -> RobotType:
+    parts: dict[str, Any] = {
+        "capabilities": ("speech", "stiffness", "behaviours"),
+        "visemes": {"aa": {"elbow": 0.2}, "PP": {"elbow": 0.0}},
+        "behaviours": {
             "bow": (
                 Keyframe(time_s=0.3, position_rad={"shoulder": 0.1}),
                 Keyframe(time_s=0.6, position_rad={"shoulder": 0.0}, say="Good day"),
@@ -116,95 +99,84 @@ def actor() -> RobotType:
                 Keyframe(time_s=61.0, say="more"),
             ),
         },
-    )
+    }
+    return robot_type(**(parts | changes))
 
 
-def make(folder: Path, **more: Any) -> DeviceHarness:
-    harness = DeviceHarness(
-        folder, driver=more.pop("driver", None) or Servos(), kind=more.pop("kind", None) or actor(), **more
-    )
-    harness.start()
-    return harness
+MakeActor = Callable[..., tuple[DeviceHarness, Servos]]
 
 
 @pytest.fixture
-def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
-    harness = make(tmp_path)
-    yield harness
-    harness.stop()
+def make_actor(make_device: MakeDevice) -> MakeActor:
+    def make(driver: Servos | None = None, **parts: Any) -> tuple[DeviceHarness, Servos]:
+        driver = driver or Servos()
+        return make_device(**({"driver": driver, "kind": actor()} | parts)), driver
+
+    return make
 
 
-def servos(harness: DeviceHarness) -> Servos:
-    assert isinstance(harness.driver, Servos)
-    return harness.driver
-
-
-def said(harness: DeviceHarness) -> list[Event]:
-    return [event for event in harness.heard(topics.EVENT, Event) if event.kind == "speech-started"]
-
-
-def ends(harness: DeviceHarness, request: Any, epoch: int = 1) -> AckStatus:
-    ack = harness.end(harness.command(request, epoch=epoch))
-    assert ack.status is AckStatus.DONE, ack.reason
-    return ack.status
-
-
-def why(harness: DeviceHarness, request: Any, epoch: int = 1) -> str:
-    reason = harness.end(harness.command(request, epoch=epoch)).reason
-    assert reason is not None
-    return reason.message
+def spoken(harness: DeviceHarness) -> list[Event]:
+    """The events of the lines that have started."""
+    events: list[Event] = eventually(lambda: harness.events("speech-started"))
+    return events
 
 
 # ---------------------------------------------------------------- speech
 
 
-def test_speech_is_published_as_text_and_moves_the_mouth(harness: DeviceHarness) -> None:
-    ends(harness, Say(text="Aha, mama!", language="sk"))
-    (event,) = eventually(lambda: said(harness))
+@pytest.mark.slow
+def test_speech_is_published_as_text_and_moves_the_mouth(make_actor: MakeActor) -> None:
+    harness, driver = make_actor()
+    harness.done(Say(text="Aha, mama!", language="sk"), epoch=1)
+    (event,) = spoken(harness)
     assert (event.message, event.data["language"]) == ("Aha, mama!", "sk")
     assert event.data["duration_s"] == pytest.approx(10 / 14, abs=0.01)
     assert "upload" not in event.data
-    assert max(servos(harness).elbows) > 0.02
-    assert servos(harness).elbows[-1] == pytest.approx(0.0, abs=1e-4)
+    assert max(driver.elbows) > 0.02
+    assert driver.elbows[-1] == pytest.approx(0.0, abs=1e-4)
 
 
-@pytest.mark.parametrize(("how", "upload"), [("", "u1"), ("fails", None), ("hangs", None)])
-def test_synthesized_audio_is_uploaded_and_named_if_in_time(tmp_path: Path, how: str, upload: str | None) -> None:
-    speech, store = FakeSpeech(), Store(how)
-    harness = make(tmp_path, speech=speech, uploads=store)
-    ends(harness, Say(text="hello"))
-    (event,) = eventually(lambda: said(harness))
+@pytest.mark.parametrize(("mode", "upload"), [("", "u1"), ("fails", None), ("hangs", None)])
+def test_synthesized_audio_is_uploaded_and_named_if_in_time(
+    make_actor: MakeActor, mode: str, upload: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if mode == "hangs":
+        monkeypatch.setattr(speech_output, "_UPLOAD_TIMEOUT_S", 0.05)
+    speech, store = FakeSpeech(), Store(mode)
+    harness, _ = make_actor(speech=speech, uploads=store)
+    harness.done(Say(text="hello"), epoch=1)
+    (event,) = spoken(harness)
     assert event.data.get("upload") == upload
     assert event.data["duration_s"] == 0.2
-    assert speech.said == [("hello", "")]
+    assert speech.spoken == [("hello", "")]
     if upload:
-        wanted = {"device": "arm", "stream": "speech", "media_type": "audio/wav", "content": b"RIFF"}
-        assert wanted.items() <= store.kept[0].items()
+        stored = {"device": "arm", "stream": "speech", "media_type": "audio/wav", "content": b"RIFF"}
+        assert stored.items() <= store.stored[0].items()
     store.ended.set()
-    harness.stop()
 
 
-def test_failed_synthesis_leaves_the_text(tmp_path: Path) -> None:
-    harness = make(tmp_path, speech=FakeSpeech(broken=True), kind=msgspec.structs.replace(actor(), visemes={}))
-    ends(harness, Say(text="hi"))
-    assert [event.message for event in eventually(lambda: said(harness))] == ["hi"]
-    harness.stop()
+@pytest.mark.parametrize(
+    "parts", [{"speech": FakeSpeech(broken=True), "kind": actor(visemes={})}, {"speech": FakeSpeech()}]
+)
+def test_without_synthesis_or_storage_the_text_is_published(make_actor: MakeActor, parts: dict[str, Any]) -> None:
+    harness, _ = make_actor(**parts)
+    harness.done(Say(text="hi"), epoch=1)
+    assert [event.message for event in spoken(harness)] == ["hi"]
 
 
-def test_synthesis_without_storage_still_speaks(tmp_path: Path) -> None:
-    harness = make(tmp_path, speech=FakeSpeech())
-    ends(harness, Say(text="hi"))
-    assert [event.message for event in eventually(lambda: said(harness))] == ["hi"]
-    harness.stop()
-
-
-def test_stop_ends_speech_without_a_mouth(tmp_path: Path) -> None:
-    harness = make(tmp_path, kind=msgspec.structs.replace(actor(), visemes={}))
-    running = harness.command(Say(text="a" * 1000), epoch=1)
-    eventually(lambda: said(harness))
-    harness.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
+@pytest.mark.parametrize(
+    ("request_", "kind", "line"),
+    [(Say(text="a" * 1000), actor(visemes={}), "a" * 1000), (RunBehaviour(name="speech"), actor(), "so much to say")],
+)
+def test_stop_ends_speech_before_the_next_line(
+    make_actor: MakeActor, request_: Task, kind: RobotType, line: str
+) -> None:
+    harness, _ = make_actor(kind=kind)
+    running = harness.command(request_, epoch=1)
+    spoken(harness)
+    harness.receive_stop()
     assert harness.end_code(running) == "stopped"
-    harness.stop()
+    assert [event.message for event in spoken(harness)] == [line]
 
 
 @pytest.mark.parametrize(
@@ -215,41 +187,17 @@ def test_invalid_speech_is_rejected(text: str, language: str, says: str) -> None
         SpeechOutput().prepare(text, language)
 
 
-def test_speech_without_observers_starts() -> None:
-    speaker = SpeechOutput()
-    speaker.start(speaker.prepare("hello", ""))
-
-
 def test_the_driver_receives_the_speech_duration() -> None:
-    heard: list[float] = []
-    speaker = SpeechOutput(on_start=heard.append)
-    said = speaker.prepare("hello, how are you today", "")
-    assert heard == []
-    speaker.start(said)
-    assert heard == [said.duration_s]
+    durations: list[float] = []
+    output = SpeechOutput(on_start=durations.append)
+    utterance = output.prepare("hello, how are you today", "")
+    assert durations == []
+    output.start(utterance)
+    assert durations == [utterance.duration_s]
+    SpeechOutput().start(utterance)
 
 
 # ---------------------------------------------------------------- behaviours
-
-
-def test_a_behaviour_moves_and_speaks_in_its_time(harness: DeviceHarness) -> None:
-    start_s = time.monotonic()
-    ends(harness, RunBehaviour(name="bow"))
-    assert time.monotonic() - start_s >= 0.6
-    assert [event.message for event in eventually(lambda: said(harness))] == ["Good day"]
-    assert harness.driver.position == pytest.approx([0.0, 0.0], abs=1e-3)
-
-
-def test_an_unknown_behaviour_is_rejected_with_the_known_ones(harness: DeviceHarness) -> None:
-    assert "no behaviour 'dance'; there are bow, speech" in why(harness, RunBehaviour(name="dance"))
-
-
-def test_stop_ends_a_behaviour_before_its_next_line(harness: DeviceHarness) -> None:
-    running = harness.command(RunBehaviour(name="speech"), epoch=1)
-    eventually(lambda: said(harness))
-    harness.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
-    assert harness.end_code(running) == "stopped"
-    assert [event.message for event in said(harness)] == ["so much to say"]
 
 
 class Speaking(Servos):
@@ -259,108 +207,84 @@ class Speaking(Servos):
 
     def __init__(self) -> None:
         super().__init__()
-        self.heard: list[str] = []
+        self.lines: list[str] = []
 
     def perform(self, skill: Skill, stage: Stage) -> None:
         del stage
         assert isinstance(skill, Say)
-        self.heard.append(skill.text)
+        self.lines.append(skill.text)
 
 
-def test_a_driver_with_speech_speaks_the_lines_of_a_behaviour(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_a_behaviour_moves_and_speaks_in_its_time(make_actor: MakeActor) -> None:
     driver = Speaking()
-    harness = make(tmp_path, driver=driver)
-    ends(harness, RunBehaviour(name="bow"))
-    assert eventually(lambda: driver.heard) == ["Good day"]
-    harness.stop()
+    harness, _ = make_actor(driver)
+    start_s = time.monotonic()
+    harness.done(RunBehaviour(name="bow"), epoch=1)
+    assert time.monotonic() - start_s >= 0.6
+    assert [event.message for event in spoken(harness)] == ["Good day"]
+    assert eventually(lambda: driver.lines) == ["Good day"]
+    assert driver.position == pytest.approx([0.0, 0.0], abs=1e-3)
+    message = harness.failed(RunBehaviour(name="dance"), epoch=1).message
+    assert "no behaviour 'dance'; there are bow, speech" in message
 
 
 # ---------------------------------------------------------------- stiffness
 
 
-def test_a_compliant_joint_is_tracked_and_does_not_jump_when_stiffened(harness: DeviceHarness) -> None:
-    ends(harness, SetStiffness(value=0.0))
-    assert servos(harness).stiffness == 0.0
-    state: State = eventually(lambda: [one for one in harness.heard(topics.STATE, State) if one.stiffness])[-1]
-    assert state.stiffness == {"shoulder": 0.0, "elbow": 0.0}
-    harness.driver.position = (0.0, 1.2)
+@pytest.mark.slow
+def test_a_compliant_joint_is_tracked_and_does_not_jump_when_stiffened(make_actor: MakeActor) -> None:
+    harness, driver = make_actor()
+
+    def set_stiffness(value: float, *joints: str, shown: dict[str, float]) -> None:
+        harness.done(SetStiffness(value=value, joints=joints), epoch=1)
+        eventually(lambda: harness.published(topics.STATE, State)[-1].stiffness == shown)
+
+    set_stiffness(0.0, shown={"shoulder": 0.0, "elbow": 0.0})
+    assert driver.stiffness == 0.0
+    driver.position = (0.0, 1.2)
     eventually(lambda: abs(harness.telemetry().commanded_rad[1] - 1.2) < 1e-6)
     assert "elbow: compliant" in harness.telemetry().limited
-    assert "elbow: no stiffness; set a stiffness above 0" in why(harness, MoveJoints(position_rad={"elbow": 0.0}))
-    assert "no stiffness" in why(harness, RunBehaviour(name="bow"))
-    ends(harness, SetStiffness(value=0.6, joints=("elbow",)))
-    time.sleep(WAIT_S)
-    assert harness.driver.position[1] == pytest.approx(1.2)
-    assert servos(harness).jumped < 0.01
-    shown = {"shoulder": 0.0, "elbow": 0.6}
-    assert eventually(lambda: harness.heard(topics.STATE, State)[-1].stiffness == shown)
-    ends(harness, SetStiffness(value=1.0))
-    assert eventually(lambda: harness.heard(topics.STATE, State)[-1].stiffness == {})
-    ends(harness, MoveJoints(position_rad={"elbow": 1.0}, speed=1.0))
+    move = MoveJoints(position_rad={"elbow": 1.0}, speed=1.0)
+    assert "elbow: no stiffness; set a stiffness above 0" in harness.failed(move, epoch=1).message
+    assert "no stiffness" in harness.failed(RunBehaviour(name="bow"), epoch=1).message
+    set_stiffness(0.6, "elbow", shown={"shoulder": 0.0, "elbow": 0.6})
+    assert driver.position[1] == pytest.approx(1.2)
+    assert driver.jumped < 0.01
+    set_stiffness(1.0, shown={})
+    harness.done(move, epoch=1)
 
 
-def test_after_an_action_setpoints_keep_unnamed_joints(harness: DeviceHarness) -> None:
-    harness.end(harness.command(GrantLease(holder="ann", lease_ms=30_000), epoch=1))
+def test_after_an_action_setpoints_keep_unnamed_joints(make_actor: MakeActor) -> None:
+    harness, driver = make_actor()
+    harness.done(GrantLease(holder="ann", lease_ms=30_000), epoch=1)
     harness.setpoint(1, 1, elbow=0.2)
-    ends(harness, MoveJoints(position_rad={"shoulder": 0.3}, speed=1.0))
+    harness.done(MoveJoints(position_rad={"shoulder": 0.3}, speed=1.0), epoch=1)
     for sequence in range(2, 20):
         harness.setpoint(1, sequence, elbow=0.1)
         time.sleep(0.02)
-    assert harness.driver.position[0] == pytest.approx(0.3, abs=1e-3)
+    assert driver.position[0] == pytest.approx(0.3, abs=1e-3)
 
 
-def test_failed_stiffness_changes_leave_joints_stiff(harness: DeviceHarness) -> None:
-    servos(harness).fails = True
-    assert "the servos do not answer" in why(harness, SetStiffness(value=0.0))
-    assert eventually(lambda: harness.telemetry().limited == ())
-    ends(harness, MoveJoints(position_rad={"elbow": 0.1}, speed=1.0))
-
-
-@pytest.mark.parametrize(
-    ("request_", "says"),
-    [
-        (SetStiffness(value=0.5, joints=("nose",)), "no joint 'nose'; there are shoulder, elbow"),
-        ("robot.stiffness(2)", "not a valid message: Expected `float` <= 1.0 - at `$.value`"),
-    ],
-)
-def test_an_invalid_stiffness_is_rejected(harness: DeviceHarness, request_: Any, says: str) -> None:
-    assert says in why(harness, harness.script(request_) if isinstance(request_, str) else request_)
+def test_failed_and_invalid_stiffness_changes_leave_joints_stiff(make_actor: MakeActor) -> None:
+    harness, driver = make_actor()
+    driver.fails = True
+    assert "the servos do not answer" in harness.failed(SetStiffness(value=0.0), epoch=1).message
+    message = harness.failed(SetStiffness(value=0.5, joints=("nose",)), epoch=1).message
+    assert "no joint 'nose'; there are shoulder, elbow" in message
+    eventually(lambda: harness.telemetry().limited == ())
+    harness.done(MoveJoints(position_rad={"elbow": 0.1}, speed=1.0), epoch=1)
 
 
 def test_a_compliant_joint_outside_its_range_is_clamped() -> None:
-    slack = JointStiffness(robot_type())
-    slack.set({"elbow": 0.0})
-    assert slack.track((0.5, 3.3)) == {1: 3.0}
-
-
-# ---------------------------------------------------------------- before it begins
-
-
-class Late:
-    """An action that is over at once."""
-
-    def __init__(self) -> None:
-        self.ended = threading.Event()
-        self.reservation: Any = type("Reservation", (), {"why": None})()
-
-
-class Restless:
-    """A controller of something that moves for ever."""
-
-    moving = True
+    stiffness = JointStiffness(robot_type())
+    stiffness.set({"elbow": 0.0})
+    assert stiffness.track((0.5, 3.3)) == {1: 3.0}
 
 
 def test_a_skill_waits_for_rest_unless_its_action_ended() -> None:
-    mover: Any = Late()
-    controller: Any = Restless()
-    body = DeviceContext(
-        robot_type=actor(),
-        controller=controller,
-        observe=lambda: None,
-        geometry=None,
-        skills=None,
-        readings=None,  # type: ignore[arg-type]
-    )
+    context = replace(device_context(actor()), controller=SimpleNamespace(moving=True))  # type: ignore[arg-type]
+    mover: Any = SimpleNamespace(ended=threading.Event(), reservation=SimpleNamespace(why=None))
     threading.Timer(0.1, mover.ended.set).start()
     with pytest.raises(Refused, match="the action ended"):
-        SkillRunner(body, mover).wait_for_rest()
+        SkillRunner(context, mover).wait_for_rest()

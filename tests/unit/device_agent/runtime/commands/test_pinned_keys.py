@@ -28,7 +28,7 @@ def statement(
     return signing.sign(codec.encode(new), by, context=context).decode()
 
 
-class Kept:
+class PinsFixture:
     """A store with one pinned key, and the cloud's time."""
 
     def __init__(self, folder: Path) -> None:
@@ -45,11 +45,11 @@ class Kept:
 
 
 @pytest.fixture
-def kept(tmp_path: Path) -> Kept:
-    return Kept(tmp_path / "agent")
+def fixture(tmp_path: Path) -> PinsFixture:
+    return PinsFixture(tmp_path / "agent")
 
 
-def refusal(pins: PinnedKeys, *statements: str) -> str:
+def rejection(pins: PinnedKeys, *statements: str) -> str:
     before = dict(pins), pins.serial
     with pytest.raises(Refused) as refused:
         pins.follow(statements)
@@ -57,45 +57,42 @@ def refusal(pins: PinnedKeys, *statements: str) -> str:
     return refused.value.code
 
 
-def test_a_new_key_is_valid_beside_the_old_one_until_it_expires(kept: Kept) -> None:
-    kept.pins.follow([statement(SECOND, FIRST, 2)])
-    assert set(kept.pins) == {name(FIRST), name(SECOND)}
-    kept.now_ms = ENDS_MS - 1
-    assert name(FIRST) in kept.pins
-    kept.now_ms = ENDS_MS
-    assert set(kept.pins) == {name(SECOND)}
-    with pytest.raises(KeyError):
-        kept.pins[name(FIRST)]
-
-
-def test_a_new_key_is_stored_before_it_is_valid(kept: Kept, tmp_path: Path) -> None:
-    kept.pins.follow([statement(SECOND, FIRST, 2)])
-    again = kept.load()
-    assert dict(again) == dict(kept.pins)
-    assert again.serial == 2
+def test_a_new_key_is_stored_and_valid_beside_the_old_one_until_it_expires(
+    fixture: PinsFixture, tmp_path: Path
+) -> None:
+    fixture.pins.follow([statement(SECOND, FIRST, 2)])
+    assert set(fixture.pins) == {name(FIRST), name(SECOND)}
+    again = fixture.load()
+    assert (dict(again), again.serial) == (dict(fixture.pins), 2)
     assert (tmp_path / "agent" / "pairing.json").stat().st_mode & 0o077 == 0
+    fixture.now_ms = ENDS_MS - 1
+    assert name(FIRST) in fixture.pins
+    fixture.now_ms = ENDS_MS
+    assert set(fixture.pins) == {name(SECOND)}
+    with pytest.raises(KeyError):
+        fixture.pins[name(FIRST)]
 
 
-def test_a_key_that_cannot_be_stored_is_not_valid(kept: Kept, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_that_cannot_be_stored_is_not_valid(fixture: PinsFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_: Pairing) -> None:
         raise ConfigError("no space left on device")
 
-    monkeypatch.setattr(kept.pins, "_save", full)
-    assert refusal(kept.pins, statement(SECOND, FIRST, 2)) == "journal"
+    monkeypatch.setattr(fixture.pins, "_save", full)
+    assert rejection(fixture.pins, statement(SECOND, FIRST, 2)) == "journal"
 
 
-def test_a_chain_is_followed_once(kept: Kept) -> None:
+def test_a_chain_is_followed_once(fixture: PinsFixture) -> None:
     chain = [statement(SECOND, FIRST, 2), statement(THIRD, SECOND, 3)]
-    kept.pins.follow(chain)
-    kept.pins.follow(chain)
-    assert kept.pins.serial == 3
-    kept.now_ms = ENDS_MS
-    kept.pins.follow(chain)
-    assert set(kept.pins) == {name(THIRD)}
+    fixture.pins.follow(chain)
+    fixture.pins.follow(chain)
+    assert fixture.pins.serial == 3
+    fixture.now_ms = ENDS_MS
+    fixture.pins.follow(chain)
+    assert set(fixture.pins) == {name(THIRD)}
 
 
 @pytest.mark.parametrize(
-    ("told", "code"),
+    ("text", "code"),
     [
         (statement(SECOND, THIRD, 2), "bad_signature"),
         (statement(SECOND, SECOND, 2), "bad_signature"),
@@ -107,11 +104,11 @@ def test_a_chain_is_followed_once(kept: Kept) -> None:
         ("{}", "malformed"),
     ],
 )
-def test_statements_without_a_pinned_signer_are_rejected(kept: Kept, told: str, code: str) -> None:
-    assert refusal(kept.pins, told) == code
+def test_statements_without_a_pinned_signer_are_rejected(fixture: PinsFixture, text: str, code: str) -> None:
+    assert rejection(fixture.pins, text) == code
 
 
-def test_a_statement_with_a_changed_byte_is_rejected(kept: Kept) -> None:
+def test_a_statement_with_a_changed_byte_is_rejected(fixture: PinsFixture) -> None:
     good = statement(SECOND, FIRST, 2).encode()
     for place in range(len(good)):
         bad = bytearray(good)
@@ -120,52 +117,41 @@ def test_a_statement_with_a_changed_byte_is_rejected(kept: Kept) -> None:
             text = bytes(bad).decode()
         except UnicodeDecodeError:
             continue
-        assert refusal(kept.pins, text) in {"bad_signature", "malformed"}
-    kept.pins.follow([good.decode()])
+        assert rejection(fixture.pins, text) in {"bad_signature", "malformed"}
+    fixture.pins.follow([good.decode()])
 
 
-def test_no_statement_leads_back_to_an_older_key(kept: Kept) -> None:
-    kept.pins.follow([statement(SECOND, FIRST, 2), statement(THIRD, SECOND, 3)])
-    old = signing.generate()
-    assert refusal(kept.pins, statement(old, THIRD, 2)) == "rolled_back"
-    assert refusal(kept.pins, statement(old, THIRD, 3)) == "rolled_back"
+def test_older_keys_and_keys_with_a_successor_sign_no_other(fixture: PinsFixture) -> None:
+    fixture.pins.follow([statement(SECOND, FIRST, 2)])
+    for pins in (fixture.pins, fixture.load()):
+        assert rejection(pins, statement(THIRD, FIRST, 3)) == "rolled_back"
+    fixture.pins.follow([statement(THIRD, SECOND, 3)])
+    for serial in (2, 3):
+        assert rejection(fixture.pins, statement(signing.generate(), THIRD, serial)) == "rolled_back"
 
 
-def test_a_key_with_a_successor_signs_no_other(kept: Kept) -> None:
-    """Who stole the old key cannot use its overlap to have a key of theirs pinned."""
-    kept.pins.follow([statement(SECOND, FIRST, 2)])
-    assert refusal(kept.pins, statement(THIRD, FIRST, 3)) == "rolled_back"
-    assert refusal(kept.load(), statement(THIRD, FIRST, 3)) == "rolled_back"
-
-
-def test_an_agent_that_missed_the_overlap_gets_advice(kept: Kept, caplog: pytest.LogCaptureFixture) -> None:
-    kept.now_ms = ENDS_MS
+def test_an_agent_that_missed_the_overlap_gets_advice(fixture: PinsFixture, caplog: pytest.LogCaptureFixture) -> None:
+    fixture.now_ms = ENDS_MS
     with pytest.raises(Refused, match="repin"):
-        kept.pins.follow([statement(SECOND, FIRST, 2)])
-    kept.pins.check(name(SECOND))
-    kept.pins.check(name(SECOND))
-    assert caplog.text.count("repin") == 1
+        fixture.pins.follow([statement(SECOND, FIRST, 2)])
+    assert len(fixture.pins) == 1
+    for key in (name(FIRST), "", name(SECOND), name(SECOND)):
+        fixture.pins.check(key)
+    assert caplog.text.count("repin") == 1, "only the unknown key, and once"
 
 
-def test_without_cloud_time_no_key_is_added_or_expires(kept: Kept) -> None:
-    kept.pins.follow([statement(SECOND, FIRST, 2)])
-    kept.now_ms = None
-    assert refusal(kept.pins, statement(THIRD, SECOND, 3)) == "no_clock"
-    assert set(kept.pins) == {name(FIRST), name(SECOND)}
+def test_without_cloud_time_no_key_is_added_or_expires(fixture: PinsFixture) -> None:
+    fixture.pins.follow([statement(SECOND, FIRST, 2)])
+    fixture.now_ms = None
+    assert rejection(fixture.pins, statement(THIRD, SECOND, 3)) == "no_clock"
+    assert set(fixture.pins) == {name(FIRST), name(SECOND)}
 
 
-def test_a_repeated_statement_of_an_expired_key_changes_nothing(kept: Kept) -> None:
+def test_a_repeated_statement_of_an_expired_key_changes_nothing(fixture: PinsFixture) -> None:
     first = statement(SECOND, FIRST, 2)
-    kept.pins.follow([first])
-    kept.now_ms = ENDS_MS
-    kept.pins.follow([statement(THIRD, SECOND, 3, ends_ms=2 * ENDS_MS)])
-    assert name(FIRST) not in kept.store.pairing().keys  # type: ignore[union-attr]
-    kept.pins.follow([first])
-    assert (set(kept.pins), kept.pins.serial) == ({name(SECOND), name(THIRD)}, 3)
-
-
-def test_a_valid_key_is_not_logged(kept: Kept, caplog: pytest.LogCaptureFixture) -> None:
-    assert len(kept.pins) == 1
-    kept.pins.check(name(FIRST))
-    kept.pins.check("")
-    assert not caplog.text
+    fixture.pins.follow([first])
+    fixture.now_ms = ENDS_MS
+    fixture.pins.follow([statement(THIRD, SECOND, 3, ends_ms=2 * ENDS_MS)])
+    assert name(FIRST) not in fixture.store.pairing().keys  # type: ignore[union-attr]
+    fixture.pins.follow([first])
+    assert (set(fixture.pins), fixture.pins.serial) == ({name(SECOND), name(THIRD)}, 3)

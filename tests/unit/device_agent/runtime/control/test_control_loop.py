@@ -1,44 +1,42 @@
-"""Control loop: early periods, Stop and telemetry rate."""
+"""Control loop: early periods, Stop, telemetry rate and bases."""
 
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from device_agent.ports.driver import Observation
-from device_agent.protocol import (
-    JointTarget,
-    JointTelemetry,
-    Mode,
-    Setpoint,
-    Stop,
-    StopDevice,
-    StopLatch,
-    codec,
-    topics,
-)
+from device_agent.ports.driver import REST, DriverError, Observation, Twist
+from device_agent.protocol import JointTarget, JointTelemetry, Mode, Setpoint, StopDevice, StopLatch
+from device_agent.protocol.manifests.robot_type import Base
 from device_agent.runtime.authority.lease_gate import LeaseGate
+from device_agent.runtime.control import control_loop as module
 from device_agent.runtime.control.control_loop import ControlLoop
 from device_agent.runtime.control.controller import Controller
-from tests.fakes.drivers import FakeDriver, robot_type
+from device_agent.runtime.control.goals import GoalResult
+from tests.fakes.drivers import BASE, FakeDriver, robot_type
+from tests.harness.agent.controller_fixture import ignore_revocation
 from tests.harness.agent.device_harness import DeviceHarness
 from tests.harness.network.brokers import SILENCE_S, wait_until
+from tests.unit.device_agent.runtime.conftest import MakeDevice
 
 LONG_MS = 600_000
-"""No test waits for a period of this length: it is longer than any patience."""
+"""No test waits for a period of this length."""
+AT_REST = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
+LATCH = StopLatch(caller="bob", reason="", at_ms=1)
 
 
 class LoopFixture:
-    """A toy arm whose control loop runs, and its operator."""
+    """A control loop, which may run, and its operator."""
 
-    def __init__(self, driver: FakeDriver | None = None, *, period_ms: int = LONG_MS) -> None:
-        kind = robot_type(period_ms=period_ms)
+    def __init__(self, driver: FakeDriver | None = None, *, period_ms: int = LONG_MS, base: Base | None = None) -> None:
+        kind = robot_type(base, period_ms=period_ms)
         self.driver = driver or FakeDriver()
         self.controller = Controller(kind, LeaseGate())
+        self.controller.start_at((0.0, 0.0))
+        self.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=time.monotonic())
         self.published: list[JointTelemetry] = []
         self.loop = ControlLoop(
             kind,
@@ -50,11 +48,6 @@ class LoopFixture:
         )
         self._sequence = 0
 
-    def start(self) -> None:
-        self.loop.start()
-        wait_until(lambda: len(self.published) == 1, "the first period")
-        self.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=time.monotonic())
-
     def send_setpoint(self, elbow_rad: float) -> None:
         self._sequence += 1
         target = JointTarget(position_rad={"elbow": elbow_rad})
@@ -63,30 +56,27 @@ class LoopFixture:
         self.loop.wake()
 
 
+MakeLoop = Callable[..., LoopFixture]
+
+
 @pytest.fixture
-def setup() -> Iterator[LoopFixture]:
-    setup = LoopFixture()
-    setup.start()
-    yield setup
-    setup.loop.stop()
+def make_loop() -> Iterator[MakeLoop]:
+    """Starts control loops, and waits for their first period."""
+    made: list[LoopFixture] = []
 
+    def make(*args: Any, **options: Any) -> LoopFixture:
+        made.append(LoopFixture(*args, **options))
+        made[-1].loop.start()
+        wait_until(lambda: made[-1].loop._next_s > time.monotonic(), "the first period")
+        return made[-1]
 
-def test_a_device_at_rest_follows_a_setpoint_at_once(setup: LoopFixture) -> None:
-    setup.send_setpoint(0.5)
-    wait_until(lambda: setup.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
-    wait_until(lambda: setup.published[-1].setpoint_sequence == 1, "telemetry of it")
-
-
-def test_a_flood_of_setpoints_adds_one_period(setup: LoopFixture) -> None:
-    setup.send_setpoint(0.5)
-    wait_until(lambda: setup.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
-    setup.send_setpoint(0.7)
-    time.sleep(SILENCE_S)
-    assert setup.driver.position[1] == pytest.approx(0.5)
+    yield make
+    for setup in made:
+        setup.loop.stop()
 
 
 class InlineDriver(FakeDriver):
-    """Its loop's thread is not needed: ``threads`` are those that have commanded it."""
+    """``threads`` are those that have commanded it."""
 
     prompt = True
 
@@ -99,62 +89,62 @@ class InlineDriver(FakeDriver):
         return super().send(position_rad)
 
 
-def test_an_inline_driver_is_commanded_by_the_callers_thread() -> None:
-    setup = LoopFixture(InlineDriver())
-    setup.start()
-    try:
-        setup.send_setpoint(0.5)
-        assert setup.driver.position[1] == pytest.approx(0.5)
-        assert setup.published[-1].setpoint_sequence == 1
-        setup.send_setpoint(0.7)  # the second waits for its period, which here takes ten minutes
-        assert setup.driver.position[1] == pytest.approx(0.5)
-        assert isinstance(setup.driver, InlineDriver)
-        assert setup.driver.threads[1:] == [threading.current_thread().name]
-    finally:
-        setup.loop.stop()
+def test_a_device_at_rest_follows_one_of_several_setpoints_at_once(make_loop: MakeLoop) -> None:
+    setup = make_loop()
+    setup.send_setpoint(0.5)
+    wait_until(lambda: setup.published[-1].setpoint_sequence == 1, "telemetry of it")
+    assert setup.driver.position[1] == pytest.approx(0.5)
+    setup.send_setpoint(0.7)
+    time.sleep(SILENCE_S)
+    assert setup.driver.position[1] == pytest.approx(0.5)
+
+
+def test_an_inline_driver_is_commanded_by_the_callers_thread_until_the_stop(make_loop: MakeLoop) -> None:
+    driver = InlineDriver()
+    setup = make_loop(driver)
+    setup.send_setpoint(0.5)
+    assert driver.position[1] == pytest.approx(0.5)
+    assert setup.published[-1].setpoint_sequence == 1
+    setup.send_setpoint(0.7)  # the second one waits for its period of ten minutes
+    assert driver.position[1] == pytest.approx(0.5)
+    assert driver.threads[1:] == [threading.current_thread().name]
+    setup.loop.stop()
     setup.loop._out_of_turn = False
     setup.send_setpoint(0.9)
-    assert len(setup.driver.threads) == 2, "who has stopped commands nothing more"
+    assert len(driver.threads) == 2
 
 
-def test_a_full_period_follows_an_early_one() -> None:
+def test_a_full_period_follows_an_early_one(make_loop: MakeLoop) -> None:
     driver = InlineDriver()
-    setup = LoopFixture(driver, period_ms=300)
-    setup.start()
-    try:
-        before = len(driver.threads)
-        wait_until(lambda: len(driver.threads) > before, "a period")
-        setup.loop._out_of_turn = False
-        setup.send_setpoint(0.5)
-        asked_s, commanded = time.monotonic(), len(driver.threads)
-        wait_until(lambda: len(driver.threads) > commanded, "the next period")
-        assert time.monotonic() - asked_s >= 0.29
-    finally:
-        setup.loop.stop()
+    setup = make_loop(driver, period_ms=300)
+    setup.loop._out_of_turn = False
+    start_s = time.monotonic()
+    setup.send_setpoint(0.5)
+    commanded = len(driver.threads)
+    wait_until(lambda: len(driver.threads) > commanded, "the next period")
+    assert time.monotonic() - start_s >= 0.3
 
 
-def test_a_blocked_period_does_not_prevent_stop() -> None:
-    setup = LoopFixture()
-    setup.start()
+def test_a_blocked_period_does_not_prevent_stop(make_loop: MakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_STOP_TIMEOUT_S", 0.01)
+    setup = make_loop()
     with setup.loop._period_lock:
         setup.loop.stop()
     assert setup.loop._stopping.is_set()
 
 
-def test_concurrent_wakes_run_one_period() -> None:
-    """The other finds out when it has the turn, not before; so does the loop's own thread."""
+def test_concurrent_wakes_run_one_period(make_loop: MakeLoop) -> None:
     driver = InlineDriver()
-    setup = LoopFixture(driver)
-    setup.start()
+    setup = make_loop(driver)
     real = setup.loop._period_lock
 
     class Turn:
         """A lock after whose acquisition another thread has just run a period."""
 
-        def acquire(self, **how: Any) -> bool:
-            taken = real.acquire(**how)
+        def acquire(self, **options: Any) -> bool:
+            acquired = real.acquire(**options)
             setup.loop._out_of_turn = True
-            return taken
+            return acquired
 
         def release(self) -> None:
             real.release()
@@ -165,161 +155,163 @@ def test_concurrent_wakes_run_one_period() -> None:
         def __exit__(self, *_: object) -> None:
             self.release()
 
-    try:
-        wait_until(lambda: setup.loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
-        setup.loop._period_lock = Turn()  # type: ignore[assignment]
-        commanded = len(driver.threads)
-        setup.send_setpoint(0.5)
-        time.sleep(SILENCE_S)
-        assert len(driver.threads) == commanded
-    finally:
-        setup.loop._period_lock = real
-        setup.loop.stop()
+    setup.loop._period_lock = Turn()  # type: ignore[assignment]
+    setup.send_setpoint(0.5)
+    time.sleep(SILENCE_S)
+    assert len(driver.threads) == 1
 
 
-def test_an_error_in_an_early_period_is_a_fault_until_the_driver_responds() -> None:
-    setup = LoopFixture(InlineDriver(), period_ms=8)
-    setup.start()
-    try:
-        with setup.loop._period_lock:  # its loop's thread waits meanwhile
-            setup.driver.broken = True
-            setup.controller.update(time.monotonic())
-        wait_until(lambda: setup.controller.fault is not None, "the fault")
-        setup.driver.broken = False
-        wait_until(lambda: setup.controller.fault is None, "the driver's return")
-    finally:
-        setup.loop.stop()
-    setup = LoopFixture(InlineDriver())
-    setup.start()
-    try:
-        setup.driver.refuses = True
-        setup.send_setpoint(0.5)
-        wait_until(lambda: setup.controller.fault == "no", "the fault")
-    finally:
-        setup.loop.stop()
+def test_an_error_in_any_period_is_a_fault_until_the_driver_responds(make_loop: MakeLoop) -> None:
+    setup = make_loop(InlineDriver(), period_ms=8)
+    setup.driver.broken = True
+    wait_until(lambda: setup.controller.fault is not None, "the fault")
+    setup.driver.broken = False
+    wait_until(lambda: setup.controller.fault is None, "the driver's return")
+    setup = make_loop(InlineDriver())
+    setup.driver.refuses = True
+    setup.send_setpoint(0.5)
+    wait_until(lambda: setup.controller.fault == "no", "the fault of an early period")
 
 
-def plainly(harness: DeviceHarness) -> None:
-    harness.receive(topics.STOP, codec.encode(Stop(id="s", caller="ann", reason="")))
-
-
-def signed(harness: DeviceHarness) -> None:
-    harness.command(StopDevice(reason=""))
-
-
-@pytest.mark.parametrize("stop", [plainly, signed])
+@pytest.mark.parametrize("stop", [DeviceHarness.receive_stop, lambda harness: harness.command(StopDevice(reason=""))])
 @pytest.mark.parametrize("driver", [FakeDriver, InlineDriver])
 def test_a_stop_at_rest_does_not_wait_for_a_period(
-    tmp_path: Path, driver: type[FakeDriver], stop: Callable[[DeviceHarness], object]
+    make_device: MakeDevice, driver: type[FakeDriver], stop: Callable[[DeviceHarness], object]
 ) -> None:
-    harness = DeviceHarness(tmp_path, driver=driver(), kind=robot_type(period_ms=LONG_MS))
-    harness.device.start()
-    try:
-        loop = harness.device._loop
-        assert isinstance(loop, ControlLoop)
-        wait_until(lambda: loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
-        stop(harness)
-        wait_until(lambda: harness.device._controller.mode is Mode.STOPPED, "the period that obeys")
-    finally:
-        harness.stop()
+    harness = make_device(driver=driver(), kind=robot_type(period_ms=LONG_MS))
+    loop = harness.device._loop
+    assert isinstance(loop, ControlLoop)
+    wait_until(lambda: loop._next_s > time.monotonic(), "the first period")
+    stop(harness)
+    wait_until(lambda: harness.device._controller.mode is Mode.STOPPED, "an early period")
 
 
 def test_in_motion_periods_keep_their_length() -> None:
     setup = LoopFixture(InlineDriver(), period_ms=8)
-    setup.controller.start_at((0.0, 0.0))
-    now_s = time.monotonic()
-    setup.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
     setup.send_setpoint(0.5)
     assert setup.loop._wait()
-    setup.controller.update(now_s)
+    setup.controller.update(time.monotonic())
     assert setup.controller.moving
     setup.send_setpoint(0.6)
     assert not setup.loop._wait()
-    assert setup.driver.position[1] == 0.0, "no period has been run"
+    assert setup.driver.position[1] == 0.0, "no period has run"
 
 
-def moving(period_ms: int, periods: int = 20) -> LoopFixture:
-    """A setup whose arm moves and whose loop's thread is held back, as between two periods."""
-    setup = LoopFixture(InlineDriver(), period_ms=period_ms)
-    setup.controller.start_at((0.0, 0.0))
+class ManualTime:
+    """Stands in for the module ``time``; advances only by assignment."""
+
+    def __init__(self) -> None:
+        self.now_s = time.monotonic()
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def moving(monkeypatch: pytest.MonkeyPatch) -> LoopFixture:
+    """An arm that moves, a quarter of a period after the last one. The loop's own thread does not run."""
+    setup, clock = LoopFixture(InlineDriver(), period_ms=4), ManualTime()
+    monkeypatch.setattr(module, "time", clock)
+    setup.loop._next_s = clock.now_s
     setup.loop._thread = threading.current_thread()
-    now_s = time.monotonic()
-    setup.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
     setup.loop._out_of_turn = True
     setup.send_setpoint(2.5)
-    for _ in range(periods):
+    for _ in range(20):
+        clock.now_s = setup.loop._next_s
         setup.loop._run_period(early=False)
+    clock.now_s += 0.001
     assert setup.controller.mode is Mode.STREAMING
     assert setup.controller.moving
     return setup
 
 
-def test_a_stop_in_motion_brakes_at_once_for_the_elapsed_time() -> None:
-    setup = moving(period_ms=4)
+def test_a_stop_in_motion_brakes_at_once_for_the_elapsed_time(moving: LoopFixture) -> None:
+    setup = moving
     assert isinstance(setup.driver, InlineDriver)
     before_rad, speed_rad_s = setup.driver.position[1], setup.controller._state.motion.velocity_rad_s[1]
     commanded = len(setup.driver.threads)
-    setup.loop._next_s = time.monotonic() + 0.004 - 0.001  # a quarter of the period has passed, or more
-    setup.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    setup.controller.stop(LATCH)
     setup.loop.wake()
     assert setup.controller.mode is Mode.STOPPED
     assert len(setup.driver.threads) == commanded + 1
-    assert 0 < setup.driver.position[1] - before_rad <= speed_rad_s * 0.004 + 1e-9
+    assert 0 < setup.driver.position[1] - before_rad <= speed_rad_s * 0.0011
     assert setup.controller.moving, "it brakes, it does not jump"
-    assert setup.loop._next_s > time.monotonic() - 1
     setup.loop.wake()
     assert len(setup.driver.threads) == commanded + 1, "only once: then periods keep their length again"
 
 
-def test_a_stop_after_an_early_period_does_not_wait() -> None:
-    setup = moving(period_ms=4)
-    setup.loop._out_of_turn = True
-    setup.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+@pytest.mark.parametrize("running", [False, True])
+def test_a_stop_does_not_wait_after_an_early_period_but_for_a_running_one(moving: LoopFixture, running: bool) -> None:
+    setup = moving
+    setup.loop._out_of_turn = not running
+    setup.controller.stop(LATCH)
+    if not running:
+        setup.loop.wake()
+        assert setup.controller.mode is Mode.STOPPED
+        return
+    setup.loop._period_s = 60.0  # longest wait for a running period
+    setup.loop._period_lock.acquire()
+    threading.Timer(0.02, setup.loop._period_lock.release).start()
     setup.loop.wake()
     assert setup.controller.mode is Mode.STOPPED
 
 
 def test_the_elapsed_time_is_bounded() -> None:
-    setup = moving(period_ms=4)
-    setup.loop._next_s = 10.0
-    assert [setup.loop._passed_s(now_s) for now_s in (9.0, 9.996, 9.998, 10.0, 11.0)] == pytest.approx(
-        [0.0001, 0.0001, 0.002, 0.004, 0.004]
-    )
+    loop = LoopFixture(period_ms=4).loop
+    loop._next_s = 10.0
+    elapsed_s = [loop._passed_s(now_s) for now_s in (9.0, 9.996, 9.998, 10.0, 11.0)]
+    assert elapsed_s == pytest.approx([0.0001, 0.0001, 0.002, 0.004, 0.004])
 
 
-def test_a_stop_waits_for_the_running_period() -> None:
-    setup = moving(period_ms=100, periods=3)
-    setup.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-    setup.loop._period_lock.acquire()
-    threading.Timer(0.05, setup.loop._period_lock.release).start()
-    setup.loop.wake()
-    assert setup.controller.mode is Mode.STOPPED
-
-
-def test_telemetry_follows_setpoints_within_its_rate_limit() -> None:
+def test_telemetry_follows_setpoints_within_its_rate_limit_or_at_33_hz() -> None:
     setup = LoopFixture()
-    setup.controller.start_at((0.0, 0.0))
-    seen, tick = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ()), setup.controller.update(0.0)
+    output = setup.controller.update(0.0)
 
-    def told(now_s: float, sequence: int) -> bool:
-        before = len(setup.published)
-        setup.loop._publish_telemetry(now_s, seen, replace(tick, setpoint_sequence=sequence), (0.0, 0.0))
-        return len(setup.published) > before
+    def publish(now_s: float, sequence: int, mode: Mode = Mode.STREAMING) -> bool:
+        count = len(setup.published)
+        changed = replace(output, setpoint_sequence=sequence, mode=mode)
+        setup.loop._publish_telemetry(now_s, AT_REST, changed, (0.0, 0.0))
+        return len(setup.published) > count
 
-    asked = ((0.0, 0), (0.03, 0), (0.03, 1), (0.04, 2), (0.045, 3), (0.0501, 3))
-    assert [told(now_s, sequence) for now_s, sequence in asked] == [True, False, True, True, False, True]
-
-
-def test_telemetry_is_in_step_with_setpoints_or_at_33_hz() -> None:
-    setup = LoopFixture()
-    setup.controller.start_at((0.0, 0.0))
-    seen = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
-    tick = replace(setup.controller.update(0.0), mode=Mode.STREAMING)
-    for period in range(1001):
-        now_s = period / 1000
-        setup.loop._publish_telemetry(now_s, seen, replace(tick, setpoint_sequence=period // 25), (0.0, 0.0))
-    assert [each.setpoint_sequence for each in setup.published] == list(range(41))
+    cases = ((0.0, 0), (0.03, 0), (0.03, 1), (0.04, 2), (0.045, 3), (0.0501, 3))
+    assert [publish(*case, Mode.IDLE) for case in cases] == [True, False, True, True, False, True]
     setup.published.clear()
-    for period in range(1001, 2002):
-        setup.loop._publish_telemetry(period / 1000, seen, replace(tick, setpoint_sequence=40), (0.0, 0.0))
-    assert 32 <= len(setup.published) <= 34
+    for period in range(2002):
+        publish(10 + period / 1000, min(period // 25, 40))
+    assert [each.setpoint_sequence for each in setup.published[:41]] == list(range(41))
+    assert 32 <= len(setup.published[41:]) <= 34
+
+
+class Cart(FakeDriver):
+    """A base, which may not move as commanded."""
+
+    def __init__(self, applied: Twist | None = None) -> None:
+        super().__init__()
+        self.applied = applied
+        self.twists: list[Twist] = []
+
+    def drive(self, twist: Twist) -> Twist:
+        self.twists.append(twist)
+        return self.applied or twist
+
+
+@pytest.mark.parametrize(("applied", "limited"), [(None, ()), (REST, ("base: driver",))])
+def test_the_driver_receives_twists_until_the_drive_ends(
+    make_loop: MakeLoop, applied: Twist | None, limited: tuple[str, ...]
+) -> None:
+    cart = Cart(applied)
+    setup = make_loop(cart, period_ms=8, base=BASE)
+    reservation = setup.controller.reserve(epoch=1, on_revoked=ignore_revocation)
+    drive = setup.controller.start_drive(reservation, Twist(0.2), duration_s=0.3)
+    wait_until(drive.finished.is_set, "the end of the drive")
+    assert drive.result is GoalResult.REACHED
+    assert drive.limited == limited
+    assert 0 < max(twist.forward_m_s for twist in cart.twists) <= 0.2 + 1e-9
+    assert cart.twists[-1] == pytest.approx(REST, abs=1e-6)
+
+
+def test_a_type_with_a_base_needs_a_mobile_driver() -> None:
+    setup = LoopFixture(base=BASE)
+    with pytest.raises(DriverError, match="'arm' has a base, but its driver cannot drive"):
+        setup.loop.start()
+    setup.loop.stop()

@@ -9,46 +9,51 @@ from device_agent.ports.driver import REST, Twist
 from device_agent.runtime.control.base_motion import BaseMotion
 from device_agent.runtime.control.goals import DriveGoal, GoalResult
 from device_agent.runtime.control.joint_motion import MotionError
-from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE, PERIOD_S
 from tests.harness.agent.controller_fixture import ControllerFixture, interruptions, refuses
 
-
-def twists(fixture: ControllerFixture, seconds: float) -> list[Twist]:
-    found = []
-    for _ in range(round(seconds / PERIOD_S)):
-        fixture.now_s += PERIOD_S
-        found.append(fixture.controller.update(fixture.now_s).twist)
-    return found
+AT_REST = pytest.approx(REST, abs=1e-6)
 
 
-def driving(fixture: ControllerFixture, duration_s: float = 2.0) -> DriveGoal:
-    reservation = fixture.reserve()
-    return fixture.controller.start_drive(reservation, Twist(0.4, 0.0, -0.5), duration_s=duration_s)
+class BaseFixture(ControllerFixture):
+    def __init__(self) -> None:
+        super().__init__(base=BASE)
+        self.grant(1, lease_s=5.0)
+
+    def twists(self, seconds: float) -> list[Twist]:
+        self.outputs.clear()
+        self.run(seconds)
+        return [output.twist for output in self.outputs]
+
+    def drive(self, twist: Twist = Twist(0.4, 0.0, -0.5), duration_s: float = 2.0) -> DriveGoal:  # noqa: B008 (a tuple)
+        return self.controller.start_drive(self.reservation, twist, duration_s=duration_s)
 
 
 def test_a_drive_accelerates_keeps_its_twist_and_ends() -> None:
-    fixture = ControllerFixture(base=BASE)
-    drive = driving(fixture)
-    found = twists(fixture, 2.0)
+    fixture = BaseFixture()
+    drive = fixture.drive()
+    twists = fixture.twists(2.0)
     assert not drive.finished.is_set()
-    assert found[-1] == pytest.approx(Twist(0.4, 0.0, -0.5))
-    gains = [(b.forward_m_s - a.forward_m_s) / PERIOD_S for a, b in pairwise(found)]
+    assert twists[-1] == pytest.approx(Twist(0.4, 0.0, -0.5))
+    gains = [(b.forward_m_s - a.forward_m_s) / PERIOD_S for a, b in pairwise(twists)]
     assert max(gains) <= BASE.max_linear_acceleration_m_s2 + 1e-6
-    assert twists(fixture, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
+    assert fixture.twists(0.3)[-1] == AT_REST
     assert drive.result is GoalResult.REACHED
     assert fixture.elbow == 0.0
 
 
-@pytest.mark.parametrize("cause", interruptions())
+@pytest.mark.parametrize("cause", [*interruptions(), "end of the action"])
 def test_every_revocation_brakes_the_base(cause: str) -> None:
-    fixture = ControllerFixture(base=BASE)
-    fixture.take(1, lease_s=5.0)
-    drive = driving(fixture, duration_s=50.0)
-    twists(fixture, 1.0)
+    fixture = BaseFixture()
+    drive = fixture.drive(duration_s=50.0)
+    fixture.twists(1.0)
     assert fixture.controller.moving
-    interruptions()[cause](fixture)  # type: ignore[operator]
-    assert twists(fixture, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
+    if cause in interruptions():
+        interruptions()[cause](fixture)
+    else:
+        fixture.controller.end_reservation(fixture.reservation)
+        fixture.controller.end_reservation(fixture.reservation)
+    assert fixture.twists(0.3)[-1] == AT_REST
     assert drive.result is GoalResult.INTERRUPTED
     assert not fixture.controller.moving
 
@@ -68,64 +73,58 @@ def test_a_new_twist_while_braking_does_not_reverse_the_base() -> None:
 
 
 def test_a_restriction_slows_a_drive() -> None:
-    fixture = ControllerFixture(base=BASE)
-    drive = driving(fixture)
-    twists(fixture, 1.0)
+    fixture = BaseFixture()
+    drive = fixture.drive()
+    fixture.twists(1.0)
     fixture.controller.restrict("zone", 0.5, "a person is near")
-    assert twists(fixture, 0.8)[-1] == pytest.approx(Twist(0.2, 0.0, -0.25))
+    assert fixture.twists(0.8)[-1] == pytest.approx(Twist(0.2, 0.0, -0.25))
     assert drive.limited == ("interlock: a person is near",)
 
 
 def test_drive_and_joint_goals_replace_each_other() -> None:
-    fixture = ControllerFixture(base=BASE)
-    reservation = fixture.reserve()
-    move = fixture.controller.start_joint_goal(reservation, {"elbow": 2.0}, speed=1.0)
+    fixture = BaseFixture()
+    move = fixture.move(elbow=2.0)
     fixture.run(0.3)
-    drive = fixture.controller.start_drive(reservation, Twist(0.4), duration_s=5.0)
+    drive = fixture.drive(duration_s=5.0)
     fixture.run(0.5)
     assert (move.result, move.why and move.why.code) == (GoalResult.INTERRUPTED, "replaced")
-    fixture.controller.start_joint_goal(reservation, {"elbow": 0.0}, speed=1.0)
+    fixture.move(elbow=0.0)
     fixture.run(2.0)
     assert drive.result is GoalResult.INTERRUPTED
     assert not fixture.controller.moving
 
 
-def refusals() -> dict[str, tuple[Twist, float]]:
-    return {
-        "out_of_range": (Twist(0.6), 1.0),
-        "out_of_range sideways": (Twist(0.0, 0.1), 1.0),
-        "out_of_range nan": (Twist(math.nan), 1.0),
-        "bad_duration": (Twist(0.1), 0.0),
-        "bad_duration long": (Twist(0.1), 61.0),
-        "bad_duration nan": (Twist(0.1), math.nan),
-    }
-
-
-@pytest.mark.parametrize("case", refusals())
-def test_invalid_drives_are_rejected(case: str) -> None:
-    fixture = ControllerFixture(base=BASE)
-    reservation = fixture.reserve()
-    twist, duration_s = refusals()[case]
-    with pytest.raises(Refused) as refused:
-        fixture.controller.start_drive(reservation, twist, duration_s=duration_s)
-    assert refused.value.code == case.split(maxsplit=1)[0]
-    assert twists(fixture, 0.1)[-1] == REST
+@pytest.mark.parametrize(
+    ("twist", "duration_s", "code"),
+    [
+        (Twist(0.6), 1.0, "out_of_range"),
+        (Twist(0.0, 0.1), 1.0, "out_of_range"),
+        (Twist(math.nan), 1.0, "out_of_range"),
+        (Twist(0.1), 0.0, "bad_duration"),
+        (Twist(0.1), 61.0, "bad_duration"),
+        (Twist(0.1), math.nan, "bad_duration"),
+    ],
+)
+def test_invalid_drives_are_rejected(twist: Twist, duration_s: float, code: str) -> None:
+    fixture = BaseFixture()
+    with refuses(code):
+        fixture.drive(twist, duration_s)
+    assert fixture.twists(0.1)[-1] == REST
 
 
 def test_a_robot_without_a_base_does_not_drive() -> None:
     fixture = ControllerFixture()
-    reservation = fixture.reserve()
     with refuses("no_base"):
-        fixture.controller.start_drive(reservation, Twist(0.1), duration_s=1.0)
+        fixture.controller.start_drive(fixture.reservation, Twist(0.1), duration_s=1.0)
 
 
 def test_after_a_fault_the_base_is_at_rest() -> None:
-    fixture = ControllerFixture(base=BASE)
-    driving(fixture)
-    twists(fixture, 0.5)
+    fixture = BaseFixture()
+    fixture.drive()
+    fixture.twists(0.5)
     fixture.controller.set_fault("no answer")
     fixture.controller.clear_fault([0.0, 0.0])
-    assert twists(fixture, 0.1)[0] == REST
+    assert fixture.twists(0.1)[0] == REST
 
 
 def test_an_impossible_base_motion_is_an_error() -> None:
@@ -133,17 +132,6 @@ def test_an_impossible_base_motion_is_an_error() -> None:
     motion.follow(Twist(math.nan))
     with pytest.raises(MotionError):
         motion.update()
-
-
-def test_the_end_of_an_action_brakes_its_drive() -> None:
-    fixture = ControllerFixture(base=BASE)
-    reservation = fixture.reserve()
-    drive = fixture.controller.start_drive(reservation, Twist(0.4), duration_s=5.0)
-    twists(fixture, 0.5)
-    fixture.controller.end_reservation(reservation)
-    fixture.controller.end_reservation(reservation)
-    assert twists(fixture, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
-    assert drive.result is GoalResult.INTERRUPTED
 
 
 def test_two_parts_of_a_period_brake_a_base_as_much_as_a_whole_one() -> None:

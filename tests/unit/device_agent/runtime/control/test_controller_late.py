@@ -17,13 +17,17 @@ def fixture() -> ControllerFixture:
     return fixture
 
 
+def update_after(fixture: ControllerFixture, gap_s: float) -> None:
+    fixture.now_s += gap_s
+    fixture.elbow = fixture.controller.update(fixture.now_s).position_rad[1]
+
+
 def rest_after(fixture: ControllerFixture, *gaps_s: float) -> float:
-    """Time to rest after the last setpoint, with these times between one call of the loop and the next."""
+    """Time from the last setpoint to rest, with these times between one call of the loop and the next."""
     start_s = fixture.now_s
     for count in range(200):
         before = fixture.elbow
-        fixture.now_s += gaps_s[count % len(gaps_s)]
-        fixture.elbow = fixture.controller.update(fixture.now_s).position_rad[1]
+        update_after(fixture, gaps_s[count % len(gaps_s)])
         assert abs(fixture.elbow - before) <= FASTEST_RAD_S * PERIOD_S, "a jump"
         if not fixture.controller.moving:
             return fixture.now_s - start_s
@@ -39,19 +43,19 @@ def test_a_constantly_late_loop_rests_at_most_one_call_later(fixture: Controller
 def test_a_loop_that_was_late_brakes_earlier(fixture: ControllerFixture, gap_s: float) -> None:
     for _ in range(20):
         fixture.offer(1, 2.9)
-        fixture.now_s += gap_s
-        fixture.elbow = fixture.controller.update(fixture.now_s).position_rad[1]
+        update_after(fixture, gap_s)
     fixture.offer(1, 2.9)
     assert rest_after(fixture, gap_s) <= LIMIT_S
 
 
-def test_loop_delay_decays(fixture: ControllerFixture) -> None:
-    fixture.now_s += 0.1
+def test_loop_delay_decays_and_does_not_slow_motion_that_is_not_braking(fixture: ControllerFixture) -> None:
+    before = fixture.controller._state.motion.fastest_rad_s
     fixture.offer(1, 2.9)
-    fixture.controller.update(fixture.now_s)
+    update_after(fixture, 0.1)
+    assert fixture.controller._state.motion.fastest_rad_s == pytest.approx(before, rel=0.2)
     fixture.offer(1, -2.9)
     sooner_s = rest_after(fixture, PERIOD_S)
-    fixture.take(2)
+    fixture.grant(2)
     fixture.stream(2, 20.0, elbow=-2.9)
     fixture.stream(2, 1.0, elbow=2.9)
     assert sooner_s + 0.05 < rest_after(fixture, PERIOD_S) <= LIMIT_S
@@ -63,18 +67,8 @@ def test_a_late_setpoint_does_not_extend_the_motion(fixture: ControllerFixture) 
     assert rest_after(fixture, PERIOD_S) <= LIMIT_S - 0.09
 
 
-@pytest.mark.parametrize("gap_s", [0.05, 0.1, 0.28])
-def test_a_loop_that_hangs_once_is_at_rest_soon_after(fixture: ControllerFixture, gap_s: float) -> None:
-    assert rest_after(fixture, gap_s, *[PERIOD_S] * 200) <= LIMIT_S + PERIOD_S
-
-
-def test_a_loop_that_hangs_past_the_limit_is_at_rest_at_once(fixture: ControllerFixture) -> None:
-    assert rest_after(fixture, 0.6, *[PERIOD_S] * 200) <= 0.6 + 3 * PERIOD_S
-
-
-def test_a_delay_does_not_slow_motion_that_is_not_braking(fixture: ControllerFixture) -> None:
-    before = fixture.controller._state.motion.fastest_rad_s
-    fixture.offer(1, 2.9)
-    fixture.now_s += 0.1
-    fixture.controller.update(fixture.now_s)
-    assert fixture.controller._state.motion.fastest_rad_s == pytest.approx(before, rel=0.2)
+@pytest.mark.parametrize(
+    ("gap_s", "limit_s"), [*((gap_s, LIMIT_S + PERIOD_S) for gap_s in (0.05, 0.1, 0.28)), (0.6, 0.6 + 3 * PERIOD_S)]
+)
+def test_a_loop_that_hangs_once_is_at_rest_soon_after(fixture: ControllerFixture, gap_s: float, limit_s: float) -> None:
+    assert rest_after(fixture, gap_s, *[PERIOD_S] * 200) <= limit_s

@@ -1,43 +1,36 @@
 """Random runs of the controller: limits hold, and nothing moves without authority."""
 
-from __future__ import annotations
-
 import math
 import random
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import pytest
 
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import Clearance, Sweep
 from device_agent.protocol import DriveTarget, JogTarget, JointTarget, Mode, Setpoint, StopLatch
+from device_agent.runtime.authority.authority import Reservation  # noqa: TC001 (only in annotations)
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE, PERIOD_S
 from tests.harness.agent.controller_fixture import ControllerFixture, Wall
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from device_agent.runtime.authority.authority import Reservation
-
-    Target = JointTarget | JogTarget | DriveTarget
+Target = JointTarget | JogTarget | DriveTarget
 
 MAX_SPEED, MAX_ACCELERATION, BRAKING, RANGE = 3.0, 8.0, 20.0, 3.0
 LIMITS = (BASE.max_linear_m_s, 0.0, BASE.max_angular_rad_s)
-EASY = (BASE.max_linear_acceleration_m_s2, BASE.max_linear_acceleration_m_s2, BASE.max_angular_acceleration_rad_s2)
-HARD = (BASE.braking_linear_m_s2, BASE.braking_linear_m_s2, BASE.braking_angular_rad_s2)
-"""Of the base, part by part of its twist: it goes nowhere sideways."""
+ACCELERATIONS = (BASE.max_linear_acceleration_m_s2, 0.0, BASE.max_angular_acceleration_rad_s2)
+DECELERATIONS = (BASE.braking_linear_m_s2, 0.0, BASE.braking_angular_rad_s2)
+"""Limits of the base for each part of its twist."""
 WALL_RAD = 1.4
 REST_WITHIN_S = 0.3
 EVENTS = 120
 CLIPPED = BRAKING * 0.04**2 / 8
-"""A braking way is looked at by straight lines between knots 40 ms apart (``Motion.propose``): the way itself bends by
-so much at most, and may cut a corner of something by it. Real margins are wider."""
+"""A braking path is checked at knots 40 ms apart (``JointMotion.propose``); in between it bends by at most this."""
 JERK_PERIODS = 20
-"""What speeds up when the room slows it needs a tenth of a second to turn."""
+"""Periods in which an acceleration ends after the room slows the device."""
 
 
 class Board(Wall):
@@ -68,32 +61,25 @@ class Post(Board):
         return super().sweep([*fine, path_rad[-1]])
 
 
-class Chance:
+class RandomRun:
     """One seeded run of a controller, checked in each period against requests and responses only."""
 
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)  # noqa: S311
         shape = self.random.random()
         self.shape = Board(WALL_RAD) if shape < 0.4 else Post(WALL_RAD) if shape < 0.8 else None
-        self.fixture = ControllerFixture(geometry=self.shape, base=BASE)
-        self.controller = self.fixture.controller
+        self.controller = ControllerFixture(geometry=self.shape, base=BASE).controller
         self.now_s = 100.0
-        self.epoch = 0
-        self.sequence = 0
+        self.epoch = self.sequence = self.burned = self.slowed_for = 0
         self.reservation: Reservation | None = None
         self.may_move_until_s = -1.0
-        self.position = [0.0, 0.0]
-        self.velocity, self.passed_s = [0.0, 0.0], PERIOD_S
-        self.twist = REST
-        self.unmoved_since_s = 0.0
-        self.rest_from_s = 0.0
-        self.unasked_s = 0.0
-        self.burned = 0
-        self.slowed_for, self.share = 0, 1.0
+        self.position, self.velocity, self.twist = [0.0, 0.0], [0.0, 0.0], REST
+        self.passed_s, self.share = PERIOD_S, 1.0
+        self.authorized_s = self.rest_from_s = self.unauthorized_s = 0.0
         self.restrictions: dict[str, float] = {}
 
-    def live(self) -> None:
-        acts: dict[Callable[[], None], float] = {
+    def run(self) -> None:
+        actions: dict[Callable[[], None], float] = {
             self.grant: 3,
             self.setpoint: 3,
             self.act: 3,
@@ -110,11 +96,11 @@ class Chance:
         }
         for _ in range(EVENTS):
             with suppress(Refused):
-                self.random.choices(list(acts), list(acts.values()))[0]()
+                self.random.choices(list(actions), list(actions.values()))[0]()
             for _ in range(self.random.choice((1, 2, 20, 50, 150))):
                 self.tick()
 
-    # ------------------------------------------------------------ what is asked
+    # ------------------------------------------------------------ requests
 
     def grant(self) -> None:
         self.epoch += self.random.choice((0, 1, 1))
@@ -122,7 +108,7 @@ class Chance:
         self.controller.grant(epoch=epoch, holder="ann", lease_s=lease_s, now_s=self.now_s)
         self.sequence = 0
 
-    def likely(self) -> bool:
+    def clear_obstacles(self) -> bool:
         """Usually clear all restrictions first."""
         if self.random.random() < 0.2:
             return False
@@ -136,7 +122,7 @@ class Chance:
         return True
 
     def setpoint(self) -> None:
-        if self.reservation is None and self.likely():
+        if self.reservation is None and self.clear_obstacles():
             self.grant()
         target = self.target()
         for _ in range(self.random.choice((1, 5, 20, 60, 120))):
@@ -158,7 +144,7 @@ class Chance:
                 self.tick()
 
     def target(self) -> Target | Callable[[], Target]:
-        """What a hand on a slider, a joystick or a pad asks for, beyond every limit as well; sometimes each in turn."""
+        """A target, also beyond the limits; sometimes a function that returns another one each time."""
         push = partial(self.random.uniform, -6, 6)
         elbow = push()
         kinds: list[Callable[[], Target]] = [
@@ -168,13 +154,13 @@ class Chance:
         if self.shape is not None:
             kinds.append(lambda: JogTarget(linear_m_s=(push(), push(), 0.0), tool=self.random.random() < 0.5))
 
-        def any_of_them() -> Target:
+        def choose() -> Target:
             return self.random.choice(kinds)()
 
-        return any_of_them if self.random.random() < 0.2 else any_of_them()
+        return choose if self.random.random() < 0.2 else choose()
 
     def act(self) -> None:
-        if self.reservation is None and not self.likely():
+        if self.reservation is None and not self.clear_obstacles():
             self.epoch += self.random.choice((0, 1))
         self.reservation = self.controller.reserve(epoch=self.epoch, on_revoked=self.lost)
         assert self.epoch > self.burned, "a lease that has ended"
@@ -202,21 +188,21 @@ class Chance:
 
     def stop(self) -> None:
         self.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
-        self.taken_away()
+        self.check_revoked()
         if self.random.random() < 0.7:
             self.tick(self.random.uniform(0.02, 1.0) * PERIOD_S)
 
     def reset(self) -> None:
         self.epoch += 1
         self.controller.reset_stop(epoch=self.epoch)
-        self.taken_away()
+        self.check_revoked()
 
     def lose(self) -> None:
         self.controller.interrupt(Refused("link_lost", "the link is gone"))
 
     def fail(self) -> None:
         self.controller.set_fault("no answer")
-        self.taken_away()
+        self.check_revoked()
         for _ in range(30):
             self.tick()
         self.controller.clear_fault(self.position)
@@ -227,7 +213,7 @@ class Chance:
         self.controller.restrict(source, speed, "a person is near")
         self.restrictions[source] = speed if speed > 0 else 0.0
         if self.speed() <= 0:
-            assert self.reservation is None, "the action was not told"
+            assert self.reservation is None, "the action was not revoked"
             self.may_move_until_s = -1.0
             assert not moved or self.controller.epochs[0] == self.controller.epochs[1]
 
@@ -241,24 +227,24 @@ class Chance:
 
     def release(self) -> None:
         self.controller.release(epoch=self.epoch)
-        self.taken_away()
+        self.check_revoked()
 
-    def taken_away(self) -> None:
-        assert self.reservation is None, "the action was not told"
+    def check_revoked(self) -> None:
+        assert self.reservation is None, "the action was not revoked"
         self.may_move_until_s = -1.0
         self.burned = max(self.burned, self.controller.epochs[0])
         assert self.controller.epochs[1] == self.controller.epochs[0]
 
-    # ------------------------------------------------------------ what must hold
+    # ------------------------------------------------------------ checks
 
     def tick(self, passed_s: float = PERIOD_S) -> None:
         self.now_s += passed_s
-        tick = self.controller.update(self.now_s, passed_s=None if passed_s == PERIOD_S else passed_s)
+        output = self.controller.update(self.now_s, passed_s=None if passed_s == PERIOD_S else passed_s)
         between_s, self.passed_s = (self.passed_s + passed_s) / 2, passed_s
         faster = False
         self.slowed_for = self.slowed_for + 1 if self.speed() == self.share else 0
         self.share = self.speed()
-        for index, (was, now) in enumerate(zip(self.position, tick.position_rad, strict=True)):
+        for index, (was, now) in enumerate(zip(self.position, output.position_rad, strict=True)):
             velocity = (now - was) / passed_s
             gain = abs(velocity) - abs(self.velocity[index])
             turned = velocity * self.velocity[index] < 0
@@ -270,30 +256,30 @@ class Chance:
             if gain > 1e-6 and self.slowed_for > JERK_PERIODS:
                 assert abs(velocity) <= self.speed() * MAX_SPEED + 1e-6, "faster than the room allows"
             self.velocity[index] = velocity
-        self.position = tick.position_rad
+        self.position = output.position_rad
         if self.shape is not None:
             assert self.shape.clearance(self.position).room_m >= -CLIPPED
-        faster |= self.base(tick.twist, passed_s)
+        faster |= self.base(output.twist, passed_s)
         allowed = self.reservation is not None or self.now_s <= self.may_move_until_s + 1e-9
-        # What speeds up when the hold begins does so for four milliseconds more: the brakes have a ramp.
-        asked = allowed and tick.mode in {Mode.STREAMING, Mode.ACTION}
-        self.unasked_s = 0.0 if asked else self.unasked_s + passed_s
-        assert self.unasked_s <= 2 * PERIOD_S + 1e-9 or not faster, "it moves by itself"
-        moving = max(map(abs, self.velocity)) > 1e-6 or any(abs(part) > 1e-6 for part in tick.twist)
-        if asked:
-            self.unmoved_since_s = self.now_s
+        authorized = allowed and output.mode in {Mode.STREAMING, Mode.ACTION}
+        # Acceleration continues for four milliseconds after the start of a hold: the brakes have a ramp.
+        self.unauthorized_s = 0.0 if authorized else self.unauthorized_s + passed_s
+        assert self.unauthorized_s <= 2 * PERIOD_S + 1e-9 or not faster, "it moves by itself"
+        moving = max(map(abs, self.velocity)) > 1e-6 or any(abs(part) > 1e-6 for part in output.twist)
+        if authorized:
+            self.authorized_s = self.now_s
         if self.reservation is not None:
             self.rest_from_s = self.now_s + REST_WITHIN_S
         assert not moving or self.now_s <= self.rest_from_s + PERIOD_S, "zero 300 ms after the last setpoint"
-        if self.now_s - self.unmoved_since_s > 0.2:
+        if self.now_s - self.authorized_s > 0.2:
             assert not moving, "a hold is complete within 200 ms"
-        if self.reservation is None and self.now_s > self.may_move_until_s + PERIOD_S and tick.mode is Mode.STREAMING:
-            pytest.fail("setpoints that stopped coming are followed no more after 300 ms")
+        if self.reservation is None and self.now_s > self.may_move_until_s + PERIOD_S and output.mode is Mode.STREAMING:
+            pytest.fail("setpoints apply no longer than 300 ms")
 
     def base(self, twist: Twist, passed_s: float) -> bool:
-        """What holds for the base; whether any part of its twist grows."""
+        """Check the base; returns whether any part of its twist grows."""
         faster = False
-        for was, now, limit, easy, hard in zip(self.twist, twist, LIMITS, EASY, HARD, strict=True):
+        for was, now, limit, easy, hard in zip(self.twist, twist, LIMITS, ACCELERATIONS, DECELERATIONS, strict=True):
             gain = abs(now) - abs(was)
             assert abs(now) <= limit + 1e-6
             assert abs(now - was) / passed_s <= (easy if gain > 0 and now * was >= 0 else hard) + 1e-3
@@ -304,13 +290,14 @@ class Chance:
         return faster
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(40))
 def test_random_runs_respect_limits_and_authority(seed: int) -> None:
-    Chance(seed).live()
+    RandomRun(seed).run()
 
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 def test_many_random_runs_respect_limits_and_authority() -> None:
     for seed in range(1000, 3000):
-        Chance(seed).live()
+        RandomRun(seed).run()

@@ -17,70 +17,67 @@ from device_agent.runtime.planning.trajectory import Trajectory
 from tests.fakes.head_driver import BENT, RANGES, head
 
 HOME = (0.0, 0.0, 0.0, 0.0)
-NAMES = ("yaw", "pitch", "left")
+RANGE = dict(zip(("yaw", "pitch", "left"), RANGES, strict=False))
 
 
 def talking() -> RobotType:
-    """Whose pitch is a jaw."""
-    jaw = {"aa": {"pitch": -0.5}, "PP": {"pitch": 0.0}, "oh": {"pitch": -0.3, "yaw": 0.2}}
-    return msgspec.structs.replace(head(), visemes=jaw)
+    """A head whose pitch is a jaw."""
+    visemes = {"aa": {"pitch": -0.5}, "PP": {"pitch": 0.0}, "oh": {"pitch": -0.3, "yaw": 0.2}}
+    return msgspec.structs.replace(head(), visemes=visemes)
 
 
-def at(way: Trajectory, time_s: float) -> list[float]:
-    place: list[float] = way.at(time_s)[0].tolist()
-    return place
+def at(trajectory: Trajectory, time_s: float) -> list[float]:
+    position: list[float] = trajectory.at(time_s)[0].tolist()
+    return position
 
 
 def frame(time_s: float, say: str = "", **position_rad: float) -> Keyframe:
     return Keyframe(time_s=time_s, position_rad=position_rad, say=say)
 
 
-def check_limits(way: Trajectory, kind: RobotType) -> None:
-    """Velocity, acceleration and jerk of joints that no other one led astray."""
+def check_limits(trajectory: Trajectory, kind: RobotType) -> None:
+    """Check velocities, and acceleration and jerk of joints without couplings."""
     for index, joint in enumerate(kind.joints):
-        assert np.abs(way.velocity_rad_s[:, index]).max() <= joint.max_velocity_rad_s * 1.001
+        assert np.abs(trajectory.velocity_rad_s[:, index]).max() <= joint.max_velocity_rad_s * 1.001
         if joint.name in {"yaw", "left"}:
-            assert np.abs(way.acceleration_rad_s2[:, index]).max() <= joint.max_acceleration_rad_s2 * 1.001
-            jerk = np.diff(way.acceleration_rad_s2[:, index]) / way.step_s
+            assert np.abs(trajectory.acceleration_rad_s2[:, index]).max() <= joint.max_acceleration_rad_s2 * 1.001
+            jerk = np.diff(trajectory.acceleration_rad_s2[:, index]) / trajectory.step_s
             assert np.abs(jerk).max() <= joint.max_jerk_rad_s3 * 1.001
 
 
 def test_joints_reach_keyframes_in_time() -> None:
-    score = BehaviourTrajectory(head(), HOME)
-    assert score.add_keyframes([frame(1.0, yaw=0.5), frame(2.0, left=-0.4), frame(3.0, yaw=0.0)], {}) == []
-    way = score.trajectory()
-    assert way.duration_s == pytest.approx(3.0, abs=0.03)
-    assert at(way, 1.0) == pytest.approx([0.5, 0.0, 0.0, 0.0], abs=1e-9)
-    assert at(way, 2.0) == pytest.approx([0.5, 0.0, -0.4, 0.2], abs=1e-9)
-    assert at(way, 1.5)[2] == pytest.approx(-0.2, abs=1e-6), "it sets out when the keyframe before is reached"
-    assert at(way, 3.0) == pytest.approx([0.0, 0.0, -0.4, 0.2], abs=1e-9)
-    assert np.abs(way.velocity_rad_s[[0, -1]]).max() < 1e-9
-    check_limits(way, head())
+    behaviour = BehaviourTrajectory(head(), HOME)
+    assert behaviour.add_keyframes([frame(1.0, yaw=0.5), frame(2.0, left=-0.4), frame(3.0, yaw=0.0)], {}) == []
+    trajectory = behaviour.trajectory()
+    assert trajectory.duration_s == pytest.approx(3.0, abs=0.03)
+    assert at(trajectory, 1.0) == pytest.approx([0.5, 0.0, 0.0, 0.0], abs=1e-9)
+    assert at(trajectory, 2.0) == pytest.approx([0.5, 0.0, -0.4, 0.2], abs=1e-9)
+    assert at(trajectory, 1.5)[2] == pytest.approx(-0.2, abs=1e-6), "it starts at the previous keyframe"
+    assert at(trajectory, 3.0) == pytest.approx([0.0, 0.0, -0.4, 0.2], abs=1e-9)
+    assert np.abs(trajectory.velocity_rad_s[[0, -1]]).max() < 1e-9
+    check_limits(trajectory, head())
 
 
 def test_unreachable_times_delay_all_later_keyframes() -> None:
-    score = BehaviourTrajectory(head(), HOME)
-    score.add_keyframes([frame(0.1, yaw=2.0), frame(0.2, yaw=-2.0)], {})
-    way = score.trajectory()
-    check_limits(way, head())
-    assert way.duration_s > 2.0
-    turn = int(np.argmax(way.position_rad[:, 0]))
-    assert way.position_rad[turn, 0] == pytest.approx(2.0, abs=0.02)
-    assert at(way, way.duration_s)[0] == pytest.approx(-2.0)
+    behaviour = BehaviourTrajectory(head(), HOME)
+    behaviour.add_keyframes([frame(0.1, yaw=2.0), frame(0.2, yaw=-2.0)], {})
+    trajectory = behaviour.trajectory()
+    check_limits(trajectory, head())
+    assert trajectory.duration_s > 2.0
+    turn = int(np.argmax(trajectory.position_rad[:, 0]))
+    assert trajectory.position_rad[turn, 0] == pytest.approx(2.0, abs=0.02)
+    assert at(trajectory, trajectory.duration_s)[0] == pytest.approx(-2.0)
 
 
 def test_lines_start_with_the_motion_to_their_keyframe() -> None:
-    score = BehaviourTrajectory(head(), HOME)
+    behaviour = BehaviourTrajectory(head(), HOME)
     frames = [frame(1.0, yaw=0.2), frame(2.0, say="there"), frame(2.5, yaw=0.0, say="and back")]
-    lines = score.add_keyframes(frames, {"there": 0.5, "and back": 3.0})
+    lines = behaviour.add_keyframes(frames, {"there": 0.5, "and back": 3.0})
     assert lines == [SpokenLine(1.0, "there", 0.5), SpokenLine(2.0, "and back", 3.0)]
-    assert score.trajectory().duration_s >= 5.0, "it lasts until all is said"
-
-
-def test_an_empty_behaviour_is_a_resting_trajectory() -> None:
-    way = BehaviourTrajectory(head(), (0.3, 0.0, 0.0, 0.0)).trajectory()
-    assert way.duration_s > 0
-    assert at(way, 0.0) == at(way, 9.0) == [0.3, 0.0, 0.0, 0.0]
+    assert behaviour.trajectory().duration_s >= 5.0, "it lasts until the end of the speech"
+    resting = BehaviourTrajectory(head(), (0.3, 0.0, 0.0, 0.0)).trajectory()
+    assert resting.duration_s > 0
+    assert at(resting, 0.0) == at(resting, 9.0) == [0.3, 0.0, 0.0, 0.0]
 
 
 @settings(max_examples=40, deadline=None)
@@ -88,7 +85,7 @@ def test_an_empty_behaviour_is_a_resting_trajectory() -> None:
     steps=st.lists(
         st.tuples(
             st.floats(0, 1.5),
-            st.dictionaries(st.sampled_from(NAMES), st.floats(0, 1), max_size=3),
+            st.dictionaries(st.sampled_from(list(RANGE)), st.floats(0, 1), max_size=3),
             st.sampled_from(("", "", "hello there")),
         ),
         min_size=1,
@@ -101,66 +98,54 @@ def test_a_trajectory_stays_within_ranges_and_limits(
 ) -> None:
     kind = talking() if table is None else head(table)
     time_s, frames = 0.0, []
-    for more_s, shares, say in steps:
-        time_s += more_s
-        places = {name: low + share * (high - low) for name, share in shares.items() for low, high in [_range(name)]}
-        frames.append(frame(time_s, say, **places))
-    score = BehaviourTrajectory(kind, HOME)
-    score.add_keyframes(frames, {"hello there": 1.0})
-    way = score.trajectory()
-    MotionLimits(kind, None).check_trajectory(way.position_rad)
-    assert np.isfinite(way.velocity_rad_s).all()
+    for pause_s, shares, say in steps:
+        time_s += pause_s
+        positions = {name: low + share * (high - low) for name, share in shares.items() for low, high in [RANGE[name]]}
+        frames.append(frame(time_s, say, **positions))
+    behaviour = BehaviourTrajectory(kind, HOME)
+    behaviour.add_keyframes(frames, {"hello there": 1.0})
+    trajectory = behaviour.trajectory()
+    MotionLimits(kind, None).check_trajectory(trajectory.position_rad)
+    assert np.isfinite(trajectory.velocity_rad_s).all()
     if table is None:
-        check_limits(way, kind)
-
-
-def _range(name: str) -> tuple[float, float]:
-    return RANGES[("yaw", "pitch", "left").index(name)]
+        check_limits(trajectory, kind)
 
 
 def test_the_mouth_opens_for_vowels_and_closes_at_the_end() -> None:
-    score = BehaviourTrajectory(talking(), (0.0, -0.1, 0.0, 0.0))
-    score.add_speech(SpokenLine(0.0, "mama", 3.0))
-    way = score.trajectory()
-    assert way.position_rad[:, 1].min() < -0.25
-    assert at(way, way.duration_s)[1] == pytest.approx(-0.1)
-    check_limits(way, talking())
+    behaviour = BehaviourTrajectory(talking(), (0.0, -0.1, 0.0, 0.0))
+    behaviour.add_speech(SpokenLine(0.0, "mama", 3.0))
+    trajectory = behaviour.trajectory()
+    assert trajectory.position_rad[:, 1].min() < -0.25
+    assert at(trajectory, trajectory.duration_s)[1] == pytest.approx(-0.1)
+    check_limits(trajectory, talking())
 
 
 def test_mouth_shapes_start_from_and_return_to_the_keyframes() -> None:
-    score = BehaviourTrajectory(talking(), HOME)
-    score.add_keyframes([frame(0.5, pitch=-0.2), frame(1.0, say="baba"), frame(4.0, pitch=0.1)], {"baba": 1.0})
-    way = score.trajectory()
-    assert at(way, 0.5)[1] == pytest.approx(-0.2)
-    assert at(way, 2.5)[1] == pytest.approx(-0.2, abs=0.15), "closed as it was, or on its way to the next"
-    assert at(way, way.duration_s)[1] == pytest.approx(0.1)
+    behaviour = BehaviourTrajectory(talking(), HOME)
+    behaviour.add_keyframes([frame(0.5, pitch=-0.2), frame(1.0, say="baba"), frame(4.0, pitch=0.1)], {"baba": 1.0})
+    trajectory = behaviour.trajectory()
+    assert at(trajectory, 0.5)[1] == pytest.approx(-0.2)
+    assert at(trajectory, 2.5)[1] == pytest.approx(-0.2, abs=0.15), "closed as it was, or on its way to the next"
+    assert at(trajectory, trajectory.duration_s)[1] == pytest.approx(0.1)
 
 
 def test_overlapping_lines_wait_for_the_mouth() -> None:
-    score = BehaviourTrajectory(talking(), HOME)
-    score.add_speech(SpokenLine(0.0, "mama", 3.0))
-    score.add_speech(SpokenLine(2.9, "mama", 3.0))
-    way = score.trajectory()
-    check_limits(way, talking())
-    assert way.duration_s == pytest.approx(5.9 + 0.2, abs=0.03)
-    assert at(way, way.duration_s)[1] == pytest.approx(0.0)
+    behaviour = BehaviourTrajectory(talking(), HOME)
+    behaviour.add_speech(SpokenLine(0.0, "mama", 3.0))
+    behaviour.add_speech(SpokenLine(2.9, "mama", 3.0))
+    trajectory = behaviour.trajectory()
+    check_limits(trajectory, talking())
+    assert trajectory.duration_s == pytest.approx(5.9 + 0.2, abs=0.03)
+    assert at(trajectory, trajectory.duration_s)[1] == pytest.approx(0.0)
 
 
-# ---------------------------------------------------------------- letters
-
-
-def test_letters_map_to_visemes_in_order() -> None:
-    there = ("sil", "PP", "aa", "TH", "SS")
-    shapes = visemes.visemes_of("Path: súm!", 2.0, there)
+def test_letters_map_to_visemes_in_order_and_missing_ones_are_substituted() -> None:
+    shapes = visemes.visemes_of("Path: súm!", 2.0, ("sil", "PP", "aa", "TH", "SS"))
     assert [shape for _, shape in shapes] == ["PP", "aa", "TH", "sil", "sil", "SS", "aa", "PP", "sil"]
     assert all(early < late for (early, _), (late, _) in pairwise(shapes))
     assert 0 < shapes[0][0] < shapes[-1][0] < 2.0
-
-
-def test_missing_visemes_are_substituted() -> None:
-    assert [shape for _, shape in visemes.visemes_of("o", 1.0, ("aa",))] == ["aa"]
-    assert [shape for _, shape in visemes.visemes_of("m", 1.0, ("aa",))] == []
-    assert visemes.visemes_of("…", 1.0, ("aa",)) == []
+    for text, substitutes in (("o", ["aa"]), ("m", []), ("…", [])):
+        assert [shape for _, shape in visemes.visemes_of(text, 1.0, ("aa",))] == substitutes
 
 
 def test_the_duration_of_silent_speech_is_estimated() -> None:

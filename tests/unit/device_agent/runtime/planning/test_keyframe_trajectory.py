@@ -1,7 +1,6 @@
 """Keyframe trajectories: times, limits and agreement with the preview."""
 
 import json
-import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -33,41 +32,41 @@ def timeline(*keyframes: Moment, speed: float = 1.0) -> KeyframeTrajectory:
     return KeyframeTrajectory(head(), START, Play(keyframes=keyframes, speed=speed))
 
 
-def at(way: Trajectory, time_s: float) -> list[float]:
-    place: list[float] = way.at(time_s)[0].tolist()
-    return place
+def at(trajectory: Trajectory, time_s: float) -> list[float]:
+    position: list[float] = trajectory.at(time_s)[0].tolist()
+    return position
 
 
-def check_limits(way: Trajectory, kind: RobotType, joints: tuple[int, ...]) -> None:
+def check_limits(trajectory: Trajectory, kind: RobotType, joints: tuple[int, ...]) -> None:
     for index in joints:
         joint = kind.joints[index]
-        assert np.abs(way.velocity_rad_s[:, index]).max() <= joint.max_velocity_rad_s * 1.001
-        assert np.abs(way.acceleration_rad_s2[:, index]).max() <= joint.max_acceleration_rad_s2 * 1.002
-        jerk = np.diff(way.acceleration_rad_s2[:, index]) / way.step_s
+        assert np.abs(trajectory.velocity_rad_s[:, index]).max() <= joint.max_velocity_rad_s * 1.001
+        assert np.abs(trajectory.acceleration_rad_s2[:, index]).max() <= joint.max_acceleration_rad_s2 * 1.002
+        jerk = np.diff(trajectory.acceleration_rad_s2[:, index]) / trajectory.step_s
         assert np.abs(jerk).max() <= joint.max_jerk_rad_s3 * 1.01
 
 
 def test_joints_reach_keyframes_in_time_and_pass_through() -> None:
-    made = timeline(frame(1.0, yaw=0.5), frame(2.0, yaw=1.0, left=0.3), frame(4.0, yaw=0.0))
-    way = made.trajectory()
-    assert made.limited == ()
-    assert way.duration_s == pytest.approx(4.0, abs=0.021)
-    assert at(way, 1.0) == pytest.approx([0.5, 0.0, at(way, 1.0)[2], at(way, 1.0)[3]], abs=1e-6)
-    assert at(way, 2.0) == pytest.approx([1.0, 0.0, 0.3, -0.15], abs=1e-6)
-    assert at(way, 4.0) == pytest.approx([0.0, 0.0, 0.3, -0.15], abs=1e-6)
-    assert way.at(1.0)[1][0] == pytest.approx(0.5, abs=1e-3), "it goes on there, and does not stop"
-    assert way.at(2.0)[1][0] == pytest.approx(0.0, abs=1e-3), "it turns there"
-    assert 0 < at(way, 1.0)[2] < 0.3, "a joint that a keyframe does not name is on its way to the next that does"
-    check_limits(way, head(), (0, 2))
+    timed = timeline(frame(1.0, yaw=0.5), frame(2.0, yaw=1.0, left=0.3), frame(4.0, yaw=0.0))
+    trajectory = timed.trajectory()
+    assert timed.limited == ()
+    assert trajectory.duration_s == pytest.approx(4.0, abs=0.021)
+    assert at(trajectory, 1.0) == pytest.approx([0.5, 0.0, at(trajectory, 1.0)[2], at(trajectory, 1.0)[3]], abs=1e-6)
+    assert at(trajectory, 2.0) == pytest.approx([1.0, 0.0, 0.3, -0.15], abs=1e-6)
+    assert at(trajectory, 4.0) == pytest.approx([0.0, 0.0, 0.3, -0.15], abs=1e-6)
+    assert trajectory.at(1.0)[1][0] == pytest.approx(0.5, abs=1e-3), "it goes on there, and does not stop"
+    assert trajectory.at(2.0)[1][0] == pytest.approx(0.0, abs=1e-3), "it turns there"
+    assert 0 < at(trajectory, 1.0)[2] < 0.3, "a joint that a keyframe does not name is on its way to the next that does"
+    check_limits(trajectory, head(), (0, 2))
 
 
 def test_keyframes_that_are_too_early_are_delayed() -> None:
-    made = timeline(frame(0.01, yaw=1.0), frame(1.0, left=0.3))
-    way = made.trajectory()
-    assert made.limited == ("keyframes: later",)
-    assert way.duration_s > 1.3
-    assert at(way, 9.0) == pytest.approx([1.0, 0.0, 0.3, -0.15], abs=1e-6)
-    check_limits(way, head(), (0, 2))
+    timed = timeline(frame(0.01, yaw=1.0), frame(1.0, left=0.3))
+    trajectory = timed.trajectory()
+    assert timed.limited == ("keyframes: later",)
+    assert trajectory.duration_s > 1.3
+    assert at(trajectory, 9.0) == pytest.approx([1.0, 0.0, 0.3, -0.15], abs=1e-6)
+    check_limits(trajectory, head(), (0, 2))
 
 
 def test_speed_scales_time_within_the_limits() -> None:
@@ -76,12 +75,9 @@ def test_speed_scales_time_within_the_limits() -> None:
     fast = timeline(*keyframes, speed=2.0)
     assert fast.limited
     check_limits(fast.trajectory(), head(), (0,))
-
-
-def test_keyframes_without_joints_only_take_time() -> None:
-    way = timeline(frame(0.5)).trajectory()
-    assert way.duration_s == pytest.approx(0.5, abs=0.021)
-    assert np.ptp(way.position_rad) == 0
+    empty = timeline(frame(0.5)).trajectory()
+    assert empty.duration_s == pytest.approx(0.5, abs=0.021)
+    assert np.ptp(empty.position_rad) == 0
 
 
 def test_poses_contain_leading_joints_at_each_keyframe() -> None:
@@ -108,62 +104,59 @@ def test_invalid_keyframes_are_rejected_with_their_number(keyframes: list[Moment
 
 def test_after_the_last_iteration_the_whole_trajectory_is_slowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("device_agent.runtime.planning.keyframe_trajectory._ITERATIONS", 1)
-    way = timeline(frame(0.1, yaw=1.5), frame(0.12, yaw=1.6), frame(0.5, yaw=-1.0)).trajectory()
-    assert np.abs(way.velocity_rad_s).max() <= 4.0
+    trajectory = timeline(frame(0.1, yaw=1.5), frame(0.12, yaw=1.6), frame(0.5, yaw=-1.0)).trajectory()
+    assert np.abs(trajectory.velocity_rad_s).max() <= 4.0
 
 
 @st.composite
 def movements(draw: st.DrawFn) -> list[Moment]:
-    reached_s, made = 0.0, []
+    reached_s, timed = 0.0, []
     for _ in range(draw(st.integers(1, 6))):
         reached_s += draw(st.floats(0.01, 1.5))
         named = draw(st.sets(st.sampled_from((0, 1, 2))))
         places = {("yaw", "pitch", "left")[one]: draw(st.floats(*RANGES[one])) for one in named}
-        made.append(Moment(time_s=reached_s, position_rad=places))
-    return made
+        timed.append(Moment(time_s=reached_s, position_rad=places))
+    return timed
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(movements())
 def test_random_movements_stay_within_limits_and_do_not_overshoot(keyframes: list[Moment]) -> None:
     kind = head()
-    way = KeyframeTrajectory(kind, START, Play(keyframes=tuple(keyframes), speed=1.0)).trajectory()
-    MotionLimits(kind, None).check_trajectory(way.position_rad)
-    check_limits(way, kind, (0, 2))
+    trajectory = KeyframeTrajectory(kind, START, Play(keyframes=tuple(keyframes), speed=1.0)).trajectory()
+    MotionLimits(kind, None).check_trajectory(trajectory.position_rad)
+    check_limits(trajectory, kind, (0, 2))
     for index, name in ((0, "yaw"), (2, "left")):
         places = [0.0, *(one.position_rad[name] for one in keyframes if name in one.position_rad)]
         turns = sum((b - a) * (c - b) < 0 for (a, b), (_, c) in pairwise(pairwise(places)))
-        way_of = way.position_rad[:, index]
+        way_of = trajectory.position_rad[:, index]
         assert min(places) - 1e-9 <= way_of.min() <= way_of.max() <= max(places) + 1e-9
         steps = np.diff(way_of)
         steps = steps[np.abs(steps) > 1e-9]
         assert np.sum(steps[1:] * steps[:-1] < 0) <= max(turns, 0) + 1
 
 
-def reckoned(case: dict[str, Any]) -> dict[str, Any]:
+def computed(case: dict[str, Any]) -> dict[str, Any]:
     """A shared movement with when its keyframes are reached and where its joints are at ten moments."""
     keyframes = msgspec.convert(case["keyframes"], tuple[Moment, ...])
-    made = KeyframeTrajectory(head(), case["start_rad"], Play(keyframes=keyframes, speed=1.0))
-    moments = made._moments()
+    timed = KeyframeTrajectory(head(), case["start_rad"], Play(keyframes=keyframes, speed=1.0))
+    moments = timed._moments()
     looks = np.linspace(0, moments[-1], 10)
-    way = [[float(value) for value in at(made.trajectory(), one)] for one in looks]
-    return {"reached_s": moments[1:].tolist(), "position_rad": way}
+    positions = [at(timed.trajectory(), time_s) for time_s in looks]
+    return {"reached_s": moments[1:].tolist(), "position_rad": positions}
 
 
 def test_the_preview_computes_the_same_timeline() -> None:
     cases = json.loads(SHARED.read_text())
     assert cases
     for case in cases:
-        now, kept = reckoned(case), case["reckoned"]
-        assert now["reached_s"] == pytest.approx(kept["reached_s"], rel=1e-6), case["name"]
-        assert np.array(now["position_rad"]) == pytest.approx(np.array(kept["position_rad"]), abs=1e-6), case["name"]
-
-
-def _write() -> None:
-    cases = json.loads(SHARED.read_text())
-    SHARED.write_text(json.dumps([case | {"reckoned": reckoned(case)} for case in cases], indent=1) + "\n")
+        actual, expected = computed(case), case["reckoned"]
+        assert actual["reached_s"] == pytest.approx(expected["reached_s"], rel=1e-6), case["name"]
+        positions = np.array(expected["position_rad"])
+        assert np.array(actual["position_rad"]) == pytest.approx(positions, abs=1e-6), case["name"]
 
 
 if __name__ == "__main__":
-    _write()
-    sys.exit(0)
+    cases = json.loads(SHARED.read_text())
+    SHARED.write_text(json.dumps([case | {"reckoned": computed(case)} for case in cases], indent=1) + "\n")

@@ -1,14 +1,17 @@
 """Motion planning around obstacles and on straight lines."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import mujoco
 import numpy as np
 import pytest
 
 from device_agent.geometry.mujoco_geometry import MujocoGeometry
-from device_agent.ports.geometry import GeometryError, PlannerLostError
+from device_agent.ports.geometry import GeometryError, PlannerLostError, never
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
@@ -26,7 +29,7 @@ POST = '<geom name="post" type="cylinder" size="0.04 0.35" pos="-0.249 -0.414 0.
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The table with a post on it, half way between the arm at home and where it shall go."""
+    """The table with a post on it, half way between the home position and the goal."""
     folder = tmp_path_factory.mktemp("ur5")
     (folder / "ur5.xml").write_bytes((UR5 / "ur5.xml").read_bytes())
     text = (UR5 / KIND.scene).read_text().replace("<worldbody>", f"<worldbody>{POST}", 1)
@@ -61,97 +64,94 @@ class Physics:
             self.touched += self.data.ncon
 
     def flange_m(self) -> list[float]:
-        place: list[float] = self.data.site("flange").xpos.tolist()
-        return place
+        position: list[float] = self.data.site("flange").xpos.tolist()
+        return position
 
 
-def check_around(scene: Path, shape: MujocoGeometry, seed: int) -> float:
-    """Plan with this seed, go, and give how far the flange then is from where it should be [m]."""
-    physics, routes = Physics(scene, shape), MotionPlanner(KIND, shape, seed=seed)
-    way = routes.plan(HOME, BEYOND, speed=1.0, ended=lambda: False)
-    goal = physics.controller.start_trajectory(physics.reservation, way)
-    physics.run(way.duration_s + 1.5)
+def execute(scene: Path, shape: MujocoGeometry, seed: int) -> float:
+    """Plan with this seed and follow the plan; returns the position error of the flange [m]."""
+    physics = Physics(scene, shape)
+    trajectory = MotionPlanner(KIND, shape, seed=seed).plan(HOME, BEYOND, speed=1.0, ended=never)
+    goal = physics.controller.start_trajectory(physics.reservation, trajectory)
+    physics.run(trajectory.duration_s + 1.5)
     assert goal.result is GoalResult.REACHED, goal.why
     assert goal.limited == ()
     assert physics.touched == 0
     return math.dist(physics.flange_m(), shape.poses(BEYOND)["flange"][:3])
 
 
-def test_the_straight_path_collides_with_the_post(shape: MujocoGeometry) -> None:
-    swept = shape.sweep([HOME, BEYOND])
-    assert swept.clearance is not None
-    assert "post" in swept.clearance.text
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_plan_avoids_the_post_and_reaches_the_goal(scene: Path, shape: MujocoGeometry, seed: int) -> None:
-    assert check_around(scene, shape, seed) <= 0.001
+    obstacle = shape.sweep([HOME, BEYOND]).clearance
+    assert obstacle is not None
+    assert "post" in obstacle.text, "the straight path collides"
+    assert execute(scene, shape, seed) <= 0.001
 
 
 @pytest.mark.long
 def test_planning_succeeds_with_twenty_seeds(scene: Path, shape: MujocoGeometry) -> None:
-    errors_m = [check_around(scene, shape, 100 + seed) for seed in range(20)]
-    assert max(errors_m) <= 0.001
+    assert max(execute(scene, shape, 100 + seed) for seed in range(20)) <= 0.001
 
 
+@pytest.mark.slow
 def test_a_straight_path_is_straight_in_simulation(scene: Path, shape: MujocoGeometry) -> None:
     physics = Physics(scene, shape)
     begin = shape.poses(HOME)["flange"]
     pose = (begin[0], begin[1] + 0.25, begin[2] - 0.05, *begin[3:])
-    way = MotionPlanner(KIND, shape).plan_straight(HOME, "flange", pose, speed=0.5)
-    physics.controller.start_trajectory(physics.reservation, way)
-    line, off_m = np.subtract(pose[:3], begin[:3]), []
-    for _ in range(round(way.duration_s / PERIOD_S) + 100):
+    line = np.subtract(pose[:3], begin[:3])
+
+    def error_m(position_m: Sequence[float]) -> float:
+        """Distance from the line."""
+        offset = np.subtract(position_m, begin[:3])
+        return float(np.linalg.norm(offset - line * (offset @ line) / (line @ line)))
+
+    trajectory = MotionPlanner(KIND, shape).plan_straight(HOME, "flange", pose, speed=0.5)
+    physics.controller.start_trajectory(physics.reservation, trajectory)
+    for _ in range(round(trajectory.duration_s / PERIOD_S) + 100):
         physics.run(PERIOD_S)
-        away = np.subtract(physics.flange_m(), begin[:3])
-        off_m.append(float(np.linalg.norm(away - line * (away @ line) / (line @ line))))
+        assert error_m(physics.flange_m()) <= 0.004
     assert math.dist(physics.flange_m(), pose[:3]) <= 0.001
-    assert max(off_m) <= 0.004
-    commanded = [shape.poses(place.tolist())["flange"] for place in way.position_rad[::5]]
-    ways = [np.subtract(place[:3], begin[:3]) for place in commanded]
-    assert max(float(np.linalg.norm(one - line * (one @ line) / (line @ line))) for one in ways) <= 0.0005
+    for position_rad in trajectory.position_rad[::5]:
+        assert error_m(shape.poses(position_rad.tolist())["flange"][:3]) <= 0.0005
 
 
-def test_a_goal_without_clearance_is_rejected_with_the_obstacle(shape: MujocoGeometry) -> None:
-    with pytest.raises(GeometryError, match="the goal is not clear: clearance: post"):
-        shape.plan(HOME, [0.8, *HOME[1:]])
-
-
-def test_a_search_times_out(shape: MujocoGeometry) -> None:
-    with pytest.raises(GeometryError, match="found no path in 0 s"):
-        shape.plan(HOME, BEYOND, within_s=0.0)
-
-
-def test_a_cancelled_search_returns_at_once(shape: MujocoGeometry) -> None:
-    with pytest.raises(GeometryError, match="cancelled"):
-        shape.plan(HOME, BEYOND, ended=lambda: True)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("goal_rad", "options", "says"),
+    [
+        ([0.8, *HOME[1:]], {}, "the goal is not clear: clearance: post"),
+        (BEYOND, {"within_s": 0.0}, "found no path in 0 s"),
+        (BEYOND, {"ended": lambda: True}, "cancelled"),
+    ],
+)
+def test_a_search_without_a_result_is_an_error(
+    shape: MujocoGeometry, goal_rad: list[float], options: dict[str, Any], says: str
+) -> None:
+    with pytest.raises(GeometryError, match=says):
+        shape.plan(HOME, goal_rad, **options)
 
 
 def test_a_lost_planner_is_reported(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
-    def lost(*_: object, **__: object) -> None:
-        raise PlannerLostError("the planner process has ended; try again")
-
-    monkeypatch.setattr(shape, "plan", lost)
+    monkeypatch.setattr(shape, "plan", mock.Mock(side_effect=PlannerLostError("the planner has ended; try again")))
     with pytest.raises(Refused, match="try again") as refused:
-        MotionPlanner(KIND, shape).plan(HOME, BEYOND, speed=1.0, ended=lambda: False)
+        MotionPlanner(KIND, shape).plan(HOME, BEYOND, speed=1.0, ended=never)
     assert refused.value.code == "planner_lost"
 
 
-def test_the_same_seed_gives_the_same_plan(shape: MujocoGeometry) -> None:
-    assert shape.plan(HOME, BEYOND, seed=7) == shape.plan(HOME, BEYOND, seed=7)
-    assert shape.plan(HOME, BEYOND, seed=7) != shape.plan(HOME, BEYOND, seed=8)
-
-
-def test_every_segment_of_a_plan_passes_the_clearance_check(shape: MujocoGeometry) -> None:
-    path = shape.plan(HOME, BEYOND, seed=3)
+def test_a_plan_depends_on_the_seed_and_passes_the_clearance_check(shape: MujocoGeometry) -> None:
+    path = shape.plan(HOME, BEYOND, seed=7)
+    assert path == shape.plan(HOME, BEYOND, seed=7)
+    assert path != shape.plan(HOME, BEYOND, seed=8)
     assert (path[0], path[-1]) == (tuple(HOME), tuple(BEYOND))
     assert shape.sweep(path).clearance is None
 
 
+@pytest.mark.slow
 def test_a_straight_path_with_a_configuration_change_or_collision_is_rejected(shape: MujocoGeometry) -> None:
-    routes, begin = MotionPlanner(KIND, shape), shape.poses(HOME)["flange"]
+    planner, begin = MotionPlanner(KIND, shape), shape.poses(HOME)["flange"]
     through = (-0.249, -0.414, begin[2], *begin[3:])
     for pose in (through, (-begin[0], -begin[1], *begin[2:]), (begin[0], begin[1], -0.05, *begin[3:])):
         with pytest.raises(Refused) as refused:
-            routes.plan_straight(HOME, "flange", pose, speed=0.5)
+            planner.plan_straight(HOME, "flange", pose, speed=0.5)
         assert refused.value.code in {"not_straight", "no_room", "out_of_reach"}

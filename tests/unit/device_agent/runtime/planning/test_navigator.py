@@ -2,24 +2,25 @@
 
 import math
 import threading
-from dataclasses import asdict
+from dataclasses import asdict, astuple, replace
+from typing import Self
 
 import numpy as np
 import pytest
 
 from device_agent.perception.occupancy_grid import GridFloorMap, OccupancyGrid
 from device_agent.ports.driver import REST, Twist
-from device_agent.protocol import GoTo, StopLatch
-from device_agent.runtime.actions.device_context import DeviceContext
+from device_agent.protocol import GoTo
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import navigator as navigator_module
 from device_agent.runtime.planning.grid_search import find_path
 from device_agent.runtime.planning.localization import Pose2D, PoseEstimator
 from device_agent.runtime.planning.navigator import BLOCKED_TIMEOUT_S, START_TIMEOUT_S, UPDATE_PERIOD_S, Navigator
-from device_agent.runtime.readings import Reading, ReadingCache
+from device_agent.runtime.readings import Reading
 from tests.fakes.drivers import BASE, PERIOD_S, robot_type
-from tests.harness.agent.controller_fixture import ControllerFixture
+from tests.harness.agent.controller_fixture import ControllerFixture, refuses
+from tests.unit.device_agent.runtime.actions.robot_api_fixture import device_context
 
 LIMITS = Twist(0.3, 0.0, 1.5)
 
@@ -36,67 +37,76 @@ def room(*walls: tuple[float, float, float, float]) -> OccupancyGrid:
     return grid
 
 
-def go(navigator: Navigator, grid: OccupancyGrid, place: Pose2D, *, seconds: float = 60.0) -> list[Pose2D]:
-    """Where an ideal base comes."""
-    places = [place]
-    for _ in range(round(seconds / UPDATE_PERIOD_S)):
-        twist = navigator.compute_twist(places[-1], grid)
+def navigator_to(goal: tuple[float, float], yaw_rad: float | None = None) -> Navigator:
+    return Navigator(goal, yaw_rad, limits=LIMITS, radius_m=0.25)
+
+
+def moved(pose: Pose2D, twist: Twist, time_s: float) -> Pose2D:
+    """The pose of an ideal base after this time."""
+    yaw_rad = pose.yaw_rad + twist.turn_rad_s * time_s / 2
+    return Pose2D(
+        pose.x_m + twist.forward_m_s * time_s * math.cos(yaw_rad),
+        pose.y_m + twist.forward_m_s * time_s * math.sin(yaw_rad),
+        pose.yaw_rad + twist.turn_rad_s * time_s,
+    )
+
+
+def go(navigator: Navigator, grid: OccupancyGrid, start: Pose2D) -> list[Pose2D]:
+    """The poses on the way to the goal."""
+    poses = [start]
+    for _ in range(round(60 / UPDATE_PERIOD_S)):
+        twist = navigator.compute_twist(poses[-1], grid)
         if twist is None:
-            return places
-        assert all(abs(part) <= most + 1e-9 for part, most in zip(twist, LIMITS, strict=True))
-        last = places[-1]
-        yaw = last.yaw_rad + twist.turn_rad_s * UPDATE_PERIOD_S / 2
-        places.append(
-            Pose2D(
-                last.x_m + twist.forward_m_s * UPDATE_PERIOD_S * math.cos(yaw),
-                last.y_m + twist.forward_m_s * UPDATE_PERIOD_S * math.sin(yaw),
-                last.yaw_rad + twist.turn_rad_s * UPDATE_PERIOD_S,
-            )
-        )
-    pytest.fail(f"not there: {places[-1]}")
+            return poses
+        assert all(abs(part) <= limit + 1e-9 for part, limit in zip(twist, LIMITS, strict=True))
+        poses.append(moved(poses[-1], twist, UPDATE_PERIOD_S))
+    pytest.fail(f"not there: {poses[-1]}")
 
 
+@pytest.mark.slow
 def test_the_robot_avoids_a_wall_and_reaches_the_heading() -> None:
     grid = room((-0.1, -2.0, 0.1, 0.8))
-    navigator = Navigator((1.2, -1.0), 1.5, limits=LIMITS, radius_m=0.25)
-    places = go(navigator, grid, Pose2D(-1.2, -1.0, 2.0))
-    assert math.dist((places[-1].x_m, places[-1].y_m), (1.2, -1.0)) <= 0.08
-    assert places[-1].yaw_rad == pytest.approx(1.5, abs=0.05)
-    taken = grid.blocked(0.15)
-    assert not any(taken.at(place.x_m, place.y_m) for place in places)
+    poses = go(navigator_to((1.2, -1.0), 1.5), grid, Pose2D(-1.2, -1.0, 2.0))
+    assert math.dist((poses[-1].x_m, poses[-1].y_m), (1.2, -1.0)) <= 0.08
+    assert poses[-1].yaw_rad == pytest.approx(1.5, abs=0.05)
+    blocked = grid.blocked(0.15)
+    assert not any(blocked.at(pose.x_m, pose.y_m) for pose in poses)
 
 
 def test_without_a_heading_any_heading_is_final() -> None:
-    places = go(Navigator((1.0, 0.0), None, limits=LIMITS, radius_m=0.25), room(), Pose2D(0.0, 0.0, 0.0))
-    assert abs(places[-1].yaw_rad) < 0.4
+    poses = go(navigator_to((1.0, 0.0)), room(), Pose2D(0.0, 0.0, 0.0))
+    assert abs(poses[-1].yaw_rad) < 0.4
 
 
-def test_unreachable_goals_are_rejected() -> None:
-    shut = room((-0.1, -2.0, 0.1, 2.0))
-    for goal, code in (((1.0, 0.0), "no_way"), ((0.0, 0.0), "taken"), ((9.0, 0.0), "out_of_room")):
-        with pytest.raises(Refused) as refused:
-            Navigator(goal, None, limits=LIMITS, radius_m=0.25).compute_twist(Pose2D(-1.0, 0.0, 0.0), shut)
-        assert refused.value.code == code
+@pytest.mark.parametrize(
+    ("goal", "code", "says"),
+    [
+        ((1.0, 0.0), "no_way", r"nearest reachable place is .*x_m -0\.\d+, y_m -?0\.0"),
+        ((0.0, 0.0), "taken", "something stands there"),
+        ((0.0, 0.3), "taken", r"nearest reachable place is .*y_m 0\.\d+"),
+        ((9.0, 0.0), "out_of_room", "The goal is outside"),
+    ],
+)
+def test_unreachable_goals_are_rejected_with_the_nearest_reachable_place(
+    goal: tuple[float, float], code: str, says: str
+) -> None:
+    with pytest.raises(Refused, match=says) as refused:
+        navigator_to(goal).compute_twist(Pose2D(-1.0, 0.0, 0.0), room((-0.1, -2.0, 0.1, 2.0)))
+    assert refused.value.code == code
 
 
-def test_a_person_in_the_way_is_avoided_or_waited_for() -> None:
+def test_a_path_needs_free_cells() -> None:
     floor = GridFloorMap(np.zeros((5, 5), dtype=bool), (0.0, 0.0), 1.0)
     assert find_path(floor, (0.5, 0.5), (4.5, 0.5))[-1] == (4.5, 0.5)
     floor.blocked[:, 2] = True
     with pytest.raises(Refused, match="no free path"):
         find_path(floor, (0.5, 0.5), (4.5, 0.5))
-
-
-def test_a_rejection_names_the_nearest_reachable_place() -> None:
-    for goal, code, near in (((1.0, 0.0), "no_way", r"x_m -0\.\d+, y_m -?0\.0"), ((0.0, 0.3), "taken", r"y_m 0\.\d+")):
-        with pytest.raises(Refused, match=f"nearest reachable place is .*{near}") as refused:
-            Navigator(goal, None, limits=LIMITS, radius_m=0.25).compute_twist(
-                Pose2D(-1.0, 0.0, 0.0), room((-0.1, -2.0, 0.1, 2.0))
-            )
-        assert refused.value.code == code
-    full = GridFloorMap(np.ones((5, 5), dtype=bool), (0.0, 0.0), 1.0)
+    floor.blocked[:, :] = True
     with pytest.raises(Refused, match=r"or it is unseen$"):
-        find_path(full, (0.5, 0.5), (4.5, 0.5))
+        find_path(floor, (0.5, 0.5), (4.5, 0.5))
+    diagonal = GridFloorMap(np.eye(6, dtype=bool)[::-1].copy(), (0.0, 0.0), 1.0)
+    diagonal.blocked[0, 5] = False
+    assert find_path(diagonal, (0.5, 0.5), (5.5, 5.5))[-1] == (5.5, 5.5), "between the obstacles"
 
 
 def test_a_robot_too_near_to_something_starts_from_the_nearest_free_cell() -> None:
@@ -109,14 +119,8 @@ def test_a_robot_too_near_to_something_starts_from_the_nearest_free_cell() -> No
         find_path(floor, (0.08, 1.0), (1.5, 1.0))
 
 
-def test_a_path_leads_between_obstacles() -> None:
-    floor = GridFloorMap(np.eye(6, dtype=bool)[::-1].copy(), (0.0, 0.0), 1.0)
-    floor.blocked[0, 5] = False
-    assert find_path(floor, (0.5, 0.5), (5.5, 5.5))[-1] == (5.5, 5.5)
-
-
 def test_an_occupied_goal_has_a_short_timeout_before_the_start() -> None:
-    navigator = Navigator((1.0, 0.0), None, limits=LIMITS, radius_m=0.25)
+    navigator = navigator_to((1.0, 0.0))
     taken = Refused("taken", "")
     assert navigator.timeout_s(taken) == START_TIMEOUT_S
     assert navigator.timeout_s(Refused("out_of_room", "")) == 0
@@ -124,17 +128,14 @@ def test_an_occupied_goal_has_a_short_timeout_before_the_start() -> None:
     assert navigator.timeout_s(taken) == BLOCKED_TIMEOUT_S
 
 
-def test_room_positions_correct_the_odometry() -> None:
-    where = PoseEstimator("qbo")
-    wheels = Reading({"x_m": 1.0, "y_m": 0.0, "yaw_rad": 0.5}, 0.02)
+def test_room_positions_correct_or_replace_the_odometry() -> None:
+    estimator = PoseEstimator("qbo")
+    odometry = Reading({"x_m": 1.0, "y_m": 0.0, "yaw_rad": 0.5}, 0.02)
     seen = Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "age_s.qbo": 0.2}, 0.1)
-    assert where.estimate(wheels, None) == Pose2D(1.0, 0.0, 0.5)
-    found = where.estimate(wheels, seen)
-    assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((1.2, 0.1, 0.5))
-    assert where.estimate(wheels, None).x_m == pytest.approx(1.2), "what it has learned stays"
-
-
-def test_without_odometry_the_room_position_is_used() -> None:
+    assert estimator.estimate(odometry, None) == Pose2D(1.0, 0.0, 0.5)
+    corrected = pytest.approx((1.2, 0.1, 0.5))
+    assert astuple(estimator.estimate(odometry, seen)) == corrected
+    assert astuple(estimator.estimate(odometry, None)) == corrected, "the correction remains"
     seen = Reading({"x_m.nao": 1.2, "y_m.nao": 0.1, "yaw_rad.nao": 0.3}, 0.1)
     assert PoseEstimator("nao").estimate(None, seen) == Pose2D(1.2, 0.1, 0.3)
 
@@ -156,81 +157,73 @@ def test_a_robot_without_a_position_does_not_drive(seen: Reading | None) -> None
 
 
 def test_at_the_goal_the_robot_only_turns() -> None:
-    navigator = Navigator((0.0, 0.0), 1.0, limits=LIMITS, radius_m=0.25)
+    navigator = navigator_to((0.0, 0.0), 1.0)
     twist = navigator.compute_twist(Pose2D(0.01, 0.0, 0.0), room())
     assert twist is not None
     assert (twist.forward_m_s, twist.left_m_s) == (REST.forward_m_s, REST.left_m_s)
     assert twist.turn_rad_s > 0
 
 
-class Toy:
-    """A base that follows commands in its own thread."""
+class MobileRobot:
+    """A base that follows the commands of a ``RobotApi`` in its own thread."""
 
-    def __init__(self, ground: OccupancyGrid | None) -> None:
+    def __init__(self, obstacle_map: OccupancyGrid | None) -> None:
         self.fixture = ControllerFixture(base=BASE)
-        self.at = Pose2D(0.0, 0.0, 0.0)
-        self.over = threading.Event()
-        body = DeviceContext(
-            robot_type=robot_type(BASE),
+        self.pose = Pose2D(0.0, 0.0, 0.0)
+        self.stopping = threading.Event()
+        context = replace(
+            device_context(robot_type(BASE)),
             controller=self.fixture.controller,
-            observe=lambda: None,
-            geometry=None,
-            skills=None,
-            readings=ReadingCache(space="s", agent="a", own=["toy"]),
-            own_readings=lambda: {"odometry": Reading(asdict(self.at), 0.0)},
-            name="toy",
-            obstacle_map=lambda: ground,
+            own_readings=lambda: {"odometry": Reading(asdict(self.pose), 0.0)},
+            obstacle_map=lambda: obstacle_map,
         )
-        self.robot = RobotApi(body)
-        self.robot.reserve(1, lambda _: None)
-        self.thread = threading.Thread(target=self.live, daemon=True)
+        self.api = RobotApi(context)
+        self.api.reserve(1, lambda _: None)
+        self.thread = threading.Thread(target=self.run, daemon=True)
+
+    def __enter__(self) -> Self:
         self.thread.start()
+        return self
 
-    def live(self) -> None:
-        while not self.over.wait(PERIOD_S):
-            self.fixture.now_s += PERIOD_S
-            twist = self.fixture.controller.update(self.fixture.now_s).twist
-            at = self.at
-            self.at = Pose2D(
-                at.x_m + twist.forward_m_s * PERIOD_S * math.cos(at.yaw_rad),
-                at.y_m + twist.forward_m_s * PERIOD_S * math.sin(at.yaw_rad),
-                at.yaw_rad + twist.turn_rad_s * PERIOD_S,
-            )
-
-    def end(self) -> None:
-        self.robot.release()
-        self.over.set()
+    def __exit__(self, *_: object) -> None:
+        self.api.release()
+        self.stopping.set()
         self.thread.join()
 
+    def run(self) -> None:
+        while not self.stopping.wait(PERIOD_S):
+            self.fixture.now_s += PERIOD_S
+            self.pose = moved(self.pose, self.fixture.controller.update(self.fixture.now_s).twist, PERIOD_S)
 
+
+@pytest.mark.slow
 def test_go_to_reaches_the_goal_and_rests() -> None:
-    toy = Toy(room())
-    toy.robot.execute(GoTo(x_m=0.3, y_m=0.0, yaw_rad=0.3))
-    assert math.dist((toy.at.x_m, toy.at.y_m), (0.3, 0.0)) < 0.15
-    assert not toy.fixture.controller.moving
-    toy.end()
+    with MobileRobot(room()) as robot:
+        robot.api.execute(GoTo(x_m=0.3, y_m=0.0, yaw_rad=0.3))
+        assert math.dist((robot.pose.x_m, robot.pose.y_m), (0.3, 0.0)) < 0.15
+        assert not robot.fixture.controller.moving
 
 
-def test_go_to_without_a_map_or_after_the_timeout_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("obstacle_map", "x_m", "code"),
+    [(None, 1.0, "no_ground"), (room((0.5, -2, 0.7, 2)), 0.6, "taken"), (room(), 9.0, "out_of_room")],
+)
+def test_go_to_without_a_map_or_after_the_timeout_is_rejected(
+    monkeypatch: pytest.MonkeyPatch, obstacle_map: OccupancyGrid | None, x_m: float, code: str
+) -> None:
     monkeypatch.setattr(navigator_module, "BLOCKED_TIMEOUT_S", 0.15)
     monkeypatch.setattr(navigator_module, "START_TIMEOUT_S", 0.15)
-    shut = room((0.5, -2, 0.7, 2))
-    for ground, x_m, code in ((None, 1.0, "no_ground"), (shut, 0.6, "taken"), (room(), 9.0, "out_of_room")):
-        toy = Toy(ground)
-        with pytest.raises(Refused) as refused:
-            toy.robot.execute(GoTo(x_m=x_m, y_m=0.0))
-        assert refused.value.code == code
-        toy.end()
+    with MobileRobot(obstacle_map) as robot, refuses(code):
+        robot.api.execute(GoTo(x_m=x_m, y_m=0.0))
 
 
 def test_go_to_ends_with_the_reservation() -> None:
-    toy = Toy(room())
-    threading.Timer(0.3, lambda: toy.fixture.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))).start()
-    with pytest.raises(Refused, match="stopped"):
-        toy.robot.execute(GoTo(x_m=1.5, y_m=0.0))
-    toy.end()
+    with MobileRobot(room()) as robot:
+        threading.Timer(0.3, robot.fixture.stop).start()
+        with pytest.raises(Refused, match="stopped"):
+            robot.api.execute(GoTo(x_m=1.5, y_m=0.0))
     with pytest.raises(Refused):
-        toy.robot.execute(GoTo(x_m=1.5, y_m=0.0))
+        robot.api.execute(GoTo(x_m=1.5, y_m=0.0))
 
 
 def test_go_to_needs_finite_numbers_and_a_base() -> None:

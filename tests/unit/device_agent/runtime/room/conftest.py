@@ -1,15 +1,30 @@
 """The harness of a room device."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.unit.device_agent.runtime.room.room_device_fixture import RoomDeviceHarness
 
+MakeRoomDevice = Callable[..., RoomDeviceHarness]
+
 
 @pytest.fixture
-def harness(tmp_path: Path) -> Iterator[RoomDeviceHarness]:
-    harness = RoomDeviceHarness(tmp_path)
-    yield harness
-    harness.stop()
+def make_room_device(tmp_path: Path) -> Iterator[MakeRoomDevice]:
+    made: list[RoomDeviceHarness] = []
+
+    def make(**parts: Any) -> RoomDeviceHarness:
+        made.append(RoomDeviceHarness(tmp_path, **parts))
+        made[-1].start()
+        return made[-1]
+
+    yield make
+    for harness in made:
+        harness.stop()
+
+
+@pytest.fixture
+def harness(make_room_device: MakeRoomDevice) -> RoomDeviceHarness:
+    return make_room_device()

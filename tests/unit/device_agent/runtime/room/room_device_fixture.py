@@ -1,19 +1,14 @@
 """A fake sensor and fake uploads, and a harness that runs a room device on them."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.sensor import Capture, Frame, SensorError
 from device_agent.ports.uploads import UploadError
-from device_agent.protocol import (
-    Ack,
-    Measurements,
-    RoomTask,
-    Stream,
-    topics,
-)
+from device_agent.protocol import Measurements, Stream, topics
 from device_agent.protocol.manifests.room import Control as RoomControl
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.runtime.room.room_device import RoomDevice
@@ -98,28 +93,33 @@ class FakeUploads:
 
 
 class RoomDeviceHarness(DeviceHarness):
-    def __init__(self, folder: Path, **more: Any) -> None:
-        self.sensor, self.store = FakeSensor(), FakeUploads()
-        self.uploads = more.pop("uploads", self.store)
-        instrument = RoomDevice(self.sensor, more.pop("entry", ENTRY), self.uploads)
-        super().__init__(folder, driver=instrument, kind=ENTRY.robot_type(), **more)  # type: ignore[arg-type]
-        self.device.start()
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        entry: RoomDeviceManifest = ENTRY,
+        uploads: bool = True,
+        interlocks: Sequence[InterlockRule] = (),
+        broken: str = "",
+    ) -> None:
+        self.sensor, self.uploads = FakeSensor(), FakeUploads()
+        self.sensor.broken = broken
+        self.room_device = RoomDevice(self.sensor, entry, self.uploads if uploads else None)
+        driver: Any = self.room_device
+        super().__init__(folder, driver=driver, kind=entry.robot_type(), interlocks=interlocks)
+        self.last_epoch = 0
 
-    def done(self, request: RoomTask, **more: Any) -> Ack:
-        """Execute an action; returns its final acknowledgement."""
-        return self.end(self.command(request, epoch=self.epoch(), **more))
-
-    def epoch(self) -> int:
-        """Return a new epoch for each action, as the cloud does."""
-        self.given = getattr(self, "given", 0) + 1
-        return self.given
+    def command(self, request: Any, *, epoch: int | None = None, **fields: Any) -> str:
+        """Send a command with a new epoch, as the cloud does."""
+        self.last_epoch += epoch is None
+        return super().command(request, epoch=self.last_epoch if epoch is None else epoch, **fields)
 
     def measured(self, stream: str = "air") -> list[Measurements]:
-        return self.heard(topics.TELE, Measurements, stream)
+        return self.published(topics.TELE, Measurements, stream)
 
     def pictures(self) -> list[bytes]:
-        wanted = topics.device("s", "a", "arm", topics.CAM, "garden")
-        return [payload for topic, payload in self.said if topic == wanted]
+        camera = topics.device("s", "a", "arm", topics.CAM, "garden")
+        return [payload for topic, payload in self.said if topic == camera]
 
 
 def await_growth(items: Callable[[], list[Any]], by: int = 3) -> None:

@@ -1,7 +1,7 @@
 """Actions of room devices: collect, picture, capture, control."""
 
-from pathlib import Path
-from typing import Any
+import math
+import re
 
 import pytest
 
@@ -13,64 +13,60 @@ from device_agent.protocol import (
     MoveJoints,
     SetControl,
     TakePicture,
+    Task,
 )
 from device_agent.protocol.manifests.room import RoomDeviceManifest
-from device_agent.runtime.room.room_device import RoomDevice
-from tests.harness.agent.device_harness import DeviceHarness, eventually
+from device_agent.runtime.errors import Refused
+from tests.harness.agent.controller_fixture import refuses
+from tests.unit.device_agent.runtime.conftest import MakeDevice
+from tests.unit.device_agent.runtime.room.conftest import MakeRoomDevice
 from tests.unit.device_agent.runtime.room.room_device_fixture import RoomDeviceHarness, await_growth
 
 
+@pytest.mark.slow
 def test_collecting_changes_the_rate_reports_progress_and_ends(harness: RoomDeviceHarness) -> None:
     before = harness.sensor.reads["rain"]
-    command = harness.command(CollectData(streams=("air", "rain"), rate_hz=50.0, duration_s=1.5), epoch=harness.epoch())
-    ack = harness.end(command)
-    assert ack.status is AckStatus.DONE
+    ack = harness.done(CollectData(streams=("air", "rain"), rate_hz=50.0, duration_s=1.5))
     assert harness.sensor.reads["rain"] - before > 20, "ten times its own rate"
     assert 20 < ack.result["samples"]["air"] <= 80
     assert ack.result["samples"]["rain"] == 0, "the stream has no values"
-    progress = [each.progress for each in harness.acks(command) if each.status is AckStatus.STARTED]
+    progress = [each.progress for each in harness.acks(ack.id) if each.status is AckStatus.STARTED]
     assert any(share and 0 < share < 1 for share in progress)
-    assert harness.device._driver.rate_hz("air") == 20.0  # type: ignore[union-attr]
+    assert harness.room_device.rate_hz("air") == 20.0
 
 
 def test_collecting_can_be_cancelled_and_excludes_other_actions(harness: RoomDeviceHarness) -> None:
-    first = harness.command(CollectData(rate_hz=1.0, duration_s=3000.0), epoch=harness.epoch())
-    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in harness.acks(first)))
-    second = harness.end(harness.command(CollectData(rate_hz=2.0, duration_s=1.0), epoch=harness.given))
-    assert (second.status, second.reason and second.reason.code) == (AckStatus.FAILED, "busy")
-    harness.command(CancelAction(action=first), epoch=harness.given)
+    first = harness.running(CollectData(rate_hz=1.0, duration_s=3000.0))
+    assert harness.failed(CollectData(rate_hz=2.0, duration_s=1.0), epoch=1).code == "busy"
+    harness.command(CancelAction(action=first), epoch=1)
     assert harness.end(first).status is AckStatus.CANCELLED
     await_growth(harness.measured)
 
 
 def test_take_picture_returns_the_values(harness: RoomDeviceHarness) -> None:
     harness.sensor.values = {"temperature_c": 21.5}
-    ack = harness.done(TakePicture(streams=("air",)))
-    assert ack.status is AckStatus.DONE
-    assert ack.result["values"]["air"]["temperature_c"] == 21.5
+    assert harness.done(TakePicture(streams=("air",))).result["values"]["air"]["temperature_c"] == 21.5
     assert set(harness.done(TakePicture()).result["values"]) == {"air", "rain"}
 
 
 def test_a_capture_is_uploaded_and_named_in_the_result(harness: RoomDeviceHarness) -> None:
-    ack = harness.done(CaptureRaw(name="image"))
-    assert ack.result == {"upload": "u1", "media_type": "image/png", "length": 3}
-    stored = harness.store.stored[0]
-    assert {key: stored[key] for key in ("device", "stream", "media_type", "content")} == {
-        "device": "arm",
-        "stream": "image",
-        "media_type": "image/png",
-        "content": b"PNG",
-    }
-    assert stored["name"].startswith("arm-image-")
-    assert stored["name"].endswith(".png")
+    assert harness.done(CaptureRaw(name="image")).result == {"upload": "u1", "media_type": "image/png", "length": 3}
+    (stored,) = harness.uploads.stored
+    expected = {"device": "arm", "stream": "image", "media_type": "image/png", "content": b"PNG"}
+    assert expected.items() <= stored.items()
+    assert re.fullmatch(r"arm-image-.*\.png", stored["name"])
+    harness.uploads.full = True
+    reason = harness.failed(CaptureRaw(name="image"))
+    assert (reason.code, reason.message) == ("not_stored", "the store is full; delete something")
 
 
 def test_a_control_is_set_within_its_limits_and_returns_the_applied_value(harness: RoomDeviceHarness) -> None:
-    ack = harness.done(SetControl(control="opening", value=0.4))
-    assert (ack.status, ack.result) == (AckStatus.DONE, {"applied": {"opening": 0.2}})
-    for value, code in ((0.6, "out_of_range"), (-0.1, "out_of_range")):
-        refused = harness.done(SetControl(control="opening", value=value))
-        assert (refused.status, refused.reason and refused.reason.code) == (AckStatus.FAILED, code)
+    assert harness.done(SetControl(control="opening", value=0.4)).result == {"applied": {"opening": 0.2}}
+    for value in (0.6, -0.1):
+        assert harness.failed(SetControl(control="opening", value=value)).code == "out_of_range"
+    for value in (math.nan, math.inf):
+        with refuses("not_finite"):
+            harness.room_device.set("opening", value)
     assert harness.sensor.set_to == [0.4]
 
 
@@ -85,49 +81,30 @@ def test_a_control_is_set_within_its_limits_and_returns_the_applied_value(harnes
     ],
 )
 def test_unknown_names_are_rejected_with_the_valid_ones(
-    harness: RoomDeviceHarness, request_: Any, code: str, message: str
+    harness: RoomDeviceHarness, request_: Task, code: str, message: str
 ) -> None:
-    ack = harness.done(request_)
-    assert ack.status is AckStatus.FAILED
-    assert ack.reason is not None
-    assert ack.reason.code == code
-    assert message in ack.reason.message
+    reason = harness.failed(request_)
+    assert reason.code == code
+    assert message in reason.message
 
 
-def test_a_robot_rejects_actions_of_room_devices(tmp_path: Path) -> None:
-    harness = DeviceHarness(tmp_path)
-    harness.device.start()
-    try:
-        ack = harness.end(harness.command(TakePicture(), epoch=1))
-        assert (ack.status, ack.reason and ack.reason.code) == (AckStatus.FAILED, "cannot")
-    finally:
-        harness.stop()
+def test_actions_without_streams_or_storage_are_rejected(
+    make_room_device: MakeRoomDevice, make_device: MakeDevice
+) -> None:
+    entry = RoomDeviceManifest(name="arm", kind="window", label="Window", driver="toy", captures=("image",))
+    harness = make_room_device(uploads=False, entry=entry)
+    assert harness.failed(TakePicture()).code == "no_streams"
+    assert harness.failed(CaptureRaw(name="image")).code == "no_store"
+    assert make_device().failed(TakePicture(), epoch=1).code == "cannot", "a robot"
 
 
-def test_actions_without_streams_or_storage_are_rejected(tmp_path: Path) -> None:
-    harness = RoomDeviceHarness(tmp_path, uploads=None, entry=RoomDeviceManifest(
-        name="arm", kind="window", label="Window", driver="toy", captures=("image",)
-    ))  # fmt: skip
-    try:
-        for request, code in ((TakePicture(), "no_streams"), (CaptureRaw(name="image"), "no_store")):
-            ack = harness.done(request)
-            assert (ack.status, ack.reason and ack.reason.code) == (AckStatus.FAILED, code)
-    finally:
-        harness.stop()
-
-
-def test_errors_of_driver_and_storage_are_reported(harness: RoomDeviceHarness) -> None:
-    harness.store.full = True
-    ack = harness.done(CaptureRaw(name="image"))
-    assert ack.reason is not None
-    assert (ack.reason.code, ack.reason.message) == ("not_stored", "the store is full; delete something")
-    instrument = harness.device._driver
-    assert isinstance(instrument, RoomDevice)
+def test_errors_of_the_driver_are_reported(harness: RoomDeviceHarness) -> None:
     harness.sensor.broken = "it is wet"
-    for call in (
-        lambda: instrument.take_picture(()),
-        lambda: instrument.capture_raw("image"),
-        lambda: instrument.set("opening", 0.1),
-    ):
-        with pytest.raises(Exception, match="it is wet"):
+    calls = (
+        lambda: harness.room_device.take_picture(()),
+        lambda: harness.room_device.capture_raw("image"),
+        lambda: harness.room_device.set("opening", 0.1),
+    )
+    for call in calls:
+        with pytest.raises(Refused, match="it is wet"):
             call()

@@ -1,6 +1,8 @@
+"""Journal: commands, acks, epochs and the Stop latch survive a kill."""
+
 import errno
 import os
-import sqlite3
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,50 +15,51 @@ def ack(command: str, status: AckStatus = AckStatus.RECEIVED, sequence: int = 1,
     return Ack(id=command, status=status, sequence=sequence, at_ms=at_ms, tick_ms=1)
 
 
+OpenJournal = Callable[..., Journal]
+
+
 @pytest.fixture
-def journal(tmp_path: Path):
-    journal = Journal(tmp_path / "journal.db")
-    journal.open(now_ms=0)
-    yield journal
-    journal.close()
+def open_journal(tmp_path: Path) -> Iterator[OpenJournal]:
+    """Opens the journal; again as after a kill, because the previous one is not closed."""
+    opened: list[Journal] = []
+
+    def open_one(now_ms: int = 0) -> Journal:
+        opened.append(Journal(tmp_path / "journal.db"))
+        opened[-1].open(now_ms=now_ms)
+        return opened[-1]
+
+    yield open_one
+    for journal in opened:
+        journal.close()
 
 
-def test_a_command_is_recorded_once(journal: Journal) -> None:
+@pytest.fixture
+def journal(open_journal: OpenJournal) -> Journal:
+    return open_journal()
+
+
+def test_a_command_is_recorded_once_and_its_terminal_ack_is_final(journal: Journal) -> None:
     assert journal.begin("arm", ack("c1")) is None
-    journal.record(ack("c1", AckStatus.STARTED, 2))
-    seen = journal.begin("arm", ack("c1"))
-    assert seen is not None
-    assert seen.status is AckStatus.STARTED
+    for sequence, status in enumerate((AckStatus.STARTED, AckStatus.DONE, AckStatus.FAILED), 2):
+        journal.record(ack("c1", status, sequence))
+        seen = journal.begin("arm", ack("c1"))
+        assert seen is not None
+        assert seen.status is (AckStatus.DONE if status is AckStatus.FAILED else status)
 
 
-def test_a_terminal_ack_is_final(journal: Journal) -> None:
-    journal.begin("arm", ack("c1"))
-    journal.record(ack("c1", AckStatus.DONE, 2))
-    journal.record(ack("c1", AckStatus.FAILED, 3))
-    seen = journal.begin("arm", ack("c1"))
-    assert seen is not None
-    assert seen.status is AckStatus.DONE
-
-
-def test_open_commands_of_a_previous_run_are_failed(tmp_path: Path) -> None:
-    before = Journal(tmp_path / "journal.db")
-    before.open(now_ms=0)
+def test_open_commands_of_a_previous_run_are_failed(open_journal: OpenJournal) -> None:
+    before = open_journal()
     before.begin("arm", ack("c1"))
     before.record(ack("c1", AckStatus.STARTED, 2))
     before.begin("arm", ack("c2"))
     before.record(ack("c2", AckStatus.DONE, 2))
-    # no close: the process was killed
-    after = Journal(tmp_path / "journal.db")
-    after.open(now_ms=5)
+    after = open_journal(now_ms=5)
     assert after.end_open(now_ms=5, tick_ms=5) == 1
     seen = after.begin("arm", ack("c1"))
     assert seen is not None
-    assert seen.status is AckStatus.FAILED
-    assert seen.sequence == 3
+    assert (seen.status, seen.sequence) == (AckStatus.FAILED, 3)
     assert seen.reason is not None
     assert seen.reason.code == "agent_restarted"
-    after.close()
-    before.close()
 
 
 def test_acks_are_undelivered_until_the_newest_is_delivered(journal: Journal) -> None:
@@ -70,14 +73,12 @@ def test_acks_are_undelivered_until_the_newest_is_delivered(journal: Journal) ->
     assert journal.undelivered("arm") == ()
 
 
-def test_epochs_and_latch_persist_and_epochs_never_decrease(tmp_path: Path) -> None:
-    before = Journal(tmp_path / "journal.db")
-    before.open(now_ms=0)
+def test_epochs_and_latch_persist_and_epochs_never_decrease(open_journal: OpenJournal) -> None:
+    before = open_journal()
     before.save_epoch("arm", epoch=7, burned=5)
     before.save_epoch("arm", epoch=3, burned=6)
     before.save_latch("arm", StopLatch(caller="ann", reason="smoke", at_ms=1))
-    after = Journal(tmp_path / "journal.db")
-    after.open(now_ms=0)
+    after = open_journal()
     record = after.device("arm")
     assert (record.epoch, record.burned) == (7, 6)
     assert record.latch is not None
@@ -85,31 +86,21 @@ def test_epochs_and_latch_persist_and_epochs_never_decrease(tmp_path: Path) -> N
     after.save_latch("arm", None)
     assert after.device("arm").latch is None
     assert after.device("other").epoch == 0
-    after.close()
-    before.close()
 
 
-def test_session_numbers_increase(tmp_path: Path) -> None:
-    numbers = []
-    for _ in range(3):
-        journal = Journal(tmp_path / "journal.db")
-        journal.open(now_ms=0)
-        numbers += [journal.next_session(), journal.next_session()]
-        journal.close()
-    assert numbers == [1, 2, 3, 4, 5, 6]
+def test_session_numbers_increase(open_journal: OpenJournal) -> None:
+    numbers = [journal.next_session() for journal in (open_journal(), open_journal()) for _ in range(2)]
+    assert numbers == [1, 2, 3, 4]
 
 
-def test_old_terminal_commands_are_deleted(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "journal.db")
-    journal.open(now_ms=0)
-    journal.begin("arm", ack("old"))
-    journal.record(ack("old", AckStatus.DONE, 2))
-    journal.begin("arm", ack("open"))
-    journal.close()
-    journal.open(now_ms=8 * 24 * 3600 * 1000)
-    assert journal.begin("arm", ack("old")) is None
-    assert journal.begin("arm", ack("open")) is not None
-    journal.close()
+def test_old_terminal_commands_are_deleted(open_journal: OpenJournal) -> None:
+    before = open_journal()
+    before.begin("arm", ack("old"))
+    before.record(ack("old", AckStatus.DONE, 2))
+    before.begin("arm", ack("open"))
+    after = open_journal(now_ms=8 * 24 * 3600 * 1000)
+    assert after.begin("arm", ack("old")) is None
+    assert after.begin("arm", ack("open")) is not None
 
 
 def test_an_invalid_journal_file_is_named_and_kept(tmp_path: Path) -> None:
@@ -122,21 +113,10 @@ def test_an_invalid_journal_file_is_named_and_kept(tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b"this is not")
 
 
-def test_a_closed_journal_raises(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "journal.db")
+def test_a_closed_journal_raises_but_ignores_deliveries(journal: Journal) -> None:
+    journal.close()
     with pytest.raises(JournalError):
         journal.next_session()
-
-
-def test_epochs_are_on_disk_when_they_are_saved(journal: Journal, tmp_path: Path) -> None:
-    journal.save_epoch("arm", epoch=9, burned=9)
-    with sqlite3.connect(tmp_path / "journal.db") as other:
-        assert other.execute("SELECT epoch FROM devices").fetchone() == (9,)
-    other.close()
-
-
-def test_a_delivery_after_close_is_ignored(journal: Journal) -> None:
-    journal.close()
     journal.delivered(ack("c1"))
     journal.close()
 

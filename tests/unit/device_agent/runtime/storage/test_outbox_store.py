@@ -1,7 +1,7 @@
 """Outbox store: order, bounds and counts of dropped messages."""
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,16 +13,29 @@ EVENT, LATE = OWN + "arm/event", OWN + "arm/late/joints"
 NOW_MS = 1_800_000_000_000
 
 
-def make(path: Path, *, own: str = OWN, max_bytes: int = 10**6, max_age_ms: int = 3_600_000) -> OutboxStore:
-    return OutboxStore(path, own=own, max_bytes=max_bytes, max_age_ms=max_age_ms)
+OpenStore = Callable[..., OutboxStore]
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[OutboxStore]:
-    store = make(tmp_path / "outbox.db")
-    store.open()
-    yield store
-    store.close()
+def open_store(tmp_path: Path) -> Iterator[OpenStore]:
+    """Opens the same file again, as after a restart."""
+    opened: list[OutboxStore] = []
+
+    def open_one(*, own: str = OWN, max_bytes: int = 10**6) -> OutboxStore:
+        for store in opened:
+            store.close()
+        opened.append(OutboxStore(tmp_path / "outbox.db", own=own, max_bytes=max_bytes, max_age_ms=3_600_000))
+        opened[-1].open()
+        return opened[-1]
+
+    yield open_one
+    for store in opened:
+        store.close()
+
+
+@pytest.fixture
+def store(open_store: OpenStore) -> OutboxStore:
+    return open_store()
 
 
 def item(number: int, topic: str = LATE, *, at_ms: int = NOW_MS, size: int = 1) -> OutboxItem:
@@ -30,18 +43,19 @@ def item(number: int, topic: str = LATE, *, at_ms: int = NOW_MS, size: int = 1) 
 
 
 def numbers(store: OutboxStore, *, late: bool = True, last: int = 0, limit: int = 100_000) -> list[int]:
-    return [int(found.payload) for _, found in store.after(last, late=late, limit=limit)]
+    return [int(stored.payload) for _, stored in store.after(last, late=late, limit=limit)]
 
 
 def dropped(store: OutboxStore) -> list[DroppedCount]:
-    told: list[DroppedCount] = []
+    """Store the events of dropped messages; returns their counts."""
+    counts: list[DroppedCount] = []
 
-    def event(what: DroppedCount) -> OutboxItem:
-        told.append(what)
-        return OutboxItem(what.device + "/event", b"0", NOW_MS, late=False)
+    def event(count: DroppedCount) -> OutboxItem:
+        counts.append(count)
+        return OutboxItem(count.device + "/event", b"0", NOW_MS, late=False)
 
     store.store_dropped_events(event)
-    return told
+    return counts
 
 
 def test_items_are_returned_oldest_first_in_pages(store: OutboxStore) -> None:
@@ -49,65 +63,51 @@ def test_items_are_returned_oldest_first_in_pages(store: OutboxStore) -> None:
     store.put([item(4)], now_ms=NOW_MS)
     assert numbers(store) == [1, 3, 4]
     assert numbers(store, late=False) == [2]
-    (first, found), (second, _) = store.after(0, late=True, limit=2)
-    assert found == item(1)
+    (first, stored), (second, _) = store.after(0, late=True, limit=2)
+    assert stored == item(1)
     assert numbers(store, last=second) == [4]
     store.remove([first, 999])
     assert numbers(store) == [3, 4]
 
 
-def test_a_restart_keeps_items_except_those_of_another_space(tmp_path: Path) -> None:
-    before = make(tmp_path / "db")
-    before.open()
-    before.put([item(1), item(2, EVENT)], now_ms=NOW_MS)
-    before.count({(OWN + "arm", True): 3})
-    before.close()
-    before.close()
-    same = make(tmp_path / "db")
-    same.open()
+def test_a_restart_keeps_items_except_those_of_another_space(open_store: OpenStore) -> None:
+    store = open_store()
+    store.put([item(1), item(2, EVENT)], now_ms=NOW_MS)
+    store.count({(OWN + "arm", True): 3})
+    same = open_store()
     assert (numbers(same), numbers(same, late=False)) == ([1], [2])
-    same.close()
-    moved = make(tmp_path / "db", own="ts/v1/other/a/")
-    moved.open()
+    moved = open_store(own="ts/v1/other/a/")
     assert (numbers(moved), numbers(moved, late=False), dropped(moved)) == ([], [], [])
-    moved.close()
 
 
-def test_beyond_the_bound_oldest_measurements_then_events_are_dropped_and_counted(tmp_path: Path) -> None:
-    store = make(tmp_path / "db", max_bytes=200_000)
-    store.open()
+@pytest.mark.slow
+def test_beyond_the_bound_oldest_measurements_then_events_are_dropped_and_counted(open_store: OpenStore) -> None:
+    store = open_store(max_bytes=200_000)
     for number in range(300):
         store.put([item(number, EVENT, size=200), item(number, size=1000)], now_ms=NOW_MS)
         assert store._bytes <= 200_000
-    assert numbers(store, late=False) == list(range(300)), "no event goes while there are measurements"
+    assert numbers(store, late=False) == list(range(300)), "no event is dropped while there are measurements"
     left = numbers(store)
-    assert left == list(range(300 - len(left), 300)), "the oldest went"
-    (told,) = dropped(store)
-    assert told == DroppedCount(OWN + "arm", measurements=300 - len(left), events=0)
+    assert left == list(range(300 - len(left), 300)), "the newest remain"
+    assert dropped(store) == [DroppedCount(OWN + "arm", measurements=300 - len(left), events=0)]
     for number in range(300, 2000):
         store.put([item(number, EVENT, size=200)], now_ms=NOW_MS)
     events = numbers(store, late=False)
     assert events[-1] == 1999
     assert numbers(store) == []
-    (told,) = dropped(store)
-    assert told.events + len(events) == 2001, "all that are not there, and the one that told, are counted"
-    store.close()
+    (count,) = dropped(store)
+    assert count.events + len(events) == 2001, "all missing events, and the event that reported drops"
 
 
-def test_the_stored_size_is_always_correct(tmp_path: Path) -> None:
-    store = make(tmp_path / "db", max_bytes=50_000)
-    store.open()
+def test_the_stored_size_is_always_correct(open_store: OpenStore) -> None:
+    store = open_store(max_bytes=50_000)
     for number in range(200):
         store.put([item(number, size=number), item(number, EVENT)], now_ms=NOW_MS + number)
         store.remove([number // 2, number // 3])
         if number % 50 == 0:
-            store.store_dropped_events(lambda what: OutboxItem(what.device + "/event", b"0", NOW_MS, late=False))
-    kept = store._bytes
-    store.close()
-    again = make(tmp_path / "db")
-    again.open()
-    assert again._bytes == kept
-    again.close()
+            dropped(store)
+    size = store._bytes
+    assert open_store()._bytes == size
 
 
 def test_old_measurements_are_dropped_and_counted(store: OutboxStore) -> None:
@@ -115,9 +115,9 @@ def test_old_measurements_are_dropped_and_counted(store: OutboxStore) -> None:
     store.enforce_bounds(now_ms=NOW_MS + 3_700_000)
     assert (numbers(store), numbers(store, late=False)) == ([2], [3])
     store.enforce_bounds(now_ms=NOW_MS + 31 * 24 * 3_600_000)
-    assert numbers(store, late=False) == [3], "what happened stays worth telling"
+    assert numbers(store, late=False) == [3], "events do not expire"
     assert dropped(store) == [DroppedCount(OWN + "arm", measurements=2, events=0)]
-    assert dropped(store) == [], "told once"
+    assert dropped(store) == [], "reported once"
 
 
 def test_unacknowledged_items_are_dropped_and_counted(store: OutboxStore) -> None:
@@ -131,24 +131,22 @@ def test_drop_events_are_stored_atomically(store: OutboxStore) -> None:
     store.count({(OWN + "arm", True): 2, (OWN + "arm", False): 1, (OWN + "leg", True): 5})
     store.count({(OWN + "arm", True): 2})
     assert dropped(store) == [DroppedCount(OWN + "arm", 4, 1), DroppedCount(OWN + "leg", 5, 0)]
-    assert [found.topic for _, found in store.after(0, late=False, limit=9)] == [OWN + "arm/event", OWN + "leg/event"]
+    assert [stored.topic for _, stored in store.after(0, late=False, limit=9)] == [OWN + "arm/event", OWN + "leg/event"]
 
 
-def test_a_damaged_file_is_replaced(tmp_path: Path) -> None:
+def test_a_damaged_file_is_replaced(open_store: OpenStore, tmp_path: Path) -> None:
     path = tmp_path / "outbox.db"
     path.write_bytes(b"no database" * 1000)
-    store = make(path)
-    store.open()
+    store = open_store()
     store.put([item(1)], now_ms=NOW_MS)
     assert numbers(store) == [1]
     assert path.with_suffix(".damaged").exists()
-    store.close()
 
 
 def test_an_unusable_file_raises(tmp_path: Path) -> None:
+    closed = OutboxStore(tmp_path / "missing" / "outbox.db", own=OWN, max_bytes=10**6, max_age_ms=1)
     with pytest.raises(OutboxStoreError, match="cannot be used"):
-        make(tmp_path / "none" / "outbox.db").open()
-    closed = make(tmp_path / "db")
+        closed.open()
     for call in (lambda: closed.put([item(1)], now_ms=NOW_MS), lambda: closed.after(0, late=True, limit=1)):
         with pytest.raises(OutboxStoreError, match="is not open"):
             call()

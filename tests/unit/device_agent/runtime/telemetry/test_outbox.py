@@ -4,12 +4,13 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
-from device_agent.protocol import Event, codec, topics
+from device_agent.protocol import Event, codec
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.storage.outbox_store import OutboxItem, OutboxStore, OutboxStoreError
+from device_agent.runtime.storage.outbox_store import OutboxStore, OutboxStoreError
 from device_agent.runtime.telemetry import outbox as module
 from device_agent.runtime.telemetry.outbox import BUSY_RATE_HZ, RATE_HZ, Outbox
 from tests.harness.agent.device_harness import eventually
@@ -18,359 +19,308 @@ ARM = "ts/v1/s/a/arm"
 LATE = ARM + "/late/joints"
 
 
-class Link:
-    """A transport whose acceptance and acknowledgements the test controls."""
+class OutboxFixture:
+    """An outbox on a manual clock, and a link whose acceptance and acknowledgements the test controls."""
 
-    def __init__(self) -> None:
-        self.takes = True
-        self.confirms = True
-        self.said: list[tuple[str, bytes]] = []
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "outbox.db"
+        self.accepts = self.acknowledges = self.quiet = True
+        self.sent: list[tuple[str, bytes]] = []
         self.open: list[Callable[[], None]] = []
+        self.now_s = 1000.0
+        self.restart()
+
+    def restart(self, max_bytes: int = 10**6) -> None:
+        self.store = OutboxStore(self.path, own="ts/v1/s/a/", max_bytes=max_bytes, max_age_ms=10**15)
+        self.outbox = Outbox(
+            self.store, publish=self.publish, device_topic=ARM, is_quiet=lambda: self.quiet, keep_hz=1.0
+        )
 
     def publish(self, topic: str, payload: bytes, *, qos: int, delivered: Callable[[], None]) -> bool:
         assert qos == 1
-        if not self.takes:
+        if not self.accepts:
             return False
-        self.said.append((topic, payload))
-        if self.confirms:
+        self.sent.append((topic, payload))
+        if self.acknowledges:
             delivered()
         else:
             self.open.append(delivered)
         return True
 
-    def confirm(self) -> None:
+    def acknowledge(self) -> None:
         while self.open:
             self.open.pop(0)()
 
-    def payloads(self, kind: str = topics.LATE) -> list[bytes]:
-        return [payload for topic, payload in self.said if f"/{kind}" in topic]
+    def connect(self) -> None:
+        self.outbox.link_changed(True)
 
-    def events(self, kind: EventKind) -> list[Event]:
-        found = [codec.decode(payload, Event) for payload in self.payloads(topics.EVENT) if payload.startswith(b"{")]
-        return [event for event in found if event.kind == kind]
-
-
-class DeviceHarness:
-    """An outbox whose rounds are walked by hand."""
-
-    def __init__(self, folder: Path, **limits: int) -> None:
-        self.path = folder / "outbox.db"
-        self.limits = {"max_bytes": 10**6, "max_age_ms": 10**15} | limits
-        self.link = Link()
-        self.now_s = 1000.0
-        self.moves = False
-        self.renew()
-
-    def renew(self) -> None:
-        """As after a restart."""
-        self.store = OutboxStore(self.path, own="ts/v1/s/a/", **self.limits)
-        self.outbox = Outbox(
-            self.store, publish=self.link.publish, device_topic=ARM, is_quiet=lambda: not self.moves, keep_hz=1.0
-        )
-
-    def rounds(self, count: int = 1, step_s: float = 0.25) -> None:
+    def iterate(self, count: int = 1, step_s: float = 0.25) -> None:
         for _ in range(count):
             self.now_s += step_s
             self.outbox._iterate(self.now_s)
 
-    def event(self, name: str) -> None:
-        self.outbox.add_event(ARM + "/event", name.encode(), at_ms=1)
+    def iterate_for(self, seconds: float) -> None:
+        self.iterate(int(4 * seconds))
 
-    def measure(self, first: int, last: int, *, sent: bool, each_s: float = 1.0) -> None:
+    def event(self, *names: str) -> None:
+        for name in names:
+            self.outbox.add_event(ARM + "/event", name.encode(), at_ms=1)
+
+    def measure(self, first: int, last: int, *, sent: bool = False, each_s: float = 1.0) -> None:
         for number in range(first, last):
             self.now_s += each_s
             self.outbox.add_measurement(LATE, str(number).encode(), at_ms=number, sent=sent, now_s=self.now_s)
 
-    def kept(self, *, late: bool = True) -> list[str]:
-        return [found.payload.decode() for _, found in self.store.after(0, late=late, limit=10**6)]
+    def stored(self, *, late: bool = False) -> list[str]:
+        return [item.payload.decode() for _, item in self.store.after(0, late=late, limit=10**6)]
+
+    def events(self) -> list[str]:
+        """The events that were sent, except those of the outbox."""
+        return [payload.decode() for topic, payload in self.sent if topic.endswith("/event") and payload[:1] != b"{"]
+
+    def reports(self, kind: EventKind) -> list[Event]:
+        """The outbox's own events that were sent."""
+        events = [codec.decode(payload, Event) for _, payload in self.sent if payload.startswith(b"{")]
+        return [event for event in events if event.kind == kind]
 
 
 @pytest.fixture
-def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
-    harness = DeviceHarness(tmp_path)
-    yield harness
-    harness.store.close()
+def fixture(tmp_path: Path) -> Iterator[OutboxFixture]:
+    fixture = OutboxFixture(tmp_path)
+    yield fixture
+    fixture.store.close()
 
 
-def test_an_event_is_stored_before_it_is_sent_and_deleted_after_the_ack(harness: DeviceHarness) -> None:
-    harness.outbox.link_changed(True)
-    harness.link.confirms = False
-    harness.event("held")
-    harness.rounds()
-    assert harness.link.payloads(topics.EVENT) == [b"held"]
-    assert harness.kept(late=False) == ["held"]
-    harness.rounds(20)
-    assert harness.link.payloads(topics.EVENT) == [b"held"], "it is under way"
-    harness.link.confirm()
-    harness.rounds()
-    assert harness.kept(late=False) == []
+def test_an_event_is_stored_before_it_is_sent_and_deleted_after_the_ack(fixture: OutboxFixture) -> None:
+    fixture.connect()
+    fixture.acknowledges = False
+    fixture.event("held")
+    fixture.iterate()
+    assert fixture.events() == fixture.stored() == ["held"]
+    fixture.iterate(20)
+    assert fixture.events() == ["held"], "it is in flight"
+    fixture.acknowledge()
+    fixture.iterate()
+    assert fixture.stored() == []
 
 
-def test_unacknowledged_messages_are_resent_in_order_after_a_lost_link(harness: DeviceHarness) -> None:
-    harness.outbox.link_changed(True)
-    harness.link.confirms = False
-    for name in ("one", "two", "three"):
-        harness.event(name)
-    harness.rounds()
-    harness.link.open.pop(0)()
-    harness.outbox.link_changed(False)
-    harness.rounds()
-    harness.link.said.clear()
-    harness.link.open.clear()
-    harness.link.confirms = True
-    harness.outbox.link_changed(True)
-    harness.rounds(2)
-    assert harness.link.payloads(topics.EVENT) == [b"two", b"three"]
-    assert harness.kept(late=False) == []
+def test_unacknowledged_messages_are_resent_in_order_after_a_lost_link(fixture: OutboxFixture) -> None:
+    fixture.connect()
+    fixture.acknowledges = False
+    fixture.event("one", "two", "three")
+    fixture.iterate()
+    fixture.open.pop(0)()
+    fixture.outbox.link_changed(False)
+    fixture.iterate()
+    fixture.sent.clear()
+    fixture.acknowledges = True
+    fixture.connect()
+    fixture.iterate(2)
+    assert fixture.events() == ["two", "three"]
+    assert fixture.stored() == []
 
 
-def test_stored_messages_are_sent_after_a_restart(harness: DeviceHarness) -> None:
-    harness.event("before")
-    harness.measure(0, 3, sent=False)
-    harness.rounds()
-    harness.store.close()
-    harness.renew()
-    harness.outbox.link_changed(True)
-    harness.rounds(4)
-    assert [payload for _, payload in harness.link.said] == [b"before", b"0", b"1", b"2"], "events first"
+def test_stored_messages_are_sent_after_a_restart(fixture: OutboxFixture) -> None:
+    fixture.event("before")
+    fixture.measure(0, 3)
+    fixture.iterate()
+    fixture.store.close()
+    fixture.restart()
+    fixture.connect()
+    fixture.iterate(4)
+    assert [payload for _, payload in fixture.sent] == [b"before", b"0", b"1", b"2"], "events first"
 
 
-def test_measurements_are_stored_at_a_reduced_rate_without_a_link(harness: DeviceHarness) -> None:
-    harness.outbox.link_changed(True)
-    harness.measure(0, 1000, sent=True, each_s=0.02)
-    harness.rounds()
-    assert harness.kept() == []
-    harness.measure(1000, 2000, sent=False, each_s=0.02)
-    harness.rounds()
-    assert 19 <= len(harness.kept()) <= 21, "one a second of twenty seconds"
+def test_measurements_are_stored_at_a_reduced_rate_from_shortly_before_the_link_was_lost(
+    fixture: OutboxFixture,
+) -> None:
+    fixture.connect()
+    fixture.measure(0, 30, sent=True)
+    fixture.iterate()
+    assert fixture.stored(late=True) == []
+    fixture.outbox.link_changed(False)
+    fixture.measure(30, 32)
+    fixture.iterate()
+    assert fixture.stored(late=True) == [str(number) for number in range(19, 32)], "the last ten seconds, in order"
+    fixture.measure(1000, 2000, each_s=0.02)
+    fixture.iterate()
+    assert 13 + 19 <= len(fixture.stored(late=True)) <= 13 + 21, "one a second of twenty seconds"
 
 
-def test_measurements_sent_shortly_before_a_lost_link_are_stored(harness: DeviceHarness) -> None:
-    harness.outbox.link_changed(True)
-    harness.rounds()
-    harness.measure(0, 30, sent=True)
-    harness.outbox.link_changed(False)
-    harness.measure(30, 32, sent=False)
-    harness.rounds()
-    assert harness.kept() == [str(number) for number in range(19, 32)], "the last ten seconds, in order"
+def test_the_send_rate_is_low_and_lower_during_motion(fixture: OutboxFixture) -> None:
+    fixture.measure(0, 500)
+    fixture.iterate()
+    fixture.connect()
+    fixture.iterate_for(1)
+    assert len(fixture.sent) <= module._WINDOW + RATE_HZ
+    for fixture.quiet, rate_hz in ((True, RATE_HZ), (False, BUSY_RATE_HZ)):
+        before = len(fixture.sent)
+        fixture.iterate_for(10)
+        assert 9 * rate_hz <= len(fixture.sent) - before <= 11 * rate_hz
+    assert [payload for _, payload in fixture.sent] == [str(number).encode() for number in range(len(fixture.sent))]
 
 
-def test_the_send_rate_is_low_and_lower_during_motion(harness: DeviceHarness) -> None:
-    harness.measure(0, 500, sent=False)
-    harness.rounds()
-    harness.outbox.link_changed(True)
-    harness.rounds(4)
-    assert len(harness.link.said) <= module._WINDOW + RATE_HZ
-    before = len(harness.link.said)
-    harness.rounds(40)
-    assert 9 * RATE_HZ <= len(harness.link.said) - before <= 11 * RATE_HZ
-    harness.moves = True
-    before = len(harness.link.said)
-    harness.rounds(40)
-    assert 9 * BUSY_RATE_HZ <= len(harness.link.said) - before <= 11 * BUSY_RATE_HZ
-    assert harness.link.payloads() == [str(number).encode() for number in range(len(harness.link.said))]
-
-
-def test_sending_starts_after_the_settle_time(tmp_path: Path) -> None:
-    harness = DeviceHarness(tmp_path)
-    harness.outbox.settle_s = 8.0
-    harness.event("held")
+def test_sending_starts_after_the_settle_time(fixture: OutboxFixture) -> None:
+    fixture.outbox.settle_s = 8.0
+    fixture.event("held")
     for _ in range(2):
-        harness.outbox.link_changed(True)
-        harness.rounds(32)
-        assert harness.link.said == []
-    harness.rounds(2)
-    assert harness.link.payloads(topics.EVENT) == [b"held"]
-    harness.event("live")
-    harness.rounds()
-    assert harness.link.payloads(topics.EVENT) == [b"held", b"live"], "from then on at once"
-    harness.store.close()
+        fixture.connect()
+        fixture.iterate_for(8)
+        assert fixture.sent == []
+    fixture.iterate(2)
+    assert fixture.events() == ["held"]
+    fixture.event("live")
+    fixture.iterate()
+    assert fixture.events() == ["held", "live"], "from then on at once"
 
 
-def test_messages_in_flight_are_limited(harness: DeviceHarness) -> None:
-    harness.measure(0, 100, sent=False)
-    harness.link.confirms = False
-    harness.outbox.link_changed(True)
-    harness.rounds(40)
-    assert len(harness.link.said) == module._WINDOW
-    harness.link.confirm()
-    harness.rounds(8)
-    assert len(harness.link.said) == 2 * module._WINDOW
+def test_messages_in_flight_are_limited_and_a_full_link_queue_is_retried(fixture: OutboxFixture) -> None:
+    fixture.measure(0, 100)
+    fixture.acknowledges = fixture.accepts = False
+    fixture.connect()
+    fixture.iterate(3)
+    fixture.accepts = True
+    fixture.iterate(40)
+    assert len(fixture.sent) == module._WINDOW
+    fixture.acknowledge()
+    fixture.iterate(8)
+    assert len(fixture.sent) == 2 * module._WINDOW
 
 
-def test_a_full_link_queue_is_retried(harness: DeviceHarness) -> None:
-    harness.outbox.link_changed(True)
-    harness.link.takes = False
-    harness.event("held")
-    harness.rounds(3)
-    harness.link.takes = True
-    harness.rounds()
-    assert harness.link.payloads(topics.EVENT) == [b"held"]
+@pytest.mark.parametrize("disk_full", [False, True])
+def test_messages_without_ack_are_retried_then_dropped_and_counted(
+    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch, disk_full: bool
+) -> None:
+    if disk_full:
+        monkeypatch.setattr(fixture.store, "put", fail)
+    fixture.connect()
+    fixture.acknowledges = False
+    fixture.event("refused")
+    fixture.iterate_for(module._ACK_TIMEOUT_S * (module._MAX_ATTEMPTS + 1))
+    assert fixture.events().count("refused") == module._MAX_ATTEMPTS
+    assert (fixture.stored(), fixture.outbox._unsaved) == ([], {})
+    if not disk_full:
+        fixture.outbox.link_changed(False)
+        fixture.connect()
+        fixture.iterate()
+        (report,) = fixture.reports(EventKind.BUFFER_DROPPED)
+        assert report.data == {"measurements": 0, "events": 1}
 
 
-def test_messages_without_ack_are_retried_then_dropped_and_counted(harness: DeviceHarness) -> None:
-    harness.outbox.link_changed(True)
-    harness.link.confirms = False
-    harness.event("refused")
-    harness.rounds(int(4 * module._ACK_TIMEOUT_S * (module._MAX_ATTEMPTS + 1)))
-    assert harness.link.payloads(topics.EVENT).count(b"refused") == module._MAX_ATTEMPTS
-    assert harness.kept(late=False) == []
-    harness.outbox.link_changed(False)
-    harness.outbox.link_changed(True)
-    harness.rounds()
-    (told,) = harness.link.events(EventKind.BUFFER_DROPPED)
-    assert told.data == {"measurements": 0, "events": 1}
-
-
-def test_dropped_messages_are_reported_after_reconnection(tmp_path: Path) -> None:
-    harness = DeviceHarness(tmp_path, max_bytes=50_000)
-    harness.measure(0, 2000, sent=False)
-    harness.rounds()
-    left = len(harness.kept())
-    harness.outbox.link_changed(True)
-    harness.rounds()
-    (told,) = harness.link.events(EventKind.BUFFER_DROPPED)
-    assert told.data == {"measurements": 2000 - left, "events": 0}
-    assert (told.device, told.severity) == ("arm", "warning")
-    harness.store.close()
+def test_dropped_messages_are_reported_after_reconnection(fixture: OutboxFixture) -> None:
+    fixture.restart(max_bytes=50_000)
+    fixture.measure(0, 2000)
+    fixture.iterate()
+    left = len(fixture.stored(late=True))
+    fixture.connect()
+    fixture.iterate()
+    (report,) = fixture.reports(EventKind.BUFFER_DROPPED)
+    assert report.data == {"measurements": 2000 - left, "events": 0}
+    assert (report.device, report.severity) == ("arm", "warning")
 
 
 def test_a_stuck_thread_uses_bounded_memory_and_counts_drops(
-    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch
+    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_MAX_INCOMING", 10)
-    for number in range(14):
-        harness.event(str(number))
-    harness.rounds()
-    assert harness.kept(late=False) == [str(number) for number in range(4, 14)]
-    harness.outbox.link_changed(True)
-    harness.rounds(4)
-    (told,) = harness.link.events(EventKind.BUFFER_DROPPED)
-    assert told.data["events"] == 4
+    fixture.event(*map(str, range(14)))
+    fixture.iterate()
+    assert fixture.stored() == [str(number) for number in range(4, 14)]
+    fixture.connect()
+    fixture.iterate(4)
+    (report,) = fixture.reports(EventKind.BUFFER_DROPPED)
+    assert report.data["events"] == 4
 
 
-class TestFullDisk:
-    @pytest.fixture
-    def full(self, harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-        """While its only entry is true, nothing can be put on disk."""
-        put, full = harness.store.put, [True]
-
-        def fail(items: Any, **options: Any) -> None:
-            if full[0]:
-                raise OutboxStoreError("outbox.db cannot be written: is the disk full?")
-            put(items, **options)
-
-        monkeypatch.setattr(harness.store, "put", fail)
-        return full
-
-    def test_events_go_out_from_memory_and_it_is_said(self, harness: DeviceHarness, full: list[bool]) -> None:
-        assert full
-        harness.outbox.link_changed(True)
-        harness.event("held")
-        harness.rounds(2)
-        assert b"held" in harness.link.payloads(topics.EVENT)
-        (told,) = harness.link.events(EventKind.BUFFER_FAILED)
-        assert told.severity == "error"
-        assert "disk full" in told.message
-        harness.event("next")
-        harness.rounds(40)
-        assert harness.link.payloads(topics.EVENT).count(b"next") == 1
-        assert len(harness.link.events(EventKind.BUFFER_FAILED)) == 1, "once"
-
-    def test_events_wait_in_memory_for_the_disk_and_measurements_are_counted(
-        self, harness: DeviceHarness, full: list[bool]
-    ) -> None:
-        harness.event("first")
-        harness.measure(0, 5, sent=False)
-        harness.rounds()
-        full[0] = False
-        harness.event("second")
-        harness.rounds()
-        assert harness.kept(late=False) == []
-        harness.rounds(int(4 * module._SAVE_RETRY_S))
-        assert harness.kept(late=False)[::2] == ["first", "second"], "with what was said of the disk between"
-        harness.outbox.link_changed(True)
-        harness.rounds(2)
-        (told,) = harness.link.events(EventKind.BUFFER_DROPPED)
-        assert told.data == {"measurements": 5, "events": 0}
-
-    def test_memory_is_bounded(self, harness: DeviceHarness, full: list[bool]) -> None:
-        assert full
-        for number in range(module._MAX_UNSAVED + 20):
-            harness.event(str(number))
-        harness.rounds()
-        assert len(harness.outbox._unsaved) == module._MAX_UNSAVED
-
-    def test_what_is_only_in_memory_and_never_confirmed_is_let_go(
-        self, harness: DeviceHarness, full: list[bool]
-    ) -> None:
-        assert full
-        harness.link.confirms = False
-        harness.outbox.link_changed(True)
-        harness.event("refused")
-        harness.rounds(int(4 * module._ACK_TIMEOUT_S * (module._MAX_ATTEMPTS + 1)))
-        assert harness.link.payloads(topics.EVENT).count(b"refused") == module._MAX_ATTEMPTS
-        assert harness.outbox._unsaved == {}
+# ---------------------------------------------------------------- errors of the disk
 
 
-def test_an_unusable_folder_does_not_stop_the_outbox(tmp_path: Path) -> None:
-    harness = DeviceHarness(tmp_path)
-    harness.path = tmp_path / "missing" / "outbox.db"
-    harness.renew()
-    harness.outbox.link_changed(True)
-    harness.event("held")
-    harness.rounds(2)
-    assert b"held" in harness.link.payloads(topics.EVENT)
-    harness.path.parent.mkdir()
-    harness.rounds(int(4 * module._SAVE_RETRY_S) + 1)
-    harness.event("again")
-    harness.link.takes = False
-    harness.rounds()
-    assert harness.kept(late=False) == ["again"]
-    harness.store.close()
+def fail(*_: Any, **__: Any) -> Any:
+    raise OutboxStoreError("outbox.db cannot be written: is the disk full?")
+
+
+def test_with_a_full_disk_events_are_sent_from_memory_and_one_event_reports_it(
+    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fixture.store, "put", fail)
+    fixture.connect()
+    fixture.event("held")
+    fixture.iterate(2)
+    assert fixture.events() == ["held"]
+    fixture.event("next")
+    fixture.iterate(40)
+    assert fixture.events() == ["held", "next"]
+    (report,) = fixture.reports(EventKind.BUFFER_FAILED)
+    assert report.severity == "error"
+    assert "disk full" in report.message
+
+
+def test_with_a_full_disk_events_wait_in_bounded_memory_and_measurements_are_counted(
+    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(fixture.store, "put", fail)
+        fixture.event("first")
+        fixture.measure(0, 5)
+        fixture.iterate()
+    fixture.event("second")
+    fixture.iterate()
+    assert fixture.stored() == []
+    fixture.iterate_for(module._SAVE_RETRY_S)
+    assert fixture.stored()[::2] == ["first", "second"], "with the report between them"
+    fixture.connect()
+    fixture.iterate(2)
+    (report,) = fixture.reports(EventKind.BUFFER_DROPPED)
+    assert report.data == {"measurements": 5, "events": 0}
+    monkeypatch.setattr(fixture.store, "put", fail)
+    fixture.event(*map(str, range(module._MAX_UNSAVED + 20)))
+    fixture.iterate()
+    assert len(fixture.outbox._unsaved) == module._MAX_UNSAVED
+
+
+def test_an_unusable_folder_does_not_stop_the_outbox(fixture: OutboxFixture, tmp_path: Path) -> None:
+    fixture.path = tmp_path / "missing" / "outbox.db"
+    fixture.restart()
+    fixture.connect()
+    fixture.event("held")
+    fixture.iterate(2)
+    assert fixture.events() == ["held"]
+    fixture.path.parent.mkdir()
+    fixture.iterate_for(module._SAVE_RETRY_S + 1)
+    fixture.event("again")
+    fixture.accepts = False
+    fixture.iterate()
+    assert fixture.stored() == ["again"]
 
 
 def test_read_errors_are_reported_and_unexpected_errors_do_not_stop_the_thread(
-    harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    harness.outbox.link_changed(True)
-
-    def fail(error: Exception) -> Callable[..., list[tuple[int, OutboxItem]]]:
-        def after(*_: object, **__: object) -> list[tuple[int, OutboxItem]]:
-            raise error
-
-        return after
-
-    with monkeypatch.context() as patch:
-        patch.setattr(harness.store, "after", fail(OutboxStoreError("outbox.db cannot be read")))
-        harness.event("one")
-        harness.rounds()
-    assert "cannot be read" in caplog.text
-    with monkeypatch.context() as patch:
-        patch.setattr(harness.store, "after", fail(RuntimeError("a mistake")))
-        harness.rounds()
-    assert "a mistake" in caplog.text
-    harness.rounds(int(4 * module._SAVE_RETRY_S) + 1)
-    assert b"one" in harness.link.payloads(topics.EVENT)
+    fixture.connect()
+    fixture.event("one")
+    for error in (OutboxStoreError("outbox.db cannot be read"), RuntimeError("a mistake")):
+        with monkeypatch.context() as patch:
+            patch.setattr(fixture.store, "after", mock.Mock(side_effect=error))
+            fixture.iterate()
+        assert str(error) in caplog.text
+    fixture.iterate_for(module._SAVE_RETRY_S + 1)
+    assert fixture.events() == ["one"]
 
 
-def test_the_thread_sends_at_once_and_drains_before_it_stops(tmp_path: Path) -> None:
-    harness = DeviceHarness(tmp_path)
-    harness.outbox.start()
-    harness.outbox.link_changed(True)
-    harness.event("held")
-    eventually(lambda: harness.link.payloads(topics.EVENT) == [b"held"])
-    harness.link.confirms = False
-    harness.event("goodbye")
-    later = threading.Timer(0.1, harness.link.confirm)
+def test_the_thread_sends_at_once_and_drains_before_it_stops(fixture: OutboxFixture) -> None:
+    fixture.outbox.start()
+    fixture.connect()
+    fixture.event("held")
+    eventually(lambda: fixture.events() == ["held"])
+    fixture.acknowledges = False
+    fixture.event("goodbye")
+    later = threading.Timer(0.1, fixture.acknowledge)
     later.start()
-    harness.outbox.stop()
-    harness.outbox.stop()
+    fixture.outbox.stop()
+    fixture.outbox.stop()
     later.join()
-    assert harness.link.payloads(topics.EVENT) == [b"held", b"goodbye"]
-    harness.renew()
-    harness.store.open()
-    harness.event("x")
-    harness.rounds()
-    assert harness.kept(late=False)[-1] == "x"
-    harness.store.close()
+    assert fixture.events() == ["held", "goodbye"]
+    fixture.restart()
+    fixture.event("last")
+    fixture.iterate()
+    assert fixture.stored() == ["last"]

@@ -1,9 +1,10 @@
-"""A grant as an Event Grid namespace reads it: judged here by a fake that follows Microsoft's pages."""
+"""Topic spaces of Event Grid for grants, evaluated by a fake that follows Microsoft's pages."""
 
 import json
 import re
 from pathlib import Path
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,11 +27,11 @@ def person(publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> Gr
 
 
 def watching(*devices: str, spaces: tuple[str, ...] = (), stops: tuple[str, ...] = ()) -> Grant:
-    heard = [topic for space in spaces for topic in grants.device_subscriptions(space, "+", "+")]
-    heard += [topic for name in devices for topic in grants.device_subscriptions("room", "agentaaaaa", name)]
-    said = [f"ts/v1/{space}/+/+/stop" for space in spaces]
-    said += [f"ts/v1/room/agentaaaaa/{name}/stop" for name in stops]
-    return person(tuple(said), tuple(dict.fromkeys(heard)))
+    subscribe = [topic for space in spaces for topic in grants.device_subscriptions(space, "+", "+")]
+    subscribe += [topic for name in devices for topic in grants.device_subscriptions("room", "agentaaaaa", name)]
+    publish = [f"ts/v1/{space}/+/+/stop" for space in spaces]
+    publish += [f"ts/v1/room/agentaaaaa/{name}/stop" for name in stops]
+    return person(tuple(publish), tuple(dict.fromkeys(subscribe)))
 
 
 HOLDER = person(("ts/v1/space/agentaaaaa/arm/ctl/7",))
@@ -75,10 +76,10 @@ def test_the_namespace_allows_exactly_what_the_grant_does(grant: Grant, pattern:
         assert may_publish(grant, pattern) == grant.may_publish(pattern)
 
 
-@pytest.mark.parametrize("grant", GRANTS)
-def test_every_topic_of_a_grant_is_allowed(grant: Grant) -> None:
-    assert all(may_subscribe(grant, pattern) for pattern in grant.subscribe)
-    assert all(may_publish(grant, pattern.replace("+", "x")) for pattern in grant.publish)
+def test_every_topic_of_a_grant_is_allowed() -> None:
+    for grant in GRANTS:
+        assert all(may_subscribe(grant, pattern) for pattern in grant.subscribe)
+        assert all(may_publish(grant, pattern.replace("+", "x")) for pattern in grant.publish)
 
 
 @pytest.mark.parametrize(
@@ -93,18 +94,18 @@ def test_every_topic_of_a_grant_is_allowed(grant: Grant) -> None:
         person(subscribe=("ts/v1/space/+/+/state",)),
         person(("ts/v1/space/agent/arm/cmd",)),
         person(("ts/v1/space/${client.attributes.kind}/arm/stop",)),
-        Grant(**{**{name: getattr(AGENT, name) for name in AGENT.__struct_fields__}, "principal": "account:x:y"}),
-        Grant(**{**{name: getattr(AGENT, name) for name in AGENT.__struct_fields__}, "publish": AGENT.publish[1:]}),
+        msgspec.structs.replace(AGENT, principal="account:x:y"),
+        msgspec.structs.replace(AGENT, publish=AGENT.publish[1:]),
         grants.gateway_grant(client_id="s", token_id="t", lifetime_s=1),
         grants.service_grant(client_id="s", token_id="t", lifetime_s=1),
     ],
 )
-def test_what_it_cannot_be_told_exactly_is_refused_whole(grant: Grant) -> None:
+def test_a_grant_that_cannot_be_expressed_exactly_is_refused(grant: Grant) -> None:
     with pytest.raises(BrokerAccessError, match="Event Grid"):
         topic_spaces.attributes(grant)
 
 
-def test_what_the_functions_publish_has_a_topic_space_in_which_no_client_has_part() -> None:
+def test_the_topic_space_of_the_functions_has_no_clients() -> None:
     space = topic_spaces.spaces()[topic_spaces.FUNCTIONS_SAY]
     assert {f"ts/v1/+/+/+/{kind}" for kind in ("cmd", "stop", "state", "ack")} <= set(space)
     assert not any(
@@ -113,10 +114,14 @@ def test_what_the_functions_publish_has_a_topic_space_in_which_no_client_has_par
     assert topic_spaces.FUNCTIONS_SAY not in {bound.space for bound in topic_spaces.bindings()}
 
 
-def test_microsofts_limits_are_kept() -> None:
+def test_microsofts_limits_are_respected() -> None:
     assert len(NAMESPACE.spaces) <= 10
     assert len(NAMESPACE.groups) <= 10
     assert len(NAMESPACE.bindings) <= 100
+    for binding in NAMESPACE.bindings:
+        assert binding["clientGroupName"] in NAMESPACE.groups
+        assert binding["topicSpaceName"] in NAMESPACE.spaces
+        assert binding["permission"] in {"Publisher", "Subscriber"}
     for name, templates in NAMESPACE.spaces.items():
         assert re.fullmatch(r"[A-Za-z0-9-]{3,50}", name)
         assert 1 <= len(templates) <= 10
@@ -124,14 +129,6 @@ def test_microsofts_limits_are_kept() -> None:
     longest = "x" * 60
     many = watching(*(f"{longest}{each}" for each in "abcd"), spaces=tuple(f"{longest}{each}" for each in "abc"))
     assert len(json.dumps(topic_spaces.attributes(many))) < 4096
-
-
-def test_the_template_names_all_that_it_binds() -> None:
-    for bound in NAMESPACE.bindings:
-        assert bound["clientGroupName"] in NAMESPACE.groups
-        assert bound["topicSpaceName"] in NAMESPACE.spaces
-        assert bound["permission"] in {"Publisher", "Subscriber"}
-        assert bound["clientGroupName"] != "$all"
 
 
 def test_the_command_writes_the_template(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

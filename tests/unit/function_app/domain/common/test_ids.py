@@ -14,15 +14,10 @@ AGENT = "abcdefgh23"
 times = st.integers(min_value=0, max_value=4_102_444_800_000)  # until 2100
 
 
-@given(st.integers(min_value=0, max_value=2**64 - 1))
-def test_an_agent_id_is_a_function_of_the_key(bits: int) -> None:
-    agent = ids.agent_id(f"{bits:016x}")
-    assert re.fullmatch("[a-z2-7]{10}", agent)
-    assert agent == ids.agent_id(f"{bits:016x}")
-
-
 def test_agent_ids_use_fifty_bits_of_the_key() -> None:
-    assert len({ids.agent_id(hashlib.sha256(str(n).encode()).hexdigest()[:16]) for n in range(2_000)}) == 2_000
+    agents = {ids.agent_id(hashlib.sha256(str(n).encode()).hexdigest()[:16]) for n in range(2_000)}
+    assert len(agents) == 2_000
+    assert all(re.fullmatch("[a-z2-7]{10}", agent) for agent in agents)
     assert ids.agent_id("0" * 16) != ids.agent_id(f"{1 << 14:016x}")
     assert ids.agent_id("f" * 16) == "7" * 10
 
@@ -53,9 +48,9 @@ def test_invalid_device_ids_are_rejected(agent: str, name: str) -> None:
         assert ids.split_command(f"{text}-{'0' * 20}") is None
 
 
-@pytest.mark.parametrize("suffix", ["", "0" * 19, "0" * 21, "0" * 19 + "/", "0" * 19 + " "])
-def test_invalid_action_ids_are_rejected(suffix: str) -> None:
-    assert ids.split_command(f"{AGENT}-arm-{suffix}") is None
+def test_invalid_action_ids_are_rejected() -> None:
+    for suffix in ("", "0" * 19, "0" * 21, "0" * 19 + "/", "0" * 19 + " "):
+        assert ids.split_command(f"{AGENT}-arm-{suffix}") is None
 
 
 @given(st.text())

@@ -67,9 +67,6 @@ def test_a_share_is_valid_until_its_expiry() -> None:
     lasting = share(DEVICE, Role.OPERATOR, expires_ms=NOW_MS)
     assert role(lasting, now_ms=NOW_MS - 1) is Role.OPERATOR
     assert role(lasting, share(SPACE, Role.VIEWER)) is Role.VIEWER
-
-
-def test_the_expiry_is_that_of_the_effective_role() -> None:
     shares = [share(DEVICE, Role.OPERATOR, expires_ms=5_000), share(SPACE, Role.VIEWER, expires_ms=9_000)]
     assert access.permissions(BERT, AGENT, "arm", shares, NOW_MS) == Permissions(Role.OPERATOR, 5_000, Role.VIEWER)
     equal = [share(DEVICE, Role.VIEWER, expires_ms=5_000), share(SPACE, Role.VIEWER)]

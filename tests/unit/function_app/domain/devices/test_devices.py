@@ -1,7 +1,5 @@
 """Connection state, claiming, moving and unpairing of agents."""
 
-from dataclasses import replace
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,18 +22,9 @@ from function_app.domain.devices.devices import (
 links = st.builds(Link, online=st.booleans(), session=st.integers(min_value=0, max_value=3), seen_ms=st.integers(0, 9))
 
 
-def test_an_old_will_does_not_end_a_new_session_and_late_messages_do_not_revive_an_old_one() -> None:
-    first = Link(online=True, session=5, seen_ms=1, pairing="p")
-    assert newer_link(first, replace(first, online=False, session=4)) is None
-    offline = replace(first, online=False, seen_ms=2)
-    assert newer_link(first, offline) == offline
-    assert newer_link(offline, replace(first, seen_ms=3)) is None
-    for newer in (replace(first, session=6), replace(first, online=False, session=1, pairing="q")):
-        assert newer_link(offline, newer) == newer
-
-
 @given(st.lists(links))
 def test_reordered_presence_never_returns_to_an_earlier_session(news: list[Link]) -> None:
+    assert newer_link(Link(online=True, session=9, seen_ms=1), Link(online=True, session=1, seen_ms=0, pairing="q"))
     known: Link | None = None
     for link in news:
         newer = newer_link(known, link)
@@ -74,7 +63,6 @@ def test_claiming_consumes_the_code_and_unpairing_removes_the_owner() -> None:
 
 
 def test_timestamps_as_text() -> None:
-    assert rfc3339(0) == "1970-01-01T00:00:00.000Z"
     assert rfc3339(1_769_860_800_007) == "2026-01-31T12:00:00.007Z"
 
 
@@ -93,7 +81,7 @@ ARM, CAM = DeviceSpec("arm", "arm", "ur5", ""), DeviceSpec("cam", "camera", "c",
 CLAIMED = claim(Agent("a", "lab", "k", "1", (ARM, CAM), 0), account="anna", space="home", pairing="p", now_ms=1)
 
 
-def test_departures_contain_former_owner_and_space() -> None:
+def test_departures_contain_the_former_owner_and_are_bounded() -> None:
     (left,) = unpair(CLAIMED).leaving
     assert (left.why, left.account, left.space, left.pairing) == ("unpaired", "anna", "home", "p")
     assert left.devices == ("arm", "cam")
@@ -101,14 +89,10 @@ def test_departures_contain_former_owner_and_space() -> None:
     assert (moved.space, moved.pairing, moved.account) == ("attic", "p", "anna")
     assert [(each.why, each.space) for each in moved.leaving] == [("moved", "home")]
 
-
-def test_only_removed_devices_of_a_claimed_agent_depart() -> None:
     assert [(each.why, each.devices) for each in with_devices(CLAIMED, (CAM,)).leaving] == [("removed", ("arm",))]
     assert with_devices(CLAIMED, (CAM, ARM)).leaving == ()
     assert with_devices(Agent("a", "lab", "k", "1", (ARM, CAM), 0), (CAM,)).leaving == ()
 
-
-def test_departures_are_bounded() -> None:
     agent = CLAIMED
     for number in range(50):
         agent = move(agent, f"space{number}")

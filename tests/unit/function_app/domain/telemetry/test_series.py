@@ -27,6 +27,7 @@ ROWS = st.lists(
     st.tuples(st.integers(0, 40_000), st.dictionaries(st.sampled_from("abc"), VALUES, min_size=1)), max_size=60
 )
 NOW_MS = 1_800_000_000_000
+Rows = list[tuple[int, dict[str, float]]]
 
 
 def rows_of(samples: Samples) -> dict[int, dict[str, float]]:
@@ -37,7 +38,7 @@ def rows_of(samples: Samples) -> dict[int, dict[str, float]]:
     return found
 
 
-def truth(rows: list[tuple[int, dict[str, float]]]) -> dict[int, dict[str, float]]:
+def truth(rows: Rows) -> dict[int, dict[str, float]]:
     first: dict[int, dict[str, float]] = {}
     for at_ms, values in rows:
         first.setdefault(at_ms, values)
@@ -45,23 +46,21 @@ def truth(rows: list[tuple[int, dict[str, float]]]) -> dict[int, dict[str, float
 
 
 @given(ROWS)
-def test_the_first_sample_of_a_time_counts(rows: list[tuple[int, dict[str, float]]]) -> None:
+def test_the_first_sample_of_a_time_counts(rows: Rows) -> None:
     samples = series.from_rows(rows)
     assert rows_of(samples) == truth(rows)
     assert list(samples.at_ms) == sorted(set(samples.at_ms))
 
 
 @given(ROWS)
-def test_unpacking_reverses_packing(rows: list[tuple[int, dict[str, float]]]) -> None:
+def test_unpacking_reverses_packing(rows: Rows) -> None:
     samples = series.from_rows(rows)
     packed = json.loads(json.dumps(series.pack(samples)))
     assert rows_of(series.unpack(packed)) == rows_of(samples)
 
 
 @given(ROWS, ROWS)
-def test_samples_are_a_set_by_time(
-    one: list[tuple[int, dict[str, float]]], other: list[tuple[int, dict[str, float]]]
-) -> None:
+def test_samples_are_a_set_by_time(one: Rows, other: Rows) -> None:
     there = series.from_rows(one)
     fresh = series.new_samples(series.from_rows(other), there)
     assert rows_of(series.merge(there, fresh)) == truth(one + other)
@@ -69,7 +68,7 @@ def test_samples_are_a_set_by_time(
 
 
 @given(ROWS)
-def test_windows_hold_every_sample_once(rows: list[tuple[int, dict[str, float]]]) -> None:
+def test_windows_hold_every_sample_once(rows: Rows) -> None:
     samples = series.from_rows(rows)
     found: dict[int, dict[str, float]] = {}
     for start_ms, window in samples.windows():
@@ -80,9 +79,7 @@ def test_windows_hold_every_sample_once(rows: list[tuple[int, dict[str, float]]]
 
 
 @given(ROWS, st.randoms(use_true_random=False))
-def test_a_bucket_does_not_depend_on_the_sample_order(
-    rows: list[tuple[int, dict[str, float]]], chance: random.Random
-) -> None:
+def test_a_bucket_does_not_depend_on_the_sample_order(rows: Rows, chance: random.Random) -> None:
     samples = series.from_rows(rows)
     parts = [samples.part(index, index + 1) for index in range(len(samples))]
     chance.shuffle(parts)

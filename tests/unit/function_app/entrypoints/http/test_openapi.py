@@ -15,50 +15,11 @@ from tests.harness.cloud.cloud import Cloud
 
 METHODS = {"get", "post", "put", "delete"}
 PROBLEM = "#/components/schemas/Problem"
-BY_PROMISE = {
-    "POST /auth/sign-in",
-    "POST /auth/sign-out",
-    "GET /accounts/me",
-    "POST /agents/enroll",
-    "GET /agents/enrollment",
-    "POST /agents/claim",
-    "GET /agents",
-    "DELETE /agents/{agent}",
-    "GET /devices",
-    "GET /devices/{device}",
-    "POST /devices/{device}/lease",
-    "GET /devices/{device}/lease",
-    "DELETE /devices/{device}/lease",
-    "POST /devices/{device}/actions",
-    "GET /devices/{device}/actions",
-    "GET /actions/{action}",
-    "POST /actions/{action}/cancel",
-    "POST /devices/{device}/stop",
-    "POST /devices/{device}/stop/reset",
-    "POST /devices/{device}/lease/requests",
-    "GET /devices/{device}/lease/requests/{request_id}",
-    "DELETE /devices/{device}/lease/requests/{request_id}",
-    "POST /devices/{device}/lease/requests/{request_id}/accept",
-    "POST /devices/{device}/lease/requests/{request_id}/reject",
-    "POST /spaces/{space}/stop",
-    "POST /stop",
-    "GET /robot-types",
-    "GET /robot-types/{robot_type}",
-    "GET /robot-types/{robot_type}/movements",
-    "GET /robot-types/{robot_type}/movements/{name}",
-    "PUT /robot-types/{robot_type}/movements/{name}",
-    "DELETE /robot-types/{robot_type}/movements/{name}",
-    "GET /robot-types/{robot_type}/scripting",
-    "POST /robot-types/{robot_type}/scripting/check",
-    "POST /mqtt/credentials",
-    "GET /spaces",
-    "GET /health",
-}
 
 
 @pytest.fixture(scope="module")
 def document(cloud: Cloud) -> dict[str, Any]:
-    answer = cloud.ask("GET", "/api/v1/openapi.json")
+    answer = cloud.request("GET", "/api/v1/openapi.json")
     assert answer.status_code == 200
     found: dict[str, Any] = answer.json()
     return found
@@ -69,13 +30,6 @@ def operations(document: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, A
         assert set(methods) <= METHODS
         for method, operation in methods.items():
             yield method.upper(), path, operation
-
-
-def test_it_describes_every_route_and_no_other(document: dict[str, Any]) -> None:
-    assert document["openapi"].startswith("3.1")
-    said = {f"{method} {path.removeprefix('/api/v1')}" for method, path, _ in operations(document)}
-    assert said >= BY_PROMISE
-    assert all(path.startswith("/api/v1/") for path in document["paths"])
 
 
 def test_every_reference_leads_somewhere(document: dict[str, Any]) -> None:
@@ -93,63 +47,29 @@ def test_every_schema_is_a_json_schema(document: dict[str, Any]) -> None:
         jsonschema.Draft202012Validator.check_schema(schema)
 
 
-def test_every_operation_says_what_it_is_and_what_it_answers(document: dict[str, Any]) -> None:
+def test_every_operation_is_complete(document: dict[str, Any]) -> None:
+    assert document["openapi"].startswith("3.1")
+    schemes = document["components"]["securitySchemes"].keys()
     names = []
     for method, path, operation in operations(document):
-        where = f"{method} {path}"
+        where, responses = f"{method} {path}", operation["responses"]
+        assert path.startswith("/api/v1/")
         names.append(operation["operationId"])
-        assert operation["summary"], where
-        assert operation["description"], where
-        assert operation["tags"], where
-        assert any(status.startswith(("2", "3")) for status in operation["responses"]), where
-        for status, response in operation["responses"].items():
+        assert all(operation[field] for field in ("summary", "description", "tags")), where
+        assert any(status.startswith(("2", "3")) for status in responses), where
+        for status, response in responses.items():
             assert response["description"], where
             if status.startswith("2"):
                 assert "content" in response or status == "204", where
             elif status != "303":
-                schema = response["content"]["application/problem+json"]["schema"]
-                assert schema == {"$ref": PROBLEM}, where
-    assert len(names) == len(set(names))
-
-
-def test_every_operation_says_who_may_call_it(document: dict[str, Any]) -> None:
-    schemes = document["components"]["securitySchemes"]
-    open_to_all = []
-    for _, path, operation in operations(document):
-        for need in operation["security"]:
-            assert set(need) <= set(schemes)
-        if operation["security"]:
-            assert "401" in operation["responses"]
-        else:
-            open_to_all.append(path)
-    assert sorted(path.removeprefix("/api/v1") for path in open_to_all) == [
-        "/auth/accounts",
-        "/auth/methods",
-        "/auth/oidc/callback",
-        "/auth/oidc/start",
-        "/auth/oidc/start",
-        "/auth/password",
-        "/auth/sign-in",
-        "/health",
-        "/xmpp/verify",
-    ]
-
-
-def test_what_changes_something_by_cookie_may_be_forbidden(document: dict[str, Any]) -> None:
-    for method, path, operation in operations(document):
-        if method != "GET" and {"sessionCookie": []} in operation["security"]:
-            assert "403" in operation["responses"], path
-
-
-def test_path_parameters_are_described(document: dict[str, Any]) -> None:
-    for _, path, operation in operations(document):
-        said = {item["name"] for item in operation.get("parameters", []) if item["in"] == "path"}
-        assert said == set(re.findall(r"{(\w+)}", path))
-
-
-def test_health_is_as_it_is_described(document: dict[str, Any], cloud: Cloud) -> None:
-    schema = {**document["components"]["schemas"]["HealthOut"], "components": document["components"]}
-    jsonschema.validate(cloud.ask("GET", "/api/v1/health").json(), schema)
+                assert response["content"]["application/problem+json"]["schema"] == {"$ref": PROBLEM}, where
+        accepted = {name for need in operation["security"] for name in need}
+        assert accepted <= schemes, where
+        assert not accepted or "401" in responses, where
+        assert method == "GET" or "sessionCookie" not in accepted or "403" in responses, where
+        described = {item["name"] for item in operation.get("parameters", []) if item["in"] == "path"}
+        assert described == set(re.findall(r"{(\w+)}", path)), where
+    assert len(names) == len(set(names)) > 100
 
 
 class _Page(HTMLParser):
@@ -176,7 +96,7 @@ class _Page(HTMLParser):
 
 
 def test_the_page_for_people_names_every_route_and_links_only_to_itself(cloud: Cloud, document: dict[str, Any]) -> None:
-    answer = cloud.ask("GET", "/api/docs")
+    answer = cloud.request("GET", "/api/docs")
     assert answer.status_code == 200
     assert answer.headers["content-type"] == "text/html; charset=utf-8"
     page = _Page()
@@ -192,28 +112,21 @@ def test_the_page_for_people_names_every_route_and_links_only_to_itself(cloud: C
 
 def test_the_page_shows_hostile_text_as_text() -> None:
     evil = "<script>alert(1)</script>&'\""
-    document: dict[str, Any] = {
-        "info": {"title": evil, "version": evil, "description": evil},
-        "paths": {
-            f"/{evil}": {
-                "get": {
-                    "summary": evil,
-                    "description": evil,
-                    "security": [{evil: []}],
-                    "parameters": [{"name": evil, "in": evil}],
-                    "responses": {
-                        "200": {
-                            "description": evil,
-                            "content": {"x": {"schema": {"$ref": f"#/components/schemas/{evil}"}}},
-                        }
-                    },
-                }
-            }
-        },
-        "components": {"schemas": {evil: {"description": evil}}},
+    text = {"summary": evil, "description": evil}
+    content = {"x": {"schema": {"$ref": f"#/components/schemas/{evil}"}}}
+    operation = {
+        **text,
+        "security": [{evil: []}],
+        "parameters": [{"name": evil, "in": evil}],
+        "responses": {"200": {**text, "content": content}},
     }
-    text = reference(document)
-    assert "<script" not in text
+    document = {
+        "info": {**text, "title": evil, "version": evil},
+        "paths": {f"/{evil}": {"get": operation}},
+        "components": {"schemas": {evil: text}},
+    }
+    page_text = reference(document)
+    assert "<script" not in page_text
     page = _Page()
-    page.feed(text)
+    page.feed(page_text)
     assert page.open == []

@@ -8,28 +8,20 @@ from typing import Any
 import httpx
 import pytest
 from fastapi.routing import APIRoute
-from hypothesis import HealthCheck, given
-from hypothesis import settings as quickly
-from hypothesis import strategies as st
 from starlette.routing import Match
 from starlette.types import Scope
 
 from function_app.domain.common.problems import Problem
 from function_app.entrypoints.http.framework.responses import MAX_BODY
+from function_app.entrypoints.http.framework.responses import problem as problem_response
 from tests.fakes.clock import MovingClock
 from tests.harness.cloud.cloud import API, Cloud, Person, problem
 from tests.harness.cloud.cloud import settings as cloud_settings
 
 SIGN_IN = f"{API}/auth/sign-in"
 DEVICE = "abcdefgh23-arm"
-MUTATING = [
-    ("POST", "/agents/claim"),
-    ("POST", f"/devices/{DEVICE}/lease"),
-    ("POST", f"/devices/{DEVICE}/actions"),
-    ("POST", f"/devices/{DEVICE}/stop"),
-    ("PUT", "/robot-types/ur5/movements/mine"),
-    ("POST", "/mqtt/credentials"),
-]
+OPTIONAL_BODY = (f"/devices/{DEVICE}/lease", f"/devices/{DEVICE}/stop")
+WITH_BODY = ["/auth/sign-in", "/agents/enroll", "/agents/claim", "/mqtt/credentials", f"/devices/{DEVICE}/actions"]
 BODIES = {
     "empty": b"",
     "space": b" ",
@@ -61,58 +53,25 @@ def anna(cloud: Cloud) -> Person:
     return cloud.sign_in("anna")
 
 
-@pytest.mark.parametrize("path", [SIGN_IN, f"{API}/agents/enroll", *(API + path for _, path in MUTATING)])
+@pytest.mark.parametrize("path", [*WITH_BODY, *OPTIONAL_BODY, "/robot-types/ur5/movements/mine"])
 @pytest.mark.parametrize("body", BODIES.values(), ids=BODIES.keys())
-def test_a_body_that_is_not_what_is_asked_for_is_a_problem_and_never_a_fault(
-    anna: Person, path: str, body: bytes
-) -> None:
-    method = "PUT" if "/robot-types/" in path else "POST"
-    answer = anna.ask(method, path.removeprefix(API), content=body)
-    optional = path.endswith(("/lease", "/stop")) and body == b""
-    if optional:
+def test_a_wrong_body_is_a_problem_and_never_a_fault(anna: Person, path: str, body: bytes) -> None:
+    answer = anna.request("PUT" if "/robot-types/" in path else "POST", path, content=body)
+    if path in OPTIONAL_BODY and body == b"":
         problem(answer, 404, "device-unknown")
     else:
         problem(answer, 422, "invalid")
 
 
-json_values: Any = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=20),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
-    max_leaves=8,
-)
-FIELDS = ("request", "kind", "name", "parameters", "position_rad", "epoch", "lease_ms", "wait_ms", "purpose", "device")
-
-
-@quickly(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    place=st.sampled_from(MUTATING),
-    body=st.dictionaries(st.sampled_from(FIELDS), json_values, max_size=4) | json_values,
-)
-def test_any_json_is_answered_below_500(anna: Person, place: tuple[str, str], body: Any) -> None:
-    answer = anna.ask(*place, json=body)
-    assert answer.status_code < 500, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-
-
 class TestBodySize:
     def test_a_body_of_a_million_bytes_is_read(self, cloud: Cloud) -> None:
         body = b'{"link":"x"}'
-        problem(cloud.ask("POST", SIGN_IN, content=body.ljust(MAX_BODY)), 401, "unauthorized")
-
-    def test_one_byte_more_is_refused_whether_declared_or_not(self, cloud: Cloud) -> None:
-        body = b'{"link":"x"}'.ljust(MAX_BODY + 1)
-
-        async def parts() -> Any:
-            yield body[:500_000]
-            yield body[500_000:]
-
-        problem(cloud.ask("POST", SIGN_IN, content=body), 413, "too-large")
-        problem(cloud.ask("POST", SIGN_IN, content=parts()), 413, "too-large")
+        problem(cloud.request("POST", SIGN_IN, content=body.ljust(MAX_BODY)), 401, "unauthorized")
 
     @pytest.mark.parametrize("length", ["1" * 5000, "-5", "x", "", "٣", "1, 2"])
     def test_a_declared_length_that_is_no_length_is_no_fault(self, cloud: Cloud, length: str) -> None:
         headers = {"content-length": length.encode()}
-        answer = cloud.ask("POST", SIGN_IN, content=b'{"link":"x"}', headers=headers)
+        answer = cloud.request("POST", SIGN_IN, content=b'{"link":"x"}', headers=headers)
         assert answer.status_code in {401, 413, 422}
 
     def test_a_caller_who_leaves_in_mid_body_is_no_fault(self, cloud: Cloud) -> None:
@@ -125,26 +84,12 @@ class TestBodySize:
             ]
 
             async def receive() -> dict[str, Any]:
-                await asyncio.sleep(0)
                 return messages.pop(0)
 
             async def send(message: Any) -> None:
                 sent.append(message)
 
-            scope: dict[str, Any] = {
-                "type": "http",
-                "asgi": {"version": "3.0"},
-                "http_version": "1.1",
-                "method": "POST",
-                "path": SIGN_IN,
-                "raw_path": SIGN_IN.encode(),
-                "query_string": b"",
-                "root_path": "",
-                "scheme": "http",
-                "headers": [],
-                "server": ("test", 80),
-                "client": None,
-            }
+            scope = {"type": "http", "method": "POST", "path": SIGN_IN, "headers": [], "query_string": b""}
             await cloud.app(scope, receive, send)
 
         cloud.run(leave())
@@ -157,7 +102,7 @@ class TestErrors:
     )
     def test_what_is_not_there_is_a_problem(self, cloud: Cloud, path: str) -> None:
         for method in ("GET", "POST", "DELETE"):
-            problem(cloud.ask(method, path), 404, "http")
+            problem(cloud.request(method, path), 404, "http")
 
     @pytest.mark.parametrize(
         ("method", "path", "allowed"),
@@ -172,7 +117,7 @@ class TestErrors:
     def test_a_method_that_a_resource_has_not_is_405_and_says_which_it_has(
         self, cloud: Cloud, method: str, path: str, allowed: set[str]
     ) -> None:
-        answer = cloud.ask(method, API + path)
+        answer = cloud.request(method, API + path)
         problem(answer, 405, "http")
         assert set(answer.headers["allow"].split(", ")) == allowed
 
@@ -183,7 +128,7 @@ class TestErrors:
             raise RuntimeError("the secret inside")
 
         monkeypatch.setattr(cloud.functions.health, "check", broken, raising=True)
-        answer = cloud.ask("GET", f"{API}/health")
+        answer = cloud.request("GET", f"{API}/health")
         problem(answer, 500, "internal")
         assert "secret" not in answer.text
         assert answer.headers["x-content-type-options"] == "nosniff"
@@ -199,12 +144,10 @@ class TestErrors:
             problem(answer, 503, "store-unavailable")
             assert answer.headers["retry-after"]
             assert str(tmp_path) not in answer.text
-            assert "damaged" in problem(cloud.ask("GET", f"{API}/health"), 503, "store-unavailable")["detail"]
+            assert "damaged" in problem(cloud.request("GET", f"{API}/health"), 503, "store-unavailable")["detail"]
 
     def test_a_refusal_carries_what_programs_need(self) -> None:
-        from function_app.entrypoints.http.framework.responses import problem as shown
-
-        answer = shown(Problem("x", 429, "T", "D.", retry_after_s=7, extras={"holder": "anna"}))
+        answer = problem_response(Problem("x", 429, "T", "D.", retry_after_s=7, extras={"holder": "anna"}))
         assert answer.headers["retry-after"] == "7"
         assert bytes(answer.body) == b'{"type":"/problems/x","title":"T","status":429,"detail":"D.","holder":"anna"}'
 
@@ -214,51 +157,45 @@ class TestHeaders:
         "path", ["/", "/assets/app-0123abcd.js", "/api/docs", "/api/v1/health", "/api/v1/devices", "/api/v1/nothing"]
     )
     def test_every_answer_has_them(self, cloud: Cloud, path: str) -> None:
-        headers = cloud.ask("GET", path).headers
+        headers = cloud.request("GET", path).headers
         policy = dict(part.strip().split(" ", 1) for part in headers["content-security-policy"].split(";"))
         assert policy == {
-            "default-src": "'none'",
-            "script-src": "'self'",
-            "style-src": "'self'",
+            **dict.fromkeys(("default-src", "base-uri", "form-action", "frame-ancestors"), "'none'"),
+            **dict.fromkeys(("script-src", "style-src", "font-src"), "'self'"),
             "img-src": "'self' data: blob:",
-            "font-src": "'self'",
             "connect-src": "'self' ws://127.0.0.1:8082/mqtt",
-            "base-uri": "'none'",
-            "form-action": "'none'",
-            "frame-ancestors": "'none'",
         }
-        assert headers["x-content-type-options"] == "nosniff"
         assert headers["referrer-policy"] == "no-referrer"
         assert headers["x-frame-options"] == "DENY"
         assert headers["cross-origin-opener-policy"] == "same-origin"
-        assert "server" not in headers
 
     def test_every_answer_tells_the_time(self, tmp_path: Path) -> None:
         clock = MovingClock()
         with Cloud(cloud_settings(tmp_path), clock=clock) as cloud:
             clock.advance(1_000_000)
             for path in ("/api/v1/health", "/api/v1/devices", "/nothing"):
-                told = int(cloud.ask("GET", path).headers["x-telescope-time-ms"])
+                told = int(cloud.request("GET", path).headers["x-telescope-time-ms"])
                 assert abs(clock.now_ms() - told) < 20_000
 
     def test_no_other_origin_is_let_in(self, cloud: Cloud) -> None:
-        answer = cloud.ask("OPTIONS", f"{API}/devices", headers={"Origin": "https://evil.example"})
+        answer = cloud.request("OPTIONS", f"{API}/devices", headers={"Origin": "https://evil.example"})
         assert answer.status_code == 405
         assert not [name for name in answer.headers if name.startswith("access-control-")]
 
 
 class TestConsole:
     def test_the_page_is_asked_for_anew_and_its_assets_are_kept(self, cloud: Cloud) -> None:
-        page = cloud.ask("GET", "/")
+        page = cloud.request("GET", "/")
         assert (page.status_code, page.headers["cache-control"]) == (200, "no-cache")
-        again = cloud.ask("GET", "/", headers={"If-None-Match": page.headers["etag"]})
+        again = cloud.request("GET", "/", headers={"If-None-Match": page.headers["etag"]})
         assert again.status_code == 304
-        asset = cloud.ask("GET", "/assets/app-0123abcd.js")
+        asset = cloud.request("GET", "/assets/app-0123abcd.js")
         assert asset.headers["cache-control"] == "public, max-age=31536000, immutable"
-        assert cloud.ask("HEAD", "/").status_code == 200
+        assert cloud.request("HEAD", "/").status_code == 200
+        problem(cloud.request("POST", "/"), 405, "http")
 
     def test_a_browser_finds_the_icon_where_no_page_names_it(self, cloud: Cloud) -> None:
-        icon = cloud.ask("GET", "/favicon.ico")
+        icon = cloud.request("GET", "/favicon.ico")
         assert (icon.status_code, icon.headers["content-type"]) == (200, "image/svg+xml")
         assert icon.headers["cache-control"] == "no-cache", "its address stays when it changes"
 
@@ -279,11 +216,7 @@ class TestConsole:
 
     def test_a_console_that_was_not_built_says_so(self, tmp_path: Path) -> None:
         with Cloud(cloud_settings(tmp_path, console=tmp_path / "nothing")) as cloud:
-            assert "make console" in problem(cloud.ask("GET", "/"), 404, "http")["detail"]
-            assert cloud.ask("GET", "/api/v1/health").status_code == 200
-
-    def test_a_page_is_only_read(self, cloud: Cloud) -> None:
-        problem(cloud.ask("POST", "/"), 405, "http")
+            assert "make console" in problem(cloud.request("GET", "/"), 404, "http")["detail"]
 
     def test_a_websocket_is_refused_without_a_fault(self, cloud: Cloud) -> None:
         sent: list[Any] = []
@@ -308,14 +241,7 @@ class TestRouteIndex:
         index = cloud.app.state.route_index
         paths = {route.path_format.replace("{", "x").replace("}", "") for route in index.routes}
         paths |= {f"{path}/more" for path in paths} | {f"{path}/" for path in paths}
-        paths |= {
-            f"{API}/robot-types/ur5/files/meshes/a/b.obj",
-            f"{API}/devicesx",
-            "",
-            "/",
-            "//",
-            f"{API}/devices//lease",
-        }
+        paths |= {"", "/", "//", f"{API}/devicesx", f"{API}/devices//lease", f"{API}/robot-types/ur5/files/a/b.obj"}
         for path in paths:
             expected = [route.path for route in index.routes if route.path_regex.match(path)]
             assert [route.path for route in index.on_path({"path": path})] == expected, path

@@ -2,12 +2,12 @@
 
 import pytest
 
-from tests.unit.function_app.services.actions.queue_requests import Pair
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Person
 
 
 @pytest.fixture
-def running(pair: Pair) -> str:
+def running(anna: Person, robot: Robot) -> str:
     """An action that runs on the robot."""
-    anna, robot = pair
     action: str = anna.start(robot.device, wait_ms=10_000).json()["id"]
     return action

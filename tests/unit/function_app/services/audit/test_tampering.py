@@ -1,65 +1,35 @@
 """Every change of stored audit records is detected."""
 
-import itertools
 import json
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
 from function_app.domain.audit.hash_chain import Head
 from function_app.domain.identity.accounts import Identity
 from function_app.services.audit.audit_log import anchors
-from function_app.services.storage import records as store
+from function_app.services.storage import records
 from tests.fakes.tables import MemoryTables
-from tests.harness.cloud.cloud import Cloud, Person, settings
+from tests.harness.cloud.cloud import Cloud, settings
 from tests.harness.cloud.memory import NO_FOLDER, Memory
 
 OWNER = "owner"
-WHO = Identity(OWNER, "anna", "s")
-
-
-def kinds(person: Person, **query: Any) -> list[str]:
-    answer = person.get("/accounts/me/audit", params=query)
-    assert answer.status_code == 200, answer.text
-    return [record["event"] for record in answer.json()["items"]]
-
-
-def verdict(cloud: Cloud, chain: str, *expected: Head) -> str:
-    return cloud.run(cloud.functions.audit_reader.verify(chain, expected=expected)).broken
-
-
-@pytest.fixture(scope="class")
-def written() -> Iterator[tuple[Cloud, MemoryTables, Head]]:
-    """A chain of ten records, noted in the blob store at the fifth; and the database below."""
-    memory = Memory()
-    with Cloud(settings(NO_FOLDER), memory=memory) as cloud:
-
-        async def write() -> None:
-            for number in range(10):
-                data: dict[str, Any] = {"n": number, "text": 'ä"\\', "deep": {"list": [1, 2.5, None, True]}}
-                await cloud.functions.audit_log.record(OWNER, "did", WHO, on=f"d{number}", **data)
-                if number == 4:
-                    await cloud.functions.audit_log.anchor(OWNER)
-            await cloud.functions.audit_log.record("other", "did", WHO, on="d1")
-
-        cloud.run(write())
-        head = cloud.run(cloud.functions.audit_reader.head(OWNER))
-        assert head is not None
-        yield cloud, memory.tables, head
-    memory.loop.end()
-
-
+CALLER = Identity(OWNER, "anna", "s")
 Rows = dict[str, bytes]
 
 
+def verdict(cloud: Cloud, *expected: Head) -> str:
+    return cloud.run(cloud.functions.audit_reader.verify(OWNER, expected=expected)).broken
+
+
 def rows_of(tables: MemoryTables, chain: str = OWNER) -> Rows:
-    stored = tables.partition(store.AUDIT, chain).rows
+    stored = tables.partition(records.AUDIT, chain).rows
     return {key: text for key, (_, text) in stored.items() if not key.startswith("once:")}
 
 
 def put(tables: MemoryTables, rows: Rows) -> None:
-    partition = tables.partition(store.AUDIT, OWNER)
+    partition = tables.partition(records.AUDIT, OWNER)
     partition.rows = {key: ("x", text) for key, text in rows.items()}
     partition.keys = sorted(rows)
 
@@ -68,110 +38,125 @@ def key(seq: int) -> str:
     return f"record:{seq:012d}"
 
 
-Written = tuple[Cloud, MemoryTables, Head]
+class Written(NamedTuple):
+    """A chain of ten records, with an anchor at the fifth, and a chain of another account."""
 
+    cloud: Cloud
+    tables: MemoryTables
+    rows: Rows
+    head: Head
 
-class TestChanged:
-    def check(self, written: Written, rows: Rows, *expected: Head) -> str:
-        cloud, db, _ = written
-        whole = rows_of(db)
-        put(db, rows)
+    def check(self, rows: Rows, *expected: Head) -> str:
+        """Return the verdict on these rows, then restore the original ones."""
+        put(self.tables, rows)
         try:
-            return verdict(cloud, OWNER, *expected)
+            return verdict(self.cloud, *expected)
         finally:
-            put(db, whole)
+            put(self.tables, self.rows)
 
-    def test_as_it_was_written_it_is_whole(self, written: Written) -> None:
-        _, db, head = written
-        assert self.check(written, rows_of(db), head) == ""
 
-    @pytest.mark.parametrize("seq", range(1, 11))
-    def test_a_deleted_record_is_found(self, written: Written, seq: int) -> None:
-        rows = rows_of(written[1])
-        del rows[key(seq)]
-        assert f"record {seq}:" in self.check(written, rows)
+@pytest.fixture(scope="module")
+def written() -> Iterator[Written]:
+    memory = Memory()
+    with Cloud(settings(NO_FOLDER), memory=memory) as cloud:
 
-    def test_each_changed_field_is_found_where_it_is(self, written: Written) -> None:
-        rows = rows_of(written[1])
-        for name in [*rows]:
-            record = json.loads(rows[name])
-            for field, value in record.items():
-                other = value + 1 if isinstance(value, int) else "x" if isinstance(value, str) else {"n": 99}
-                for changed in (
-                    {**record, field: other},
-                    {known: kept for known, kept in record.items() if known != field},
-                    {**record, field: None},
-                    {**record, "more": 1},
-                ):
-                    said = self.check(written, {**rows, name: json.dumps(changed).encode()})
-                    place = f"record {int(name.rpartition(':')[2])}" if name != "head" else ""
-                    assert said, f"{name} {field}"
-                    assert place in said or field == "seq"
+        async def write() -> Head | None:
+            audit_log = cloud.functions.audit_log
+            for number in range(10):
+                data: dict[str, Any] = {"n": number, "text": 'ä"\\', "deep": {"list": [1, 2.5, None, True]}}
+                await audit_log.record(OWNER, "did", CALLER, on=f"d{number}", **data)
+                if number == 4:
+                    await audit_log.anchor(OWNER)
+            await audit_log.record("other", "did", CALLER, on="d1")
+            return await cloud.functions.audit_reader.head(OWNER)
 
-    def test_each_changed_byte_of_a_record_and_of_the_head_is_found(self, written: Written) -> None:
-        rows = rows_of(written[1])
-        found = 0
-        for name in (key(3), "head"):
-            text = rows[name]
-            for place, bit in itertools.product(range(len(text)), (0,)):
-                changed = bytearray(text)
-                changed[place] ^= 1 << bit
-                try:
-                    same = json.loads(bytes(changed)) == json.loads(text)
-                except ValueError:
-                    continue  # the store itself says that this is no row
-                if not same:
-                    assert self.check(written, {**rows, name: bytes(changed)}), changed
-                    found += 1
-        assert found > 200
+        head = cloud.run(write())
+        assert head is not None
+        yield Written(cloud, memory.tables, rows_of(memory.tables), head)
+    memory.loop.end()
 
-    def test_swapped_inserted_doubled_and_anothers_records_are_found(self, written: Written) -> None:
-        rows = rows_of(written[1])
-        swapped = {**rows, key(4): rows[key(5)], key(5): rows[key(4)]}
-        assert "record 4:" in self.check(written, swapped)
-        again = {**rows, key(11): rows[key(10)]}
-        assert "behind the head" in self.check(written, again)
-        shifted = {key(seq + 1): rows[key(seq)] for seq in range(4, 11)}
-        inserted = {**rows, **shifted, key(4): rows[key(3)]}
-        assert "record 4:" in self.check(written, inserted)
-        others = rows_of(written[1], "other")
-        assert "record 1:" in self.check(written, {**rows, key(1): others[key(1)]})
-        assert self.check(written, others), "another account's chain does not stand in"
 
-    def test_a_head_that_is_forged_or_gone_is_found(self, written: Written) -> None:
-        rows = rows_of(written[1])
-        head = json.loads(rows["head"])
-        cut = {name: data for name, data in rows.items() if name != key(10)}
-        forged = {**head, "seq": 9, "hash": json.loads(rows[key(9)])["hash"]}
-        assert "signature" in self.check(written, {**cut, "head": json.dumps(forged).encode()})
-        unknown = {**forged, "key": "0" * 16}
-        assert "none of this cloud's" in self.check(written, {**cut, "head": json.dumps(unknown).encode()})
-        del rows["head"]
-        assert "head is gone" in self.check(written, rows)
+def test_an_unchanged_chain_is_intact(written: Written) -> None:
+    assert written.head.seq == 10
+    assert written.check(written.rows, written.head) == ""
 
-    def test_a_chain_cut_back_to_an_old_head_is_found_by_a_head_noted_elsewhere(
-        self, cloud: Cloud, memory: Memory, written: Written
-    ) -> None:
-        """With its own signed head of then it is a whole chain: only what was noted elsewhere knows better."""
-        _, _, head = written
-        assert "record 1: it and all after it are gone" in self.check(written, {}), "the blob store knows of five"
-        audit_log = cloud.functions.audit_log
+
+@pytest.mark.parametrize("seq", range(1, 11))
+def test_deleted_records(written: Written, seq: int) -> None:
+    assert f"record {seq}:" in written.check({name: text for name, text in written.rows.items() if name != key(seq)})
+
+
+def test_changed_fields(written: Written) -> None:
+    for name, text in written.rows.items():
+        record = json.loads(text)
+        place = f"record {int(name.rpartition(':')[2])}" if name != "head" else ""
+        for field, value in record.items():
+            other = value + 1 if isinstance(value, int) else "x" if isinstance(value, str) else {"n": 99}
+            for changed in (
+                {**record, field: other},
+                {name: value for name, value in record.items() if name != field},
+                {**record, field: None},
+                {**record, "more": 1},
+            ):
+                error = written.check({**written.rows, name: json.dumps(changed).encode()})
+                assert error, f"{name} {field}"
+                assert place in error or field == "seq"
+
+
+def test_changed_bytes(written: Written) -> None:
+    detected = 0
+    for name in (key(3), "head"):
+        text = written.rows[name]
+        for place in range(len(text)):
+            changed = bytearray(text)
+            changed[place] ^= 1
+            try:
+                same = json.loads(bytes(changed)) == json.loads(text)
+            except ValueError:
+                continue  # the store cannot read this row
+            if not same:
+                assert written.check({**written.rows, name: bytes(changed)}), changed
+                detected += 1
+    assert detected > 200
+
+
+def test_swapped_inserted_repeated_and_foreign_records(written: Written) -> None:
+    rows, check = written.rows, written.check
+    assert "record 4:" in check({**rows, key(4): rows[key(5)], key(5): rows[key(4)]})
+    assert "behind the head" in check({**rows, key(11): rows[key(10)]})
+    shifted = {key(seq + 1): rows[key(seq)] for seq in range(4, 11)}
+    assert "record 4:" in check({**rows, **shifted, key(4): rows[key(3)]})
+    foreign = rows_of(written.tables, "other")
+    assert "record 1:" in check({**rows, key(1): foreign[key(1)]})
+    assert check(foreign), "a chain of another account"
+
+
+def test_forged_and_missing_heads(written: Written) -> None:
+    rows, check = written.rows, written.check
+    cut = {name: text for name, text in rows.items() if name != key(10)}
+    forged = {**json.loads(rows["head"]), "seq": 9, "hash": json.loads(rows[key(9)])["hash"]}
+    assert "signature" in check({**cut, "head": json.dumps(forged).encode()})
+    assert "none of this cloud's" in check({**cut, "head": json.dumps({**forged, "key": "0" * 16}).encode()})
+    assert "head is gone" in check({name: text for name, text in rows.items() if name != "head"})
+    assert "record 1: it and all after it are gone" in check({}), "the anchor has five records"
+    assert "another one was noted" in check(rows, Head(7, "0" * 64))
+    assert "two different heads" in check(rows, Head(5, "0" * 64))
+
+
+def test_a_chain_restored_to_an_old_state_contradicts_newer_anchors(cloud: Cloud, memory: Memory) -> None:
+    """An old state has a valid signed head: only a head that was recorded elsewhere reveals it."""
+
+    async def write() -> Head | None:
         for _ in range(3):
-            cloud.run(audit_log.record(OWNER, "did", WHO))
-        old = rows_of(memory.tables)
-        for _ in range(3):
-            cloud.run(audit_log.record(OWNER, "did", WHO))
-        newest = cloud.run(cloud.functions.audit_reader.head(OWNER))
-        assert newest is not None
-        put(memory.tables, old)
-        assert verdict(cloud, OWNER) == "", "this is why there are anchors"
-        assert "record 4: it and all after it are gone" in verdict(cloud, OWNER, newest)
-        cloud.run(cloud.functions.blobs.append(anchors(OWNER), f'{{"seq":6,"hash":"{newest.hash}"}}\n'.encode()))
-        assert "record 4: it and all after it are gone" in verdict(cloud, OWNER)
-        assert head.seq == 10
+            await cloud.functions.audit_log.record(OWNER, "did", CALLER)
+        return await cloud.functions.audit_reader.head(OWNER)
 
-    def test_another_head_than_was_noted_is_found(self, written: Written) -> None:
-        cloud, _, head = written
-        assert "another one was noted" in verdict(cloud, OWNER, Head(7, "0" * 64))
-        assert "two different heads" in verdict(cloud, OWNER, Head(5, "0" * 64))
-        assert verdict(cloud, OWNER, head) == ""
+    cloud.run(write())
+    old = rows_of(memory.tables)
+    newest = cloud.run(write())
+    assert newest is not None
+    put(memory.tables, old)
+    assert verdict(cloud) == ""
+    assert "record 4: it and all after it are gone" in verdict(cloud, newest)
+    cloud.run(cloud.functions.blobs.append(anchors(OWNER), f'{{"seq":6,"hash":"{newest.hash}"}}\n'.encode()))
+    assert "record 4: it and all after it are gone" in verdict(cloud)

@@ -1,156 +1,122 @@
-"""Who looks at a device at this moment, and what its owner calls it."""
-
-from typing import Any
+"""Present viewers of a device, and its label."""
 
 import pytest
 
 from function_app.services.devices import viewers
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
-from tests.fakes.clock import MovingClock
-from tests.fixtures.cloud import OpenCloud
 from tests.harness.cloud.cloud import Cloud, Person, problem
-from tests.harness.cloud.memory import Memory
 
 
 @pytest.fixture
-def clock(memory: Memory) -> MovingClock:
-    return memory.clock
+def anna(cloud: Cloud) -> Person:
+    return cloud.sign_in("anna")
 
 
 @pytest.fixture
-def alone(open_cloud: OpenCloud) -> Cloud:
-    """The functions where no broker is needed, with a clock that moves."""
-    return open_cloud()
-
-
-def claimed(cloud: Cloud, owner: Person) -> Robot:
+def robot(cloud: Cloud, anna: Person) -> Robot:
+    """Anna's robot, which is not connected."""
     robot = cloud.robot()
-    code = robot.enroll().json()["claim_code"]
-    assert owner.post("/agents/claim", {"code": code}).status_code == 200
+    robot.pair(anna)
     return robot
 
 
-def looks(person: Person, robot: Robot) -> list[tuple[str, str, bool]]:
+def view(person: Person, robot: Robot) -> list[tuple[str, str, bool]]:
+    """View the device and return the other viewers."""
     answer = person.put(f"/devices/{robot.device}/viewers", None)
     assert answer.status_code == 200, answer.text
     return [(other["name"], other["role"], other["mine"]) for other in answer.json()["items"]]
 
 
-def rows(cloud: Cloud, robot: Robot) -> int:
-    return len(cloud.run(cloud.functions.tables.query(records.WATCHERS, robot.device, limit=1000)).rows)
+def rows(cloud: Cloud, robot: Robot) -> dict[str, str]:
+    page = cloud.run(cloud.functions.tables.query(records.WATCHERS, robot.device, limit=1000))
+    return {row.key: row.etag for row in page.rows}
 
 
-class TestWatching:
-    def test_each_is_told_of_the_others_for_as_long_as_they_say_so(self, alone: Cloud, clock: MovingClock) -> None:
-        anna, again, bert = alone.sign_in("anna"), alone.sign_in("anna"), alone.sign_in("bert")
-        robot = claimed(alone, anna)
+class TestViewing:
+    def test_each_viewer_sees_the_others_while_they_view(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
+        again, bert = cloud.sign_in("anna"), cloud.sign_in("bert")
+        path = f"/devices/{robot.device}/viewers"
+        for method in (lambda: bert.put(path, None), lambda: bert.delete(path)):
+            problem(method(), 404, "device-unknown")
         assert anna.post(f"/devices/{robot.device}/shares", {"account": "bert", "role": "viewer"}).status_code == 201
-        assert looks(anna, robot) == []
-        clock.advance(1)
-        assert looks(bert, robot) == [("anna", "owner", False)]
-        clock.advance(1)
-        assert looks(again, robot) == [("anna", "owner", True), ("bert", "viewer", False)]
-        clock.advance(20)
-        assert looks(bert, robot) == [("anna", "owner", False), ("anna", "owner", False)]
-        clock.advance(8)
-        assert looks(anna, robot) == [("bert", "viewer", False)], "who says nothing is gone"
-        assert bert.delete(f"/devices/{robot.device}/viewers").status_code == 204
-        assert looks(anna, robot) == [], "and who says so is gone at once"
+        assert view(anna, robot) == []
+        cloud.clock.advance(1)
+        assert view(bert, robot) == [("anna", "owner", False)]
+        cloud.clock.advance(1)
+        assert view(again, robot) == [("anna", "owner", True), ("bert", "viewer", False)]
+        cloud.clock.advance(20)
+        assert view(bert, robot) == [("anna", "owner", False), ("anna", "owner", False)]
+        cloud.clock.advance(8)
+        assert view(anna, robot) == [("bert", "viewer", False)], "a silent viewer is gone"
+        assert bert.delete(path).status_code == 204
+        assert view(anna, robot) == [], "a viewer that leaves is gone at once"
 
-    def test_since_when_is_from_the_first_word_without_a_pause(self, alone: Cloud, clock: MovingClock) -> None:
-        anna, again = alone.sign_in("anna"), alone.sign_in("anna")
-        robot = claimed(alone, anna)
+    def test_the_start_is_that_of_the_uninterrupted_view(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
+        again = cloud.sign_in("anna")
 
         def since() -> str:
             (other,) = again.put(f"/devices/{robot.device}/viewers", None).json()["items"]
             return str(other["since"])
 
-        looks(anna, robot)
+        view(anna, robot)
         first = since()
         for _ in range(4):
-            clock.advance(10)
-            looks(anna, robot)
+            cloud.clock.advance(10)
+            view(anna, robot)
         assert since() == first
-        clock.advance(30)
-        looks(anna, robot)
+        cloud.clock.advance(30)
+        view(anna, robot)
         assert since() > first
 
-    def test_who_may_not_see_it_neither_watches_nor_learns_who_does(self, alone: Cloud) -> None:
-        anna, bert = alone.sign_in("anna"), alone.sign_in("bert")
-        robot = claimed(alone, anna)
-        looks(anna, robot)
-        for method in (lambda path: bert.put(path, None), bert.delete):
-            problem(method(f"/devices/{robot.device}/viewers"), 404, "device-unknown")
-        assert looks(anna, robot) == []
-
-    def test_who_watched_an_earlier_owners_pairing_is_not_told_of(self, alone: Cloud) -> None:
-        anna, bert = alone.sign_in("anna"), alone.sign_in("bert")
-        robot = claimed(alone, anna)
-        looks(anna, robot)
-        assert anna.delete(f"/agents/{robot.id}").status_code == 204
-        code = robot.enroll().json()["claim_code"]
-        assert bert.post("/agents/claim", {"code": code}).status_code == 200
-        assert looks(bert, robot) == []
-
-    def test_rows_stay_few_and_are_forgotten(
-        self, alone: Cloud, clock: MovingClock, monkeypatch: pytest.MonkeyPatch
+    def test_rows_are_bounded_and_deleted(
+        self, cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(viewers, "MOST", 3)
-        people = [alone.sign_in("anna") for _ in range(5)]
-        robot = claimed(alone, people[0])
-        told = [len(looks(person, robot)) for person in people]
-        assert (told, rows(alone, robot)) == ([0, 1, 2, 3, 3], 3)
-        clock.advance(26)
-        assert looks(people[4], robot) == []
-        assert rows(alone, robot) == 1, "what was over is tidied up by who comes"
-        clock.advance(3 * 3600)
-        alone.run(alone.functions.retention.delete_due(clock.now_ms()))
-        assert rows(alone, robot) == 0
+        people = [anna, *(cloud.sign_in("anna") for _ in range(4))]
+        assert [len(view(person, robot)) for person in people] == [0, 1, 2, 3, 3]
+        assert len(rows(cloud, robot)) == 3
+        cloud.clock.advance(26)
+        assert view(people[4], robot) == []
+        assert len(rows(cloud, robot)) == 1, "the next viewer deletes expired rows"
+        cloud.clock.advance(3 * 3600)
+        cloud.run(cloud.functions.retention.delete_due(cloud.clock.now_ms()))
+        assert rows(cloud, robot) == {}
 
-    def test_what_is_said_again_at_once_writes_nothing(self, alone: Cloud, clock: MovingClock) -> None:
-        anna = alone.sign_in("anna")
-        robot = claimed(alone, anna)
-
-        def etag() -> Any:
-            return alone.run(alone.functions.tables.get(records.WATCHERS, robot.device, anna.session))
-
-        looks(anna, robot)
-        first = etag()
-        clock.advance(2)
-        looks(anna, robot)
-        assert etag() == first
-        clock.advance(4)
-        looks(anna, robot)
-        assert etag() != first
+    def test_an_immediate_repetition_writes_nothing(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
+        view(anna, robot)
+        first = rows(cloud, robot)
+        cloud.clock.advance(2)
+        view(anna, robot)
+        assert rows(cloud, robot) == first
+        cloud.clock.advance(4)
+        view(anna, robot)
+        assert rows(cloud, robot) != first
 
 
-class TestNaming:
-    def test_everybody_sees_what_the_owner_calls_it_until_they_call_it_as_before(self, alone: Cloud) -> None:
-        anna, bert = alone.sign_in("anna"), alone.sign_in("bert")
-        robot = claimed(alone, anna)
+class TestLabel:
+    def test_everyone_with_access_sees_the_owners_label(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
+        bert = cloud.sign_in("bert")
+        path = f"/devices/{robot.device}/label"
         anna.post(f"/devices/{robot.device}/shares", {"account": "bert", "role": "operator"})
         before = anna.get(f"/devices/{robot.device}").json()["label"]
-        assert anna.put(f"/devices/{robot.device}/label", {"label": " Left\n arm "}).json()["label"] == "Left arm"
+        assert anna.put(path, {"label": " Left\n arm "}).json()["label"] == "Left arm"
         assert [each["label"] for each in bert.get("/devices").json()["items"]] == ["Left arm"]
         robot.enroll()
         assert bert.get(f"/devices/{robot.device}").json()["label"] == "Left arm", "enrolling again changes nothing"
-        problem(bert.put(f"/devices/{robot.device}/label", {"label": "Mine"}), 403, "forbidden")
-        assert anna.put(f"/devices/{robot.device}/label", {"label": None}).json()["label"] == before
-        whats = [each["event"] for each in anna.get("/accounts/me/audit").json()["items"]]
-        assert whats.count("device-renamed") == 2
+        problem(bert.put(path, {"label": "Mine"}), 403, "forbidden")
+        assert anna.put(path, {"label": None}).json()["label"] == before
+        audited = [each["event"] for each in anna.get("/accounts/me/audit").json()["items"]]
+        assert audited.count("device-renamed") == 2
+        for invalid in ("", " \n", "a\x00b", "x" * 81, 7):
+            problem(anna.put(path, {"label": invalid}), 422, "invalid")
 
-    @pytest.mark.parametrize("label", ["", " \n", "a\x00b", "x" * 81, 7])
-    def test_what_is_no_name_is_refused(self, alone: Cloud, label: object) -> None:
-        anna = alone.sign_in("anna")
-        robot = claimed(alone, anna)
-        problem(anna.put(f"/devices/{robot.device}/label", {"label": label}), 422, "invalid")
-
-    def test_a_new_owner_finds_it_called_as_its_agent_calls_it(self, alone: Cloud) -> None:
-        anna, bert = alone.sign_in("anna"), alone.sign_in("bert")
-        robot = claimed(alone, anna)
+    def test_a_new_owner_sees_neither_label_nor_viewers(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
+        bert = cloud.sign_in("bert")
         before = anna.get(f"/devices/{robot.device}").json()["label"]
         anna.put(f"/devices/{robot.device}/label", {"label": "Anna's own"})
+        view(anna, robot)
         assert anna.delete(f"/agents/{robot.id}").status_code == 204
-        code = robot.enroll().json()["claim_code"]
-        assert bert.post("/agents/claim", {"code": code}).json()["devices"][0]["label"] == before
+        robot.pair(bert)
+        assert bert.get(f"/devices/{robot.device}").json()["label"] == before
+        assert view(bert, robot) == []

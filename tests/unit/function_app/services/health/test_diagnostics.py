@@ -1,4 +1,4 @@
-"""Telediagnostics: what robots measure is judged while it comes in; faults are raised, seen, cleared, remembered."""
+"""Measurements are monitored as they arrive; faults are raised, acknowledged and cleared."""
 
 import random
 from collections.abc import Callable, Iterable
@@ -7,21 +7,18 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import JointTelemetry, Measurements, Mode, State, codec, topics
-from function_app.adapters.local import device_feed
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person, paired, problem
-from tests.harness.network.brokers import wait_until
 
-Pair = tuple[Person, Robot]
 Temperature = Callable[[int], float]
 MINUTE = 6
 """Windows."""
 
 
 class Life:
-    """A robot that measures every ten seconds of its own, faster time."""
+    """A robot that measures every ten seconds of simulated time."""
 
     def __init__(self, cloud: Cloud, robot: Robot, *, stream: str = "health", seed: int = 0) -> None:
         self.cloud = cloud
@@ -29,11 +26,10 @@ class Life:
         self.topic = topics.device(robot.space, robot.id, robot.names[0], topics.TELE, stream)
         self.windows = 0
         self.now_ms = cloud.clock.now_ms()
-        """The robot's own clock: how long a test takes is nothing to it."""
         self._chance = random.Random(seed)  # noqa: S311 (repeatable noise)
 
     def messages(self, windows: int, **truth: Temperature) -> Iterable[tuple[str, bytes]]:
-        """The measurements of so many windows; each truth is given the window's number."""
+        """The measurements of so many windows; each truth maps the window's number to a value."""
         for number in range(windows):
             self.cloud.clock.advance(10)
             self.now_ms += 10_000
@@ -45,7 +41,7 @@ class Life:
             yield self.topic, codec.encode(message)
 
     def live(self, windows: int, **truth: Temperature) -> None:
-        """As if the broker had delivered them."""
+        """Ingest the measurements of so many windows."""
         batch = list(self.messages(windows, **truth))
         self.cloud.run(ingest_telemetry(self.cloud.functions, batch))
 
@@ -59,19 +55,23 @@ def warming(level: float, per_minute: float) -> Temperature:
 
 
 def health(cloud: Cloud, who: Person, robot: Robot) -> str:
-    """Of a robot that is there: its clock has run ahead of its last word."""
+    """Health of the robot, which has just published its state."""
     now_ms = cloud.clock.now_ms()
     state = State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0)
     cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), codec.encode(state)))
-    found: str = diagnostics(who, robot)["health"]
-    return found
+    return str(diagnostics(who, robot)["health"])
 
 
 def diagnostics(who: Person, robot: Robot) -> dict[str, Any]:
     answer = who.get(f"/devices/{robot.device}/diagnostics")
     assert answer.status_code == 200, answer.text
-    found: dict[str, Any] = answer.json()
-    return found
+    return answer.json()  # type: ignore[no-any-return]
+
+
+def partition(cloud: Cloud, robot: Robot) -> str:
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
+    assert row is not None
+    return f"{robot.device}/{row.data['pairing']}"
 
 
 def field(who: Person, robot: Robot, name: str) -> dict[str, Any]:
@@ -83,46 +83,25 @@ def open_faults(who: Person, robot: Robot) -> list[dict[str, Any]]:
     return items
 
 
-def test_a_joint_that_heats_up_is_told_before_its_limit_over_the_broker(
-    cloud: Cloud, pair: Pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(device_feed, "COLLECT_S", 0.1)
+def test_a_warming_joint_is_reported_before_its_limit(cloud: Cloud, anna: Person, robot: Robot) -> None:
     cloud.start_telemetry()
-    anna, robot = pair
     life = Life(cloud, robot)
 
-    def publish(windows: int, **truth: Temperature) -> Person:
-        """Until it is in the tables; and Anna, whose token has run out since."""
+    def publish(windows: int, elbow: Temperature) -> None:
         assert robot.link is not None
-        for topic, payload in life.messages(windows, **truth):
+        for topic, payload in life.messages(windows, temperature_c__elbow=elbow, temperature_c__wrist_1=still(30)):
             robot.link.publish_acknowledged(topic, payload)
-        newest_ms = life.now_ms - 30_000
-        wait_until(
-            lambda: any(
-                row.data["window_ms"] > newest_ms
-                for row in cloud.run(cloud.functions.tables.query(records.DIAGNOSTICS, partition)).rows
-            ),
-            "the newest window",
-        )
-        return cloud.sign_in("anna")
 
-    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
-    assert row is not None
-    partition = f"{robot.device}/{row.data['pairing']}"
-    anna = publish(12 * MINUTE, temperature_c__elbow=still(35), temperature_c__wrist_1=still(30))
+    publish(12 * MINUTE, still(35))
     assert health(cloud, anna, robot) == "ok"
     at_c = 35.0
     while not open_faults(anna, robot):
-        anna = publish(5 * MINUTE, temperature_c__elbow=warming(at_c, 0.5), temperature_c__wrist_1=still(30))
+        publish(5 * MINUTE, warming(at_c, 0.5))
         at_c += 2.5
         assert at_c < 65, "half an hour before the limit at the latest"
     (fault,) = open_faults(anna, robot)
-    assert (fault["code"], fault["kind"], fault["severity"], fault["limit"]) == (
-        "health.temperature_c.elbow",
-        "trend",
-        "warning",
-        80.0,
-    )
+    expected = {"code": "health.temperature_c.elbow", "kind": "trend", "severity": "warning", "limit": 80.0}
+    assert fault.items() >= expected.items()
     assert 50 < fault["value"] < 65
     assert fault["message"].startswith("Joint temperature (elbow) is ")
     assert "rises by 0." in fault["message"]
@@ -133,19 +112,17 @@ def test_a_joint_that_heats_up_is_told_before_its_limit_over_the_broker(
     assert 1_000 < shown["limit_in_s"] < 2_700
     assert field(anna, robot, "temperature_c.wrist_1")["findings"] == []
     assert health(cloud, anna, robot) == "warning"
-
-    seen = anna.post(f"/devices/{robot.device}/faults/{fault['id']}/acknowledge")
-    assert seen.json()["state"] == "acknowledged"
-    anna = publish(20 * MINUTE, temperature_c__elbow=still(40), temperature_c__wrist_1=still(30))
+    assert anna.post(f"/devices/{robot.device}/faults/{fault['id']}/acknowledge").json()["state"] == "acknowledged"
+    publish(20 * MINUTE, still(40))
     assert open_faults(anna, robot) == []
     assert health(cloud, anna, robot) == "ok"
     (past,) = anna.get(f"/devices/{robot.device}/faults").json()["items"]
     assert (past["id"], past["state"], past["acknowledged_by"]) == (fault["id"], "cleared", "anna")
-    page = anna.get(f"/devices/{robot.device}/events").json()
-    assert [event["kind"] for event in page["items"]] == ["fault-cleared", "fault-acknowledged", "fault-raised"]
+    events = anna.get(f"/devices/{robot.device}/events").json()["items"]
+    assert [event["kind"] for event in events] == ["fault-cleared", "fault-acknowledged", "fault-raised"]
 
 
-def test_it_is_the_same_for_a_robot_that_speaks_http(cloud: Cloud) -> None:
+def test_measurements_over_http_are_monitored(cloud: Cloud) -> None:
     anna = cloud.sign_in("anna")
     with cloud.robot() as robot:
         code = robot.enroll(transport="http").json()["claim_code"]
@@ -153,60 +130,43 @@ def test_it_is_the_same_for_a_robot_that_speaks_http(cloud: Cloud) -> None:
         robot.space = robot.enrollment()["space"]
         life = Life(cloud, robot)
         for _ in range(2):
-            told = [
-                {"topic": topic, "payload": codec.decode(payload, dict)}
-                for topic, payload in life.messages(5, temperature_c__elbow=still(84))
-            ]
-            answer = robot.ask("POST", f"/agents/{robot.id}/messages", json={"messages": told})
+            measured = life.messages(5, temperature_c__elbow=still(84))
+            messages = [{"topic": topic, "payload": codec.decode(payload, dict)} for topic, payload in measured]
+            answer = robot.request("POST", f"/agents/{robot.id}/messages", json={"messages": messages})
             assert answer.status_code == 200, answer.text
         (fault,) = open_faults(anna, robot)
         assert (fault["kind"], fault["severity"], fault["limit"]) == ("level", "error", 80.0)
         assert health(cloud, anna, robot) == "fault"
 
 
-def test_a_warning_becomes_an_error_beyond_the_limit_and_stays_one_fault(cloud: Cloud, pair: Pair) -> None:
-    anna, robot = pair
+def test_a_warning_becomes_an_error_beyond_the_limit_within_a_minute(cloud: Cloud, anna: Person, robot: Robot) -> None:
     life = Life(cloud, robot)
-    life.live(4, temperature_c__elbow=still(74))
-    (warned,) = open_faults(anna, robot)
-    assert (warned["kind"], warned["severity"], warned["limit"]) == ("level", "warning", 70.0)
-    life.live(4, temperature_c__elbow=still(83))
+    life.now_ms = life.now_ms // 60_000 * 60_000 - 10_000
+    life.live(3, temperature_c__elbow=still(74))
+    (warning,) = open_faults(anna, robot)
+    assert (warning["kind"], warning["severity"], warning["limit"]) == ("level", "warning", 70.0)
+    life.live(3, temperature_c__elbow=still(90))
+    assert life.now_ms % 60_000 == 50_000, "all in one minute"
     (fault,) = open_faults(anna, robot)
-    assert (fault["id"], fault["severity"], fault["limit"], fault["worsened"]) == (warned["id"], "error", 80.0, 1)
+    assert (fault["id"], fault["severity"], fault["limit"], fault["worsened"]) == (warning["id"], "error", 80.0, 1)
     life.live(10, temperature_c__elbow=still(45))
     assert open_faults(anna, robot) == []
 
 
-def test_what_passes_its_limit_is_told_at_once_and_not_at_the_end_of_the_minute(cloud: Cloud, pair: Pair) -> None:
-    anna, robot = pair
-    life = Life(cloud, robot)
-    life.now_ms = life.now_ms // 60_000 * 60_000 - 10_000
-    life.live(3, temperature_c__elbow=still(74))
-    life.live(3, temperature_c__elbow=still(90))
-    assert life.now_ms % 60_000 == 50_000, "all in one minute"
-    assert [fault["severity"] for fault in open_faults(anna, robot)] == ["error"]
-
-
-def test_a_value_without_limits_is_reported_without_a_warning(cloud: Cloud, pair: Pair) -> None:
-    anna, robot = pair
+def test_a_change_of_a_value_without_limits_is_an_info(cloud: Cloud, anna: Person, robot: Robot) -> None:
     life = Life(cloud, robot)
     life.live(20 * MINUTE, fan_hz=still(50), door=still(0))
     assert open_faults(anna, robot) == []
     life.live(2 * MINUTE, fan_hz=still(20), door=still(0))
     (fault,) = open_faults(anna, robot)
-    assert (fault["code"], fault["severity"], fault["baseline"]) == (
-        "health.fan_hz",
-        "info",
-        pytest.approx(50, abs=1),
-    )
+    assert (fault["code"], fault["severity"], fault["baseline"]) == ("health.fan_hz", "info", pytest.approx(50, abs=1))
     assert health(cloud, anna, robot) == "ok"
     shown = field(anna, robot, "fan_hz")
     assert shown["usual_low"] > 20
     assert (shown["high"], shown["low"], shown["advice"]) == (None, None, "")
 
 
-def test_lasting_effort_is_told_and_positions_are_not_judged(cloud: Cloud, pair: Pair) -> None:
-    anna, robot = pair
+def test_effort_is_monitored_and_positions_are_not(cloud: Cloud, anna: Person, robot: Robot) -> None:
 
     def joints(effort_nm: float) -> Iterable[tuple[str, bytes]]:
         for _ in range(6):
@@ -231,7 +191,7 @@ def test_lasting_effort_is_told_and_positions_are_not_judged(cloud: Cloud, pair:
     assert (fault["kind"], fault["limit"], fault["stream"]) == ("level", -120.0, "joints")
 
 
-def test_devices_stand_worst_first_in_their_space_and_with_counts(cloud: Cloud) -> None:
+def test_devices_are_listed_worst_first_with_counts(cloud: Cloud) -> None:
     with paired(cloud, "anna", "arm", "leg") as (anna, robot):
         life = Life(cloud, robot)
         life.live(4, temperature_c__elbow=still(90))
@@ -244,15 +204,8 @@ def test_devices_stand_worst_first_in_their_space_and_with_counts(cloud: Cloud) 
         assert listed["items"][0]["worst"]["severity"] == "error"
         assert listed["items"][0]["counts"] == {"error": 1, "warning": 0, "info": 0}
         assert anna.get(f"/spaces/{robot.space}/diagnostics").json() == listed
-        pages = []
-        cursor = None
-        while True:
-            page = anna.get("/diagnostics", params={"limit": 1, **({"cursor": cursor} if cursor else {})}).json()
-            pages += page["items"]
-            cursor = page["cursor"]
-            if cursor is None:
-                break
-        assert sorted(item["device"] for item in pages) == sorted(item["device"] for item in listed["items"])
+        devices = [item["device"] for item in anna.pages("/diagnostics", limit=1)]
+        assert sorted(devices) == sorted(item["device"] for item in listed["items"])
         bert = cloud.sign_in("bert")
         assert bert.get("/diagnostics").json()["items"] == []
         problem(bert.get(f"/spaces/{robot.space}/diagnostics"), 404, "space-unknown")
@@ -260,18 +213,7 @@ def test_devices_stand_worst_first_in_their_space_and_with_counts(cloud: Cloud) 
         problem(anna.get("/diagnostics", params={"cursor": "x"}), 422, "cursor-invalid")
 
 
-def test_a_new_owner_begins_with_nothing(cloud: Cloud, pair: Pair) -> None:
-    anna, robot = pair
-    Life(cloud, robot).live(4, temperature_c__elbow=still(90))
-    assert diagnostics(anna, robot)["fields"]
-    anna.delete(f"/agents/{robot.id}")
-    bert = cloud.sign_in("bert")
-    robot.pair(bert)
-    assert (diagnostics(bert, robot)["fields"], diagnostics(bert, robot)["faults"]) == ([], [])
-
-
-def test_several_workers_see_one_fault_and_lose_no_window(open_cloud: Any, cloud: Cloud, pair: Pair) -> None:
-    anna, robot = pair
+def test_concurrent_workers_lose_no_window(open_cloud: Any, cloud: Cloud, anna: Person, robot: Robot) -> None:
     clouds = [cloud, open_cloud(clock=cloud.clock), open_cloud(clock=cloud.clock)]
     batch = list(Life(cloud, robot).messages(12, temperature_c__elbow=still(90), temperature_c__wrist_1=still(30)))
     calls = [one.begin(ingest_telemetry(one.functions, batch)) for one in clouds for _ in "ab"]
@@ -281,10 +223,9 @@ def test_several_workers_see_one_fault_and_lose_no_window(open_cloud: Any, cloud
     assert diagnostics(anna, robot)["fields"][0]["value"] == pytest.approx(90, abs=1)
 
 
-def test_what_a_killed_worker_left_is_put_right_within_a_minute(
-    cloud: Cloud, pair: Pair, monkeypatch: pytest.MonkeyPatch
+def test_a_state_lost_by_a_killed_worker_is_corrected(
+    cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    anna, robot = pair
     life = Life(cloud, robot)
     life.live(2, temperature_c__elbow=still(40))
     real = cloud.functions.tables.replace
@@ -296,7 +237,7 @@ def test_what_a_killed_worker_left_is_put_right_within_a_minute(
 
     monkeypatch.setattr(cloud.functions.tables, "replace", dying)
     life.live(4, temperature_c__elbow=still(90))
-    assert len(open_faults(anna, robot)) == 1, "the fault was written before the watch that found it was not"
+    assert len(open_faults(anna, robot)) == 1, "the fault was stored, the state of its detector was not"
     monkeypatch.undo()
     life.live(8, temperature_c__elbow=still(40))
     assert open_faults(anna, robot) == []
@@ -314,32 +255,29 @@ def test_an_unknown_robot_type_with_a_hundred_fields_is_monitored_without_limits
         life.live(130, **many)
         fields = diagnostics(anna, robot)["fields"]
         assert [item["field"] for item in fields] == sorted(many)[:100]
-        row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
+        row = cloud.run(cloud.functions.tables.get(records.DIAGNOSTICS, partition(cloud, robot), "health"))
         assert row is not None
-        partition = f"{robot.device}/{row.data['pairing']}"
-        kept = cloud.run(cloud.functions.tables.get(records.DIAGNOSTICS, partition, "health"))
-        assert kept is not None
-        assert len(codec.encode(kept.data)) < 200_000
+        assert len(codec.encode(row.data)) < 200_000
 
 
-def test_what_an_earlier_pairing_left_is_forgotten(cloud: Cloud, pair: Pair) -> None:
-    anna, robot = pair
+def test_data_of_an_earlier_pairing_are_hidden_and_deleted(cloud: Cloud, anna: Person, robot: Robot) -> None:
     Life(cloud, robot).live(4, temperature_c__elbow=still(90))
     sample = {"at_ms": cloud.clock.now_ms(), "ms": 5.0}
     latency = {"transport": "mqtt", "path": "operator-device", "samples": [sample]}
     assert anna.post(f"/devices/{robot.device}/latency", latency).status_code == 204
-    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
-    assert row is not None
-    partition = f"{robot.device}/{row.data['pairing']}"
+    former = partition(cloud, robot)
 
     def left() -> set[str]:
         tables = (records.FAULTS, records.DIAGNOSTICS, records.LATENCY)
-        pages = {table: cloud.run(cloud.functions.tables.query(table, partition)) for table in tables}
-        # How often a code was raised has a note of its own, and says itself how long it stays.
+        pages = {table: cloud.run(cloud.functions.tables.query(table, former)) for table in tables}
+        # Rows that count a code contain their own expiry.
         return {table for table, page in pages.items() if any("expires_ms" not in row.data for row in page.rows)}
 
     assert left() == {records.FAULTS, records.DIAGNOSTICS, records.LATENCY}
     anna.delete(f"/agents/{robot.id}")
+    bert = cloud.sign_in("bert")
+    robot.pair(bert)
+    assert (diagnostics(bert, robot)["fields"], diagnostics(bert, robot)["faults"]) == ([], [])
     cloud.clock.advance(2 * 3600)
     cloud.sweep()
     assert left() == set()

@@ -1,38 +1,31 @@
 """The token cache is bounded: expired checks are removed."""
 
-import asyncio
-from pathlib import Path
-
 import pytest
 
-from function_app import bootstrap, settings
 from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
 from function_app.services.identity.authenticator import API, RECHECK_MS
-from tests.fakes.clock import MovingClock
+from tests.harness.cloud.cloud import Cloud
 
 
-def test_tokens_due_for_a_check_are_not_cached(tmp_path: Path) -> None:
-    asyncio.run(_kept(tmp_path))
+def test_tokens_due_for_a_check_are_not_cached(cloud: Cloud) -> None:
+    authenticator = cloud.functions.authenticator
+    caller = Identity("account", "ann", "session", until_ms=cloud.clock.now_ms() + 3_600_000)
 
+    async def check() -> None:
+        early = [await authenticator.issue(caller, API, 600) for _ in range(5)]
+        for token in early:
+            assert (await authenticator.person(token, API)).account == "account"
+        assert len(authenticator._known) == len(early)
+        cloud.clock.advance(RECHECK_MS / 1000 - 1)
+        await authenticator.person(early[0], API)
+        cloud.clock.advance(2)
+        late = await authenticator.issue(caller, API, 600)
+        await authenticator.person(late, API)
+        assert set(authenticator._known) == {(API, late)}
+        assert (await authenticator.person(early[1], API)).account == "account", "valid, cached or not"
+        cloud.clock.advance(601)
+        with pytest.raises(Problem, match="expired"):
+            await authenticator.person(late, API)
 
-async def _kept(tmp_path: Path) -> None:
-    clock = MovingClock()
-    functions = bootstrap.build(settings.read({"TELESCOPE_HOME": str(tmp_path)}), clock=clock)
-    identify = functions.authenticator
-    who = Identity("account", "ann", "session", until_ms=clock.now_ms() + 3_600_000)
-    early = [await identify.issue(who, API, 600) for _ in range(5)]
-    for token in early:
-        assert (await identify.person(token, API)).account == "account"
-    assert len(identify._known) == len(early)
-    clock.advance(RECHECK_MS / 1000 - 1)
-    await identify.person(early[0], API)
-    clock.advance(2)
-    late = await identify.issue(who, API, 600)
-    await identify.person(late, API)
-    assert set(identify._known) == {(API, late)}
-    assert (await identify.person(early[1], API)).account == "account", "it counts, remembered or not"
-    clock.advance(601)
-    with pytest.raises(Problem, match="expired"):
-        await identify.person(late, API)
-    await functions.close()
+    cloud.run(check())

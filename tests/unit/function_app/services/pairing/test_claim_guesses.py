@@ -16,7 +16,10 @@ LIVE = 20
 """Codes that are shown at the same time."""
 
 
-def guess(cloud: Cloud, guesses: int) -> None:
+@pytest.mark.parametrize(
+    "guesses", [1_000, pytest.param(100_000, marks=[pytest.mark.long, pytest.mark.timeout(3_600)])]
+)
+def test_guessed_claim_codes_claim_nothing(cloud: Cloud, guesses: int) -> None:
     """As many accounts as one likes, each with its five tries: what protects is that there are 2.56·10¹⁰ codes."""
     chance = random.Random(1)  # noqa: S311 (chance with a seed)
     functions = cloud.functions
@@ -45,16 +48,6 @@ def guess(cloud: Cloud, guesses: int) -> None:
         return claimed
 
     assert cloud.run(work()) == 0
-
-
-def test_guessed_claim_codes_claim_nothing(cloud: Cloud) -> None:
-    guess(cloud, 1_000)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(3_600)
-def test_a_hundred_thousand_guessed_claim_codes_claim_nothing(cloud: Cloud) -> None:
-    guess(cloud, 100_000)
 
 
 def test_of_a_hundred_who_redeem_one_code_at_once_one_wins(cloud: Cloud) -> None:

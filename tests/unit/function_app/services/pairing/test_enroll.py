@@ -18,10 +18,8 @@ from infra.tls import agent_ca as devices
 from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker
 from tests.fakes.clock import MovingClock
-from tests.fixtures.cloud import OpenCloud
-from tests.harness.cloud.cloud import API, Cloud, Person, paired, problem
+from tests.harness.cloud.cloud import Cloud, Person, problem
 from tests.harness.cloud.memory import Memory
-from tests.harness.network.brokers import wait_until
 
 Pair = tuple[Person, Robot]
 
@@ -29,12 +27,6 @@ Pair = tuple[Person, Robot]
 @pytest.fixture
 def clock(memory: Memory) -> MovingClock:
     return memory.clock
-
-
-@pytest.fixture
-def alone(open_cloud: OpenCloud) -> Cloud:
-    """The functions where no broker is needed, with a clock that moves."""
-    return open_cloud()
 
 
 class TestEnroll:
@@ -68,61 +60,40 @@ class TestEnroll:
         "claims",
         [
             pytest.param({"key": signing.generate()}, id="another key"),
-            {"aud": "telescope/session"},
-            {"aud": None},
-            {"iss": "telescope"},
-            {"iss": None},
-            {"exp": None},
-            {"iat": None},
-            {"jti": None},
-            {"exp": 1},
+            {"aud": "telescope/session"}, {"aud": None}, {"iss": "telescope"}, {"iss": None}, {"jti": None},
+            {"exp": None}, {"exp": 1}, {"exp": "never"}, {"exp": "4000000000"}, {"exp": 1e308}, {"exp": float("inf")},
+            {"iat": None}, {"iat": 0}, {"iat": "0"}, {"iat": [1]}, {"iat": float("nan")},
             {"iat": 4_000_000_000, "exp": 4_000_000_030},
-            {"iat": 0},
-            {"exp": "never"},
-            {"exp": "4000000000"},
-            {"iat": "0"},
-            {"iat": [1]},
-            {"exp": 1e308},
-            {"iat": float("nan")},
-            {"exp": float("inf")},
         ],
         ids=str,
-    )
+    )  # fmt: skip
     def test_a_token_that_its_key_did_not_sign_for_this_now_is_refused(
         self, alone: Cloud, claims: dict[str, Any]
     ) -> None:
         robot = alone.robot()
         robot.enroll()
-        answer = robot.ask("GET", "/agents/enrollment", token=robot.token(**claims))
+        answer = robot.request("GET", "/agents/enrollment", token=robot.token(**claims))
         problem(answer, 401, "unauthorized")
-        answer = robot.ask("POST", "/agents/enroll", token=robot.token(**claims), json=robot.introduction())
+        answer = robot.request("POST", "/agents/enroll", token=robot.token(**claims), json=robot.introduction())
         problem(answer, 401, "unauthorized")
 
     def test_an_agent_cannot_enroll_with_anothers_key(self, alone: Cloud) -> None:
         robot, thief = alone.robot(), alone.robot()
-        answer = thief.ask("POST", "/agents/enroll", json=thief.introduction(public_key=robot.public))
+        answer = thief.request("POST", "/agents/enroll", json=thief.introduction(public_key=robot.public))
         problem(answer, 401, "unauthorized")
-
-    def test_an_agent_that_is_not_enrolled_is_told_to(self, alone: Cloud) -> None:
-        body = problem(alone.robot().ask("GET", "/agents/enrollment"), 401, "unauthorized")
-        assert "Enroll" in body["detail"]
+        assert "Enroll" in problem(thief.request("GET", "/agents/enrollment"), 401, "unauthorized")["detail"]
 
     @pytest.mark.parametrize(
         "changes",
         [
-            {"devices": []},
-            {"devices": [{"name": "a", "kind": "arm", "robot_type": "ur5", "label": ""}] * 2},
-            {"devices": [{"name": "a/b", "kind": "arm", "robot_type": "ur5", "label": ""}]},
-            {"devices": [{"name": "x" * 33, "kind": "arm", "robot_type": "ur5", "label": ""}]},
-            {"devices": [{"name": f"d{n}", "kind": "a", "robot_type": "ur5", "label": ""} for n in range(65)]},
-            {"name": ""},
-            {"public_key": "x"},
-            {"public_key": "!" * 43},
-            {"software": "x" * 201},
-            {"space": "mine"},
+            *(
+                {"devices": [{"name": name, "kind": "arm", "robot_type": "ur5", "label": ""} for name in names]}
+                for names in ([], ["a", "a"], ["a/b"], ["x" * 33], [f"d{number}" for number in range(65)])
+            ),
+            {"name": ""}, {"public_key": "x"}, {"public_key": "!" * 43}, {"software": "x" * 201}, {"space": "mine"},
         ],
         ids=lambda changes: str(changes)[:50],
-    )
+    )  # fmt: skip
     def test_an_introduction_that_is_wrong_is_refused(self, alone: Cloud, changes: dict[str, Any]) -> None:
         problem(alone.robot().enroll(**changes), 422, "invalid")
 
@@ -161,14 +132,14 @@ class TestClaim:
         assert (agent["id"], agent["devices"]) == (robot.id, ["left", "right"])
 
     def test_a_wrong_a_used_and_an_expired_code_are_answered_alike(self, alone: Cloud, clock: MovingClock) -> None:
-        anna, bert = alone.sign_in("anna"), alone.sign_in("bert")
-        used, expired, last = alone.robot().code(), "", alone.robot().code()
+        bert = alone.sign_in("bert")
+        used, last = alone.robot().code(), alone.robot().code()
         assert bert.post("/agents/claim", {"code": used}).status_code == 200
         clock.advance(299)
         assert bert.post("/agents/claim", {"code": last}).status_code == 200
         expired = alone.robot().code()
         clock.advance(300)
-        anna, bert = alone.sign_in("anna"), alone.sign_in("bert")
+        anna = alone.sign_in("anna")
         answers = [anna.post("/agents/claim", {"code": code}) for code in ("BCDF-GHJK", "nonsense", used, expired)]
         bodies = [problem(answer, 404, "claim-code-unknown") for answer in answers]
         assert all(body == bodies[0] for body in bodies)
@@ -200,10 +171,13 @@ class TestClaim:
         clock.advance(300)
         assert late.post("/agents/claim", {"code": alone.robot().code()}).status_code == 200
 
-    def test_parallel_guesses_from_one_address_are_no_way_around(self, alone: Cloud) -> None:
-        guessers = [alone.sign_in(f"guesser{number}", address="10.0.0.9") for number in range(10)]
+    @pytest.mark.parametrize("accounts", [1, 10])
+    def test_parallel_guesses_are_no_way_around(self, alone: Cloud, accounts: int) -> None:
+        guessers = [alone.sign_in(f"guesser{number}", address="10.0.0.9") for number in range(accounts)]
         answers = [
-            guesser.begin("POST", "/agents/claim", json={"code": "BCDF-GHJK"}) for guesser in guessers for _ in range(3)
+            guesser.begin("POST", "/agents/claim", json={"code": "BCDF-GHJK"})
+            for guesser in guessers
+            for _ in range(30 // accounts)
         ]
         statuses = [answer().status_code for answer in answers]
         assert 1 <= statuses.count(404) <= 5
@@ -212,39 +186,19 @@ class TestClaim:
     @pytest.mark.parametrize(
         ("client", "proxies", "forwarded", "found"),
         [
-            ("10.0.0.1", 0, [], "10.0.0.1"),
-            ("10.0.0.1", 0, ["1.1.1.1"], "10.0.0.1"),
-            ("10.0.0.1", 1, ["1.1.1.1"], "1.1.1.1"),
-            ("10.0.0.1", 1, ["6.6.6.6, 1.1.1.1"], "1.1.1.1"),
-            ("10.0.0.1", 2, ["6.6.6.6, 1.1.1.1", "2.2.2.2"], "1.1.1.1"),
-            ("10.0.0.1", 1, [], "10.0.0.1"),
-            ("10.0.0.1", 1, ["1.1.1.1:4711"], "1.1.1.1"),
-            ("10.0.0.1", 1, ["[2001:db8::1]:4711"], "2001:db8::/64"),
-            ("10.0.0.1", 1, ["2001:db8:0:0:ffff::1"], "2001:db8::/64"),
-            ("10.0.0.1", 1, ["::ffff:1.1.1.1"], "1.1.1.1"),
-            ("10.0.0.1", 1, ["<script>"], ""),
-            ("fe80::1%eth0", 0, [], "fe80::/64"),
-            (None, 0, ["6.6.6.6, 1.1.1.1:4711"], "1.1.1.1"),
-            (None, 0, [], ""),
+            ("10.0.0.1", 0, [], "10.0.0.1"), ("10.0.0.1", 0, ["1.1.1.1"], "10.0.0.1"),
+            ("10.0.0.1", 1, [], "10.0.0.1"), ("10.0.0.1", 1, ["1.1.1.1"], "1.1.1.1"),
+            ("10.0.0.1", 1, ["6.6.6.6, 1.1.1.1"], "1.1.1.1"), ("10.0.0.1", 1, ["1.1.1.1:4711"], "1.1.1.1"),
+            ("10.0.0.1", 1, ["::ffff:1.1.1.1"], "1.1.1.1"), ("10.0.0.1", 1, ["<script>"], ""),
+            ("10.0.0.1", 1, ["[2001:db8::1]:4711"], "2001:db8::/64"), ("fe80::1%eth0", 0, [], "fe80::/64"),
+            ("10.0.0.1", 1, ["2001:db8:0:0:ffff::1"], "2001:db8::/64"), (None, 0, [], ""),
+            ("10.0.0.1", 2, ["6.6.6.6, 1.1.1.1", "2.2.2.2"], "1.1.1.1"), (None, 0, ["6.6.6.6, 1.1.1.1:1"], "1.1.1.1"),
         ],
-    )
+    )  # fmt: skip
     def test_whose_address_it_is(self, client: str | None, proxies: int, forwarded: list[str], found: str) -> None:
         headers = [(b"x-forwarded-for", line.encode()) for line in forwarded]
         scope = {"type": "http", "client": client and (client, 1), "headers": headers}
         assert client_address(Request(scope), proxies) == found
-
-    def test_right_codes_are_not_counted(self, alone: Cloud) -> None:
-        anna = alone.sign_in("anna")
-        for _ in range(8):
-            assert anna.post("/agents/claim", {"code": alone.robot().code()}).status_code == 200
-        assert len(anna.get("/agents").json()["items"]) == 8
-
-    def test_parallel_guesses_are_no_way_around(self, alone: Cloud) -> None:
-        anna = alone.sign_in("anna")
-        answers = [anna.begin("POST", "/agents/claim", json={"code": "BCDF-GHJK"}) for _ in range(30)]
-        statuses = [answer().status_code for answer in answers]
-        assert statuses.count(404) <= 5
-        assert set(statuses) <= {404, 429}
 
     def test_a_space_of_ones_own_may_be_chosen_and_no_other(self, alone: Cloud) -> None:
         anna, bert = alone.sign_in("anna"), alone.sign_in("bert")
@@ -258,79 +212,60 @@ class TestClaim:
 
 def test_the_lists_page_agent_by_agent(alone: Cloud) -> None:
     anna = alone.sign_in("anna")
-    for _ in range(5):
-        alone.robot("a", "b").pair(anna)
+    for _ in range(7):
+        alone.robot("a", "b").pair(anna)  # right codes are not counted as tries
     for path, each in (("/agents", 1), ("/devices", 2)):
-        found: list[str] = []
-        cursor: str | None = None
-        for _ in range(3):
-            page = anna.get(path, params={"limit": 2} | ({"cursor": cursor} if cursor else {})).json()
-            found += [item["id"] for item in page["items"]]
-            cursor = page["cursor"]
-        assert cursor is None
-        assert len(set(found)) == len(found) == 5 * each
+        pages = anna.each_page(path, limit=2)
+        assert [len(page) for page in pages] == [2 * each] * 3 + [each]
+        assert len({item["id"] for page in pages for item in page}) == 7 * each
         problem(anna.get(path, params={"cursor": "§"}), 422, "cursor-invalid")
 
 
-def test_unpairing_cuts_the_agent_and_leaves_nothing_of_it(cloud: Cloud, pair: Pair, broker: MemoryBroker) -> None:
-    anna, robot = pair
-    epoch = anna.take(robot.device).json()["epoch"]
+def test_unpairing_cuts_the_agent_and_leaves_nothing_of_it(
+    cloud: Cloud, anna: Person, robot: Robot, broker: MemoryBroker
+) -> None:
+    epoch = anna.take_lease(robot.device).json()["epoch"]
     action = anna.start(robot.device, epoch=epoch, wait_ms=10_000).json()["id"]
-    issued = robot.ask("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
+    issued = robot.request("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
     link = robot.link
     assert link is not None
     assert anna.delete(f"/agents/{robot.id}").status_code == 204
-    wait_until(link.disconnected.is_set, "the cut")
+    assert link.disconnected.is_set()
     late = broker.connect(issued["client_id"], Credentials(issued["username"], issued["password"]))
     assert not late.connected.is_set()
     late.close()
     assert robot.commands[-1].epoch > epoch, "the former holder is fenced"
-    for path in (f"/devices/{robot.device}", f"/devices/{robot.device}/actions", f"/actions/{action}"):
-        assert anna.get(path).status_code == 404
+    problem(anna.get(f"/actions/{action}"), 404, "action-unknown")
     assert anna.get("/agents").json()["items"] == anna.get("/devices").json()["items"] == []
     problem(anna.delete(f"/agents/{robot.id}"), 404, "agent-unknown")
-    problem(robot.ask("POST", "/mqtt/credentials", json={"purpose": "agent"}), 409, "agent-unclaimed")
+    problem(robot.request("POST", "/mqtt/credentials", json={"purpose": "agent"}), 409, "agent-unclaimed")
     assert robot.enrollment()["state"] == "waiting"
 
     bert = cloud.sign_in("bert")
     robot.pair(bert)
     robot.connect()
-    wait_until(lambda: bert.get(f"/devices/{robot.device}").json()["online"], "the robot to be online")
-    assert bert.get(f"/devices/{robot.device}/actions").json()["items"] == []
-    assert bert.get(f"/devices/{robot.device}/lease").json()["lease"] is None
     started = bert.start(robot.device, wait_ms=10_000)
     assert started.status_code == 200, "an earlier owner's action does not hold the slot"
     assert started.json()["epoch"] > epoch
     problem(bert.get(f"/actions/{action}"), 404, "action-unknown")
 
 
-def test_an_idempotency_key_of_an_earlier_pairing_starts_anew(pair: Pair) -> None:
-    anna, robot = pair
+def test_an_idempotency_key_of_an_earlier_pairing_starts_anew(anna: Person, robot: Robot) -> None:
     first = anna.start(robot.device, once="k", wait_ms=10_000).json()["id"]
     anna.delete(f"/agents/{robot.id}")
-    assert robot.link is not None
-    wait_until(robot.link.disconnected.is_set, "the cut")
     robot.pair(anna)
     robot.connect()
-    wait_until(lambda: anna.get(f"/devices/{robot.device}").json()["online"], "the robot to be online")
     again = anna.start(robot.device, once="k", wait_ms=10_000)
     assert again.status_code == 200
     assert again.json()["id"] != first
     assert anna.action(again.json()["id"])["status"] == "started"
 
 
-def test_two_agents_of_two_owners_are_apart(cloud: Cloud) -> None:
-    with paired(cloud, "anna") as (anna, one), paired(cloud, "bert") as (bert, two):
-        assert [item["id"] for item in anna.get("/devices").json()["items"]] == [one.device]
-        assert [item["id"] for item in bert.get("/devices").json()["items"]] == [two.device]
-        assert cloud.ask("GET", f"{API}/devices").status_code == 401
-
-
 class TestCertificates:
     def test_where_the_broker_wants_none_none_is_made(self, alone: Cloud) -> None:
         robot = alone.robot()
         robot.pair(alone.sign_in("anna"))
-        answer = robot.ask("POST", "/agents/certificate", json={"request": "x"})
+        answer = robot.request("POST", "/agents/certificate", json={"request": "x"})
         problem(answer, 409, "certificates-unused")
 
     def test_an_agent_that_is_claimed_gets_one_and_loses_it_with_its_pairing(
@@ -344,10 +279,10 @@ class TestCertificates:
         key = ec.generate_private_key(ec.SECP256R1())
         request = x509.CertificateSigningRequestBuilder().subject_name(x509.Name([])).sign(key, hashes.SHA256())
         asked = {"request": request.public_bytes(serialization.Encoding.PEM).decode()}
-        problem(robot.ask("POST", "/agents/certificate", json=asked), 409, "agent-unclaimed")
+        problem(robot.request("POST", "/agents/certificate", json=asked), 409, "agent-unclaimed")
         robot.pair(anna)
-        problem(robot.ask("POST", "/agents/certificate", json={"request": "x"}), 422, "invalid")
-        made = robot.ask("POST", "/agents/certificate", json=asked)
+        problem(robot.request("POST", "/agents/certificate", json={"request": "x"}), 422, "invalid")
+        made = robot.request("POST", "/agents/certificate", json=asked)
         assert made.status_code == 200, made.text
         certificate = x509.load_pem_x509_certificate(made.json()["chain"].encode())
         assert certificate.subject.rfc4514_string() == f"CN={robot.id}"

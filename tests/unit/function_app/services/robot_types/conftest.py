@@ -2,13 +2,7 @@
 
 import pytest
 
-from tests.fixtures.cloud import OpenCloud
 from tests.harness.cloud.cloud import Cloud, Person
-
-
-@pytest.fixture
-def alone(open_cloud: OpenCloud) -> Cloud:
-    return open_cloud()
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 from device_agent.protocol import RunMovement
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Person, problem
-from tests.unit.function_app.services.robot_types.movements import MINE, UR5
+from tests.unit.function_app.services.robot_types.movements import MINE
 
 
 class TestParameters:
@@ -21,12 +21,6 @@ class TestParameters:
         "additionalProperties": False,
     }
 
-    def test_built_in_ones_say_what_they_take(self, anna: Person) -> None:
-        for item in anna.get(f"{UR5}/movements").json()["items"]:
-            properties = item["parameters_schema"]["properties"]
-            assert properties["speed"]["default"] > 0
-            assert all(value["description"] for value in properties.values())
-
     def test_a_schema_is_the_callers_else_the_scripts_else_none(self, anna: Person) -> None:
         literal = 'PARAMETERS = {"who": {"type": "string"}, "times": {"type": "integer", "default": 1}}'
         read = anna.put(MINE, {"source": literal}).json()["parameters_schema"]
@@ -37,32 +31,20 @@ class TestParameters:
         assert anna.put(MINE, {"source": "1"}).json()["parameters_schema"] is None
         assert anna.get(MINE, params={"version": 2}).json()["parameters_schema"] == said
 
-    @pytest.mark.parametrize(
-        "schema",
-        [
-            {"type": "object", "properties": {"a": {"$ref": "#"}}},
-            {"type": "object", "properties": {"a": {"type": "string", "pattern": "(a+)+$"}}},
-            {"type": "object", "patternProperties": {}},
-            {"type": "array", "items": {"type": "string"}},
-            {"type": "object", "properties": {"a": {"type": ["string", "null"]}}},
-        ],
-    )
-    def test_what_a_schema_may_not_say_is_refused(self, anna: Person, schema: dict[str, Any]) -> None:
-        problem(anna.put(MINE, {"source": "1", "parameters_schema": schema}), 422, "invalid")
-
-    def test_a_schema_that_contradicts_itself_is_refused(self, anna: Person) -> None:
+    def test_a_wrong_schema_is_refused(self, anna: Person) -> None:
+        for unknown in ({"type": "object", "properties": {"a": {"$ref": "#"}}}, {"type": "array", "items": {}}):
+            problem(anna.put(MINE, {"source": "1", "parameters_schema": unknown}), 422, "invalid")
         schema = {"type": "object", "properties": {"a": {"type": "integer", "default": "x"}}}
         refused = problem(anna.put(MINE, {"source": "1", "parameters_schema": schema}), 422, "schema-invalid")
         assert "$.a" in refused["detail"]
         problem(anna.put(MINE, {"source": 'PARAMETERS = {"a": 1}'}), 422, "schema-invalid")
         problem(anna.put(MINE, {"source": "PARAMETERS = f()"}), 422, "movement-invalid")
 
-    def test_an_action_gets_the_defaults_and_keeps_them(self, pair: tuple[Person, Robot]) -> None:
-        anna, robot = pair
+    def test_an_action_gets_the_defaults_and_keeps_them(self, anna: Person, robot: Robot) -> None:
         anna.put(MINE, {"source": "1", "parameters_schema": self.SCHEMA})
         asked = {"kind": "run_movement", "name": "mine", "parameters": {"who": "bert"}}
         started = anna.start(robot.device, request=asked, wait_ms=10_000, once="x").json()
-        (command,) = robot.heard(RunMovement)
+        (command,) = robot.received(RunMovement)
         assert isinstance(command.request, RunMovement)
         assert command.request.parameters == {"who": "bert", "times": 3}
         assert started["request"]["parameters"] == {"who": "bert", "times": 3}
@@ -71,13 +53,10 @@ class TestParameters:
     @pytest.mark.parametrize(
         ("given", "place"),
         [
-            ({}, "$"),
-            ({"who": "carl"}, "$.who"),
-            ({"who": "anna", "times": 0}, "$.times"),
-            ({"who": "anna", "times": True}, "$.times"),
-            ({"who": "anna", "more": 1}, "$"),
+            ({}, "$"), ({"who": "carl"}, "$.who"), ({"who": "anna", "more": 1}, "$"),
+            ({"who": "anna", "times": 0}, "$.times"), ({"who": "anna", "times": True}, "$.times"),
         ],
-    )
+    )  # fmt: skip
     def test_what_does_not_fit_is_refused_with_its_place_and_takes_no_slot(
         self, anna: Person, given: dict[str, Any], place: str
     ) -> None:

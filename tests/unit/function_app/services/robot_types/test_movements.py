@@ -2,6 +2,7 @@
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -84,11 +85,8 @@ def test_a_version_is_not_saved_over_one_that_its_author_has_not_seen(anna: Pers
 
 def test_a_script_is_checked_without_being_saved_and_an_editor_learns_what_there_is(anna: Person) -> None:
     checked = anna.post(f"{UR5}/scripting/check", {"source": '"""Wave."""\nrobot.home(\n'}).json()
-    assert (checked["savable"], checked["diagnostics"][0]["line"], checked["diagnostics"][0]["severity"]) == (
-        False,
-        2,
-        "error",
-    )
+    mark = checked["diagnostics"][0]
+    assert (checked["savable"], mark["line"], mark["severity"]) == (False, 2, "error")
     good = '"""Wave."""\nPARAMETERS = {"speed": {"type": "number", "default": 1}}\nrobot.posture("x")\n'
     checked = anna.post(f"{UR5}/scripting/check", {"source": good}).json()
     assert (checked["savable"], checked["description"]) == (True, "Wave.")
@@ -113,38 +111,23 @@ def test_what_is_not_python_is_refused_with_the_line(anna: Person, source: str, 
 @pytest.mark.parametrize(
     "source",
     [
-        "(" * 30_000,
-        "-" * 30_000 + "1",
-        "1+" * 30_000 + "1",
-        "a." * 30_000 + "b",
-        "[" * 150 + "]" * 150,
-        "x" * 64_001,
-        "",
+        "(" * 30_000, "-" * 30_000 + "1", "1+" * 30_000 + "1", "a." * 30_000 + "b", "[" * 150 + "]" * 150,
+        "x" * 64_001, "",
     ],
     ids=["parentheses", "minus", "plus", "dots", "lists", "long", "empty"],
-)
+)  # fmt: skip
 def test_a_script_that_is_too_much_is_refused_or_kept_and_never_a_fault(anna: Person, source: str) -> None:
     assert anna.put(MINE, {"source": source}).status_code in {201, 422}
     assert anna.get(f"{UR5}/movements").status_code == 200
 
 
 def test_a_script_that_is_taken_can_be_sent_with_all_the_parameters_it_may_have(alone: Cloud, anna: Person) -> None:
-    sources = {
-        "letters": "# ".ljust(MAX_SOURCE),
-        "umlauts": "# ".ljust(48_000, "ü"),
-        "lines": "\n" * 48_000,
-        "quotes": '#"' * 24_000,
-    }
     text = "x" * (MAX_PARAMETERS_BYTES - len('{"text":""}'))
-    starting = []
-    for name, source in sources.items():
-        saved = anna.put(f"{UR5}/movements/{name}", {"source": source})
-        assert saved.status_code == 201, saved.text
-        assert anna.get(f"{UR5}/movements/{name}").json()["source"] == source
-        device = alone.robot().pair(anna)
-        asked = {"kind": "run_movement", "name": name, "parameters": {"text": text}}
-        starting.append(anna.begin("POST", f"/devices/{device}/actions", json={"request": asked}))
-    assert [started().status_code for started in starting] == [202] * len(sources)
+    for source in ("# ".ljust(MAX_SOURCE), "# ".ljust(48_000, "ü"), "\n" * 48_000, '#"' * 24_000):
+        assert anna.put(MINE, {"source": source}).status_code in {200, 201}
+        assert anna.get(MINE).json()["source"] == source
+        asked = {"kind": "run_movement", "name": "mine", "parameters": {"text": text}}
+        assert anna.start(alone.robot().pair(anna), request=asked).status_code == 202
 
 
 @pytest.mark.parametrize("letter", ["🤖", "ü", "\x01", '"'])
@@ -172,24 +155,9 @@ def test_a_script_that_was_changed_in_the_store_is_not_run(alone: Cloud, memory:
     problem(anna.get(MINE), 409, "movement-damaged")
 
 
-def test_an_action_runs_the_newest_version_of_the_callers_own(pair: tuple[Person, Robot]) -> None:
-    anna, robot = pair
-    robot.reports = lambda _: (AckStatus.DONE,)
-    asked = {"kind": "run_movement", "name": "wave"}
-    sources = ["robot.home()\n", "robot.home()  # again\n"]
-    for source in sources:
-        anna.put(WAVE, {"source": source})
-        anna.start(robot.device, request=asked, wait_ms=10_000, wait_for="done")
-    anna.delete(WAVE)
-    anna.start(robot.device, request=asked, wait_ms=10_000, wait_for="done")
-    ran = [command.request for command in robot.heard(RunMovement)]
-    assert [each.source for each in ran if isinstance(each, RunMovement)] == [*sources, anna.get(WAVE).json()["source"]]
-
-
 def test_no_version_that_may_run_is_older_for_the_device_than_one_that_ran(
-    pair: tuple[Person, Robot], tmp_path: Path
+    anna: Person, robot: Robot, tmp_path: Path
 ) -> None:
-    anna, robot = pair
     robot.reports = lambda _: (AckStatus.DONE,)
     asked = {"kind": "run_movement", "name": "wave"}
 
@@ -197,26 +165,26 @@ def test_no_version_that_may_run_is_older_for_the_device_than_one_that_ran(
         anna.start(robot.device, request=asked, wait_ms=10_000, wait_for="done")
 
     run()
-    for source in ("robot.home()\n", "robot.home()  # again\n"):
+    built_in = anna.get(WAVE).json()["source"]
+    own = [f"robot.home()  # {number}\n" for number in range(3)]
+    for source in own[:2]:
         anna.put(WAVE, {"source": source})
         run()
     anna.delete(WAVE)
     run()
-    anna.put(WAVE, {"source": "robot.home()  # made anew\n"})
+    anna.put(WAVE, {"source": own[2]})
     run()
-    orders = [command.request for command in robot.heard(RunMovement)]
+    orders: list[Any] = [command.request for command in robot.received(RunMovement)]
+    assert [order.source for order in orders] == [built_in, *own[:2], built_in, own[2]]
     journal = Journal(tmp_path / "journal.db")
     journal.open(now_ms=0)
     trust = ScriptPolicy(device="arm", robot_type="ur5", owner=anna.account, keys=robot._keys, journal=journal)
     for order in orders:
-        assert isinstance(order, RunMovement)
         trust.verify(order)
         trust.record_version(order)
         assert not trust.is_untrusted(order)
         assert order.timeout_ms == 300_000
     with pytest.raises(Refused, match="older than version"):
-        trust.verify(orders[1])  # type: ignore[arg-type]
+        trust.verify(orders[1])
     journal.close()
-    assert [each.author for each in orders if isinstance(each, RunMovement)] == [
-        SHIPPED, anna.account, anna.account, SHIPPED, anna.account,
-    ]  # fmt: skip
+    assert [order.author for order in orders] == [SHIPPED, anna.account, anna.account, SHIPPED, anna.account]

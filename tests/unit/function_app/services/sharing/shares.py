@@ -3,11 +3,9 @@
 from typing import Any
 
 from function_app.ports.broker_access import Credentials
-from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker, MemoryConnection
 from tests.harness.cloud.cloud import Person
 
-Three = tuple[Person, Person, Robot]
 SHARED_S = 120
 
 
@@ -25,24 +23,12 @@ def unshare(owner: Person, on: str, person: Person) -> None:
 
 def devices(person: Person) -> dict[str, str]:
     """Id → role, over all pages of one agent each."""
-    found: dict[str, str] = {}
-    cursor: str | None = ""
-    while cursor is not None:
-        page = person.get("/devices", params={"limit": 1} | ({"cursor": cursor} if cursor else {})).json()
-        found |= {item["id"]: item["role"] for item in page["items"]}
-        cursor = page["cursor"]
-    return found
+    return {item["id"]: item["role"] for item in person.pages("/devices", limit=1)}
 
 
-def watching(broker: MemoryBroker, person: Person) -> tuple[MemoryConnection, dict[str, Any]]:
-    issued = person.post("/mqtt/credentials", {"purpose": "view"}).json()
-    client = broker.connect(issued["client_id"], Credentials(issued["username"], issued["password"]))
-    assert client.connected.is_set(), client.answer
-    return client, issued
-
-
-def steering(broker: MemoryBroker, person: Person, device: str, epoch: int) -> MemoryConnection:
-    issued = person.post("/mqtt/credentials", {"purpose": "control", "device": device, "epoch": epoch}).json()
+def connected(broker: MemoryBroker, person: Person, purpose: str = "view", **more: Any) -> MemoryConnection:
+    """A connection of a person, with credentials for this purpose."""
+    issued = person.post("/mqtt/credentials", {"purpose": purpose, **more}).json()
     client = broker.connect(issued["client_id"], Credentials(issued["username"], issued["password"]))
     assert client.connected.is_set(), client.answer
     return client

@@ -1,22 +1,16 @@
 """Operations of an owner: one that would leave no owner is refused, and the error names the alternative."""
 
-from typing import Any
-
 import pytest
 
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person, problem
+from tests.unit.function_app.services.sharing.shares import share
 
-Three = tuple[Person, Person, Robot]
 
-
-@pytest.fixture
-def three(cloud: Cloud, pair: tuple[Person, Robot]) -> Three:
-    """Anna, Bert, and Anna's robot, which Bert operates."""
-    anna, robot = pair
-    bert = cloud.sign_in("bert")
-    assert anna.post(f"/devices/{robot.device}/shares", {"account": "bert", "role": "operator"}).status_code == 201
-    return anna, bert, robot
+@pytest.fixture(autouse=True)
+def shared(anna: Person, bert: Person, robot: Robot) -> None:
+    """Bert operates the robot."""
+    share(anna, f"devices/{robot.device}", bert, "operator")
 
 
 def stands(anna: Person, bert: Person, robot: Robot) -> None:
@@ -24,12 +18,13 @@ def stands(anna: Person, bert: Person, robot: Robot) -> None:
     assert anna.get(f"/devices/{robot.device}").json()["role"] == "owner"
     assert bert.get(f"/devices/{robot.device}").json()["role"] == "operator"
     assert [each["account"]["name"] for each in anna.get(f"/devices/{robot.device}/shares").json()["items"]] == ["bert"]
-    assert anna.take(robot.device).status_code == 200
+    assert anna.take_lease(robot.device).status_code == 200
 
 
 @pytest.mark.parametrize("kind", ["devices", "spaces"])
-def test_an_owner_cannot_leave_or_lower_themselves_and_is_told_how_to_give_it_away(three: Three, kind: str) -> None:
-    anna, bert, robot = three
+def test_an_owner_cannot_leave_or_lower_themselves_and_is_told_how_to_give_it_away(
+    anna: Person, bert: Person, robot: Robot, kind: str
+) -> None:
     at = f"/{kind}/{robot.device if kind == 'devices' else robot.space}/shares"
     left = problem(anna.delete(f"{at}/{anna.account}"), 409, "already-owner")
     lowered = problem(anna.post(at, {"account": "anna", "role": "viewer"}), 422, "invalid")
@@ -40,8 +35,7 @@ def test_an_owner_cannot_leave_or_lower_themselves_and_is_told_how_to_give_it_aw
     stands(anna, bert, robot)
 
 
-def test_nothing_is_handed_to_an_account_that_there_is_not(three: Three) -> None:
-    anna, bert, robot = three
+def test_nothing_is_handed_to_an_account_that_there_is_not(anna: Person, bert: Person, robot: Robot) -> None:
     anna.post("/spaces", {"name": "second"})
     for path, body in (
         (f"/agents/{robot.id}/transfers", {}),
@@ -56,35 +50,23 @@ def test_nothing_is_handed_to_an_account_that_there_is_not(three: Three) -> None
     stands(anna, bert, robot)
 
 
-def test_nothing_is_handed_to_its_owner(three: Three) -> None:
-    anna, bert, robot = three
-    anna.post("/spaces", {"name": "second"})
-    for path in (f"/agents/{robot.id}/transfers", f"/spaces/{robot.space}/transfers"):
-        problem(anna.post(path, {"account": "anna"}), 409, "already-owner")
-        for_anybody = anna.post(path, {}).json()
-        problem(anna.post("/invitations/redeem", {"secret": for_anybody["secret"]}), 409, "already-owner")
-    stands(anna, bert, robot)
-
-
 @pytest.mark.parametrize("role", ["viewer", "owner"])
-def test_an_invitation_that_its_maker_tries_is_not_used_up(cloud: Cloud, three: Three, role: str) -> None:
-    anna, bert, robot = three
-    made: Any = (
-        anna.post(f"/agents/{robot.id}/transfers", {})
-        if role == "owner"
-        else anna.post(f"/devices/{robot.device}/invitations", {"role": role})
-    ).json()
-    for _ in range(2):
-        problem(anna.post("/invitations/redeem", {"secret": made["secret"]}), 409, "already-owner")
+def test_an_invitation_that_its_maker_tries_is_not_used_up(
+    cloud: Cloud, anna: Person, bert: Person, robot: Robot, role: str
+) -> None:
+    transfers = f"/agents/{robot.id}/transfers"
+    problem(anna.post(transfers, {"account": "anna"}), 409, "already-owner")
+    path, body = (transfers, {}) if role == "owner" else (f"/devices/{robot.device}/invitations", {"role": role})
+    secret = {"secret": anna.post(path, body).json()["secret"]}
+    problem(anna.post("/invitations/redeem", secret), 409, "already-owner")
     stands(anna, bert, robot)
     anna.delete(f"/devices/{robot.device}/lease?epoch=1")
     clara = cloud.sign_in("clara")
-    assert clara.post("/invitations/redeem", {"secret": made["secret"]}).status_code == 200
+    assert clara.post("/invitations/redeem", secret).status_code == 200
     assert clara.get(f"/devices/{robot.device}").json()["role"] == role
 
 
-def test_the_last_space_cannot_be_given_away(three: Three) -> None:
-    anna, bert, robot = three
+def test_the_last_space_cannot_be_given_away(anna: Person, bert: Person, robot: Robot) -> None:
     problem(anna.post(f"/spaces/{robot.space}/transfers", {}), 409, "last-space")
     second = anna.post("/spaces", {"name": "second"}).json()["id"]
     offers = [anna.post(f"/spaces/{space}/transfers", {}).json() for space in (second, robot.space)]

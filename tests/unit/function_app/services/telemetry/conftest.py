@@ -1,12 +1,10 @@
 """Fixtures of the telemetry tests."""
 
 from collections.abc import AsyncIterator
-from typing import Any
+from pathlib import Path
 
 import pytest
 
-from function_app.adapters.local.blobs import FileBlobs
-from function_app.adapters.local.tables import SqliteTables
 from tests.unit.function_app.services.telemetry.house import House
 
 
@@ -16,9 +14,8 @@ def anyio_backend() -> str:
 
 
 @pytest.fixture
-async def house(tmp_path: Any) -> AsyncIterator[House]:
-    tables = SqliteTables(tmp_path / "tables.sqlite")
-    house = House(tables, FileBlobs(tmp_path / "blobs"))
+async def house(tmp_path: Path) -> AsyncIterator[House]:
+    house = House(tmp_path)
     await house.pair()
     yield house
-    await tables.close()
+    await house.tables.close()

@@ -3,28 +3,26 @@
 import math
 import random
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from device_agent.protocol import Measurements, codec, topics
 from device_agent.protocol.topics import Topic
-from function_app.adapters.local.blobs import FileBlobs
+from function_app.adapters.local.tables import SqliteTables
 from function_app.domain.devices.devices import Agent, Device, DeviceSpec
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.telemetry import series
 from function_app.domain.telemetry.series import LEVELS, RetentionPolicy
-from function_app.ports.tables import Tables
 from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.storage import records
 from function_app.services.storage.retention import Retention
-from function_app.services.telemetry.ingest import (
-    InboundMessage,
-    TelemetryIngest,
-    Values,
-)
+from function_app.services.telemetry.ingest import InboundMessage, TelemetryIngest, Values
 from function_app.services.telemetry.series_reader import Part, Range, SeriesReader
 from function_app.services.telemetry.series_writer import Place, SeriesWriter
+from tests.fakes.blobs import MemoryBlobs
+from tests.harness.crash_injection import CrashPoint, crashing_tables
 
 AGENT = "abcdefghij"
 DEVICE = f"{AGENT}-arm"
@@ -42,55 +40,23 @@ class Clock:
         return self.at_ms
 
 
-class Killed(BaseException):
-    """The process ends here."""
-
-
-class Spoilt:
-    """Tables that fail at a write: before it is done, or after."""
-
-    def __init__(self, tables: Tables) -> None:
-        self._tables = tables
-        self.left: int | None = None
-        self.after = False
-        self.error: BaseException = Killed()
-
-    def __getattr__(self, name: str) -> Any:
-        real = getattr(self._tables, name)
-        if name not in {"create", "replace", "delete", "batch"}:
-            return real
-
-        async def write(*arguments: Any) -> Any:
-            if self.left is not None:
-                if self.left == 0 and not self.after:
-                    raise self.error
-                self.left -= 1
-            done = await real(*arguments)
-            if self.left is not None and self.left < 0:
-                raise self.error
-            return done
-
-        return write
-
-
 class House:
     """The services over SQLite, and one agent with an arm that is Anna's."""
 
-    def __init__(self, tables: Tables, blobs: FileBlobs) -> None:
+    def __init__(self, folder: Path) -> None:
         self.clock = Clock()
         self.keep = RetentionPolicy()
-        self.tables = Spoilt(tables)
+        self.crash = CrashPoint()
+        self.tables: Any = crashing_tables(SqliteTables(folder / "tables.sqlite"), self.crash)
         self.seen: list[tuple[str, str, Sequence[tuple[int, Values]]]] = []
-        self.blobs = blobs
         self.reader, self.intake, self.writer, self.forget = self.instance()
 
     def instance(self) -> tuple[SeriesReader, TelemetryIngest, SeriesWriter, Retention]:
-        tables: Any = self.tables
-        forget = Retention(tables=tables, blobs=self.blobs)
-        writer = SeriesWriter(tables=tables, retention=forget, keep=self.keep, clock=self.clock)
-        devices = DeviceAccess(tables=tables, clock=self.clock)
-        intake = TelemetryIngest(tables=tables, writer=writer, clock=self.clock, observers=[self.observe])
-        return SeriesReader(tables=tables, devices=devices, keep=self.keep, clock=self.clock), intake, writer, forget
+        stores: dict[str, Any] = {"tables": self.tables, "clock": self.clock}
+        forget = Retention(tables=self.tables, blobs=MemoryBlobs(now_s=lambda: 0.0))
+        writer = SeriesWriter(retention=forget, keep=self.keep, **stores)
+        intake = TelemetryIngest(writer=writer, observers=[self.observe], **stores)
+        return SeriesReader(devices=DeviceAccess(**stores), keep=self.keep, **stores), intake, writer, forget
 
     async def observe(self, device: Device, stream: str, means: Sequence[tuple[int, Values]]) -> None:
         self.seen.append((device.id, stream, means))
@@ -116,10 +82,6 @@ class House:
 def message(at_ms: int, stream: str = "health", /, **values: float) -> InboundMessage:
     body = Measurements(tick_ms=at_ms, at_ms=at_ms, sequence=0, values=dict(values))
     return InboundMessage(Topic("space", AGENT, "arm", topics.TELE, stream), codec.encode(body))
-
-
-def values_of(part: Part, name: str) -> dict[int, float | None]:
-    return dict(zip(part.at_ms, part.values[name], strict=True))
 
 
 async def assert_whole(house: House, rows: dict[int, dict[str, float]], stream: str = "health") -> None:

@@ -15,10 +15,8 @@ from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.harness.cloud.polling import PollingRobot
-from tests.harness.network.brokers import wait_until
 
 HOUR_MS = 3_600_000
-NO_CREDENTIALS = ServiceCredentials("", "", "", math.inf)
 
 
 def late(robot: Robot | PollingRobot) -> str:
@@ -35,14 +33,12 @@ def stored(anna: Person, device: str) -> int:
     return sum(stream["samples"] for stream in streams if stream["name"] == "health")
 
 
-def test_over_mqtt_each_is_confirmed_and_counts_once(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
-    anna, robot = pair
-
+def test_over_mqtt_each_is_confirmed_and_counts_once(cloud: Cloud, anna: Person, robot: Robot) -> None:
     cloud.start_late()
     samples = [sample(cloud, number) for number in range(60)]
     for each in (*samples, *samples[:20]):
-        robot.say(late(robot), each)
-    wait_until(lambda: stored(anna, robot.device) == 60, "the samples")
+        robot.publish(late(robot), each)
+    assert stored(anna, robot.device) == 60
     newest = anna.get(f"/devices/{robot.device}/data/health", params={"resolution": "raw"}).json()
     assert newest["at_ms"] == [each.at_ms for each in samples]
 
@@ -57,7 +53,7 @@ def test_over_http_they_are_stored_and_not_told_to_the_broker(cloud: Cloud, brok
         login = Credentials(own.username, own.password)
         with broker.connect(own.client_id, login) as ear:
             ear.subscribe(late(robot), live)
-            assert [result["status"] for result in robot.tell_raw(*told).json()["results"]] == ["stored"] * 2
+            assert [result["status"] for result in robot.post_raw(*told).json()["results"]] == ["stored"] * 2
             assert ear.receive().topic == live
             assert ear.pending() == []
         assert stored(anna, robot.device) == 2
@@ -73,7 +69,7 @@ def test_it_is_tried_until_the_store_takes_it(monkeypatch: pytest.MonkeyPatch) -
             raise StoreError("the store is away")
 
     feed = device_feed.MqttTelemetryFeed(
-        Broker(host="127.0.0.1", port=1, credentials=lambda: NO_CREDENTIALS), late=True
+        Broker(host="127.0.0.1", port=1, credentials=lambda: ServiceCredentials("", "", "", math.inf)), late=True
     )
     asyncio.run(feed.store([("t", b"")], away))
     assert tries == [1] * 20

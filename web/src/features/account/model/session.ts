@@ -4,7 +4,7 @@ import { signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
 import { ApiError, sentence } from "../../../shared/api/http";
 
-export type SessionState =
+type SessionState =
   | { kind: "checking" }
   /** `why`: the error of a sign-in link or the reason for the session's end; empty on a first visit. */
   | { kind: "out"; why: string }

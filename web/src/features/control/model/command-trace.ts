@@ -31,7 +31,7 @@ export interface TraceLine {
 
 const KEPT = 20;
 /** Change since the click that counts as motion [rad; prismatic joints and bases: m]. */
-export const MOVED = 0.005;
+const MOVED = 0.005;
 /** A joint faster than this at the click was already moving [rad/s]. */
 const UNDER_WAY_RAD_S = 0.02;
 /** Telemetry up to this long after the end still counts as observation [ms]. */

@@ -7,7 +7,7 @@ import { now, onThisClock } from "../../../shared/lib/clock";
 import { ApiError, sentence } from "../../../shared/api/http";
 
 /** Time for the holder to respond [ms]. */
-export const ANSWER_WITHIN_MS = 30_000;
+const ANSWER_WITHIN_MS = 30_000;
 const LOOK_MS = 1_000;
 /** Grace time after the deadline before the request counts as expired [ms]. */
 const AFTER_MS = 5_000;

@@ -13,7 +13,7 @@ import { MqttLink, type Link, type LinkStatus } from "../../../shared/mqtt/mqtt-
 export const LEASE_MS = 30_000;
 const RETRY_MS = 1_000;
 
-export type ControlState =
+type ControlState =
   | { kind: "none" }
   | { kind: "taking" }
   | { kind: "held"; epoch: number; confirmed: boolean }
@@ -23,14 +23,14 @@ export type ControlState =
   | { kind: "refused"; why: string };
 
 /** The holder's response to a control request. */
-export type AnswerState =
+type AnswerState =
   | { kind: "none" }
   | { kind: "sending"; accept: boolean }
   | { kind: "kept"; from: string }
   | { kind: "failed"; why: string };
 
 /** Creates the setpoint connection. */
-export type OpenControlLink = (device: string, epoch: number) => Link;
+type OpenControlLink = (device: string, epoch: number) => Link;
 
 export class Control {
   readonly #api: Api;

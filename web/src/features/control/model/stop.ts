@@ -9,13 +9,13 @@ import type { Link } from "../../../shared/mqtt/mqtt-link";
 import type { KnownState } from "../../../shared/mqtt/parse-messages";
 import type { Stop } from "../../../shared/mqtt/protocol.generated";
 
-export const REPEAT_MS = 200;
+const REPEAT_MS = 200;
 /** Without confirmation for this long, the page shows a prominent warning [ms]. */
-export const DOUBT_MS = 1_000;
+const DOUBT_MS = 1_000;
 /** Stop is republished for at most this long; after it, an operator must be at the robot [ms]. */
-export const GIVE_UP_MS = 60_000;
+const GIVE_UP_MS = 60_000;
 
-export type StopState =
+type StopState =
   | { kind: "clear" }
   /** Sent and not confirmed; `doubtful` after `DOUBT_MS`. */
   | { kind: "sending"; doubtful: boolean }

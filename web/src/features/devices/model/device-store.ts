@@ -16,22 +16,22 @@ import { deviceTopics, type DeviceTopics } from "../../../shared/mqtt/topics";
 export type Reach = "online" | "stale" | "offline" | "unknown";
 
 /** On its own page, a device without telemetry for this long is stale [ms]. */
-export const STALE_MS = 1_000;
+const STALE_MS = 1_000;
 /** The list receives only `state`, every 30 s: two missed messages and a margin [ms]. */
-export const LIST_STALE_MS = 65_000;
+const LIST_STALE_MS = 65_000;
 const EVENTS_KEPT = 20;
 
-export interface Timed<T> {
+interface Timed<T> {
   message: T;
   /** On the page's clock [ms]. */
   receivedAt: number;
 }
 
 /** `receivedAt`: arrival time on the page's clock [ms]. */
-export type AckReceiver = (ack: KnownAck, receivedAt: number) => void;
+type AckReceiver = (ack: KnownAck, receivedAt: number) => void;
 
 /** The newest message of a stream; `everyMs`: time since the previous one, `null` for the first. */
-export interface MeasuredValues extends Timed<Measurements> {
+interface MeasuredValues extends Timed<Measurements> {
   everyMs: number | null;
 }
 

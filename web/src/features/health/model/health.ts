@@ -7,19 +7,15 @@ import type { Fault as ReportedFault } from "../../../shared/mqtt/protocol.gener
 
 /** A fault as stored in the cloud and as reported by the device; differences are shown. */
 export interface Standing {
-  /** What the cloud has stored of it; `null`: only the device says so. */
+  /** `null`: only the device reports it. */
   stored: Fault | null;
-  /** What the device says; `null`: not, or not any more, or it is no fault that the device itself tells. */
+  /** `null`: not reported by the device, or not a fault that devices report. */
   told: ReportedFault | null;
-  /** `same`: the two agree, or there is nothing to compare; `unstored`, `ended`: one of them does not know it yet. */
+  /** `unstored`, `ended`: only one of them knows it yet. `unheard`: the device is unreachable. */
   agreement: "same" | "unstored" | "ended" | "unheard";
 }
 
-/**
- * Open faults of the cloud and of the device's own word, worst first.
- *
- * @param told What the device says; `null` where it cannot be heard: what it last said then counts for nothing.
- */
+/** Open faults of the cloud and the device, worst first. `told`: the device's faults; `null` if it is unreachable. */
 export function standings(open: readonly Fault[], told: readonly ReportedFault[] | null): Standing[] {
   const left = new Map((told ?? []).map((fault) => [fault.code, fault]));
   const found = open.map((stored): Standing => {
@@ -32,7 +28,7 @@ export function standings(open: readonly Fault[], told: readonly ReportedFault[]
   return [...[...left.values()].map((one): Standing => ({ stored: null, told: one, agreement: "unstored" })), ...found];
 }
 
-/** What the device says of its own faults now; `null` where it cannot be heard. */
+/** The faults that the device reports now; `null` if it is unreachable. */
 export function reportedFaults(device: DeviceStore): readonly ReportedFault[] | null {
   return device.live.value ? (device.state.value?.faults ?? null) : null;
 }
@@ -51,7 +47,7 @@ export function healthNow(stored: HealthState, told: readonly ReportedFault[] | 
   return stored;
 }
 
-/** What a watched field is called and in which unit it is shown, with its limits. */
+/** Label, displayed unit and limits of a monitored field. */
 export function watchedQuantity(watched: Watched, description: KnownDescription | null): Quantity {
   const { stream, field, label, unit, advice, low, high, warning_low, warning_high } = watched;
   const [name = field, ...part] = field.split(".");
@@ -68,7 +64,7 @@ function plain(name: string): string {
   return name.replaceAll("_", " ");
 }
 
-export interface Newest {
+interface Newest {
   /** On the agent's wall clock [ms since 1970]. */
   atMs: number;
   value: number | boolean;
@@ -94,17 +90,17 @@ function ofJoints(device: DeviceStore, message: KnownTelemetry, field: string): 
   return message[quantity][joint];
 }
 
-/** Whether what was heard of a stream is older than it should be. */
+/** Whether a stream is older than expected. */
 export function isLate(device: DeviceStore, stream: string): boolean {
   return stream === JOINTS ? !device.live.value : device.late(stream);
 }
 
-/** Of what is watched: what is found first, then in the order of the list. */
+/** Fields with findings first, otherwise in list order. */
 export function worstFirst(fields: readonly Watched[]): Watched[] {
   return [...fields].sort((one, other) => other.findings.length - one.findings.length);
 }
 
-/** What happened in the time around a fault [ms since 1970]. */
+/** The time span around a fault [ms since 1970]. */
 export function intervalAround(fault: Fault, marginMs = 60_000): [fromMs: number, toMs: number] {
   const end = fault.cleared_at === null ? Infinity : Date.parse(fault.cleared_at) + marginMs;
   return [Date.parse(fault.raised_at) - marginMs, end];

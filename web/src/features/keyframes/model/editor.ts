@@ -6,8 +6,7 @@ import { addAfter, duplicate, poseOf, remove, type Movement, type Positions, typ
 import { readMovement } from "./script-codec";
 import { UndoHistory } from "../../../shared/lib/undo-history";
 
-/** What keeps drafts: a browser's storage. */
-export type Storage = Pick<globalThis.Storage, "getItem" | "setItem" | "removeItem">;
+type Storage = Pick<globalThis.Storage, "getItem" | "setItem" | "removeItem">;
 
 export class Editor {
   readonly robot: Robot;
@@ -23,17 +22,16 @@ export class Editor {
   readonly canRedo: ReadonlySignal<boolean>;
   readonly plan;
   readonly problems;
-  /** Index of the keyframe that is being edited. */
   readonly chosen;
-  /** Where the preview is, in the time that the robot would need [s]. */
+  /** Preview position on the robot's time scale [s]. */
   readonly at: ReadonlySignal<number> = this.#at;
   readonly playing: ReadonlySignal<boolean> = this.#playing;
-  /** Whether the movement is another than the one that the cloud has. */
+  /** Whether the movement differs from the saved version. */
   readonly changed;
-  /** Where the joints are at this moment of the preview [rad]. */
+  /** Joint positions at the preview position [rad]. */
   readonly pose;
 
-  /** `saved`: as the cloud has it, `null`: it has none. `draft`: what was left here before. `fresh`: where neither is. */
+  /** `saved`: the cloud's version, `null`: none. `draft`: stored in this browser. `fresh`: used if both are absent. */
   constructor(
     robot: Robot,
     from: { saved: Movement | null; draft: Movement | null; fresh: Movement },
@@ -62,7 +60,7 @@ export class Editor {
     this.#show();
   }
 
-  /** The end of a drag. */
+  /** Ends a drag. */
   settle(): void {
     this.#history.settle();
   }
@@ -83,7 +81,7 @@ export class Editor {
     this.#show();
   }
 
-  /** A keyframe after the one that is chosen, with all joints as they are there. */
+  /** Adds a keyframe with these positions after the selected one. */
   add(positions: Positions): void {
     this.change(addAfter(this.movement.value, this.chosen.value, poseOf(positions, this.robot)));
     this.choose(this.chosen.value + 1);
@@ -99,12 +97,12 @@ export class Editor {
     this.choose(this.chosen.value);
   }
 
-  /** Every joint at a keyframe, also those that are only on their way there [rad]. */
+  /** Every joint's position at a keyframe, including interpolated ones [rad]. */
   poseAtKeyframe(index: number): Positions {
     return this.plan.value.at(this.plan.value.reached_s[index] ?? 0);
   }
 
-  /** The preview to a moment, on the scale of the keyframes' own times [s]. */
+  /** Moves the preview to a time on the scale of the keyframes [s]. */
   scrub(asked_s: number): void {
     this.#playing.value = false;
     this.#at.value = this.plan.value.played(asked_s);
@@ -119,19 +117,18 @@ export class Editor {
     this.#playing.value = false;
   }
 
-  /** So much time has passed [s]. */
+  /** Advances the preview by the elapsed time [s]. */
   tick(passed_s: number): void {
     if (!this.#playing.value) return;
     this.#at.value = Math.min(this.#at.value + passed_s, this.plan.value.duration_s);
     if (this.#at.value >= this.plan.value.duration_s) this.#playing.value = false;
   }
 
-  /** The cloud has it now as it is. */
   saved(movement: Movement): void {
     this.#saved.value = movement;
   }
 
-  /** Back to what the cloud has; that can be undone. */
+  /** Reverts to the saved version; can be undone. */
   revert(): void {
     if (this.#saved.value !== null) this.change(this.#saved.value);
     this.choose(0);
@@ -152,7 +149,7 @@ export function begun(robot: Robot, measured: Positions | null): Movement {
   return { description: "", keyframes: [{ time_s: 0, position_rad: poseOf(positions, robot) }] };
 }
 
-/** Drafts by robot type and name; a movement without a name yet has one draft a robot type. */
+/** Drafts by robot type and name; an unnamed movement has one draft per robot type. */
 export class Drafts {
   readonly #storage: Storage;
 
@@ -164,11 +161,11 @@ export class Drafts {
     try {
       return readMovement(JSON.parse(this.#storage.getItem(key(robotType, name)) ?? "null"));
     } catch {
-      return null; // Nothing that can be read is no draft.
+      return null; // Unreadable content counts as no draft.
     }
   }
 
-  /** Whether it could be kept: a browser's storage can be full, or forbidden. */
+  /** Whether the draft was stored: storage can be full or forbidden. */
   keep(robotType: string, name: string, movement: Movement | null): boolean {
     try {
       if (movement === null) this.#storage.removeItem(key(robotType, name));

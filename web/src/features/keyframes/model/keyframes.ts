@@ -1,20 +1,17 @@
-/**
- * A movement as keyframes: when which joints are where, and what else is done there. The same few words serve an arm, a
- * humanoid, a base and a head. Everything here is pure; what it gives back is new.
- */
+/** A movement as keyframes: joint positions and steps at times. All functions are pure and return new objects. */
 import { clamp } from "../../../shared/lib/angles";
 import type { KnownDescription } from "../../../shared/mqtt/parse-messages";
 import type { Joint } from "../../../shared/mqtt/protocol.generated";
 
 export type Positions = Readonly<Record<string, number>>;
 
-export interface Drive {
+interface Drive {
   forward_m_s: number;
   turn_rad_s: number;
   duration_s: number;
 }
 
-export interface Place {
+interface Place {
   x_m: number;
   y_m: number;
   yaw_rad?: number;
@@ -36,18 +33,18 @@ export type ActionKind = (typeof ACTION_KINDS)[number];
 
 export interface Keyframe extends KeyframeActions {
   time_s: number;
-  /** Joints that are not named are on their way to where the next keyframe names them. */
+  /** Joints that are absent are interpolated. */
   position_rad: Positions;
 }
 
 export interface Movement {
-  /** What it is, in a line. */
+  /** One line. */
   description: string;
   /** At least one; the first is at 0 s. */
   keyframes: readonly Keyframe[];
 }
 
-/** What the editor needs to know of a robot. */
+/** The robot properties that the editor uses. */
 export type Robot = Pick<
   KnownDescription,
   "joints" | "mimic_joints" | "position_dependent_limits" | "postures" | "expressions" | "behaviours" | "capabilities" | "actions"
@@ -55,10 +52,10 @@ export type Robot = Pick<
 
 export const LONGEST_S = 600;
 
-/** Between two keyframes there is at least this much time [s]. */
+/** Minimum time between two keyframes [s]. */
 export const SHORTEST_S = 0.05;
 
-/** Text of a keyframe, as the robot takes it. */
+/** Maximum length of a keyframe's text that a robot accepts. */
 export const LONGEST_TEXT = 500;
 
 const STEP_RAD = 1e-4;
@@ -68,9 +65,7 @@ export const DEED_S = 0.8;
 
 export const SAME_RAD = 1e-6;
 
-// ---------------------------------------------------------------- edits
-
-/** A position as it is written down: in whole steps, and inside of a range. */
+/** A position rounded to the stored precision, within a range. */
 export function normalize(value: number, lower: number, upper: number): number {
   const inside = clamp(value, lower, upper);
   const steps = Math.round(inside / STEP_RAD);
@@ -78,7 +73,7 @@ export function normalize(value: number, lower: number, upper: number): number {
   return Number((rounded * STEP_RAD).toFixed(4)) + 0;
 }
 
-/** Times in hundredths of a second. */
+/** Rounds a time to hundredths of a second. */
 export function tidyTime(time: number): number {
   return Number(time.toFixed(2));
 }
@@ -87,7 +82,7 @@ export function withKeyframe(movement: Movement, index: number, change: (old: Ke
   return { ...movement, keyframes: movement.keyframes.map((one, other) => (other === index ? change(one) : one)) };
 }
 
-/** Where a joint is at a keyframe [rad]; `null`: it passes there, on its way. */
+/** Sets a joint's position at a keyframe [rad]; `null` removes it. */
 export function setPosition(movement: Movement, index: number, joint: Joint, position: number | null, robot: Robot): Movement {
   const mirror = robot.mimic_joints.find((one) => one.joint === joint.name);
   const leader = robot.joints.find((one) => one.name === mirror?.mimics);
@@ -102,12 +97,11 @@ export function setPosition(movement: Movement, index: number, joint: Joint, pos
   });
 }
 
-/** All joints as given, of those that the robot has and that count. */
+/** Sets all positions of joints that the robot has and that are not coupled to another. */
 export function setPose(movement: Movement, index: number, positions: Positions, robot: Robot): Movement {
   return withKeyframe(movement, index, (old) => ({ ...old, position_rad: poseOf(positions, robot) }));
 }
 
-/** A whole pose as keyframes hold it. */
 export function poseOf(positions: Positions, robot: Robot): Positions {
   const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));
   const counted = robot.joints.flatMap(({ name, lower_rad, upper_rad }) => {
@@ -117,7 +111,7 @@ export function poseOf(positions: Positions, robot: Robot): Positions {
   return Object.fromEntries(counted);
 }
 
-/** Set or take away (`undefined`) what is done at a keyframe. */
+/** Sets or removes (`undefined`) a step at a keyframe. */
 export function setAction<D extends ActionKind>(movement: Movement, index: number, deed: D, value: KeyframeActions[D] | undefined): Movement {
   return withKeyframe(movement, index, (old) => {
     const { time_s, position_rad, ...deeds } = old;
@@ -128,7 +122,7 @@ export function setAction<D extends ActionKind>(movement: Movement, index: numbe
   });
 }
 
-/** What is done there, in the order of doing. */
+/** The steps of a keyframe, in order of execution. */
 export function actionsOf(keyframe: KeyframeActions): KeyframeActions {
   return Object.fromEntries(ACTION_KINDS.filter((deed) => keyframe[deed] !== undefined).map((deed) => [deed, keyframe[deed]]));
 }
@@ -156,7 +150,7 @@ export function setTime(movement: Movement, index: number, time: number, shiftin
   };
 }
 
-/** A keyframe after another one: in the middle of what follows, or a second later. It names what that one names. */
+/** Inserts a keyframe after another one, with the same joints: in the middle of the gap, or one second later. */
 export function addAfter(movement: Movement, index: number, positions: Positions): Movement {
   const { keyframes } = movement;
   const [old, after] = [keyframes[index], keyframes[index + 1]];
@@ -168,7 +162,7 @@ export function addAfter(movement: Movement, index: number, positions: Positions
   return room ? next : setTime(next, index + 1, old.time_s + 1, true);
 }
 
-/** The same once more, a second later, with all that follows. */
+/** Duplicates a keyframe one second later; later keyframes are shifted. */
 export function duplicate(movement: Movement, index: number): Movement {
   const old = movement.keyframes[index];
   if (old === undefined) return movement;
@@ -176,13 +170,13 @@ export function duplicate(movement: Movement, index: number): Movement {
   return setTime(next, index + 1, old.time_s + 1, true);
 }
 
-/** Without a keyframe; there is always one. */
+/** Removes a keyframe, except the last one. */
 export function remove(movement: Movement, index: number): Movement {
   if (movement.keyframes.length < 2) return movement;
   return startAtZero({ ...movement, keyframes: movement.keyframes.toSpliced(index, 1) });
 }
 
-/** The first keyframe at 0. */
+/** Shifts all keyframes so that the first is at 0. */
 export function startAtZero(movement: Movement): Movement {
   const begin = movement.keyframes[0]?.time_s ?? 0;
   return {

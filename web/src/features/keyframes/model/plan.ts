@@ -5,16 +5,14 @@ import type { Joint } from "../../../shared/mqtt/protocol.generated";
 import { at, Curve, curveOf, fitted, moments, type Stay } from "./timeline-layout";
 import { type Positions, type Keyframe, type Movement, type Robot, DEED_S, hasAction } from "./keyframes";
 
-// ---------------------------------------------------------------- how it is played
-
-/** One joint in one piece of the movement: from where it rests to where it rests again. */
+/** One joint between two poses at which it rests. */
 interface Track {
   joint: Joint;
   stays: Stay[];
 }
 
 interface Piece {
-  /** Indices of the keyframes where it begins and ends. */
+  /** Indices of the first and last keyframe. */
   first: number;
   last: number;
   gaps: number[];
@@ -53,22 +51,21 @@ export function pieces(keyframes: readonly Keyframe[], robot: Robot): Piece[] {
   return found;
 }
 
-/** What the robot will do, and when. */
-export interface Plan {
-  /** Where time would be at each keyframe if the robot played it now [s]: later than asked where that is too fast. */
+interface Plan {
+  /** When the robot would reach each keyframe [s]: later than requested if that is too fast. */
   reached_s: number[];
   duration_s: number;
-  /** Where joints are at a time of `reached_s` [rad]. */
+  /** Joint positions at a time of `reached_s` [rad]. */
   at: (time: number) => Positions;
-  /** That time on the scale of the keyframes' own times [s]. */
+  /** Converts that time to the scale of the keyframes [s]. */
   asked: (time: number) => number;
-  /** The other way round. */
+  /** The inverse of `asked`. */
   played: (asked: number) => number;
 }
 
 export function plan({ keyframes }: Movement, robot: Robot): Plan {
   const reached = [0];
-  /** The two scales side by side: where something is done one of them stands still. */
+  /** Corresponding times on both scales: one of them stops during a step. */
   const scale: [played: number, asked: number][] = [[0, 0]];
   const parts: { begin: number; end: number; curves: [string, Curve][] }[] = [];
   let begin = hasAction(keyframes[0] ?? {}) ? DEED_S : 0;
@@ -102,8 +99,8 @@ export function plan({ keyframes }: Movement, robot: Robot): Plan {
   };
 }
 
-/** A value on one scale from that on another; beyond their ends that of the ends. */
-export function between(value: number, from: readonly number[], to: readonly number[]): number {
+/** Maps a value from one scale to another, clamped to their ends. */
+function between(value: number, from: readonly number[], to: readonly number[]): number {
   const end = from.findIndex((one) => one > value);
   if (end === 0) return at(to, 0);
   if (end < 0) return at(to, to.length - 1);
@@ -111,7 +108,7 @@ export function between(value: number, from: readonly number[], to: readonly num
   return at(to, end - 1) + share * (at(to, end) - at(to, end - 1));
 }
 
-/** Joints that hang together as they do: the range that narrows, and those that one motor moves. */
+/** Applies coupled joints and position-dependent limits. */
 export function poseAt(positions: Positions, robot: Robot): Positions {
   const all: Record<string, number> = { ...positions };
   for (const { joint, depends_on, table } of robot.position_dependent_limits) {
@@ -127,7 +124,7 @@ export function poseAt(positions: Positions, robot: Robot): Positions {
   return all;
 }
 
-/** The range that is left where the other joint is. */
+/** The range that remains at a position of the other joint. */
 export function room(table: KnownDescription["position_dependent_limits"][number]["table"], where: number): [number, number] {
   const by = table.map((row) => row[0]);
   return [1, 2].map((column) => between(where, by, table.map((row) => row[column] ?? NaN))) as [number, number];

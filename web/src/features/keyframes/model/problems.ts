@@ -4,13 +4,11 @@ import type { Joint } from "../../../shared/mqtt/protocol.generated";
 import { at, Curve, curveOf, FITS, moments, type Limiting } from "./timeline-layout";
 import { ACTION_KINDS, type ActionKind, type Movement, type Robot, LONGEST_S, SHORTEST_S, LONGEST_TEXT, SAME_RAD, normalize, tidyTime, withKeyframe, setAction, setTime, startAtZero, inOrder } from "./keyframes";
 
-// ---------------------------------------------------------------- checks
-
 /** A problem at one keyframe, and its fix. A `warning` does not prevent running. */
 export interface Problem {
   severity: "error" | "warning";
   keyframe: number;
-  /** Joint's name, where one is meant. */
+  /** The affected joint, if any. */
   joint: string | null;
   what:
     | { kind: "range"; lower_rad: number; upper_rad: number }
@@ -100,7 +98,7 @@ function placeProblems(movement: Movement, index: number, robot: Robot): Problem
   });
 }
 
-/** Where a joint is at a keyframe [rad]: as it says, or on the way between those that do; `undefined`: none does. */
+/** A joint's position at a keyframe [rad], interpolated if it is not set; `undefined`: never set. */
 export function placeOf({ keyframes }: Movement, index: number, joint: string): number | undefined {
   const said = keyframes.flatMap(({ time_s, position_rad }) => {
     const place = position_rad[joint];
@@ -139,7 +137,7 @@ const ACTIONS: Readonly<Record<ActionKind, string>> = {
   go_to: "go_to",
 };
 
-/** Whether a robot can do such a thing at a keyframe, by its own description. */
+/** Whether the robot's description supports a step. */
 export function supports(robot: Robot, deed: ActionKind): boolean {
   return robot.actions.includes(ACTIONS[deed]);
 }
@@ -162,12 +160,12 @@ function lateJoints(movement: Movement, robot: Robot): Problem[] {
 interface TooFast {
   joint: Joint;
   by: Limiting;
-  /** How long it must take in all, and takes [s]. */
+  /** The required and the available time, relative [s]. */
   over: number;
   lasts_s: number;
 }
 
-/** What is fastest of all that ends at a keyframe, by its index. */
+/** The fastest joint of each keyframe, by the keyframe's index. */
 function fastest({ keyframes }: Movement, robot: Robot): Map<number, TooFast> {
   const found = new Map<number, TooFast>();
   for (const { first, gaps, tracks } of pieces(keyframes, robot)) {
@@ -199,7 +197,7 @@ function fastProblems(movement: Movement, robot: Robot): Problem[] {
   });
 }
 
-/** With so much more time before a keyframe that all that ends there is slow enough. */
+/** The movement with enough time before a keyframe for all joints. */
 function slowed(movement: Movement, keyframe: number, robot: Robot): Movement {
   let now = movement;
   for (let tries = 0; tries < 60; tries += 1) {
@@ -212,7 +210,7 @@ function slowed(movement: Movement, keyframe: number, robot: Robot): Movement {
   return now;
 }
 
-/** With as much time everywhere as the robot's limits ask for. */
+/** The movement with enough time everywhere. */
 export function stretchAll(movement: Movement, robot: Robot): Movement {
   let now = movement;
   for (let tries = 0; tries < 20; tries += 1) {

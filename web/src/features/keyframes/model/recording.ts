@@ -4,13 +4,13 @@ import { startAtZero, poseOf, normalize, type Keyframe, type Movement, type Posi
 import type { KnownEvent, KnownTelemetry } from "../../../shared/mqtt/parse-messages";
 
 export interface Sample {
-  /** Since the beginning [s]. */
+  /** Since the start [s]. */
   time_s: number;
   position_rad: readonly number[];
 }
 
-/** Nothing was heard between these times [s]: the way there is a guess. */
-export interface Gap {
+/** No telemetry arrived between these times [s]; the motion is interpolated. */
+interface Gap {
   from_s: number;
   to_s: number;
 }
@@ -22,9 +22,9 @@ export interface Recording {
 }
 
 const NOTHING: Recording = { samples: [], gaps: [], said: [] };
-/** Five samples of 20 a second. */
+/** Five samples at 20 Hz. */
 const GAP_S = 0.25;
-/** Twenty minutes of 20 a second. */
+/** Twenty minutes at 20 Hz. */
 const MOST = 24_000;
 
 export class Recorder {
@@ -49,7 +49,7 @@ export class Recorder {
     this.#tell();
   }
 
-  /** On the robot's own clock; where that has begun again, on the wall's. */
+  /** Uses the robot's clock; after its restart, the wall clock. */
   hear(message: KnownTelemetry): void {
     if (!this.#running.value || message === this.#last) return;
     const last = this.#last;
@@ -64,7 +64,6 @@ export class Recorder {
     else if (this.#samples.length % 10 === 0 || last === null) this.#tell();
   }
 
-  /** What the robot said is a fact of this moment. */
   hearEvent(event: KnownEvent): void {
     const text = event.data["text"];
     if (!this.#running.value || event.kind !== "speech-started" || typeof text !== "string" || this.#last === null) return;
@@ -73,7 +72,7 @@ export class Recorder {
     this.#tell();
   }
 
-  /** Of an earlier page. */
+  /** Restores a recording of a previous page. */
   restore(take: Recording): void {
     this.#take.value = take;
   }
@@ -87,7 +86,7 @@ export class Recorder {
   }
 }
 
-/** Between two times; they count from the first. */
+/** The part between two times, starting at 0. */
 export function trim(take: Recording, from_s: number, to_s: number): Recording {
   const within = (time: number): boolean => time >= from_s && time <= to_s;
   return {
@@ -97,7 +96,7 @@ export function trim(take: Recording, from_s: number, to_s: number): Recording {
   };
 }
 
-/** Indices of the samples that are kept, so that none is further from the lines between them (Ramer–Douglas–Peucker). */
+/** Indices of samples such that all others are within the tolerance of the lines between them (Ramer–Douglas–Peucker). */
 export function trimmedGaps(samples: readonly Sample[], toleranceRad: number, always: ReadonlySet<number>): number[] {
   const found = new Set([0, samples.length - 1, ...always]);
   const open = pairs([...found].sort((a, b) => a - b));

@@ -1,10 +1,7 @@
-/**
- * Keyframes as a plain movement script, and back. A script is read back only when it is exactly what would be written
- * from the keyframes in it: a script that was edited by hand opens in the code editor and is never overwritten here.
- */
+/** Converts keyframes to a movement script and back. Only an unedited script is read back: others open in the code editor. */
 import { ACTION_KINDS, actionsOf, type ActionKind, type KeyframeActions, type Keyframe, type Movement } from "./keyframes";
 
-/** As the cloud takes a script [characters]. */
+/** The server's limit [characters]. */
 export const LONGEST_SCRIPT = 65_536;
 const OPENS = "KEYFRAMES = [";
 const QUOTES = '"""';
@@ -33,13 +30,13 @@ robot.play(KEYFRAMES, speed=min(2, max(0.1, float(parameters.get("speed", 1)))))
 `;
 }
 
-/** One line that ends no docstring and begins no escape. */
+/** One line without docstring ends or escapes. */
 function plain(text: string): string {
   const line = text.replaceAll('"', "'").replaceAll("\\", "/").replaceAll(/\s+/gu, " ").trim();
   return line === "" ? "A movement." : line;
 }
 
-/** JSON of these types is Python too. */
+/** JSON of these types is valid Python. */
 function literal({ time_s, position_rad, ...deeds }: Keyframe): string {
   const spaced = (value: unknown): string => {
     if (typeof value !== "object" || value === null) return JSON.stringify(value);
@@ -50,7 +47,7 @@ function literal({ time_s, position_rad, ...deeds }: Keyframe): string {
   return spaced({ time_s, position_rad, ...actionsOf(deeds) });
 }
 
-export type ParsedScript = { kind: "keyframes"; movement: Movement } | { kind: "changed" } | { kind: "other" };
+type ParsedScript = { kind: "keyframes"; movement: Movement } | { kind: "changed" } | { kind: "other" };
 
 /** `changed`: keyframes with manual edits. `other`: not written by the editor. */
 export function readScript(source: string): ParsedScript {
@@ -68,7 +65,7 @@ export function readScript(source: string): ParsedScript {
   }
 }
 
-/** What was kept in a browser, where it still is a movement. */
+/** A stored movement; `null` if invalid. */
 export function readMovement(value: unknown): Movement | null {
   try {
     const { description, keyframes } = object(value, "description", "keyframes");
@@ -105,7 +102,7 @@ function deedOf(deed: ActionKind, how: unknown): KeyframeActions[ActionKind] {
   }
 }
 
-/** Throws `TypeError`, as the others do. Without names any will do. */
+/** Throws `TypeError`. Without names any field is allowed. */
 function object(value: unknown, ...names: string[]): Record<string, unknown> {
   if (typeof value !== "object" || value === null || Array.isArray(value)) throw new TypeError("not an object");
   const other = Object.keys(value).find((name) => names.length > 0 && !names.includes(name));

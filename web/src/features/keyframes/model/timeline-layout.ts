@@ -1,36 +1,36 @@
 /**
- * Where a joint is between keyframes, as the robot will play them: `device_agent/runtime/planning/keyframe_trajectory.py` does the same, and
- * `tests/unit/device_agent/runtime/planning/timelines.json` holds both equal. Between two places a polynomial of the fifth degree that accelerates
- * at neither; its speed where it passes is the harmonic mean of what it needs before and after, so that it never goes back.
+ * Joint positions between keyframes, computed as in `device_agent/runtime/planning/keyframe_trajectory.py`;
+ * `tests/unit/device_agent/runtime/planning/timelines.json` verifies both. Quintic polynomials without acceleration at
+ * keyframes. The velocity at a keyframe is the harmonic mean of the adjacent mean velocities, so that motion never
+ * reverses.
  */
 import { clamp } from "../../../shared/lib/angles";
 import type { Joint } from "../../../shared/mqtt/protocol.generated";
 
-export type JointLimits = Pick<Joint, "max_velocity_rad_s" | "max_acceleration_rad_s2" | "max_jerk_rad_s3">;
+type JointLimits = Pick<Joint, "max_velocity_rad_s" | "max_acceleration_rad_s2" | "max_jerk_rad_s3">;
 
-/** One place at which a joint is at a time [s], [rad]. */
+/** A joint's position [rad] at a keyframe. */
 export interface Stay {
   number: number;
   place: number;
 }
 
-/** What limits a stretch most. */
 export type Limiting = "velocity" | "acceleration" | "jerk";
 
-export interface Stretch {
-  /** How many times as long it must take; up to 1 it is slow enough. */
+interface Stretch {
+  /** Required time relative to the available time; up to 1 is feasible. */
   over: number;
   by: Limiting;
 }
 
-/** More than this is too fast: a little is rounding. */
+/** Tolerance for rounding. */
 export const FITS = 1.0005;
 const LOOKS = 33;
 const TRIES = 100;
 
 type Parts = readonly [way: number, begin: number, end: number];
 
-/** Rows: place, speed, acceleration, jerk; columns: of the way, of the speed at the beginning, at the end. */
+/** Rows: position, velocity, acceleration, jerk; columns: factors of the distance, the start and the end velocity. */
 function shape(u: number): readonly Parts[] {
   const [u2, u3, u4] = [u * u, u ** 3, u ** 4];
   return [
@@ -47,7 +47,7 @@ function sum(row: Parts | undefined, parts: Parts): number {
   return row === undefined ? 0 : row[0] * parts[0] + row[1] * parts[1] + row[2] * parts[2];
 }
 
-/** One joint's way through its places. Before and after it rests. */
+/** One joint's curve through its positions. It rests before and after it. */
 export class Curve {
   readonly times: readonly number[];
   readonly places: readonly number[];
@@ -63,7 +63,7 @@ export class Curve {
     });
   }
 
-  /** Where it is at a time [rad]. */
+  /** The position at a time [rad]. */
   at(time: number): number {
     const end = this.times.findIndex((one) => one > time);
     if (end === 0) return at(this.places, 0);
@@ -74,7 +74,7 @@ export class Curve {
     return clamp(from + sum(row, this.#parts(end)), Math.min(from, to), Math.max(from, to));
   }
 
-  /** How fast each stretch is for a joint; the first leads to the second place. */
+  /** The demand of each segment on a joint; the first segment ends at the second position. */
   stretches(joint: JointLimits): Stretch[] {
     return this.places.slice(1).map((_, index) => this.#stretch(index + 1, joint));
   }
@@ -117,8 +117,8 @@ export function curveOf(stays: readonly Stay[], times: readonly number[]): Curve
 }
 
 /**
- * The gaps between keyframes [s], each as long as the limits ask for: as the robot does it, when they are too short. A
- * longer one changes the speed in others, hence again and again.
+ * The gaps between keyframes [s], extended where the limits require it. Extending one changes the velocity in others,
+ * so this iterates.
  */
 export function fitted(gaps: readonly number[], tracks: readonly { joint: JointLimits; stays: readonly Stay[] }[]): number[] {
   let now = [...gaps];

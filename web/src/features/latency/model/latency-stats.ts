@@ -2,23 +2,23 @@
 import type { Path, Sample, StoredLatency, Transport } from "../../../shared/api/latency";
 import { percentile } from "./round-trip";
 
-/** What is drawn as one line: one device, transport and path. */
+/** One line of a plot: one device, transport and path. */
 export interface Line {
   device: string;
   transport: Transport;
   path: Path;
-  /** In the order of time. */
+  /** In order of time. */
   samples: readonly Sample[];
-  /** How many the cloud has counted in the span; more than there are samples where older ones are only in its sums. */
+  /** Samples that the cloud has counted in the time span; old ones are only part of its statistics. */
   stored: number;
 }
 
-export interface LatencyQuery {
-  /** `null`: all of them. */
+interface LatencyQuery {
+  /** `null`: all. */
   device: string | null;
   transport: Transport | null;
   path: Path | null;
-  /** Nothing older [ms since 1970]. */
+  /** Start of the time span [ms since 1970]. */
   sinceMs: number;
 }
 
@@ -26,12 +26,7 @@ export function lineKey({ device, transport, path }: Pick<Line, "device" | "tran
   return `${device} ${transport} ${path}`;
 }
 
-/**
- * Lines of what is stored and of what was measured here and is not stored yet.
- *
- * @param stored By device.
- * @param fresh Measured on this page; a sample that has come back from the cloud counts once.
- */
+/** Joins stored samples and this page's unsaved ones (`fresh`); each sample counts once. */
 export function linesOf(stored: ReadonlyMap<string, readonly StoredLatency[]>, fresh: readonly Line[], wanted: LatencyQuery): Line[] {
   const found = new Map<string, Line>();
   for (const [device, items] of stored) {
@@ -55,7 +50,7 @@ export function linesOf(stored: ReadonlyMap<string, readonly StoredLatency[]>, f
     .sort((one, other) => lineKey(one).localeCompare(lineKey(other)));
 }
 
-export interface Figures {
+interface Figures {
   count: number;
   meanMs: number;
   medianMs: number;
@@ -64,7 +59,7 @@ export interface Figures {
   maxMs: number;
 }
 
-/** Of samples as they came; there must be one at least. */
+/** Statistics of at least one sample. */
 export function figuresOf(samples: readonly Sample[]): Figures {
   const sorted = samples.map(({ ms }) => ms).sort((one, other) => one - other);
   return {
@@ -77,7 +72,7 @@ export function figuresOf(samples: readonly Sample[]): Figures {
   };
 }
 
-/** For each time the share of samples that took no longer, 0…1. */
+/** For each time, the share of samples up to it, 0…1. */
 export function distribution(samples: readonly Sample[]): [ms: number[], share: number[]] {
   const sorted = samples.map(({ ms }) => ms).sort((one, other) => one - other);
   const ends = [...new Set(sorted)];

@@ -10,11 +10,11 @@ import { newId } from "../../../shared/lib/ids";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
 import type { Line } from "./latency-stats";
 
-/** As many as in the papers. */
+/** As in the papers. */
 export const TIMES = 20;
-/** So that one does not wait for the one before in some queue [ms]. */
+/** Avoids queueing behind the previous request [ms]. */
 const BETWEEN_MS = 100;
-/** A single measurement of a room device is answered, or has failed, within this time [ms]. */
+/** Timeout of a single measurement of a room device [ms]. */
 const SHOT_TIMEOUT_MS = 10_000;
 
 /** `cloud`: the server by HTTP; `broker`: the broker over this page's own connection; `device`: a room device measures once. */
@@ -22,13 +22,13 @@ export type ProbeKind = "cloud" | "broker" | "device";
 
 type Kind = Pick<LatencyBatch, "transport" | "path">;
 
-export const KINDS: Readonly<Record<ProbeKind, Kind>> = {
+const KINDS: Readonly<Record<ProbeKind, Kind>> = {
   cloud: { transport: "http", path: "operator-cloud" },
   broker: { transport: "websocket", path: "operator-cloud" },
   device: { transport: "http", path: "operator-device" },
 };
 
-export interface Progress {
+interface Progress {
   way: ProbeKind;
   done: number;
   of: number;
@@ -43,7 +43,7 @@ interface Batch {
 
 const SHOOT = "shoot";
 
-/** What can be asked of a device so that nothing moves. */
+/** The probes that a device supports without motion. */
 export function probeKindsOf(device: DeviceStore): ProbeKind[] {
   const canShoot = device.description.value?.actions.includes(SHOOT) === true;
   return canShoot && device.info.value.role !== "viewer" ? ["cloud", "broker", "device"] : ["cloud", "broker"];
@@ -60,12 +60,12 @@ export class LatencyProbe {
   readonly #why = signal("");
   #ended = new AbortController();
 
-  /** What is being measured; `null`: nothing. */
+  /** The running measurement; `null`: none. */
   readonly progress: ReadonlySignal<Progress | null> = this.#progress;
-  /** Why it ended early, or could not be stored; empty otherwise. */
+  /** Why it ended early or could not be stored; empty otherwise. */
   readonly why: ReadonlySignal<string> = this.#why;
 
-  /** `epoch`: of the lease that this page holds, if it does. */
+  /** `epoch`: the epoch of this page's lease, if any. */
   constructor(api: Api, link: Link, device: DeviceStore, epoch: () => number | null, betweenMs = BETWEEN_MS) {
     this.#api = api;
     this.#link = link;
@@ -74,17 +74,16 @@ export class LatencyProbe {
     this.#betweenMs = betweenMs;
   }
 
-  /** What was measured here. */
   get lines(): Line[] {
     return this.#batches.value.map(({ way, samples }) => ({ ...KINDS[way], device: this.#device.id, samples, stored: 0 }));
   }
 
-  /** Whether something was measured and is not stored. */
+  /** Whether samples are not stored yet. */
   get unstored(): boolean {
     return this.#progress.value === null && this.#batches.value.some(({ stored, samples }) => !stored && samples.length > 0);
   }
 
-  /** Measure each way in turn, and store it. Until its end, or until `stop`. */
+  /** Measures and stores each path in turn, until the end or `stop`. */
   async run(ways: readonly ProbeKind[]): Promise<void> {
     if (this.#progress.value !== null) return;
     this.#ended = new AbortController();
@@ -97,12 +96,12 @@ export class LatencyProbe {
     await this.store();
   }
 
-  /** End it; what was measured stays. */
+  /** Stops; the samples stay. */
   stop(): void {
     this.#ended.abort();
   }
 
-  /** Store what is not. Who only watches adds nothing to a device's record. */
+  /** Stores pending samples. Viewers cannot store any. */
   async store(): Promise<void> {
     if (this.#device.info.value.role === "viewer") return;
     for (const batch of this.#batches.value) {

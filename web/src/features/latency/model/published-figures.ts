@@ -1,11 +1,10 @@
 /** Response times published in the papers, for comparison. */
 import type { Path } from "../../../shared/api/latency";
 
-/** One published figure. Nothing here was measured by this page. */
 export interface Published {
   id: string;
   ms: number;
-  /** Which of our parts it can be held beside. */
+  /** The comparable paths. */
   paths: readonly Path[];
   source: "ur5" | "telescope";
 }
@@ -35,7 +34,7 @@ const MESSAGE: readonly Path[] = ["operator-device", "command-answered"];
 const REACTION: readonly Path[] = ["operator-device", "command-started"];
 const CLIENT: readonly Path[] = ["operator-cloud", "device-cloud", "operator-device"];
 
-/** Averages, and where a paper printed them the best and the worst. */
+/** Averages, and the minimum and maximum where a paper states them. */
 export const PUBLISHED: readonly Published[] = [
   { id: "ur5-http", ms: 2994.6, paths: MESSAGE, source: "ur5" },
   { id: "ur5-xmpp", ms: 824.25, paths: MESSAGE, source: "ur5" },
@@ -46,7 +45,7 @@ export const PUBLISHED: readonly Published[] = [
   { id: "telescope-client-best", ms: 36, paths: CLIENT, source: "telescope" },
 ];
 
-/** Those that can be held beside one part, or all. */
+/** The figures that are comparable with a path, or all. */
 export function publishedFor(path: Path | null): readonly Published[] {
   return path === null ? PUBLISHED : PUBLISHED.filter(({ paths }) => paths.includes(path));
 }

@@ -1,20 +1,20 @@
 /** Time from sending a setpoint to the telemetry that echoes it, on this page's clock. */
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 
-export interface RoundTripFigures {
+interface RoundTripFigures {
   latestMs: number;
   medianMs: number;
   p95Ms: number;
   samples: number;
 }
 
-/** Nearest-rank percentile of values in rising order, `share` in 0…1. */
+/** Nearest-rank percentile of sorted values, `share` in 0…1. */
 export function percentile(sorted: readonly number[], share: number): number {
   const rank = Math.max(1, Math.ceil(share * sorted.length));
   return sorted[rank - 1] ?? NaN;
 }
 
-/** Figures over the newest samples; `null` until there is one. */
+/** Statistics of the newest samples; `null` without one. */
 export class RoundTrip {
   readonly #window: number;
   readonly #samples: number[] = [];
@@ -45,7 +45,7 @@ export class RoundTrip {
     };
   }
 
-  /** A new lease: sequences start again. */
+  /** Starts a new lease, whose sequence numbers start again. */
   restart(): void {
     this.#lastSequence = 0;
     this.#samples.length = 0;

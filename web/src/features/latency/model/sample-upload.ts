@@ -7,16 +7,16 @@ import { ApiError } from "../../../shared/api/http";
 import { newId } from "../../../shared/lib/ids";
 import type { RoundTrip } from "./round-trip";
 
-export const EVERY_MS = 10_000;
-/** The cloud takes no more at once, and keeps no more as they came. */
+const EVERY_MS = 10_000;
+/** The cloud's limit per batch. */
 const MOST = 1_000;
 
-/** What waits for the cloud to come back; later ones are let go. */
+/** Maximum number of pending batches; later ones are dropped. */
 const MOST_PARCELS = 6;
 
 type Sample = LatencyBatch["samples"][number];
 
-/** With its key it counts once, however often it is sent. */
+/** The key makes repeated sending idempotent. */
 interface Parcel {
   key: string;
   batch: LatencyBatch;
@@ -27,9 +27,9 @@ export class LatencySamples {
   readonly #device: string;
   readonly #timer: ReturnType<typeof setInterval>;
   readonly #forget: () => void;
-  /** From a setpoint to the telemetry that answers it, over the broker. */
+  /** From a setpoint to the telemetry that echoes it, over the broker. */
   readonly #setpoints: Sample[] = [];
-  /** From a call to its answer, over HTTP: of the calls that bring these times. */
+  /** From an HTTP call to its response: the uploads themselves. */
   readonly #calls: Sample[] = [];
   readonly #parcels: Parcel[] = [];
   #sending = false;
@@ -68,10 +68,10 @@ export class LatencySamples {
     const askedAt = now();
     try {
       await this.#api.addLatency(this.#device, parcel.batch, parcel.key);
-      // Alone they are no reason to send anything.
+      // These samples alone do not cause an upload.
       if (parcel.batch.path === "operator-device") this.#calls.push({ at_ms: Date.now(), ms: now() - askedAt });
     } catch (error) {
-      // Refused as they are, they would be again.
+      // A rejected batch would be rejected again.
       const later = error instanceof ApiError && (error.status === 0 || error.status === 429 || error.status >= 500);
       if (later && this.#parcels.length < MOST_PARCELS) this.#parcels.push(parcel);
     }

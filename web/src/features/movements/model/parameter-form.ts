@@ -2,7 +2,7 @@
 import { degrees, radians } from "../../../shared/lib/angles";
 import type { ObjectSchema, Parameters, Schema } from "../../../shared/api/movement-library";
 
-/** `list`: numbers, one after the other. `json`: any value without a field kind of its own. */
+/** `list`: a sequence of numbers. `json`: any other value. */
 export type FieldKind = "number" | "integer" | "text" | "choice" | "yes-no" | "list" | "json";
 
 export interface Field {
@@ -10,12 +10,12 @@ export interface Field {
   kind: FieldKind;
   title: string;
   description: string;
-  /** As it is shown: angles in degrees. */
+  /** The displayed unit: degrees for angles. */
   unit: string;
   required: boolean;
   schema: Schema;
   choices: readonly string[];
-  /** As they are shown. */
+  /** In the displayed unit. */
   least: number | null;
   most: number | null;
 }
@@ -24,10 +24,10 @@ export type Wrong =
   | { kind: "missing" | "number" | "whole" | "json" }
   | { kind: "above" | "below" | "least" | "most" | "shorter" | "longer" | "fewer" | "more"; limit: number };
 
-/** What stands in a form, by field. */
+/** The entered text by field. */
 export type Filled = Readonly<Record<string, string>>;
 
-export interface Read {
+interface Read {
   values: Parameters;
   wrong: Readonly<Record<string, Wrong>>;
 }
@@ -51,7 +51,7 @@ export function fieldsOf(schema: ObjectSchema | null): Field[] {
   }));
 }
 
-/** The texts of a form: of `used` where that still fits, else of the defaults. */
+/** Initial texts: the last used values if they are still valid, otherwise the defaults. */
 export function fill(fields: readonly Field[], used: Parameters = {}): Filled {
   return Object.fromEntries(fields.map((field) => [field.name, startText(field, used[field.name])]));
 }
@@ -100,7 +100,7 @@ function readNumber(schema: Schema, text: string, whole: boolean): Found {
   const wrong = outside(schema, shown);
   if (wrong !== null) return { wrong };
   if (schema.type !== "number" && schema.type !== "integer") return { value };
-  // A limit in degrees is rounded for people: at the limit the exact one counts.
+  // A limit in degrees is rounded for display: use the exact limit at the limit.
   return { value: Math.min(Math.max(value, schema.minimum ?? value), schema.maximum ?? value) };
 }
 
@@ -191,7 +191,7 @@ function rounded(value: number): number {
   return Math.round(value * 100) / 100;
 }
 
-/** `pause_s` → "Pause": the unit is said beside the field. */
+/** `pause_s` → "Pause": the unit is shown beside the field. */
 function named(name: string): string {
   const words = name.replace(/_(m|s|ms|rad|rad_s|m_s)$/, "").replaceAll("_", " ");
   return words.charAt(0).toUpperCase() + words.slice(1);

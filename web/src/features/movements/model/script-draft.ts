@@ -4,10 +4,10 @@ import { ApiError, sentence } from "../../../shared/api/http";
 import type { Draft, StoredValue } from "../../../shared/lib/local-storage";
 import { MovementChanged, type Library, type Movement, type MovementSource } from "../../../shared/api/movement-library";
 
-export type Loading = { kind: "loading" } | { kind: "there" } | { kind: "failed"; why: string };
+type Loading = { kind: "loading" } | { kind: "there" } | { kind: "failed"; why: string };
 
 /** Another user saved meanwhile; `theirs` is `null` if the movement was deleted. */
-export interface Conflict {
+interface Conflict {
   theirs: MovementSource | null;
 }
 
@@ -27,19 +27,18 @@ export class ScriptDraft {
   #basedOn = 0;
 
   readonly loading: ReadonlySignal<Loading> = this.#loading;
-  /** What was saved last, as far as this page knows; `null`: nothing yet. */
+  /** The last saved version known to this page; `null`: none. */
   readonly base: ReadonlySignal<MovementSource | null> = this.#base;
   readonly text: ReadonlySignal<string> = this.#text;
   readonly saving: ReadonlySignal<boolean> = this.#saving;
-  /** Why the last save was refused; empty otherwise. */
+  /** Why the last save was rejected; empty otherwise. */
   readonly why: ReadonlySignal<string> = this.#why;
   readonly conflict: ReadonlySignal<Conflict | null> = this.#conflict;
-  /** When the text was written that this browser has kept and that is shown again [ms since 1970]; else `null`. */
+  /** When the restored text was written [ms since 1970]; `null`: not restored. */
   readonly restored: ReadonlySignal<number | null> = this.#restored;
-  /** Whether there is something to save. */
   readonly changed = computed(() => this.#base.value === null || this.#text.value !== this.#base.value.source);
 
-  /** `template`: what a movement begins with that there is not yet. */
+  /** `template`: the initial text of a new movement. */
   constructor(library: Library, robotType: string, name: string, kept: StoredValue<Draft>, template: string) {
     this.#library = library;
     this.robotType = robotType;
@@ -71,7 +70,7 @@ export class ScriptDraft {
     this.#keep();
   }
 
-  /** Go back to what is saved; returns the text that was given up. */
+  /** Discards the changes; returns the discarded text. */
   discard(): string {
     const given = this.#text.value;
     this.#text.value = this.#base.value?.source ?? this.#template;
@@ -82,7 +81,7 @@ export class ScriptDraft {
     return given;
   }
 
-  /** Saves the draft. Returns whether it is saved now. The text stays after an error. */
+  /** Saves the text and returns whether it was saved. The text stays after an error. */
   async save(): Promise<boolean> {
     if (this.#saving.value) return false;
     const source = this.#text.value;
@@ -108,7 +107,7 @@ export class ScriptDraft {
     return this.save();
   }
 
-  /** Go on with what others have saved; returns the text that was given up. */
+  /** Uses the other user's version; returns the discarded text. */
   takeTheirs(): string {
     const theirs = this.#conflict.value?.theirs ?? null;
     this.#base.value = theirs;

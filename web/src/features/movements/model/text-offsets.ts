@@ -8,7 +8,7 @@ export interface Place {
   message: string;
 }
 
-/** A mark's place in a text, as its offset; nothing lies outside of it, and nothing is empty where it can be helped. */
+/** The offsets of a mark in a text: never outside of it, and not empty if possible. */
 export function placed(text: string, { severity, message, line, column, end_line, end_column }: Mark): Place {
   const lines = text.split(/\r\n?|\n/);
   const starts = [0];
@@ -22,7 +22,7 @@ export function placed(text: string, { severity, message, line, column, end_line
   return { from, to: Math.max(at(end_line, end_column), Math.min(from + 1, text.length)), severity, message };
 }
 
-/** Where a run of this script failed, when its end says so: the jail begins with the line. */
+/** The line of a failed run, which the sandbox puts first in the error; `null`: none. */
 export function failureMark(why: string): Mark | null {
   const found = /\bline (\d+): (.+)/s.exec(why);
   if (found === null) return null;

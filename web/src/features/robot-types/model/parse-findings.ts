@@ -1,6 +1,6 @@
 /** Parses validation errors into file, line and kind, so that the page can give advice. */
 
-export type FindingKind =
+type FindingKind =
   | "range"
   | "missing"
   | "torn"
@@ -24,15 +24,15 @@ export type FindingKind =
   | "other";
 
 export interface Finding {
-  /** Name in the folder; empty where it is not about one file. */
+  /** Relative to the folder; empty: not about one file. */
   file: string;
   line: number | null;
   kind: FindingKind;
-  /** What the check said, without file and line. */
+  /** The message without file and line. */
   said: string;
   /** The affected name, such as a joint or file; may be empty. */
   about: string;
-  /** Of a range: what the model allows [rad]. */
+  /** For a range error: the range that the model allows [rad]. */
   range_rad: readonly [number, number] | null;
 }
 
@@ -40,7 +40,7 @@ const FILE = /^([\w./ -]+\.(?:xml|toml|py|stl|obj|png)):\s*/;
 const LINES = [/\(at line (\d+)[^)]*\)/, /\(line (\d+)\)/, /Line number=(\d+)/, /\bline (\d+)/i];
 const RANGE = /range of (?:joint|actuator) '[^']*' is (-?[\d.]+) to (-?[\d.]+)/;
 
-/** The first that fits; what is about a line alone comes last. */
+/** The first match applies, so patterns with only a line are last. */
 const KINDS: readonly (readonly [FindingKind, RegExp])[] = [
   ["range", RANGE],
   ["missing", /is not among the files/],
@@ -90,7 +90,7 @@ function kindOf(file: string, said: string): FindingKind {
   return "other";
 }
 
-/** The line is shown beside it. */
+/** Removes the line number, which is shown separately. */
 function tidy(said: string): string {
   return said
     .replace(/\s*\((?:at )?line \d+[^)]*\)/, "")

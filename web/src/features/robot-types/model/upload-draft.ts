@@ -6,17 +6,17 @@ import { ApiError, sentence } from "../../../shared/api/http";
 import type { Look, RobotType, RobotTypes, TypeModel } from "../../../shared/api/robot-types";
 import { selectFiles, MANIFEST, MAX_BYTES, packFiles, size, type Files } from "./upload-files";
 
-export type DraftStep = "empty" | "sending" | "checking" | "good" | "wrong" | "unsent" | "saving" | "saved";
+type DraftStep = "empty" | "sending" | "checking" | "good" | "wrong" | "unsent" | "saving" | "saved";
 
-/** How a movement that came with the type fared when it was saved. */
-export interface SavedMovement {
+/** The result of saving one of the type's movements. */
+interface SavedMovement {
   name: string;
-  /** Empty: it was accepted. */
+  /** The error, or "". */
   why: string;
 }
 
-/** What is wrong before anything is sent. */
-export type LocalFault = "no-manifest" | "too-large" | null;
+/** Errors that prevent sending. */
+type LocalFault = "no-manifest" | "too-large" | null;
 
 const ASK_EVERY_MS = 500;
 
@@ -37,7 +37,7 @@ export class UploadDraft {
   #disposed = false;
 
   readonly files: ReadonlySignal<Files> = this.#files;
-  /** Chosen, and of no use to a robot type. */
+  /** Chosen files that a robot type does not use. */
   readonly left: ReadonlySignal<readonly string[]> = this.#left;
   readonly step: ReadonlySignal<DraftStep> = this.#step;
   readonly look: ReadonlySignal<Look | null> = this.#look;
@@ -46,7 +46,7 @@ export class UploadDraft {
   readonly trouble: ReadonlySignal<string> = this.#trouble;
   readonly saved: ReadonlySignal<RobotType | null> = this.#saved;
   readonly movements: ReadonlySignal<readonly SavedMovement[]> = this.#movements;
-  /** When the step that is under way began, on the page's clock [ms]. */
+  /** Start of the current step on the page's clock [ms]. */
   readonly since: ReadonlySignal<number> = this.#since;
   readonly errors: ReadonlySignal<readonly Finding[]> = computed(() => readFindings(this.#errors.value));
   readonly warnings: ReadonlySignal<readonly Finding[]> = computed(() =>
@@ -90,7 +90,7 @@ export class UploadDraft {
     await this.#change(new Map(), []);
   }
 
-  /** Send all files, and wait for what the checkers say. */
+  /** Sends all files and waits for the result. */
   async check(): Promise<void> {
     const round = this.#begin("sending");
     const folder = packFiles(this.#files.value);
@@ -128,7 +128,7 @@ export class UploadDraft {
     }
   }
 
-  /** Make it a robot type, and give it the movements that came with it. */
+  /** Saves the robot type and its movements. */
   async save(): Promise<void> {
     const look = this.#look.value;
     if (look === null || this.#step.value !== "good") return;
@@ -214,7 +214,7 @@ export class UploadDraft {
     this.#since.value = now();
   }
 
-  /** The server has said no to the files, or nothing at all. */
+  /** The server rejected the files or was unreachable. */
   #refuse(error: unknown): void {
     const told = error instanceof ApiError ? error.extra["errors"] : undefined;
     const errors = Array.isArray(told) ? told.filter((each): each is string => typeof each === "string") : [];
@@ -240,7 +240,7 @@ export class UploadDraft {
     try {
       await this.#types.drop(look.id);
     } catch {
-      // It goes by itself.
+      // The server deletes it later.
     }
   }
 }

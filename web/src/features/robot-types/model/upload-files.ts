@@ -4,22 +4,18 @@ import type { TypeFolder } from "../../../shared/api/robot-types";
 export const MANIFEST = "robot.toml";
 const SCRIPT = /^movements\/([^/]+)\.py$/;
 const MODEL = /\.(xml|stl|obj|png)$/;
-/** As much as the server takes, of all files together [bytes]. */
+/** The server's limit for all files [bytes]. */
 export const MAX_BYTES = 6_000_000;
 const CHUNK = 0x8000;
 
 export type Files = ReadonlyMap<string, Uint8Array>;
 
-export interface SelectedUpload {
+interface SelectedUpload {
   files: Map<string, Uint8Array>;
-  /** What was chosen and is of no use to a robot type. */
   left: string[];
 }
 
-/**
- * The files below the folder that holds `robot.toml`, by their names in it. Without a manifest among them: below the
- * folder that all of them are in.
- */
+/** The files in the folder of `robot.toml`, by relative path. Without a manifest: below the common parent folder. */
 export function selectFiles(entries: Files): SelectedUpload {
   const files = new Map<string, Uint8Array>();
   const left: string[] = [];
@@ -58,7 +54,7 @@ function belongs(name: string): boolean {
   return name === MANIFEST || SCRIPT.test(name) || MODEL.test(name);
 }
 
-/** What file systems and archivers add by themselves. */
+/** Files that file systems and archivers add. */
 function hidden(name: string): boolean {
   return name.split("/").some((part) => part.startsWith(".") || part === "__MACOSX" || part === "__pycache__");
 }

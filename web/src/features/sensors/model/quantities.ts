@@ -6,17 +6,17 @@ export interface Quantity {
   stream: string;
   field: string;
   label: string;
-  /** As shown, which for angles is degrees. */
+  /** The displayed unit: degrees for angles. */
   unit: string;
   /** Converts from the message's unit to the displayed unit. */
   shown: (value: number) => number;
-  /** How the room has it judged; `null` where it does not say. */
+  /** The room's limits; `null`: none. */
   judged: KnownDiagnostic | null;
 }
 
 const same = (value: number): number => value;
 
-/** By the end of a name; the longest that fits counts. */
+/** Units by name suffix; the longest match applies. */
 const UNITS: readonly (readonly [string, string, (value: number) => number])[] = [
   ["rad_s", "°/s", degrees],
   ["percent", "%", same],
@@ -36,7 +36,7 @@ const UNITS: readonly (readonly [string, string, (value: number) => number])[] =
   ["w", "W", same],
 ];
 
-/** What one field of one stream is. */
+/** Label, unit and limits of one field. */
 export function quantityOf(description: Pick<KnownDescription, "controls" | "diagnostics">, stream: string, field: string): Quantity {
   const [name = field, ...part] = field.split(".");
   const judged = description.diagnostics.find((one) => (one.stream === "" || one.stream === stream) && fits(one.fields, field)) ?? null;
@@ -50,20 +50,20 @@ export function quantityOf(description: Pick<KnownDescription, "controls" | "dia
   const bare = found === undefined ? name : name.slice(0, -found[0].length);
   const words = bare.replaceAll("_", " ").trim();
   const plain = control?.label ?? (words === "" ? name : words.charAt(0).toUpperCase() + words.slice(1));
-  // A label that is meant for all fields of a stream names none of them.
+  // A label for all fields of a stream does not name one of them.
   const label = judged !== null && judged.fields !== "*" && part.length === 0 ? judged.label : [plain, ...part].join(" · ");
   return { stream, field, label, unit, shown, judged };
 }
 
-/** Whether a pattern, in which `*` stands for any text, covers a field. */
+/** Whether a pattern, in which `*` matches any text, matches a field. */
 function fits(pattern: string, field: string): boolean {
   const parts = pattern.split("*").map((part) => part.replace(/[.+?^${}()|[\]\\]/g, "\\$&"));
   return new RegExp(`^${parts.join(".*")}$`).test(field);
 }
 
-export type Judgement = "well" | "warning" | "bad";
+type Judgement = "well" | "warning" | "bad";
 
-/** A value against the limits that its room gives. */
+/** Compares a value with the room's limits. */
 export function judge(value: number, judged: KnownDiagnostic | null): Judgement {
   if (judged === null) return "well";
   const { low, high, warning_low: warningLow, warning_high: warningHigh } = judged;
@@ -72,7 +72,7 @@ export function judge(value: number, judged: KnownDiagnostic | null): Judgement 
   return "well";
 }
 
-/** How many digits after the point a range deserves: its limits differ in the third place. */
+/** Decimal places for a range, so that its limits differ in the third digit. */
 export function digits(spread: number): number {
   if (!(spread > 0)) return 1;
   return Math.min(3, Math.max(0, 2 - Math.floor(Math.log10(spread))));

@@ -10,14 +10,14 @@ import { now } from "../../../shared/lib/clock";
 import { readApplied, readShot } from "../../../shared/mqtt/parse-messages";
 import type { RoomRequest } from "../../../shared/api/action-requests";
 
-/** A short question is answered, or has failed, within this time [ms]. */
+/** Timeout of a short action [ms]. */
 const TIMEOUT_MS = 30_000;
-/** A survey of a room takes ten seconds by itself. */
+/** Timeout of a capture: surveying a room takes ten seconds [ms]. */
 const CAPTURE_TIMEOUT_MS = 120_000;
 const MARGIN_MS = 15_000;
 
-export interface Shot {
-  /** On the page's clock, when the answer came [ms]. */
+interface Shot {
+  /** Arrival time on the page's clock [ms]. */
   at: number;
   streams: Readonly<Record<string, Values>>;
 }
@@ -28,9 +28,9 @@ export interface Taken {
 }
 
 /** The requested and the applied value of a control. */
-export interface Setting {
+interface Setting {
   asked: number;
-  /** `null` while the answer is awaited, or where there was none. */
+  /** `null` until the response, or without one. */
   applied: number | null;
   why: string;
 }
@@ -48,17 +48,17 @@ export class RoomDeviceAction {
   readonly #wanted = new Map<string, number>();
   #setting = false;
 
-  /** What is asked for just now. */
+  /** The running request. */
   readonly busy: ReadonlySignal<RoomRequest["kind"] | null> = this.#busy;
-  /** Why the last thing asked for did not happen; empty otherwise. */
+  /** The error of the last request, or "". */
   readonly why: ReadonlySignal<string> = this.#why;
   /** The last single measurement. */
   readonly shot: ReadonlySignal<Shot | null> = this.#shot;
   readonly settings: ReadonlySignal<ReadonlyMap<string, Setting>> = this.#settings;
-  /** Captured files, newest first; `null` before the first answer. */
+  /** Captured files, newest first; `null` until loaded. */
   readonly uploads: ReadonlySignal<readonly Upload[] | null> = this.#uploads;
 
-  /** `epoch`: of the lease that this page holds, if it does. */
+  /** `epoch`: the epoch of this page's lease, if any. */
   constructor(api: Api, device: DeviceStore, actions: ActionRunner, epoch: () => number | null) {
     this.#api = api;
     this.#device = device;
@@ -94,7 +94,7 @@ export class RoomDeviceAction {
     return this.find(id);
   }
 
-  /** A captured file, with an address. */
+  /** A captured file with its address. */
   async find(id: string): Promise<Taken | null> {
     try {
       const { url, ...upload } = await this.#api.upload(this.#device.id, id);
@@ -141,7 +141,7 @@ export class RoomDeviceAction {
     if (done !== null) {
       this.#try(() => (setting = { asked: value, applied: readApplied(done.result)[control] ?? null, why: "" }));
     }
-    // Asked anew meanwhile: that one's answer counts.
+    // A newer request is pending: its response applies.
     if (!this.#wanted.has(control)) this.#note(control, setting);
   }
 

@@ -1,7 +1,7 @@
 /** A measured field: the stored series and the live measurements since. */
 import type { Series } from "../../../shared/api/types";
 
-export interface Sample {
+interface Sample {
   /** On the agent's wall clock [ms since 1970]. */
   at: number;
   mean: number;
@@ -33,15 +33,15 @@ export class Recording {
     if (this.#live.length > MAX_LIVE) this.#live.splice(0, MAX_LIVE / 10);
   }
 
-  /** In order of time, since a moment. */
+  /** Samples since a time, in order. */
   samples(sinceMs: number): Sample[] {
     const begin = this.#live[0]?.at ?? Infinity;
     return [...this.#stored.filter((one) => one.at < begin), ...this.#live].filter((one) => one.at >= sinceMs);
   }
 
   /**
-   * Columns for a plot: times [s], means, lows, highs. A pause of three times what is usual is a gap, drawn as one.
-   * Buckets stand in their middle.
+   * Plot columns: times [s], means, minima, maxima. A pause of three usual intervals is a gap. Buckets are drawn at
+   * their centre.
    */
   columns(sinceMs: number): [number[], (number | null)[], (number | null)[], (number | null)[]] {
     const samples = this.samples(sinceMs);
@@ -64,8 +64,8 @@ export class Recording {
   }
 
   /**
-   * Since when a state has been as it is: `at` the change, or, with `atLeast`, the first that is known of it. In a bucket
-   * of both states the change lies somewhere: its end counts. `null`: nothing is known.
+   * The start of the current state; with `atLeast`, the first known sample. A change inside a bucket counts at its end.
+   * `null`: unknown.
    */
   since(): { at: number; atLeast: boolean } | null {
     const samples = this.samples(-Infinity);

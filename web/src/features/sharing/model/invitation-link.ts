@@ -4,7 +4,7 @@ import { signal, type ReadonlySignal } from "@preact/signals-core";
 const KEY = "telescope.invitation";
 const AWAY = "telescope.invitation.away";
 
-export type Followed =
+type Followed =
   | { kind: "none" }
   /** `away`: signing in has led to a provider, where an account that was made on the way has taken it already. */
   | { kind: "open"; secret: string; away: boolean }

@@ -1,4 +1,4 @@
-/** Where the names of what moves on a plan stand, so that none covers another, or anything that is marked there [px]. */
+/** Places the labels of moving marks on a plan without overlap [px]. */
 
 export interface Box {
   left: number;
@@ -7,7 +7,7 @@ export interface Box {
   height: number;
 }
 
-/** The middle of a mark, and how large its name is. */
+/** The centre of a mark and the size of its label. */
 export interface Named {
   x: number;
   y: number;
@@ -18,18 +18,18 @@ export interface Named {
 export interface Placed {
   left: number;
   top: number;
-  /** Which of the places around the mark it is: given again, it stays there as long as it can. */
+  /** The index of the position around the mark; passing it again keeps the label in place. */
   place: number;
-  /** From the mark to the nearest point of the name where something may stand between, `null` beside it. */
+  /** The line from the mark to the label; `null` if they are adjacent. */
   leader: { length: number; angleRad: number } | null;
 }
 
-/** Half a mark and a little air. */
+/** Half a mark plus a margin. */
 const BESIDE = 15;
-/** How far off a name may go, from beside its mark on. */
+/** Distances from the mark. */
 const STEPS = [0, 20, 40, 60, 85];
 const AIR = 2;
-/** Below first, where one looks for it. */
+/** Below first. */
 const SIDES = [
   [0, 1],
   [0, -1],
@@ -42,8 +42,8 @@ const SIDES = [
 ] as const;
 
 /**
- * Greedy: each name in turn takes the nearest place around its mark that is free. `null` where none is: it has to be told
- * elsewhere. `before`: which place each had last, tried first, so that names do not jump about while things move.
+ * Greedy: each label takes the nearest free position around its mark, or `null`. `before`: the previous positions,
+ * tried first, so that labels stay in place.
  */
 export function placeLabels(
   marks: readonly Named[],

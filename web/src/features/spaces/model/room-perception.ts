@@ -1,23 +1,23 @@
-/** What a room says of itself by the streams of its perception: who is where, and which of its floor is taken. */
+/** Reads the perception streams of a room: positions and occupancy. */
 
 export type Values = Readonly<Record<string, number | boolean>>;
 
 /** A robot or person in the room at the time of the measurement. */
 export interface Place {
-  /** A robot's name at its agent, or `person`, `person-2`. */
+  /** The robot's name at its agent, or `person`, `person-2`. */
   name: string;
   xM: number;
   yM: number;
-  /** How long ago a sensor last saw them [s]. */
+  /** Age of the last observation [s]. */
   ageS: number;
   speedMS: number;
-  /** The way they go, counter-clockwise from x; `null` before they have gone anywhere. */
+  /** Direction of motion, counter-clockwise from x; `null` before any motion. */
   yawRad: number | null;
 }
 
-export type Cell = "free" | "taken" | "unknown";
+type Cell = "free" | "taken" | "unknown";
 
-/** The floor in squares; row 0 is the one with the lowest y. */
+/** The occupancy grid; row 0 has the lowest y. */
 export interface Floor {
   lowerXM: number;
   lowerYM: number;
@@ -28,10 +28,10 @@ export interface Floor {
 }
 
 const MOST_PLACES = 128;
-/** A row's bits are exact in a number up to here. */
+/** A number represents this many bits exactly. */
 const MOST_COLUMNS = 53;
 
-/** The stream `positions`, by name. Who lacks a coordinate is left out. */
+/** The stream `positions`, by name. Entries without a coordinate are omitted. */
 export function readPlaces(values: Values): Place[] {
   const names = Object.keys(values).flatMap((field) => (field.startsWith("x_m.") ? [field.slice("x_m.".length)] : []));
   return names.sort().flatMap((name) => {
@@ -43,7 +43,7 @@ export function readPlaces(values: Values): Place[] {
   });
 }
 
-/** The stream `occupancy`; `null` where it is none. */
+/** The stream `occupancy`; `null` if invalid. */
 export function readFloor(values: Values): Floor | null {
   const [lowerXM, lowerYM] = [numeric(values["lower_x_m"]), numeric(values["lower_y_m"])];
   const [sideM, columns, rows] = [numeric(values["side_m"]), numeric(values["columns"]), numeric(values["rows"])];
@@ -62,7 +62,7 @@ function bits(values: Values, name: string, rows: number): (number | null)[] {
   return Array.from({ length: rows }, (_, row) => numeric(values[`${name}.${row}`]));
 }
 
-/** The bits are beyond 32, so no shift reaches them. */
+/** Bits above 32 cannot be shifted. */
 function isSet(row: number | null | undefined, column: number): boolean {
   return typeof row === "number" && Math.floor(row / 2 ** column) % 2 === 1;
 }
@@ -75,7 +75,7 @@ function numeric(value: number | boolean | undefined): number | null {
   return typeof value === "number" ? value : null;
 }
 
-/** A stretch of the room [m]. */
+/** A rectangle of the room [m]. */
 export interface Extent {
   lowX: number;
   lowY: number;
@@ -83,7 +83,7 @@ export interface Extent {
   highY: number;
 }
 
-/** What has to fit on a plan: the floor, and all that hangs or stands beyond it. `null`: nothing is known. */
+/** The rectangle that contains all floors and points; `null` without any. */
 export function extent(floors: readonly Floor[], points: readonly (readonly [number, number])[]): Extent | null {
   const xs = points.map(([x]) => x);
   const ys = points.map(([, y]) => y);
@@ -93,12 +93,12 @@ export function extent(floors: readonly Floor[], points: readonly (readonly [num
   }
   if (xs.length === 0) return null;
   const found = { lowX: Math.min(...xs), lowY: Math.min(...ys), highX: Math.max(...xs), highY: Math.max(...ys) };
-  // A single thing has no stretch: a metre round it is shown.
+  // A single point is shown with a surrounding metre.
   const missing = Math.max(0, (1 - Math.max(found.highX - found.lowX, found.highY - found.lowY)) / 2);
   return { lowX: found.lowX - missing, lowY: found.lowY - missing, highX: found.highX + missing, highY: found.highY + missing };
 }
 
-/** Pins that would cover one another, moved apart until none does [px]. Each stays as near to its place, and as far inside, as it can. */
+/** Moves overlapping pins apart [px]. Each stays as near to its position as possible and inside the plan. */
 export function apart(
   points: readonly (readonly [number, number])[],
   gap: number,

@@ -30,7 +30,7 @@ export interface PadReading {
 export const DEAD_ZONE = 0.15;
 
 /** Rescales values outside the dead zone to the whole range, starting at 0. */
-export function beyondDeadZone(x: number, y: number): [number, number] {
+function beyondDeadZone(x: number, y: number): [number, number] {
   const length = Math.hypot(x, y);
   if (!(length > DEAD_ZONE)) return [0, 0];
   const scale = (Math.min(length, 1) - DEAD_ZONE) / (1 - DEAD_ZONE) / length;

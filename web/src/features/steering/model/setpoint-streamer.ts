@@ -21,20 +21,20 @@ export const LOST_MS = 400;
 export const SETTLE_MS = 400;
 const SETTLE_AT_MOST_MS = 1_500;
 /** Tolerance of the measured position at the target [rad]. */
-export const REACHED_RAD = radians(0.2);
+const REACHED_RAD = radians(0.2);
 /** Tolerance of the commanded position at the target [rad]. */
 const COMMANDED_RAD = radians(0.02);
 const STILL_RAD_S = 0.005;
 /** Without motion for this long before the target, the robot is blocked and the stream ends [ms]. */
 export const STUCK_MS = 2_000;
 
-export type StreamState = "idle" | "streaming" | "waiting";
+type StreamState = "idle" | "streaming" | "waiting";
 export type EndedBecause = "reached" | "stuck" | "let-go" | "stopped" | "hidden" | "lost-sight" | "busy" | "no-connection" | null;
 
 /** Joint name → position [rad]. */
 export type Targets = Readonly<Record<string, number>>;
 
-export interface StreamerOptions {
+interface StreamerOptions {
   epoch: number;
   joints: readonly Joint[];
   /** Sends one setpoint; rejects without a connection. */

@@ -40,7 +40,7 @@ export interface Push {
 
 export const AT_REST: Push = { forward: 0, left: 0, turn: 0 };
 
-export interface JogSpeed {
+interface JogSpeed {
   linear_m_s: number;
   angular_rad_s: number;
 }

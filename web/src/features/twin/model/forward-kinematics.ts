@@ -1,9 +1,9 @@
-/** Forward kinematics of a twin, as MuJoCo does it: where each body is when its joint stands at a position. */
+/** Forward kinematics of a twin, equal to MuJoCo's. */
 import type { KnownBody, KnownTwin } from "../../../shared/mqtt/parse-messages";
 import type { TwinJoint } from "../../../shared/mqtt/protocol.generated";
 import type { Quaternion, Vector3 } from "../../../shared/lib/vectors";
 
-export interface Placement {
+interface Placement {
   position_m: Vector3;
   quaternion: Quaternion;
 }
@@ -17,7 +17,7 @@ export function multiply(a: Quaternion, b: Quaternion): Quaternion {
   ];
 }
 
-/** `vector` turned by a unit quaternion. */
+/** Rotates `vector` by a unit quaternion. */
 export function rotate(q: Quaternion, vector: Vector3): Vector3 {
   const [w, x, y, z] = q;
   const [a, b, c] = vector;
@@ -44,7 +44,7 @@ function about(axis: Vector3, angle: number): Quaternion {
   return [Math.cos(angle / 2), axis[0] * s, axis[1] * s, axis[2] * s];
 }
 
-/** Where a joint stands [rad or m]: one without a motor follows others; one that is not named stands at its reference. */
+/** A joint's position [rad or m]: passive joints follow others; absent ones are at their reference. */
 export function standing(joint: TwinJoint | null, positions: Readonly<Record<string, number>>): number {
   if (joint === null) return 0;
   const followed = Object.entries(joint.follows ?? {});
@@ -52,7 +52,7 @@ export function standing(joint: TwinJoint | null, positions: Readonly<Record<str
   return followed.reduce((sum, [name, factor]) => sum + factor * (positions[name] ?? 0), 0);
 }
 
-/** A body in its parent's frame when its joint stands at `position` [rad or m]. */
+/** A body's placement in its parent's frame with its joint at `position` [rad or m]. */
 export function placed(body: KnownBody, position: number): Placement {
   const quaternion = unit(body.quaternion);
   const { joint } = body;
@@ -63,14 +63,14 @@ export function placed(body: KnownBody, position: number): Placement {
     const along = joint.axis.map((part) => (part * moved) / length) as Vector3;
     return { position_m: add(body.position_m, rotate(quaternion, along)), quaternion };
   }
-  // The anchor is the point that stays where it is while the body turns.
+  // The anchor does not move when the body turns.
   const turned = multiply(quaternion, about(joint.axis, moved));
   const anchor = add(body.position_m, rotate(quaternion, joint.anchor_m));
   const [x, y, z] = rotate(turned, joint.anchor_m);
   return { position_m: [anchor[0] - x, anchor[1] - y, anchor[2] - z], quaternion: turned };
 }
 
-/** Every body in the robot's base, in the order of the twin. Joints that are not named stand at their reference. */
+/** Every body in the robot's base, in the order of the twin. Absent joints are at their reference. */
 export function forward(twin: KnownTwin, positions: Readonly<Record<string, number>>): Placement[] {
   const world: Placement[] = [];
   for (const body of twin.bodies) {
@@ -88,7 +88,7 @@ export function forward(twin: KnownTwin, positions: Readonly<Record<string, numb
   return world;
 }
 
-/** Where each joint is: its anchor, and how the body that it turns stands; in the order of the twin. */
+/** Each joint's anchor and its body's rotation, in the order of the twin. */
 export function jointFrames(twin: KnownTwin, positions: Readonly<Record<string, number>>): (Placement & { name: string })[] {
   const world = forward(twin, positions);
   return twin.bodies.flatMap(({ joint }, index) => {
@@ -99,10 +99,10 @@ export function jointFrames(twin: KnownTwin, positions: Readonly<Record<string, 
   });
 }
 
-/** Nearer than this to a pitch of a quarter turn, roll and yaw turn about the same axis: all of it is called roll. */
+/** Closer than this to a pitch of ±90°, roll and yaw share an axis: the rotation is assigned to roll. */
 const LOCKED = 1 - 1e-9;
 
-/** Roll, pitch and yaw [rad] of a unit quaternion: turns about x, then y, then z of the fixed base. */
+/** Roll, pitch and yaw [rad] of a unit quaternion: rotations about the fixed x, y and z axes. */
 export function rollPitchYaw([w, x, y, z]: Quaternion): Vector3 {
   const sinPitch = 2 * (w * y - z * x);
   if (Math.abs(sinPitch) > LOCKED) {

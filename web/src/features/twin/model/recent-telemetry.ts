@@ -1,8 +1,8 @@
-/** The last seconds of one device's telemetry, for the plot: one column of times, three of values for each joint. */
+/** The last seconds of a device's telemetry for plots. */
 import type { KnownTelemetry } from "../../../shared/mqtt/parse-messages";
 
 export const SPAN_MS = 20_000;
-/** Longer than this without a message is a gap, drawn as one [ms]. */
+/** A pause longer than this is drawn as a gap [ms]. */
 const GAP_MS = 1_000;
 
 export type Quantity = "position_rad" | "velocity_rad_s" | "effort_nm";
@@ -21,11 +21,11 @@ export class RecentTelemetry {
     this.#samples.push({ at, message });
     const oldest = at - SPAN_MS - GAP_MS;
     const keepFrom = this.#samples.findIndex((sample) => sample.at >= oldest);
-    // In blocks, so that the array is not moved at every message.
+    // In blocks, to avoid moving the array for every message.
     if (keepFrom > 100) this.#samples.splice(0, keepFrom);
   }
 
-  /** Times relative to `now` [s], then one column for each joint index asked for; `null` marks a gap. */
+  /** Times relative to `now` [s], then one column for each requested joint; `null` marks a gap. */
   columns(quantity: Quantity, joints: readonly number[], now: number): [number[], ...(number | null)[][]] {
     const from = this.#samples.findIndex((sample) => sample.at >= now - SPAN_MS);
     const shown = from < 0 ? [] : this.#samples.slice(from);

@@ -1,12 +1,11 @@
-/** Whether a change of pose can be seen. */
 import type { Targets } from "../../steering/model";
 
-/** Less than this of a pixel is not seen. */
+/** Smaller changes are invisible [px]. */
 const SEEN_PX = 0.5;
 
 /**
- * `drawn`: the pose that the picture shows, `null` before the first. `leverM`: the furthest that a part is from a joint
- * that turns it [m]; `pxPerM`: how large a metre is drawn. Joints carry one another, so what they move adds up.
+ * Whether a change of pose is visible. `drawn`: the displayed pose, `null`: none. `leverM`: maximum distance of a part
+ * from its joints [m]; `pxPerM`: scale. Joint motions add up.
  */
 export function isVisibleChange(drawn: Targets | null, next: Targets | null, leverM: number, pxPerM: number): boolean {
   if (drawn === null || next === null) return drawn !== next;

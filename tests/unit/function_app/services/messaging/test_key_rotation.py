@@ -1,0 +1,134 @@
+"""Signing keys change during a session."""
+
+from typing import Any
+
+import jwt
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from device_agent.protocol import AckStatus, Mode, RotateKey, RunMovement, State, codec
+from device_agent.protocol.security import signing
+from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
+from tests.fakes.agent import Robot
+from tests.fixtures.cloud import OpenCloud
+from tests.harness.cloud.cloud import Cloud, Person
+from tests.unit.function_app.services.robot_types.movements import MINE, SOURCE
+
+Pair = tuple[Person, Robot]
+LEARN_S, OVERLAP_S = 1800, 86_400
+WAIT_MS = 20_000
+
+
+def rotate(cloud: Cloud, **options: Any) -> str:
+    """The new key's id."""
+    options = options or {"learn_ms": LEARN_S * 1000, "overlap_ms": OVERLAP_S * 1000}
+    return cloud.run(cloud.functions.keys.rotate(**options)).pins[-1].id
+
+
+def old_key(cloud: Cloud) -> Ed25519PrivateKey:
+    return cloud.run(cloud.functions.keys.current())
+
+
+def follow(robot: Robot) -> None:
+    """Learn as an agent does, from the key announcement it receives with its credentials."""
+    given = robot.request("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
+    for statement in given["key_statements"]:
+        news = codec.decode(signing.verify(statement.encode(), robot._keys, context=KEYS_CONTEXT), NewKey)
+        half = signing.public_key(news.key)
+        robot._keys[signing.key_id(half)] = half
+
+
+def run(person: Person, robot: Robot) -> None:
+    request = {"kind": "run_movement", "name": "mine"}
+    started = person.start(robot.device, request=request, wait_for="started", wait_ms=WAIT_MS).json()
+    assert started["status"] == "started", started
+    robot.report(started["id"], AckStatus.DONE)
+    assert person.action(started["id"], wait_ms=WAIT_MS, wait_for="done")["status"] == "done"
+
+
+def test_a_session_continues_through_a_rotation(pair: Pair, cloud: Cloud, open_cloud: OpenCloud) -> None:
+    anna, robot = pair
+    old = signing.key_id(old_key(cloud).public_key())
+    assert anna.put(MINE, {"source": SOURCE}).status_code == 201
+    assert anna.take_lease(robot.device).json()["confirmed"]
+    new = rotate(cloud)
+    follow(robot)
+    for ahead_s, signer in ((1, old), (LEARN_S, new)):
+        cloud.clock.advance(ahead_s)
+        assert anna.get("/devices").status_code == 200
+        assert anna.take_lease(robot.device, take_over=True, reason="on").json()["confirmed"]
+        run(anna, robot)
+        ran = robot.received(RunMovement)[-1].request
+        assert isinstance(ran, RunMovement)
+        assert ran.key == signer
+        text = signing.movement_text(ran.robot_type, ran.name, ran.version, ran.sha256)
+        signing.verify_text(text, ran.signature, robot._keys[signer], context=signing.MOVEMENT_CONTEXT)
+    assert robot.link is not None
+    robot.link.close()
+    robot.connect()
+    cloud.clock.advance(OVERLAP_S)
+    later = open_cloud(clock=cloud.clock)
+    later.start_ingest()
+    again = later.sign_in("anna")
+    assert again.get(MINE).status_code == 200, "what was saved with an old key is still there"
+    assert again.take_lease(robot.device, take_over=True, reason="on").json()["confirmed"]
+    run(again, robot)
+
+
+def get_devices(cloud: Cloud, token: str) -> int:
+    return cloud.request("GET", "/api/v1/devices", headers={"Authorization": f"Bearer {token}"}).status_code
+
+
+def test_a_token_of_an_old_key_counts_until_the_end_of_the_overlap(cloud: Cloud, open_cloud: OpenCloud) -> None:
+    token, key = cloud.sign_in("anna").token, old_key(cloud)
+    rotate(cloud)
+    other = open_cloud()
+    assert get_devices(other, token) == 200
+    cloud.clock.advance(OVERLAP_S)
+    now_s = cloud.clock.now_ms() // 1000
+    claims = jwt.decode(token, options={"verify_signature": False}) | {"iat": now_s, "exp": now_s + 600}
+    forged = jwt.encode(claims, key, "EdDSA", headers={"kid": signing.key_id(key.public_key())})
+    assert get_devices(cloud, forged) == get_devices(other, forged) == 401
+    assert cloud.sign_in("anna").get("/devices").status_code == 200
+
+
+def test_a_leaked_key_ends_tokens_at_once_in_all_instances(cloud: Cloud, open_cloud: OpenCloud) -> None:
+    token, other = cloud.sign_in("anna").token, open_cloud()
+    assert get_devices(cloud, token) == get_devices(other, token) == 200
+    rotate(cloud, leaked=True)
+    cloud.clock.advance(6)  # a result of a recent check is valid for some seconds
+    assert get_devices(cloud, token) == get_devices(other, token) == 401
+
+
+def test_an_agent_gets_the_new_key_in_a_command_that_the_old_key_signed(pair: Pair, cloud: Cloud) -> None:
+    _, robot = pair
+    new = rotate(cloud)
+    for tick in range(3):
+        robot.publish_state(State(device="arm", mode=Mode.IDLE, epoch=0, at_ms=tick, tick_ms=tick))
+    assert len(robot.received(RotateKey)) == 1
+    order = robot.received(RotateKey)[0].request
+    assert isinstance(order, RotateKey)
+    (statement,) = order.statements
+    news = codec.decode(signing.verify(statement.encode(), robot._keys, context=KEYS_CONTEXT), NewKey)
+    assert signing.key_id(signing.public_key(news.key)) == new
+
+
+def test_an_agent_that_is_claimed_during_an_overlap_pins_both_keys(cloud: Cloud) -> None:
+    rotate(cloud)
+    robot = cloud.robot("arm")
+    robot.pair(cloud.sign_in("anna"))
+    (first, second) = robot.enrollment()["keys"]
+    assert (first["serial"], second["serial"]) == (1, 2)
+    assert first["until_ms"] == pytest.approx(cloud.clock.now_ms() + OVERLAP_S * 1000, abs=60_000)
+    assert second["until_ms"] == 0
+
+
+def test_an_agent_that_was_away_for_the_whole_overlap_gets_no_statement(pair: Pair, cloud: Cloud) -> None:
+    _, robot = pair
+    new = rotate(cloud)
+    cloud.clock.advance(OVERLAP_S)
+    state = robot.enrollment()
+    assert state["key_statements"] == []
+    assert state["signing_key"] == new
+    assert [key["id"] for key in state["keys"]] == [new]
+    assert new not in robot._keys
