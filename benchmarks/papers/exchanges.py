@@ -98,16 +98,16 @@ def _require_none(heard: "queue.SimpleQueue[Any]") -> None:
 class _XmppUser:
     """An XMPP client in its own thread. Leaving the context stops it."""
 
-    def __init__(self, port: int, name: str, hear: Callable[[Any], None]) -> None:
+    def __init__(self, port: int, name: str, received: Callable[[Any], None]) -> None:
         self.jid = f"{name}@{DOMAIN}/bench"
         self._login = Login(HOST, port, self.jid, "any")
-        self._hear = hear
+        self._received = received
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
 
     async def _open(self) -> None:
-        self._stream = Stream(self._login, message=self._hear, presence=lambda _: None)
+        self._stream = Stream(self._login, message=self._received, presence=lambda _: None)
         await self._stream.open()
         self._staying = asyncio.create_task(self._stream.stay())
 
@@ -116,7 +116,7 @@ class _XmppUser:
         await asyncio.gather(self._staying, return_exceptions=True)
         await self._stream.close()
 
-    def say(self, stanza: str) -> None:
+    def send(self, stanza: str) -> None:
         self._loop.call_soon_threadsafe(self._stream.send, stanza)
 
     def __enter__(self) -> Self:
