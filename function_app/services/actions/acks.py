@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Iterable
+from typing import NamedTuple
 
 import msgspec
 
@@ -23,6 +24,13 @@ _POLL_S = 0.02
 _SLOWEST_POLL_S = 0.2
 _FIRST_READ_S = 0.05
 _SLOWEST_READ_S = 0.5
+
+
+class Publication(NamedTuple):
+    """When [ms since 1970] and over which transport a command was published."""
+
+    at_ms: int
+    transport: Transport
 
 
 class ActionAcks:
@@ -58,7 +66,8 @@ class ActionAcks:
         stored = await self._queues.change(ack.id, lambda action: apply_report(action, heard))
         if stored is None:
             await self._answer(topic.agent, ack)
-        elif ack.status.terminal:
+        elif ack.status.terminal and Status.PUBLISHED.value in stored.action.times:
+            # Otherwise the request that published the command has not stored that yet, and measures when it does.
             await self._latencies.measured(stored.action, by)
         if by != "mqtt":
             # Last, so that after a failure the agent gets the command again and repeats the ack.
@@ -76,7 +85,7 @@ class ActionAcks:
         *,
         wanted: Status,
         wait_ms: int,
-        published: bool = False,
+        published: Publication | None = None,
     ) -> Action:
         """Wait until the action reaches ``wanted`` or ends, at most ``wait_ms``.
 
@@ -85,14 +94,13 @@ class ActionAcks:
         too.
         """
         end = asyncio.get_running_loop().time() + wait_ms / 1000
-        published_ms = self._clock.now_ms() if published else None
         if acks is None:
             if published:
-                stored = await self._write(stored, (), published_ms, stored.action)
+                stored = await self._write(stored, (), published, stored.action)
             return await self._poll(stored, wanted, end)
         reports: list[AckReport] = []
         stored, action = await self._receive(stored, acks, wanted, end, reports)
-        return (await self._write(stored, reports, published_ms, action)).action
+        return (await self._write(stored, reports, published, action)).action
 
     async def _receive(
         self, stored: StoredAction, acks: AsyncIterator[Ack], wanted: Status, end: float, reports: list[AckReport]
@@ -117,13 +125,22 @@ class ActionAcks:
         return stored, action
 
     async def _write(
-        self, stored: StoredAction, reports: Iterable[AckReport], published_ms: int | None, action: Action
+        self, stored: StoredAction, reports: Iterable[AckReport], published: Publication | None, action: Action
     ) -> StoredAction:
-        def changed(current: Action) -> Action:
-            after = action if current is stored.action else _applied(current, reports)
-            return after if published_ms is None else mark_published(after, published_ms)
+        ended_before = False
 
-        return await self._queues.change(stored.action.id, changed, existing=stored) or stored
+        def changed(current: Action) -> Action:
+            nonlocal ended_before
+            after = action if current is stored.action else _applied(current, reports)
+            if published is None:
+                return after
+            ended_before = current.status.terminal and Status.PUBLISHED.value not in current.times
+            return mark_published(after, published.at_ms)
+
+        written = await self._queues.change(stored.action.id, changed, existing=stored) or stored
+        if published and ended_before:
+            await self._latencies.measured(written.action, published.transport)
+        return written
 
     async def _poll(self, stored: StoredAction, wanted: Status, end: float) -> Action:
         loop = asyncio.get_running_loop()

@@ -21,7 +21,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.actions import capability_check
-from function_app.services.actions.acks import ActionAcks
+from function_app.services.actions.acks import ActionAcks, Publication
 from function_app.services.actions.action_store import ActionStore, StoredAction, new_row
 from function_app.services.actions.queue import ActionQueues, action_lease
 from function_app.services.actions.requests import ActionRequest
@@ -40,8 +40,8 @@ ABANDON_MS = 30_000
 PINNED = ("robot_type", "version", "sha256", "author", "key", "signature")
 """Fields of the movement that an action stores, so that a republished command is identical."""
 
-_Pending = tuple[StoredAction, AsyncIterator[Ack] | None, bool]
-"""A stored action, its acks, and whether this request published its command."""
+_Pending = tuple[StoredAction, AsyncIterator[Ack] | None, Publication | None]
+"""A stored action, its acks, and the publication of its command if this request published it."""
 
 
 class _Undelivered(Exception):  # noqa: N818 (an outcome, not a fault)
@@ -171,11 +171,13 @@ class StartAction:
             msgspec.structs.replace(command, epoch=action.epoch, issued_at_ms=action.created_ms, ttl_ms=action.ttl_ms)
         )
         acks = await stack.enter_async_context(self._delivery.acks(device, action.id))
+        # Read before the command is sent: the device may answer before the broker confirms it.
+        published = Publication(self._clock.now_ms(), device.transport)
         try:
             await self._delivery.send(device, signed)
         except BusUnavailable as error:
             raise _Undelivered(action) from error
-        return stored, acks, True
+        return stored, acks, published
 
     async def _require_still(self, caller: Identity, device: Device, stored: StoredAction) -> None:
         """End the action if the caller lost access to the device while it was written.
@@ -196,7 +198,7 @@ class StartAction:
     async def _join(self, stored: StoredAction, device: Device, stack: AsyncExitStack) -> _Pending:
         """Follow an action without sending it: an earlier request started it, or it is queued."""
         acks = await stack.enter_async_context(self._delivery.acks(device, stored.action.id))
-        return await self._action_store.get(stored.action.id) or stored, acks, False
+        return await self._action_store.get(stored.action.id) or stored, acks, None
 
     async def _task(
         self, device: Device, request: ActionRequest

@@ -7,9 +7,12 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import Ack, AckStatus, codec, topics
+from function_app.domain.actions.action import Action
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.telemetry.histogram import ERROR
 from function_app.entrypoints.ingest.router import ingest
+from function_app.services.actions.acks import ActionAcks
+from function_app.services.actions.action_store import StoredAction
 from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS
 from function_app.services.telemetry.latency import HOUR_MS, KEEP_HOURS_MS
@@ -195,6 +198,24 @@ def test_the_cloud_counts_what_the_end_of_an_action_tells_once(cloud: Cloud, ann
     assert len(answered) == len(started) == 3
     for first, second in zip(answered, started, strict=True):
         assert 0 <= first <= second < 60_000, "measured by the cloud's clock, not the agent's"
+
+
+def test_an_action_that_ends_before_its_request_returns_is_measured(
+    cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    follow = ActionAcks.follow
+
+    async def follow_late(self: ActionAcks, stored: StoredAction, acks: Any, **options: Any) -> Action:
+        for status in (AckStatus.RECEIVED, AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE):
+            ack = robot.ack(stored.action.id, status, at_ms=cloud.clock.now_ms())
+            await ingest(cloud.functions, robot.topic(topics.ACK), codec.encode(ack))
+        return await follow(self, stored, acks, **options)
+
+    monkeypatch.setattr(ActionAcks, "follow", follow_late)
+    robot.silent = True
+    assert anna.start(robot.device, wait_ms=0).json()["status"] == "done"
+    for path in ("command-answered", "command-started", "received-started"):
+        assert len(_ms(anna, robot, path)) == 1, path
 
 
 def _ms(who: Person, robot: Robot, path: str) -> list[float]:
