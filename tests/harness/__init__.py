@@ -1,1 +1,1 @@
-"""What suites share: real brokers as processes, and clients to try them with."""
+"""Shared test infrastructure: broker and server processes, clients, emulated stores and browsers."""

@@ -36,7 +36,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
         }
         with start_program(["-m", "function_app", "serve"], environment_of(settings)) as server:
             wait_until(lambda: _answers(port) or server.process.poll() is not None, "the server")
-            assert server.process.poll() is None, server.said()
+            assert server.process.poll() is None, server.stderr()
             yield settings
 
 

@@ -71,7 +71,7 @@ class Server:
         program = self._stack.enter_context(start_program(["-m", "function_app", "serve"], self._environment))
         self._program = program
         wait_until(lambda: _listens(self.port) or program.process.poll() is not None, "the server")
-        assert program.process.poll() is None, program.said()
+        assert program.process.poll() is None, program.stderr()
 
 
 class BrokerEnd:

@@ -1,4 +1,4 @@
-"""The functions under each of their hosts: programs of their own, behind one interface.
+"""The functions under each of their hosts, as separate programs with one interface.
 
 with start_host("lambda", {"TELESCOPE_HOME": str(home)}) as host:
     httpx.get(f"{host.url}/api/v1/health")
@@ -28,5 +28,5 @@ _START: dict[HostKind, Callable[[Mapping[str, str]], contextlib.AbstractContextM
 
 
 def start_host(kind: HostKind, environment: Mapping[str, str]) -> contextlib.AbstractContextManager[Host]:
-    """The functions with these settings (``TELESCOPE_…``, ``AWS_…``) under this host, ready for requests."""
+    """Start the functions under this host with these settings (``TELESCOPE_…``, ``AWS_…``)."""
     return _START[kind](environment)

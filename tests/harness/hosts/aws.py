@@ -1,7 +1,7 @@
-"""AWS Lambda: Amazon's own runtime client in processes, before it the runtime's API and a gateway as API Gateway is.
+"""AWS Lambda: processes with Amazon's runtime client, a fake runtime API, and a fake API Gateway.
 
-Any number of instances, as many as there are requests at once; each serves one request at a time and is frozen between
-two, by ``SIGSTOP``, as Amazon does.
+Each instance serves one request at a time and is frozen between requests by ``SIGSTOP``, as Lambda does. Concurrent
+requests start further instances.
 """
 
 import base64
@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 from urllib.parse import unquote_to_bytes
 
-from tests.harness.hosts.host import PATIENCE_S, HostFailed, Program, environment_of, only, start_program
+from tests.harness.hosts.host import PATIENCE_S, HostFailed, Program, environment_of, isolated_path, start_program
 from tests.harness.network.http_server import QuietHandler, serve
 from tests.harness.paths import ROOT
 
 MAX_INSTANCES = 8
 MAX_EVENT_BYTES = 6 * 1024 * 1024
-"""Most that Lambda takes and gives in one invocation."""
+"""Lambda's limit for the request and the response of an invocation."""
 _RUNTIME = "/2018-06-01/runtime"
 _TEXT = re.compile(r"text/|application/(json|javascript|xml|[\w.+-]+\+json)")
 _HANDLER = "function_app.entrypoints.hosts.aws.handler"
@@ -36,7 +36,7 @@ _ARN = "arn:aws:lambda:eu-west-1:123456789012:function:telescope"
 def start_lambda(
     environment: Mapping[str, str], *, freeze: bool = True, package: Path | None = None
 ) -> Iterator["Lambda"]:
-    """The functions behind a gateway on a free port; with ``package``, the code and libraries in it alone."""
+    """Start the functions behind a gateway on a free port; ``package``: use only the code and libraries in it."""
     with contextlib.ExitStack() as stack:
         instances = stack.enter_context(contextlib.ExitStack())
         host = Lambda(environment, instances, freeze=freeze, package=package)
@@ -46,7 +46,7 @@ def start_lambda(
 
 
 class Lambda:
-    """The service: starts instances, gives each an event at a time."""
+    """The service: starts instances and sends events to them."""
 
     def __init__(
         self, environment: Mapping[str, str], stack: contextlib.ExitStack, *, freeze: bool, package: Path | None
@@ -60,7 +60,9 @@ class Lambda:
         self._libraries: dict[str, str] = {}
         if package is not None:
             self._folder, self._arguments = package, ["-S", *self._arguments]
-            self._libraries = only(package, "awslambdaric", "runtime_client*", "simplejson", "snapshot_restore_py")
+            self._libraries = isolated_path(
+                package, "awslambdaric", "runtime_client*", "simplejson", "snapshot_restore_py"
+            )
         self._lock = threading.Lock()
         self._idle: list[_Instance] = []
 
@@ -81,10 +83,10 @@ class Lambda:
         self.invoke({"topic": topic, "payload": base64.b64encode(payload).decode(), "at_ms": at_ms})
 
     def invoke(self, event: dict[str, Any]) -> Any:
-        """One invocation's answer.
+        """Invoke the function; returns its response.
 
         Raises:
-            HostFailed: It ended with an error.
+            HostFailed: The function failed.
         """
         with self._lock:
             instance = self._idle.pop() if self._idle else self._start()
@@ -95,18 +97,18 @@ class Lambda:
                 self._idle.append(instance)
         if "error" in outcome:
             raise HostFailed(json.dumps(outcome["error"]))
-        return outcome["answer"]
+        return outcome["response"]
 
     def thaw(self) -> None:
-        """Let all instances run from now on, so that they can end."""
+        """Resume all instances and stop freezing them, so that they can end."""
         for instance in self.instances:
             instance.thaw()
 
     def _start(self) -> "_Instance":
-        assert len(self.instances) < MAX_INSTANCES, "more requests at once than instances may run"
+        assert len(self.instances) < MAX_INSTANCES, "more concurrent requests than permitted instances"
         instance = _Instance(freeze=self._freeze)
         address = self._stack.enter_context(serve(_runtime_api(instance))).removeprefix("http://")
-        given = environment_of(
+        settings = environment_of(
             {
                 "AWS_REGION": "eu-west-1",
                 **self._environment,
@@ -118,13 +120,13 @@ class Lambda:
                 **self._libraries,
             }
         )
-        instance.program = self._stack.enter_context(start_program(self._arguments, given, folder=self._folder))
+        instance.program = self._stack.enter_context(start_program(self._arguments, settings, folder=self._folder))
         self.instances.append(instance)
         return instance
 
 
 class _Instance:
-    """One process that asks for an event, answers, and asks again."""
+    """One process that polls for events and responds."""
 
     def __init__(self, *, freeze: bool) -> None:
         self.program: Program | None = None
@@ -140,11 +142,11 @@ class _Instance:
             with contextlib.suppress(queue.Empty):
                 return self.outcomes.get(timeout=0.2)
             assert self.program is not None
-            assert self.program.process.poll() is None, f"the instance ended: {self.program.said()}"
-            assert time.monotonic() < deadline, f"the instance does not answer: {self.program.said()}"
+            assert self.program.process.poll() is None, f"the instance ended: {self.program.stderr()}"
+            assert time.monotonic() < deadline, f"the instance does not respond: {self.program.stderr()}"
 
     def next(self) -> dict[str, Any]:
-        """Its next event; frozen until there is one."""
+        """The next event. Freezes the process until one exists."""
         with contextlib.suppress(queue.Empty):
             return self.events.get_nowait()
         self._signal(signal.SIGSTOP)
@@ -153,7 +155,7 @@ class _Instance:
         return event
 
     def thaw(self) -> None:
-        """Let it run from now on."""
+        """Resume the process and stop freezing it."""
         self._signal(signal.SIGCONT, last=True)
 
     def _signal(self, number: signal.Signals, *, last: bool = False) -> None:
@@ -181,7 +183,7 @@ def _runtime_api(instance: _Instance) -> type[_Handler]:
     class RuntimeApi(_Handler):
         def handle_any(self) -> None:
             if self.command == "POST":
-                outcome = "answer" if self.path.endswith("/response") else "error"
+                outcome = "response" if self.path.endswith("/response") else "error"
                 instance.outcomes.put({outcome: json.loads(self.read())})
                 self.respond(202, [], b"{}")
                 return
@@ -226,9 +228,9 @@ def _gateway(service: Lambda) -> type[_Handler]:
             path, _, query = self.path.partition("?")
             headers: dict[str, str] = {}
             for name, value in self.headers.items():
-                known = name.lower()
-                if known not in {*self.hop_by_hop, "cookie"} or known == "content-length":
-                    headers[known] = f"{headers[known]},{value}" if known in headers else value
+                key = name.lower()
+                if key not in {*self.hop_by_hop, "cookie"} or key == "content-length":
+                    headers[key] = f"{headers[key]},{value}" if key in headers else value
             cookies = [part.strip() for line in self.headers.get_all("cookie", ()) for part in line.split(";")]
             decoded = unquote_to_bytes(path).decode(errors="replace")
             return {

@@ -1,4 +1,4 @@
-"""Azure Functions: Microsoft's own worker code in a process, behind a front as the Functions host is one."""
+"""Azure Functions: Microsoft's worker in a process, behind a fake Functions host."""
 
 import base64
 import contextlib
@@ -11,25 +11,25 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from tests.harness.hosts.host import PATIENCE_S, Host, HostFailed, environment_of, only, start_program
+from tests.harness.hosts.host import PATIENCE_S, Host, HostFailed, environment_of, isolated_path, start_program
 
 WORKER = Path(sys.prefix) / "azure-worker"
-"""Where ``make`` installs the worker: not among the project's packages, because it asks for a newer Python."""
+"""Folder into which ``make`` installs the worker, separately because its metadata requires a newer Python."""
 
 
 @contextlib.contextmanager
 def start_azure(environment: Mapping[str, str], *, package: Path | None = None) -> Iterator[Host]:
-    """The worker on a free port, with the functions indexed and loaded; with ``package``, on its libraries alone."""
+    """Start the worker on a free port and load the functions; ``package``: use only the libraries in it."""
     assert any(WORKER.glob("azure_functions_runtime")), f"the Functions worker is not in {WORKER}; run `make test`"
     arguments, more = ["-m", "tests.harness.hosts.functions_host", str(WORKER)], {}
     if package is not None:
-        arguments, more = ["-S", *arguments], only(package, "uvicorn", "h11", "click")
+        arguments, more = ["-S", *arguments], isolated_path(package, "uvicorn", "h11", "click")
     with start_program(arguments, environment_of({**environment, **more})) as program:
-        yield _Azure(program.line())
+        yield _Azure(program.read_line())
 
 
 class _Azure:
-    """The non-HTTP functions are fired through the host's own addresses for that."""
+    """Fires the functions without HTTP trigger through administrative addresses of the host."""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -50,13 +50,13 @@ class _Azure:
         self._post("/runtime/webhooks/eventgrid?functionName=ingest", [event], {"aeg-event-type": "Notification"})
 
     def _post(self, path: str, body: Any, headers: dict[str, str]) -> None:
-        where = urlsplit(self.url)
-        connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=PATIENCE_S)
+        address = urlsplit(self.url)
+        connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=PATIENCE_S)
         try:
             connection.request("POST", path, json.dumps(body), {"content-type": "application/json", **headers})
             answer = connection.getresponse()
-            said = answer.read().decode()
+            text = answer.read().decode()
             if answer.status != 202:
-                raise HostFailed(f"{answer.status} {said}")
+                raise HostFailed(f"{answer.status} {text}")
         finally:
             connection.close()

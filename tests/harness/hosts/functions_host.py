@@ -1,9 +1,9 @@
-"""``python -m tests.harness.hosts.functions_host WORKER``: what stands around the functions at Azure.
+"""``python -m tests.harness.hosts.functions_host WORKER``: a fake Azure Functions host.
 
 The worker is Microsoft's (``azure-functions-runtime``): it indexes, loads and invokes the functions as in production.
-This is the host before it, which turns each HTTP request into an invocation and its answer back. The behaviour that the
-functions can notice is the Functions host's: the route prefix of ``host.json``, header values joined with commas, the
-path decoded where it is UTF-8 and encoded again, cookies as fields of their own, whole bodies. Prints its address.
+This host converts each HTTP request to an invocation, and its result to a response. Functions observe the behaviour of
+the real host: the route prefix of ``host.json``, header values joined with commas, a path that is decoded if it is
+UTF-8 and encoded again, cookies as separate fields, and complete bodies. Prints its address.
 """
 
 import asyncio
@@ -46,13 +46,13 @@ class FunctionsHost:
         """Index and load all functions.
 
         Raises:
-            SystemExit: There is none, or one cannot be loaded.
+            SystemExit: No function exists, or one cannot be loaded.
         """
         init = rpc.record(capabilities={}, function_app_directory=str(self._folder))
-        asked = rpc.record(
+        request = rpc.record(
             request=rpc.record(worker_init_request=init), properties={"host": LOOPBACK, "protos": rpc.PROTOS}
         )
-        answer = await self._worker.worker_init_request(asked)
+        answer = await self._worker.worker_init_request(request)
         _check(answer.result)
         answer = await self._worker.functions_metadata_request(rpc.record())
         _check(answer.result)
@@ -72,7 +72,7 @@ class FunctionsHost:
             raise SystemExit("the worker found no functions")
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        """One HTTP request."""
+        """Serve one HTTP request."""
         body = b""
         more = True
         while more:
@@ -92,11 +92,11 @@ class FunctionsHost:
     async def _http(self, scope: Any, body: bytes) -> "_Answer":
         path = _path(scope["raw_path"])
         if "\0" in path:
-            return http.HTTPStatus.BAD_REQUEST, [], b""  # Kestrel's answer
+            return http.HTTPStatus.BAD_REQUEST, [], b""  # as Kestrel responds
         for function, trigger in self._functions.values():
-            found = self._match(trigger, scope["method"], path)
-            if found is not None:
-                request = _request(scope, path, found, body)
+            parameters = self._match(trigger, scope["method"], path)
+            if parameters is not None:
+                request = _request(scope, path, parameters, body)
                 answer = await self._invoke(function, trigger["name"], rpc.TypedData(http=request))
                 if answer.result.status == rpc.FAILED:
                     return http.HTTPStatus.INTERNAL_SERVER_ERROR, [], b""
@@ -104,11 +104,11 @@ class FunctionsHost:
         return http.HTTPStatus.NOT_FOUND, [], b""
 
     def _match(self, trigger: dict[str, Any], method: str, path: str) -> dict[str, str] | None:
-        """The route's parameters, when the function is for this request."""
+        """The route's parameters, or ``None`` if the route does not match."""
         if trigger["type"] != "httpTrigger" or method not in trigger["methods"]:
             return None
         if trigger["authLevel"].lower() != "anonymous":
-            raise SystemExit("a function wants a key of the host; our own tokens decide")
+            raise SystemExit("a function requires a key of the host; only the product's tokens may decide")
         route = "/".join(part for part in (self._prefix, trigger["route"]) if part)
         parts = re.split(r"\{\*(\w+)\}", route)
         pattern = "".join(f"(?P<{part}>.*)" if number % 2 else re.escape(part) for number, part in enumerate(parts))
@@ -116,7 +116,7 @@ class FunctionsHost:
         return None if found is None else found.groupdict()
 
     async def _fire(self, name: str) -> "_Answer":
-        """The administration's way to call a function that is not for HTTP."""
+        """Call a function without HTTP trigger, as the administration API does."""
         function, trigger = self._functions[name]
         status = {"Last": "2026-01-01T00:00:00", "Next": "2026-01-01T00:00:05", "LastUpdated": "2026-01-01T00:00:00"}
         timer = {"Schedule": {"AdjustForDST": True}, "ScheduleStatus": status, "IsPastDue": False}
@@ -124,7 +124,7 @@ class FunctionsHost:
         return _accepted(answer)
 
     async def _events(self, scope: Any, body: bytes) -> "_Answer":
-        """Event Grid's push: an invocation for each event."""
+        """Invoke the function for each event of an Event Grid push."""
         query = dict(part.split(b"=", 1) for part in scope["query_string"].split(b"&"))
         function, trigger = self._functions[query[b"functionName"].decode()]
         assert trigger["type"] == "eventGridTrigger"
@@ -158,9 +158,9 @@ def _check(result: Any) -> None:
 
 
 def _path(raw: bytes) -> str:
-    """A request's path as Kestrel reads it: what is no UTF-8 stays encoded."""
+    """A request's path as Kestrel decodes it: parts that are not UTF-8 stay encoded."""
 
-    def shown(found: re.Match[bytes]) -> bytes:
+    def decode(found: re.Match[bytes]) -> bytes:
         plain = unquote_to_bytes(found[0])
         try:
             plain.decode()
@@ -168,15 +168,15 @@ def _path(raw: bytes) -> str:
             return found[0]
         return plain
 
-    return re.sub(rb"(?:%[0-9A-Fa-f]{2})+", shown, raw).decode()
+    return re.sub(rb"(?:%[0-9A-Fa-f]{2})+", decode, raw).decode()
 
 
 def _request(scope: Any, path: str, parameters: dict[str, str], body: bytes) -> Any:
     headers: dict[str, str] = {}
     for name, value in scope["headers"]:
-        known, text = name.decode("latin-1").lower(), value.decode("latin-1")
-        separator = "; " if known == "cookie" else ","
-        headers[known] = f"{headers[known]}{separator}{text}" if known in headers else text
+        key, text = name.decode("latin-1").lower(), value.decode("latin-1")
+        separator = "; " if key == "cookie" else ","
+        headers[key] = f"{headers[key]}{separator}{text}" if key in headers else text
     query = scope["query_string"].decode("latin-1")
     url = f"{scope['scheme']}://{headers.get('host', 'localhost')}{quote(path, safe=_UNQUOTED)}"
     return rpc.record(
@@ -200,7 +200,7 @@ def _answer(answer: Any) -> _Answer:
 
 
 def _cookie(cookie: Any) -> str:
-    """One ``Set-Cookie``, as ASP.NET writes it."""
+    """A ``Set-Cookie`` header in ASP.NET's format."""
     parts = [f"{cookie.name}={quote(cookie.value, safe='')}"]
     plain: tuple[tuple[str, Any], ...] = (
         ("max-age", cookie.max_age and int(cookie.max_age.value)),

@@ -1,4 +1,4 @@
-"""What all hosts have in common."""
+"""The interface of all hosts, and programs as child processes."""
 
 import contextlib
 import os
@@ -15,104 +15,104 @@ from tests.harness.paths import ROOT
 
 LOOPBACK = "127.0.0.1"
 PATIENCE_S = 60.0
-"""How long a test waits for a host [s]: the machine may be busy."""
+"""Timeout for a host's response [s]; generous, because the machine may be busy."""
 
 
-class HostFailed(Exception):  # noqa: N818 (what a test looks for)
-    """A function ended with an error: the cloud would call it again."""
+class HostFailed(Exception):  # noqa: N818 (an outcome that tests expect)
+    """A function failed; the cloud would call it again."""
 
 
 class Host(Protocol):
     """The functions under one host.
 
     Attributes:
-        url: Where requests go, without a slash at its end.
+        url: Base URL of requests, without a trailing slash.
     """
 
     url: str
 
     def tick(self) -> None:
-        """Fire the timer once, and wait until the round is over.
+        """Fire the timer once and wait for the end of the function.
 
         Raises:
-            HostFailed: The function ended with an error.
+            HostFailed: The function failed.
         """
 
     def deliver(self, topic: str, payload: bytes) -> None:
-        """Hand over one MQTT message as this cloud does, and wait until it has been taken in.
+        """Deliver one MQTT message as this cloud does, and wait until it is processed.
 
         Raises:
-            HostFailed: The function ended with an error: to be delivered again.
+            HostFailed: The function failed, so the cloud would deliver the message again.
         """
 
 
 def environment_of(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment of a host's program: this one's, with no settings but those given."""
+    """This process's environment without product and cloud settings, plus ``environment``."""
     own = ("TELESCOPE_", "AWS_", "_HANDLER", "AZURE_", "FUNCTIONS_", "PYTHONPATH")
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(own)}
-    return {**kept, "PYTHONUNBUFFERED": "1", **environment}
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(own)}
+    return {**inherited, "PYTHONUNBUFFERED": "1", **environment}
 
 
 @contextlib.contextmanager
 def start_program(
     arguments: Sequence[str], environment: Mapping[str, str], *, folder: Path = ROOT
 ) -> Iterator["Program"]:
-    """A Python program, which ends when its standard input does, or is made to; its words are kept for failures."""
-    with tempfile.TemporaryFile("w+") as said:
+    """Run a Python program until the context exits; its standard error is available for failure messages."""
+    with tempfile.TemporaryFile("w+") as stderr:
         process = subprocess.Popen(
             [sys.executable, *arguments],
             cwd=folder,
             env=dict(environment),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=said,
+            stderr=stderr,
             text=True,
         )
-        program = Program(process, said)
+        program = Program(process, stderr)
         try:
             yield program
         finally:
             program.end()
 
 
-def only(package: Path, *programs: str) -> dict[str, str]:
-    """What lets a program see the libraries in ``package`` alone, and beside them these of the tests'.
+def isolated_path(package: Path, *programs: str) -> dict[str, str]:
+    """Environment in which only the libraries in ``package`` and these test programs can be imported.
 
-    To be run with ``-S``, so that Python adds none of its own.
+    Start Python with ``-S``, so that it does not add its own site packages.
     """
-    beside = Path(tempfile.mkdtemp(dir=package.parent))
+    links = Path(tempfile.mkdtemp(dir=package.parent))
     site = Path(sysconfig.get_path("purelib"))
     for program in programs:
         for found in site.glob(program):
-            (beside / found.name).symlink_to(found)
-    return {"PYTHONPATH": f"{package}{os.pathsep}{beside}"}
+            (links / found.name).symlink_to(found)
+    return {"PYTHONPATH": f"{package}{os.pathsep}{links}"}
 
 
 class Program:
-    """One that runs."""
+    """A running program with pipes."""
 
-    def __init__(self, process: "subprocess.Popen[str]", said: IO[str]) -> None:
+    def __init__(self, process: "subprocess.Popen[str]", stderr: IO[str]) -> None:
         self.process = process
-        self._said = said
+        self._stderr = stderr
 
-    def line(self) -> str:
-        """Its next line on standard output; fails with what it said when none comes."""
+    def read_line(self) -> str:
+        """The next line of standard output. Fails with the standard error after a timeout."""
         assert self.process.stdout is not None
         ready, _, _ = select.select([self.process.stdout], [], [], PATIENCE_S)
         text = self.process.stdout.readline() if ready else ""
-        assert text, f"{self.process.args!r} does not answer: {self.said()}"
+        assert text, f"{self.process.args!r} does not respond: {self.stderr()}"
         return text.rstrip("\n")
 
-    def tell(self, line: str) -> None:
+    def write_line(self, line: str) -> None:
         assert self.process.stdin is not None
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
 
-    def said(self) -> str:
-        """Everything on its standard error so far."""
+    def stderr(self) -> str:
+        """The standard error so far."""
         with contextlib.suppress(ValueError):
-            self._said.seek(0)
-            return self._said.read()
+            self._stderr.seek(0)
+            return self._stderr.read()
         return ""
 
     def end(self) -> None:

@@ -1,7 +1,7 @@
-"""The messages between the Functions host and its worker, as far as the worker looks at them.
+"""The messages between the Functions host and its worker, with the fields that the worker reads.
 
-In production they are protobuf's; the worker takes them from its host. These check what protobuf would: one
-value in ``TypedData``, text in text fields.
+In production the host passes protobuf classes to the worker. These replacements check what protobuf would check: one
+value in ``TypedData``, and text in text fields.
 """
 
 from types import SimpleNamespace
@@ -19,9 +19,9 @@ class TypedData:
     def __init__(self, **value: Any) -> None:
         assert len(value) <= 1, value
         assert value.keys() <= self._KINDS, value
-        for kind, what in value.items():
-            assert kind == "http" or isinstance(what, bytes if kind == "bytes" else str), (kind, what)
-            setattr(self, kind, what)
+        for kind, content in value.items():
+            assert kind == "http" or isinstance(content, bytes if kind == "bytes" else str), (kind, content)
+            setattr(self, kind, content)
         self._kind = next(iter(value), None)
 
     def WhichOneof(self, _group: str) -> str | None:  # noqa: N802 (protobuf's name)
@@ -47,7 +47,7 @@ class Record:
 
 
 class RpcHttp(Record):
-    """An answer to an HTTP request."""
+    """A response to an HTTP request."""
 
     def __init__(self, *, status_code: str, headers: dict[str, str], cookies: Any, body: Any, **more: Any) -> None:
         assert isinstance(status_code, str)
@@ -56,22 +56,20 @@ class RpcHttp(Record):
 
 
 class RpcHttpCookie(Record):
-    """A cookie to be set."""
-
     SameSite = SimpleNamespace(Lax="lax", Strict="strict", ExplicitNone="none", **{"None": ""})
 
 
 class BindingInfo(Record):
-    """What one parameter is bound to."""
+    """The binding of one parameter."""
 
-    # ``azure.functions`` has numbers of its own for these, which the worker compares.
+    # The worker compares these numbers with those of ``azure.functions``.
     out = 1
     inout = 2
     undefined = None
 
 
 class StatusResult(Record):
-    """How it went."""
+    """The result of a call."""
 
     Success = SUCCESS
     Failure = FAILED

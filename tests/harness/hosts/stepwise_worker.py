@@ -1,6 +1,6 @@
-"""``python -m tests.harness.hosts.stepwise_worker``: what the worker does, each time a line says so.
+"""``python -m tests.harness.hosts.stepwise_worker``: executes one task of the worker for each input line.
 
-In: ``{"do": "sweep"}`` or ``{"do": "ingest", "topic": …, "payload": base64}``. Out: ``""``, or what went wrong.
+Input: ``{"do": "sweep"}`` or ``{"do": "ingest", "topic": …, "payload": base64}``. Output: ``""`` or the error.
 """
 
 import asyncio
@@ -19,7 +19,7 @@ async def main() -> None:
     while line := await asyncio.to_thread(sys.stdin.readline):
         try:
             await _do(functions, json.loads(line))
-        except Exception as error:  # noqa: BLE001 (the test gets it)
+        except Exception as error:  # noqa: BLE001 (returned to the test)
             answer = f"{type(error).__name__}: {error}"
         else:
             answer = ""

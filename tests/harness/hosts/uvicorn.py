@@ -1,4 +1,4 @@
-"""One machine: ``python -m function_app serve``, and beside it what ``work`` does, one step at a time."""
+"""The functions on one machine: ``python -m function_app serve``, and the tasks of ``work`` on request."""
 
 import base64
 import contextlib
@@ -12,15 +12,15 @@ from tests.harness.network.brokers import wait_until
 
 @contextlib.contextmanager
 def start_uvicorn(environment: Mapping[str, str]) -> Iterator[Host]:
-    """The server on a free port, and a worker that runs on request."""
+    """Start the server on a free port, and a worker that executes tasks on request."""
     port = _free_port()
-    given = environment_of({"TELESCOPE_HOST": LOOPBACK, **environment, "TELESCOPE_PORT": str(port)})
+    settings = environment_of({"TELESCOPE_HOST": LOOPBACK, **environment, "TELESCOPE_PORT": str(port)})
     with (
-        start_program(["-m", "function_app", "serve"], given) as server,
-        start_program(["-m", "tests.harness.hosts.stepwise_worker"], given) as worker,
+        start_program(["-m", "function_app", "serve"], settings) as server,
+        start_program(["-m", "tests.harness.hosts.stepwise_worker"], settings) as worker,
     ):
-        wait_until(lambda: _answers(port) or server.process.poll() is not None, "the server", PATIENCE_S)
-        assert server.process.poll() is None, server.said()
+        wait_until(lambda: _listens(port) or server.process.poll() is not None, "the server", PATIENCE_S)
+        assert server.process.poll() is None, server.stderr()
         yield _Uvicorn(f"http://{LOOPBACK}:{port}", worker)
 
 
@@ -36,19 +36,19 @@ class _Uvicorn:
         self._do({"do": "ingest", "topic": topic, "payload": base64.b64encode(payload).decode()})
 
     def _do(self, step: dict[str, str]) -> None:
-        self._worker.tell(json.dumps(step))
-        answer = json.loads(self._worker.line())
-        if answer:
-            raise HostFailed(answer)
+        self._worker.write_line(json.dumps(step))
+        error = json.loads(self._worker.read_line())
+        if error:
+            raise HostFailed(error)
 
 
 def _free_port() -> int:
-    with socket.socket() as found:
-        found.bind((LOOPBACK, 0))
-        port: int = found.getsockname()[1]
+    with socket.socket() as listener:
+        listener.bind((LOOPBACK, 0))
+        port: int = listener.getsockname()[1]
         return port
 
 
-def _answers(port: int) -> bool:
+def _listens(port: int) -> bool:
     with socket.socket() as caller:
         return caller.connect_ex((LOOPBACK, port)) == 0

@@ -14,7 +14,7 @@ from function_app.adapters.local.signing_keys import FileKeys
 from function_app.adapters.mqtt import connection
 from tests.harness.cloud.cloud import MOVE
 from tests.harness.hosts.aws import start_lambda
-from tests.harness.hosts.reached import Reached
+from tests.harness.hosts.host_client import HostClient
 from tests.harness.network.brokers import PATIENCE_S, Client, RunningBroker, start_broker
 from tests.harness.network.proxy import Proxy, start_proxy
 
@@ -132,12 +132,12 @@ def test_a_lambda_instance_exchanges_messages_with_a_robot_after_each_freeze(tmp
     ):
         environment = {"TELESCOPE_HOME": str(keys.parent), "TELESCOPE_MQTT_PORT": str(proxy.port)}
         with start_lambda(environment) as host:
-            there = Reached(host, environment)
-            with there.sign_in("anna") as anna, there.robot() as robot:
-                there.pair(anna, robot)
+            client = HostClient(host, environment)
+            with client.sign_in("anna") as anna, client.robot() as robot:
+                client.pair(anna, robot)
                 for _ in range(3):
                     robot.connect()
-                    presence = Presence(online=True, session=robot.session, at_ms=there.clock.now_ms())
+                    presence = Presence(online=True, session=robot.session, at_ms=client.clock.now_ms())
                     host.deliver(topics.conn(robot.space, robot.id), codec.encode(presence))
                     asked = {"request": MOVE, "wait_ms": 10_000}
                     action = anna.post(f"/devices/{robot.device}/actions", json=asked).json()

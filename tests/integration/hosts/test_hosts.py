@@ -14,7 +14,7 @@ from tests.harness.cloud.cloud import API, MOVE, problem
 from tests.harness.cloud.polling import PollingRobot
 from tests.harness.hosts import HOSTS, HostFailed, HostKind, start_host
 from tests.harness.hosts.host import PATIENCE_S
-from tests.harness.hosts.reached import Reached
+from tests.harness.hosts.host_client import HostClient
 from tests.harness.network.brokers import wait_until
 
 
@@ -25,16 +25,16 @@ def kind(request: pytest.FixtureRequest) -> HostKind:
 
 
 @pytest.fixture(scope="module")
-def there(kind: HostKind, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reached]:
+def client(kind: HostKind, tmp_path_factory: pytest.TempPathFactory) -> Iterator[HostClient]:
     home = tmp_path_factory.mktemp(kind)
     environment = {"TELESCOPE_HOME": str(home), "TELESCOPE_MQTT_PORT": "1"}
     with start_host(kind, environment) as host:
-        yield Reached(host, environment)
+        yield HostClient(host, environment)
 
 
-def test_a_person_signs_in_with_a_cookie_and_out_again(there: Reached) -> None:
-    with httpx.Client(base_url=there.host.url + API, timeout=PATIENCE_S) as anna:
-        answer = anna.post("/auth/sign-in", json={"link": there.link("anna")})
+def test_a_person_signs_in_with_a_cookie_and_out_again(client: HostClient) -> None:
+    with httpx.Client(base_url=client.host.url + API, timeout=PATIENCE_S) as anna:
+        answer = anna.post("/auth/sign-in", json={"link": client.link("anna")})
         (cookie,) = answer.headers.get_list("set-cookie")
         fields = {part.strip().lower().partition("=")[0] for part in cookie.split(";")}
         assert fields >= {"path", "max-age", "httponly", "samesite"}
@@ -45,20 +45,20 @@ def test_a_person_signs_in_with_a_cookie_and_out_again(there: Reached) -> None:
         problem(anna.get("/accounts/me"), 401, "unauthorized")
 
 
-def test_bodies_are_transferred_completely(there: Reached) -> None:
-    document = there.request("GET", f"{API}/openapi.json")
+def test_bodies_are_transferred_completely(client: HostClient) -> None:
+    document = client.request("GET", f"{API}/openapi.json")
     assert len(document.content) == int(document.headers["content-length"]) > 50_000
     assert document.json()["openapi"].startswith("3.")
     sign_in = f"{API}/auth/sign-in"
-    problem(there.request("POST", sign_in, content=b" " * (MAX_BODY + 1)), 413, "too-large")
-    problem(there.request("POST", sign_in, content=b" " * MAX_BODY), 422, "invalid")
-    problem(there.request("POST", sign_in, content=b"\x00\xff\xfe"), 422, "invalid")
-    problem(there.request("POST", sign_in, content='{"link": "grüß 🤖"}'.encode()), 401, "unauthorized")
-    assert there.request("HEAD", f"{API}/health").content == b""
+    problem(client.request("POST", sign_in, content=b" " * (MAX_BODY + 1)), 413, "too-large")
+    problem(client.request("POST", sign_in, content=b" " * MAX_BODY), 422, "invalid")
+    problem(client.request("POST", sign_in, content=b"\x00\xff\xfe"), 422, "invalid")
+    problem(client.request("POST", sign_in, content='{"link": "grüß 🤖"}'.encode()), 401, "unauthorized")
+    assert client.request("HEAD", f"{API}/health").content == b""
 
 
-def test_invalid_paths_and_queries_are_problems(there: Reached) -> None:
-    with there.sign_in("anna") as anna:
+def test_invalid_paths_and_queries_are_problems(client: HostClient) -> None:
+    with client.sign_in("anna") as anna:
         for path in ("%ff", "a%2Fb", "a+b%20c", "gr%C3%BC%C3%9F", "%25", "a;b=c"):
             answer = anna.get(f"/devices/{path}")
             assert answer.status_code in {404, 422}, answer.text
@@ -70,24 +70,24 @@ def test_invalid_paths_and_queries_are_problems(there: Reached) -> None:
             assert anna.get(f"/devices?{query}").status_code in {200, 422}
         problem(anna.get("/nothing"), 404, "http")
         problem(anna.post("/devices"), 405, "http")
-    assert int(there.request("GET", f"{API}/health").headers["x-telescope-time-ms"]) > 0
+    assert int(client.request("GET", f"{API}/health").headers["x-telescope-time-ms"]) > 0
 
 
-def test_messages_of_devices_are_stored_and_the_timer_expires_actions(there: Reached) -> None:
-    with there.sign_in("bert") as bert, there.robot() as robot:
-        there.pair(bert, robot)
+def test_messages_of_devices_are_stored_and_the_timer_expires_actions(client: HostClient) -> None:
+    with client.sign_in("bert") as bert, client.robot() as robot:
+        client.pair(bert, robot)
         assert bert.get(f"/devices/{robot.device}").json()["online"] is False
-        presence = Presence(online=True, session=1, at_ms=there.clock.now_ms())
-        there.host.deliver(topics.conn(robot.space, robot.id), codec.encode(presence))
+        presence = Presence(online=True, session=1, at_ms=client.clock.now_ms())
+        client.host.deliver(topics.conn(robot.space, robot.id), codec.encode(presence))
         assert bert.get(f"/devices/{robot.device}").json()["online"] is True
-        there.host.deliver(topics.conn(robot.space, robot.id), b"nonsense")
-        there.host.deliver("nonsense", b"")
+        client.host.deliver(topics.conn(robot.space, robot.id), b"nonsense")
+        client.host.deliver("nonsense", b"")
 
         begun = bert.post(f"/devices/{robot.device}/actions", json={"request": MOVE, "ttl_ms": 1_000})
         action = f"/actions/{begun.json()['id']}"
 
         def ended() -> bool:
-            there.host.tick()
+            client.host.tick()
             return bool(bert.get(action).json()["status"] == "expired")
 
         wait_until(ended, "the timer to end the action", PATIENCE_S)
@@ -105,10 +105,10 @@ def test_an_error_reaches_the_host_which_delivers_again(kind: HostKind, tmp_path
         problem(httpx.post(f"{host.url}{API}/auth/sign-in", json={"link": "x"}), 503, "store-unavailable")
 
 
-def test_a_polling_robot_executes_actions(there: Reached) -> None:
+def test_a_polling_robot_executes_actions(client: HostClient) -> None:
     """It needs no broker, only HTTP."""
-    with there.sign_in("anna") as anna, PollingRobot(there, wait_ms=0, pause_s=0.1) as robot:
-        there.pair(anna, robot)
+    with client.sign_in("anna") as anna, PollingRobot(client, wait_ms=0, pause_s=0.1) as robot:
+        client.pair(anna, robot)
         robot.connect()
         assert anna.get(f"/devices/{robot.device}").json()["online"]
         body = {"request": MOVE, "wait_ms": 0}

@@ -1,4 +1,4 @@
-"""People and robots who reach the functions through a host."""
+"""HTTP access of people and robots to the functions under a host."""
 
 import asyncio
 from collections.abc import Mapping
@@ -14,8 +14,8 @@ from tests.harness.cloud.cloud import API, Cloud, connect_to_broker
 from tests.harness.hosts.host import PATIENCE_S, Host
 
 
-class Reached:
-    """A host, as the toy robot speaks to the functions."""
+class HostClient:
+    """Replaces ``Cloud`` for the fake robot: sends its requests to a host."""
 
     def __init__(self, host: Host, environment: Mapping[str, str]) -> None:
         self.host = host
@@ -27,15 +27,15 @@ class Reached:
         return httpx.request(method, self.host.url + path, timeout=PATIENCE_S, **options)
 
     def link(self, name: str) -> str:
-        """A one-time sign-in token, made beside the host."""
+        """A one-time sign-in token, created by functions in this process."""
 
-        async def made() -> str:
+        async def create() -> str:
             functions = bootstrap.build(settings.read(self._environment))
             link = await functions.sign_in.link(await functions.sign_in.account(name))
             await functions.close()
             return link
 
-        return asyncio.run(made())
+        return asyncio.run(create())
 
     def sign_in(self, name: str) -> httpx.Client:
         answer = self.request("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
@@ -44,7 +44,7 @@ class Reached:
         return httpx.Client(base_url=self.host.url + API, headers=token, timeout=PATIENCE_S)
 
     def robot(self) -> Robot:
-        """A toy robot; it asks for nothing of a cloud but what is here."""
+        """A fake robot; it uses only the methods of ``Cloud`` that this class has."""
         return Robot(cast("Cloud", self), ("arm",))
 
     def pair(self, owner: httpx.Client, robot: Robot) -> None:
