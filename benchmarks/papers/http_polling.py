@@ -21,7 +21,7 @@ from benchmarks.baseline.interleaved import Exchange
 from benchmarks.baseline.product import TIMEOUT_S, HttpConnection
 from benchmarks.papers.exchanges import SETPOINT
 from device_agent.protocol import AckStatus
-from tests.harness.cloud.cloud_processes import Ground
+from tests.harness.cloud.cloud_processes import CloudProcesses
 from tests.harness.cloud.polling import PollingRobot, Site
 from tests.harness.network.brokers import HOST, Message, wait_until
 
@@ -94,17 +94,17 @@ class _Receiver(PollingRobot):
         super().handle(message)
 
 
-def long_poll(stack: contextlib.ExitStack, ports: Mapping[int, int], ground: Ground) -> Exchange:
+def long_poll(stack: contextlib.ExitStack, ports: Mapping[int, int], processes: CloudProcesses) -> Exchange:
     """Telescope's HTTP transport: an action through the functions until the long-polling agent receives it."""
-    port = ports[ground.endpoints["server"].port]
+    port = ports[processes.endpoints["server"].port]
     robot = _Receiver(Site(f"http://{HOST}:{port}"))
     stack.callback(robot.cloud.close)  # type: ignore[attr-defined]  # a Site's
-    robot.pair(ground.anna)
+    robot.pair(processes.anna)
     stack.enter_context(robot)
     robot.connect()
     device = robot.device
-    wait_until(lambda: ground.anna.get(f"/devices/{device}").json()["online"], "the robot to be online")
-    key = ground.anna.post("/api-keys", {"name": device, "role": "operator", "days": 1}).json()["token"]
+    wait_until(lambda: processes.anna.get(f"/devices/{device}").json()["online"], "the robot to be online")
+    key = processes.anna.post("/api-keys", {"name": device, "role": "operator", "days": 1}).json()["token"]
     caller = stack.enter_context(HttpConnection(port, {"Authorization": f"Bearer {key}"}))
     body = json.dumps({"request": {"kind": "move_joints", "position_rad": {"elbow": 0.1}}}).encode()
 

@@ -13,7 +13,7 @@ from benchmarks.baseline.interleaved import SHARES, Exchange, measure_interleave
 from benchmarks.baseline.product import free_port, start_peer
 from benchmarks.papers import exchanges, http_polling
 from benchmarks.reporting.report import Cell, Chart, Claim, Report, Table, percentile
-from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
 from tests.harness.network.brokers import HOST, TRANSPORTS, RunningBroker, start_broker
 from tests.harness.network.delay import start_delay
 from tests.harness.network.xmpp import start_prosody
@@ -43,7 +43,7 @@ ROUNDS: Final = 5
 class Servers:
     """All running servers. ``web`` (polling) and ``relay`` (WebSocket) are reference servers."""
 
-    ground: Ground
+    processes: CloudProcesses
     amqtt: RunningBroker
     prosody: int
     web: int
@@ -52,13 +52,13 @@ class Servers:
     @property
     def mosquitto(self) -> RunningBroker:
         """Port of the product."""
-        return self.ground.broker.now
+        return self.processes.broker.running
 
     @property
     def ports(self) -> tuple[int, ...]:
         """Returns the ports of all servers."""
         brokers = (each.port(kind) for each in (self.mosquitto, self.amqtt) for kind in TRANSPORTS)
-        return (self.ground.endpoints["server"].port, self.prosody, self.web, self.relay, *brokers)
+        return (self.processes.endpoints["server"].port, self.prosody, self.web, self.relay, *brokers)
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ def servers(folder: Path) -> Iterator[Servers]:
         stack.enter_context(start_peer("benchmarks.papers.relays", "socket", str(relay)))
         prosody = stack.enter_context(start_prosody(folder / "prosody", f"http://{HOST}:{web}/verify"))
         amqtt = stack.enter_context(start_broker("amqtt", folder / "amqtt"))
-        ground = stack.enter_context(start_ground("mosquitto", folder / "ground", unlimited))
-        yield Servers(ground, amqtt, prosody.port, web, relay)
+        processes = stack.enter_context(start_cloud_processes("mosquitto", folder / "cloud", unlimited))
+        yield Servers(processes, amqtt, prosody.port, web, relay)
 
 
 def with_condition(there: Servers, condition: Condition, *, quick: bool) -> dict[str, list[float]]:
@@ -119,7 +119,7 @@ def with_condition(there: Servers, condition: Condition, *, quick: bool) -> dict
             way = stack.enter_context(start_delay(*there.ports, rtt_ms=condition.rtt_ms))
             ports = way.ports
         ways = _ways(stack, ports, there, quick=quick)
-        slow: dict[str, Exchange] = {HELD: http_polling.long_poll(stack, ports, there.ground)}
+        slow: dict[str, Exchange] = {HELD: http_polling.long_poll(stack, ports, there.processes)}
         if condition.loss:
             way.set(rtt_ms=condition.rtt_ms, loss=condition.loss)
         waiting = _poll(stack, ports[there.web])

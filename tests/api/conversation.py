@@ -198,9 +198,9 @@ class Conversation:
 
     def actions(self) -> None:
         device, asked = self.robot.device, {"request": MOVE}
-        action = self.start(once="a/b#c? ü".encode().hex())
-        assert self.start(once="a/b#c? ü".encode().hex()) == action
-        self.anna.start(device, once="a/b#c? ü".encode().hex(), ttl_ms=5)
+        action = self.start(idempotency_key="a/b#c? ü".encode().hex())
+        assert self.start(idempotency_key="a/b#c? ü".encode().hex()) == action
+        self.anna.start(device, idempotency_key="a/b#c? ü".encode().hex(), ttl_ms=5)
         assert self.anna.start(device).status_code == 409
         self.robot.step()
         assert self.anna.action(action)["status"] == "started"

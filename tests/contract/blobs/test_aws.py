@@ -21,7 +21,7 @@ from function_app.ports.blobs import Blobs
 from function_app.ports.tables import StoreError
 from tests.contract.blobs.suite import PNG, Again, BlobsSuite, Direct
 from tests.contract.conftest import Closing
-from tests.harness.stores.aws import REGION, Refusal, Wire, reset, start_wire, use_credentials
+from tests.harness.stores.aws import REGION, FaultProxy, Refusal, reset, start_fault_proxy, use_credentials
 
 Open = Callable[[str], S3Blobs]
 NAME = "telescope"
@@ -57,23 +57,23 @@ def again(open_at: Open, moto: str) -> Again:
 
 
 @pytest.fixture
-def wire(moto: str) -> Iterator[Wire]:
-    with start_wire(moto) as wire:
-        yield wire
+def proxy(moto: str) -> Iterator[FaultProxy]:
+    with start_fault_proxy(moto) as proxy:
+        yield proxy
 
 
 @pytest.fixture
-async def over_wire(blobs: Blobs, open_at: Open, wire: Wire) -> Blobs:
-    """The same bucket over a wire with faults, after its first call."""
-    over_wire = open_at(wire.endpoint)
+async def over_wire(blobs: Blobs, open_at: Open, proxy: FaultProxy) -> Blobs:
+    """The same bucket over a proxy with faults, after its first call."""
+    over_wire = open_at(proxy.endpoint)
     assert await over_wire.list("") == await blobs.list("")
     return over_wire
 
 
 @pytest.fixture
-async def direct(over_wire: Blobs, wire: Wire) -> AsyncIterator[Direct]:
-    """Over a wire that checks signatures as Amazon documents them, which moto does not."""
-    wire.guard = check_signature
+async def direct(over_wire: Blobs, proxy: FaultProxy) -> AsyncIterator[Direct]:
+    """Over a proxy that checks signatures as Amazon documents them, which moto does not."""
+    proxy.guard = check_signature
     async with httpx.AsyncClient() as client:
         yield Direct(over_wire, client)
 
@@ -161,13 +161,13 @@ def test_keys_sort_and_begin_as_names_do_and_are_reversible(one: str, other: str
 # ---------------------------------------------------------------- lost requests and responses
 
 
-async def test_an_append_is_done_once_if_the_wire_fails(blobs: Blobs, over_wire: Blobs, wire: Wire) -> None:
+async def test_an_append_is_done_once_if_the_wire_fails(blobs: Blobs, over_wire: Blobs, proxy: FaultProxy) -> None:
     for number in range(2):
-        wire.spoil("pass", "lose answer")
+        proxy.inject("pass", "lose response")
         await over_wire.append("log", b"%d" % number)
-        assert wire.operations == ["GET", "PUT", "PUT", "GET"]
+        assert proxy.operations == ["GET", "PUT", "PUT", "GET"]
     for number in range(2, 4):
-        wire.spoil("pass", "lose request")
+        proxy.inject("pass", "lose request")
         await over_wire.append("log", b"%d" % number)
     assert await blobs.get("log") == b"0123"
 
@@ -179,33 +179,33 @@ def meanwhile(write: Coroutine[Any, Any, None]) -> Callable[[], None]:
 
 
 async def test_an_append_keeps_what_other_clients_write_at_the_same_time(
-    blobs: Blobs, over_wire: Blobs, wire: Wire
+    blobs: Blobs, over_wire: Blobs, proxy: FaultProxy
 ) -> None:
-    wire.spoil("pass", meanwhile(blobs.append("log", b"0")), "pass", meanwhile(blobs.append("log", b"1")))
+    proxy.inject("pass", meanwhile(blobs.append("log", b"0")), "pass", meanwhile(blobs.append("log", b"1")))
     await over_wire.append("log", b"2")
     assert await blobs.get("log") == b"012"
-    wire.spoil("pass", "lose request", meanwhile(blobs.append("log", b"3")))
+    proxy.inject("pass", "lose request", meanwhile(blobs.append("log", b"3")))
     await over_wire.append("log", b"4")
     assert await blobs.get("log") == b"01234"
-    wire.spoil("pass", meanwhile(blobs.delete("log")))
+    proxy.inject("pass", meanwhile(blobs.delete("log")))
     await over_wire.append("log", b"5")
     assert await blobs.get("log") == b"5"
 
 
-async def test_an_append_starts_again_after_a_conflict(blobs: Blobs, over_wire: Blobs, wire: Wire) -> None:
+async def test_an_append_starts_again_after_a_conflict(blobs: Blobs, over_wire: Blobs, proxy: FaultProxy) -> None:
     await blobs.append("log", b"0")
-    wire.spoil("pass", CONFLICT, "pass", Refusal(409, "ConditionalRequestConflict", {}))
+    proxy.inject("pass", CONFLICT, "pass", Refusal(409, "ConditionalRequestConflict", {}))
     await over_wire.append("log", b"1")
-    assert wire.operations == ["GET", "PUT"] * 3
+    assert proxy.operations == ["GET", "PUT"] * 3
     assert await blobs.get("log") == b"01"
 
 
 async def test_an_append_that_is_always_in_conflict_is_an_error(
-    over_wire: Blobs, wire: Wire, monkeypatch: pytest.MonkeyPatch
+    over_wire: Blobs, proxy: FaultProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(appending, "_LONGEST_PAUSE_S", 0.001)
     for _ in range(appending.TRIES):
-        wire.faults.extend(("pass", CONFLICT))
+        proxy.faults.extend(("pass", CONFLICT))
     with pytest.raises(StoreError, match=r"'log' at once\. Try again"):
         await over_wire.append("log", b"1")
     assert await over_wire.get("log") is None

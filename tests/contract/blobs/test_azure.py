@@ -15,7 +15,7 @@ from function_app.adapters.azure.client import Place
 from function_app.ports.blobs import MAX_BYTES, Blobs
 from tests.contract.blobs.suite import Again, BlobsSuite, Direct
 from tests.contract.conftest import Closing
-from tests.harness.stores.aws import Fault, Refusal, Wire, start_wire
+from tests.harness.stores.aws import Fault, FaultProxy, Refusal, start_fault_proxy
 from tests.harness.stores.azure import endpoint, through
 
 pytestmark = pytest.mark.anyio
@@ -48,18 +48,18 @@ class TestAzureBlobs(BlobsSuite):
 
 
 @pytest.fixture
-def wire(azurite: str) -> Iterator[Wire]:
-    with start_wire(endpoint(azurite, "Blob")) as wire:
-        yield wire
+def proxy(azurite: str) -> Iterator[FaultProxy]:
+    with start_fault_proxy(endpoint(azurite, "Blob")) as proxy:
+        yield proxy
 
 
 @pytest.fixture
 async def over_wire(
-    azurite: str, wire: Wire, container: str, closing: Closing, monkeypatch: pytest.MonkeyPatch
+    azurite: str, proxy: FaultProxy, container: str, closing: Closing, monkeypatch: pytest.MonkeyPatch
 ) -> Blobs:
-    """The same store over a wire with faults; its container exists."""
+    """The same store over a proxy with faults; its container exists."""
     monkeypatch.setattr(adapter, "RETRY_WITHIN_S", 0)
-    blobs = closing(AzureBlobs(place=Place(through(azurite, wire.endpoint, "Blob")), container=container))
+    blobs = closing(AzureBlobs(place=Place(through(azurite, proxy.endpoint, "Blob")), container=container))
     await blobs.put("first", b"")
     return blobs
 
@@ -124,58 +124,58 @@ async def test_nothing_exists_before_the_first_write(blobs: Blobs) -> None:
 # ---------------------------------------------------------------- lost requests and responses
 
 
-@pytest.mark.parametrize("fault", ["lose answer", "lose request"])
+@pytest.mark.parametrize("fault", ["lose response", "lose request"])
 @pytest.mark.parametrize("exists", [False, True])
 async def test_an_append_is_done_once_if_the_wire_fails(
-    over_wire: Blobs, blobs: Blobs, wire: Wire, exists: bool, fault: Fault
+    over_wire: Blobs, blobs: Blobs, proxy: FaultProxy, exists: bool, fault: Fault
 ) -> None:
     for number in range(7):  # more than an append has requests
         await (blobs.put if exists else blobs.append)(f"log{number}", b"old,")
         faults: list[Fault] = ["pass"] * number
-        wire.spoil(*faults, fault)
+        proxy.inject(*faults, fault)
         await over_wire.append(f"log{number}", b"new")
-        wire.faults.clear()
+        proxy.faults.clear()
         assert await blobs.get(f"log{number}") == b"old,new"
-        wire.spoil(*faults[1:], fault)
+        proxy.inject(*faults[1:], fault)
         await over_wire.append(f"new{number}", b"new")
-        wire.faults.clear()
+        proxy.faults.clear()
         assert await blobs.get(f"new{number}") == b"new"
 
 
-@pytest.mark.parametrize("fault", ["lose answer", "lose request", "cut answer", Refusal(500, "InternalError", {})])
-async def test_the_other_calls_are_sent_again(over_wire: Blobs, blobs: Blobs, wire: Wire, fault: Fault) -> None:
-    wire.spoil(fault)
+@pytest.mark.parametrize("fault", ["lose response", "lose request", "cut response", Refusal(500, "InternalError", {})])
+async def test_the_other_calls_are_sent_again(over_wire: Blobs, blobs: Blobs, proxy: FaultProxy, fault: Fault) -> None:
+    proxy.inject(fault)
     await over_wire.put("a", b"1")
     assert await blobs.get("a") == b"1"
-    wire.spoil(fault)
+    proxy.inject(fault)
     assert await over_wire.get("a") == b"1"
-    wire.spoil(fault)
+    proxy.inject(fault)
     assert await over_wire.list("") == ("a", "first")
-    wire.spoil(fault)
+    proxy.inject(fault)
     await over_wire.delete("a")
     assert await blobs.get("a") is None
 
 
 def meanwhile(write: Coroutine[Any, Any, None]) -> Callable[[], None]:
-    """Lets another client write while a request waits on the wire."""
+    """Lets another client write while a request waits on the proxy."""
     loop = asyncio.get_running_loop()
     return lambda: asyncio.run_coroutine_threadsafe(write, loop).result(20)
 
 
 async def test_an_append_keeps_what_other_clients_write_at_the_same_time(
-    over_wire: Blobs, blobs: Blobs, wire: Wire
+    over_wire: Blobs, blobs: Blobs, proxy: FaultProxy
 ) -> None:
     for number in range(4):
         passed: list[Fault] = ["pass"] * number
-        wire.spoil(*passed, meanwhile(blobs.append("log", b"a%d," % number)))
+        proxy.inject(*passed, meanwhile(blobs.append("log", b"a%d," % number)))
         await over_wire.append("log", b"b%d," % number)
-        assert not wire.faults
+        assert not proxy.faults
         await blobs.put("a", b"old")
-        wire.spoil(*passed, meanwhile(blobs.put("a", b"new")))
+        proxy.inject(*passed, meanwhile(blobs.put("a", b"new")))
         await over_wire.append("a", b"!")
         assert await blobs.get("a") == b"new!"
     parts = (await blobs.get("log") or b"").split(b",")
     assert sorted(parts) == [b"", b"a0", b"a1", b"a2", b"a3", b"b0", b"b1", b"b2", b"b3"]
-    wire.spoil("pass", meanwhile(blobs.delete("a")))
+    proxy.inject("pass", meanwhile(blobs.delete("a")))
     await over_wire.append("a", b"!")
     assert await blobs.get("a") == b"!"

@@ -1,4 +1,4 @@
-"""The command bus over AWS IoT Core: moto, which takes messages and keeps them, behind a wire that can be spoilt."""
+"""The command bus over AWS IoT Core: moto, which stores messages, behind a proxy that injects faults."""
 
 import threading
 import time
@@ -14,20 +14,20 @@ from function_app.ports.command_bus import BusUnavailable
 from tests.contract.bus.suite import MAX_BLOCKED_S, BusContract, Sent, Stage, assert_loop_is_free
 from tests.contract.conftest import Closing
 from tests.harness.network.brokers import PATIENCE_S
-from tests.harness.stores.aws import REGION, Refusal, Wire, start_wire
+from tests.harness.stores.aws import REGION, FaultProxy, Refusal, start_fault_proxy
 
 ACCOUNT = "123456789012"
 
 
 @pytest.fixture
-def wire(moto: str) -> Iterator[Wire]:
-    with start_wire(moto) as wire:
-        yield wire
+def proxy(moto: str) -> Iterator[FaultProxy]:
+    with start_fault_proxy(moto) as proxy:
+        yield proxy
 
 
 class TestIot(BusContract):
     @pytest.fixture
-    def stage(self, wire: Wire, space: str, closing: Closing, monkeypatch: pytest.MonkeyPatch) -> Stage:
+    def stage(self, proxy: FaultProxy, space: str, closing: Closing, monkeypatch: pytest.MonkeyPatch) -> Stage:
         monkeypatch.setattr(publishing_bus, "GIVE_UP_S", PATIENCE_S)
         taken = iotdata_backends[ACCOUNT][REGION].published_payloads
 
@@ -35,30 +35,30 @@ class TestIot(BusContract):
             return [Sent(topic, payload) for topic, payload in taken if f"/{space}/" in topic]
 
         def retained(topic: str) -> bytes | None:
-            # moto does not retain: what Amazon is asked to is seen on the wire.
-            found = None
-            for asked in wire.asked:
-                url = urlsplit(asked.path)
+            # moto does not retain messages, so the requests are checked.
+            newest = None
+            for request in proxy.requests:
+                url = urlsplit(request.path)
                 if unquote(url.path) == f"/topics/{topic}" and parse_qs(url.query)["retain"] == ["true"]:
-                    found = asked.body
-            return found
+                    newest = request.body
+            return newest
 
         bus, away = (
             closing(IotCommandBus(region=REGION, endpoint=endpoint))
-            for endpoint in (wire.endpoint, "http://127.0.0.1:1")
+            for endpoint in (proxy.endpoint, "http://127.0.0.1:1")
         )
         return Stage(bus, space, sent, retained, away)
 
-    async def test_qos_is_passed_on(self, stage: Stage, wire: Wire) -> None:
+    async def test_qos_is_passed_on(self, stage: Stage, proxy: FaultProxy) -> None:
         for qos in (0, 1):
             await stage.bus.publish(stage.topic, b"x", qos=qos)
-        assert [parse_qs(urlsplit(asked.path).query)["qos"] for asked in wire.asked] == [["0"], ["1"]]
+        assert [parse_qs(urlsplit(request.path).query)["qos"] for request in proxy.requests] == [["0"], ["1"]]
 
-    async def test_a_message_without_response_is_sent_again(self, stage: Stage, wire: Wire) -> None:
-        wire.spoil("lose answer")  # a device drops duplicates
+    async def test_a_message_without_response_is_sent_again(self, stage: Stage, proxy: FaultProxy) -> None:
+        proxy.inject("lose response")  # a device drops duplicates
         await stage.bus.publish(stage.topic, b"x")
         assert set(await stage.until(1)) == {Sent(stage.topic, b"x")}
-        assert len(wire.asked) == 2
+        assert len(proxy.requests) == 2
 
     @pytest.mark.parametrize(
         ("refusal", "words"),
@@ -70,26 +70,26 @@ class TestIot(BusContract):
         ids=["rights", "throttled", "invalid"],
     )
     async def test_a_refusal_is_reported_in_one_sentence(
-        self, stage: Stage, wire: Wire, refusal: Refusal, words: str
+        self, stage: Stage, proxy: FaultProxy, refusal: Refusal, words: str
     ) -> None:
-        wire.spoil(*[refusal] * 3)
+        proxy.inject(*[refusal] * 3)
         with pytest.raises(BusUnavailable, match=words) as caught:
             await stage.bus.publish(stage.topic, b"x")
         assert "\n" not in str(caught.value)
         assert await stage.bus.status() == str(caught.value)
-        assert len(wire.asked) <= 3
-        wire.faults.clear()
+        assert len(proxy.requests) <= 3
+        proxy.faults.clear()
         await stage.bus.publish(stage.topic, b"x")
         assert await stage.bus.status() == "ok"
 
     async def test_a_slow_response_delays_no_other_call_and_times_out(
-        self, stage: Stage, wire: Wire, monkeypatch: pytest.MonkeyPatch
+        self, stage: Stage, proxy: FaultProxy, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         await stage.bus.publish(stage.topic, b"x")
         release = threading.Event()
-        wire.spoil(lambda: release.wait(MAX_BLOCKED_S))
+        proxy.inject(lambda: release.wait(MAX_BLOCKED_S))
         await assert_loop_is_free(stage.bus.publish(stage.topic, b"x"), release)
         monkeypatch.setattr(publishing_bus, "GIVE_UP_S", 0.2)
-        wire.spoil(lambda: time.sleep(1.0))
+        proxy.inject(lambda: time.sleep(1.0))
         with pytest.raises(BusUnavailable, match="did not answer"):
             await stage.bus.publish(stage.topic, b"x")

@@ -22,7 +22,7 @@ from function_app.adapters.shared import publishing_bus
 from function_app.ports.command_bus import BusUnavailable
 from tests.contract.bus.suite import MAX_BLOCKED_S, BusContract, Sent, Stage, assert_loop_is_free
 from tests.contract.conftest import Closing
-from tests.harness.cloud.identity import HOST, Host, make_certificate, start_host
+from tests.harness.cloud.identity import HOST, IdentityEndpoint, make_certificate, start_identity_endpoint
 from tests.harness.network.brokers import PATIENCE_S
 from tests.harness.network.http_server import QuietHandler, running
 
@@ -103,8 +103,8 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def host(monkeypatch: pytest.MonkeyPatch, certificate: Path) -> Iterator[Host]:
-    with start_host(monkeypatch, certificate) as host:
+def host(monkeypatch: pytest.MonkeyPatch, certificate: Path) -> Iterator[IdentityEndpoint]:
+    with start_identity_endpoint(monkeypatch, certificate) as host:
         yield host
 
 
@@ -119,7 +119,12 @@ def namespace(certificate: Path) -> Iterator[Namespace]:
 class TestEventGrid(BusContract):
     @pytest.fixture
     def stage(
-        self, namespace: Namespace, host: Host, space: str, closing: Closing, monkeypatch: pytest.MonkeyPatch
+        self,
+        namespace: Namespace,
+        host: IdentityEndpoint,
+        space: str,
+        closing: Closing,
+        monkeypatch: pytest.MonkeyPatch,
     ) -> Stage:
         assert host
         monkeypatch.setattr(publishing_bus, "GIVE_UP_S", PATIENCE_S)
@@ -138,17 +143,17 @@ class TestEventGrid(BusContract):
             await stage.bus.publish(stage.topic, b"x", qos=qos)
         assert [qos for _, qos, _ in namespace.taken] == [0, 1]
 
-    async def test_one_token_serves_many_messages(self, stage: Stage, host: Host) -> None:
+    async def test_one_token_serves_many_messages(self, stage: Stage, host: IdentityEndpoint) -> None:
         for _ in range(5):
             await stage.bus.publish(stage.topic, b"x")
-        assert [asked["resource"] for asked in host.asked] == [[AUDIENCE]]
+        assert [request["resource"] for request in host.requests] == [[AUDIENCE]]
 
     async def test_another_identity_is_requested_by_its_id(
-        self, namespace: Namespace, host: Host, closing: Closing
+        self, namespace: Namespace, host: IdentityEndpoint, closing: Closing
     ) -> None:
         client_id = "11059fcc-5514-4800-b5f8-49808b9cfab6"
         await closing(EventGridCommandBus(endpoint=f"{namespace.address}/", identity=client_id)).publish("t", b"x")
-        assert [asked["client_id"] for asked in host.asked] == [[client_id]]
+        assert [request["client_id"] for request in host.requests] == [[client_id]]
 
     async def test_a_message_without_response_is_sent_again(self, stage: Stage, namespace: Namespace) -> None:
         namespace.faults.append("lost")  # a device drops duplicates

@@ -10,7 +10,7 @@ from function_app.adapters.aws.client import ATTEMPTS
 from function_app.adapters.aws.tables import DynamoTables
 from function_app.ports.tables import Row, StoreError, Write
 from tests.contract.conftest import Closing
-from tests.harness.stores.aws import HOST, REGION, Refusal, reset, start_wire
+from tests.harness.stores.aws import HOST, REGION, Refusal, reset, start_fault_proxy
 
 NAME = "telescope"
 Calls = tuple[Callable[[], Awaitable[object]], ...]
@@ -80,22 +80,22 @@ async def test_a_missing_table_or_bucket_is_named(service: str, open_store: Open
 async def test_a_refusal_is_reported_in_one_line_and_not_retried(
     open_store: OpenStore, moto: str, code: str, expected: str
 ) -> None:
-    with start_wire(moto) as wire:
-        for call in open_store(wire.endpoint):
-            wire.spoil(Refusal(403, code, {}))
+    with start_fault_proxy(moto) as proxy:
+        for call in open_store(proxy.endpoint):
+            proxy.inject(Refusal(403, code, {}))
             with pytest.raises(StoreError, match=f"'{NAME}'.*{expected}") as caught:
                 await call()
             assert "\n" not in str(caught.value)
-            assert len(wire.asked) == 1
+            assert len(proxy.requests) == 1
 
 
 async def test_a_throttled_call_is_tried_a_few_times(open_store: OpenStore, moto: str) -> None:
-    with start_wire(moto) as wire:
-        get, *_ = open_store(wire.endpoint)
-        wire.spoil(*[Refusal(400, "ThrottlingException", {})] * ATTEMPTS)
+    with start_fault_proxy(moto) as proxy:
+        get, *_ = open_store(proxy.endpoint)
+        proxy.inject(*[Refusal(400, "ThrottlingException", {})] * ATTEMPTS)
         with pytest.raises(StoreError, match=r"too much to do.*Try again"):
             await get()
-        assert len(wire.asked) == ATTEMPTS
+        assert len(proxy.requests) == ATTEMPTS
 
 
 async def test_an_unreachable_address_is_named(open_store: OpenStore) -> None:
@@ -116,11 +116,11 @@ async def test_missing_credentials_are_reported(open_store: OpenStore, monkeypat
 
 async def test_an_s3_response_that_ends_early_is_an_error(moto: str, closing: Closing) -> None:
     reset(moto)
-    with start_wire(moto) as wire:
-        blobs = closing(S3Blobs(bucket=NAME, region=REGION, endpoint=wire.endpoint))
+    with start_fault_proxy(moto) as proxy:
+        blobs = closing(S3Blobs(bucket=NAME, region=REGION, endpoint=proxy.endpoint))
         await blobs.prepare()
         await blobs.put("a", bytes(100_000))
-        wire.spoil("cut answer")
+        proxy.inject("cut response")
         with pytest.raises(StoreError, match=f"bucket '{NAME}'"):
             await blobs.get("a")
         assert await blobs.get("a") == bytes(100_000)

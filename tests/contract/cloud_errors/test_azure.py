@@ -16,8 +16,16 @@ from function_app.adapters.azure.sas_keys import SigningKeys
 from function_app.adapters.azure.tables import AzureTables
 from function_app.ports.tables import Row, StoreError
 from tests.contract.conftest import Closing
-from tests.harness.cloud.identity import HOST, OBJECT_ID, SECRET, TENANT_ID, Host, make_certificate, start_host
-from tests.harness.stores.aws import Refusal, start_wire
+from tests.harness.cloud.identity import (
+    HOST,
+    OBJECT_ID,
+    SECRET,
+    TENANT_ID,
+    IdentityEndpoint,
+    make_certificate,
+    start_identity_endpoint,
+)
+from tests.harness.stores.aws import Refusal, start_fault_proxy
 from tests.harness.stores.azure import KEY, endpoint, start_azurite, through
 
 CLIENT_ID = "11059fcc-5514-4800-b5f8-49808b9cfab6"
@@ -99,8 +107,8 @@ async def test_a_wrong_key_is_reported_but_not_shown(azurite: str, open_store: O
 
 
 async def test_a_failing_store_is_tried_a_few_times(azurite: str, service: str, open_store: OpenStore) -> None:
-    with start_wire(endpoint(azurite, service)) as wire:
-        calls = open_store(Place(through(azurite, wire.endpoint, service)))
+    with start_fault_proxy(endpoint(azurite, service)) as proxy:
+        calls = open_store(Place(through(azurite, proxy.endpoint, service)))
         call = calls[2]
         await calls[0]()
         await call()
@@ -109,9 +117,9 @@ async def test_a_failing_store_is_tried_a_few_times(azurite: str, service: str, 
             (Refusal(500, "InternalError", {}), "cannot be used"),
             (Refusal(502, "BadGateway", {}, "application/x-nonsense"), NONSENSE[service]),
         ):
-            wire.spoil(*[refusal] * ATTEMPTS)
+            proxy.inject(*[refusal] * ATTEMPTS)
             assert expected in await error_of(call)
-            assert len(wire.asked) == ATTEMPTS
+            assert len(proxy.requests) == ATTEMPTS
         await call()
 
 
@@ -132,14 +140,14 @@ def secure_azurite(certificate: Path) -> Iterator[str]:
 
 
 @pytest.fixture
-def host(monkeypatch: pytest.MonkeyPatch, certificate: Path) -> Iterator[Host]:
-    with start_host(monkeypatch, certificate) as host:
+def host(monkeypatch: pytest.MonkeyPatch, certificate: Path) -> Iterator[IdentityEndpoint]:
+    with start_identity_endpoint(monkeypatch, certificate) as host:
         yield host
 
 
 @pytest.mark.parametrize("identity", ["", CLIENT_ID], ids=["the host's", "another"])
 async def test_tables_and_blobs_are_used_with_the_identity(
-    secure_azurite: str, host: Host, closing: Closing, identity: str
+    secure_azurite: str, host: IdentityEndpoint, closing: Closing, identity: str
 ) -> None:
     places = {name: Place(url=endpoint(secure_azurite, name), identity=identity) for name in ("Table", "Blob")}
     tables = closing(AzureTables(place=places["Table"], prefix="test"))
@@ -149,8 +157,8 @@ async def test_tables_and_blobs_are_used_with_the_identity(
     await blobs.put("a", b"content")
     await blobs.append("a", b"!")
     assert await blobs.get("a") == b"content!"
-    assert {tuple(asked["resource"]) for asked in host.asked} == {("https://storage.azure.com",)}
-    assert {tuple(asked.get("client_id", ())) for asked in host.asked} == {(identity,) if identity else ()}
+    assert {tuple(request["resource"]) for request in host.requests} == {("https://storage.azure.com",)}
+    assert {tuple(request.get("client_id", ())) for request in host.requests} == {(identity,) if identity else ()}
 
 
 @pytest.mark.usefixtures("host")
@@ -179,7 +187,7 @@ async def test_blob_addresses_are_signed_with_a_borrowed_key(
 
 
 async def test_a_refused_identity_is_reported_with_the_role_that_it_needs(
-    secure_azurite: str, host: Host, closing: Closing
+    secure_azurite: str, host: IdentityEndpoint, closing: Closing
 ) -> None:
     host.lifetime_s = -30
     tables = closing(AzureTables(place=Place(url=endpoint(secure_azurite, "Table")), prefix="test"))

@@ -18,7 +18,7 @@ from function_app.ports.tables import StoreError
 from tests.contract.conftest import Closing
 from tests.contract.keys.suite import Again, Time
 from tests.contract.keys.vault_suite import SECRET, Erase, VaultSuite
-from tests.harness.cloud.identity import HOST, make_certificate, start_host
+from tests.harness.cloud.identity import HOST, make_certificate, start_identity_endpoint
 from tests.harness.network.http_server import QuietHandler, running
 
 
@@ -65,7 +65,7 @@ class _Answer(QuietHandler):
 def vault(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeVault]:
     certificate = make_certificate(tmp_path_factory.mktemp("tls"))
     vault = FakeVault(certificate)
-    with running(vault), pytest.MonkeyPatch.context() as environment, start_host(environment, certificate):
+    with running(vault), pytest.MonkeyPatch.context() as environment, start_identity_endpoint(environment, certificate):
         yield vault
 
 

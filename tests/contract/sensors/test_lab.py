@@ -10,18 +10,18 @@ from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.perception import driver as perception
 from device_agent.simulation import renderer
 from tests.contract.sensors.suite import RoomDriverContract
-from tests.harness.agent.rooms import LAB, StillWorld
+from tests.harness.agent.rooms import LAB, ManualWorld
 
 DEVICES = {device.name: device for device in room.load(LAB).devices}
 
 
 @pytest.fixture(scope="module")
-def world() -> StillWorld:
-    return StillWorld()
+def world() -> ManualWorld:
+    return ManualWorld()
 
 
 @pytest.fixture(scope="module")
-def neighbours(world: StillWorld) -> Iterator[dict[str, RoomDriver]]:
+def neighbours(world: ManualWorld) -> Iterator[dict[str, RoomDriver]]:
     """The sensors of perception, connected."""
     found = {name: world.driver(name) for name, device in DEVICES.items() if device.driver != "perception"}
     for driver in found.values():
@@ -41,13 +41,13 @@ class TestLab(RoomDriverContract):
     def driver(
         self,
         entry: RoomDeviceManifest,
-        world: StillWorld,
+        world: ManualWorld,
         neighbours: dict[str, RoomDriver],
         monkeypatch: pytest.MonkeyPatch,
     ) -> Iterator[RoomDriver]:
         monkeypatch.setattr(perception, "SURVEY_EVERY_S", 0.0)
         monkeypatch.setattr(renderer, "TIMEOUT_S", 60.0)
-        world.go_on(0.02)
+        world.advance(0.02)
         driver = world.driver(entry, neighbours)
         yield driver
         driver.close()

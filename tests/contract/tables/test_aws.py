@@ -11,7 +11,7 @@ from function_app.adapters.aws.tables import TRIES, DynamoTables
 from function_app.ports.tables import Conflict, Page, Row, StoreError, Tables
 from tests.contract.conftest import Closing
 from tests.contract.tables.suite import Again, TablesSuite, all_rows, create_rows
-from tests.harness.stores.aws import REGION, Refusal, Wire, reset, start_wire
+from tests.harness.stores.aws import REGION, FaultProxy, Refusal, reset, start_fault_proxy
 
 Open = Callable[[str], DynamoTables]
 NAME = "telescope"
@@ -50,17 +50,17 @@ class TestDynamoTables(TablesSuite):
 
 
 @pytest.fixture
-def wire(moto: str) -> Iterator[Wire]:
-    with start_wire(moto) as wire:
-        yield wire
+def proxy(moto: str) -> Iterator[FaultProxy]:
+    with start_fault_proxy(moto) as proxy:
+        yield proxy
 
 
 @pytest.fixture
-async def over_wire(tables: Tables, open_at: Open, wire: Wire) -> Tables:
-    """The same table over a wire with faults, after its first call."""
-    over_wire = open_at(wire.endpoint)
+async def over_wire(tables: Tables, open_at: Open, proxy: FaultProxy) -> Tables:
+    """The same table over a proxy with faults, after its first call."""
+    over_wire = open_at(proxy.endpoint)
     assert await over_wire.query("T", "p") == await tables.query("T", "p")
-    wire.spoil()
+    proxy.inject()
     return over_wire
 
 
@@ -105,7 +105,9 @@ async def test_reading_with_an_invalid_key_is_refused(tables: Tables) -> None:
 # ---------------------------------------------------------------- requests
 
 
-async def test_a_page_is_one_request_for_few_more_than_its_rows(tables: Tables, over_wire: Tables, wire: Wire) -> None:
+async def test_a_page_is_one_request_for_few_more_than_its_rows(
+    tables: Tables, over_wire: Tables, proxy: FaultProxy
+) -> None:
     keys = [f"{number:03d}" for number in range(100)]
     await create_rows(tables, *keys)
     page = await over_wire.query("T", "p", first="020", last="090", limit=10)
@@ -113,54 +115,58 @@ async def test_a_page_is_one_request_for_few_more_than_its_rows(tables: Tables, 
     page = await over_wire.query("T", "p", first="020", last="090", limit=10, cursor=page.cursor)
     assert page.rows[0].key == "030"
     await over_wire.get("T", "p", "k")
-    assert wire.operations == ["Query", "Query", "GetItem"]
-    assert all(request.json["Limit"] <= 12 for request in wire.asked[:2])
-    assert [request.json["ConsistentRead"] for request in wire.asked] == [True] * 3
+    assert proxy.operations == ["Query", "Query", "GetItem"]
+    assert all(request.json["Limit"] <= 12 for request in proxy.requests[:2])
+    assert [request.json["ConsistentRead"] for request in proxy.requests] == [True] * 3
 
 
-async def test_a_page_may_need_several_of_amazons_pages(tables: Tables, over_wire: Tables, wire: Wire) -> None:
+async def test_a_page_may_need_several_of_amazons_pages(tables: Tables, over_wire: Tables, proxy: FaultProxy) -> None:
     keys = [f"{number:02d}" for number in range(12)]
     for key in keys:
         await tables.create("T", Row("p", key, {"text": "x" * 200_000}))
     page = await over_wire.query("T", "p", limit=11)
     assert [row.key for row in page.rows] == keys[:11]
     assert page.cursor is not None
-    assert wire.operations.count("Query") == len(wire.operations) > 2
+    assert proxy.operations.count("Query") == len(proxy.operations) > 2
 
 
 # ---------------------------------------------------------------- lost requests and responses
 
 
-async def test_a_write_without_response_is_no_conflict(tables: Tables, over_wire: Tables, wire: Wire) -> None:
-    wire.spoil("lose answer")
+async def test_a_write_without_response_is_no_conflict(tables: Tables, over_wire: Tables, proxy: FaultProxy) -> None:
+    proxy.inject("lose response")
     row = await over_wire.create("T", Row("p", "k", {"n": 1}))
     assert await tables.get("T", "p", "k") == row
-    wire.spoil("lose answer")
+    proxy.inject("lose response")
     row = await over_wire.replace("T", Row("p", "k", {"n": 2}, row.etag))
     assert await tables.get("T", "p", "k") == row
-    assert wire.operations == ["PutItem", "PutItem", "GetItem"]
+    assert proxy.operations == ["PutItem", "PutItem", "GetItem"]
 
 
-async def test_a_lost_write_after_another_write_is_a_conflict(tables: Tables, over_wire: Tables, wire: Wire) -> None:
+async def test_a_lost_write_after_another_write_is_a_conflict(
+    tables: Tables, over_wire: Tables, proxy: FaultProxy
+) -> None:
     row = await tables.create("T", Row("p", "k", {"n": 1}))
-    wire.spoil("lose request")
+    proxy.inject("lose request")
     with pytest.raises(Conflict):
         await over_wire.create("T", Row("p", "k", {"n": 1}))
     await tables.replace("T", row)
-    wire.spoil("lose request")
+    proxy.inject("lose request")
     with pytest.raises(Conflict):
         await over_wire.replace("T", row)
-    assert wire.operations == ["PutItem", "PutItem", "GetItem"]
+    assert proxy.operations == ["PutItem", "PutItem", "GetItem"]
 
 
-async def test_a_transaction_is_retried_with_the_same_token(tables: Tables, over_wire: Tables, wire: Wire) -> None:
-    wire.spoil("lose request")
+async def test_a_transaction_is_retried_with_the_same_token(
+    tables: Tables, over_wire: Tables, proxy: FaultProxy
+) -> None:
+    proxy.inject("lose request")
     (row,) = await create_rows(over_wire, "k")
-    first = {request.json["ClientRequestToken"] for request in wire.asked}
-    wire.spoil("lose request")
+    first = {request.json["ClientRequestToken"] for request in proxy.requests}
+    proxy.inject("lose request")
     await over_wire.delete("T", row)
-    second = {request.json["ClientRequestToken"] for request in wire.asked}
-    assert wire.operations == ["TransactWriteItems"] * 2
+    second = {request.json["ClientRequestToken"] for request in proxy.requests}
+    assert proxy.operations == ["TransactWriteItems"] * 2
     assert (len(first), len(second), first & second) == (1, 1, set())
     assert await tables.get("T", "p", "k") is None
 
@@ -170,30 +176,30 @@ def cancelled(*reasons: str) -> Refusal:
     return Refusal(400, "TransactionCanceledException", more)
 
 
-async def test_a_write_waits_for_another_transaction(over_wire: Tables, wire: Wire) -> None:
-    wire.spoil(*[cancelled("None", "TransactionConflict")] * 2)
+async def test_a_write_waits_for_another_transaction(over_wire: Tables, proxy: FaultProxy) -> None:
+    proxy.inject(*[cancelled("None", "TransactionConflict")] * 2)
     rows = await create_rows(over_wire, "a", "b")
-    assert len(wire.asked) == 3
-    wire.spoil(Refusal(400, "TransactionConflictException", {}))
+    assert len(proxy.requests) == 3
+    proxy.inject(Refusal(400, "TransactionConflictException", {}))
     await over_wire.replace("T", rows[0])
-    assert wire.operations == ["PutItem", "PutItem"]
+    assert proxy.operations == ["PutItem", "PutItem"]
 
 
 async def test_a_write_that_is_always_in_conflict_with_another_transaction_is_an_error(
-    over_wire: Tables, wire: Wire, monkeypatch: pytest.MonkeyPatch
+    over_wire: Tables, proxy: FaultProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(adapter, "_PAUSE_S", 0.001)
-    wire.spoil(*[cancelled("None", "TransactionConflict")] * TRIES)
+    proxy.inject(*[cancelled("None", "TransactionConflict")] * TRIES)
     with pytest.raises(StoreError, match=r"too much to do.*Try again"):
         await create_rows(over_wire, "a", "b")
     assert (await over_wire.query("T", "p")).rows == ()
 
 
-async def test_a_conflict_is_not_retried_and_names_the_row(over_wire: Tables, wire: Wire) -> None:
-    wire.spoil(cancelled("TransactionConflict", "ConditionalCheckFailed"))
+async def test_a_conflict_is_not_retried_and_names_the_row(over_wire: Tables, proxy: FaultProxy) -> None:
+    proxy.inject(cancelled("TransactionConflict", "ConditionalCheckFailed"))
     with pytest.raises(Conflict, match="'b'"):
         await create_rows(over_wire, "a", "b")
-    assert len(wire.asked) == 1
+    assert len(proxy.requests) == 1
 
 
 async def test_preparing_is_safe_to_repeat_and_keeps_rows(tables: Tables, open_at: Open, moto: str) -> None:

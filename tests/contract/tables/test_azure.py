@@ -21,7 +21,7 @@ from function_app.ports.tables import (
 )
 from tests.contract.conftest import Closing
 from tests.contract.tables.suite import Again, TablesSuite, all_rows, create_rows
-from tests.harness.stores.aws import Fault, Refusal, Wire, start_wire
+from tests.harness.stores.aws import Fault, FaultProxy, Refusal, start_fault_proxy
 from tests.harness.stores.azure import endpoint, through
 
 pytestmark = pytest.mark.anyio
@@ -48,15 +48,15 @@ class TestAzureTables(TablesSuite):
 
 
 @pytest.fixture
-def wire(azurite: str) -> Iterator[Wire]:
-    with start_wire(endpoint(azurite, "Table")) as wire:
-        yield wire
+def proxy(azurite: str) -> Iterator[FaultProxy]:
+    with start_fault_proxy(endpoint(azurite, "Table")) as proxy:
+        yield proxy
 
 
 @pytest.fixture
-async def over_wire(azurite: str, wire: Wire, prefix: str, closing: Closing) -> Tables:
-    """The same store over a wire with faults; its table exists."""
-    tables = closing(AzureTables(place=Place(through(azurite, wire.endpoint, "Table")), prefix=prefix))
+async def over_wire(azurite: str, proxy: FaultProxy, prefix: str, closing: Closing) -> Tables:
+    """The same store over a proxy with faults; its table exists."""
+    tables = closing(AzureTables(place=Place(through(azurite, proxy.endpoint, "Table")), prefix=prefix))
     await tables.create("T", Row("p", "first"))
     return tables
 
@@ -127,60 +127,60 @@ async def test_the_largest_batch_is_written_and_a_larger_one_is_refused(tables: 
 # ---------------------------------------------------------------- lost requests and responses
 
 
-@pytest.mark.parametrize("fault", ["lose answer", "lose request", Refusal(500, "InternalError", {})], ids=str)
+@pytest.mark.parametrize("fault", ["lose response", "lose request", Refusal(500, "InternalError", {})], ids=str)
 async def test_a_write_is_done_once_if_the_wire_fails(
-    over_wire: Tables, tables: Tables, wire: Wire, fault: Fault
+    over_wire: Tables, tables: Tables, proxy: FaultProxy, fault: Fault
 ) -> None:
-    wire.spoil(fault)
+    proxy.inject(fault)
     row = await over_wire.create("T", Row("p", "k", {"n": 1}))
     assert await tables.get("T", "p", "k") == row
-    wire.spoil(fault)
+    proxy.inject(fault)
     row = await over_wire.replace("T", Row("p", "k", {"n": 2}, row.etag))
     assert await tables.get("T", "p", "k") == row
     deleted = await tables.create("T", Row("p", "deleted"))
     replacement = Row("p", "k", {"n": 3}, row.etag)
-    wire.spoil(fault)
+    proxy.inject(fault)
     created, row, _ = await over_wire.batch(
         "T", [Write("create", Row("p", "new")), Write("replace", replacement), Write("delete", deleted)]
     )
     assert await tables.get("T", "p", "k") == row
     assert await tables.get("T", "p", "new") == created
     assert await tables.get("T", "p", "deleted") is None
-    assert not wire.faults
-    wire.spoil(fault)
+    assert not proxy.faults
+    proxy.inject(fault)
     assert await over_wire.get("T", "p", "k") == row
-    wire.spoil(fault)
+    proxy.inject(fault)
     assert len((await over_wire.query("T", "p")).rows) == 3
 
 
 async def test_the_row_of_another_writer_is_never_taken_for_the_own(
-    over_wire: Tables, tables: Tables, wire: Wire
+    over_wire: Tables, tables: Tables, proxy: FaultProxy
 ) -> None:
     row = await tables.create("T", Row("p", "k", {"n": 1}))
-    wire.spoil("lose request")
+    proxy.inject("lose request")
     with pytest.raises(Conflict):
         await over_wire.create("T", Row("p", "k", {"n": 1}))
     await tables.replace("T", row)
-    wire.spoil("lose request")
+    proxy.inject("lose request")
     with pytest.raises(Conflict):
         await over_wire.replace("T", row)
-    wire.spoil("lose request")
+    proxy.inject("lose request")
     with pytest.raises(Conflict):
         await over_wire.batch("T", [Write("create", Row("p", "l")), Write("replace", row)])
     assert await tables.get("T", "p", "l") is None
 
 
-async def test_a_delete_without_response_is_an_error(over_wire: Tables, tables: Tables, wire: Wire) -> None:
+async def test_a_delete_without_response_is_an_error(over_wire: Tables, tables: Tables, proxy: FaultProxy) -> None:
     row = await tables.create("T", Row("p", "k"))
-    wire.spoil("lose answer")
+    proxy.inject("lose response")
     with pytest.raises(StoreError, match="cannot be reached"):
         await over_wire.delete("T", row)
 
 
 async def test_a_missing_right_to_make_a_table_is_reported(
-    azurite: str, wire: Wire, prefix: str, closing: Closing
+    azurite: str, proxy: FaultProxy, prefix: str, closing: Closing
 ) -> None:
-    tables = closing(AzureTables(place=Place(through(azurite, wire.endpoint, "Table")), prefix=prefix))
-    wire.spoil("pass", Refusal(403, "AuthorizationPermissionMismatch", {}))
+    tables = closing(AzureTables(place=Place(through(azurite, proxy.endpoint, "Table")), prefix=prefix))
+    proxy.inject("pass", Refusal(403, "AuthorizationPermissionMismatch", {}))
     with pytest.raises(StoreError, match=f"'{prefix}…' may not be used"):
         await tables.create("T", Row("p", "k"))

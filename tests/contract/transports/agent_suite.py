@@ -20,7 +20,7 @@ from device_agent.protocol import Ack, AckStatus, MoveJoints, State, codec, topi
 from device_agent.transports.http.client import CloudClient
 from device_agent.transports.pairing_monitor import SOFTWARE
 from tests.contract.transports.suite import Spoken
-from tests.harness.cloud.cloud_processes import Ground
+from tests.harness.cloud.cloud_processes import CloudProcesses
 from tests.harness.network.brokers import wait_until
 
 FAR = {"shoulder_pan": 6.0}
@@ -39,24 +39,24 @@ class PairedAgent:
         links: Changes of the link.
     """
 
-    def __init__(self, ground: Ground, spoken: Spoken, folder: Path) -> None:
-        self.ground = ground
+    def __init__(self, processes: CloudProcesses, spoken: Spoken, folder: Path) -> None:
+        self.processes = processes
         self.store = IdentityStore(folder)
         key = self.store.private_key(create=True)
         config = AgentConfig(
-            server=ground.url, name="lab", devices=(DeviceEntry(name="arm", type="ur5"),), **spoken.configuration
+            server=processes.url, name="lab", devices=(DeviceEntry(name="arm", type="ur5"),), **spoken.configuration
         )
         config.save(self.store.folder)
-        api = CloudClient(ground.url, key, CloudClock())
+        api = CloudClient(processes.url, key, CloudClock())
         claim = api.enroll(
             name="lab", software=SOFTWARE, transport=config.transport, devices=catalogue.enrolled_devices(config)
         )
-        self.id: str = ground.anna.post("/agents/claim", {"code": claim.code}).json()["devices"][0]["id"]
+        self.id: str = processes.anna.post("/agents/claim", {"code": claim.code}).json()["devices"][0]["id"]
         enrollment = api.enrollment()
         self.agent: str = enrollment["agent"]
         keys = {each["id"]: each["public"] for each in enrollment["keys"]}
         self.store.save_pairing(Pairing(agent=self.agent, space=enrollment["space"], account="anna", keys=keys))
-        self._page = ground.ear(self.agent)
+        self._page = processes.viewer(self.agent)
         self._acks: list[Ack] = []
         self._states: list[State] = []
         self.start()
@@ -89,24 +89,24 @@ class PairedAgent:
         wait_until(self.online, "the agent to be online")
 
     def online(self) -> bool:
-        online: bool = self.ground.anna.get(f"/devices/{self.id}").json()["online"]
+        online: bool = self.processes.anna.get(f"/devices/{self.id}").json()["online"]
         return online
 
     def take(self) -> int:
         """Takes control and returns the epoch."""
-        answer = self.ground.anna.take_lease(self.id, wait_ms=20_000, lease_ms=600_000)
+        answer = self.processes.anna.take_lease(self.id, wait_ms=20_000, lease_ms=600_000)
         assert answer.json()["confirmed"], answer.text
         epoch: int = answer.json()["epoch"]
         return epoch
 
     def move(self, target: dict[str, float], *, speed: float = 1.0, **options: Any) -> dict[str, Any]:
         request = {"kind": "move_joints", "position_rad": target, "speed": speed}
-        action: dict[str, Any] = self.ground.anna.start(self.id, request=request, wait_ms=30_000, **options).json()
+        action: dict[str, Any] = self.processes.anna.start(self.id, request=request, wait_ms=30_000, **options).json()
         assert "id" in action, action
         return action
 
     def end_of(self, action: str) -> dict[str, Any]:
-        return self.ground.anna.action(action, wait_ms=30_000, wait_for="done")
+        return self.processes.anna.action(action, wait_ms=30_000, wait_for="done")
 
     def acks(self, command: str) -> list[AckStatus]:
         """Acknowledgements of a command at the broker, including repeated ones."""
@@ -152,33 +152,33 @@ class AgentSuite:
     spoken: Spoken
 
     @pytest.fixture
-    def agent(self, ground: Ground, spoken: Spoken, tmp_path: Path) -> Iterator[PairedAgent]:
-        agent = PairedAgent(ground, spoken, tmp_path / "agent")
+    def agent(self, processes: CloudProcesses, spoken: Spoken, tmp_path: Path) -> Iterator[PairedAgent]:
+        agent = PairedAgent(processes, spoken, tmp_path / "agent")
         yield agent
         agent.stop()
 
-    def test_the_same_commands_leave_the_same_journal(self, ground: Ground, agent: PairedAgent) -> None:
+    def test_the_same_commands_leave_the_same_journal(self, processes: CloudProcesses, agent: PairedAgent) -> None:
         epoch = agent.take()
         done = agent.move({"shoulder_pan": 0.3}, epoch=epoch, wait_for="done")
         assert done["status"] == "done", done
-        epoch = self._a_repeated_command_runs_once(ground, agent, epoch)
+        epoch = self._a_repeated_command_runs_once(processes, agent, epoch)
         cancelled = agent.move(FAR, speed=0.3, epoch=epoch, wait_for="started")
-        assert ground.anna.post(f"/actions/{cancelled['id']}/cancel").status_code < 300
+        assert processes.anna.post(f"/actions/{cancelled['id']}/cancel").status_code < 300
         ended = agent.end_of(cancelled["id"])
         assert ended["status"] == "cancelled", ended
         stopped = agent.move(FAR, speed=0.3, epoch=epoch, wait_for="started")
-        wait_until(lambda: ground.anna.post(f"/devices/{agent.id}/stop").json()["confirmed"], "the Stop")
+        wait_until(lambda: processes.anna.post(f"/devices/{agent.id}/stop").json()["confirmed"], "the Stop")
         assert agent.end_of(stopped["id"])["reason"]["code"] == "stopped"
-        self._a_restart_keeps_the_latch_and_the_epoch(ground, agent, epoch)
+        self._a_restart_keeps_the_latch_and_the_epoch(processes, agent, epoch)
 
     @staticmethod
-    def _a_repeated_command_runs_once(ground: Ground, agent: PairedAgent, epoch: int) -> int:
+    def _a_repeated_command_runs_once(processes: CloudProcesses, agent: PairedAgent, epoch: int) -> int:
         move = MoveJoints(position_rad={"shoulder_pan": 0.6}, speed=1.0)
-        order = ground.order(agent.agent, move, epoch=epoch)
-        ground.deliver(agent.agent, order)
+        order = processes.command(agent.agent, move, epoch=epoch)
+        processes.deliver(agent.agent, order)
         wait_until(lambda: AckStatus.DONE in agent.acks(order.command), "its end")
         acks, ticks = agent.acks(order.command), len(agent.commanded)
-        ground.deliver(agent.agent, order)
+        processes.deliver(agent.agent, order)
         new_epoch = agent.take()  # an agent that still has this command is asked for others
         wait_until(lambda: len(agent.acks(order.command)) > len(acks), "the last acknowledgement again")
         statuses = list(dict.fromkeys(agent.acks(order.command)))
@@ -187,7 +187,7 @@ class AgentSuite:
         return new_epoch
 
     @staticmethod
-    def _a_restart_keeps_the_latch_and_the_epoch(ground: Ground, agent: PairedAgent, epoch: int) -> None:
+    def _a_restart_keeps_the_latch_and_the_epoch(processes: CloudProcesses, agent: PairedAgent, epoch: int) -> None:
         agent.cell.stop()
         wait_until(lambda: not agent.online(), "the agent to be offline")
         agent.start()
@@ -196,14 +196,14 @@ class AgentSuite:
         new_epoch = agent.take()
         assert new_epoch > epoch
         assert agent.move(FAR, epoch=new_epoch, wait_for="done")["reason"]["code"] == "stopped"
-        wait_until(lambda: ground.anna.post(f"/devices/{agent.id}/stop/reset").json()["confirmed"], "the reset")
+        wait_until(lambda: processes.anna.post(f"/devices/{agent.id}/stop/reset").json()["confirmed"], "the reset")
         assert agent.move({"shoulder_pan": 0.0}, epoch=agent.take(), wait_for="done")["status"] == "done"
 
-    def test_the_cloud_receives_latencies(self, ground: Ground, agent: PairedAgent, spoken: Spoken) -> None:
+    def test_the_cloud_receives_latencies(self, processes: CloudProcesses, agent: PairedAgent, spoken: Spoken) -> None:
         agent.take()
 
         def latencies() -> list[dict[str, Any]]:
-            answer = ground.anna.get(f"/devices/{agent.id}/latency", params={"path": "device-cloud"})
+            answer = processes.anna.get(f"/devices/{agent.id}/latency", params={"path": "device-cloud"})
             items: list[dict[str, Any]] = answer.json()["items"]
             return items
 
@@ -215,18 +215,18 @@ class AgentSuite:
         assert item["min_ms"] > 0
 
     def test_a_lost_link_ends_motion_and_nothing_resumes(
-        self, ground: Ground, agent: PairedAgent, spoken: Spoken
+        self, processes: CloudProcesses, agent: PairedAgent, spoken: Spoken
     ) -> None:
         epoch = agent.take()
         action = agent.move(FAR, speed=0.3, epoch=epoch, wait_for="started")
         wait_until(lambda: agent.commanded[-1][1][0] > 0.3, "motion at full speed")
         before = len(agent.interrupted_s)
-        ground.endpoints[spoken.endpoint].kill()
+        processes.endpoints[spoken.endpoint].kill()
         wait_until(lambda: len(agent.interrupted_s) > before, "the loss", 4 * spoken.notices_s)
         wait_until(lambda: not agent.device._controller.moving, "rest")
         moving = agent.moved_since(agent.interrupted_s[before])
         assert len(moving) * catalogue.TYPES.load("ur5").period_ms <= HELD_WITHIN_MS, moving
-        ground.endpoints[spoken.endpoint].revive()
+        processes.endpoints[spoken.endpoint].revive()
         back_s = time.monotonic()
         wait_until(lambda: agent.links == [True, False, True], "the agent to be back")
         last = agent.journalled(action["id"])

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 
 from tests.contract.transports.suite import Spoken
-from tests.harness.cloud.cloud_processes import Ground, Link
+from tests.harness.cloud.cloud_processes import CloudProcesses, Link
 
 
 @pytest.fixture
@@ -15,19 +15,19 @@ def spoken(request: pytest.FixtureRequest) -> Spoken:
 
 
 @pytest.fixture
-def ground(spoken: Spoken, grounds: Callable[[Any], Ground]) -> Ground:
-    return grounds(spoken.broker)
+def processes(spoken: Spoken, start_processes: Callable[[Any], CloudProcesses]) -> CloudProcesses:
+    return start_processes(spoken.broker)
 
 
 @pytest.fixture
-def link(ground: Ground, spoken: Spoken) -> Iterator[Link]:
+def link(processes: CloudProcesses, spoken: Spoken) -> Iterator[Link]:
     """A transport that is not yet started."""
-    with Link(ground, spoken.configuration) as link:
+    with Link(processes, spoken.configuration) as link:
         yield link
 
 
 @pytest.fixture
-def fragile(ground: Ground, spoken: Spoken) -> Iterator[Link]:
+def fragile(processes: CloudProcesses, spoken: Spoken) -> Iterator[Link]:
     """Like ``link``, through a proxy in front of its endpoint."""
-    with Link(ground, spoken.configuration, through=spoken.endpoint) as link:
+    with Link(processes, spoken.configuration, through=spoken.endpoint) as link:
         yield link

@@ -1,7 +1,7 @@
 """Contract of the agent's transports, tested against the real functions.
 
 A test class inherits ``TransportSuite`` and sets ``spoken``. If the transport connects to neither the server nor the
-broker, the class overrides the fixture ``ground`` and adds its endpoint to ``ground.endpoints``.
+broker, the class overrides the fixture ``processes`` and adds its endpoint to ``processes.endpoints``.
 """
 
 import itertools
@@ -17,7 +17,7 @@ import pytest
 
 from device_agent.protocol import Ack, AckStatus, Event, Fault, Measurements, Mode, State, codec, topics
 from function_app.domain.common.ids import command_id
-from tests.harness.cloud.cloud_processes import Ground, Link
+from tests.harness.cloud.cloud_processes import CloudProcesses, Link
 from tests.harness.network.brokers import BrokerKind, wait_until
 
 ODD = '{"b" : "grüß 🤖 \\u00fc\\n\\"\\\\", "a":1.50,\t"c": [ ]}'.encode()
@@ -32,7 +32,7 @@ class Spoken:
 
     Attributes:
         configuration: Its part of ``agent.toml``.
-        endpoint: Other end of its connection, one of ``ground.endpoints``.
+        endpoint: Other end of its connection, one of ``processes.endpoints``.
         notices_s: Time in which it detects a network that drops all data while something moves [s].
         stores: Whether an acknowledged message is in the cloud's tables; a broker acknowledges for itself alone.
         broker: Broker of the cloud.
@@ -50,21 +50,23 @@ class TransportSuite:
 
     spoken: Spoken
 
-    def test_publishing_is_possible_once_the_agent_is_online(self, ground: Ground, link: Link) -> None:
+    def test_publishing_is_possible_once_the_agent_is_online(self, processes: CloudProcesses, link: Link) -> None:
         assert not link.transport.publish(link.topic(topics.STATE), b"{}", qos=1)
         link.start().up()
         wait_until(lambda: link.presences() == [(True, link.sessions)], "one presence")
-        wait_until(lambda: ground.anna.get(f"/devices/{link.robot.device}").json()["online"], "the cloud to know")
+        wait_until(lambda: processes.anna.get(f"/devices/{link.robot.device}").json()["online"], "the cloud to know")
         assert link.changes == [True]
 
-    def test_commands_arrive_unchanged_in_order_and_expired_ones_do_not(self, ground: Ground, link: Link) -> None:
-        ground.keep(link.topic(topics.CMD), b'{"retained":1}')
-        ground.send(link.robot, b'{"expired":1}', in_ms=1)
+    def test_commands_arrive_unchanged_in_order_and_expired_ones_do_not(
+        self, processes: CloudProcesses, link: Link
+    ) -> None:
+        processes.publish_retained(link.topic(topics.CMD), b'{"retained":1}')
+        processes.send(link.robot, b'{"expired":1}', in_ms=1)
         time.sleep(0.01)
         link.start().up()
         commands = [ODD, *(b'{"number":%d}' % number for number in range(20)), b'{"large":"%s"}' % (b"x" * 120_000)]
         for command in commands:
-            ground.send(link.robot, command)
+            processes.send(link.robot, command)
         wait_until(lambda: commands[-1] in dict.fromkeys(payload for _, payload in link.received), "the last one")
         assert list(dict.fromkeys(payload for _, payload in link.received)) == commands
         assert {topic for topic, _ in link.received} == {link.topic(topics.CMD)}
@@ -76,11 +78,11 @@ class TransportSuite:
         for number, payload in enumerate(events):
             assert link.publish(topics.EVENT, payload, partial(acknowledged.append, number))
         wait_until(lambda: len(acknowledged) == len(events), "all acknowledgements")
-        wait_until(lambda: len(link.heard(topics.EVENT)) == len(events), "all events")
-        assert link.heard(topics.EVENT) == events
+        wait_until(lambda: len(link.published(topics.EVENT)) == len(events), "all events")
+        assert link.published(topics.EVENT) == events
         assert sorted(acknowledged) == list(range(len(events)))
 
-    def test_the_largest_retained_message_arrives(self, ground: Ground, link: Link) -> None:
+    def test_the_largest_retained_message_arrives(self, processes: CloudProcesses, link: Link) -> None:
         link.start().up()
         fault = Fault(code="tested", message="x" * 2000, since_ms=_now_ms())
         message = State(device="arm", at_ms=_now_ms(), tick_ms=1, mode=Mode.IDLE, epoch=0, faults=(fault,))
@@ -89,8 +91,8 @@ class TransportSuite:
         acknowledged = threading.Event()
         assert link.transport.publish(link.topic(topics.STATE), state, qos=1, retain=True, delivered=acknowledged.set)
         wait_until(acknowledged.is_set, "the acknowledgement")
-        wait_until(lambda: link.heard(topics.STATE) == [state], "the state")
-        with ground.ear(link.robot.id) as late:
+        wait_until(lambda: link.published(topics.STATE) == [state], "the state")
+        with processes.viewer(link.robot.id) as late:
             messages = [late.receive(), late.receive()]
             assert state in [message.payload for message in messages if message.retain]
 
@@ -103,8 +105,8 @@ class TransportSuite:
                 link.publish_measurement(100 * number + sequence)
             assert link.publish(topics.ACK, ack, partial(acknowledged.append, number))
         wait_until(lambda: sorted(acknowledged) == list(range(30)), "all acknowledgements")
-        wait_until(lambda: len(link.heard(topics.ACK)) == len(acks), "all acks")
-        assert link.heard(topics.ACK) == acks
+        wait_until(lambda: len(link.published(topics.ACK)) == len(acks), "all acks")
+        assert link.published(topics.ACK) == acks
         wait_until(lambda: _sequences(link)[-1:] == [2999], "the newest measurement, which replaces older ones")
         assert _sequences(link) == sorted(set(_sequences(link)))
 
@@ -128,15 +130,17 @@ class TransportSuite:
         wait_until(lambda: len(acknowledged) == 15, "all acknowledgements")
         assert link.changes == [True]
 
-    def test_it_reconnects_after_the_other_end_was_killed(self, ground: Ground, link: Link, spoken: Spoken) -> None:
+    def test_it_reconnects_after_the_other_end_was_killed(
+        self, processes: CloudProcesses, link: Link, spoken: Spoken
+    ) -> None:
         link.start().up()
-        ground.endpoints[spoken.endpoint].kill()
+        processes.endpoints[spoken.endpoint].kill()
         wait_until(lambda: link.changes == [True, False], "the loss")
         assert not link.publish(topics.ACK, codec.encode(_ack(link, 1)))
-        ground.endpoints[spoken.endpoint].revive()
+        processes.endpoints[spoken.endpoint].revive()
         link.up(2)
         assert link.sessions >= 2, "each connection has a number of its own"
-        ground.send(link.robot, ODD)
+        processes.send(link.robot, ODD)
         wait_until(lambda: (link.topic(topics.CMD), ODD) in link.received, "a command over the new link")
         assert link.changes == [True, False, True]
 
@@ -158,7 +162,7 @@ class TransportSuite:
                 break
             fragile.up(fragile.changes.count(True) + (not fragile.changes[-1]))
         assert acknowledged == events.keys()
-        wait_until(lambda: set(fragile.heard(topics.EVENT)) == set(events.values()), "all events")
+        wait_until(lambda: set(fragile.published(topics.EVENT)) == set(events.values()), "all events")
         assert all(after is not before for before, after in itertools.pairwise(fragile.changes))
 
     @pytest.mark.long
@@ -174,13 +178,13 @@ class TransportSuite:
         fragile.up(2)
 
     @pytest.mark.parametrize("change", ["unpaired", "moved"])
-    def test_an_agent_without_its_pairing_disconnects(self, ground: Ground, link: Link, change: str) -> None:
+    def test_an_agent_without_its_pairing_disconnects(self, processes: CloudProcesses, link: Link, change: str) -> None:
         link.start().up()
         if change == "unpaired":
-            assert ground.anna.delete(f"/agents/{link.robot.id}").status_code == 204
+            assert processes.anna.delete(f"/agents/{link.robot.id}").status_code == 204
         else:
-            attic = ground.anna.post("/spaces", {"name": f"Attic of {link.robot.id}"}).json()["id"]
-            assert ground.anna.put(f"/agents/{link.robot.id}/space", {"space": attic}).status_code == 200
+            attic = processes.anna.post("/spaces", {"name": f"Attic of {link.robot.id}"}).json()["id"]
+            assert processes.anna.put(f"/agents/{link.robot.id}/space", {"space": attic}).status_code == 200
 
         def detected() -> bool:
             link.publish_measurement(1)  # some transports detect only on sending that the pairing is invalid
@@ -200,7 +204,7 @@ class TransportSuite:
         assert link.changes == [True, False]
         assert not link.publish(topics.ACK, b"{}")
         wait_until(lambda: link.presences()[-1:] == [(False, link.sessions)], "the offline presence of this session")
-        assert link.heard(topics.ACK) == [last]
+        assert link.published(topics.ACK) == [last]
         wait_until(lambda: not link.threads(), f"the end of {link.threads()}")
         assert duration_s < STOPS_WITHIN_S
         link.transport.stop()
@@ -232,7 +236,7 @@ def _ack(link: Link, number: int) -> Ack:
 
 
 def _sequences(link: Link) -> list[int]:
-    return [codec.decode(payload, Measurements).sequence for payload in link.heard(topics.TELE)]
+    return [codec.decode(payload, Measurements).sequence for payload in link.published(topics.TELE)]
 
 
 def _reformat(payload: bytes) -> bytes:

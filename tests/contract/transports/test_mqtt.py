@@ -19,7 +19,7 @@ class _OverMqtt(TransportSuite):
         fragile.start().up()
         assert fragile.proxy is not None
         assert fragile.transport.publish(fragile.topic(topics.TELE, "joints"), b"{}", qos=0)
-        wait_until(lambda: fragile.heard(topics.TELE), "a measurement at the broker")
+        wait_until(lambda: fragile.published(topics.TELE), "a measurement at the broker")
         fragile.transport._connection._client._last_mid -= 1  # type: ignore[attr-defined]
         fragile.proxy.freeze()
         acknowledged = threading.Event()

@@ -9,7 +9,7 @@ from tests.harness.browser.browser import person
 from tests.harness.cloud.oidc_provider import CLIENT_ID, CLIENT_SECRET, new_key, start_provider
 from tests.harness.cloud.people import sign_in_link
 from tests.harness.hosts.host import environment_of, start_program
-from tests.harness.hosts.uvicorn import _answers, _free_port
+from tests.harness.hosts.uvicorn import _free_port, _listens
 from tests.harness.network.brokers import wait_until
 
 PASSWORD = "correct horse battery"
@@ -35,7 +35,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
             "TELESCOPE_OIDC_ACCOUNTS": "anyone",
         }
         with start_program(["-m", "function_app", "serve"], environment_of(settings)) as server:
-            wait_until(lambda: _answers(port) or server.process.poll() is not None, "the server")
+            wait_until(lambda: _listens(port) or server.process.poll() is not None, "the server")
             assert server.process.poll() is None, server.stderr()
             yield settings
 

@@ -1,6 +1,6 @@
-"""A real agent in a process of its own, without the functions: a test has their key, and gives the broker's rights.
+"""A real agent in a separate process without the functions: the test signs commands and grants broker permissions.
 
-``python -m tests.harness.agent.custom_agent HOME`` runs it; its credentials are in ``access.json`` there.
+``python -m tests.harness.agent.custom_agent HOME`` runs it with the credentials in ``HOME/access.json``.
 """
 
 import json
@@ -38,11 +38,11 @@ from tests.harness.paths import ROOT
 
 SPACE, AGENT, DEVICE = "lab", "arm1", "arm"
 _ACCESS = "access.json"
-_HEARD = (topics.STATE, topics.ACK, topics.EVENT)
+_KINDS = (topics.STATE, topics.ACK, topics.EVENT)
 
 
 class _Api:
-    """What the agent asks the functions for, from a file."""
+    """Replaces the HTTP API; reads the credentials from a file."""
 
     server = "http://server.invalid"
     ca = None
@@ -57,17 +57,20 @@ class _Api:
     def credentials(self) -> dict[str, Any]:
         now = tick_ms()
         self._clock.observe(server_ms=wall_ms(), sent_tick_ms=now, received_tick_ms=now)
-        found: dict[str, Any] = json.loads(self._path.read_text())
-        return found
+        credentials: dict[str, Any] = json.loads(self._path.read_text())
+        return credentials
 
 
-class OwnAgent:
-    """The agent's process, the connection on which the functions would speak with it, and all that was heard.
+class AgentProcess:
+    """The agent's process, and a broker connection with the permissions of the functions.
 
     Args:
-        folder: Its store.
-        broker: Running.
-        toml: ``agent.toml`` below server and name; one device ``arm``.
+        folder: Home folder of the agent.
+        broker: A running broker.
+        toml: Text of ``agent.toml`` after server and name, with one device ``arm``.
+
+    Attributes:
+        messages: Topic and payload of each message received from the agent.
     """
 
     def __init__(self, folder: Path, broker: RunningBroker, toml: str) -> None:
@@ -78,11 +81,11 @@ class OwnAgent:
         self.store.save_pairing(Pairing(agent=AGENT, space=SPACE, account="ann", keys=keys))
         (folder / "agent.toml").write_text(f'server = "http://server.invalid"\nname = "arm"\n{toml}')
         self.process: subprocess.Popen[bytes] | None = None
-        self.heard: list[tuple[str, bytes]] = []
-        self.use(broker)
+        self.messages: list[tuple[str, bytes]] = []
+        self.use_broker(broker)
 
-    def use(self, broker: RunningBroker) -> None:
-        """Speak over this broker from now on."""
+    def use_broker(self, broker: RunningBroker) -> None:
+        """Connect to this broker and issue new credentials for the agent."""
         grant = grants.agent_grant(SPACE, AGENT, token_id=os.urandom(8).hex(), lifetime_s=300)
         login = broker.issue(grant)
         access = {
@@ -94,9 +97,9 @@ class OwnAgent:
             "lifetime_s": 300,
         }
         (self.store.folder / _ACCESS).write_text(json.dumps(access))
-        self.line: Client = broker.service()
-        self.line.subscribe(*(self.topic(kind) for kind in _HEARD))
-        self.line.subscribe(self.topic(topics.TELE, "+"), self.topic(topics.LATE, "+"))
+        self.client: Client = broker.service()
+        self.client.subscribe(*(self.topic(kind) for kind in _KINDS))
+        self.client.subscribe(self.topic(topics.TELE, "+"), self.topic(topics.LATE, "+"))
 
     def start(self) -> Self:
         command = [sys.executable, "-m", "tests.harness.agent.custom_agent", str(self.store.folder)]
@@ -106,7 +109,7 @@ class OwnAgent:
         return self
 
     def kill(self) -> None:
-        """As a machine that loses its power; ``with`` ends it in order."""
+        """Kill the agent; the context manager terminates it by SIGTERM."""
         assert self.process is not None
         self.process.kill()
         self.process.wait(20)
@@ -121,9 +124,9 @@ class OwnAgent:
                 self.process.wait(20)
             except subprocess.TimeoutExpired:
                 self.process.kill()
-        self.line.close()
+        self.client.close()
 
-    # ------------------------------------------------------------ to it
+    # ------------------------------------------------------------ commands
 
     @staticmethod
     def topic(kind: str, name: str = "") -> str:
@@ -141,77 +144,79 @@ class OwnAgent:
             epoch=epoch,
             request=request,
         )
-        self.line.publish(self.topic(topics.CMD), signing.sign(codec.encode(command), self.key))
+        self.client.publish(self.topic(topics.CMD), signing.sign(codec.encode(command), self.key))
         return command.id
 
     def execute(self, request: Request, *, epoch: int = 0) -> Ack:
-        """A command that ends at once; its last answer."""
-        return self.ended(self.command(request, epoch=epoch))
+        """Send a command and wait for its final acknowledgement."""
+        return self.final_ack(self.command(request, epoch=epoch))
 
     def move(self, target_rad: float, *, epoch: int, speed: float = 0.3) -> str:
-        """Take control and turn the base; the action's id once it moves."""
+        """Grant a lease and turn the base. Returns the command's id when the arm moves."""
         self.execute(GrantLease(holder="ann", lease_ms=60_000), epoch=epoch)
         command = self.command(MoveJoints(position_rad={"shoulder_pan": target_rad}, speed=speed), epoch=epoch)
         wait_until(lambda: self.speeds()[-3:] and min(self.speeds()[-3:]) > 0.05, "the arm to move")
         return command
 
-    # ------------------------------------------------------------ from it
+    # ------------------------------------------------------------ messages
 
-    def _listen(self) -> list[tuple[str, bytes]]:
-        self.heard += [(message.topic, message.payload) for message in self.line.pending()]
-        return self.heard
+    def _receive_pending(self) -> list[tuple[str, bytes]]:
+        self.messages += [(message.topic, message.payload) for message in self.client.pending()]
+        return self.messages
 
-    def told(self, kind: str, message: type[Any], name: str = "") -> list[Any]:
-        wanted = self.topic(kind, name)
-        return [codec.decode(payload, message) for topic, payload in self._listen() if topic == wanted]
+    def received(self, kind: str, message: type[Any], name: str = "") -> list[Any]:
+        """All messages received on one topic, decoded."""
+        expected = self.topic(kind, name)
+        return [codec.decode(payload, message) for topic, payload in self._receive_pending() if topic == expected]
 
-    def ended(self, command: str) -> Ack:
-        """The last answer to a command, once there is one."""
-        found: list[Ack] = []
+    def final_ack(self, command: str) -> Ack:
+        """Wait for the final acknowledgement of a command."""
+        acks: list[Ack] = []
 
-        def over() -> bool:
-            found[:] = [ack for ack in self.told(topics.ACK, Ack) if ack.id == command and ack.status.terminal]
-            return bool(found)
+        def ended() -> bool:
+            acks[:] = [ack for ack in self.received(topics.ACK, Ack) if ack.id == command and ack.status.terminal]
+            return bool(acks)
 
-        wait_until(over, f"the end of {command}")
-        return found[0]
+        wait_until(ended, f"the end of {command}")
+        return acks[0]
 
     def telemetry(self) -> list[JointTelemetry]:
-        return self.told(topics.TELE, JointTelemetry, topics.JOINTS)
+        return self.received(topics.TELE, JointTelemetry, topics.JOINTS)
 
     def speeds(self, *, since: int = 0) -> list[float]:
-        """Commanded speed of the base between each two measurements that were told, from one on [rad/s]."""
-        seen = self.telemetry()[since:]
+        """Commanded speed of the base between consecutive measurements, starting with number ``since`` [rad/s]."""
+        measurements = self.telemetry()[since:]
         return [
             abs(after.commanded_rad[0] - before.commanded_rad[0]) / (after.tick_ms - before.tick_ms) * 1000
-            for before, after in pairwise(seen)
+            for before, after in pairwise(measurements)
             if after.tick_ms > before.tick_ms
         ]
 
     def state(self) -> State:
-        """The newest."""
-        wait_until(lambda: self.told(topics.STATE, State), "a state")
-        newest: State = self.told(topics.STATE, State)[-1]
+        """The newest state; waits for the first one."""
+        wait_until(lambda: self.received(topics.STATE, State), "a state")
+        newest: State = self.received(topics.STATE, State)[-1]
         return newest
 
     def events(self, kind: str) -> list[Event]:
-        return [event for event in self.told(topics.EVENT, Event) if event.kind == kind]
+        return [event for event in self.received(topics.EVENT, Event) if event.kind == kind]
 
     def ready(self) -> None:
-        """Wait until it measures over this link."""
+        """Wait for telemetry over the current connection."""
         before = len(self.telemetry())
         wait_until(lambda: len(self.telemetry()) > before + 3, "telemetry")
 
 
 class Sensor:
-    """A room device behind another agent, as the broker sees it. Says ``values`` ten times a second; ``None``: nothing.
+    """A fake room device of another agent; a context manager that publishes ``values`` at 10 Hz.
 
-    ``with`` ends it.
+    Attributes:
+        values: Published values; ``None``: no messages.
     """
 
     def __init__(self, broker: RunningBroker, agent: str, device: str, stream: str, **values: float | bool) -> None:
         grant = grants.agent_grant(SPACE, agent, token_id=os.urandom(8).hex(), lifetime_s=300)
-        self._line = broker.connect(agent, broker.issue(grant))
+        self._client = broker.connect(agent, broker.issue(grant))
         self._topic = topics.device(SPACE, agent, device, topics.TELE, stream)
         self._sequence = 0
         self._ending = threading.Event()
@@ -225,7 +230,7 @@ class Sensor:
     def __exit__(self, *_: object) -> None:
         self._ending.set()
         self._thread.join(5)
-        self._line.close()
+        self._client.close()
 
     def _run(self) -> None:
         while not self._ending.wait(0.1):
@@ -233,7 +238,7 @@ class Sensor:
             if values is not None:
                 self._sequence += 1
                 message = Measurements(tick_ms=tick_ms(), at_ms=wall_ms(), sequence=self._sequence, values=values)
-                self._line.publish(self._topic, codec.encode(message), qos=0)
+                self._client.publish(self._topic, codec.encode(message), qos=0)
 
 
 if __name__ == "__main__":

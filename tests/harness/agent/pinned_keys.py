@@ -1,4 +1,4 @@
-"""Pinned keys, as an agent has them that was claimed."""
+"""Pinned keys of a claimed agent."""
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -8,11 +8,11 @@ from device_agent.runtime.commands.pinned_keys import PinnedKeys
 
 
 def pinned(pairing: Pairing) -> PinnedKeys:
-    """The pins of a pairing that is written nowhere."""
+    """Pinned keys of a pairing, without storage."""
     return PinnedKeys(pairing, save=lambda _: None, now_ms=lambda: None)
 
 
 def pinned_keys_of(*keys: Ed25519PrivateKey) -> PinnedKeys:
-    """PinnedKeys of the public halves of some keys."""
-    halves = {signing.key_id(key.public_key()): signing.public_text(key.public_key()) for key in keys}
-    return pinned(Pairing(agent="a", space="s", account="ann", keys=halves))
+    """``PinnedKeys`` with the public parts of these keys."""
+    public = {signing.key_id(key.public_key()): signing.public_text(key.public_key()) for key in keys}
+    return pinned(Pairing(agent="a", space="s", account="ann", keys=public))

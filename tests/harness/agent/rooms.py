@@ -1,4 +1,4 @@
-"""The laboratory's simulation driven by hand, and drivers of its devices: no test waits for real time."""
+"""The laboratory's simulation with time advanced by the test, and drivers of its devices."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,8 +20,8 @@ LAB = ROBOTS / "rooms" / "lab"
 STEP_S = 0.002
 
 
-class StillWorld:
-    """A room's world in which time passes only by ``go_on``. Otherwise as ``ports.world.SimulatedWorld``."""
+class ManualWorld:
+    """``ports.world.SimulatedWorld`` whose time advances only in ``advance``."""
 
     def __init__(self, folder: Path = LAB, manifest: Room | None = None) -> None:
         self.manifest = manifest or room.load(folder)
@@ -60,25 +60,25 @@ class StillWorld:
     def sound(self, name: str, level_db: float, *, for_s: float) -> None:
         self.world.sound(name, level_db, for_s=for_s)
 
-    def go_on(self, for_s: float) -> None:
+    def advance(self, for_s: float) -> None:
         self.world.step(round(for_s / STEP_S))
 
     def place(self, name: str) -> tuple[float, float, float]:
-        """Where a body of the model is now [m]."""
+        """Current position of a body of the model [m]."""
         x, y, z = self.world.snapshot().body_position_m[self.model.body(name).id].tolist()
         return (x, y, z)
 
     # ------------------------------------------------------------ devices
 
     def entry(self, name: str) -> RoomDeviceManifest:
-        found = self.manifest.device(name)
-        assert found is not None
-        return found
+        entry = self.manifest.device(name)
+        assert entry is not None
+        return entry
 
     def driver(
         self, device: RoomDeviceManifest | str, neighbours: Mapping[str, RoomDriver] | None = None
     ) -> RoomDriver:
-        """The driver of one of its devices, not connected."""
+        """A disconnected driver of a device."""
         entry = self.entry(device) if isinstance(device, str) else device
         surroundings = Surroundings(neighbours=neighbours or {}, world=self)
         return sensors.load(entry.driver)(entry, self._folder, surroundings)

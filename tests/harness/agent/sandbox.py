@@ -1,4 +1,4 @@
-"""One warm sandbox per test process, and an unavailable one for tests without scripts."""
+"""A shared running sandbox for each test process, and an unavailable one for tests without scripts."""
 
 import atexit
 from functools import cache
@@ -12,7 +12,7 @@ LACK = "no seccomp; install libseccomp2"
 
 @cache
 def warm_sandbox() -> SandboxHost:
-    """The real one, with every layer."""
+    """The real sandbox with every layer."""
     sandbox = SandboxHost()
     sandbox.start()
     atexit.register(sandbox.close)
@@ -20,17 +20,17 @@ def warm_sandbox() -> SandboxHost:
 
 
 class LateSandbox(SandboxHost):
-    """The real one, which starts its first process for the first script only: for agents that live a moment."""
+    """The real sandbox, started by the first script; for agents that run briefly."""
 
     def status(self) -> SandboxStatus:
         return SandboxStatus("sandboxed")
 
 
 class NoSandbox:
-    """A machine on which no script runs; starts no process."""
+    """A sandbox that rejects every script and starts no process."""
 
-    def __init__(self, how: Literal["unconfined", "unavailable"] = "unavailable") -> None:
-        self._mode = how
+    def __init__(self, mode: Literal["unconfined", "unavailable"] = "unavailable") -> None:
+        self._mode = mode
 
     def start(self) -> None:
         pass

@@ -1,4 +1,4 @@
-"""The functions over real SQLite and a real broker, for tests that are not async; people who use them, and a toy robot.
+"""The functions for synchronous tests, over SQLite and a real broker or over fakes, and people who use them.
 
 with Cloud(settings(home, broker)) as cloud:
     anna = cloud.sign_in("anna")
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 BASE = "http://telescope.test"
 API = "/api/v1"
 MOVE = {"kind": "move_joints", "position_rad": {"elbow": 1.0}}
-"""An action that every robot takes."""
+"""A request that every robot accepts."""
 
 TOKEN_MS = ACCESS_S * 1000
 
@@ -44,16 +44,16 @@ T = TypeVar("T")
 
 
 def connect_to_broker(issued: dict[str, Any], *, on_message: Callable[[Message], None] | None = None) -> Client:
-    """Returns a connection to a real broker with credentials that the API issued."""
+    """A connection to a real broker with credentials that the API issued."""
     credentials = Credentials(issued["username"], issued["password"])
     return Client(issued["client_id"], credentials, port=issued["tcp"]["port"], on_message=on_message).open()
 
 
 class Cloud:
-    """One instance of the functions, with the ingest beside it.
+    """One instance of the functions, with its ingest.
 
-    With ``memory`` it runs over fakes in the thread of the test: a call returns once all that it caused is stored.
-    Without, it runs over the adapters that the settings choose, on an event loop in a thread of its own.
+    With ``memory`` it uses fakes and runs in the thread of the test; a call returns when all its effects are stored.
+    Otherwise it uses the adapters of the settings and runs on an event loop in a separate thread.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Cloud:
         return result
 
     def begin(self, call: Coroutine[Any, Any, T]) -> Callable[[], T]:
-        """Run a coroutine without waiting for its end; call what this returns for the result."""
+        """Start a coroutine. Returns a function that waits for its result."""
         if self.memory is None:
             future = asyncio.run_coroutine_threadsafe(call, self.loop)
             return lambda: future.result(4 * PATIENCE_S)
@@ -98,12 +98,12 @@ class Cloud:
         return lambda: self.run(_result(task))
 
     def settle(self) -> None:
-        """In memory: run what is ready, until everything that was published is stored."""
+        """With ``memory``: run all ready tasks until every published message is stored."""
         if self.memory is not None:
             self.memory.settle()
 
     def connect(self, issued: dict[str, Any], *, on_message: Callable[[Message], None] | None = None) -> Client:
-        """A connection to the broker with credentials that the API has issued."""
+        """A connection to the broker with credentials that the API issued."""
         if self.memory is None:
             return connect_to_broker(issued, on_message=on_message)
         credentials = Credentials(issued["username"], issued["password"])
@@ -111,7 +111,7 @@ class Cloud:
         return cast("Client", connection)
 
     def client(self, *, address: str = "127.0.0.1", **options: Any) -> httpx.AsyncClient:
-        """A new HTTP client with a cookie jar of its own, that asks from ``address``."""
+        """A new HTTP client with separate cookies whose requests come from ``address``."""
         transport = httpx.ASGITransport(self.app, raise_app_exceptions=False, client=(address, 50_000))
         client = httpx.AsyncClient(transport=transport, base_url=BASE, timeout=PATIENCE_S, **options)
         self._clients.append(client)
@@ -125,10 +125,10 @@ class Cloud:
     def link(self, name: str) -> str:
         """A one-time sign-in token."""
 
-        async def made() -> str:
+        async def create() -> str:
             return await self.functions.sign_in.link(await self.functions.sign_in.account(name))
 
-        return self.run(made())
+        return self.run(create())
 
     def sign_in(self, name: str, *, address: str = "127.0.0.1") -> "Person":
         """Returns a person in a new sign-in session whose requests come from ``address``."""
@@ -141,25 +141,25 @@ class Cloud:
         return Robot(self, names or ("arm",))
 
     def start_ingest(self) -> None:
-        """Take in what agents say, until the end; returns once it hears them."""
+        """Process messages of agents until the end; returns when it is subscribed."""
 
         async def handle(topic: str, payload: bytes) -> None:
             await ingest(self.functions, topic, payload)
 
-        self._listen(self.functions.feed, handle)
+        self._run_feed(self.functions.feed, handle)
 
     def start_telemetry(self) -> None:
-        """Take in what robots measure, until the end; returns once it hears them."""
-        self._listen(self.functions.telemetry, self._store)
+        """Process live measurements until the end; returns when it is subscribed."""
+        self._run_feed(self.functions.telemetry, self._store)
 
     def start_late(self) -> None:
-        """Take in what robots measured while their link was down, until the end; returns once it hears them."""
-        self._listen(self.functions.late, self._store)
+        """Process measurements that agents buffered while offline; returns when it is subscribed."""
+        self._run_feed(self.functions.late, self._store)
 
     async def _store(self, messages: Sequence[tuple[str, bytes]]) -> None:
         await ingest_telemetry(self.functions, messages)
 
-    def _listen(self, feed: Any, handle: Callable[..., Coroutine[Any, Any, None]]) -> None:
+    def _run_feed(self, feed: Any, handle: Callable[..., Coroutine[Any, Any, None]]) -> None:
         async def start() -> None:
             self._feeds.append(asyncio.ensure_future(feed.run(handle)))
             if self.memory is None:
@@ -170,7 +170,7 @@ class Cloud:
         self.run(start())
 
     def sweep(self) -> None:
-        """One round of the timer."""
+        """Run the due jobs of the timer once."""
         self.run(self.functions.scheduler.run_due_jobs())
 
     def __enter__(self) -> Self:
@@ -199,7 +199,7 @@ async def _result(task: asyncio.Task[T]) -> T:
 
 
 class Person:
-    """An account in one sign-in session, by access token, for which it gets the next one in time."""
+    """An account in one sign-in session; renews its access token in time."""
 
     def __init__(self, cloud: Cloud, signed_in: dict[str, Any], *, address: str = "127.0.0.1") -> None:
         self.cloud = cloud
@@ -207,25 +207,25 @@ class Person:
         self.account: str = signed_in["account"]["id"]
         self.name: str = signed_in["account"]["name"]
         self.session: str = signed_in["session"]
-        self._given_ms = cloud.clock.now_ms()
+        self._issued_ms = cloud.clock.now_ms()
         self._client = cloud.client(address=address, headers={"Authorization": f"Bearer {self.token}"})
 
-    def _stay(self) -> None:
-        """As a program does that has kept the cookie of its session."""
+    def _renew_token(self) -> None:
+        """Renew the access token, as a program with the cookie of its session does."""
         now_ms = self.cloud.clock.now_ms()
-        if TOKEN_MS // 2 < now_ms - self._given_ms < SESSION_S * 1000:
-            who = Identity(self.account, self.name, self.session)
-            self.token, _ = self.cloud.run(self.cloud.functions.sessions.access_token(who))
-            self._given_ms = now_ms
+        if TOKEN_MS // 2 < now_ms - self._issued_ms < SESSION_S * 1000:
+            identity = Identity(self.account, self.name, self.session)
+            self.token, _ = self.cloud.run(self.cloud.functions.sessions.access_token(identity))
+            self._issued_ms = now_ms
             self._client.headers["Authorization"] = f"Bearer {self.token}"
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
-        self._stay()
+        self._renew_token()
         return self.cloud.run(self._client.request(method, API + path, **options))
 
     def begin(self, method: str, path: str, **options: Any) -> Callable[[], httpx.Response]:
-        """Ask without waiting; call what this gives for the answer."""
-        self._stay()
+        """Start a request. Returns a function that waits for the response."""
+        self._renew_token()
         call = self._client.request(method, API + path, **options)
         return self.cloud.begin(call)
 
@@ -234,12 +234,12 @@ class Person:
 
     def each_page(self, path: str, **query: Any) -> list[list[dict[str, Any]]]:
         """All pages of a list."""
-        found: list[list[dict[str, Any]]] = []
+        pages: list[list[dict[str, Any]]] = []
         while True:
             page = self.get(path, params=query).json()
-            found.append(page["items"])
+            pages.append(page["items"])
             if page["cursor"] is None:
-                return found
+                return pages
             query["cursor"] = page["cursor"]
 
     def pages(self, path: str, **query: Any) -> list[dict[str, Any]]:
@@ -260,8 +260,8 @@ class Person:
         return self.request("DELETE", path)
 
     def start(self, device: str, **options: Any) -> httpx.Response:
-        """Start an action; ``MOVE`` where no ``request`` is given. ``once`` is the idempotency key."""
-        headers = {"Idempotency-Key": options.pop("once")} if "once" in options else {}
+        """Start an action; default ``request``: ``MOVE``."""
+        headers = {"Idempotency-Key": options.pop("idempotency_key")} if "idempotency_key" in options else {}
         return self.post(f"/devices/{device}/actions", {"request": MOVE, **options}, headers=headers)
 
     def take_lease(self, device: str, **options: Any) -> httpx.Response:
@@ -270,26 +270,29 @@ class Person:
     def action(self, action: str, **query: Any) -> dict[str, Any]:
         answer = self.get(f"/actions/{action}", params=query)
         assert answer.status_code == 200, answer.text
-        found: dict[str, Any] = answer.json()
-        return found
+        action_body: dict[str, Any] = answer.json()
+        return action_body
 
 
 def settings(home: Path, broker: RunningBroker | None = None, **changes: Any) -> Settings:
-    """Settings of functions with this home, at this broker (``None``: at no broker).
+    """Settings of functions with this home and broker (``None``: no broker).
 
-    Requests are counted only where a test asks for it: all of a test's people share one address.
+    Rate limits are off unless a test sets them, because all people of a test share one address.
     """
     unlimited = RateLimits(address=0, account=0, key=0, agent=0)
-    known = Settings(**{"home": home, "public_url": BASE, "mqtt_port": 1, "rate_limits": unlimited, **changes})
+    without_broker = Settings(**{"home": home, "public_url": BASE, "mqtt_port": 1, "rate_limits": unlimited, **changes})
     if broker is None:
-        return known
+        return without_broker
     return replace(
-        known, broker=broker.kind, mqtt_port=broker.tcp_port, websocket_url=f"ws://127.0.0.1:{broker.websocket_port}"
+        without_broker,
+        broker=broker.kind,
+        mqtt_port=broker.tcp_port,
+        websocket_url=f"ws://127.0.0.1:{broker.websocket_port}",
     )
 
 
 def problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
-    """The body of a refusal, once it is seen to be a proper one."""
+    """Assert that a response is this problem in the documented form; returns its body."""
     assert answer.status_code == status, f"{answer.status_code} {answer.text}"
     assert answer.headers["content-type"] == "application/problem+json"
     body: dict[str, Any] = answer.json()

@@ -1,9 +1,9 @@
-"""The cloud as agents meet it: a server that is a process, a broker that is another, and people beside them.
+"""The cloud as separate processes: a server and a broker, with an agent's transport connected to them.
 
-with start_ground("amqtt", folder) as ground:
-    with Link(ground, {"transport": "http"}) as link:
+with start_cloud_processes("amqtt", folder) as processes:
+    with Link(processes, {"transport": "http"}) as link:
         link.up()
-        ground.send(link.robot, b'{"any": "order"}')
+        processes.send(link.robot, b'{"any": "command"}')
 """
 
 import contextlib
@@ -39,11 +39,11 @@ from tests.harness.hosts.host import Program, environment_of, start_program
 from tests.harness.network.brokers import HOST, BrokerKind, Client, Message, RunningBroker, start_broker, wait_until
 from tests.harness.network.proxy import Proxy, start_proxy
 
-ORDER_MS = 30_000
+COMMAND_TTL_MS = 30_000
 
 
 class Endpoint(Protocol):
-    """What a transport's connection ends at: can be killed, and come back at the same port."""
+    """The server of a transport's connection; can be killed and restarted at the same port."""
 
     port: int
 
@@ -74,30 +74,30 @@ class Server:
         assert program.process.poll() is None, program.stderr()
 
 
-class BrokerEnd:
+class BrokerEndpoint:
     """The broker's process."""
 
     def __init__(self, kind: BrokerKind, folder: Path, keys: Path, stack: contextlib.ExitStack) -> None:
         self._begin = lambda **ports: stack.enter_context(
             start_broker(kind, folder, keys=keys / "public.json", **ports)
         )
-        self.now: RunningBroker = self._begin()
-        self.port = self.now.tcp_port
+        self.running: RunningBroker = self._begin()
+        self.port = self.running.tcp_port
 
     def kill(self) -> None:
-        self.now.kill()
+        self.running.kill()
 
     def revive(self) -> None:
-        self.now = self._begin(tcp_port=self.now.tcp_port, websocket_port=self.now.websocket_port)
+        self.running = self._begin(tcp_port=self.running.tcp_port, websocket_port=self.running.websocket_port)
 
 
-class Ground:
-    """Everything that runs.
+class CloudProcesses:
+    """The started processes.
 
     Attributes:
-        endpoints: ``server`` and ``broker``; who adds a transport adds what it ends at.
-        home: The cloud's folder.
-        environment: The server's settings, for further programs of the test.
+        endpoints: ``server`` and ``broker``; a test of another transport adds its endpoint.
+        home: Home folder of the functions.
+        environment: Settings of the server, for further programs of the test.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class Ground:
         FileKeys(home / "keys").load()
         self.stack = stack
         self.folder = folder
-        self.broker = BrokerEnd(kind, folder / "broker", home / "keys", stack)
+        self.broker = BrokerEndpoint(kind, folder / "broker", home / "keys", stack)
         if kind == "mosquitto":
             (home / "mosquitto").symlink_to(folder / "broker")
         self.environment: dict[str, str] = {
@@ -120,25 +120,27 @@ class Ground:
         self.url = f"http://{HOST}:{self.endpoints['server'].port}"
         self.home = home
         self._last_ms = 0
-        self.cloud = stack.enter_context(Cloud(settings(home, self.broker.now)))
+        self.cloud = stack.enter_context(Cloud(settings(home, self.broker.running)))
         self.cloud.start_ingest()
         self.anna = self.cloud.sign_in("anna")
 
     def devices(self, agent: str) -> tuple[Device, ...]:
-        """The devices of an agent, as the functions know them."""
+        """The stored devices of an agent."""
         row = self.cloud.run(self.cloud.functions.tables.get(records.AGENTS, agent, "agent"))
         assert row is not None
         return tuple(devices_of(records.read(row, Agent)))
 
-    def send(self, robot: Robot, payload: bytes, *, in_ms: int = ORDER_MS, first: bool = False) -> str:
-        """Send anything the way commands go; its id."""
+    def send(self, robot: Robot, payload: bytes, *, in_ms: int = COMMAND_TTL_MS, first: bool = False) -> str:
+        """Send any payload as a command; returns its id."""
         self._last_ms = max(self._last_ms + 1, self.cloud.clock.now_ms())
         command = command_id(robot.device, self._last_ms)
         self.deliver(robot.id, SignedCommand(command, payload, self.cloud.clock.now_ms() + in_ms, first))
         return command
 
-    def order(self, agent: str, request: Request, *, epoch: int, key: Ed25519PrivateKey | None = None) -> SignedCommand:
-        """A command of Anna's to an agent's only device; signed by the cloud's key where no other is given."""
+    def command(
+        self, agent: str, request: Request, *, epoch: int, key: Ed25519PrivateKey | None = None
+    ) -> SignedCommand:
+        """A command of Anna to an agent's only device; default ``key``: that of the cloud."""
         (device,) = self.devices(agent)
         now_ms = self.cloud.clock.now_ms()
         command = Command(
@@ -147,28 +149,27 @@ class Ground:
             agent=agent,
             device=device.name,
             issued_at_ms=now_ms,
-            ttl_ms=ORDER_MS,
+            ttl_ms=COMMAND_TTL_MS,
             caller="anna",
             epoch=epoch,
             request=request,
         )
         payload = signing.sign(codec.encode(command), key or FileKeys(self.home / "keys").load())
-        return SignedCommand(command.id, payload, now_ms + ORDER_MS)
+        return SignedCommand(command.id, payload, now_ms + COMMAND_TTL_MS)
 
-    def deliver(self, agent: str, order: SignedCommand) -> None:
-        """Send an order to an agent's only device."""
+    def deliver(self, agent: str, command: SignedCommand) -> None:
+        """Send a command to an agent's only device."""
         (device,) = self.devices(agent)
-        self.cloud.run(self.delivery.send(device, order))
+        self.cloud.run(self.delivery.send(device, command))
 
-    def keep(self, topic: str, payload: bytes) -> None:
-        """Have the broker keep a message."""
+    def publish_retained(self, topic: str, payload: bytes) -> None:
         self.cloud.run(self.delivery._bus.publish(topic, payload, retain=True))
 
-    def ear(self, agent: str) -> Client:
-        """What a page hears at the broker of an agent."""
+    def viewer(self, agent: str) -> Client:
+        """A broker connection with Anna's view credentials, subscribed to all topics of an agent."""
         issued = self.anna.post("/mqtt/credentials", {"purpose": "view"}).json()
         credentials = Credentials(issued["username"], issued["password"])
-        client = self.broker.now.connect(issued["client_id"], credentials)
+        client = self.broker.running.connect(issued["client_id"], credentials)
         filters = [pattern for pattern in issued["subscribe"] if pattern.split("/")[3] == agent]
         assert filters
         assert client.subscribe(*filters) == [1] * len(filters)
@@ -180,64 +181,66 @@ class Ground:
 
 
 @contextlib.contextmanager
-def start_ground(kind: BrokerKind, folder: Path, more: Mapping[str, str] | None = None) -> Iterator[Ground]:
-    """Everything, with these settings more, until the end of the ``with``."""
+def start_cloud_processes(
+    kind: BrokerKind, folder: Path, more: Mapping[str, str] | None = None
+) -> Iterator[CloudProcesses]:
+    """Start server, broker and functions with these additional settings; the context stops them."""
     with contextlib.ExitStack() as stack:
-        yield Ground(kind, folder, stack, more)
+        yield CloudProcesses(kind, folder, stack, more)
 
 
 class Link:
-    """A transport of an agent that was paired, built as ``bootstrap`` does, and what it has told. ``with`` ends it.
+    """The transport of a paired agent, built as ``bootstrap`` does; a context manager that stops it.
 
     Args:
-        ground: Where.
+        processes: The cloud.
         configuration: The transport's part of ``agent.toml``.
-        through: A proxy that stands before this endpoint.
+        through: Endpoint to which it connects through a proxy.
     """
 
-    def __init__(self, ground: Ground, configuration: Mapping[str, Any], *, through: str = "") -> None:
-        self.ground = ground
+    def __init__(self, processes: CloudProcesses, configuration: Mapping[str, Any], *, through: str = "") -> None:
+        self.processes = processes
         self.received: list[tuple[str, bytes]] = []
         self.changes: list[bool] = []
         self.changed_s: list[float] = []
         self.sessions = 0
         self.quiet = True
         self.proxy: Proxy | None = None
-        self._heard: list[Message] = []
+        self._published: list[Message] = []
         self._stack = contextlib.ExitStack()
         self._through = through
-        self.robot = ground.cloud.robot("arm")
-        self.robot.pair(ground.anna)
-        self.ear = self._stack.enter_context(ground.ear(self.robot.id))
-        self.known = set(threading.enumerate())
-        told = AgentConfig(
-            server=ground.url, name="lab", devices=(DeviceEntry(name="arm", type="ur5"),), **configuration
+        self.robot = processes.cloud.robot("arm")
+        self.robot.pair(processes.anna)
+        self.viewer = self._stack.enter_context(processes.viewer(self.robot.id))
+        self._other_threads = set(threading.enumerate())
+        config = AgentConfig(
+            server=processes.url, name="lab", devices=(DeviceEntry(name="arm", type="ur5"),), **configuration
         )
         pairing = Pairing(agent=self.robot.id, space=self.robot.space, account="anna", keys={})
         entry = {"name": "arm", "kind": "arm", "robot_type": "ur5", "label": "Arm"}
-        self.membership = pairing_monitor.PairingMonitor(pairing, told, [entry], pinned(pairing))
+        self.membership = pairing_monitor.PairingMonitor(pairing, config, [entry], pinned(pairing))
         if through:
-            self.proxy = self._stack.enter_context(start_proxy(ground.endpoints[through].port))
+            self.proxy = self._stack.enter_context(start_proxy(processes.endpoints[through].port))
         self.transport = factory.make(
             factory.Wiring(
-                configuration=told,
+                configuration=config,
                 pairing=pairing,
                 pairing_monitor=self.membership,
                 open_api=self._open_api,
                 next_session=self._next_session,
                 quiet=lambda: self.quiet,
-                certificate=ClientCertificate(ground.folder),
+                certificate=ClientCertificate(processes.folder),
                 now_ms=lambda: None,
             )
         )
 
     def start(self) -> Self:
-        self.known |= set(threading.enumerate())
+        self._other_threads |= set(threading.enumerate())
         self.transport.start(lambda topic, payload: self.received.append((topic, payload)), self._changed)
         return self
 
     def up(self, times: int = 1) -> Self:
-        """Wait for the link to come up for this time."""
+        """Wait until the link has come up this number of times."""
         wait_until(lambda: self.changes.count(True) >= times, f"link number {times}")
         return self
 
@@ -251,19 +254,19 @@ class Link:
         message = Measurements(tick_ms=1, at_ms=wall_ms(), sequence=sequence, values={"temperature_c": 20.0 + sequence})
         self.transport.publish(self.topic(topics.TELE, "load"), codec.encode(message), qos=0)
 
-    def heard(self, kind: str) -> list[bytes]:
-        """Payloads of a class that the broker's subscribers have heard of this agent so far."""
-        self._heard += self.ear.pending()
-        return [message.payload for message in self._heard if topics.parse(message.topic).kind == kind]
+    def published(self, kind: str) -> list[bytes]:
+        """Payloads of a class that a subscriber of the broker has received from this agent."""
+        self._published += self.viewer.pending()
+        return [message.payload for message in self._published if topics.parse(message.topic).kind == kind]
 
     def presences(self) -> list[tuple[bool, int]]:
-        """Presence that was told: online or not, and in which session."""
-        told = [codec.decode(payload, Presence) for payload in self.heard(topics.CONN)]
-        return [(each.online, each.session) for each in told]
+        """Published presences: whether online, and the session."""
+        presences = [codec.decode(payload, Presence) for payload in self.published(topics.CONN)]
+        return [(each.online, each.session) for each in presences]
 
     def threads(self) -> list[str]:
-        """Threads that the transport has left running."""
-        return [each.name for each in threading.enumerate() if each not in self.known]
+        """Names of running threads of the transport."""
+        return [each.name for each in threading.enumerate() if each not in self._other_threads]
 
     def _changed(self, up: bool) -> None:
         self.changed_s.append(time.monotonic())
@@ -274,12 +277,12 @@ class Link:
         return self.sessions
 
     def _open_api(self) -> CloudClient:
-        ends = self.ground.endpoints
+        ends = self.processes.endpoints
         if self.proxy is None:
-            return CloudClient(self.ground.url, self.robot.key, CloudClock())
+            return CloudClient(self.processes.url, self.robot.key, CloudClock())
         if self._through == "server":
             return CloudClient(f"http://{HOST}:{self.proxy.port}", self.robot.key, CloudClock())
-        return _Rerouted(self.ground.url, self.robot.key, {ends[self._through].port: self.proxy.port})
+        return _Rerouted(self.processes.url, self.robot.key, {ends[self._through].port: self.proxy.port})
 
     def __enter__(self) -> Self:
         return self
@@ -290,7 +293,7 @@ class Link:
 
 
 class _Rerouted(CloudClient):
-    """The API of a cloud whose other addresses are behind proxies."""
+    """The API, with ports in its responses replaced by those of proxies."""
 
     def __init__(self, server: str, key: Any, ports: Mapping[int, int]) -> None:
         super().__init__(server, key, CloudClock())
@@ -306,9 +309,9 @@ class _Rerouted(CloudClient):
 
 
 def _free_port() -> int:
-    with socket.socket() as found:
-        found.bind((HOST, 0))
-        port: int = found.getsockname()[1]
+    with socket.socket() as listener:
+        listener.bind((HOST, 0))
+        port: int = listener.getsockname()[1]
         return port
 
 

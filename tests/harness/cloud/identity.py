@@ -1,4 +1,4 @@
-"""What a Functions host gives its functions: an identity endpoint. And a certificate for services that want TLS."""
+"""A fake identity endpoint of a Functions host, and certificates for servers with TLS."""
 
 import contextlib
 import datetime as dt
@@ -30,7 +30,7 @@ def make_certificate(folder: Path, host: str = HOST) -> Path:
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, host)])
     alternative = x509.IPAddress(ipaddress.ip_address(HOST)) if host == HOST else x509.DNSName(host)
     now = dt.datetime.now(dt.UTC)
-    made = (
+    certificate = (
         x509.CertificateBuilder()
         .subject_name(name)
         .issuer_name(name)
@@ -46,42 +46,43 @@ def make_certificate(folder: Path, host: str = HOST) -> Path:
         key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
     )
     path = folder / "certificate.pem"
-    path.write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    path.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
     return path
 
 
-class Host(ThreadingHTTPServer):
-    """A Functions host's identity endpoint."""
+class IdentityEndpoint(ThreadingHTTPServer):
+    """Issues tokens and records the queries of requests."""
 
     def __init__(self) -> None:
-        super().__init__((HOST, 0), _Answer)
-        self.asked: list[dict[str, list[str]]] = []
+        super().__init__((HOST, 0), _TokenHandler)
+        self.requests: list[dict[str, list[str]]] = []
         self.lifetime_s = 3600
 
 
-class _Answer(QuietHandler):
-    server: Host
+class _TokenHandler(QuietHandler):
+    server: IdentityEndpoint
 
     def handle_any(self) -> None:
         assert self.headers["X-IDENTITY-HEADER"] == SECRET
-        asked = parse_qs(urlsplit(self.path).query)
-        self.server.asked.append(asked)
-        (audience,) = asked["resource"]
+        query = parse_qs(urlsplit(self.path).query)
+        self.server.requests.append(query)
+        (audience,) = query["resource"]
         now = int(time.time())
         times = {"iat": now - 60, "nbf": now - 60, "exp": now + self.server.lifetime_s}
-        who = {"oid": OBJECT_ID, "tid": TENANT_ID}
-        claims = {"aud": audience, "iss": "https://sts.windows.net/telescope/", **who, **times}
+        principal = {"oid": OBJECT_ID, "tid": TENANT_ID}
+        claims = {"aud": audience, "iss": "https://sts.windows.net/telescope/", **principal, **times}
         token = jwt.encode(claims, "not verified by the server under test", "HS256")
-        answer = {"access_token": token, "expires_on": str(now + 3600), "resource": audience, "token_type": "Bearer"}
-        self.respond_json(answer)
+        self.respond_json(
+            {"access_token": token, "expires_on": str(now + 3600), "resource": audience, "token_type": "Bearer"}
+        )
 
 
 @contextlib.contextmanager
-def start_host(monkeypatch: pytest.MonkeyPatch, certificate: Path) -> Iterator[Host]:
-    """A host in whose environment the functions run."""
-    host = Host()
-    monkeypatch.setenv("IDENTITY_ENDPOINT", f"http://{HOST}:{host.server_port}/msi/token")
+def start_identity_endpoint(monkeypatch: pytest.MonkeyPatch, certificate: Path) -> Iterator[IdentityEndpoint]:
+    """Run an identity endpoint and set the environment variables that name it."""
+    endpoint = IdentityEndpoint()
+    monkeypatch.setenv("IDENTITY_ENDPOINT", f"http://{HOST}:{endpoint.server_port}/msi/token")
     monkeypatch.setenv("IDENTITY_HEADER", SECRET)
     monkeypatch.setenv("REQUESTS_CA_BUNDLE", str(certificate))
-    with running(host):
-        yield host
+    with running(endpoint):
+        yield endpoint

@@ -1,4 +1,4 @@
-"""The functions over fakes: stores, broker and time in memory, in the thread of the test."""
+"""The functions with fake stores, broker and clock, in the thread of the test."""
 
 from contextvars import ContextVar
 from pathlib import Path
@@ -28,16 +28,16 @@ NO_FOLDER = Path("/nonexistent")
 """The home of an in-memory cloud, which never uses it."""
 
 _catalogue = FolderCatalogue(ROBOTS)
-"""Read once for all tests."""
+"""Shared by all tests, because reading it is slow."""
 _apps: dict[tuple[Any, ...], FastAPI] = {}
 _functions: ContextVar[Functions] = ContextVar("functions")
 
 
 class Memory:
-    """What all in-memory instances of one test share.
+    """Stores, broker and clock that all in-memory instances of one test share.
 
     Attributes:
-        clock: Moves when a test advances it, and by the time that a wait in the product takes.
+        clock: Advanced by the test and by waits of the product.
     """
 
     def __init__(self) -> None:
@@ -50,13 +50,13 @@ class Memory:
         self.keys = MemorySigningKeys(now_ms=self.clock.now_ms)
 
     def settle(self) -> None:
-        """Run what is ready, until everything that was published is stored."""
+        """Run all ready tasks until every published message is stored."""
         self.loop.settle()
         self.loop.run_until_complete(self.broker.idle())
         self.loop.settle()
 
     def adapters(self, settings: Settings, tables: Tables | None = None) -> Adapters:
-        """The fakes as one instance of the functions sees them."""
+        """The adapters of one instance of the functions."""
         self.blobs.url = f"{settings.public_url}{BLOBS_PATH}"
         return Adapters(
             keys=self.keys,
@@ -75,10 +75,10 @@ class Memory:
 
 
 class SharedApp:
-    """The HTTP application over one instance of the functions.
+    """The HTTP application of one instance of the functions.
 
-    Building an application takes 0.2 s. So all instances with the same settings share one, which looks up at each
-    request whose functions it is to use.
+    Building an application takes 0.2 s. All instances with the same settings therefore share one application, which
+    selects the instance for each request.
     """
 
     def __init__(self, functions: Functions) -> None:
@@ -99,7 +99,7 @@ class SharedApp:
 
 
 class _CurrentFunctions:
-    """Each service of ``Functions``, of the instance that handles the present request."""
+    """Delegates each service of ``Functions`` to the instance that handles the current request."""
 
     def __getattr__(self, name: str) -> "_CurrentField":
         return _CurrentField(name)

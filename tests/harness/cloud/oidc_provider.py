@@ -1,4 +1,4 @@
-"""OpenID Connect providers for tests: a real one from npm, and one with configurable false responses.
+"""OpenID Connect providers: a real one from npm, and a fake one with configurable responses.
 
 with start_provider([new_key()]) as provider: ...
 """
@@ -28,43 +28,43 @@ _FIELD = re.compile(r'name="(\w+)" value="(\w*)"')
 
 @dataclass(frozen=True, slots=True)
 class SigningKey:
-    """A provider's key: private, and as it shows itself."""
+    """A signing key of a provider."""
 
     name: str
     private: rsa.RSAPrivateKey
 
-    def shown(self, *, private: bool = False) -> dict[str, Any]:
-        """As a JWK."""
+    def jwk(self, *, private: bool = False) -> dict[str, Any]:
+        """The public key, or the private key, as a JWK."""
         key = self.private if private else self.private.public_key()
         return {**jwt.algorithms.RSAAlgorithm.to_jwk(key, as_dict=True), "kid": self.name, "alg": "RS256", "use": "sig"}
 
 
 def new_key(name: str = "one") -> SigningKey:
-    """A new key."""
+    """Generate a key."""
     return SigningKey(name, rsa.generate_private_key(65537, 2048))
 
 
 @contextlib.contextmanager
 def start_provider(keys: Sequence[SigningKey], port: int = 0, *, redirect: str = REDIRECT) -> Iterator[str]:
-    """``oidc-provider`` with one client; yields its address. It stores nothing beyond its end."""
+    """Run ``oidc-provider`` with one client and no persistent storage; yields its address."""
     client = {"client_id": CLIENT_ID, "client_secret": CLIENT_SECRET, "redirect_uris": [redirect]}
-    options = {"port": port, "client": client, "keys": [key.shown(private=True) for key in keys]}
+    options = {"port": port, "client": client, "keys": [key.jwk(private=True) for key in keys]}
     arguments = [str(FOLDER / "server.mjs")]
-    with start_node(FOLDER, "oidc-provider", arguments, _LISTENS, line=json.dumps(options) + "\n") as (found,):
-        yield found[1]
+    with start_node(FOLDER, "oidc-provider", arguments, _LISTENS, line=json.dumps(options) + "\n") as (match,):
+        yield match[1]
 
 
-def sign_in_there(address: str, name: str, browser: httpx.Client | None = None) -> httpx.URL:
-    """Follow the provider's redirects and fill in its forms; where the browser is sent back to."""
+def sign_in_at_provider(address: str, name: str, browser: httpx.Client | None = None) -> httpx.URL:
+    """Follow the provider's redirects and submit its forms; returns the address of the final redirect."""
     with contextlib.ExitStack() as stack:
         client = browser or stack.enter_context(httpx.Client())
         answer = client.get(address)
         for _ in range(12):
             if answer.is_redirect:
-                place = answer.url.join(answer.headers["location"])
-                if place.host == httpx.URL(REDIRECT).host:
-                    return place
-                answer = client.get(place)
+                target = answer.url.join(answer.headers["location"])
+                if target.host == httpx.URL(REDIRECT).host:
+                    return target
+                answer = client.get(target)
                 continue
             assert answer.status_code == httpx.codes.OK, answer.text
             action = _ACTION.search(answer.text)
@@ -73,50 +73,53 @@ def sign_in_there(address: str, name: str, browser: httpx.Client | None = None) 
             if fields.get("prompt") == "login":
                 fields |= {"login": name, "password": "any"}
             answer = client.post(answer.url.join(action[1]), data=fields)
-    raise AssertionError("the provider sends one from form to form")
+    raise AssertionError("the provider redirects too often")
 
 
 @dataclass
-class Liar:
-    """What the lying provider says: each may be changed at any time.
+class FakeProvider:
+    """Responses of the fake provider, which a test may change at any time, and its requests.
 
     Attributes:
-        document: About itself; set by the server.
-        keys: Shown.
-        token: What stands for an ID token.
-        status: Of the token endpoint's answer.
-        asked: Forms that it was sent.
+        document: Discovery document.
+        keys: Published keys.
+        token: The ``id_token`` in the response of the token endpoint.
+        status: Status of that response.
+        forms: Received forms.
+        paths: Requested paths.
     """
 
     document: dict[str, Any] = field(default_factory=dict)
     keys: list[Any] = field(default_factory=list)
     token: Any = None
     status: int = 200
-    asked: list[str] = field(default_factory=list)
-    fetched: list[str] = field(default_factory=list)
+    forms: list[str] = field(default_factory=list)
+    paths: list[str] = field(default_factory=list)
     issuer: str = ""
 
 
 @contextlib.contextmanager
-def start_liar() -> Iterator[Liar]:
-    """A provider that returns the configured documents and keys."""
-    liar = Liar()
+def start_fake_provider() -> Iterator[FakeProvider]:
+    """Run a fake provider."""
+    provider = FakeProvider()
 
     class Handler(QuietHandler):
         def handle_any(self) -> None:
             if self.command == "POST":
-                liar.asked.append(self.rfile.read(int(self.headers["Content-Length"])).decode())
-                tokens = {"access_token": "x", "token_type": "Bearer", "id_token": liar.token}
-                self.respond_json(tokens, liar.status)
+                provider.forms.append(self.rfile.read(int(self.headers["Content-Length"])).decode())
+                tokens = {"access_token": "x", "token_type": "Bearer", "id_token": provider.token}
+                self.respond_json(tokens, provider.status)
             else:
-                liar.fetched.append(self.path)
-                self.respond_json(liar.document if self.path.startswith("/.well-known/") else {"keys": liar.keys})
+                provider.paths.append(self.path)
+                self.respond_json(
+                    provider.document if self.path.startswith("/.well-known/") else {"keys": provider.keys}
+                )
 
-    with serve(Handler) as liar.issuer:
-        liar.document = {
-            "issuer": liar.issuer,
-            "authorization_endpoint": f"{liar.issuer}/authorize",
-            "token_endpoint": f"{liar.issuer}/token",
-            "jwks_uri": f"{liar.issuer}/keys",
+    with serve(Handler) as provider.issuer:
+        provider.document = {
+            "issuer": provider.issuer,
+            "authorization_endpoint": f"{provider.issuer}/authorize",
+            "token_endpoint": f"{provider.issuer}/token",
+            "jwks_uri": f"{provider.issuer}/keys",
         }
-        yield liar
+        yield provider

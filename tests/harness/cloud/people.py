@@ -1,4 +1,4 @@
-"""People who use the functions over HTTP, wherever they run."""
+"""People who use the functions of any host over HTTP."""
 
 import asyncio
 import os
@@ -16,7 +16,7 @@ from tests.harness.hosts import Host
 
 
 class Visitor(Person):
-    """As ``Person``, over real sockets."""
+    """``Person`` over real sockets."""
 
     def __init__(self, site: Site, signed_in: dict[str, Any]) -> None:
         self.site = site
@@ -32,23 +32,23 @@ class Visitor(Person):
 
 
 def sign_in_link(environment: Mapping[str, str], name: str) -> str:
-    """A one-time token for the store of these functions."""
+    """Create a one-time sign-in token in the store of these functions."""
     (token,) = sign_in_links(environment, name)
     return token
 
 
 def sign_in_links(environment: Mapping[str, str], *names: str) -> list[str]:
-    """One-time tokens, made as the program that prints links makes them, without starting it for each."""
+    """Create one-time sign-in tokens in this process; ``make link`` would start a program for each."""
 
-    async def made() -> list[str]:
+    async def create() -> list[str]:
         functions = bootstrap.build(settings.read({**os.environ, **environment}))
         try:
             return [await functions.sign_in.link(await functions.sign_in.account(name)) for name in names]
         finally:
             await functions.close()
 
-    with ThreadPoolExecutor(1) as pool:  # where a browser is, this thread has a loop of its own
-        return pool.submit(asyncio.run, made()).result()
+    with ThreadPoolExecutor(1) as pool:  # Playwright runs an event loop in this thread
+        return pool.submit(asyncio.run, create()).result()
 
 
 def sign_in(host: Host, site: Site, home: Path, name: str, environment: Mapping[str, str] | None = None) -> Visitor:

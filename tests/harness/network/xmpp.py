@@ -27,7 +27,7 @@ from function_app.ports.broker_access import Credentials
 from function_app.settings import Settings, Xmpp
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person
-from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
 from tests.harness.hosts.host import environment_of, start_program
 from tests.harness.network.brokers import HOST, PATIENCE_S, Client, Message, RunningBroker, wait_until
 from tests.harness.paths import ROOT
@@ -91,7 +91,7 @@ def start_prosody(home: Path, verify_url: str, *, port: int = 0, more: tuple[str
                     process.wait(PATIENCE_S)
 
 
-class ProsodyEnd:
+class ProsodyEndpoint:
     """Prosody as an endpoint of a transport."""
 
     def __init__(self, home: Path, verify_url: str, port: int, stack: contextlib.ExitStack) -> None:
@@ -332,13 +332,15 @@ class XmppClient:
 
 
 @contextlib.contextmanager
-def start_xmpp_ground(folder: Path) -> Iterator[Ground]:
+def start_xmpp_processes(folder: Path) -> Iterator[CloudProcesses]:
     """Cloud processes with Prosody and an XMPP gateway."""
     port = free_port()
     settings = {"TELESCOPE_XMPP_DOMAIN": DOMAIN, "TELESCOPE_XMPP_HOST": HOST, "TELESCOPE_XMPP_PORT": str(port)}
-    with start_ground("mosquitto", folder, settings) as ground:
-        end = ProsodyEnd(folder / "prosody", f"{ground.url}/api/v1/xmpp/verify", port, ground.stack)
-        ground.endpoints["xmpp"] = end
-        environment = environment_of({**ground.environment, "TELESCOPE_PORT": str(ground.endpoints["server"].port)})
-        ground.stack.enter_context(start_program(["-m", "function_app", "xmpp"], environment))
-        yield ground
+    with start_cloud_processes("mosquitto", folder, settings) as processes:
+        end = ProsodyEndpoint(folder / "prosody", f"{processes.url}/api/v1/xmpp/verify", port, processes.stack)
+        processes.endpoints["xmpp"] = end
+        environment = environment_of(
+            {**processes.environment, "TELESCOPE_PORT": str(processes.endpoints["server"].port)}
+        )
+        processes.stack.enter_context(start_program(["-m", "function_app", "xmpp"], environment))
+        yield processes

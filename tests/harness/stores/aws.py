@@ -1,8 +1,8 @@
-"""An emulated Amazon for tests, and a wire to it that can be spoilt.
+"""Emulated AWS services, and an HTTP proxy that injects faults.
 
-with start_moto() as endpoint, start_wire(endpoint) as wire:
-    tables = DynamoTables(table="t", region=REGION, endpoint=wire.endpoint)
-    wire.spoil("lose answer")
+with start_moto() as endpoint, start_fault_proxy(endpoint) as proxy:
+    tables = DynamoTables(table="t", region=REGION, endpoint=proxy.endpoint)
+    proxy.inject("lose response")
 """
 
 import contextlib
@@ -35,7 +35,7 @@ CREDENTIALS = {
 
 @contextlib.contextmanager
 def start_moto() -> Iterator[str]:
-    """moto as an HTTP server on a free loopback port; gives its address."""
+    """Run moto as an HTTP server on a free loopback port; yields its address."""
     logging.getLogger("werkzeug").setLevel(logging.WARNING)
     app = _OneAtATime(DomainDispatcherApplication(create_backend_app))
     server = make_server(HOST, 0, app, threaded=True, request_handler=MotoRequestHandler)
@@ -44,16 +44,16 @@ def start_moto() -> Iterator[str]:
 
 
 def reset(endpoint: str) -> None:
-    """Make moto forget everything."""
-    where = urlsplit(endpoint)
-    connection = http.client.HTTPConnection(where.hostname or HOST, where.port)
+    """Delete all data of moto."""
+    address = urlsplit(endpoint)
+    connection = http.client.HTTPConnection(address.hostname or HOST, address.port)
     connection.request("POST", "/moto-api/reset")
     assert connection.getresponse().status == 200
     connection.close()
 
 
 class _OneAtATime:
-    """Answers one request after the other: moto's transactions undo what others write meanwhile. Amazon's do not."""
+    """Serializes requests, because a transaction of moto, unlike DynamoDB's, undoes concurrent writes."""
 
     def __init__(self, app: Any) -> None:
         self._app = app
@@ -65,7 +65,7 @@ class _OneAtATime:
 
 
 def use_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Credentials that moto takes, and nothing of this machine's own."""
+    """Use credentials that moto accepts, and no configuration of this machine."""
     for name, value in CREDENTIALS.items():
         monkeypatch.setenv(name, value)
     for name in ("AWS_PROFILE", "AWS_SESSION_TOKEN", "AWS_ENDPOINT_URL"):
@@ -73,76 +73,79 @@ def use_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """One request as it came by."""
+class Request:
+    """A received request."""
 
     method: str
     operation: str
-    """DynamoDB's; empty for S3."""
+    """The DynamoDB operation; empty for S3."""
     body: bytes
     path: str = ""
 
     @property
     def json(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.body)
-        return found
+        body: dict[str, Any] = json.loads(self.body)
+        return body
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """An answer in the emulator's place."""
+    """An error response instead of the emulator's response."""
 
     status: int
     code: str
     more: dict[str, Any]
     kind: str = ""
-    """Content type, when not the service's own."""
+    """Content type; default: that of the service."""
 
 
-Fault = Literal["lose request", "lose answer", "cut answer", "pass"] | Refusal | Callable[[], object]
-"""A function is called before the request goes on: what happens meanwhile."""
+Fault = Literal["lose request", "lose response", "cut response", "pass"] | Refusal | Callable[[], object]
+"""A function is called before the request is forwarded."""
 
 
-class Wire:
-    """Notes what an adapter asks, and spoils it in order; then everything passes."""
+class FaultProxy:
+    """Records requests and applies the injected faults in order; later requests pass.
+
+    Attributes:
+        guard: Called with method, path and headers; rejects what the emulator does not check.
+    """
 
     def __init__(self, endpoint: str) -> None:
-        self.asked: list[Asked] = []
+        self.requests: list[Request] = []
         self.endpoint = ""
         self.behind = urlsplit(endpoint)
         self.faults: deque[Fault] = deque()
         self.guard: Callable[[str, str, Mapping[str, str]], Refusal | None] | None = None
-        """Given method, path and headers: what the emulator itself does not check."""
 
-    def spoil(self, *faults: Fault) -> None:
-        self.asked.clear()
+    def inject(self, *faults: Fault) -> None:
+        self.requests.clear()
         self.faults.extend(faults)
 
     @property
     def operations(self) -> list[str]:
-        return [asked.operation or asked.method for asked in self.asked]
+        return [request.operation or request.method for request in self.requests]
 
 
 @contextlib.contextmanager
-def start_wire(endpoint: str) -> Iterator[Wire]:
-    """A wire to an emulator."""
-    wire = Wire(endpoint)
+def start_fault_proxy(endpoint: str) -> Iterator[FaultProxy]:
+    """Run a proxy in front of an emulator."""
+    proxy = FaultProxy(endpoint)
 
     class Handler(_Handler):
-        between = wire
+        between = proxy
 
-    with serve(Handler) as wire.endpoint:
-        yield wire
+    with serve(Handler) as proxy.endpoint:
+        yield proxy
 
 
 class _Handler(QuietHandler):
     protocol_version = "HTTP/1.1"
-    between: Wire
+    between: FaultProxy
 
     def handle_any(self) -> None:
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         operation = self.headers.get("X-Amz-Target", "").rpartition(".")[2]
-        self.between.asked.append(Asked(self.command, operation, body, self.path))
+        self.between.requests.append(Request(self.command, operation, body, self.path))
         fault = self.between.faults.popleft() if self.between.faults else "pass"
         if fault == "pass" and self.between.guard is not None:
             fault = self.between.guard(self.command, self.path, dict(self.headers)) or "pass"
@@ -152,10 +155,10 @@ class _Handler(QuietHandler):
         if callable(fault):
             fault()
         answer = None if fault == "lose request" else self._forward(body)
-        if answer is None or fault == "lose answer":
+        if answer is None or fault == "lose response":
             self.close_connection = True
             return
-        if fault == "cut answer":
+        if fault == "cut response":
             self.close_connection = True
             status, headers, content = answer
             self._answer(status, headers, content, sent=len(content) // 2)
@@ -170,8 +173,8 @@ class _Handler(QuietHandler):
                 if name.lower() != "expect":
                     behind.putheader(name, value)
             behind.endheaders(body)
-            found = behind.getresponse()
-            return found.status, found.getheaders(), found.read()
+            response = behind.getresponse()
+            return response.status, response.getheaders(), response.read()
         finally:
             behind.close()
 

@@ -1,4 +1,4 @@
-"""An emulated Azure for tests: Azurite, from npm.
+"""Emulated Azure Storage: Azurite from npm.
 
 with start_azurite() as connection:
     tables = AzureTables(connection=connection, prefix="test")
@@ -21,7 +21,7 @@ _LISTENS = re.compile(r"Azurite (Blob|Table) service is successfully listening a
 
 @contextlib.contextmanager
 def start_azurite(*options: str) -> Iterator[str]:
-    """Azurite without data, on free loopback ports; yields its connection string."""
+    """Run an empty Azurite on free loopback ports; yields its connection string."""
     require = ["--require", str(FOLDER / "ends-with-stdin.cjs")]
     settings = ["--inMemoryPersistence", "--skipApiVersionCheck", "--disableTelemetry", "--silent"]
     ports = [word for service in ("blob", "queue", "table") for word in (f"--{service}Port", "0")]
@@ -37,7 +37,6 @@ def endpoint(connection: str, service: str) -> str:
     return dict(part.split("=", 1) for part in connection.split(";"))[f"{service}Endpoint"]
 
 
-def through(connection: str, wire: str, service: str) -> str:
-    """The same connection, with one service reached at another address."""
-    place = endpoint(connection, service)
-    return connection.replace(place, f"{wire}/{ACCOUNT}")
+def through(connection: str, proxy: str, service: str) -> str:
+    """The connection string with the address of a proxy for one service."""
+    return connection.replace(endpoint(connection, service), f"{proxy}/{ACCOUNT}")

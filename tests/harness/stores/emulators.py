@@ -1,4 +1,4 @@
-"""The three stores for tests, as the environment that chooses one: whole programs and processes take it as it is.
+"""The three kinds of store, each as the environment variables that select it.
 
 with start_emulator("azure") as emulator:
     environment = empty_store("azure", emulator)
@@ -24,7 +24,7 @@ STORES: tuple[StoreKind, ...] = ("local", "azure", "aws")
 
 @contextlib.contextmanager
 def start_emulator(kind: StoreKind) -> Iterator[str]:
-    """What stands in for the cloud's own store; gives its address (empty: none is needed)."""
+    """Run the emulator of a cloud store; yields its address, or an empty string for the local store."""
     if kind == "azure":
         with start_azurite() as connection:
             yield connection
@@ -36,7 +36,7 @@ def start_emulator(kind: StoreKind) -> Iterator[str]:
 
 
 def empty_store(kind: StoreKind, emulator: str) -> dict[str, str]:
-    """The environment of a store with nothing in it; the local one is in ``TELESCOPE_HOME``."""
+    """Environment variables of an empty store; the local one is in ``TELESCOPE_HOME``."""
     name = f"test{secrets.token_hex(8)}"
     if kind == "azure":
         return {
@@ -58,9 +58,9 @@ def empty_store(kind: StoreKind, emulator: str) -> dict[str, str]:
 
 
 def make_places(home: Path, environment: dict[str, str]) -> None:
-    """Make Amazon's table and bucket, which a deployment does otherwise. Needs the credentials in this process."""
+    """Create the table and bucket on AWS, as a deployment does. Requires credentials in this process."""
 
-    async def make() -> None:
+    async def prepare() -> None:
         functions = bootstrap.build(read({"TELESCOPE_HOME": str(home), **environment}))
         if isinstance(functions.tables, DynamoTables):
             await functions.tables.prepare()
@@ -68,4 +68,4 @@ def make_places(home: Path, environment: dict[str, str]) -> None:
             await functions.blobs.prepare()
         await functions.close()
 
-    asyncio.run(make())
+    asyncio.run(prepare())

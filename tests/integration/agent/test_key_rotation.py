@@ -13,7 +13,7 @@ from function_app.adapters.local.signing_keys import FileKeys
 from function_app.adapters.shared.key_ring import Ring
 from tests.contract.transports.agent_suite import PairedAgent
 from tests.contract.transports.suite import Spoken
-from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
 from tests.harness.network.brokers import wait_until
 
 LEARN_MS, OVERLAP_MS = 3_600_000, 7_200_000
@@ -21,25 +21,25 @@ SOURCE = '"""Nod."""\nrobot.move_joints({"wrist_1": -1.5})\n'
 
 
 @pytest.fixture
-def ground(tmp_path: Path) -> Iterator[Ground]:
-    with start_ground("amqtt", tmp_path) as ground:
-        yield ground
+def processes(tmp_path: Path) -> Iterator[CloudProcesses]:
+    with start_cloud_processes("amqtt", tmp_path) as processes:
+        yield processes
 
 
 @pytest.fixture
-def agent(ground: Ground, tmp_path: Path) -> Iterator[PairedAgent]:
-    agent = PairedAgent(ground, Spoken(endpoint="broker", notices_s=10.0), tmp_path / "agent")
+def agent(processes: CloudProcesses, tmp_path: Path) -> Iterator[PairedAgent]:
+    agent = PairedAgent(processes, Spoken(endpoint="broker", notices_s=10.0), tmp_path / "agent")
     yield agent
     agent.stop()
 
 
-def require_operation(ground: Ground, agent: PairedAgent) -> None:
+def require_operation(processes: CloudProcesses, agent: PairedAgent) -> None:
     """Takes a lease, moves, and runs a movement."""
     epoch = agent.take()
     moved = agent.move({"shoulder_pan": 0.1}, epoch=epoch, wait_for="done")
     assert moved["status"] == "done", moved
     request = {"kind": "run_movement", "name": "nod"}
-    ran = ground.anna.start(agent.id, request=request, epoch=epoch, wait_for="done", wait_ms=30_000).json()
+    ran = processes.anna.start(agent.id, request=request, epoch=epoch, wait_for="done", wait_ms=30_000).json()
     assert ran["status"] == "done", ran
 
 
@@ -48,28 +48,28 @@ def rejections(agent: PairedAgent) -> dict[str, int]:
     return dict(agent.device.publisher.rejections)
 
 
-def rejections_of(ground: Ground, agent: PairedAgent, key: Any) -> dict[str, int]:
+def rejections_of(processes: CloudProcesses, agent: PairedAgent, key: Any) -> dict[str, int]:
     """Sends a lease that is signed with this key, and returns the new rejections."""
     epoch = agent.device._controller.epochs[0] + 1
     lease = GrantLease(holder="anna", lease_ms=30_000)
     before = rejections(agent)
-    ground.deliver(agent.agent, ground.order(agent.agent, lease, epoch=epoch, key=key))
+    processes.deliver(agent.agent, processes.command(agent.agent, lease, epoch=epoch, key=key))
     wait_until(lambda: rejections(agent) != before or agent.device._controller.epochs[0] == epoch, "a response")
     return {code: count - before.get(code, 0) for code, count in rejections(agent).items()}
 
 
 def test_a_running_agent_follows_a_rotation_and_rejects_the_old_key_afterwards(
-    ground: Ground, agent: PairedAgent
+    processes: CloudProcesses, agent: PairedAgent
 ) -> None:
-    keys = FileKeys(ground.home / "keys")
+    keys = FileKeys(processes.home / "keys")
     old = keys.load()
     pins: Any = agent.device._commands._keys
-    assert ground.anna.put("/robot-types/ur5/movements/nod", {"source": SOURCE}).status_code == 201
-    require_operation(ground, agent)
+    assert processes.anna.put("/robot-types/ur5/movements/nod", {"source": SOURCE}).status_code == 201
+    require_operation(processes, agent)
 
-    rotation = ground.cloud.run(ground.cloud.functions.keys.rotate(learn_ms=LEARN_MS, overlap_ms=OVERLAP_MS))
+    rotation = processes.cloud.run(processes.cloud.functions.keys.rotate(learn_ms=LEARN_MS, overlap_ms=OVERLAP_MS))
     new = rotation.pins[-1].id
-    require_operation(ground, agent)
+    require_operation(processes, agent)
     wait_until(lambda: pins.serial == 2, "the agent to pin the new key")
     assert new in pins
     pairing = agent.store.pairing()
@@ -79,12 +79,12 @@ def test_a_running_agent_follows_a_rotation_and_rejects_the_old_key_afterwards(
 
     ring = keys._parse()
     keys._write(Ring((*ring.keys[:-1], replace(ring.newest, devices_from_ms=0))))  # as after LEARN_MS
-    assert signing.key_id(ground.cloud.run(ground.cloud.functions.keys.for_devices()).public_key()) == new
-    require_operation(ground, agent)
+    assert signing.key_id(processes.cloud.run(processes.cloud.functions.keys.for_devices()).public_key()) == new
+    require_operation(processes, agent)
     assert rejections(agent) == {}
 
-    assert rejections_of(ground, agent, old) == {}, "the old key is valid during the overlap"
+    assert rejections_of(processes, agent, old) == {}, "the old key is valid during the overlap"
     now_ms = pins._now_ms
     pins._now_ms = lambda: (now_ms() or 0) + OVERLAP_MS
-    assert rejections_of(ground, agent, old) == {"bad_signature": 1}
+    assert rejections_of(processes, agent, old) == {"bad_signature": 1}
     pins._now_ms = now_ms

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from device_agent.__main__ import main
-from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
 from tests.harness.network.brokers import BrokerKind, wait_until
 from tests.harness.paths import ROOT
 
@@ -28,41 +28,41 @@ def start(*options: str, token: str = "", link: str = "") -> "subprocess.Popen[s
     )
 
 
-def devices(ground: Ground) -> list[dict[str, Any]]:
+def devices(processes: CloudProcesses) -> list[dict[str, Any]]:
     items: list[dict[str, Any]] = []
     query: dict[str, str] = {}
     while True:
-        page = ground.anna.get("/devices", params=query).json()
+        page = processes.anna.get("/devices", params=query).json()
         items += page["items"]
         if page["cursor"] is None:
             return items
         query = {"cursor": page["cursor"]}
 
 
-def require_motion_and_stop(ground: Ground, device: str) -> None:
+def require_motion_and_stop(processes: CloudProcesses, device: str) -> None:
     move = {"request": {"kind": "move_joints", "position_rad": {"joint_1": 0.2}}, "wait_for": "done", "wait_ms": 20_000}
-    done = ground.anna.post(f"/devices/{device}/actions", move).json()
+    done = processes.anna.post(f"/devices/{device}/actions", move).json()
     assert done["status"] == "done", done
     assert done["result"] == {"position_rad": {"joint_1": pytest.approx(0.2), "joint_2": 0.0}}
-    assert ground.anna.post(f"/devices/{device}/stop").json() == {"confirmed": True}
-    refused = ground.anna.post(f"/devices/{device}/actions", move).json()
+    assert processes.anna.post(f"/devices/{device}/stop").json() == {"confirmed": True}
+    refused = processes.anna.post(f"/devices/{device}/actions", move).json()
     assert (refused["status"], refused["reason"]["code"]) == ("failed", "stopped"), refused
-    assert ground.anna.post(f"/devices/{device}/stop/reset").json() == {"confirmed": True}
+    assert processes.anna.post(f"/devices/{device}/stop/reset").json() == {"confirmed": True}
 
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("kind", ["amqtt", "mosquitto"])
 def test_twenty_agents_are_claimed_operated_and_reused(kind: BrokerKind, tmp_path: Path) -> None:
-    with start_ground(kind, tmp_path / "ground") as ground:
-        common = ["--cloud", ground.url, "--home", str(tmp_path / "home"), "--count", str(COUNT), "--joints", "2"]
+    with start_cloud_processes(kind, tmp_path / "cloud") as processes:
+        common = ["--cloud", processes.url, "--home", str(tmp_path / "home"), "--count", str(COUNT), "--joints", "2"]
         common += ["--rate-hz", "2", "--spread-s", "1"]
         figures = tmp_path / "figures.json"
-        sign_in = {"token": ground.anna.token} if kind == "amqtt" else {"link": ground.cloud.link("anna")}
+        sign_in = {"token": processes.anna.token} if kind == "amqtt" else {"link": processes.cloud.link("anna")}
         with start(*common, "--seconds", "60", "--every-s", "1", "--json", str(figures), **sign_in) as load:
-            wait_until(lambda: sum(each["online"] for each in devices(ground)) == COUNT, "all to be online", 120)
-            device = devices(ground)[0]
+            wait_until(lambda: sum(each["online"] for each in devices(processes)) == COUNT, "all to be online", 120)
+            device = devices(processes)[0]
             assert device["robot_type"] == "load-test-arm"
-            require_motion_and_stop(ground, device["id"])
+            require_motion_and_stop(processes, device["id"])
             load.terminate()
             output, _ = load.communicate(timeout=60)
         assert load.returncode == 0, output
@@ -73,13 +73,13 @@ def test_twenty_agents_are_claimed_operated_and_reused(kind: BrokerKind, tmp_pat
         assert summary["troubles"] == {}
         assert summary["counts"]["heard"] >= 3
         assert summary["counts"]["lost_links"] == 0
-        wait_until(lambda: not any(each["online"] for each in devices(ground)), "all to be offline")
+        wait_until(lambda: not any(each["online"] for each in devices(processes)), "all to be offline")
 
         # The next run reuses the agents, so no claim is necessary.
         again = start(*common, "--seconds", "4")
         output, _ = again.communicate(timeout=120)
         assert again.returncode == 0, output
-        assert len(devices(ground)) == COUNT
+        assert len(devices(processes)) == COUNT
 
 
 @pytest.mark.parametrize(

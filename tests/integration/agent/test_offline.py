@@ -8,7 +8,7 @@ from pathlib import Path
 from device_agent.ports.clock import wall_ms
 from device_agent.protocol import AckStatus, GrantLease, JointTelemetry, MoveJoints, topics
 from device_agent.protocol.events import EventKind
-from tests.harness.agent.custom_agent import OwnAgent
+from tests.harness.agent.custom_agent import AgentProcess
 from tests.harness.network.brokers import start_broker, wait_until
 
 TOML = """
@@ -24,26 +24,26 @@ MAX_GAP = 30
 """Every fourth measurement is stored; the rest is tolerance for a busy machine."""
 
 
-def stored(agent: OwnAgent, *, late: bool) -> list[bytes]:
+def stored(agent: AgentProcess, *, late: bool) -> list[bytes]:
     """Messages in the outbox on disk."""
     with contextlib.closing(sqlite3.connect(agent.store.outbox, timeout=20)) as database:
         rows = database.execute("SELECT payload FROM items WHERE late = ? ORDER BY id", (late,)).fetchall()
     return [payload for (payload,) in rows]
 
 
-def has_stored_event(agent: OwnAgent, kind: EventKind) -> bool:
+def has_stored_event(agent: AgentProcess, kind: EventKind) -> bool:
     return any(f'"{kind}"'.encode() in payload for payload in stored(agent, late=False))
 
 
 def test_messages_are_sent_later_after_broker_and_agent_were_killed(tmp_path: Path) -> None:
     with contextlib.ExitStack() as stack:
         broker = stack.enter_context(start_broker("mosquitto", tmp_path / "broker"))
-        agent = stack.enter_context(OwnAgent(tmp_path / "store", broker, TOML))
+        agent = stack.enter_context(AgentProcess(tmp_path / "store", broker, TOML))
         agent.start()
         agent.ready()
         agent.execute(GrantLease(holder="ann", lease_ms=60_000), epoch=3)
         done = agent.command(MoveJoints(position_rad={"shoulder_pan": 0.1}, speed=0.5), epoch=3)
-        assert agent.ended(done).status is AckStatus.DONE
+        assert agent.final_ack(done).status is AckStatus.DONE
         running = agent.move(6.0, epoch=3, speed=0.05)
         # Acknowledged messages that the broker has not forwarded yet are lost with it; this is not tested here.
         wait_until(lambda: agent.events(EventKind.AGENT_STARTED), "the first start to be reported")
@@ -58,10 +58,10 @@ def test_messages_are_sent_later_after_broker_and_agent_were_killed(tmp_path: Pa
         wait_until(lambda: has_stored_event(agent, EventKind.AGENT_STARTED), "the second start on disk")
         wait_until(lambda: len(stored(agent, late=True)) > count, "its measurements on disk")
 
-        agent.line.close()
+        agent.client.close()
         again = stack.enter_context(start_broker("mosquitto", tmp_path / "broker", tcp_port=broker.tcp_port))
         back_ms = wall_ms()
-        agent.use(again)
+        agent.use_broker(again)
         agent.ready()
         wait_until(lambda: not stored(agent, late=False) and not stored(agent, late=True), "an empty outbox")
 
@@ -69,13 +69,13 @@ def test_messages_are_sent_later_after_broker_and_agent_were_killed(tmp_path: Pa
         assert held.data["code"] == "link_lost"
         assert held.at_ms < killed_ms
         assert len(agent.events(EventKind.AGENT_STARTED)) == 2
-        assert agent.ended(running).status is AckStatus.FAILED
+        assert agent.final_ack(running).status is AckStatus.FAILED
         require_complete_measurements(agent, killed_ms, back_ms)
         require_no_repetition(agent, done)
 
 
-def require_complete_measurements(agent: OwnAgent, killed_ms: int, back_ms: int) -> None:
-    late = agent.told(topics.LATE, JointTelemetry, topics.JOINTS)
+def require_complete_measurements(agent: AgentProcess, killed_ms: int, back_ms: int) -> None:
+    late = agent.received(topics.LATE, JointTelemetry, topics.JOINTS)
     times_ms = [each.at_ms for each in late]
     assert times_ms == sorted(times_ms)
     numbers = sorted({each.sequence for each in (*late, *agent.telemetry()) if each.at_ms < killed_ms})
@@ -83,7 +83,7 @@ def require_complete_measurements(agent: OwnAgent, killed_ms: int, back_ms: int)
     assert any(killed_ms < at_ms < back_ms for at_ms in times_ms), "after the second start"
 
 
-def require_no_repetition(agent: OwnAgent, done: str) -> None:
+def require_no_repetition(agent: AgentProcess, done: str) -> None:
     state = agent.state()
     assert (state.epoch, state.ended_epoch) == (3, 3)
     count = len(agent.telemetry())
@@ -91,5 +91,5 @@ def require_no_repetition(agent: OwnAgent, done: str) -> None:
     stale = agent.execute(GrantLease(holder="bert", lease_ms=60_000), epoch=2).reason
     assert stale is not None
     assert stale.code == "stale_epoch"
-    assert agent.ended(done).status is AckStatus.DONE
+    assert agent.final_ack(done).status is AckStatus.DONE
     assert max(agent.speeds(since=count), default=0.0) == 0

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from device_agent.protocol import AckStatus
 from device_agent.protocol.events import EventKind
-from tests.harness.agent.custom_agent import OwnAgent, Sensor
+from tests.harness.agent.custom_agent import AgentProcess, Sensor
 from tests.harness.network.brokers import start_broker, wait_until
 
 STALE_S = 2.5
@@ -38,22 +38,22 @@ FREE, NEAR, TOO_NEAR = 5.0, 1.5, 0.5
 FULL_RAD_S = 0.3 * 3.14
 
 
-def reasons(agent: OwnAgent) -> list[str]:
+def reasons(agent: AgentProcess) -> list[str]:
     return [event.data["reason"] for event in agent.events(EventKind.INTERLOCK_ENGAGED)]
 
 
-def restrictions(agent: OwnAgent) -> dict[str, float]:
+def restrictions(agent: AgentProcess) -> dict[str, float]:
     return {each.source.rpartition(" < ")[2]: each.speed for each in agent.state().restrictions}
 
 
-def end(agent: OwnAgent, action: str) -> tuple[AckStatus, str]:
-    ack = agent.ended(action)
+def end(agent: AgentProcess, action: str) -> tuple[AckStatus, str]:
+    ack = agent.final_ack(action)
     return ack.status, "" if ack.reason is None else ack.reason.code
 
 
 def test_presence_slows_then_holds_and_silence_holds(tmp_path: Path) -> None:
     failed = (AckStatus.FAILED, "interlock")
-    with start_broker("amqtt", tmp_path / "broker") as broker, OwnAgent(tmp_path / "home", broker, TOML) as agent:
+    with start_broker("amqtt", tmp_path / "broker") as broker, AgentProcess(tmp_path / "home", broker, TOML) as agent:
         agent.start()
         agent.ready()
         wait_until(lambda: restrictions(agent) == {"2": SLOW, "1": 0.0}, "holds without measurements")

@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
 from tests.harness.network.brokers import PATIENCE_S, wait_until
 from tests.harness.paths import ROOT
 
@@ -32,10 +32,10 @@ SCRIPT = {"kind": "run_movement", "name": "mine"}
 
 
 @pytest.fixture(scope="module")
-def ground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
-    with start_ground("amqtt", tmp_path_factory.mktemp("service")) as ground:
-        ground.anna.put("/robot-types/ur5/movements/mine", {"source": "print('here')"})
-        yield ground
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CloudProcesses]:
+    with start_cloud_processes("amqtt", tmp_path_factory.mktemp("service")) as processes:
+        processes.anna.put("/robot-types/ur5/movements/mine", {"source": "print('here')"})
+        yield processes
 
 
 @pytest.fixture
@@ -81,13 +81,13 @@ def program(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]"
     return subprocess.run(command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, check=False)
 
 
-def enroll(ground: Ground, folder: Path, *options: str) -> str:
+def enroll(processes: CloudProcesses, folder: Path, *options: str) -> str:
     """Enroll the agent and claim it for Anna; returns the device's id."""
-    enroll = ("-m", "device_agent", "enroll", "--server", ground.url, "--device", "arm=ur5", "--no-wait", *options)
+    enroll = ("-m", "device_agent", "enroll", "--server", processes.url, "--device", "arm=ur5", "--no-wait", *options)
     done = program(folder, *enroll)
     code = re.search(r"claim code (\S+)  ", done.stdout)
     assert code is not None, done
-    device: str = ground.anna.post("/agents/claim", {"code": code[1]}).json()["devices"][0]["id"]
+    device: str = processes.anna.post("/agents/claim", {"code": code[1]}).json()["devices"][0]["id"]
     return device
 
 
@@ -103,14 +103,14 @@ def running(folder: Path, *arguments: str, **environment: str) -> Iterator["subp
             process.wait()
 
 
-def online(ground: Ground, device: str) -> bool:
-    state: bool = ground.anna.get(f"/devices/{device}").json()["online"]
+def online(processes: CloudProcesses, device: str) -> bool:
+    state: bool = processes.anna.get(f"/devices/{device}").json()["online"]
     return state
 
 
-def end_of(ground: Ground, device: str, request: Any) -> dict[str, Any]:
+def end_of(processes: CloudProcesses, device: str, request: Any) -> dict[str, Any]:
     """Start an action and wait for its end."""
-    action: dict[str, Any] = ground.anna.start(device, request=request, wait_ms=30_000, wait_for="done").json()
+    action: dict[str, Any] = processes.anna.start(device, request=request, wait_ms=30_000, wait_for="done").json()
     return action
 
 
@@ -146,8 +146,8 @@ class ServiceManager:
         self._socket.close()
 
 
-def test_it_runs_unprivileged_and_ends_on_a_signal(ground: Ground, folder: Path) -> None:
-    device = enroll(ground, folder, "--transport", "http")
+def test_it_runs_unprivileged_and_ends_on_a_signal(processes: CloudProcesses, folder: Path) -> None:
+    device = enroll(processes, folder, "--transport", "http")
     home, notify = folder / "agent", folder / "notify"
     with (
         contextlib.closing(ServiceManager(notify)) as manager,
@@ -155,9 +155,9 @@ def test_it_runs_unprivileged_and_ends_on_a_signal(ground: Ground, folder: Path)
     ):
         wait_until(lambda: any("STATUS=running" in text for text in manager.notifications), "it to be ready")
         wait_until(lambda: "WATCHDOG=1" in manager.notifications[-1], "the watchdog")
-        wait_until(lambda: online(ground, device), "it to be online")
-        assert end_of(ground, device, MOVE)["status"] == "done"
-        script = end_of(ground, device, SCRIPT)
+        wait_until(lambda: online(processes, device), "it to be online")
+        assert end_of(processes, device, MOVE)["status"] == "done"
+        script = end_of(processes, device, SCRIPT)
         assert (script["status"], script["output"].strip()) == ("done", "here"), script
 
         second = program(folder, "-m", "device_agent", "run")
@@ -169,7 +169,7 @@ def test_it_runs_unprivileged_and_ends_on_a_signal(ground: Ground, folder: Path)
 
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 0
-    wait_until(lambda: not online(ground, device), "it to be offline")
+    wait_until(lambda: not online(processes, device), "it to be offline")
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in home.iterdir()}
     assert stat.S_IMODE(home.stat().st_mode) == 0o700
     assert {"identity.pem", "agent.toml", "pairing.json", "journal.db"} <= modes.keys()
@@ -200,17 +200,17 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.parametrize("platform", ["win32", pytest.param("darwin", marks=pytest.mark.long)])
-def test_without_a_sandbox_it_runs_without_scripts(ground: Ground, folder: Path, platform: str) -> None:
-    device = enroll(ground, folder, "--transport", "http" if platform == "win32" else "mqtt")
+def test_without_a_sandbox_it_runs_without_scripts(processes: CloudProcesses, folder: Path, platform: str) -> None:
+    device = enroll(processes, folder, "--transport", "http" if platform == "win32" else "mqtt")
     source = ELSEWHERE.replace("PLATFORM", repr(platform))
     with running(folder, "-c", source) as process:
-        wait_until(lambda: online(ground, device) or process.poll() is not None, "it to be online")
+        wait_until(lambda: online(processes, device) or process.poll() is not None, "it to be online")
         assert process.poll() is None, (folder / "log").read_text()
-        assert end_of(ground, device, MOVE)["status"] == "done"
-        script = end_of(ground, device, SCRIPT)
+        assert end_of(processes, device, MOVE)["status"] == "done"
+        script = end_of(processes, device, SCRIPT)
         assert script["status"] == "failed"
         assert "scripts run on Linux only" in script["reason"]["message"]
-        assert end_of(ground, device, MOVE)["status"] == "done"
+        assert end_of(processes, device, MOVE)["status"] == "done"
     done = program(folder, "-c", source, "doctor")
     assert done.returncode == 0, done
     assert "warning  scripts: scripts run on Linux only" in done.stdout

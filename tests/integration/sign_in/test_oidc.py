@@ -22,7 +22,7 @@ from tests.harness.cloud.oidc_provider import (
     REDIRECT,
     SigningKey,
     new_key,
-    sign_in_there,
+    sign_in_at_provider,
     start_provider,
 )
 
@@ -80,7 +80,7 @@ class Browser:
         return self.cloud.run(self.page.get(place.raw_path.decode()))
 
     def sign_in(self, name: str) -> httpx.Response:
-        return self.back(sign_in_there(self.start(), name))
+        return self.back(sign_in_at_provider(self.start(), name))
 
     def me(self) -> httpx.Response:
         return self.cloud.run(self.page.get(f"{API}/accounts/me"))
@@ -147,7 +147,7 @@ class TestWhoMayCome:
         owner = closed.sign_in("anna")
         secret = self.invite(owner)
         browser = Browser(closed)
-        answer = browser.back(sign_in_there(browser.start_with(secret), "bert"))
+        answer = browser.back(sign_in_at_provider(browser.start_with(secret), "bert"))
         assert answer.headers["location"] == f"{BASE}/#/"
         me = browser.me().json()
         assert me["name"] == "Name of bert"
@@ -167,7 +167,7 @@ class TestWhoMayCome:
     ) -> None:
         owner, _ = closed.sign_in("anna"), closed.sign_in("carl")
         browser = Browser(closed)
-        place = sign_in_there(browser.start_with(self.invite(owner, **limits)), "bert")
+        place = sign_in_at_provider(browser.start_with(self.invite(owner, **limits)), "bert")
         closed.clock.advance(later_s)
         failed(browser.back(place), "uninvited")
 
@@ -203,7 +203,7 @@ def test_the_page_is_told_how_one_may_sign_in(here: Cloud, cloud: Cloud) -> None
 
 def test_a_way_back_is_good_once_and_in_the_browser_that_began(here: Cloud) -> None:
     anna, mallory = Browser(here), Browser(here)
-    place = sign_in_there(anna.start(), "anna")
+    place = sign_in_at_provider(anna.start(), "anna")
     failed(mallory.back(place), "expired")
     mallory.start()
     failed(mallory.back(place), "expired")
@@ -215,12 +215,12 @@ def test_a_way_back_is_good_once_and_in_the_browser_that_began(here: Cloud) -> N
 def test_a_code_of_another_sign_in_is_refused(here: Cloud) -> None:
     """The PKCE verifier does not match, so the provider rejects the code."""
     anna, mallory = Browser(here), Browser(here)
-    first = sign_in_there(anna.start(), "anna")
-    stolen = sign_in_there(mallory.start(), "mallory").copy_set_param("code", first.params["code"])
+    first = sign_in_at_provider(anna.start(), "anna")
+    stolen = sign_in_at_provider(mallory.start(), "mallory").copy_set_param("code", first.params["code"])
     failed(mallory.back(stolen), "rejected")
     assert mallory.me().status_code == 401
     anna.back(first)
-    used = sign_in_there(anna.start(), "anna").copy_set_param("code", first.params["code"])
+    used = sign_in_at_provider(anna.start(), "anna").copy_set_param("code", first.params["code"])
     failed(anna.back(used), "rejected")
 
 
@@ -240,7 +240,7 @@ def test_a_wrong_way_back_is_refused(
     here: Cloud, change: Callable[[httpx.URL], httpx.URL], later_s: float, why: str
 ) -> None:
     browser = Browser(here)
-    place = sign_in_there(browser.start(), "anna")
+    place = sign_in_at_provider(browser.start(), "anna")
     here.clock.advance(later_s)
     failed(browser.back(change(place)), why)
     assert browser.me().status_code == 401

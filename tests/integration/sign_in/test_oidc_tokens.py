@@ -14,7 +14,15 @@ import pytest
 from function_app.adapters.oidc.provider import HttpOidcProvider
 from function_app.ports.oidc_provider import OidcError, Subject
 from tests.fakes.clock import MovingClock
-from tests.harness.cloud.oidc_provider import CLIENT_ID, CLIENT_SECRET, REDIRECT, Liar, SigningKey, new_key, start_liar
+from tests.harness.cloud.oidc_provider import (
+    CLIENT_ID,
+    CLIENT_SECRET,
+    REDIRECT,
+    FakeProvider,
+    SigningKey,
+    new_key,
+    start_fake_provider,
+)
 
 NONCE = "of this sign-in"
 STARTED_S = int(time.time())
@@ -28,19 +36,23 @@ def strange() -> SigningKey:
 
 
 @pytest.fixture
-def liar(key: SigningKey) -> Iterator[Liar]:
-    with start_liar() as liar:
-        liar.keys = [key.shown()]
-        yield liar
+def provider(key: SigningKey) -> Iterator[FakeProvider]:
+    with start_fake_provider() as provider:
+        provider.keys = [key.jwk()]
+        yield provider
 
 
-def client(liar: Liar, *, secret: str = CLIENT_SECRET, clock: MovingClock | None = None) -> HttpOidcProvider:
-    return HttpOidcProvider(issuer=liar.issuer, client_id=CLIENT_ID, client_secret=secret, clock=clock or MovingClock())
+def client(
+    provider: FakeProvider, *, secret: str = CLIENT_SECRET, clock: MovingClock | None = None
+) -> HttpOidcProvider:
+    return HttpOidcProvider(
+        issuer=provider.issuer, client_id=CLIENT_ID, client_secret=secret, clock=clock or MovingClock()
+    )
 
 
-def claims(liar: Liar, **changes: Any) -> dict[str, Any]:
+def claims(provider: FakeProvider, **changes: Any) -> dict[str, Any]:
     now = int(time.time())
-    good = {"iss": liar.issuer, "sub": "anna", "aud": CLIENT_ID, "iat": now, "exp": now + 300, "nonce": NONCE}
+    good = {"iss": provider.issuer, "sub": "anna", "aud": CLIENT_ID, "iat": now, "exp": now + 300, "nonce": NONCE}
     return {name: value for name, value in {**good, **changes}.items() if value is not None}
 
 
@@ -52,12 +64,12 @@ def redeem(asked: HttpOidcProvider, issuer: str | None = None) -> Subject:
     return asyncio.run(asked.redeem(code="c", verifier="v", nonce=NONCE, redirect=REDIRECT, issuer=issuer))
 
 
-def test_an_honest_token_is_believed(liar: Liar, key: SigningKey) -> None:
-    liar.token = signed(claims(liar), key)
-    assert redeem(client(liar)) == Subject(liar.issuer, "anna", "anna")
-    liar.token = signed(claims(liar, aud=[CLIENT_ID, "other"], azp=CLIENT_ID, name=" A\u0000nna\n"), key)
-    assert redeem(client(liar), liar.issuer).name == "Anna"
-    assert parse_qs(liar.asked[0]) == {
+def test_an_honest_token_is_believed(provider: FakeProvider, key: SigningKey) -> None:
+    provider.token = signed(claims(provider), key)
+    assert redeem(client(provider)) == Subject(provider.issuer, "anna", "anna")
+    provider.token = signed(claims(provider, aud=[CLIENT_ID, "other"], azp=CLIENT_ID, name=" A\u0000nna\n"), key)
+    assert redeem(client(provider), provider.issuer).name == "Anna"
+    assert parse_qs(provider.forms[0]) == {
         "grant_type": ["authorization_code"], "code": ["c"], "redirect_uri": [REDIRECT], "code_verifier": ["v"],
     }  # fmt: skip
 
@@ -76,23 +88,23 @@ def test_an_honest_token_is_believed(liar: Liar, key: SigningKey) -> None:
     # Named alike however late a process looks: tests that run side by side must have the same names in each.
     ids=lambda changes: re.sub(r"\d{10}", "another time", json.dumps(changes)),
 )  # fmt: skip
-def test_a_token_of_other_claims_is_not(liar: Liar, key: SigningKey, changes: dict[str, Any]) -> None:
-    liar.token = signed(claims(liar, **changes), key)
+def test_a_token_of_other_claims_is_not(provider: FakeProvider, key: SigningKey, changes: dict[str, Any]) -> None:
+    provider.token = signed(claims(provider, **changes), key)
     with pytest.raises(OidcError):
-        redeem(client(liar))
+        redeem(client(provider))
 
 
-def test_a_token_that_others_signed_is_not(liar: Liar, key: SigningKey, strange: SigningKey) -> None:
-    said = claims(liar)
+def test_a_token_that_others_signed_is_not(provider: FakeProvider, key: SigningKey, strange: SigningKey) -> None:
+    said = claims(provider)
     good = signed(said, key)
     head, body, tail = good.split(".")
     for token in (
         signed(said, strange),
         signed(said, strange, kid="two"),
-        signed(said, strange, jwk=strange.shown(), jku="http://127.0.0.1:1/keys"),
+        signed(said, strange, jwk=strange.jwk(), jku="http://127.0.0.1:1/keys"),
         jwt.encode(said, "", "none", headers={"kid": key.name}),
         jwt.encode(said, CLIENT_SECRET, "HS256", headers={"kid": key.name}),
-        jwt.encode(said, str(key.shown()["n"]), "HS512", headers={"kid": key.name}),
+        jwt.encode(said, str(key.jwk()["n"]), "HS512", headers={"kid": key.name}),
         f"{head}.{body}.",
         f"{head}.{body[:-4]}AAAA.{tail}",
         f"{head}.{body}.{tail[:-8]}AAAAAAAA",
@@ -101,40 +113,42 @@ def test_a_token_that_others_signed_is_not(liar: Liar, key: SigningKey, strange:
         None,
         1,
     ):
-        liar.token = token
+        provider.token = token
         with pytest.raises(OidcError):
-            redeem(client(liar))
-    liar.token = good
-    assert redeem(client(liar)).id == "anna"
+            redeem(client(provider))
+    provider.token = good
+    assert redeem(client(provider)).id == "anna"
 
 
-def test_a_key_for_something_else_is_none(liar: Liar, key: SigningKey) -> None:
-    liar.token = signed(claims(liar), key)
-    for shown in ({**key.shown(), "use": "enc"}, {**key.shown(), "alg": "PS256"}, {"kid": "one", "kty": "oct"}, "x",
-                  {**key.shown(), "n": "!"}, {**key.shown(), "n": 1}, {**key.shown(), "e": None}):  # fmt: skip
-        liar.keys = [shown]
+def test_a_key_for_something_else_is_none(provider: FakeProvider, key: SigningKey) -> None:
+    provider.token = signed(claims(provider), key)
+    for shown in ({**key.jwk(), "use": "enc"}, {**key.jwk(), "alg": "PS256"}, {"kid": "one", "kty": "oct"}, "x",
+                  {**key.jwk(), "n": "!"}, {**key.jwk(), "n": 1}, {**key.jwk(), "e": None}):  # fmt: skip
+        provider.keys = [shown]
         with pytest.raises(OidcError):
-            redeem(client(liar))
+            redeem(client(provider))
 
 
-def test_an_unknown_key_has_the_keys_fetched_but_not_for_ever(liar: Liar, key: SigningKey, strange: SigningKey) -> None:
+def test_an_unknown_key_has_the_keys_fetched_but_not_for_ever(
+    provider: FakeProvider, key: SigningKey, strange: SigningKey
+) -> None:
     clock = MovingClock()
-    asked = client(liar, clock=clock)
-    liar.token = signed(claims(liar), key)
+    asked = client(provider, clock=clock)
+    provider.token = signed(claims(provider), key)
     redeem(asked)
-    liar.token = signed(claims(liar), strange, kid="two")
+    provider.token = signed(claims(provider), strange, kid="two")
     for _ in range(5):
         with pytest.raises(OidcError):
             redeem(asked)
-    assert liar.fetched.count("/keys") == 1
+    assert provider.paths.count("/keys") == 1
     clock.advance(11)
-    liar.keys.append({**strange.shown(), "kid": "two"})
+    provider.keys.append({**strange.jwk(), "kid": "two"})
     assert redeem(asked).id == "anna"
-    liar.keys = [{**strange.shown(), "kid": "two"}]
-    liar.token = signed(claims(liar), key)
+    provider.keys = [{**strange.jwk(), "kid": "two"}]
+    provider.token = signed(claims(provider), key)
     assert redeem(asked).id == "anna", "a key is kept for an hour"
     clock.advance(3_600)
-    liar.token = signed(claims(liar, exp=int(time.time()) + 7_200), key)
+    provider.token = signed(claims(provider, exp=int(time.time()) + 7_200), key)
     with pytest.raises(OidcError, match="does not show"):
         redeem(asked)
 
@@ -148,29 +162,29 @@ def test_an_unknown_key_has_the_keys_fetched_but_not_for_ever(liar: Liar, key: S
     ],
     ids=json.dumps,
 )  # fmt: skip
-def test_a_provider_that_is_not_what_it_should_be_is_not_used(liar: Liar, changes: dict[str, Any]) -> None:
-    liar.document |= changes
+def test_a_provider_that_is_not_what_it_should_be_is_not_used(provider: FakeProvider, changes: dict[str, Any]) -> None:
+    provider.document |= changes
     with pytest.raises(OidcError):
-        asyncio.run(client(liar).address(state="s", nonce="n", challenge="c", redirect=REDIRECT))
-    assert liar.asked == []
+        asyncio.run(client(provider).address(state="s", nonce="n", challenge="c", redirect=REDIRECT))
+    assert provider.forms == []
 
 
-def test_a_client_without_a_secret_says_who_it_is(liar: Liar, key: SigningKey) -> None:
-    liar.token = signed(claims(liar), key)
-    redeem(client(liar, secret=""))
-    liar.document["token_endpoint_auth_methods_supported"] = ["client_secret_post"]
-    redeem(client(liar))
-    public, posted = (parse_qs(form) for form in liar.asked)
+def test_a_client_without_a_secret_says_who_it_is(provider: FakeProvider, key: SigningKey) -> None:
+    provider.token = signed(claims(provider), key)
+    redeem(client(provider, secret=""))
+    provider.document["token_endpoint_auth_methods_supported"] = ["client_secret_post"]
+    redeem(client(provider))
+    public, posted = (parse_qs(form) for form in provider.forms)
     assert public["client_id"] == posted["client_id"] == [CLIENT_ID]
     assert "client_secret" not in public
     assert posted["client_secret"] == [CLIENT_SECRET]
 
 
-def test_a_refusal_and_too_long_an_answer_are_told_apart_from_a_token(liar: Liar, key: SigningKey) -> None:
-    liar.token = signed(claims(liar), key)
-    liar.status = 400
+def test_a_refusal_and_too_long_an_answer_are_told_apart_from_a_token(provider: FakeProvider, key: SigningKey) -> None:
+    provider.token = signed(claims(provider), key)
+    provider.status = 400
     with pytest.raises(OidcError, match="answered 400"):
-        redeem(client(liar))
-    liar.status, liar.token = 200, "x" * 300_000
+        redeem(client(provider))
+    provider.status, provider.token = 200, "x" * 300_000
     with pytest.raises(OidcError, match="more than"):
-        redeem(client(liar))
+        redeem(client(provider))

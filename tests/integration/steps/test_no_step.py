@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import topics
-from tests.harness.cloud.cloud_processes import Ground, Link
+from tests.harness.cloud.cloud_processes import CloudProcesses, Link
 from tests.harness.network.brokers import BROKERS, HOST, TRANSPORTS, BrokerKind, Client, Transport, wait_until
 from tests.harness.network.proxy import Proxy, start_proxy
 
@@ -92,10 +92,12 @@ def test_a_heap_among_quick_pairs_is_a_step_and_a_slow_machine_is_none() -> None
 
 
 @contextlib.contextmanager
-def client(ground: Ground, name: str, *, publish: str = "#", subscribe: str = "#", **options: Any) -> Iterator[Client]:
+def client(
+    processes: CloudProcesses, name: str, *, publish: str = "#", subscribe: str = "#", **options: Any
+) -> Iterator[Client]:
     """A connected client with these rights, behind the port in ``options`` if there is one."""
-    broker, functions = ground.broker.now, ground.cloud.functions
-    login = ground.cloud.run(functions.access.issue(broker.grant(name, publish=(publish,), subscribe=(subscribe,))))
+    broker, functions = processes.broker.running, processes.cloud.functions
+    login = processes.cloud.run(functions.access.issue(broker.grant(name, publish=(publish,), subscribe=(subscribe,))))
     port = options.pop("port", 0) or broker.port(options.get("transport", "tcp"))
     with Client(name, login, port=port, **options).open() as found:
         assert found.connected.is_set(), found.answer
@@ -103,13 +105,13 @@ def client(ground: Ground, name: str, *, publish: str = "#", subscribe: str = "#
 
 
 @pytest.fixture(params=["mqtt", "xmpp"])
-def link(request: pytest.FixtureRequest, grounds: Callable[[Any], Ground]) -> Iterator[Link]:
+def link(request: pytest.FixtureRequest, start_processes: Callable[[Any], CloudProcesses]) -> Iterator[Link]:
     """An agent's transport behind a proxy."""
     if request.param == "mqtt":
-        ground, endpoint = grounds("amqtt"), "broker"
+        processes, endpoint = start_processes("amqtt"), "broker"
     else:
-        ground, endpoint = request.getfixturevalue("xmpp_ground"), "xmpp"
-    with Link(ground, {"transport": request.param}, through=endpoint).start() as link:
+        processes, endpoint = request.getfixturevalue("xmpp_processes"), "xmpp"
+    with Link(processes, {"transport": request.param}, through=endpoint).start() as link:
         yield link.up()
 
 
@@ -123,7 +125,7 @@ def test_an_agent_publishes_at_once(link: Link) -> None:
 def test_an_agent_gets_setpoints_at_once(link: Link) -> None:
     assert link.proxy is not None
     topic = f"{link.topic(topics.CTL)}/1"
-    with client(link.ground, "operator") as operator:
+    with client(link.processes, "operator") as operator:
         wait_until(lambda: operator.publish(topic, b"{}", qos=0) and link.received, "the first setpoint")
         gaps = gaps_ms(link.proxy, lambda mark: operator.publish(topic, mark, qos=0), from_server=True)
     assert not stepped(gaps), gaps
@@ -132,24 +134,24 @@ def test_an_agent_gets_setpoints_at_once(link: Link) -> None:
 @pytest.mark.parametrize("transport", TRANSPORTS)
 @pytest.mark.parametrize("kind", BROKERS)
 def test_a_broker_delivers_at_once(
-    grounds: Callable[[BrokerKind], Ground], kind: BrokerKind, transport: Transport
+    start_processes: Callable[[BrokerKind], CloudProcesses], kind: BrokerKind, transport: Transport
 ) -> None:
-    ground, topic = grounds(kind), "ts/v1/lab/robot/arm/tele/joints"
+    processes, topic = start_processes(kind), "ts/v1/lab/robot/arm/tele/joints"
     with (
-        start_proxy(ground.broker.now.port(transport)) as proxy,
-        client(ground, "page", subscribe=topic, port=proxy.port, transport=transport) as page,
-        client(ground, "robot", publish=topic) as robot,
+        start_proxy(processes.broker.running.port(transport)) as proxy,
+        client(processes, "page", subscribe=topic, port=proxy.port, transport=transport) as page,
+        client(processes, "robot", publish=topic) as robot,
     ):
         page.subscribe(topic, qos=0)
         gaps = gaps_ms(proxy, lambda mark: robot.publish(topic, mark, qos=0), from_server=True)
     assert not stepped(gaps), gaps
 
 
-def test_the_functions_send_to_the_broker_at_once(grounds: Callable[[BrokerKind], Ground]) -> None:
+def test_the_functions_send_to_the_broker_at_once(start_processes: Callable[[BrokerKind], CloudProcesses]) -> None:
     """Their messages are acknowledged one by one, which hides a step; so the options of their sockets are read."""
-    ground = grounds("amqtt")
-    ground.keep("ts/v1/lab/robot/arm/state", b"{}")
-    options = no_delay_options(ground.broker.port)
+    processes = start_processes("amqtt")
+    processes.publish_retained("ts/v1/lab/robot/arm/state", b"{}")
+    options = no_delay_options(processes.broker.port)
     assert options
     assert all(options), options
 
@@ -167,9 +169,9 @@ def no_delay_options(port: int) -> list[bool]:
     return found
 
 
-def test_the_functions_answer_over_http_at_once(grounds: Callable[[BrokerKind], Ground]) -> None:
+def test_the_functions_answer_over_http_at_once(start_processes: Callable[[BrokerKind], CloudProcesses]) -> None:
     """Head and body of a response are two writes."""
-    with start_proxy(grounds("amqtt").endpoints["server"].port) as proxy:
+    with start_proxy(start_processes("amqtt").endpoints["server"].port) as proxy:
         proxy.acknowledge_late()
         connection = http.client.HTTPConnection(HOST, proxy.port, timeout=60)
         gaps = []
@@ -183,9 +185,9 @@ def test_the_functions_answer_over_http_at_once(grounds: Callable[[BrokerKind], 
     assert not stepped(gaps), gaps
 
 
-def test_an_agent_sends_over_http_at_once(grounds: Callable[[BrokerKind], Ground]) -> None:
+def test_an_agent_sends_over_http_at_once(start_processes: Callable[[BrokerKind], CloudProcesses]) -> None:
     """Head and body of a request are two writes."""
-    with Link(grounds("amqtt"), {"transport": "http"}, through="server").start() as link:
+    with Link(start_processes("amqtt"), {"transport": "http"}, through="server").start() as link:
         link.up()
         assert link.proxy is not None
         link.proxy.acknowledge_late()

@@ -63,7 +63,7 @@ def test_a_robot_is_paired_leased_and_runs_a_movement(clouds: tuple[Cloud, Cloud
         assert again.get(f"/devices/{robot.device}/lease").json()["lease"]["epoch"] == epoch
 
         request = {"kind": "run_movement", "name": "mine", "parameters": {"note": "grüß 🤖"}}
-        options: dict[str, Any] = {"request": request, "epoch": epoch, "wait_ms": 10_000, "once": "a/b#c?"}
+        options: dict[str, Any] = {"request": request, "epoch": epoch, "wait_ms": 10_000, "idempotency_key": "a/b#c?"}
         action = anna.start(robot.device, **options).json()
         assert action["status"] == "started"
         assert anna.start(robot.device, **options).json()["id"] == action["id"]

@@ -95,8 +95,8 @@ class Machine(RuleBasedStateMachine):
         asked: dict[str, Any] = {
             "ttl_ms": 1000 * TTL_S, "timeout_ms": 1000 * TIMEOUT_S, "queue_ms": 1000 * QUEUE_S, "policy": policy
         }  # fmt: skip
-        once = {"once": f"{key}{policy}"} if key else {}
-        answer = self.people[name].start(self.robot.device, request=MOVE, **asked, **once)
+        idempotency = {"idempotency_key": f"{key}{policy}"} if key else {}
+        answer = self.people[name].start(self.robot.device, request=MOVE, **asked, **idempotency)
         if not self.may(name):
             assert answer.status_code == 404
             return

@@ -17,7 +17,7 @@ from device_agent.protocol.manifests.room import Room
 from device_agent.sensors.mujoco import cameras, shared_view
 from device_agent.sensors.perception import PerceptionDriver
 from device_agent.simulation import renderer
-from tests.harness.agent.rooms import LAB, ROBOTS, StillWorld
+from tests.harness.agent.rooms import LAB, ROBOTS, ManualWorld
 from tests.unit.robots.simulated_robot import SimulatedRobot
 
 EYES = ("lidar", "depth", "depth_ceiling")
@@ -51,7 +51,7 @@ class Watched:
     """
 
     def __init__(self, manifest: Room | None = None, *, walks: bool = False) -> None:
-        self.world = StillWorld(LAB, manifest)
+        self.world = ManualWorld(LAB, manifest)
         self.nao = SimulatedRobot(ROBOTS / "nao", room=self.world.world) if walks else None
         self._walk_ended = threading.Event()
         self._walk_ended.set()

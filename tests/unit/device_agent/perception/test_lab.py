@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.harness.agent.rooms import StillWorld
+from tests.harness.agent.rooms import ManualWorld
 from tests.unit.device_agent.perception.lab import EYES, Watched, by_hand
 
 pytestmark = pytest.mark.slow
@@ -56,10 +56,10 @@ class EmptyRoom:
 
 def test_the_shipped_background_matches_the_room() -> None:
     """When this fails the furniture has moved: `python robots/rooms/survey.py lab`."""
-    manifest = StillWorld().manifest
+    manifest = ManualWorld().manifest
     watched = Watched(msgspec.structs.replace(manifest, robots=(), people=()))
     watched.world.add(EmptyRoom())
-    watched.world.go_on(4.0)
+    watched.world.advance(4.0)
     try:
         for name in EYES:
             assert watched.sight.background.change_share(name, watched.raw(name)) < 0.01, name

@@ -14,14 +14,14 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import room
 from device_agent.sensors.mujoco import fault_injection, scalar_sensors
 from device_agent.sensors.mujoco.fault_injection import NO_FAULTS, InjectedFaults, read
-from tests.harness.agent.rooms import LAB, StillWorld
+from tests.harness.agent.rooms import LAB, ManualWorld
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def world() -> StillWorld:
-    return StillWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
+def world() -> ManualWorld:
+    return ManualWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ Connect = Callable[[str], RoomDriver]
 
 
 @pytest.fixture
-def connect(world: StillWorld, file: Path) -> Iterator[Connect]:
+def connect(world: ManualWorld, file: Path) -> Iterator[Connect]:
     """Connects a device of the laboratory with the fault file."""
     with contextlib.ExitStack() as stack:
 
@@ -134,7 +134,7 @@ def test_an_invalid_fault_file_is_rejected_with_valid_names(text: str, message: 
     assert read("", []) == NO_FAULTS == InjectedFaults()
 
 
-def test_an_invalid_fault_path_is_rejected(world: StillWorld) -> None:
+def test_an_invalid_fault_path_is_rejected(world: ManualWorld) -> None:
     entry = msgspec.structs.replace(world.entry("pir"), options={"faults": 3})
     with pytest.raises(SensorError, match="path of a file"):
         world.driver(entry)

@@ -16,7 +16,7 @@ from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors import load, names
 from device_agent.sensors import mujoco as simulated
 from device_agent.sensors.mujoco.noise import NOISE, NoiseParameters, SensorNoise, generator
-from tests.harness.agent.rooms import LAB, StillWorld
+from tests.harness.agent.rooms import LAB, ManualWorld
 
 pytestmark = pytest.mark.slow
 ROUND_S = 45.0
@@ -25,18 +25,18 @@ LEG_M = 0.35
 
 
 @pytest.fixture
-def world() -> StillWorld:
+def world() -> ManualWorld:
     """The laboratory without robots, which is faster."""
-    return StillWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
+    return ManualWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
 
 
 @pytest.fixture
-def lab() -> StillWorld:
+def lab() -> ManualWorld:
     """The laboratory with robots."""
-    return StillWorld()
+    return ManualWorld()
 
 
-def connected(world: StillWorld, device: RoomDeviceManifest | str) -> RoomDriver:
+def connected(world: ManualWorld, device: RoomDeviceManifest | str) -> RoomDriver:
     driver = world.driver(device)
     driver.connect()
     return driver
@@ -51,23 +51,23 @@ def raw(driver: RoomDriver, kind: type[Raw]) -> Raw:
     return measured
 
 
-def until(world: StillWorld, condition: Callable[[], bool], step_s: float = 0.25) -> None:
+def until(world: ManualWorld, condition: Callable[[], bool], step_s: float = 0.25) -> None:
     for _ in range(round(ROUND_S / step_s)):
         if condition():
             return
-        world.go_on(step_s)
+        world.advance(step_s)
     pytest.fail("not within one round of the person")
 
 
 # ---------------------------------------------------------------- motion
 
 
-def test_the_motion_detector_only_detects_motion(world: StillWorld) -> None:
+def test_the_motion_detector_only_detects_motion(world: ManualWorld) -> None:
     pir = connected(world, "pir")
     readings: list[tuple[bool, float]] = []
     for _ in range(round(ROUND_S / 0.25)):
         before = world.place("person")
-        world.go_on(0.25)
+        world.advance(0.25)
         readings.append((bool(pir.read("motion")["present"]), math.dist(before, world.place("person")) / 0.25))
     assert {present for present, _ in readings} == {True, False}
     speeds = [speed for (before, _), (after, speed) in pairwise(readings) if after and not before]
@@ -75,23 +75,23 @@ def test_the_motion_detector_only_detects_motion(world: StillWorld) -> None:
     assert min(speeds) > 0.1, "false detection"
 
 
-def test_the_motion_detector_ignores_cold_and_hidden_bodies(world: StillWorld) -> None:
+def test_the_motion_detector_ignores_cold_and_hidden_bodies(world: ManualWorld) -> None:
     entry = world.entry("pir")
     still = connected(world, msgspec.structs.replace(entry, options={"warm": ["chair"]}))
     door = connected(world, msgspec.structs.replace(entry, options={"warm": ["unknown"]}))
     world.set("door", 1.5)
     for _ in range(20):
-        world.go_on(0.25)
+        world.advance(0.25)
         assert not still.read("motion")["present"]
         assert not door.read("motion")["present"], "the door is not warm"
 
 
-def test_the_lidar_measures_the_persons_legs(world: StillWorld) -> None:
+def test_the_lidar_measures_the_persons_legs(world: ManualWorld) -> None:
     lidar = connected(world, "lidar")
     empty_m = raw(lidar, Scan).range_m
     detections = 0
     for _ in range(40):
-        world.go_on(1.0)
+        world.advance(1.0)
         scan = raw(lidar, Scan)
         nearer = np.isfinite(scan.range_m) & (scan.range_m < empty_m - 0.25)
         angle_rad = scan.angle_rad[nearer]
@@ -102,7 +102,7 @@ def test_the_lidar_measures_the_persons_legs(world: StillWorld) -> None:
     assert detections > 25, f"the person was detected in {detections} of 40 scans"
 
 
-def test_a_scan_has_noise_and_excludes_the_lidar(world: StillWorld) -> None:
+def test_a_scan_has_noise_and_excludes_the_lidar(world: ManualWorld) -> None:
     lidar = connected(world, "lidar")
     scans = np.array([raw(lidar, Scan).range_m for _ in range(60)])
     known = np.isfinite(scans).all(axis=0)
@@ -112,7 +112,7 @@ def test_a_scan_has_noise_and_excludes_the_lidar(world: StillWorld) -> None:
     assert scans.min() >= 0.15
 
 
-def test_cameras_show_a_moving_robot(lab: StillWorld) -> None:
+def test_cameras_show_a_moving_robot(lab: ManualWorld) -> None:
     corner, turning = connected(lab, "camera"), connected(lab, "pan_tilt")
     model = lab.model
     arm = [index for index in range(model.nu) if model.actuator(index).name.startswith("ur5/")]
@@ -121,7 +121,7 @@ def test_cameras_show_a_moving_robot(lab: StillWorld) -> None:
         before = raw(camera, Image)
         now = lab.world.snapshot().ctrl[arm]
         lab.world.command("test", np.array(arm), now + np.array([1.2, 0.4, -0.6, 0, 0, 0]), ramp_s=1.0)
-        lab.go_on(2.0)
+        lab.advance(2.0)
         after = raw(camera, Image)
         assert difference(before, after) > noise + 20, "the image has not changed"
         camera.close()
@@ -134,7 +134,7 @@ def difference(one: Image, other: Image) -> int:
     return int((np.abs(one.rgb.astype(int) - other.rgb.astype(int)).max(axis=2) > 25).sum())
 
 
-def test_the_depth_camera_measures_the_person(world: StillWorld) -> None:
+def test_the_depth_camera_measures_the_person(world: ManualWorld) -> None:
     depth = connected(world, "depth")
 
     def visible() -> bool:
@@ -154,7 +154,7 @@ def test_the_depth_camera_measures_the_person(world: StillWorld) -> None:
     depth.close()
 
 
-def test_depth_is_infinite_out_of_range(world: StillWorld) -> None:
+def test_depth_is_infinite_out_of_range(world: ManualWorld) -> None:
     near = connected(world, msgspec.structs.replace(world.entry("depth"), options={"furthest_m": 2.0}))
     depth_m = raw(near, Image).depth_m
     assert depth_m is not None
@@ -163,28 +163,28 @@ def test_depth_is_infinite_out_of_range(world: StillWorld) -> None:
     near.close()
 
 
-def test_the_door_follows_its_control_until_held_and_its_contact_reports_it(world: StillWorld) -> None:
+def test_the_door_follows_its_control_until_held_and_its_contact_reports_it(world: ManualWorld) -> None:
     door, contact = connected(world, "door"), connected(world, "door_contact")
     assert contact.read("contact") == {"open": False}
     assert door.set("opening", 1.0) == pytest.approx(1.0)
-    world.go_on(1.0)
+    world.advance(1.0)
     assert contact.read("contact") == {"open": True}
     assert isinstance(door, Movable)
     door.hold()
     held = door.read("settings")["opening"]
     assert 0.05 < held < 0.95, "the door moves at limited speed"
-    world.go_on(5.0)
+    world.advance(5.0)
     assert door.read("settings")["opening"] == pytest.approx(held, abs=0.08)
     door.set("opening", 0.0)
-    world.go_on(6.0)
+    world.advance(6.0)
     assert contact.read("contact") == {"open": False}
 
 
-def test_a_pan_tilt_camera_reports_its_pose(world: StillWorld) -> None:
+def test_a_pan_tilt_camera_reports_its_pose(world: ManualWorld) -> None:
     camera = connected(world, "pan_tilt")
     before = raw(camera, Image)
     camera.set("pan", 1.0)
-    world.go_on(5.0)
+    world.advance(5.0)
     after = raw(camera, Image)
     assert camera.read("settings")["pan"] == pytest.approx(1.0, abs=0.03)
     cosine = float(before.rotation[:, 2] @ after.rotation[:, 2])
@@ -193,16 +193,16 @@ def test_a_pan_tilt_camera_reports_its_pose(world: StillWorld) -> None:
     camera.close()
 
 
-def test_the_lamp_changes_the_light_meter(world: StillWorld) -> None:
+def test_the_lamp_changes_the_light_meter(world: ManualWorld) -> None:
     lamp, meter = (
         connected(world, "lamp"),
         connected(world, msgspec.structs.replace(world.entry("light"), options={"seed": 3})),
     )
     lamp.set("level", 0.0)
-    world.go_on(0.02)
+    world.advance(0.02)
     dark = meter.read("light")["light_lux"]
     lamp.set("level", 1.0)
-    world.go_on(0.02)
+    world.advance(0.02)
     until(world, lambda: meter.read("light")["light_lux"] > dark + 100, step_s=0.02)
 
 
@@ -248,12 +248,14 @@ def test_readings_respect_minimum_and_resolution(quantity: str) -> None:
         ("camera", {"options": {"width": 100_000}}, "at most 1920 x 1080"),
     ],
 )
-def test_an_invalid_entry_is_rejected(world: StillWorld, device: str, changes: dict[str, object], message: str) -> None:
+def test_an_invalid_entry_is_rejected(
+    world: ManualWorld, device: str, changes: dict[str, object], message: str
+) -> None:
     with pytest.raises(SensorError, match=message):
         world.driver(msgspec.structs.replace(world.entry(device), **changes)).connect()
 
 
-def test_unknown_drivers_and_rooms_without_model_are_rejected(world: StillWorld) -> None:
+def test_unknown_drivers_and_rooms_without_model_are_rejected(world: ManualWorld) -> None:
     with pytest.raises(SensorError, match=r"no sensor driver 'crystal_ball'; there are: .*mujoco"):
         load("crystal_ball")
     assert {"mujoco", "perception"} <= set(names())
@@ -261,8 +263,8 @@ def test_unknown_drivers_and_rooms_without_model_are_rejected(world: StillWorld)
         simulated.create(world.entry("pir"), LAB, Surroundings(neighbours={}))
 
 
-def test_a_missing_quantity_is_reported(world: StillWorld, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(StillWorld, "quantities", {"temperature_c": 20.0})
+def test_a_missing_quantity_is_reported(world: ManualWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ManualWorld, "quantities", {"temperature_c": 20.0})
     meter = connected(world, msgspec.structs.replace(world.entry("co2"), streams=(Stream(name="co2", rate_hz=1.0),)))
     with pytest.raises(SensorError, match="this room has no co2_ppm; it has: temperature_c"):
         meter.read("co2")

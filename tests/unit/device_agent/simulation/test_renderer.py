@@ -5,20 +5,20 @@ import numpy as np
 import pytest
 
 from device_agent.simulation import renderer
-from tests.harness.agent.rooms import StillWorld
+from tests.harness.agent.rooms import ManualWorld
 
 pytestmark = pytest.mark.slow
 SIZE = (160, 120)
 
 
 @pytest.fixture(scope="module")
-def lab() -> StillWorld:
-    return StillWorld()
+def lab() -> ManualWorld:
+    return ManualWorld()
 
 
 @pytest.mark.parametrize("camera", ["camera", "depth", "depth_ceiling", "pan_tilt", "nao/CameraTop"])
 def test_culling_hides_geoms_and_does_not_change_images(
-    lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch
+    lab: ManualWorld, camera: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(renderer, "TIMEOUT_S", 60.0)
     index = mujoco.mj_name2id(lab.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from device_agent.simulation.stepper import Stepper
-from tests.harness.agent.rooms import StillWorld
+from tests.harness.agent.rooms import ManualWorld
 
 
 @pytest.mark.slow
 def test_batched_steps_equal_single_steps() -> None:
-    lab = StillWorld()
-    lab.go_on(0.5)
+    lab = ManualWorld()
+    lab.advance(0.5)
     model = lab.model
     one = mujoco.MjData(model)
     lab.copy(one)

@@ -32,7 +32,7 @@ class _Keys(QuietHandler):
 
     def handle_any(self) -> None:
         self.server.requests.append(self.path)
-        self.respond_json({"keys": [key.shown() for key in self.server.keys]})
+        self.respond_json({"keys": [key.jwk() for key in self.server.keys]})
 
 
 @pytest.fixture(scope="module")

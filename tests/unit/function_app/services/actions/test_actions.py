@@ -52,7 +52,7 @@ class TestWaiting:
         call = anna.begin("GET", f"/actions/{action}", params={"wait_ms": 20_000, "wait_for": "started"})
         robot.report(action, AckStatus.STARTED)
         assert call().json()["status"] == "started"
-        assert anna.start(robot.device, once="k").status_code == 409, "refused until this one has ended"
+        assert anna.start(robot.device, idempotency_key="k").status_code == 409, "refused until this one has ended"
 
     def test_a_call_returns_202_when_its_time_is_over(self, anna: Person, robot: Robot) -> None:
         answer = anna.start(robot.device, wait_ms=500, wait_for="done")
@@ -196,18 +196,18 @@ class TestIdempotencyKey:
         for other in others:
             assert (other.status_code, other.json()["id"]) == (200, first.json()["id"])
         robot.report(first.json()["id"], AckStatus.DONE)
-        assert anna.start(robot.device, once="k1", wait_ms=10_000).json()["status"] == "done"
+        assert anna.start(robot.device, idempotency_key="k1", wait_ms=10_000).json()["status"] == "done"
         assert len(robot.payloads[first.json()["id"]]) == len(robot.received(MoveJoints)) == 1
-        problem(anna.start(robot.device, once="k1", ttl_ms=9_000), 422, "idempotency-key-reused")
+        problem(anna.start(robot.device, idempotency_key="k1", ttl_ms=9_000), 422, "idempotency-key-reused")
 
     def test_each_account_and_device_has_its_own_keys(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
         with paired(cloud, "bert", "left", "right") as (bert, other):
             callers = [(anna, robot.device), *((bert, device) for device in other.devices)]
-            assert len({caller.start(device, once="k1").json()["id"] for caller, device in callers}) == 3
+            assert len({caller.start(device, idempotency_key="k1").json()["id"] for caller, device in callers}) == 3
 
     def test_a_key_has_1_to_200_characters(self, anna: Person, robot: Robot) -> None:
         for key in ("", "x" * 201):
-            problem(anna.start(robot.device, once=key), 422, "invalid")
+            problem(anna.start(robot.device, idempotency_key=key), 422, "invalid")
 
 
 def test_a_cancelled_action_ends_when_the_robot_reports_it(anna: Person, robot: Robot) -> None:

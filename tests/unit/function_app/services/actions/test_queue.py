@@ -70,11 +70,11 @@ class TestTurns:
         assert len(set(robot.payloads[first])) == 1
 
     def test_an_idempotency_key_is_valid_while_queued_and_after(self, anna: Person, robot: Robot, running: str) -> None:
-        action = queued(anna, robot.device, once="k")
-        assert queued(anna, robot.device, once="k") == action
-        problem(anna.start(robot.device, once="k", queue_ms=5_000, **QUEUE), 422, "idempotency-key-reused")
+        action = queued(anna, robot.device, idempotency_key="k")
+        assert queued(anna, robot.device, idempotency_key="k") == action
+        problem(anna.start(robot.device, idempotency_key="k", queue_ms=5_000, **QUEUE), 422, "idempotency-key-reused")
         robot.report(running, AckStatus.DONE)
-        assert anna.start(robot.device, once="k", **QUEUE).json()["id"] == action
+        assert anna.start(robot.device, idempotency_key="k", **QUEUE).json()["id"] == action
         assert started(anna, action)
         assert sent(robot) == [running, action]
 

@@ -24,7 +24,7 @@ def fleet(cloud: Cloud) -> Iterator[Fleet]:
 
 
 def start(person: Person, *devices: str, **options: Any) -> Any:
-    headers = {"Idempotency-Key": options.pop("once")} if "once" in options else {}
+    headers = {"Idempotency-Key": options.pop("idempotency_key")} if "idempotency_key" in options else {}
     return person.post("/actions", {"devices": devices, "request": MOVE, **options}, headers=headers)
 
 
@@ -80,8 +80,8 @@ def test_an_unresponsive_robot_delays_its_own_result_only(fleet: Fleet) -> None:
 
 def test_an_idempotency_key_applies_to_each_device(fleet: Fleet) -> None:
     anna, robot = fleet
-    first = start(anna, *robot.devices[:2], once="k", wait_ms=10_000).json()["items"]
-    again = start(anna, *robot.devices[:3], once="k", wait_ms=10_000)
+    first = start(anna, *robot.devices[:2], idempotency_key="k", wait_ms=10_000).json()["items"]
+    again = start(anna, *robot.devices[:3], idempotency_key="k", wait_ms=10_000)
     assert again.status_code == 200
     assert [item["action"]["id"] for item in again.json()["items"][:2]] == [item["action"]["id"] for item in first]
     assert len(robot.received(MoveJoints)) == 3

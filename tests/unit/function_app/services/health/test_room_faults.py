@@ -16,7 +16,7 @@ from device_agent.simulation.room.pedestrian import Pedestrian
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from tests.fakes.agent import Robot
 from tests.harness.agent.device_harness import DeviceHarness, eventually
-from tests.harness.agent.rooms import LAB, StillWorld
+from tests.harness.agent.rooms import LAB, ManualWorld
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.unit.function_app.services.health.test_diagnostics import MINUTE, diagnostics, open_faults
 
@@ -33,7 +33,7 @@ class Air:
     def __init__(self, cloud: Cloud, who: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
         self.cloud, self.now_s = cloud, 0.0
         manifest = msgspec.structs.replace(room.load(LAB), robots=())
-        self.world = StillWorld(manifest=manifest)
+        self.world = ManualWorld(manifest=manifest)
         self.people: list[Pedestrian] = []
         self.world.add(Climate(manifest, self.world.world, self.people, speedup=HURRY))
         monkeypatch.setattr(scalar_sensors, "time", self)
@@ -52,7 +52,7 @@ class Air:
     def live(self, minutes: int) -> None:
         messages = []
         for number in range(minutes * MINUTE):
-            self.world.go_on(WINDOW_S / HURRY)
+            self.world.advance(WINDOW_S / HURRY)
             self.cloud.clock.advance(WINDOW_S)
             self.now_s += WINDOW_S
             self._at_ms += round(WINDOW_S * 1000)
@@ -113,7 +113,7 @@ def test_people_behind_a_closed_door_raise_a_fault_of_the_air_and_the_open_door_
 @pytest.fixture
 def meter(tmp_path: Path) -> Iterator[DeviceHarness]:
     """The laboratory's carbon dioxide meter at work, read and watched faster than there."""
-    world = StillWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
+    world = ManualWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
     entry = world.entry("co2")
     (stream,) = entry.streams
     entry = msgspec.structs.replace(

@@ -317,7 +317,7 @@ def test_a_start_killed_after_any_write_reaches_the_robot_or_ends(
         caller = at_instance(process, anna)
         assert caller.get("/accounts/me").status_code == 200
         crash.left = after
-        answer = caller.start(robot.device, once=f"k{after}", **SHORT)
+        answer = caller.start(robot.device, idempotency_key=f"k{after}", **SHORT)
         survived = crash.left > 0
         assert (answer.status_code < 500) is survived
         actions = anna.get(f"/devices/{robot.device}/actions").json()["items"]

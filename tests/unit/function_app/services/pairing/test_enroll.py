@@ -251,11 +251,11 @@ def test_unpairing_cuts_the_agent_and_leaves_nothing_of_it(
 
 
 def test_an_idempotency_key_of_an_earlier_pairing_starts_anew(anna: Person, robot: Robot) -> None:
-    first = anna.start(robot.device, once="k", wait_ms=10_000).json()["id"]
+    first = anna.start(robot.device, idempotency_key="k", wait_ms=10_000).json()["id"]
     anna.delete(f"/agents/{robot.id}")
     robot.pair(anna)
     robot.connect()
-    again = anna.start(robot.device, once="k", wait_ms=10_000)
+    again = anna.start(robot.device, idempotency_key="k", wait_ms=10_000)
     assert again.status_code == 200
     assert again.json()["id"] != first
     assert anna.action(again.json()["id"])["status"] == "started"

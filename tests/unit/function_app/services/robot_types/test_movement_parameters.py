@@ -43,12 +43,14 @@ class TestParameters:
     def test_an_action_gets_the_defaults_and_keeps_them(self, anna: Person, robot: Robot) -> None:
         anna.put(MINE, {"source": "1", "parameters_schema": self.SCHEMA})
         asked = {"kind": "run_movement", "name": "mine", "parameters": {"who": "bert"}}
-        started = anna.start(robot.device, request=asked, wait_ms=10_000, once="x").json()
+        started = anna.start(robot.device, request=asked, wait_ms=10_000, idempotency_key="x").json()
         (command,) = robot.received(RunMovement)
         assert isinstance(command.request, RunMovement)
         assert command.request.parameters == {"who": "bert", "times": 3}
         assert started["request"]["parameters"] == {"who": "bert", "times": 3}
-        assert anna.start(robot.device, request=asked, wait_ms=10_000, once="x").json()["id"] == started["id"]
+        assert (
+            anna.start(robot.device, request=asked, wait_ms=10_000, idempotency_key="x").json()["id"] == started["id"]
+        )
 
     @pytest.mark.parametrize(
         ("given", "place"),

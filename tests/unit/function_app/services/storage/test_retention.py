@@ -138,7 +138,7 @@ def test_a_blob_goes_at_its_time_and_one_that_is_gone_is_no_trouble(alone: Cloud
 def test_an_action_is_kept_for_30_days_after_its_end_and_its_key_for_one(
     cloud: Cloud, anna: Person, robot: Robot
 ) -> None:
-    action = anna.start(robot.device, once="k", wait_ms=10_000).json()["id"]
+    action = anna.start(robot.device, idempotency_key="k", wait_ms=10_000).json()["id"]
     robot.report(action, AckStatus.DONE)
     assert anna.action(action, wait_ms=10_000)["status"] == "done"
     cloud.clock.advance(2)
