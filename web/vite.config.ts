@@ -5,9 +5,9 @@ const backEnd = "http://127.0.0.1:8080";
 export default defineConfig({
   build: {
     target: "es2022",
-    // The 3D part is one library of that size; it is loaded only where a robot is looked at.
+    // The 3D library has this size; it is loaded only with a 3D view.
     chunkSizeWarningLimit: 900,
-    // No data: addresses for small assets: what is served is what is in the folder.
+    // Small assets are files too, not data: URLs.
     assetsInlineLimit: 0,
     modulePreload: { polyfill: false },
   },

@@ -17,16 +17,16 @@ const NO_TYPE = new Set([
   "propertyNames",
 ]);
 
-const WORDS = { string: "string", number: "number", integer: "number", boolean: "boolean", null: "null" };
+const TYPES = { string: "string", number: "number", integer: "number", boolean: "boolean", null: "null" };
 
 function typeOf(schema, at) {
   const keys = Object.keys(schema).filter((key) => !NO_TYPE.has(key));
-  const has = (...wanted) => keys.length === wanted.length && wanted.every((key) => keys.includes(key));
+  const has = (...expected) => keys.length === expected.length && expected.every((key) => keys.includes(key));
   if (has()) return "unknown";
   if (has("$ref")) return schema.$ref.split("/").pop();
   if (keys.includes("enum")) return schema.enum.map((value) => JSON.stringify(value)).join(" | ");
   if (has("anyOf")) return schema.anyOf.map((one) => typeOf(one, at)).join(" | ");
-  if (has("type") && schema.type in WORDS) return WORDS[schema.type];
+  if (has("type") && schema.type in TYPES) return TYPES[schema.type];
   if (has("type") && schema.type === "object") return "Record<string, unknown>";
   if (has("type", "additionalProperties")) return `Record<string, ${typeOf(schema.additionalProperties, at)}>`;
   if (has("type", "prefixItems", "items")) return `[${schema.prefixItems.map((one) => typeOf(one, at)).join(", ")}]`;
@@ -34,7 +34,7 @@ function typeOf(schema, at) {
     const item = typeOf(schema.items, at);
     return item.includes(" | ") ? `(${item})[]` : `${item}[]`;
   }
-  throw new Error(`${at}: this script does not know a schema with ${keys.join(", ")}`);
+  throw new Error(`${at}: unsupported schema keys ${keys.join(", ")}`);
 }
 
 function comment(text, indent = "") {

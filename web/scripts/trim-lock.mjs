@@ -1,5 +1,5 @@
-// Takes addresses out of package-lock.json: npm writes who asks for donations, which no installation reads.
-// Run by `npm run lock` after a change of dependencies, in the folder of the lock file; tests hold lock files to it.
+// Removes URLs from package-lock.json, so that every registry can serve the packages. Tests check the lock files.
+// `npm run lock` runs it in the folder of the lock file after a change of dependencies.
 import { readFileSync, writeFileSync } from "node:fs";
 
 const path = "package-lock.json";

@@ -12,16 +12,16 @@ import { texts } from "./texts";
 import { lazyPage } from "./lazy-page";
 import { Navigation } from "./navigation-bar";
 import { type PageProps, ROWS } from "./page-registry";
-import { type At, route } from "../shared/routing/routes";
+import { type RouteParameters, route } from "../shared/routing/routes";
 import { SignInPage } from "../features/account/sign-in-page";
 
-const LATER = new Map([...ROWS].map(([name, { load }]) => [name, lazyPage(load)]));
+const LAZY_PAGES = new Map([...ROWS].map(([name, { load }]) => [name, lazyPage(load)]));
 
 /** Preloads the requested page and the operating pages while the session is being checked. */
-export function fetchEarly(): void {
+export function preloadPages(): void {
   for (const [name, { early }] of ROWS) {
     // A failed preload is retried, and reported, when the page opens.
-    if (early === true || name === route.value.page) LATER.get(name)?.fetch().catch(() => undefined);
+    if (early === true || name === route.value.page) LAZY_PAGES.get(name)?.fetch().catch(() => undefined);
   }
 }
 
@@ -66,15 +66,15 @@ interface SignedInProps extends AppProps {
 function SignedIn({ api, session, followed, pairing, account }: SignedInProps) {
   const [fleet, setFleet] = useState<Fleet | null>(null);
   useEffect(() => {
-    const made = new Fleet(api);
-    setFleet(made);
-    const forget = effect(() => {
-      // Rejected credentials usually mean an expired session: ask the server.
-      if (made.link.status.value.state === "refused") void checkSession(api, session);
+    const created = new Fleet(api);
+    setFleet(created);
+    const disposeEffect = effect(() => {
+      // Rejected credentials usually mean an expired session: check it.
+      if (created.link.status.value.state === "refused") void checkSession(api, session);
     });
     return () => {
-      forget();
-      made.dispose();
+      disposeEffect();
+      created.dispose();
     };
   }, [api, session]);
   if (fleet === null) return null;
@@ -85,13 +85,13 @@ function SignedIn({ api, session, followed, pairing, account }: SignedInProps) {
       </a>
       <Navigation account={account} session={session} />
       <LinkBanner fleet={fleet} />
-      <Opened api={api} fleet={fleet} account={account} followed={followed} pairing={pairing} />
+      <CurrentPage api={api} fleet={fleet} account={account} followed={followed} pairing={pairing} />
     </>
   );
 }
 
 /** The page of the current address. */
-function Opened(props: Omit<PageProps, keyof At>) {
+function CurrentPage(props: Omit<PageProps, keyof RouteParameters>) {
   const { page, at } = route.value;
   const title = ROWS.get(page)?.title ?? "";
   const name = typeof title === "string" ? title : title(at, props.fleet);
@@ -101,7 +101,7 @@ function Opened(props: Omit<PageProps, keyof At>) {
       document.title = texts.product;
     };
   }, [name]);
-  const Page = LATER.get(page)?.Page;
+  const Page = LAZY_PAGES.get(page)?.Page;
   return Page === undefined ? null : <Page key={`${page} ${Object.values(at).join()}`} {...props} {...at} />;
 }
 
@@ -123,19 +123,19 @@ function focusContent(event: MouseEvent): void {
 
 /** Notice while the connection is lost, shown after a short delay. */
 function LinkBanner({ fleet }: { fleet: Fleet }) {
-  const { state, why } = fleet.link.status.value;
+  const { state, reason } = fleet.link.status.value;
   const [wasUp, setWasUp] = useState(false);
   useSignalEffect(() => {
     if (fleet.link.up.value) setWasUp(true);
   });
-  const lost = state === "down" || state === "refused" || (state === "connecting" && (wasUp || why !== ""));
-  const trouble = fleet.trouble.value;
+  const lost = state === "down" || state === "refused" || (state === "connecting" && (wasUp || reason !== ""));
+  const error = fleet.error.value;
   return (
     <div aria-live="assertive">
       {lost && (
         <div class="banner warn" data-testid="link-banner" data-state={state}>
           <strong>{state === "refused" ? texts.link.refused : texts.link.down}</strong>{" "}
-          <span>{why !== "" && `${why} `}</span>
+          <span>{reason !== "" && `${reason} `}</span>
           {state === "refused" ? (
             <button type="button" onClick={() => fleet.link.renew()}>
               {common.tryAgain}
@@ -145,9 +145,9 @@ function LinkBanner({ fleet }: { fleet: Fleet }) {
           )}
         </div>
       )}
-      {trouble !== null && (
+      {error !== null && (
         <div class="banner warn">
-          {texts.link.deviceListFailed} {trouble}
+          {texts.link.deviceListFailed} {error}
         </div>
       )}
     </div>

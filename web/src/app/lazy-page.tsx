@@ -11,28 +11,28 @@ interface LazyPage<Props> {
 }
 
 export function lazyPage<Props extends object>(load: () => Promise<ComponentType<Props>>): LazyPage<Props> {
-  let known: ComponentType<Props> | null = null;
+  let component: ComponentType<Props> | null = null;
   const fetch = async (): Promise<void> => {
-    known = await load();
+    component = await load();
   };
   function Page(props: Props) {
-    const [, setCame] = useState(known !== null);
+    const [, setLoaded] = useState(component !== null);
     const [failed, setFailed] = useState(false);
-    const [tries, setTries] = useState(0);
+    const [attempt, setAttempt] = useState(0);
     useEffect(() => {
-      if (known !== null) {
-        setCame(true); // It came between the drawing and now.
+      if (component !== null) {
+        setLoaded(true); // Loaded between render and effect.
         return;
       }
       setFailed(false);
       fetch().then(
-        () => setCame(true),
+        () => setLoaded(true),
         () => setFailed(true),
       );
-    }, [tries]);
-    if (known !== null) {
-      const Known = known;
-      return <Known {...props} />;
+    }, [attempt]);
+    if (component !== null) {
+      const Loaded = component;
+      return <Loaded {...props} />;
     }
     return (
       <main class="page" id="content">
@@ -40,7 +40,7 @@ export function lazyPage<Props extends object>(load: () => Promise<ComponentType
           {failed ? common.pageFailed : common.loading}
         </p>
         {failed && (
-          <button type="button" onClick={() => setTries(tries + 1)}>
+          <button type="button" onClick={() => setAttempt(attempt + 1)}>
             {common.tryAgain}
           </button>
         )}

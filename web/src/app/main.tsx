@@ -14,7 +14,7 @@ import "../shared/ui/styles/charts.css";
 import "../shared/ui/styles/lists.css";
 import "../shared/ui/styles/forms.css";
 import { texts } from "./texts";
-import { App, fetchEarly } from "./app";
+import { App, preloadPages } from "./app";
 import { invitationAddress, pairAddress, replaceWith } from "../shared/routing/routes";
 
 const api = new Api();
@@ -63,7 +63,7 @@ effect(() => {
 effect(() => {
   if (session.state.value.kind === "in" && pairing.code.value !== null) replaceWith(pairAddress);
 });
-fetchEarly();
+preloadPages();
 startClock();
 void session.start(takeToken(), takeFailure());
 addEventListener("hashchange", () => {

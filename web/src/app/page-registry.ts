@@ -8,11 +8,11 @@ import type { Api } from "../shared/api/client";
 import type { Fleet } from "../features/devices/model/device-list";
 import type { FollowedInvitation } from "../features/sharing/model/invitation-link";
 import type { FollowedCode } from "../features/pairing/model/claim-code";
-import type { At, PageName } from "../shared/routing/routes";
+import type { RouteParameters, PageName } from "../shared/routing/routes";
 import { texts } from "./texts";
 
-/** Properties that are passed to every page. */
-export interface PageProps extends At {
+/** Properties of every page. */
+export interface PageProps extends RouteParameters {
   api: Api;
   fleet: Fleet;
   account: Account;
@@ -24,12 +24,12 @@ type Loaded = Promise<ComponentType<PageProps>>;
 type Part = "account" | "devices" | "health" | "movements" | "robotTypes" | "latency";
 
 interface Page {
-  readonly title: string | ((at: At, fleet: Fleet) => string);
+  readonly title: string | ((at: RouteParameters, fleet: Fleet) => string);
   /** The section of the console that contains the page. */
   readonly part: Part;
   /** The navigation link; one page per section has one. */
   readonly link?: string;
-  /** Whether its code is preloaded, so that operators do not wait for it. */
+  /** Whether the code is preloaded. */
   readonly early?: true;
   readonly load: () => Loaded;
 }
@@ -47,7 +47,7 @@ export const PAGES = {
     load: async (): Loaded => (await import("../features/devices/list-page")).DeviceListPage,
   },
   device: {
-    title: ({ id }: At, fleet: Fleet): string => device(id, fleet),
+    title: ({ id }: RouteParameters, fleet: Fleet): string => device(id, fleet),
     part: "devices",
     early: true,
     load: async (): Loaded => (await import("../features/devices/robot-page")).DevicePage,
@@ -58,12 +58,12 @@ export const PAGES = {
     load: async (): Loaded => (await import("../features/keyframes/device-page")).KeyframesPage,
   },
   multiRobot: {
-    title: ({ ids }: At): string => texts.pages.multiRobot(ids.split(",").length),
+    title: ({ ids }: RouteParameters): string => texts.pages.multiRobot(ids.split(",").length),
     part: "devices",
     load: async (): Loaded => (await import("../features/steering/multi-robot/page")).MultiRobotPage,
   },
   space: {
-    title: ({ id }: At, fleet: Fleet): string => fleet.spaceName(id),
+    title: ({ id }: RouteParameters, fleet: Fleet): string => fleet.spaceName(id),
     part: "devices",
     early: true,
     load: async (): Loaded => (await import("../features/spaces/detail-page")).SpacePage,
@@ -80,7 +80,7 @@ export const PAGES = {
     load: async (): Loaded => (await import("../features/movements/library-page")).LibraryPage,
   },
   movement: {
-    title: ({ name }: At): string => name,
+    title: ({ name }: RouteParameters): string => name,
     part: "movements",
     load: async (): Loaded => (await import("../features/movements/editor-page")).EditorPage,
   },
@@ -96,7 +96,7 @@ export const PAGES = {
     load: async (): Loaded => (await import("../features/robot-types/list-page")).RobotTypesPage,
   },
   robotType: {
-    title: ({ id }: At): string => id.replaceAll("_", " "),
+    title: ({ id }: RouteParameters): string => id.replaceAll("_", " "),
     part: "robotTypes",
     load: async (): Loaded => (await import("../features/robot-types/detail-page")).RobotTypePage,
   },
@@ -107,18 +107,18 @@ export const PAGES = {
   },
   health: { title: texts.sections.health, part: "health", link: texts.sections.health, load: health },
   deviceHealth: {
-    title: (at: At, fleet: Fleet): string => texts.pages.healthOf(device(at.device, fleet)),
+    title: (at: RouteParameters, fleet: Fleet): string => texts.pages.healthOf(device(at.device, fleet)),
     part: "health",
     load: health,
   },
   spaceHealth: {
-    title: ({ space }: At, fleet: Fleet): string => texts.pages.healthOf(fleet.spaceName(space)),
+    title: ({ space }: RouteParameters, fleet: Fleet): string => texts.pages.healthOf(fleet.spaceName(space)),
     part: "health",
     load: health,
   },
   latency: { title: texts.sections.latency, part: "latency", link: texts.sections.latency, load: latency },
   deviceLatency: {
-    title: (at: At, fleet: Fleet): string => texts.pages.latencyOf(device(at.device, fleet)),
+    title: (at: RouteParameters, fleet: Fleet): string => texts.pages.latencyOf(device(at.device, fleet)),
     part: "latency",
     load: latency,
   },

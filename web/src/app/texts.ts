@@ -1,7 +1,7 @@
 /** Texts of the page frame, and page titles. */
 export const texts = {
   product: "Telescope",
-  /** For the browser's tab. */
+  /** Title of the browser tab. */
   tabTitle: (page: string): string => (page === "" ? "Telescope" : `${page} · Telescope`),
   skipToContent: "Skip to content",
   signedInAs: (name: string): string => `Signed in as ${name}`,

@@ -7,8 +7,8 @@ const { ROWS } = await import("../../src/app/page-registry");
 const route = await import("../../src/shared/routing/routes");
 
 describe("the table of pages", () => {
-  it("reads each address as the page that it was written for", () => {
-    const written = {
+  it("maps the address of each page to that page", () => {
+    const addresses = {
       devices: route.deviceListAddress,
       device: route.deviceAddress("a-b"),
       keyframes: route.keyframesAddress("a-b", "wave"),
@@ -30,7 +30,7 @@ describe("the table of pages", () => {
       auditLog: route.auditLogAddress,
       invitation: route.invitationAddress,
     } satisfies Record<PageName, string>;
-    for (const [page, address] of Object.entries(written)) expect(route.read(address).page, address).toBe(page);
+    for (const [page, address] of Object.entries(addresses)) expect(route.read(address).page, address).toBe(page);
   });
 
   it("reads the parameters of an address; an unknown address is the device list", () => {
@@ -40,7 +40,7 @@ describe("the table of pages", () => {
     for (const hash of ["", "#", "#/nowhere", "#/devices/", "#/devices/a/b/c", "#/devices/<b>"]) expect(route.read(hash).page, hash).toBe("devices");
   });
 
-  it("has one link in the navigation for each part but the account", () => {
+  it("has one navigation link for each section except the account", () => {
     const linked = [...ROWS.values()].filter(({ link }) => link !== undefined).map(({ part }) => part);
     const parts = new Set([...ROWS.values()].map(({ part }) => part).filter((part) => part !== "account"));
     expect(linked.sort()).toEqual([...parts].sort());

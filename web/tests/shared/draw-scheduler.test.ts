@@ -13,9 +13,9 @@ afterEach(() => {
   vi.useRealTimers();
 });
 
-it("lets every view draw in its turn, one a frame, and together a quarter of the time at most", async () => {
+it("draws the views in turn, one per frame, and limits their share of the time", async () => {
   const drawn = [0, 0, 0];
-  const turns = drawn.map(
+  const slots = drawn.map(
     (_, index) =>
       new DrawSlot(() => {
         drawn[index] = (drawn[index] ?? 0) + 1;
@@ -24,14 +24,14 @@ it("lets every view draw in its turn, one a frame, and together a quarter of the
       }),
   );
   for (let passed = 0; passed < 6_000; passed += 20) {
-    for (const turn of turns) turn.ask();
+    for (const slot of slots) slot.request();
     await vi.advanceTimersByTimeAsync(20);
   }
   const all = drawn.reduce((sum, count) => sum + count, 0);
   expect(Math.max(...drawn) - Math.min(...drawn)).toBeLessThanOrEqual(1);
   expect(all * COST_MS).toBeLessThan(6_000 / 2);
   expect(all).toBeGreaterThan(15);
-  turns.forEach((turn) => turn.dispose());
+  slots.forEach((slot) => slot.dispose());
   const before = [...drawn];
   await vi.advanceTimersByTimeAsync(1_000);
   expect(drawn).toEqual(before);

@@ -4,7 +4,7 @@ import { deviceTopics, matches } from "../../src/shared/mqtt/topics";
 import { format } from "../../src/shared/i18n/format";
 
 describe("formats", () => {
-  it("are degrees without a sign for zero, and ages in the largest fitting unit", () => {
+  it("have no sign for zero, and the largest fitting unit for ages", () => {
     expect(degrees(radians(12.5))).toBeCloseTo(12.5);
     expect([-0.04, -0.06].map(format.degrees)).toEqual(["0.0°", "-0.1°"]);
     const ages = [0, 59_000, 61_000, 3_700_000, 200_000_000].map(format.age);
@@ -13,7 +13,7 @@ describe("formats", () => {
 });
 
 describe("topics", () => {
-  it("are those of the contract", () => {
+  it("equal those of the contract", () => {
     const topics = deviceTopics("ts/v1/lab/a1/arm");
     expect([topics.conn, topics.ctl(5)]).toEqual(["ts/v1/lab/a1/conn", "ts/v1/lab/a1/arm/ctl/5"]);
   });
@@ -24,7 +24,7 @@ describe("topics", () => {
     ["a/#", "a/b/c", true],
     ["a/b", "a/b/c", false],
     ["a/b/c", "a/b", false],
-  ])("the filter %s and the topic %s match: %s", (filter, topic, wanted) => {
-    expect(matches(filter, topic)).toBe(wanted);
+  ])("the filter %s and the topic %s match: %s", (filter, topic, expected) => {
+    expect(matches(filter, topic)).toBe(expected);
   });
 });

@@ -52,11 +52,11 @@ describe("the link to the broker", () => {
     expect(order).toEqual([1, 2, 3]);
     const lost = link.ping();
     link.close();
-    await expect(lost).rejects.toThrow("The broker did not answer.");
+    await expect(lost).rejects.toThrow("The broker did not respond.");
     await expect(link.ping()).rejects.toThrow("There is no connection");
   });
 
-  it("reconnects with new credentials after the connection was cut, also if the broker stays away at first", async () => {
+  it("reconnects with new credentials after a connection loss, also if the broker is unavailable at first", async () => {
     const link = open();
     let count = 0;
     link.subscribe(FILTER, () => (count += 1));
@@ -65,7 +65,7 @@ describe("the link to the broker", () => {
     broker.down = true;
     broker.cutAll();
     await until(() => link.status.value.state === "down" && broker.issued > 1);
-    expect(link.status.value.why).not.toBe("");
+    expect(link.status.value.reason).not.toBe("");
     broker.down = false;
     count = 0;
     await until(() => link.up.value && count > 0);
@@ -94,11 +94,11 @@ describe("the link to the broker", () => {
     expect(broker.published).toEqual([STOP]);
   });
 
-  it("stays closed while the server refuses credentials, until it is renewed", async () => {
+  it("stays closed after the server rejects the credentials request, until it is renewed", async () => {
     let signedOut = true;
     const link = open(() => (signedOut ? Promise.reject(new ApiError(401, "signed-out", "You are not signed in.")) : broker.credentials()));
     await until(() => link.status.value.state === "refused");
-    expect(link.status.value.why).toBe("You are not signed in.");
+    expect(link.status.value.reason).toBe("You are not signed in.");
     signedOut = false;
     link.renew();
     await until(() => link.up.value);

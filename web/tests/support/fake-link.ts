@@ -5,7 +5,7 @@ import { matches } from "../../src/shared/mqtt/topics";
 
 export class FakeLink implements Link {
   readonly #receivers = new Set<[filter: string, receiver: Receiver]>();
-  readonly status = signal<LinkStatus>({ state: "up", why: "" });
+  readonly status = signal<LinkStatus>({ state: "up", reason: "" });
   readonly up = computed(() => this.status.value.state === "up");
   readonly published: { topic: string; message: object }[] = [];
   pings = 0;
@@ -36,7 +36,7 @@ export class FakeLink implements Link {
   }
 
   set(state: LinkState): void {
-    this.status.value = { state, why: "" };
+    this.status.value = { state, reason: "" };
   }
 
   deliver(topic: string, message: object | string): void {

@@ -6,7 +6,7 @@ import { Choice } from "../../shared/ui/choice";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
-import type { ApiKey, ApiKeyMade, SharedRole } from "../../shared/api/sharing";
+import type { ApiKey, CreatedApiKey, SharedRole } from "../../shared/api/sharing";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { InlineForm } from "../../shared/ui/inline-form";
@@ -24,7 +24,7 @@ export function ApiKeys({ api, fleet }: { api: Api; fleet: Fleet }) {
   const [wrong, setWrong] = useState("");
   const [said, setSaid] = useState("");
   const [making, setMaking] = useState(false);
-  const [made, setMade] = useState<ApiKeyMade | null>(null);
+  const [made, setMade] = useState<CreatedApiKey | null>(null);
 
   const read = async (): Promise<void> => {
     try {
@@ -105,17 +105,17 @@ function KeyRow({ of: key, names, onRevoke }: { of: ApiKey; names: Names; onRevo
         label={texts.keys.revoke}
         description={texts.keys.revokeOf(key.name)}
         question={texts.keys.revokeSure(key.name)}
-        yes={texts.keys.revokeYes}
-        busy={texts.keys.revoking}
-        keep={texts.keys.keep}
+        confirmLabel={texts.keys.revokeYes}
+        busyLabel={texts.keys.revoking}
+        cancelLabel={texts.keys.keep}
         data-testid="revoke-key"
-        onYes={onRevoke}
+        onConfirm={onRevoke}
       />
     </li>
   );
 }
 
-function MadeKey({ made, onDone }: { made: ApiKeyMade; onDone: () => void }) {
+function MadeKey({ made, onDone }: { made: CreatedApiKey; onDone: () => void }) {
   const box = useRef<HTMLDivElement>(null);
   useEffect(() => box.current?.querySelector("input")?.focus(), []);
   return (
@@ -139,7 +139,7 @@ function MadeKey({ made, onDone }: { made: ApiKeyMade; onDone: () => void }) {
 interface KeyFormProps {
   api: Api;
   names: Names;
-  onMade: (made: ApiKeyMade) => void;
+  onMade: (made: CreatedApiKey) => void;
   onClose: () => void;
 }
 
@@ -172,7 +172,7 @@ function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
     setBusy(true);
     setWrong("");
     try {
-      onMade(await api.makeApiKey({ name: name.trim(), role, only: chosen, days: Number(days) }));
+      onMade(await api.createApiKey({ name: name.trim(), role, only: chosen, days: Number(days) }));
     } catch (error) {
       setWrong(sentence(error)); // What was typed stays.
       setBusy(false);
@@ -182,12 +182,12 @@ function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
   return (
     <InlineForm
       label={texts.keys.new}
-      todo={texts.keys.make}
-      doing={texts.keys.making}
+      submitLabel={texts.keys.make}
+      busyLabel={texts.keys.making}
       busy={busy}
-      wrong={wrong}
-      sendTestId="make-key"
-      onSend={make}
+      error={wrong}
+      submitTestId="make-key"
+      onSubmit={make}
       onClose={onClose}
     >
       <div class="field">

@@ -1,6 +1,6 @@
 /** Number and names of the other viewers, while the server's list is current. */
 import { Age } from "../../shared/ui/age";
-import { onThisClock } from "../../shared/lib/clock";
+import { toPageClock } from "../../shared/lib/clock";
 import type { Watchers } from "./model/watchers";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
@@ -39,7 +39,7 @@ export function WatcherNames({ watching, id }: { watching: Watchers; id: string 
       {others.map(({ name, role, mine, since }, index) => (
         <li key={index}>
           {name} <span class="quiet small">
-            {mine ? texts.watchers.mine : common.role[role].toLowerCase()}, <Age at={onThisClock(Date.parse(since))} as={texts.watchers.since} />
+            {mine ? texts.watchers.mine : common.role[role].toLowerCase()}, <Age at={toPageClock(Date.parse(since))} as={texts.watchers.since} />
           </span>
         </li>
       ))}

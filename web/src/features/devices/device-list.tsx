@@ -1,7 +1,7 @@
 /** Devices of one space: robots with details first, then room devices. */
 import { MultiRobotCheckbox } from "../steering";
 import { LastSeenAge, ReachChip } from "./reach-chip";
-import type { HealthLine } from "../../shared/api/health";
+import type { HealthSummary } from "../../shared/api/health";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
 import { isRoomDevice } from "./model/filter";
@@ -14,7 +14,7 @@ interface DeviceListsProps {
   devices: readonly DeviceStore[];
   fleet: Fleet;
   /** The cloud's health results by id. Faults that a device reports are shown without them. */
-  found?: ReadonlyMap<string, HealthLine> | undefined;
+  found?: ReadonlyMap<string, HealthSummary> | undefined;
 }
 
 export function DeviceLists({ devices, fleet, found }: DeviceListsProps) {
@@ -40,7 +40,7 @@ export function DeviceLists({ devices, fleet, found }: DeviceListsProps) {
   );
 }
 
-function RobotRow({ device, fleet, line }: { device: DeviceStore; fleet: Fleet; line: HealthLine | undefined }) {
+function RobotRow({ device, fleet, line }: { device: DeviceStore; fleet: Fleet; line: HealthSummary | undefined }) {
   const info = device.info.value;
   return (
     <li class="card device-row" data-testid="device-row" data-device={device.id}>
@@ -81,7 +81,7 @@ function RobotRow({ device, fleet, line }: { device: DeviceStore; fleet: Fleet; 
   );
 }
 
-function SensorTile({ device, line }: { device: DeviceStore; line: HealthLine | undefined }) {
+function SensorTile({ device, line }: { device: DeviceStore; line: HealthSummary | undefined }) {
   const info = device.info.value;
   const state = device.state.value;
   return (
@@ -102,12 +102,12 @@ function SensorTile({ device, line }: { device: DeviceStore; line: HealthLine | 
 }
 
 /** Faults from the device or from its measurements, without informational ones. */
-export function faultsOf(device: DeviceStore, line: HealthLine | undefined): number {
+export function faultsOf(device: DeviceStore, line: HealthSummary | undefined): number {
   const found = line === undefined ? 0 : line.counts.error + line.counts.warning;
   return Math.max(found, device.state.value?.faults.length ?? 0);
 }
 
-function Doing({ device, line }: { device: DeviceStore; line: HealthLine | undefined }) {
+function Doing({ device, line }: { device: DeviceStore; line: HealthSummary | undefined }) {
   const state = device.state.value;
   if (state === null) return <span class="quiet">{format.unknown}</span>;
   const faults = faultsOf(device, line);

@@ -1,5 +1,5 @@
 import { Card } from "../../shared/ui/card";
-import { clock, onThisClock } from "../../shared/lib/clock";
+import { clock, toPageClock } from "../../shared/lib/clock";
 import type { DeviceStore } from "./model/device-store";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
@@ -8,7 +8,7 @@ import { texts } from "./texts";
 export function EventLog({ device }: { device: DeviceStore }) {
   const events = device.events.value;
   const faults = device.state.value?.faults ?? [];
-  const age = (atMs: number): string => format.age(Math.max(0, clock.value - onThisClock(atMs)));
+  const age = (atMs: number): string => format.age(Math.max(0, clock.value - toPageClock(atMs)));
   return (
     <Card title={texts.cards.events} class="events">
       {faults.length > 0 && (

@@ -4,7 +4,7 @@ import { shown } from "../sensors";
 import { type Quantity, quantityOf } from "../sensors/model";
 import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
-import type { DeviceHealth, Fault, StoredStream, Watched } from "../../shared/api/health";
+import type { DeviceHealth, Fault, StoredStream, MonitoredField } from "../../shared/api/health";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { healthNow, isLate, newestOf, openCount, standings, reportedFaults, watchedQuantity, worstFirst } from "./model/health";
@@ -26,9 +26,9 @@ interface Chosen {
 }
 
 export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStore }) {
-  const { value, trouble, again } = usePolling(() => api.health.of(device.id), EVERY_MS, [api, device]);
+  const { value, error, refresh } = usePolling(() => api.health.of(device.id), EVERY_MS, [api, device]);
   const told = reportedFaults(device);
-  useReportedFaults(codes(told), again);
+  useReportedFaults(codes(told), refresh);
   const past = usePast(api, device, value?.faults.map(({ id }) => id).join(" ") ?? "");
   const [chosen, setChosen] = useState<Chosen | null>(null);
   const trend = useRef<HTMLDivElement>(null);
@@ -43,8 +43,8 @@ export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStor
   return (
     <div class="desk health-columns">
       <div class="column">
-        <Now device={device} value={value} trouble={trouble} />
-        <Faults api={api} device={device} open={value?.faults ?? null} past={past} again={again} show={show} />
+        <Now device={device} value={value} trouble={error} />
+        <Faults api={api} device={device} open={value?.faults ?? null} past={past} again={refresh} show={show} />
       </div>
       <div class="column">
         <div ref={trend} tabIndex={-1} class="trend-place">
@@ -95,7 +95,7 @@ function usePast(api: Api, device: DeviceStore, open: string): Past {
   const asked = useRef(0);
   const read = (from: string | null): void => {
     const mine = ++asked.current;
-    api.health.past(device.id, from, PAST).then(
+    api.health.clearedFaults(device.id, from, PAST).then(
       (page) => {
         if (mine !== asked.current) return;
         setItems((known) => (from === null ? page.items : [...known, ...page.items]));
@@ -152,7 +152,7 @@ interface ChartProps {
   api: Api;
   device: DeviceStore;
   at: Chosen;
-  fields: readonly Watched[];
+  fields: readonly MonitoredField[];
   faults: readonly Fault[];
 }
 
@@ -170,7 +170,7 @@ function Chart({ api, device, at: { stream, field }, fields, faults }: ChartProp
 
 interface FieldsProps {
   device: DeviceStore;
-  fields: readonly Watched[];
+  fields: readonly MonitoredField[];
   at: Chosen | null;
   show: (stream: string, field: string) => void;
 }
@@ -212,7 +212,7 @@ function Fields({ device, fields, at, show }: FieldsProps) {
 
 interface FieldProps {
   device: DeviceStore;
-  watched: Watched;
+  watched: MonitoredField;
   quantity: Quantity;
   chosen: boolean;
   show: (stream: string, field: string) => void;
@@ -254,7 +254,7 @@ function Field({ device, watched, quantity, chosen, show }: FieldProps) {
 interface OthersProps {
   api: Api;
   device: DeviceStore;
-  fields: readonly Watched[];
+  fields: readonly MonitoredField[];
   at: Chosen | null;
   choose: (chosen: Chosen) => void;
 }

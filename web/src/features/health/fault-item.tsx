@@ -5,7 +5,7 @@ import type { Fault, StoredEvent } from "../../shared/api/health";
 import { useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { intervalAround, type Standing } from "./model/health";
-import { onThisClock } from "../../shared/lib/clock";
+import { toPageClock } from "../../shared/lib/clock";
 import { sentence } from "../../shared/api/http";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
@@ -47,7 +47,7 @@ export function FaultItem({ api, device, standing, changed, show }: FaultItemPro
       {stored === null ? (
         told !== null && (
           <p class="quiet small">
-            <Age at={onThisClock(told.since_ms)} as={texts.health.saidSince} />
+            <Age at={toPageClock(told.since_ms)} as={texts.health.saidSince} />
           </p>
         )
       ) : (
@@ -77,7 +77,7 @@ function Life({ fault }: { fault: Fault }) {
     <>
       <strong>{what}</strong> <time dateTime={at}>{format.dateTime(at)}</time>{" "}
       <span class="quiet">
-        <Age at={onThisClock(Date.parse(at))} />
+        <Age at={toPageClock(Date.parse(at))} />
       </span>
     </>
   );

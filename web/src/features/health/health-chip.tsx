@@ -23,7 +23,7 @@ export function HealthLabel({ health }: { health: HealthState }) {
 }
 
 /** Reloads when the device reports other faults: immediately, and after they are stored. */
-export function useReportedFaults(told: string, again: Polled<unknown>["again"]): void {
+export function useReportedFaults(told: string, again: Polled<unknown>["refresh"]): void {
   useEffect(() => {
     again();
     const timer = setTimeout(again, STORED_AFTER_MS);
@@ -34,8 +34,8 @@ export function useReportedFaults(told: string, again: Polled<unknown>["again"])
 /** The number of open faults, with a link to the health page. */
 export function HealthChip({ api, device }: { api: Api; device: DeviceStore }) {
   const told = reportedFaults(device);
-  const { value, again } = usePolling(() => api.health.of(device.id), EVERY_MS, [api, device]);
-  useReportedFaults(codes(told), again);
+  const { value, refresh } = usePolling(() => api.health.of(device.id), EVERY_MS, [api, device]);
+  useReportedFaults(codes(told), refresh);
   if (value === null && told === null) return null;
   const count = openCount(value?.faults ?? null, told);
   const bad = (told?.length ?? 0) > 0 || value?.health === "fault";

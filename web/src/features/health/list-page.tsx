@@ -4,12 +4,12 @@ import { DevicePageFrame, LastSeenAge, ReachChip } from "../devices";
 import type { DeviceStore, Fleet } from "../devices/model";
 import { Age } from "../../shared/ui/age";
 import { Choice } from "../../shared/ui/choice";
-import { RANK, type HealthLine, type HealthState } from "../../shared/api/health";
+import { RANK, type HealthSummary, type HealthState } from "../../shared/api/health";
 import { useComputed } from "@preact/signals";
 import { useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { healthNow, reportedFaults } from "./model/health";
-import { onThisClock } from "../../shared/lib/clock";
+import { toPageClock } from "../../shared/lib/clock";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
@@ -42,7 +42,7 @@ export function HealthPage({ device, space, ...rest }: HealthPageProps) {
 
 /** A device with this page's own observation. */
 interface Shown {
-  line: HealthLine;
+  line: HealthSummary;
   device: DeviceStore | null;
   health: HealthState;
 }
@@ -50,13 +50,13 @@ interface Shown {
 type Which = "all" | "look";
 
 function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: string }) {
-  const { value, trouble, again } = usePolling(() => api.health.all(space === "" ? null : space), EVERY_MS, [api, space]);
+  const { value, error, refresh } = usePolling(() => api.health.all(space === "" ? null : space), EVERY_MS, [api, space]);
   const [which, setWhich] = useState<Which>("all");
   const devices = fleet.devices.value;
   const told = useComputed(() =>
     [...(fleet.devices.value?.values() ?? [])].map((device) => `${device.id} ${codes(reportedFaults(device))}`).join(" "),
   );
-  useReportedFaults(told.value, again);
+  useReportedFaults(told.value, refresh);
   const lines = (value ?? []).map((line): Shown => {
     const device = devices?.get(line.device) ?? null;
     const health = device === null ? line.health : healthNow(line.health, reportedFaults(device), device.reach.value);
@@ -82,8 +82,8 @@ function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: stri
           </a>
         ))}
       </nav>
-      {trouble !== "" && <p class="notice bad">{texts.health.failed(trouble)}</p>}
-      {value === null && trouble === "" && <p class="quiet">{common.loading}</p>}
+      {error !== "" && <p class="notice bad">{texts.health.failed(error)}</p>}
+      {value === null && error === "" && <p class="quiet">{common.loading}</p>}
       {value !== null && (
         <div class="row health-summary">
           <p role="status" data-testid="health-counts">
@@ -132,7 +132,7 @@ function Line({ shown: { line, device, health }, fleet }: { shown: Shown; fleet:
           <p>
             {worst.message}{" "}
             <span class="quiet">
-              {texts.health.since(format.recentTime(Date.parse(worst.raised_at)))}, <Age at={onThisClock(Date.parse(worst.raised_at))} />
+              {texts.health.since(format.recentTime(Date.parse(worst.raised_at)))}, <Age at={toPageClock(Date.parse(worst.raised_at))} />
               {worst.acknowledged_at !== null && ` · ${texts.health.life.seen(worst.acknowledged_by)}`}
             </span>
           </p>

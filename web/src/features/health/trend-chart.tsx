@@ -4,7 +4,7 @@ import { Figure, HistoryCard, Limits, shown, useRecording } from "../sensors";
 import type { Quantity, Recording } from "../sensors/model";
 import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
-import type { Fault, Watched } from "../../shared/api/health";
+import type { Fault, MonitoredField } from "../../shared/api/health";
 import { useMemo, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { serverNow } from "../../shared/lib/clock";
@@ -23,7 +23,7 @@ interface TrendProps {
   device: DeviceStore;
   quantity: Quantity;
   /** `null`: not monitored. */
-  watched: Watched | null;
+  watched: MonitoredField | null;
   /** All open and past faults of the device. */
   faults: readonly Fault[];
 }
@@ -92,7 +92,7 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
 }
 
 /** The learned range and trend as text. */
-function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_in_s: left }: Watched, quantity: Quantity): string {
+function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_in_s: left }: MonitoredField, quantity: Quantity): string {
   const text = (value: number): string => `${shown(quantity, value)} ${quantity.unit}`.trim();
   const said = [low === null || high === null ? texts.trend.learning : texts.trend.usual(text(low), text(high))];
   const perMinute = slope === null ? 0 : (quantity.shown(slope) - quantity.shown(0)) * 60;

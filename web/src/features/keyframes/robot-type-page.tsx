@@ -20,7 +20,7 @@ export function TypeKeyframesPage({ api, robotType, name }: TypeKeyframesPagePro
   const model = useResource(useCallback(() => api.robotTypes.model(robotType), [api, robotType]));
   const robot = useMemo(() => (type.value === null ? null : robotOf(type.value)), [type.value]);
   const loaded = useMovementSource(api, robotType, name);
-  const trouble = type.trouble !== "" ? type : model;
+  const trouble = type.error !== "" ? type : model;
   return (
     <main class="page kf-page" id="content">
       <div class="heading">
@@ -31,10 +31,10 @@ export function TypeKeyframesPage({ api, robotType, name }: TypeKeyframesPagePro
           {name !== "" && ` · ${name}`}
         </p>
       </div>
-      {trouble.trouble !== "" && (
+      {trouble.error !== "" && (
         <p class="notice bad" role="alert">
-          {trouble.trouble}{" "}
-          <button type="button" onClick={trouble.again}>
+          {trouble.error}{" "}
+          <button type="button" onClick={trouble.reload}>
             {common.tryAgain}
           </button>
         </p>

@@ -80,7 +80,7 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
   const [scale, setScale] = useState<Scale>("log");
   const sinceMs = serverNow() - SPAN_MS[filter.span];
   const ids = devices.map(({ id }) => id);
-  const { value, trouble } = usePolling(
+  const { value, error } = usePolling(
     () => readAll(api, ids, serverNow() - SPAN_MS[filter.span]),
     EVERY_MS,
     [api, ids.join(" "), filter.span, fresh.length],
@@ -127,8 +127,8 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
         <Choice label={texts.axis} value={axis} onChange={setAxis} options={Object.entries(texts.axes) as [Axis, string][]} />
         <Choice label={texts.scale} value={scale} onChange={setScale} options={Object.entries(texts.scales) as [Scale, string][]} />
       </fieldset>
-      {trouble !== "" && <p class="notice bad">{texts.failed(trouble)}</p>}
-      {value === null && trouble === "" && <p class="quiet">{common.loading}</p>}
+      {error !== "" && <p class="notice bad">{texts.failed(error)}</p>}
+      {value === null && error === "" && <p class="quiet">{common.loading}</p>}
       {value !== null && count === 0 && (
         <p class="notice" data-testid="no-times">
           {texts.none} {texts.how}

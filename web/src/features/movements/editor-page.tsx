@@ -11,7 +11,7 @@ import type { Api } from "../../shared/api/client";
 import { now } from "../../shared/lib/clock";
 import { sentence } from "../../shared/api/http";
 import { storedDraft } from "../../shared/lib/local-storage";
-import type { Checked, Scripting } from "../../shared/api/movement-library";
+import type { CheckResult, Scripting } from "../../shared/api/movement-library";
 import { ScriptDraft } from "./model/script-draft";
 import { failureMark, placed, type Place } from "./model/text-offsets";
 import { common } from "../../shared/i18n/common";
@@ -108,7 +108,7 @@ interface DeskProps {
 
 function Desk({ api, fleet, account, script, sessions, chosen, onChoose }: DeskProps) {
   const { robotType, name } = script;
-  const [checked, setChecked] = useState<{ of: string; found: Checked } | null>(null);
+  const [checked, setChecked] = useState<{ of: string; found: CheckResult } | null>(null);
   const base = script.base.value;
   const unsaved = script.changed.value;
   // Use the unsaved script's PARAMETERS if they are valid.
@@ -153,8 +153,8 @@ interface CodeProps {
   fleet: Fleet;
   script: ScriptDraft;
   sessions: readonly DeviceSession[];
-  checked: { of: string; found: Checked } | null;
-  onChecked: (checked: { of: string; found: Checked }) => void;
+  checked: { of: string; found: CheckResult } | null;
+  onChecked: (checked: { of: string; found: CheckResult }) => void;
 }
 
 function Code({ api, fleet, script, sessions, checked, onChecked }: CodeProps) {

@@ -136,11 +136,11 @@ function TypeShelf({ api, shelf, onRemoved }: TypeShelfProps) {
                 label={texts.library.remove}
                 description={texts.library.removeOf(movement.name)}
                 question={texts.library.removeSure(movement.name)}
-                yes={texts.library.removeYes}
-                busy={texts.library.removing}
-                keep={texts.library.keep}
+                confirmLabel={texts.library.removeYes}
+                busyLabel={texts.library.removing}
+                cancelLabel={texts.library.keep}
                 data-testid={`remove-${movement.name}`}
-                onYes={async () => {
+                onConfirm={async () => {
                   await api.library.remove(type.type, movement.name);
                   onRemoved(movement.name);
                 }}

@@ -74,7 +74,7 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
 
   const into = async (): Promise<string | null> => {
     if (space !== NEW) return space === "" ? null : space;
-    const made = await api.makeSpace(name.trim());
+    const made = await api.createSpace(name.trim());
     // The space exists now, even if pairing fails: a retry uses it and does not create a second one.
     setSpaces([...(spaces ?? []), made]);
     setSpace(made.id);

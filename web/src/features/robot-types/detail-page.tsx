@@ -28,19 +28,19 @@ interface TypePageProps {
 }
 
 export function RobotTypePage({ api, fleet, id }: TypePageProps) {
-  const { value: type, trouble, again } = useResource(useCallback(() => api.robotTypes.get(id), [api, id]));
+  const { value: type, error, reload } = useResource(useCallback(() => api.robotTypes.get(id), [api, id]));
   const devices = [...(fleet.devices.value?.values() ?? [])]
     .map(({ info }) => info.value)
     .filter(({ robot_type: used }) => used === id);
   return (
     <main class="page fleet robot-types" id="content">
       <a href={robotTypesAddress}>← {texts.title}</a>
-      {type === null && trouble === "" && (
+      {type === null && error === "" && (
         <p class="quiet" role="status">
           {common.loading}
         </p>
       )}
-      <LoadError said={trouble} again={again} />
+      <LoadError reason={error} retry={reload} />
       {type !== null && <Loaded api={api} type={type} devices={devices} />}
     </main>
   );
@@ -82,8 +82,8 @@ function Model({ api, type }: { api: Api; type: RobotType }) {
       throw error;
     }
   }, [api, type]);
-  const { value, trouble, again } = useResource(load);
-  if (trouble !== "") return <LoadError said={trouble} again={again} />;
+  const { value, error, reload } = useResource(load);
+  if (error !== "") return <LoadError reason={error} retry={reload} />;
   if (value === null) return <p class="quiet">{common.loading}</p>;
   if (value === "none") return <p class="quiet">{texts.model.none}</p>;
   return <ModelViewer twin={value.twin} joints={type.joints} />;
@@ -175,11 +175,11 @@ function Joints({ type }: { type: RobotType }) {
 function Movements({ api, type }: { api: Api; type: RobotType }) {
   const ready = type.state === "ready";
   const load = useCallback(() => (ready ? api.robotTypes.movements(type.type) : Promise.resolve([])), [api, type, ready]);
-  const { value, trouble, again } = useResource(load);
+  const { value, error, reload } = useResource(load);
   return (
     <Card title={texts.movements.title}>
-      <LoadError said={trouble} again={again} />
-      {value === null && trouble === "" && <p class="quiet">{common.loading}</p>}
+      <LoadError reason={error} retry={reload} />
+      {value === null && error === "" && <p class="quiet">{common.loading}</p>}
       {value?.length === 0 && <p class="quiet">{texts.movements.none}</p>}
       {value !== null && value.length > 0 && (
         <ul class="plain-list" data-testid="type-movements">
@@ -236,11 +236,11 @@ function Own({ api, type }: { api: Api; type: RobotType }) {
       <ConfirmButton
         label={words.remove}
         question={words.question(type.label)}
-        yes={words.yes}
-        busy={words.busy}
-        keep={words.keep}
+        confirmLabel={words.yes}
+        busyLabel={words.busy}
+        cancelLabel={words.keep}
         data-testid="delete-type"
-        onYes={async () => {
+        onConfirm={async () => {
           await api.robotTypes.delete(type.type);
           replaceWith(robotTypesAddress);
         }}

@@ -13,7 +13,7 @@ import { useResource } from "../../shared/hooks/use-resource";
 import "./robot-types.css";
 
 export function RobotTypesPage({ api, fleet }: { api: Api; fleet: Fleet }) {
-  const { value: types, trouble, again } = useResource(useCallback(() => api.robotTypes.list(), [api]));
+  const { value: types, error, reload } = useResource(useCallback(() => api.robotTypes.list(), [api]));
   const words = texts;
   const own = types?.filter((type) => !type.built_in) ?? [];
   const builtIn = types?.filter((type) => type.built_in) ?? [];
@@ -27,12 +27,12 @@ export function RobotTypesPage({ api, fleet }: { api: Api; fleet: Fleet }) {
       </header>
       <p class="quiet">{words.explained}</p>
       <PageExplainer page="robotTypes" />
-      {types === null && trouble === "" && (
+      {types === null && error === "" && (
         <p class="quiet" role="status">
           {common.loading}
         </p>
       )}
-      <LoadError said={trouble} again={again} />
+      <LoadError reason={error} retry={reload} />
       {types !== null && (
         <>
           <section aria-label={words.own}>

@@ -4,7 +4,7 @@ import type { DeviceStore } from "../devices/model";
 import { Age } from "../../shared/ui/age";
 import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
-import { onThisClock } from "../../shared/lib/clock";
+import { toPageClock } from "../../shared/lib/clock";
 import type { RoomDeviceAction } from "./model/room-device-action";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
@@ -79,7 +79,7 @@ function File({ upload, roomAction }: { upload: Upload; roomAction: RoomDeviceAc
       <span class="file-name">
         {name}
         <span class="quiet small">
-          {format.fileSize(upload.length)} · <Age at={onThisClock(Date.parse(upload.at))} />
+          {format.fileSize(upload.length)} · <Age at={toPageClock(Date.parse(upload.at))} />
         </span>
       </span>
       <button type="button" aria-label={texts.files.downloadNamed(name)} onClick={() => void download()}>

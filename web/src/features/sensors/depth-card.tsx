@@ -6,13 +6,13 @@ import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
 import { now } from "../../shared/lib/clock";
 import type { RoomDeviceAction } from "./model/room-device-action";
-import { readDepth, type DepthPicture } from "../../shared/lib/png";
+import { readDepth, type DepthImage } from "../../shared/lib/png";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
-import { falseColour, NOTHING } from "../../shared/ui/colour-map";
+import { falseColour, MISSING_COLOUR } from "../../shared/ui/colour-map";
 
-interface Drawn extends DepthPicture {
+interface Drawn extends DepthImage {
   nearM: number;
   farM: number;
   at: number;
@@ -137,7 +137,7 @@ function reading({ depthM, width }: Drawn, { x, y }: Point): string {
 function paint(canvas: HTMLCanvasElement, { width, height, depthM, nearM, farM }: Drawn): void {
   const image = new ImageData(width, height);
   depthM.forEach((m, index) => {
-    const [red, green, blue] = m > 0 ? falseColour((m - nearM) / Math.max(0.001, farM - nearM)) : NOTHING;
+    const [red, green, blue] = m > 0 ? falseColour((m - nearM) / Math.max(0.001, farM - nearM)) : MISSING_COLOUR;
     image.data.set([red, green, blue, 255], index * 4);
   });
   canvas.getContext("2d")?.putImageData(image, 0, 0);

@@ -5,7 +5,7 @@ import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
 import { useMemo, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import { onThisClock } from "../../shared/lib/clock";
+import { toPageClock } from "../../shared/lib/clock";
 import { digits, judge, quantityOf, type Quantity } from "./model/quantities";
 import type { Recording } from "./model/stored-series";
 import { common } from "../../shared/i18n/common";
@@ -132,7 +132,7 @@ function Status({ recording, field, value, loads }: { recording: Recording; fiel
         <span class="quiet">
           {(since.atLeast ? texts.room.sinceLonger : texts.room.since)(format.recentTime(since.at))}
           {" · "}
-          <Age at={onThisClock(since.at)} />
+          <Age at={toPageClock(since.at)} />
         </span>
       )}
     </>

@@ -6,7 +6,7 @@ import type { Api } from "../../shared/api/client";
 import { ApiError, sentence } from "../../shared/api/http";
 import type { Invitation, Person, Role, Share, SharedRole, Target } from "../../shared/api/sharing";
 import { secondsLeft, ShareList } from "./model/shares";
-import type { Whole } from "../../shared/api/transfers";
+import type { Transferable } from "../../shared/api/transfers";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
@@ -14,7 +14,7 @@ import { InlineForm } from "../../shared/ui/inline-form";
 import { ConfirmButton } from "../../shared/ui/confirm-button";
 import { useReturnFocus } from "../../shared/hooks/use-return-focus";
 import { InviteForm, MAY } from "./invite-form";
-import { AS_IT_IS, DurationPicker, seconds } from "../../shared/ui/duration-picker";
+import { UNCHANGED, DurationPicker, seconds } from "../../shared/ui/duration-picker";
 import { spaceAddress } from "../../shared/routing/routes";
 import { TransferPanel } from "./transfer-panel";
 import "./sharing.css";
@@ -28,7 +28,7 @@ interface AccessProps {
   account: Account;
   target: Target;
   /** What is handed over where it is, and the names of all that goes with it. */
-  whole: Whole;
+  whole: Transferable;
   goes: readonly string[];
   owner: Person;
   role: Role;
@@ -75,10 +75,10 @@ function OwnPart({ api, account, target, owner, role, onLeft }: PartProps & { ro
       <ConfirmButton
         label={texts.access.leave}
         question={texts.access.leaveSure}
-        yes={texts.access.leaveYes}
-        busy={texts.access.leaving}
-        keep={texts.access.keep}
-        onYes={leave}
+        confirmLabel={texts.access.leaveYes}
+        busyLabel={texts.access.leaving}
+        cancelLabel={texts.access.keep}
+        onConfirm={leave}
       />
     </Card>
   );
@@ -249,7 +249,7 @@ interface ChangeFormProps {
 
 function ChangeForm({ share, sharing, onDone }: ChangeFormProps) {
   const [role, setRole] = useState(share.role);
-  const [lasts, setLasts] = useState(AS_IT_IS);
+  const [lasts, setLasts] = useState(UNCHANGED);
   const [busy, setBusy] = useState(false);
   const [wrong, setWrong] = useState("");
   const save = async (): Promise<void> => {
@@ -271,11 +271,11 @@ function ChangeForm({ share, sharing, onDone }: ChangeFormProps) {
   return (
     <InlineForm
       label={texts.access.changeOf(share.account.name)}
-      todo={texts.access.save}
-      doing={texts.access.saving}
+      submitLabel={texts.access.save}
+      busyLabel={texts.access.saving}
       busy={busy}
-      wrong={wrong}
-      onSend={save}
+      error={wrong}
+      onSubmit={save}
       onClose={() => onDone("")}
     >
       <div class="field">
@@ -321,10 +321,10 @@ function OpenLink({ invitation, sharing }: { invitation: Invitation; sharing: Sh
         label={texts.access.withdraw}
         description={`${texts.access.withdraw}: ${texts.access.linkFor[role]}`}
         question={texts.access.withdrawSure}
-        yes={texts.access.withdrawYes}
-        busy={texts.access.withdrawing}
-        keep={texts.access.keep}
-        onYes={() => sharing.withdraw(invitation)}
+        confirmLabel={texts.access.withdrawYes}
+        busyLabel={texts.access.withdrawing}
+        cancelLabel={texts.access.keep}
+        onConfirm={() => sharing.withdraw(invitation)}
       />
     </li>
   );

@@ -123,10 +123,10 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
           <ConfirmButton
             label={texts.invitation.acceptTransfer}
             question={texts.invitation.handsSure(offer.label)}
-            yes={texts.invitation.handsYes}
-            busy={texts.invitation.accepting}
-            keep={texts.invitation.handsKeep}
-            onYes={accept}
+            confirmLabel={texts.invitation.handsYes}
+            busyLabel={texts.invitation.accepting}
+            cancelLabel={texts.invitation.handsKeep}
+            onConfirm={accept}
             data-testid="accept"
           />
         )}

@@ -1,13 +1,13 @@
 import { Choice } from "../../shared/ui/choice";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
-import type { InvitationMade, SharedRole } from "../../shared/api/sharing";
+import type { CreatedInvitation, SharedRole } from "../../shared/api/sharing";
 import type { ShareList } from "./model/shares";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { AccountNameField, InlineForm } from "../../shared/ui/inline-form";
-import { FOR_GOOD, DurationPicker, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
+import { NO_EXPIRY, DurationPicker, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
 import { LinkOnce } from "../../shared/ui/link-once";
 
 const HOW = [
@@ -31,13 +31,13 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
   const [how, setHow] = useState<"link" | "name">("link");
   const [name, setName] = useState("");
   const [role, setRole] = useState<SharedRole>("operator");
-  const [lasts, setLasts] = useState(FOR_GOOD);
+  const [lasts, setLasts] = useState(NO_EXPIRY);
   const [uses, setUses] = useState("1");
   const [valid, setValid] = useState(ONE_DAY);
   const [busy, setBusy] = useState(false);
   const [wrong, setWrong] = useState("");
   const [done, setDone] = useState("");
-  const [made, setMade] = useState<InvitationMade | null>(null);
+  const [made, setMade] = useState<CreatedInvitation | null>(null);
   const form = useRef<HTMLFormElement>(null);
   useEffect(() => form.current?.querySelector("input")?.focus(), []);
 
@@ -68,27 +68,27 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
 
   if (made !== null) {
     const note = texts.invite.madeNote(common.role[made.role], made.uses, format.until(made.expires_at));
-    return <LinkOnce link={made.link} note={note} onDone={onClose} />;
+    return <LinkOnce link={made.link} note={note} onClose={onClose} />;
   }
   return (
     <InlineForm
       label={texts.invite.title}
-      todo={how === "name" ? texts.invite.share : texts.invite.make}
-      doing={how === "name" ? texts.invite.sharing : texts.invite.making}
+      submitLabel={how === "name" ? texts.invite.share : texts.invite.make}
+      busyLabel={how === "name" ? texts.invite.sharing : texts.invite.making}
       busy={busy}
-      close={texts.invite.close}
-      wrong={wrong}
-      done={done}
-      answerId="invite-answer"
+      cancelLabel={texts.invite.close}
+      error={wrong}
+      successMessage={done}
+      messageId="invite-answer"
       form={form}
-      sendTestId="invite-send"
-      onSend={send}
+      submitTestId="invite-send"
+      onSubmit={send}
       onClose={onClose}
     >
       <Choice label={texts.invite.how} value={how} options={HOW} onChange={setHow} />
       <p class="quiet small">{how === "name" ? texts.invite.nameNote : texts.invite.linkNote}</p>
       {how === "name" && (
-        <AccountNameField id="invite-name" answerId="invite-answer" value={name} wrong={wrong !== ""} onInput={setName} />
+        <AccountNameField id="invite-name" messageId="invite-answer" value={name} invalid={wrong !== ""} onInput={setName} />
       )}
       <div class="field">
         <span class="label">{texts.invite.role}</span>

@@ -4,8 +4,8 @@ import { Choice } from "../../shared/ui/choice";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
-import type { Invitation, InvitationMade } from "../../shared/api/sharing";
-import type { Whole } from "../../shared/api/transfers";
+import type { Invitation, CreatedInvitation } from "../../shared/api/sharing";
+import type { Transferable } from "../../shared/api/transfers";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { AccountNameField, InlineForm } from "../../shared/ui/inline-form";
@@ -26,14 +26,14 @@ const TO = [
 
 interface TransferProps {
   api: Api;
-  of: Whole;
+  of: Transferable;
   /** All that goes along, by name. */
   goes: readonly string[];
 }
 
 export function TransferPanel({ api, of, goes }: TransferProps) {
-  const { value: offers, trouble, again } = usePolling(() => api.transfers.open(of), LOOK_AGAIN_MS, [api, of.kind, of.id]);
-  const [step, setStep] = useState<"closed" | "asking" | InvitationMade>("closed");
+  const { value: offers, error, refresh } = usePolling(() => api.transfers.open(of), LOOK_AGAIN_MS, [api, of.kind, of.id]);
+  const [step, setStep] = useState<"closed" | "asking" | CreatedInvitation>("closed");
   const opener = useReturnFocus(step !== "closed");
   const open = step !== "closed" ? null : (
     <button type="button" ref={opener} data-testid="transfer" onClick={() => setStep("asking")}>
@@ -50,24 +50,24 @@ export function TransferPanel({ api, of, goes }: TransferProps) {
             goes={goes}
             onMade={(made) => {
               setStep(made);
-              again();
+              refresh();
             }}
             onClose={() => setStep("closed")}
           />
         )}
         {typeof step === "object" && (
-          <LinkOnce link={step.link} note={texts.transfer.madeNote(format.until(step.expires_at))} onDone={() => setStep("closed")} />
+          <LinkOnce link={step.link} note={texts.transfer.madeNote(format.until(step.expires_at))} onClose={() => setStep("closed")} />
         )}
-        {trouble !== "" && (
+        {error !== "" && (
           <p class="notice bad" role="alert">
-            {texts.transfer.failed(trouble)}
+            {texts.transfer.failed(error)}
           </p>
         )}
         {offers?.length === 0 && step === "closed" && <p class="quiet">{texts.transfer.none}</p>}
         {offers !== null && offers.length > 0 && (
           <ul class="people" data-testid="offers">
             {offers.map((offer) => (
-              <OpenOffer key={offer.id} offer={offer} withdraw={() => api.transfers.withdraw(of, offer.id)} onGone={again} />
+              <OpenOffer key={offer.id} offer={offer} withdraw={() => api.transfers.withdraw(of, offer.id)} onGone={refresh} />
             ))}
           </ul>
         )}
@@ -94,10 +94,10 @@ function OpenOffer({ offer: { account, expires_at: until }, withdraw, onGone }: 
         label={texts.access.withdraw}
         description={`${texts.access.withdraw}: ${name}`}
         question={texts.transfer.withdrawSure}
-        yes={texts.access.withdrawYes}
-        busy={texts.access.withdrawing}
-        keep={texts.access.keep}
-        onYes={async () => {
+        confirmLabel={texts.access.withdrawYes}
+        busyLabel={texts.access.withdrawing}
+        cancelLabel={texts.access.keep}
+        onConfirm={async () => {
           await withdraw();
           onGone();
         }}
@@ -107,7 +107,7 @@ function OpenOffer({ offer: { account, expires_at: until }, withdraw, onGone }: 
 }
 
 interface OfferFormProps extends TransferProps {
-  onMade: (made: InvitationMade) => void;
+  onMade: (made: CreatedInvitation) => void;
   onClose: () => void;
 }
 
@@ -131,9 +131,9 @@ function OfferForm({ api, of, goes, onMade, onClose }: OfferFormProps) {
     }
   };
   const { todo, doing, title } = texts.transfer;
-  const asked = { label: title, todo, doing, busy, wrong, form, answerId: "transfer-answer", sendTestId: "transfer-send" };
+  const props = { label: title, submitLabel: todo, busyLabel: doing, busy, error: wrong, form, messageId: "transfer-answer", submitTestId: "transfer-send" };
   return (
-    <InlineForm {...asked} onSend={send} onClose={onClose}>
+    <InlineForm {...props} onSubmit={send} onClose={onClose}>
       <ul class="terms" data-testid="transfer-terms">
         <li>{texts.transfer.goes[of.kind](goes)}</li>
         {texts.transfer.terms.map((line) => (
@@ -142,7 +142,7 @@ function OfferForm({ api, of, goes, onMade, onClose }: OfferFormProps) {
       </ul>
       <Choice label={texts.transfer.to} value={to} options={TO} onChange={setTo} />
       {to === "name" && (
-        <AccountNameField id="transfer-name" answerId="transfer-answer" value={name} wrong={wrong !== ""} onInput={setName} />
+        <AccountNameField id="transfer-name" messageId="transfer-answer" value={name} invalid={wrong !== ""} onInput={setName} />
       )}
       <DurationPicker id="transfer-valid" label={texts.transfer.valid} value={valid} choices={VALID} onChange={setValid} />
     </InlineForm>

@@ -59,7 +59,7 @@ function MakeSpace({ api, onMade }: { api: Api; onMade: () => void }) {
     setBusy(true);
     setSaid({ text: "", wrong: false });
     try {
-      const made = await api.makeSpace(name.trim());
+      const made = await api.createSpace(name.trim());
       setName("");
       setSaid({ text: texts.spaces.made(made.name), wrong: false });
       onMade();

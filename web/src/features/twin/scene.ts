@@ -58,7 +58,7 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
   });
   // A view outside the viewport does not draw, except its first frame, so that scrolling never shows an empty view.
   const drawSoon = (): void => {
-    if (inSight || drawn === null) turn.ask();
+    if (inSight || drawn === null) turn.request();
   };
   const resetView = (): void => {
     controls.target.copy(home.centre);

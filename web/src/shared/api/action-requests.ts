@@ -30,8 +30,8 @@ export type RoomRequest = CollectData | TakePicture | CaptureRaw | SetControl;
 export type AnyRequest = RobotRequest | RoomRequest;
 
 /** Actions without motion: the device's state confirms them. */
-const STILL: ReadonlySet<AnyRequest["kind"]> = new Set(["say", "set_stiffness", "gather", "shoot", "capture", "set_control"]);
+const WITHOUT_MOTION: ReadonlySet<AnyRequest["kind"]> = new Set(["say", "set_stiffness", "gather", "shoot", "capture", "set_control"]);
 
 export function moves({ kind }: { kind: AnyRequest["kind"] | "stream" }): boolean {
-  return kind === "stream" || !STILL.has(kind);
+  return kind === "stream" || !WITHOUT_MOTION.has(kind);
 }

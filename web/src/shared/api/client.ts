@@ -6,7 +6,7 @@ import { Http, type Page } from "./http";
 import { Library, type Movement } from "./movement-library";
 import type { AnyRequest } from "./action-requests";
 import type {
-  ApiKey, ApiKeyMade, ApiKeyWanted, AuditPage, AuditQuery, Invitation, InvitationMade, InvitationWanted, Share,
+  ApiKey, CreatedApiKey, ApiKeySettings, AuditPage, AuditQuery, Invitation, CreatedInvitation, InvitationSettings, Share,
   SharedRole, Target,
 } from "./sharing";
 import { RobotTypes } from "./robot-types";
@@ -49,14 +49,13 @@ export class Api {
   }
 
   /** Creates an account with an invitation's secret, signs in and redeems the invitation. */
-  async makeAccount(invitation: string, name: string, password: string): Promise<Account> {
+  async createAccount(invitation: string, name: string, password: string): Promise<Account> {
     return this.#signedIn(await this.#http.call("POST", "/auth/accounts", { body: { invitation, name, password } }));
   }
 
   /** The URL of the external sign-in, with an invitation for users without an account. */
   async startOpenIdSignIn(invitation: string): Promise<string> {
-    const begun = await this.#http.call<{ url: string }>("POST", "/auth/oidc/start", { body: { invitation } });
-    return begun.url;
+    return (await this.#http.call<{ url: string }>("POST", "/auth/oidc/start", { body: { invitation } })).url;
   }
 
   signInMethods(): Promise<SignInMethods> {
@@ -86,7 +85,7 @@ export class Api {
 
   async me(): Promise<Account> {
     const { csrf_token: csrf, ...account } = await this.#http.call<Account & { csrf_token: string | null }>("GET", "/accounts/me");
-    this.#http.trust(csrf ?? "");
+    this.#http.setCsrfToken(csrf ?? "");
     return account;
   }
 
@@ -98,7 +97,7 @@ export class Api {
     return this.#http.all("/spaces");
   }
 
-  makeSpace(name: string): Promise<Space> {
+  createSpace(name: string): Promise<Space> {
     return this.#http.call("POST", "/spaces", { body: { name } });
   }
 
@@ -107,22 +106,22 @@ export class Api {
   }
 
   /** Creates or changes a share; `forS` null: no expiry [s]. */
-  share(target: Target, account: string, role: SharedRole, forS: number | null): Promise<Share> {
-    return this.#http.call("POST", `${at(target)}/shares`, { body: { account, role, expires_in_s: forS } });
+  share(target: Target, account: string, role: SharedRole, durationS: number | null): Promise<Share> {
+    return this.#http.call("POST", `${at(target)}/shares`, { body: { account, role, expires_in_s: durationS } });
   }
 
-  /** The unfinished revocations that the broker has not confirmed; empty if all are complete. */
+  /** Removes a share. Returns a description of revocations that the broker has not confirmed, or "". */
   async unshare(target: Target, account: string): Promise<string> {
-    const rest = await this.#http.call<{ detail: string } | null>("DELETE", `${at(target)}/shares/${account}`);
-    return rest?.detail ?? "";
+    const unfinished = await this.#http.call<{ detail: string } | null>("DELETE", `${at(target)}/shares/${account}`);
+    return unfinished?.detail ?? "";
   }
 
   invitations(target: Target): Promise<Invitation[]> {
     return this.#http.all(`${at(target)}/invitations`);
   }
 
-  invite(target: Target, wanted: InvitationWanted): Promise<InvitationMade> {
-    return this.#http.call("POST", `${at(target)}/invitations`, { body: wanted });
+  invite(target: Target, settings: InvitationSettings): Promise<CreatedInvitation> {
+    return this.#http.call("POST", `${at(target)}/invitations`, { body: settings });
   }
 
   async withdrawInvitation(target: Target, id: string): Promise<void> {
@@ -141,8 +140,8 @@ export class Api {
     return this.#http.all("/api-keys");
   }
 
-  makeApiKey(wanted: ApiKeyWanted): Promise<ApiKeyMade> {
-    return this.#http.call("POST", "/api-keys", { body: wanted });
+  createApiKey(settings: ApiKeySettings): Promise<CreatedApiKey> {
+    return this.#http.call("POST", "/api-keys", { body: settings });
   }
 
   async revokeApiKey(id: string): Promise<void> {
@@ -151,20 +150,20 @@ export class Api {
 
   /** One page of the account's audit log, newest first. */
   audit(query: AuditQuery, cursor: string | null, limit: number): Promise<AuditPage> {
-    const asked = new URLSearchParams({ limit: String(limit) });
-    if (query.event !== "") asked.set("event", query.event);
-    if (query.target !== "") asked.set("target", query.target);
-    if (query.sinceMs !== null) asked.set("from", String(query.sinceMs));
-    if (query.untilMs !== null) asked.set("to", String(query.untilMs));
-    if (cursor !== null) asked.set("cursor", cursor);
-    return this.#http.call("GET", `/accounts/me/audit?${asked.toString()}`);
+    const parameters = new URLSearchParams({ limit: String(limit) });
+    if (query.event !== "") parameters.set("event", query.event);
+    if (query.target !== "") parameters.set("target", query.target);
+    if (query.sinceMs !== null) parameters.set("from", String(query.sinceMs));
+    if (query.untilMs !== null) parameters.set("to", String(query.untilMs));
+    if (cursor !== null) parameters.set("cursor", cursor);
+    return this.#http.call("GET", `/accounts/me/audit?${parameters.toString()}`);
   }
 
   /** Pairs an agent by its claim code; `space` null: the account's first space. */
   async claim(code: string, space: string | null = null): Promise<Device[]> {
     const body = space === null ? { code } : { code, space };
-    const answer = await this.#http.call<{ devices: Device[] }>("POST", "/agents/claim", { body });
-    return answer.devices;
+    const response = await this.#http.call<{ devices: Device[] }>("POST", "/agents/claim", { body });
+    return response.devices;
   }
 
   takeLease(device: string, leaseMs: number): Promise<GrantedLease> {
@@ -202,7 +201,7 @@ export class Api {
   }
 
   /** Hands this session's control over to the requester, or rejects the request. */
-  async answerRequest(device: string, id: string, accept: boolean): Promise<void> {
+  async respondToRequest(device: string, id: string, accept: boolean): Promise<void> {
     await this.#http.call("POST", `${requests(device)}/${id}/${accept ? "accept" : "reject"}`);
   }
 
@@ -283,9 +282,9 @@ export class Api {
     return this.#http.call("POST", "/mqtt/credentials", { body: purpose });
   }
 
-  #signedIn(answer: SignedIn): Account {
-    this.#http.trust(answer.csrf_token);
-    return { ...answer.account, session: answer.session };
+  #signedIn(response: SignedIn): Account {
+    this.#http.setCsrfToken(response.csrf_token);
+    return { ...response.account, session: response.session };
   }
 }
 

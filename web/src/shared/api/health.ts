@@ -31,7 +31,7 @@ export interface Fault {
 }
 
 /** One monitored field, averaged over ten seconds. */
-export interface Watched {
+export interface MonitoredField {
   stream: string;
   field: string;
   label: string;
@@ -64,11 +64,11 @@ export interface DeviceHealth {
   last_seen_at: string | null;
   counts: Counts;
   faults: Fault[];
-  fields: Watched[];
+  fields: MonitoredField[];
 }
 
 /** One device in the health list. */
-export interface HealthLine {
+export interface HealthSummary {
   device: string;
   label: string;
   space: string;
@@ -93,9 +93,9 @@ export interface StoredStream {
   fields: string[];
 }
 
-/** One method per call. All methods throw only `ApiError`. */
 export const RANK: Readonly<Record<HealthState, number>> = { ok: 0, unknown: 1, warning: 2, fault: 3 };
 
+/** All methods throw only `ApiError`. */
 export class HealthApi {
   readonly #http: Http;
 
@@ -104,8 +104,8 @@ export class HealthApi {
   }
 
   /** Health of all devices, or those of one space, worst first. */
-  async all(space: string | null): Promise<HealthLine[]> {
-    const lines = await this.#http.all<HealthLine>(space === null ? "/diagnostics" : `/spaces/${space}/diagnostics`);
+  async all(space: string | null): Promise<HealthSummary[]> {
+    const lines = await this.#http.all<HealthSummary>(space === null ? "/diagnostics" : `/spaces/${space}/diagnostics`);
     return lines.sort((one, other) => RANK[other.health] - RANK[one.health] || one.label.localeCompare(other.label));
   }
 
@@ -114,7 +114,7 @@ export class HealthApi {
   }
 
   /** Cleared faults, newest first. */
-  past(device: string, cursor: string | null, limit: number): Promise<Page<Fault>> {
+  clearedFaults(device: string, cursor: string | null, limit: number): Promise<Page<Fault>> {
     return this.#http.call("GET", `/devices/${device}/faults?open=false&${paging(cursor, limit)}`);
   }
 

@@ -1,5 +1,5 @@
 /** HTTP API calls with an HttpOnly session cookie. All failures are `ApiError`. */
-import { learnServerTime, now } from "../lib/clock";
+import { updateServerTime, now } from "../lib/clock";
 
 export interface Page<T> {
   items: T[];
@@ -33,7 +33,7 @@ interface CallOptions {
   /** Completes the call after the page closes. */
   keepalive?: boolean;
   /** Whether the call is a retry after a missing CSRF token. */
-  again?: boolean;
+  retried?: boolean;
 }
 
 /** All methods throw only `ApiError`. */
@@ -46,8 +46,8 @@ export class Http {
     this.#base = base;
   }
 
-  /** The CSRF token from this session's responses. */
-  trust(csrf: string): void {
+  /** Sets the CSRF token that this session's responses contain. */
+  setCsrfToken(csrf: string): void {
     this.#csrf = csrf;
   }
 
@@ -68,7 +68,7 @@ export class Http {
     const headers: Record<string, string> = { Accept: "application/json", ...options.headers };
     if (method !== "GET") headers["X-CSRF-Token"] = this.#csrf;
     if (options.body !== undefined) headers["Content-Type"] = "application/json";
-    const askedAt = now();
+    const sentAt = now();
     let response: Response;
     let text: string;
     try {
@@ -82,19 +82,19 @@ export class Http {
       });
       text = await response.text();
     } catch (error) {
-      const late = error instanceof DOMException && error.name === "TimeoutError";
-      throw new ApiError(0, "unreachable", late ? "The server did not answer in time." : "The server cannot be reached.");
+      const timedOut = error instanceof DOMException && error.name === "TimeoutError";
+      throw new ApiError(0, "unreachable", timedOut ? "The server did not respond in time." : "The server cannot be reached.");
     }
     const serverMs = response.headers.get("X-Telescope-Time-Ms");
-    if (serverMs !== null) learnServerTime(Number(serverMs), askedAt, now());
+    if (serverMs !== null) updateServerTime(Number(serverMs), sentAt, now());
     const body = parseBody(text, response.status);
     if (response.ok) return body as T;
-    const refused = problem(response.status, body);
+    const rejection = problem(response.status, body);
     // After a new sign-in in another tab the cookie has changed, so use the new session's token.
-    if (refused.code !== "csrf-token" || options.again === true) throw refused;
+    if (rejection.code !== "csrf-token" || options.retried === true) throw rejection;
     const { csrf_token: csrf } = await this.call<{ csrf_token: string | null }>("GET", "/accounts/me");
-    this.trust(csrf ?? "");
-    return this.call(method, path, { ...options, again: true });
+    this.setCsrfToken(csrf ?? "");
+    return this.call(method, path, { ...options, retried: true });
   }
 }
 
@@ -103,16 +103,16 @@ function parseBody(text: string, status: number): unknown {
   try {
     return JSON.parse(text);
   } catch {
-    throw new ApiError(status, "not-json", `The server answered ${status} with something that is not JSON.`);
+    throw new ApiError(status, "not-json", `The server's response with status ${status} is not valid JSON.`);
   }
 }
 
 function problem(status: number, body: unknown): ApiError {
-  const given = (typeof body === "object" && body !== null ? body : {}) as Record<string, unknown>;
-  const said = [given["detail"], given["title"]].find((text) => typeof text === "string" && text !== "");
-  const type = typeof given["type"] === "string" ? given["type"] : "";
-  const message = typeof said === "string" ? said : `The server answered ${status}.`;
-  return new ApiError(status, type.split("/").pop() ?? "", message, given);
+  const fields = (typeof body === "object" && body !== null ? body : {}) as Record<string, unknown>;
+  const detail = [fields["detail"], fields["title"]].find((text) => typeof text === "string" && text !== "");
+  const type = typeof fields["type"] === "string" ? fields["type"] : "";
+  const message = typeof detail === "string" ? detail : `The server responded with status ${status}.`;
+  return new ApiError(status, type.split("/").pop() ?? "", message, fields);
 }
 
 /** An error as a sentence for display. */

@@ -51,7 +51,7 @@ export class LatencyApi {
   }
 
   /** Measures one HTTP round trip to the server's health endpoint. */
-  async ask(): Promise<void> {
+  async measureRoundTrip(): Promise<void> {
     await this.#http.call("GET", "/health");
   }
 }

@@ -59,7 +59,7 @@ export interface Mark {
   end_column: number;
 }
 
-export interface Checked {
+export interface CheckResult {
   diagnostics: Mark[];
   savable: boolean;
   description: string;
@@ -160,7 +160,7 @@ export class Library {
     await this.#http.call("DELETE", at(robotType, name));
   }
 
-  check(robotType: string, source: string): Promise<Checked> {
+  check(robotType: string, source: string): Promise<CheckResult> {
     return this.#http.call("POST", `/robot-types/${encodeURIComponent(robotType)}/scripting/check`, { body: { source } });
   }
 
@@ -168,7 +168,7 @@ export class Library {
     return this.#http.call("GET", `/robot-types/${encodeURIComponent(robotType)}/scripting`);
   }
 
-  /** Runs a movement on several devices; returns a result per device. `epochs`: of the leases of this session. */
+  /** Runs a movement on several devices; returns a result per device. `epochs`: lease epochs by device. */
   async runOnMany(
     devices: readonly string[],
     movement: string,

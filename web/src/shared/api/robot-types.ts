@@ -40,7 +40,7 @@ export interface RobotType {
 }
 
 /** A temporary upload for checking. Only its owner sees it; it expires. */
-export interface Look {
+export interface TypePreview {
   id: string;
   expires_at: string;
   robot_type: RobotType;
@@ -67,7 +67,7 @@ export interface TypeFolder {
   movements: Record<string, string>;
 }
 
-interface TwinAnswer {
+interface TwinResponse {
   device: string;
   bodies: unknown;
   actuators: string[];
@@ -75,9 +75,9 @@ interface TwinAnswer {
 }
 
 /** Timeout of an upload over a slow connection [ms]. */
-const SENDING_MS = 170_000;
+const UPLOAD_TIMEOUT_MS = 170_000;
 /** Requested server-side wait for the validation result [ms]. */
-const VERDICT_MS = 20_000;
+const VALIDATION_WAIT_MS = 20_000;
 
 /** All methods throw only `ApiError`, or `MessageError` for an invalid model. */
 export class RobotTypes {
@@ -120,30 +120,30 @@ export class RobotTypes {
     return `/api/v1/robot-types/${type}/files/${name}`;
   }
 
-  /** Uploads a preview; its validation result is requested separately. */
-  look(folder: TypeFolder): Promise<Look> {
-    return this.#http.call("POST", "/robot-type-previews", { body: { ...folder, wait_ms: 0 }, waitMs: SENDING_MS });
+  /** Uploads a folder as a preview. `preview` returns its validation result. */
+  createPreview(folder: TypeFolder): Promise<TypePreview> {
+    return this.#http.call("POST", "/robot-type-previews", { body: { ...folder, wait_ms: 0 }, waitMs: UPLOAD_TIMEOUT_MS });
   }
 
-  lookAgain(id: string): Promise<Look> {
+  preview(id: string): Promise<TypePreview> {
     return this.#http.call("GET", `/robot-type-previews/${id}`);
   }
 
-  lookModel(id: string): Promise<TypeModel> {
+  previewModel(id: string): Promise<TypeModel> {
     return this.#model(`/robot-type-previews/${id}/twin`);
   }
 
-  save(id: string): Promise<RobotType> {
-    const body = { wait_ms: VERDICT_MS };
-    return this.#http.call("POST", `/robot-type-previews/${id}/save`, { body, waitMs: VERDICT_MS });
+  savePreview(id: string): Promise<RobotType> {
+    const body = { wait_ms: VALIDATION_WAIT_MS };
+    return this.#http.call("POST", `/robot-type-previews/${id}/save`, { body, waitMs: VALIDATION_WAIT_MS });
   }
 
-  async drop(id: string): Promise<void> {
+  async deletePreview(id: string): Promise<void> {
     await this.#http.call("DELETE", `/robot-type-previews/${id}`, { keepalive: true });
   }
 
   async #model(path: string): Promise<TypeModel> {
-    const { actuators, cameras, ...twin } = await this.#http.call<TwinAnswer>("GET", path);
+    const { actuators, cameras, ...twin } = await this.#http.call<TwinResponse>("GET", path);
     // Validate it like a robot's own model: the page draws validated models only.
     return { twin: readTwin(new TextEncoder().encode(JSON.stringify(twin))), actuators, cameras };
   }

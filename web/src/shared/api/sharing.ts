@@ -40,19 +40,19 @@ export interface Invitation {
 }
 
 /** The secret and its link are returned only in this response. */
-export interface InvitationMade extends Invitation {
+export interface CreatedInvitation extends Invitation {
   secret: string;
   link: string;
 }
 
-export interface InvitationWanted {
+export interface InvitationSettings {
   role: SharedRole;
   expires_in_s: number;
   uses: number;
   share_s: number | null;
 }
 
-export interface ApiKeyWanted {
+export interface ApiKeySettings {
   name: string;
   role: SharedRole;
   /** Device ids and `space:<id>`; empty: everything the account can access. */
@@ -60,7 +60,7 @@ export interface ApiKeyWanted {
   days: number;
 }
 
-export interface ApiKey extends Omit<ApiKeyWanted, "days"> {
+export interface ApiKey extends Omit<ApiKeySettings, "days"> {
   id: string;
   created_at: string;
   expires_at: string;
@@ -69,7 +69,7 @@ export interface ApiKey extends Omit<ApiKeyWanted, "days"> {
   last_used_at: string | null;
 }
 
-export interface ApiKeyMade {
+export interface CreatedApiKey {
   api_key: ApiKey;
   /** Returned only in this response. */
   token: string;

@@ -1,5 +1,5 @@
 /**
- * Schedules expensive views in turn. Each frame draws at least one view and stays within a time budget, so that sliders
+ * Draws expensive views in the order of their requests. Each frame draws at least one view and stays within a time budget, so that sliders
  * and setpoints keep priority.
  */
 import { now } from "../lib/clock";
@@ -11,8 +11,8 @@ const LONGEST_WAIT_MS = 400;
 const FREE_MS = 6;
 
 /** Slots waiting to draw, in the order of their requests. */
-const waiting = new Set<DrawSlot>();
-let asked = false;
+const queue = new Set<DrawSlot>();
+let scheduled = false;
 
 export class DrawSlot {
   readonly #draw: () => void;
@@ -22,37 +22,37 @@ export class DrawSlot {
     this.#draw = draw;
   }
 
-  /** Requests a redraw in this view's next turn. */
-  ask(): void {
-    waiting.add(this);
+  /** Requests a redraw in one of the next frames. */
+  request(): void {
+    queue.add(this);
     next();
   }
 
   dispose(): void {
-    waiting.delete(this);
+    queue.delete(this);
   }
 
   static next(): void {
-    const [turn] = waiting;
-    if (turn === undefined) return;
-    waiting.delete(turn);
-    turn.#draw();
+    const [slot] = queue;
+    if (slot === undefined) return;
+    queue.delete(slot);
+    slot.#draw();
   }
 }
 
 function next(): void {
-  if (asked || waiting.size === 0) return;
-  asked = true;
+  if (scheduled || queue.size === 0) return;
+  scheduled = true;
   requestAnimationFrame(() => {
     const startedAt = now();
     do DrawSlot.next();
-    while (waiting.size > 0 && now() - startedAt < FREE_MS / 2);
+    while (queue.size > 0 && now() - startedAt < FREE_MS / 2);
     // Without a GPU a frame can exceed its budget; then the next one is delayed.
     setTimeout(() => {
       const tookMs = now() - startedAt;
       setTimeout(
         () => {
-          asked = false;
+          scheduled = false;
           next();
         },
         Math.min((TIME_SHARE - 1) * Math.max(0, tookMs - FREE_MS), LONGEST_WAIT_MS),

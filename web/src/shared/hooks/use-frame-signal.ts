@@ -1,5 +1,5 @@
 /**
- * Limits signal updates to one per animation frame. A page that falls behind draws only the newest value.
+ * Limits signal updates to one per animation frame. A slow page draws only the newest value.
  */
 import { batch, type ReadonlySignal, type Signal, useSignal, useSignalEffect } from "@preact/signals";
 

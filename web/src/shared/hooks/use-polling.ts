@@ -5,40 +5,40 @@ import { sentence } from "../api/http";
 export interface Polled<T> {
   /** The newest response; `null` before the first. */
   value: T | null;
-  /** The error of the last call, or "". The previous response stays. */
-  trouble: string;
+  /** The error of the last call, or "". An error does not clear the previous response. */
+  error: string;
   /** Polls immediately. */
-  again: () => void;
+  refresh: () => void;
 }
 
 /** Polls at an interval, and when one of `keys` changes, which also clears the last response. */
 export function usePolling<T>(load: () => Promise<T>, everyMs: number, keys: readonly unknown[]): Polled<T> {
   const [value, setValue] = useState<T | null>(null);
-  const [trouble, setTrouble] = useState("");
-  const asked = useRef(0);
+  const [error, setError] = useState("");
+  const callCount = useRef(0);
   const newest = useRef(load);
   newest.current = load;
-  const again = useCallback(() => {
-    const mine = ++asked.current;
+  const refresh = useCallback(() => {
+    const call = ++callCount.current;
     newest.current().then(
       (found) => {
-        if (mine !== asked.current) return;
+        if (call !== callCount.current) return;
         setValue(found);
-        setTrouble("");
+        setError("");
       },
-      (error: unknown) => mine === asked.current && setTrouble(sentence(error)),
+      (error: unknown) => call === callCount.current && setError(sentence(error)),
     );
   }, []);
   useEffect(() => {
     setValue(null);
-    again();
+    refresh();
     const timer = setInterval(() => {
-      if (document.visibilityState === "visible") again();
+      if (document.visibilityState === "visible") refresh();
     }, everyMs);
     return () => {
       clearInterval(timer);
-      asked.current += 1;
+      callCount.current += 1;
     };
-  }, [again, everyMs, ...keys]);
-  return { value, trouble, again };
+  }, [refresh, everyMs, ...keys]);
+  return { value, error, refresh };
 }

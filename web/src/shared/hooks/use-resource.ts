@@ -5,25 +5,25 @@ interface Loaded<T> {
   /** `null` until loaded. */
   value: T | null;
   /** The error, or "". */
-  trouble: string;
-  again: () => void;
+  error: string;
+  reload: () => void;
 }
 
 /** Loads a resource on mount. A new `load` function reloads it, so callers memoize it. */
 export function useResource<T>(load: () => Promise<T>): Loaded<T> {
   const [value, setValue] = useState<T | null>(null);
-  const [trouble, setTrouble] = useState("");
-  const [tries, setTries] = useState(0);
+  const [error, setError] = useState("");
+  const [attempt, setAttempt] = useState(0);
   useEffect(() => {
-    let wanted = true;
-    setTrouble("");
+    let active = true;
+    setError("");
     load().then(
-      (found) => wanted && setValue(() => found),
-      (error: unknown) => wanted && setTrouble(sentence(error)),
+      (found) => active && setValue(() => found),
+      (error: unknown) => active && setError(sentence(error)),
     );
     return () => {
-      wanted = false;
+      active = false;
     };
-  }, [load, tries]);
-  return { value, trouble, again: () => setTries(tries + 1) };
+  }, [load, attempt]);
+  return { value, error, reload: () => setAttempt(attempt + 1) };
 }

@@ -6,14 +6,14 @@ export function now(): number {
   return performance.now();
 }
 
-const beat = signal(now());
+const tick = signal(now());
 
 /** `now()`, updated four times per second. Displayed ages subscribe to it. */
-export const clock: ReadonlySignal<number> = beat;
+export const clock: ReadonlySignal<number> = tick;
 
 /** Starts the clock updates; returns a function that stops them. */
 export function startClock(): () => void {
-  const timer = setInterval(() => (beat.value = now()), 250);
+  const timer = setInterval(() => (tick.value = now()), 250);
   return () => {
     clearInterval(timer);
   };
@@ -23,16 +23,16 @@ let serverOffsetMs: number | null = null;
 let bestRoundTripMs = Infinity;
 
 /** Updates the clock offset from a response; the response with the shortest round trip is used. */
-export function learnServerTime(serverMs: number, askedAt: number, answeredAt: number): void {
-  const roundTripMs = answeredAt - askedAt;
+export function updateServerTime(serverMs: number, sentAt: number, receivedAt: number): void {
+  const roundTripMs = receivedAt - sentAt;
   if (Number.isFinite(serverMs) && roundTripMs <= bestRoundTripMs) {
     bestRoundTripMs = roundTripMs;
-    serverOffsetMs = serverMs - (askedAt + answeredAt) / 2;
+    serverOffsetMs = serverMs - (sentAt + receivedAt) / 2;
   }
 }
 
 /** Converts server wall-clock time [ms since 1970] to the page's monotonic clock [ms]. */
-export function onThisClock(serverMs: number): number {
+export function toPageClock(serverMs: number): number {
   return serverMs - (serverOffsetMs ?? Date.now() - now());
 }
 

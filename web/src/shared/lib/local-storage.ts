@@ -6,19 +6,19 @@ type Store = Pick<Storage, "getItem" | "setItem" | "removeItem">;
 export class StoredValue<T> {
   readonly #store: Store | null;
   readonly #key: string;
-  readonly #fits: (value: unknown) => value is T;
+  readonly #isValid: (value: unknown) => value is T;
 
   /** `fits`: validates a stored value, which another version of the page may have written. */
-  constructor(store: Store | null, key: string, fits: (value: unknown) => value is T) {
+  constructor(store: Store | null, key: string, isValid: (value: unknown) => value is T) {
     this.#store = store;
     this.#key = `telescope.${key}`;
-    this.#fits = fits;
+    this.#isValid = isValid;
   }
 
   read(): T | null {
     try {
       const value: unknown = JSON.parse(this.#store?.getItem(this.#key) ?? "null");
-      return this.#fits(value) ? value : null;
+      return this.#isValid(value) ? value : null;
     } catch {
       return null;
     }
@@ -34,7 +34,7 @@ export class StoredValue<T> {
     }
   }
 
-  drop(): void {
+  remove(): void {
     try {
       this.#store?.removeItem(this.#key);
     } catch {

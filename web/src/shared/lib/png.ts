@@ -5,7 +5,7 @@
 import { MessageError } from "../mqtt/checks";
 
 /** Distance per pixel, in rows from the top [m]; 0: out of range. */
-export interface DepthPicture {
+export interface DepthImage {
   width: number;
   height: number;
   depthM: Float32Array;
@@ -19,31 +19,31 @@ const BYTES = 2;
 const MM_PER_M = 1000;
 
 /** Throws `MessageError`. */
-export async function readDepth(file: Uint8Array): Promise<DepthPicture> {
-  if (!SIGNATURE.every((byte, index) => file[index] === byte)) throw new MessageError("the depth picture is no PNG");
+export async function readDepth(file: Uint8Array): Promise<DepthImage> {
+  if (!SIGNATURE.every((byte, index) => file[index] === byte)) throw new MessageError("the depth image is not a PNG file");
   const view = new DataView(file.buffer, file.byteOffset, file.byteLength);
   const parts: Uint8Array<ArrayBuffer>[] = [];
   let size: { width: number; height: number } | null = null;
   for (let at = SIGNATURE.length; at + 8 <= file.byteLength; ) {
     const length = view.getUint32(at);
-    const kind = view.getUint32(at + 4);
+    const chunk = view.getUint32(at + 4);
     const begin = at + 8;
-    if (begin + length > file.byteLength) throw new MessageError("the depth picture is cut off");
-    if (kind === IHDR && length === 13) size = header(view, begin);
-    if (kind === IDAT) parts.push(file.slice(begin, begin + length));
+    if (begin + length > file.byteLength) throw new MessageError("the depth image is truncated");
+    if (chunk === IHDR && length === 13) size = header(view, begin);
+    if (chunk === IDAT) parts.push(file.slice(begin, begin + length));
     at = begin + length + 4;
   }
-  if (size === null) throw new MessageError("the depth picture has no header");
+  if (size === null) throw new MessageError("the depth image has no header");
   return { ...size, depthM: metres(unfiltered(await inflate(parts), size.width, size.height)) };
 }
 
 function header(view: DataView, at: number): { width: number; height: number } {
   const width = view.getUint32(at);
   const height = view.getUint32(at + 4);
-  if (width < 1 || height < 1 || width * height > MAX_PIXELS) throw new MessageError("the depth picture is too large");
+  if (width < 1 || height < 1 || width * height > MAX_PIXELS) throw new MessageError("the depth image is empty or too large");
   // Bits per sample, then: greyscale, the standard compression and filter methods, not interlaced.
-  const kind = [16, 0, 0, 0, 0].every((wanted, index) => view.getUint8(at + 8 + index) === wanted);
-  if (!kind) throw new MessageError("the depth picture is not grey with 16 bits");
+  const supported = [16, 0, 0, 0, 0].every((expected, index) => view.getUint8(at + 8 + index) === expected);
+  if (!supported) throw new MessageError("the depth image is not 16-bit greyscale");
   return { width, height };
 }
 
@@ -52,14 +52,14 @@ async function inflate(parts: Uint8Array<ArrayBuffer>[]): Promise<Uint8Array> {
   try {
     return new Uint8Array(await new Response(stream).arrayBuffer());
   } catch {
-    throw new MessageError("the depth picture is damaged");
+    throw new MessageError("the depth image is corrupt");
   }
 }
 
 /** Reverses the PNG row filters. */
 function unfiltered(raw: Uint8Array, width: number, height: number): Uint8Array {
   const stride = width * BYTES;
-  if (raw.length !== height * (stride + 1)) throw new MessageError("the depth picture is damaged");
+  if (raw.length !== height * (stride + 1)) throw new MessageError("the depth image is corrupt");
   const out = new Uint8Array(height * stride);
   const at = (index: number): number => out[index] ?? 0;
   for (let row = 0; row < height; row += 1) {
@@ -88,7 +88,7 @@ function predicted(filter: number, left: number, up: number, corner: number): nu
     case 4:
       return paeth(left, up, corner);
     default:
-      throw new MessageError("the depth picture is damaged");
+      throw new MessageError("the depth image is corrupt");
   }
 }
 

@@ -1,7 +1,7 @@
 /** A value with undo and redo. */
 import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-core";
 
-const KEPT = 200;
+const MAX_STEPS = 200;
 
 export class UndoHistory<T> {
   readonly #now;
@@ -21,17 +21,17 @@ export class UndoHistory<T> {
   /** Records a change. Consecutive changes of one `gesture` (a slider drag) are one step. */
   change(next: T, gesture = ""): void {
     if (Object.is(next, this.#now.value)) return;
-    const goesOn = gesture !== "" && gesture === this.#gesture;
+    const continues = gesture !== "" && gesture === this.#gesture;
     this.#gesture = gesture;
     batch(() => {
-      if (!goesOn) this.#before.value = [...this.#before.value, this.#now.value].slice(-KEPT);
+      if (!continues) this.#before.value = [...this.#before.value, this.#now.value].slice(-MAX_STEPS);
       this.#after.value = [];
       this.#now.value = next;
     });
   }
 
   /** Ends the gesture; the next change is a new step. */
-  settle(): void {
+  endGesture(): void {
     this.#gesture = "";
   }
 

@@ -2,11 +2,11 @@
 import { MessageError } from "./checks";
 
 export interface CameraFrame {
-  /** Increases from one agent start to the next. */
+  /** Increases until the agent restarts. */
   sequence: number;
   /** Capture time on the agent's monotonic clock [ms]. */
   tickMs: number;
-  /** In pixels. */
+  /** Image size [px]. */
   width: number;
   height: number;
   jpeg: Uint8Array;
@@ -20,11 +20,11 @@ const JPEG_BEGINS = 0xffd8;
 
 /** Throws `MessageError`. */
 export function readFrame(payload: Uint8Array): CameraFrame {
-  const whole = payload.byteLength > HEADER_BYTES + 2 && payload.byteLength <= MAX_BYTES;
-  if (!whole) throw new MessageError(`a picture of ${payload.byteLength} bytes is none`);
+  const validLength = payload.byteLength > HEADER_BYTES + 2 && payload.byteLength <= MAX_BYTES;
+  if (!validLength) throw new MessageError(`a camera frame cannot have ${payload.byteLength} bytes`);
   const view = new DataView(payload.buffer, payload.byteOffset, payload.byteLength);
-  if (view.getUint32(0) !== MAGIC) throw new MessageError("the header is not that of a picture of version 1");
-  if (view.getUint16(HEADER_BYTES) !== JPEG_BEGINS) throw new MessageError("the picture is no JPEG");
+  if (view.getUint32(0) !== MAGIC) throw new MessageError("the frame header does not have version 1");
+  if (view.getUint16(HEADER_BYTES) !== JPEG_BEGINS) throw new MessageError("the frame is not a JPEG image");
   return {
     sequence: view.getUint32(4),
     tickMs: Number(view.getBigUint64(8)),

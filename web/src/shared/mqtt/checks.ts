@@ -12,13 +12,13 @@ export class MessageError extends Error {
  */
 export type Check<T> = (value: unknown, at: string, key?: string | number) => T;
 
-export function place(at: string, key?: string | number): string {
+export function pathOf(at: string, key?: string | number): string {
   if (key === undefined) return at;
   return typeof key === "number" ? `${at}[${key}]` : `${at}.${key}`;
 }
 
-export function fail(at: string, wanted: string, key?: string | number): never {
-  throw new MessageError(`${place(at, key)} is not ${wanted}`);
+export function fail(at: string, expected: string, key?: string | number): never {
+  throw new MessageError(`${pathOf(at, key)} is not ${expected}`);
 }
 
 export const number: Check<number> = (value, at, key) =>
@@ -31,7 +31,7 @@ export const text: Check<string> = (value, at, key) => (typeof value === "string
 
 export const flag: Check<boolean> = (value, at, key) => (typeof value === "boolean" ? value : fail(at, "true or false", key));
 
-export const anything: Check<Record<string, unknown>> = (value, at, key) =>
+export const record: Check<Record<string, unknown>> = (value, at, key) =>
   typeof value === "object" && value !== null && !Array.isArray(value)
     ? (value as Record<string, unknown>)
     : fail(at, "an object", key);
@@ -46,23 +46,23 @@ export function oneOf<const T extends string>(...names: T[]): Check<T> {
 export function list<T>(item: Check<T>, longest: number): Check<T[]> {
   return (value, at, key) => {
     if (!Array.isArray(value) || value.length > longest) fail(at, `a list of at most ${longest}`, key);
-    const here = place(at, key);
+    const here = pathOf(at, key);
     return value.map((entry, index) => item(entry, here, index));
   };
 }
 
 /** Numbers by name, without the object prototype's properties. */
 export const byName: Check<Record<string, number>> = (value, at, key) => {
-  const entries = Object.entries(anything(value, at, key));
+  const entries = Object.entries(record(value, at, key));
   if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} numbers`, key);
-  const here = place(at, key);
+  const here = pathOf(at, key);
   return Object.fromEntries(entries.map(([name, entry]) => [name, number(entry, here, name)]));
 };
 
 export function numbers<T extends number[]>(length: T["length"]): Check<T> {
   return (value, at, key) => {
     if (!Array.isArray(value) || value.length !== length) fail(at, `${length} numbers`, key);
-    const here = place(at, key);
+    const here = pathOf(at, key);
     return value.map((entry, index) => number(entry, here, index)) as T;
   };
 }
@@ -80,8 +80,8 @@ type Fields<T> = { [K in keyof T]-?: Check<T[K]> };
 export function object<T extends object>(fields: Fields<T>): Check<T> {
   const entries = Object.entries<Check<unknown>>(fields as Record<string, Check<unknown>>);
   return (value, at, key) => {
-    const given = anything(value, at, key);
-    const here = place(at, key);
-    return Object.fromEntries(entries.map(([name, check]) => [name, check(given[name], here, name)])) as T;
+    const values = record(value, at, key);
+    const here = pathOf(at, key);
+    return Object.fromEntries(entries.map(([name, check]) => [name, check(values[name], here, name)])) as T;
   };
 }

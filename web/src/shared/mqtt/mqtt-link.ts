@@ -13,8 +13,8 @@ export type LinkState = "connecting" | "up" | "down" | "refused" | "closed";
 
 export interface LinkStatus {
   state: LinkState;
-  /** The reason if it is down or rejected, or "". */
-  why: string;
+  /** Why the connection is down or was rejected, or "". */
+  reason: string;
 }
 
 /** `retained`: the message was published before this page subscribed. */
@@ -36,7 +36,7 @@ export interface Link {
 }
 
 /** Maximum filters per SUBSCRIBE at Event Grid and AWS IoT Core. */
-const FILTERS_AT_ONCE = 8;
+const FILTERS_PER_SUBSCRIBE = 8;
 const KEEPALIVE_S = 60;
 const PING_AFTER_SILENCE_MS = 5_000;
 const DEAD_AFTER_SILENCE_MS = 12_000;
@@ -49,34 +49,34 @@ interface Connection {
   client: MqttClient;
   credentials: Credentials;
   obtainedAt: number;
-  heardAt: number;
+  lastPacketAt: number;
   retired: boolean;
   /** Number of unanswered pings; the broker responds in order. */
   pings: number;
 }
 
 export class MqttLink implements Link {
-  readonly #obtain: () => Promise<Credentials>;
-  readonly #status = signal<LinkStatus>({ state: "connecting", why: "" });
+  readonly #fetchCredentials: () => Promise<Credentials>;
+  readonly #status = signal<LinkStatus>({ state: "connecting", reason: "" });
   readonly #receivers = new Map<string, Set<Receiver>>();
   readonly #wildcards = new Set<string>();
   /** Topic → matching filters, cached per topic. Cleared when filters change. */
-  readonly #covering = new Map<string, readonly string[]>();
+  readonly #filtersByTopic = new Map<string, readonly string[]>();
   #current: Connection | null = null;
   #opening = false;
-  #again = false;
+  #reopen = false;
   #attempts = 0;
   #timer: ReturnType<typeof setTimeout> | undefined;
-  readonly #watch: ReturnType<typeof setInterval>;
-  readonly #fresh = new Set<string>();
+  readonly #aliveTimer: ReturnType<typeof setInterval>;
+  readonly #pendingFilters = new Set<string>();
   readonly #closing = new AbortController();
 
   readonly status: ReadonlySignal<LinkStatus> = this.#status;
   readonly up = computed(() => this.#status.value.state === "up");
 
-  constructor(obtain: () => Promise<Credentials>) {
-    this.#obtain = obtain;
-    this.#watch = setInterval(() => this.#checkAlive(), PING_AFTER_SILENCE_MS);
+  constructor(fetchCredentials: () => Promise<Credentials>) {
+    this.#fetchCredentials = fetchCredentials;
+    this.#aliveTimer = setInterval(() => this.#checkAlive(), PING_AFTER_SILENCE_MS);
     void this.#open();
   }
 
@@ -85,15 +85,15 @@ export class MqttLink implements Link {
     receivers.add(receiver);
     this.#receivers.set(filter, receivers);
     if (isWildcard(filter)) this.#wildcards.add(filter);
-    this.#covering.clear();
+    this.#filtersByTopic.clear();
     if (receivers.size === 1) this.#subscribeSoon(filter);
     return () => {
       receivers.delete(receiver);
       if (receivers.size > 0 || this.#receivers.get(filter) !== receivers) return;
       this.#receivers.delete(filter);
       this.#wildcards.delete(filter);
-      this.#covering.clear();
-      this.#fresh.delete(filter);
+      this.#filtersByTopic.clear();
+      this.#pendingFilters.delete(filter);
       const client = this.#current?.client;
       if (client?.connected) client.unsubscribe(filter, () => undefined);
     };
@@ -115,26 +115,26 @@ export class MqttLink implements Link {
     if (!connection?.client.connected) return Promise.reject(new Error(NO_CONNECTION));
     const { client } = connection;
     return new Promise((resolve, reject) => {
-      let before = connection.pings;
+      let earlierPings = connection.pings;
       const settle = (): void => {
         clearTimeout(timer);
-        client.off("packetreceive", heard);
-        client.off("close", lost);
+        client.off("packetreceive", onPacket);
+        client.off("close", fail);
       };
-      const heard = ({ cmd }: { cmd: string }): void => {
+      const onPacket = ({ cmd }: { cmd: string }): void => {
         if (cmd !== "pingresp") return;
-        before -= 1;
-        if (before >= 0) return;
+        earlierPings -= 1;
+        if (earlierPings >= 0) return;
         settle();
         resolve();
       };
-      const lost = (): void => {
+      const fail = (): void => {
         settle();
-        reject(new Error("The broker did not answer."));
+        reject(new Error("The broker did not respond."));
       };
-      const timer = setTimeout(lost, CONNECT_TIMEOUT_MS);
-      client.on("packetreceive", heard);
-      client.on("close", lost);
+      const timer = setTimeout(fail, CONNECT_TIMEOUT_MS);
+      client.on("packetreceive", onPacket);
+      client.on("close", fail);
       client.sendPing();
     });
   }
@@ -146,18 +146,18 @@ export class MqttLink implements Link {
   close(): void {
     this.#closing.abort();
     clearTimeout(this.#timer);
-    clearInterval(this.#watch);
+    clearInterval(this.#aliveTimer);
     this.#receivers.clear();
     this.#wildcards.clear();
     this.#drop();
-    this.#status.value = { state: "closed", why: "" };
+    this.#status.value = { state: "closed", reason: "" };
   }
 
   /** Opens a new connection and replaces the current one, if any. */
   async #open(): Promise<void> {
     if (this.#closed) return;
     if (this.#opening) {
-      this.#again = true;
+      this.#reopen = true;
       return;
     }
     this.#opening = true;
@@ -165,16 +165,16 @@ export class MqttLink implements Link {
     if (this.#current === null) this.#status.value = { ...this.#status.value, state: "connecting" };
     try {
       const obtainedAt = now();
-      const credentials = await this.#obtain();
+      const credentials = await this.#fetchCredentials();
       const client = await connect(credentials, this.#closing.signal);
-      await this.#adopt({ client, credentials, obtainedAt, heardAt: now(), retired: false, pings: 0 });
+      await this.#adopt({ client, credentials, obtainedAt, lastPacketAt: now(), retired: false, pings: 0 });
     } catch (error) {
       this.#failed(error);
     } finally {
       this.#opening = false;
     }
-    if (this.#again) {
-      this.#again = false;
+    if (this.#reopen) {
+      this.#reopen = false;
       void this.#open();
     }
   }
@@ -186,27 +186,27 @@ export class MqttLink implements Link {
   async #adopt(next: Connection): Promise<void> {
     const { client, credentials } = next;
     client.on("message", (topic, payload, packet) => {
-      next.heardAt = now();
+      next.lastPacketAt = now();
       // Both connections may deliver briefly: receivers accept duplicate messages.
       if (!next.retired) this.#deliver(topic, payload, packet.retain);
     });
     client.on("packetreceive", ({ cmd }) => {
-      next.heardAt = now();
+      next.lastPacketAt = now();
       if (cmd === "pingresp") next.pings -= 1;
     });
     client.on("packetsend", ({ cmd }) => {
       if (cmd === "pingreq") next.pings += 1;
     });
     client.on("close", () => this.#lost(next));
-    client.on("error", () => undefined); // 'close' follows, and says what there is to say.
+    client.on("error", () => undefined); // The 'close' event that follows is handled.
     const previous = this.#current;
     this.#current = next;
-    this.#fresh.clear();
+    this.#pendingFilters.clear();
     await subscribeAll(client, [...this.#receivers.keys()]);
     if (previous !== null) retire(previous);
     if (!client.connected) throw new Error("The broker closed the connection.");
     this.#attempts = 0;
-    this.#status.value = { state: "up", why: "" };
+    this.#status.value = { state: "up", reason: "" };
     const lifetimeMs = credentials.lifetime_s * 1000;
     const spentMs = now() - next.obtainedAt;
     const refreshMs = Math.max(lifetimeMs - Math.min(REFRESH_MARGIN_MS, lifetimeMs / 3) - spentMs, 1_000);
@@ -217,7 +217,7 @@ export class MqttLink implements Link {
   #lost(connection: Connection): void {
     if (this.#current !== connection || this.#closed) return;
     this.#drop();
-    this.#status.value = { state: "down", why: "The connection to the broker was lost." };
+    this.#status.value = { state: "down", reason: "The connection to the broker was lost." };
     if (!this.#opening) this.#retry();
   }
 
@@ -226,12 +226,12 @@ export class MqttLink implements Link {
     const refused = error instanceof ApiError && [401, 403, 404, 409].includes(error.status);
     if (refused) {
       this.#drop();
-      this.#status.value = { state: "refused", why: sentence(error) };
+      this.#status.value = { state: "refused", reason: sentence(error) };
       return;
     }
     if (this.#current === null || !this.#current.client.connected) {
       this.#drop();
-      this.#status.value = { state: "down", why: sentence(error) };
+      this.#status.value = { state: "down", reason: sentence(error) };
     }
     this.#retry();
   }
@@ -250,37 +250,37 @@ export class MqttLink implements Link {
   }
 
   #deliver(topic: string, payload: Uint8Array, retained: boolean): void {
-    let filters = this.#covering.get(topic);
+    let filters = this.#filtersByTopic.get(topic);
     if (filters === undefined) {
       filters = [topic, ...[...this.#wildcards].filter((filter) => matches(filter, topic))];
-      this.#covering.set(topic, filters);
+      this.#filtersByTopic.set(topic, filters);
     }
     for (const filter of filters) this.#receivers.get(filter)?.forEach((receiver) => receiver(topic, payload, retained));
   }
 
   /** Sends the subscriptions of one event-loop turn together, in as few packets as the limit permits. */
   #subscribeSoon(filter: string): void {
-    if (this.#fresh.size === 0) {
+    if (this.#pendingFilters.size === 0) {
       queueMicrotask(() => {
-        const filters = [...this.#fresh];
-        this.#fresh.clear();
+        const filters = [...this.#pendingFilters];
+        this.#pendingFilters.clear();
         const client = this.#current?.client;
-        if (client?.connected) subscribeAll(client, filters).catch(() => undefined); // Lost: all are asked for again.
+        if (client?.connected) subscribeAll(client, filters).catch(() => undefined); // After a connection loss all filters are subscribed again.
       });
     }
-    this.#fresh.add(filter);
+    this.#pendingFilters.add(filter);
   }
 
   /** Detects a dead connection before the broker's keep-alive does. */
   #checkAlive(): void {
     const connection = this.#current;
     if (!connection?.client.connected) return;
-    const silenceMs = now() - connection.heardAt;
+    const silenceMs = now() - connection.lastPacketAt;
     if (silenceMs > DEAD_AFTER_SILENCE_MS && silenceMs < 4 * DEAD_AFTER_SILENCE_MS) {
       this.#lost(connection);
     } else if (silenceMs > PING_AFTER_SILENCE_MS / 2) {
       // After a suspended page, silence is no evidence: ping first.
-      if (silenceMs >= 4 * DEAD_AFTER_SILENCE_MS) connection.heardAt = now();
+      if (silenceMs >= 4 * DEAD_AFTER_SILENCE_MS) connection.lastPacketAt = now();
       connection.client.sendPing();
     }
   }
@@ -321,7 +321,7 @@ async function connect(credentials: Credentials, closing: AbortSignal): Promise<
     };
     const failed = (error: Error): void => {
       settle();
-      client.on("error", () => undefined); // What it says after its end is of no use.
+      client.on("error", () => undefined); // Ignore errors after the end.
       client.end(true);
       reject(error);
     };
@@ -339,19 +339,19 @@ async function connect(credentials: Credentials, closing: AbortSignal): Promise<
 }
 
 async function subscribeAll(client: MqttClient, filters: readonly string[]): Promise<void> {
-  for (let start = 0; start < filters.length; start += FILTERS_AT_ONCE) {
-    const batch = filters.slice(start, start + FILTERS_AT_ONCE);
+  for (let start = 0; start < filters.length; start += FILTERS_PER_SUBSCRIBE) {
+    const batch = filters.slice(start, start + FILTERS_PER_SUBSCRIBE);
     // QoS 1 is the maximum: telemetry is still delivered at its published QoS 0.
     await new Promise<void>((resolve, reject) => {
       const failed = (): void => {
         clearTimeout(timer);
         client.off("close", failed);
-        reject(new Error("The broker did not answer."));
+        reject(new Error("The broker did not respond."));
       };
       const timer = setTimeout(failed, CONNECT_TIMEOUT_MS);
       client.once("close", failed);
       client.subscribe(batch, { qos: 1 }, () => {
-        // A rejected filter does not affect the others; its data stays unknown and is shown as such.
+        // A rejected filter does not affect the others; its data is shown as unknown.
         clearTimeout(timer);
         client.off("close", failed);
         if (client.connected) resolve();

@@ -3,8 +3,8 @@
  * are accepted, so that the page can read messages of newer agents. The page draws validated data only.
  */
 import {
-  MAX_JOINTS, MessageError, anything, byName, count, fail, flag, list, nullable, number, numbers, object, oneOf,
-  optional, place, text, type Check,
+  MAX_JOINTS, MessageError, record, byName, count, fail, flag, list, nullable, number, numbers, object, oneOf,
+  optional, pathOf, text, type Check,
 } from "./checks";
 import type { Pose, Quaternion, Vector3 } from "../lib/vectors";
 import type {
@@ -15,8 +15,6 @@ import type {
 
 /** Largest message of the contract [bytes]. */
 const MAX_BYTES = 128 * 1024;
-
-
 const MAX_BODIES = 512;
 
 const vector3 = numbers<Vector3>(3);
@@ -186,9 +184,9 @@ const jointTelemetry = object<Required<JointTelemetry>>({
 
 /** Numbers and states by name. */
 const values: Check<Record<string, number | boolean>> = (value, at, key) => {
-  const entries = Object.entries(anything(value, at, key));
+  const entries = Object.entries(record(value, at, key));
   if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} values`, key);
-  const here = place(at, key);
+  const here = pathOf(at, key);
   return Object.fromEntries(
     entries.map(([name, entry]) => [name, typeof entry === "boolean" ? entry : number(entry, here, name)]),
   );
@@ -203,7 +201,7 @@ const event = object<Required<Event>>({
   kind: text,
   severity: oneOf("info", "warning", "error"),
   message: text,
-  data: optional(anything, {}),
+  data: optional(record, {}),
 });
 
 const ack = object<Required<Ack>>({
@@ -215,7 +213,7 @@ const ack = object<Required<Ack>>({
   reason: nullable(object<Reason>({ code: text, message: text })),
   progress: nullable(number),
   output: optional(text, ""),
-  result: optional(anything, {}),
+  result: optional(record, {}),
 });
 
 const decoder = new TextDecoder("utf-8", { fatal: true });
@@ -303,13 +301,13 @@ export function readMeasurements(payload: Uint8Array): Measurements {
 
 /** The result of `shoot`: the values of each stream. Throws `MessageError`. */
 export function readShot(result: unknown): Record<string, Record<string, number | boolean>> {
-  const streams = Object.entries(anything(anything(result, "result")["values"], "result.values"));
+  const streams = Object.entries(record(record(result, "result")["values"], "result.values"));
   return Object.fromEntries(streams.map(([name, entry]) => [name, values(entry, `result.values.${name}`)]));
 }
 
 /** The result of `set_control`: the applied values. Throws `MessageError`. */
 export function readApplied(result: unknown): Record<string, number> {
-  return byName(anything(result, "result")["applied"], "result.applied");
+  return byName(record(result, "result")["applied"], "result.applied");
 }
 
 /** One lidar revolution from a `scan` capture. `range_m` is `null` for a beam without a return. */
@@ -322,11 +320,11 @@ export interface LidarScan {
 
 const MAX_BEAMS = 100_000;
 
-/** A file `scan`. Throws `MessageError`. */
+/** The content of a `scan` file. Throws `MessageError`. */
 export function readScan(content: string): LidarScan {
-  let given: unknown;
+  let parsed: unknown;
   try {
-    given = JSON.parse(content);
+    parsed = JSON.parse(content);
   } catch {
     throw new MessageError("scan is not JSON");
   }
@@ -335,7 +333,7 @@ export function readScan(content: string): LidarScan {
     angle_rad: list(number, MAX_BEAMS),
     range_m: list(nullable(number), MAX_BEAMS),
     furthest_m: number,
-  })(given, "scan");
+  })(parsed, "scan");
   if (found.angle_rad.length !== found.range_m.length) fail("scan.range_m", "as long as angle_rad");
   return found;
 }

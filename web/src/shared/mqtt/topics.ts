@@ -5,7 +5,7 @@ export interface DeviceTopics {
   desc: string;
   twin: string;
   state: string;
-  /** The filter; the joints' stream is `tele/joints`. */
+  /** Filter for all measurement streams. */
   tele: string;
   joints: string;
   cam: (name: string) => string;
@@ -33,8 +33,8 @@ export function deviceTopics(base: string): DeviceTopics {
 
 /** Whether an MQTT filter matches a topic. */
 export function matches(filter: string, topic: string): boolean {
-  const wanted = filter.split("/");
-  const given = topic.split("/");
-  if (wanted.at(-1) !== "#" && wanted.length !== given.length) return false;
-  return wanted.every((level, index) => level === "#" || (index < given.length && (level === "+" || level === given[index])));
+  const filterLevels = filter.split("/");
+  const topicLevels = topic.split("/");
+  if (filterLevels.at(-1) !== "#" && filterLevels.length !== topicLevels.length) return false;
+  return filterLevels.every((level, index) => level === "#" || (index < topicLevels.length && (level === "+" || level === topicLevels[index])));
 }

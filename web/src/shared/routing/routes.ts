@@ -2,7 +2,7 @@
 import { signal, type ReadonlySignal } from "@preact/signals";
 
 /** Route parameters; empty if the address lacks the parameter. */
-export type At = Readonly<Record<"device" | "id" | "ids" | "name" | "robotType" | "space", string>>;
+export type RouteParameters = Readonly<Record<"device" | "id" | "ids" | "name" | "robotType" | "space", string>>;
 
 /** The address of each page: `:name` is a parameter, `:name?` an optional one. */
 const PATTERNS = {
@@ -32,10 +32,10 @@ export type PageName = keyof typeof PATTERNS;
 
 interface Route {
   page: PageName;
-  at: At;
+  at: RouteParameters;
 }
 
-const NOTHING: At = { device: "", id: "", ids: "", name: "", robotType: "", space: "" };
+const NO_PARAMETERS: RouteParameters = { device: "", id: "", ids: "", name: "", robotType: "", space: "" };
 
 const EXPRESSIONS: readonly (readonly [PageName, RegExp])[] = (Object.entries(PATTERNS) as [PageName, string][]).map(([name, pattern]) => [
   name,
@@ -52,14 +52,14 @@ export function read(hash: string): Route {
     const found = expression.exec(hash);
     if (found === null) continue;
     const named = Object.entries(found.groups ?? {}).filter(([, value]) => (value as string | undefined) !== undefined);
-    return { page, at: { ...NOTHING, ...Object.fromEntries(named) } };
+    return { page, at: { ...NO_PARAMETERS, ...Object.fromEntries(named) } };
   }
-  return { page: "devices", at: NOTHING };
+  return { page: "devices", at: NO_PARAMETERS };
 }
 
 /** The address of a page with its parameters. */
-export function pageAddress(page: PageName, at: Partial<At> = {}): string {
-  return PATTERNS[page].replaceAll(/\/:(\w+)\??/g, (_, name: keyof At) => (at[name] ? `/${at[name]}` : ""));
+export function pageAddress(page: PageName, at: Partial<RouteParameters> = {}): string {
+  return PATTERNS[page].replaceAll(/\/:(\w+)\??/g, (_, name: keyof RouteParameters) => (at[name] ? `/${at[name]}` : ""));
 }
 
 const current = signal(read(location.hash));

@@ -5,7 +5,7 @@ import { CollapsibleTitle } from "./collapsible-card";
 interface CardProps {
   title: string;
   class?: string;
-  /** Content beside the title, such as a note. */
+  /** Content next to the title, such as a note. */
   aside?: ComponentChildren;
   "data-testid"?: string;
   children: ComponentChildren;

@@ -17,12 +17,12 @@ const STEPS: readonly Colour[] = [
 ];
 
 /** Colour for missing values. */
-export const NOTHING: Colour = [128, 128, 128];
+export const MISSING_COLOUR: Colour = [128, 128, 128];
 
 export function falseColour(value: number): Colour {
   const at = Math.min(1, Math.max(0, value)) * (STEPS.length - 1);
   const index = Math.min(STEPS.length - 2, Math.floor(at));
-  const [from = NOTHING, to = NOTHING] = STEPS.slice(index, index + 2);
+  const [from = MISSING_COLOUR, to = MISSING_COLOUR] = STEPS.slice(index, index + 2);
   const mix = (channel: 0 | 1 | 2): number => Math.round(from[channel] + (to[channel] - from[channel]) * (at - index));
   return [mix(0), mix(1), mix(2)];
 }

@@ -7,34 +7,34 @@ interface ConfirmProps {
   /** The action and its object, for screen readers. */
   description?: string;
   question: string;
-  yes: string;
-  busy: string;
-  keep: string;
-  onYes: () => Promise<void>;
+  confirmLabel: string;
+  busyLabel: string;
+  cancelLabel: string;
+  onConfirm: () => Promise<void>;
   "data-testid"?: string;
 }
 
 /** A button for irreversible actions: it asks for confirmation in place and shows errors there. */
-export function ConfirmButton({ label, description, question, yes, busy, keep, onYes, ...rest }: ConfirmProps) {
-  const [asking, setAsking] = useState(false);
+export function ConfirmButton({ label, description, question, confirmLabel, busyLabel, cancelLabel, onConfirm, ...rest }: ConfirmProps) {
+  const [confirming, setConfirming] = useState(false);
   const [working, setWorking] = useState(false);
-  const [wrong, setWrong] = useState("");
-  const ask = useReturnFocus(asking);
-  const safe = useRef<HTMLButtonElement>(null);
+  const [error, setError] = useState("");
+  const openButton = useReturnFocus(confirming);
+  const cancelButton = useRef<HTMLButtonElement>(null);
 
   // The focused button is removed: move the focus to Cancel.
   useEffect(() => {
-    if (asking) safe.current?.focus();
-  }, [asking]);
+    if (confirming) cancelButton.current?.focus();
+  }, [confirming]);
 
-  const go = async (): Promise<void> => {
+  const confirm = async (): Promise<void> => {
     setWorking(true);
-    setWrong("");
+    setError("");
     try {
-      await onYes();
-      setAsking(false);
+      await onConfirm();
+      setConfirming(false);
     } catch (error) {
-      setWrong(sentence(error));
+      setError(sentence(error));
     } finally {
       setWorking(false);
     }
@@ -42,34 +42,34 @@ export function ConfirmButton({ label, description, question, yes, busy, keep, o
 
   return (
     <div class="confirm">
-      {asking ? (
+      {confirming ? (
         <div class="row" role="group" aria-label={question}>
           <span>{question}</span>
-          <button type="button" class="danger" data-testid="confirm-yes" disabled={working} onClick={() => void go()}>
-            {working ? busy : yes}
+          <button type="button" class="danger" data-testid="confirm-yes" disabled={working} onClick={() => void confirm()}>
+            {working ? busyLabel : confirmLabel}
           </button>
-          <button type="button" ref={safe} disabled={working} onClick={() => setAsking(false)}>
-            {keep}
+          <button type="button" ref={cancelButton} disabled={working} onClick={() => setConfirming(false)}>
+            {cancelLabel}
           </button>
         </div>
       ) : (
         <button
           type="button"
           class="plain"
-          ref={ask}
+          ref={openButton}
           aria-label={description}
           onClick={() => {
-            setWrong("");
-            setAsking(true);
+            setError("");
+            setConfirming(true);
           }}
           {...rest}
         >
           {label}
         </button>
       )}
-      {wrong !== "" && (
+      {error !== "" && (
         <p class="field-error" role="alert">
-          {wrong}
+          {error}
         </p>
       )}
     </div>

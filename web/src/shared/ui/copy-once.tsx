@@ -10,16 +10,16 @@ interface SecretProps {
 /** A secret that is shown once, with a copy button. */
 export function CopyOnce({ id, label, value }: SecretProps) {
   const field = useRef<HTMLInputElement>(null);
-  const [said, setSaid] = useState("");
+  const [message, setMessage] = useState("");
   const copy = async (): Promise<void> => {
     try {
       await navigator.clipboard.writeText(value);
-      setSaid(common.copy.copied);
+      setMessage(common.copy.copied);
     } catch {
       // Browsers deny clipboard access on insecure origins.
       field.current?.focus();
       field.current?.select();
-      setSaid(common.copy.manually);
+      setMessage(common.copy.manually);
     }
   };
   return (
@@ -41,7 +41,7 @@ export function CopyOnce({ id, label, value }: SecretProps) {
         </button>
       </div>
       <p class="field-note" role="status">
-        {said}
+        {message}
       </p>
     </div>
   );

@@ -9,20 +9,20 @@ interface DurationChoice {
   date: string;
 }
 
-export const FOR_GOOD: DurationChoice = { choice: "never", date: "" };
-export const AS_IT_IS: DurationChoice = { choice: "keep", date: "" };
+export const NO_EXPIRY: DurationChoice = { choice: "never", date: "" };
+export const UNCHANGED: DurationChoice = { choice: "keep", date: "" };
 export const ONE_DAY: DurationChoice = { choice: "day", date: "" };
 
-/** Duration in seconds from now; `null`: no end, `undefined`: invalid. `kept`: the previous remaining time. */
-export function seconds({ choice, date }: DurationChoice, kept: number | null = null): number | null | undefined {
+/** Duration in seconds from now; `null`: no end, `undefined`: invalid. `remainingS`: the previous remaining time. */
+export function seconds({ choice, date }: DurationChoice, remainingS: number | null = null): number | null | undefined {
   if (choice === "never") return null;
-  if (choice === "keep") return kept;
+  if (choice === "keep") return remainingS;
   if (choice !== "date") return LENGTHS[choice];
   const left = Math.floor((new Date(date).getTime() - Date.now()) / 1000);
-  return left >= 60 ? left : undefined; // And where there is no date yet.
+  return left >= 60 ? left : undefined; // `left` is NaN without a date.
 }
 
-interface LastingFieldProps {
+interface DurationPickerProps {
   id: string;
   label: string;
   value: DurationChoice;
@@ -30,7 +30,7 @@ interface LastingFieldProps {
   onChange: (value: DurationChoice) => void;
 }
 
-export function DurationPicker({ id, label, value, choices, onChange }: LastingFieldProps) {
+export function DurationPicker({ id, label, value, choices, onChange }: DurationPickerProps) {
   return (
     <div class="field">
       <label for={id}>{label}</label>

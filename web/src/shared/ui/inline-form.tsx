@@ -2,26 +2,26 @@
 import type { ComponentChildren, Ref } from "preact";
 import { common } from "../i18n/common";
 
-interface AskedFormProps {
+interface InlineFormProps {
   label: string;
   /** Labels of the submit button: idle and busy. */
-  todo: string;
-  doing: string;
+  submitLabel: string;
+  busyLabel: string;
   busy: boolean;
-  close?: string;
+  cancelLabel?: string;
   /** Empty without a message. */
-  wrong: string;
-  done?: string;
+  error: string;
+  successMessage?: string;
   /** Id of the message, for `aria-describedby` of invalid fields. */
-  answerId?: string;
+  messageId?: string;
   form?: Ref<HTMLFormElement>;
-  sendTestId?: string;
-  onSend: () => Promise<void>;
+  submitTestId?: string;
+  onSubmit: () => Promise<void>;
   onClose: () => void;
   children: ComponentChildren;
 }
 
-export function InlineForm({ label, todo, doing, busy, wrong, done = "", onSend, onClose, children, ...rest }: AskedFormProps) {
+export function InlineForm({ label, submitLabel, busyLabel, busy, error, successMessage = "", onSubmit, onClose, children, ...rest }: InlineFormProps) {
   return (
     <form
       class="panel fields"
@@ -29,27 +29,27 @@ export function InlineForm({ label, todo, doing, busy, wrong, done = "", onSend,
       aria-label={label}
       onSubmit={(event) => {
         event.preventDefault();
-        void onSend();
+        void onSubmit();
       }}
     >
       {children}
       <div class="row">
-        <button type="submit" class="primary" data-testid={rest.sendTestId} disabled={busy}>
-          {busy ? doing : todo}
+        <button type="submit" class="primary" data-testid={rest.submitTestId} disabled={busy}>
+          {busy ? busyLabel : submitLabel}
         </button>
         <button type="button" disabled={busy} onClick={onClose}>
-          {rest.close ?? common.form.cancel}
+          {rest.cancelLabel ?? common.form.cancel}
         </button>
       </div>
-      <p id={rest.answerId} class={wrong === "" ? "field-note" : "field-error"} aria-live="polite">
-        {wrong === "" ? done : wrong}
+      <p id={rest.messageId} class={error === "" ? "field-note" : "field-error"} aria-live="polite">
+        {error === "" ? successMessage : error}
       </p>
     </form>
   );
 }
 
-/** The recipient's account name. The error `wrong` is shown in the form message `answerId`. */
-export function AccountNameField(props: { id: string; answerId: string; value: string; wrong: boolean; onInput: (name: string) => void }) {
+/** The recipient's account name. If `invalid`, the form message `messageId` contains the error. */
+export function AccountNameField(props: { id: string; messageId: string; value: string; invalid: boolean; onInput: (name: string) => void }) {
   return (
     <div class="field">
       <label for={props.id}>{common.form.accountName}</label>
@@ -62,8 +62,8 @@ export function AccountNameField(props: { id: string; answerId: string; value: s
         required
         maxLength={200}
         value={props.value}
-        aria-invalid={props.wrong}
-        aria-describedby={props.answerId}
+        aria-invalid={props.invalid}
+        aria-describedby={props.messageId}
         onInput={(event) => props.onInput(event.currentTarget.value)}
       />
     </div>

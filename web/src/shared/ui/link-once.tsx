@@ -3,14 +3,14 @@ import { useEffect, useRef } from "preact/hooks";
 import { common } from "../i18n/common";
 import { CopyOnce } from "./copy-once";
 
-interface MadeLinkProps {
+interface LinkOnceProps {
   link: string;
   /** The recipient and the expiry. */
   note: string;
-  onDone: () => void;
+  onClose: () => void;
 }
 
-export function LinkOnce({ link, note, onDone }: MadeLinkProps) {
+export function LinkOnce({ link, note, onClose }: LinkOnceProps) {
   const box = useRef<HTMLDivElement>(null);
   useEffect(() => box.current?.querySelector("input")?.focus(), []);
   return (
@@ -21,7 +21,7 @@ export function LinkOnce({ link, note, onDone }: MadeLinkProps) {
       <CopyOnce id="invitation-link" label={common.createdLink.label} value={link} />
       <p class="quiet small">{note}</p>
       <div class="row">
-        <button type="button" onClick={onDone}>
+        <button type="button" onClick={onClose}>
           {common.createdLink.close}
         </button>
       </div>

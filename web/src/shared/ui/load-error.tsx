@@ -1,12 +1,12 @@
 import { common } from "../i18n/common";
 
 /** A load error with a retry button; empty without an error. */
-export function LoadError({ said, again }: { said: string; again: () => void }) {
-  if (said === "") return null;
+export function LoadError({ reason, retry }: { reason: string; retry: () => void }) {
+  if (reason === "") return null;
   return (
     <p class="notice bad row" role="alert">
-      <span>{common.loadFailed(said)}</span>
-      <button type="button" onClick={again}>
+      <span>{common.loadFailed(reason)}</span>
+      <button type="button" onClick={retry}>
         {common.tryAgain}
       </button>
     </p>

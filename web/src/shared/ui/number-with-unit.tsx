@@ -1,4 +1,4 @@
-interface SpeedFieldProps {
+interface NumberWithUnitProps {
   label: string;
   name: string;
   range: { least: number; most: number; step: number };
@@ -8,7 +8,7 @@ interface SpeedFieldProps {
   onChange: (value: number) => void;
 }
 
-export function NumberWithUnit({ label, name, range, value, shown, onChange }: SpeedFieldProps) {
+export function NumberWithUnit({ label, name, range, value, shown, onChange }: NumberWithUnitProps) {
   return (
     <label class="speed">
       <span>{label}</span>

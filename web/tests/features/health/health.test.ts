@@ -1,6 +1,6 @@
 import { describe, expect, it } from "vitest";
 import { healthNow, intervalAround, openCount, standings, watchedQuantity, worstFirst } from "../../../src/features/health/model/health";
-import type { Fault, Watched } from "../../../src/shared/api/health";
+import type { Fault, MonitoredField } from "../../../src/shared/api/health";
 
 const fault = (code: string, more: Partial<Fault> = {}): Fault => ({
   id: code, code, state: "raised", source: "device", kind: "reported", severity: "error", message: code, stream: "",
@@ -41,7 +41,7 @@ describe("an open fault", () => {
   });
 });
 
-const watched = (more: Partial<Watched>): Watched => ({
+const watched = (more: Partial<MonitoredField>): MonitoredField => ({
   stream: "health", field: "temperature_c.elbow", label: "Joint temperature", unit: "°C", advice: "Let it rest.",
   value: 30, baseline: 30, usual_low: null, usual_high: null, warning_low: null, warning_high: 70, low: null, high: 80,
   slope_per_s: null, limit_in_s: null, findings: [], updated_at: "2026-01-01T12:00:00Z", ...more,

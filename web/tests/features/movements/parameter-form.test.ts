@@ -74,7 +74,7 @@ describe("stored values", () => {
     expect(storedDraft(storage, "ann", "ur5", "wave").read()).toEqual(draft);
     expect(storedDraft(storage, "bob", "ur5", "wave").read()).toBeNull();
     expect(storedParameters(storage, "ann", "ur5", "wave").read()).toBeNull();
-    storedDraft(storage, "ann", "ur5", "wave").drop();
+    storedDraft(storage, "ann", "ur5", "wave").remove();
     expect(storedDraft(storage, "ann", "ur5", "wave").read()).toBeNull();
   });
 

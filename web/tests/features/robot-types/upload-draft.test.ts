@@ -1,7 +1,7 @@
 import { beforeEach, describe, expect, it } from "vitest";
 import { readFinding, readFindings } from "../../../src/features/robot-types/model/parse-findings";
 import { ApiError } from "../../../src/shared/api/http";
-import type { Look, RobotType, RobotTypes, TypeFolder, TypeModel } from "../../../src/shared/api/robot-types";
+import type { TypePreview, RobotType, RobotTypes, TypeFolder, TypeModel } from "../../../src/shared/api/robot-types";
 import { UploadDraft } from "../../../src/features/robot-types/model/upload-draft";
 import { selectFiles, packFiles } from "../../../src/features/robot-types/model/upload-files";
 
@@ -71,26 +71,26 @@ class FakeChecker {
   open = 1;
   failure: Error | null = null;
 
-  #look(id: string, state: "checking" | "ready" | "rejected"): Look {
+  #look(id: string, state: "checking" | "ready" | "rejected"): TypePreview {
     const errors = state === "rejected" ? this.errors : [];
     return { id, expires_at: "", robot_type: { type: "lever", upload: { version: 1, state, errors, warnings: [], uploaded_at: "" } } as unknown as RobotType };
   }
 
-  look(files: TypeFolder): Promise<Look> {
+  createPreview(files: TypeFolder): Promise<TypePreview> {
     if (this.failure !== null) return Promise.reject(this.failure);
     return Promise.resolve(this.#look(`look${this.checked.push(files)}`, "checking"));
   }
 
-  lookAgain(id: string): Promise<Look> {
+  preview(id: string): Promise<TypePreview> {
     this.open -= 1;
     return Promise.resolve(this.#look(id, this.open > 0 ? "checking" : this.errors.length > 0 ? "rejected" : "ready"));
   }
 
-  lookModel(): Promise<TypeModel> {
+  previewModel(): Promise<TypeModel> {
     return Promise.resolve({ twin: { device: "lever", bodies: [] }, actuators: [], cameras: [] });
   }
 
-  save(): Promise<RobotType> {
+  savePreview(): Promise<RobotType> {
     return Promise.resolve(this.#look("", "ready").robot_type);
   }
 
@@ -98,7 +98,7 @@ class FakeChecker {
     return name === "bad" ? Promise.reject(new ApiError(422, "movement-invalid", "Line 1: no.")) : Promise.resolve({});
   }
 
-  drop(id: string): Promise<void> {
+  deletePreview(id: string): Promise<void> {
     this.dropped.push(id);
     return Promise.resolve();
   }

@@ -44,7 +44,7 @@ export class Session {
 
   /** Creates an account with an invitation and signs in to it. Throws the server's error. */
   async join(invitation: string, name: string, password: string): Promise<void> {
-    await this.#api.makeAccount(invitation, name, password);
+    await this.#api.createAccount(invitation, name, password);
     this.#state.value = { kind: "in", account: await this.#api.me() };
   }
 

@@ -3,7 +3,7 @@ import type { ControlRequestInfo } from "../../../shared/api/types";
 import type { DeviceStore } from "../../devices/model";
 import { effect, signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
-import { now, onThisClock } from "../../../shared/lib/clock";
+import { now, toPageClock } from "../../../shared/lib/clock";
 import { ApiError, sentence } from "../../../shared/api/http";
 
 /** Time for the holder to respond [ms]. */
@@ -56,7 +56,7 @@ export class ControlRequest {
         this.#takeBack(request.id);
         return;
       }
-      const until = onThisClock(Date.parse(request.expires_at));
+      const until = toPageClock(Date.parse(request.expires_at));
       this.#state.value = { kind: "open", id: request.id, epoch: request.epoch, until, shown: confirmed, of };
       this.#lookIn(LOOK_MS);
     } catch (error) {

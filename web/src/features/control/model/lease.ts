@@ -105,7 +105,7 @@ export class Control {
     this.#answer.value = { kind: "sending", accept };
     if (accept) this.#handingTo = asked.by;
     try {
-      await this.#api.answerRequest(this.#device.id, asked.id, accept);
+      await this.#api.respondToRequest(this.#device.id, asked.id, accept);
       this.#answer.value = accept ? { kind: "none" } : { kind: "kept", from: asked.by };
       if (accept) this.#handed(asked.by);
     } catch (error) {
@@ -183,7 +183,7 @@ export class Control {
     this.#cleanups = [
       effect(() => {
         this.#linkStatus.value = link.status.value;
-        if (link.status.value.state === "refused") this.#lose(link.status.value.why);
+        if (link.status.value.state === "refused") this.#lose(link.status.value.reason);
       }),
       effect(() => this.#hear(epoch)),
     ];

@@ -12,7 +12,7 @@ export class Fleet {
   readonly #api: Api;
   readonly link: Link;
   readonly #devices = signal<ReadonlyMap<string, DeviceStore> | null>(null);
-  readonly #trouble = signal<string | null>(null);
+  readonly #error = signal<string | null>(null);
   readonly #spaces = signal<ReadonlyMap<string, string>>(new Map());
   readonly #ends = new Map<string, () => void>();
   readonly #timer: ReturnType<typeof setInterval>;
@@ -22,7 +22,7 @@ export class Fleet {
   /** By id, in list order; `null` until the first response. */
   readonly devices: ReadonlySignal<ReadonlyMap<string, DeviceStore> | null> = this.#devices;
   /** The error of the last read, or `null`. */
-  readonly trouble: ReadonlySignal<string | null> = this.#trouble;
+  readonly error: ReadonlySignal<string | null> = this.#error;
 
   constructor(api: Api, link?: Link) {
     this.#api = api;
@@ -41,9 +41,9 @@ export class Fleet {
     try {
       this.#take(await this.#api.devices());
       if (this.#unnamed()) this.#spaces.value = new Map((await this.#api.spaces()).map(({ id, name }) => [id, name]));
-      this.#trouble.value = null;
+      this.#error.value = null;
     } catch (error) {
-      this.#trouble.value = sentence(error);
+      this.#error.value = sentence(error);
     }
   }
 

@@ -5,7 +5,7 @@ import { RecentTelemetry } from "../../twin/model";
 import { computed, signal, type ReadonlySignal, type Signal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
 import { ApiError } from "../../../shared/api/http";
-import { clock, now, onThisClock } from "../../../shared/lib/clock";
+import { clock, now, toPageClock } from "../../../shared/lib/clock";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
 import { readAck, readDescription, readEvent, readMeasurements, readPresence, readState, readTelemetry, readTwin, type KnownAck, type KnownDescription, type KnownEvent, type KnownState, type KnownTelemetry, type KnownTwin } from "../../../shared/mqtt/parse-messages";
 import { readFrame, type CameraFrame } from "../../../shared/mqtt/camera-frame";
@@ -83,7 +83,7 @@ export class DeviceStore {
   /** Time of the last message from the device, or from the cloud for it, on the page's clock [ms]. */
   readonly lastSeenAt = computed(() => {
     const at = this.#info.value.last_seen_at;
-    const told = at === null ? null : onThisClock(Date.parse(at));
+    const told = at === null ? null : toPageClock(Date.parse(at));
     const heard = this.#heardAt.value;
     return told === null || (heard !== null && heard > told) ? heard : told;
   });
@@ -131,7 +131,7 @@ export class DeviceStore {
   readonly holder = computed<{ name: string; mine: boolean } | null>(() => {
     const lease = this.#lease.value;
     const told = this.live.value ? this.#state.value : null;
-    const current = lease !== null && onThisClock(Date.parse(lease.expires_at)) > clock.value ? lease : null;
+    const current = lease !== null && toPageClock(Date.parse(lease.expires_at)) > clock.value ? lease : null;
     if (told !== null && (current === null || current.epoch < told.epoch)) {
       return told.lease === null ? null : { name: told.lease.holder, mine: false };
     }
@@ -150,7 +150,7 @@ export class DeviceStore {
       return request ? { id: request.id, by: request.requester, until: this.#stateAt + request.expires_in_ms } : null;
     }
     const request = lease?.request ?? null;
-    return request === null ? null : { id: request.id, by: request.requester, until: onThisClock(Date.parse(request.expires_at)) };
+    return request === null ? null : { id: request.id, by: request.requester, until: toPageClock(Date.parse(request.expires_at)) };
   });
 
   constructor(info: Device, api: Api, link: Link) {
@@ -188,7 +188,7 @@ export class DeviceStore {
       [this.topics.conn]: (payload, _, retained) => this.#hearPresence(readPresence(payload), retained),
       [this.topics.state]: (payload, _, retained) => {
         const state = readState(payload);
-        this.#stateAt = retained ? Math.min(now(), onThisClock(state.at_ms)) : now();
+        this.#stateAt = retained ? Math.min(now(), toPageClock(state.at_ms)) : now();
         this.#state.value = state;
         this.#noteHeard(state.at_ms, retained);
       },
@@ -364,7 +364,7 @@ export class DeviceStore {
 
   /** A retained message is older than its arrival: use its own time, but never a future one. */
   #noteHeard(atMs: number, retained: boolean): void {
-    const at = retained ? Math.min(now(), onThisClock(atMs)) : now();
+    const at = retained ? Math.min(now(), toPageClock(atMs)) : now();
     if (this.#heardAt.value === null || at > this.#heardAt.value) this.#heardAt.value = at;
   }
 }

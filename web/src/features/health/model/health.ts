@@ -1,7 +1,7 @@
 /** Device health: monitored fields, and faults from the first report to the end. */
 import type { DeviceStore, Reach } from "../../devices/model";
 import { type Quantity, quantityOf } from "../../sensors/model";
-import type { Fault, HealthState, Watched } from "../../../shared/api/health";
+import type { Fault, HealthState, MonitoredField } from "../../../shared/api/health";
 import type { KnownDescription, KnownTelemetry } from "../../../shared/mqtt/parse-messages";
 import type { Fault as ReportedFault } from "../../../shared/mqtt/protocol.generated";
 
@@ -48,7 +48,7 @@ export function healthNow(stored: HealthState, told: readonly ReportedFault[] | 
 }
 
 /** Label, displayed unit and limits of a monitored field. */
-export function watchedQuantity(watched: Watched, description: KnownDescription | null): Quantity {
+export function watchedQuantity(watched: MonitoredField, description: KnownDescription | null): Quantity {
   const { stream, field, label, unit, advice, low, high, warning_low, warning_high } = watched;
   const [name = field, ...part] = field.split(".");
   const limited = [low, high, warning_low, warning_high].some((limit) => limit !== null);
@@ -96,7 +96,7 @@ export function isLate(device: DeviceStore, stream: string): boolean {
 }
 
 /** Fields with findings first, otherwise in list order. */
-export function worstFirst(fields: readonly Watched[]): Watched[] {
+export function worstFirst(fields: readonly MonitoredField[]): MonitoredField[] {
   return [...fields].sort((one, other) => other.findings.length - one.findings.length);
 }
 

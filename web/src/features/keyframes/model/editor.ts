@@ -62,7 +62,7 @@ export class Editor {
 
   /** Ends a drag. */
   settle(): void {
-    this.#history.settle();
+    this.#history.endGesture();
   }
 
   undo(): void {

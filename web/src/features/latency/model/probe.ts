@@ -139,7 +139,7 @@ export class LatencyProbe {
   }
 
   async #once(way: ProbeKind): Promise<void> {
-    if (way === "cloud") return this.#api.latency.ask();
+    if (way === "cloud") return this.#api.latency.measureRoundTrip();
     if (way === "broker") return this.#link.ping();
     const asked = { epoch: this.#epoch(), waitFor: "done", timeoutMs: SHOT_TIMEOUT_MS } as const;
     const action = await this.#api.startAction(this.#device.id, { kind: SHOOT, streams: [] }, asked, newId());

@@ -77,7 +77,7 @@ export class ScriptDraft {
     this.#basedOn = this.#base.value?.version ?? 0;
     this.#restored.value = null;
     this.#conflict.value = null;
-    this.#kept.drop();
+    this.#kept.remove();
     return given;
   }
 
@@ -124,7 +124,7 @@ export class ScriptDraft {
   }
 
   #keep(): void {
-    if (this.#text.value === (this.#base.value?.source ?? this.#template)) this.#kept.drop();
+    if (this.#text.value === (this.#base.value?.source ?? this.#template)) this.#kept.remove();
     else this.#kept.write({ source: this.#text.value, basedOn: this.#basedOn, at: Date.now() });
   }
 

@@ -3,7 +3,7 @@ import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-co
 import { now } from "../../../shared/lib/clock";
 import { readFindings, type Finding } from "./parse-findings";
 import { ApiError, sentence } from "../../../shared/api/http";
-import type { Look, RobotType, RobotTypes, TypeModel } from "../../../shared/api/robot-types";
+import type { TypePreview, RobotType, RobotTypes, TypeModel } from "../../../shared/api/robot-types";
 import { selectFiles, MANIFEST, MAX_BYTES, packFiles, size, type Files } from "./upload-files";
 
 type DraftStep = "empty" | "sending" | "checking" | "good" | "wrong" | "unsent" | "saving" | "saved";
@@ -26,7 +26,7 @@ export class UploadDraft {
   readonly #files = signal<Files>(new Map());
   readonly #left = signal<readonly string[]>([]);
   readonly #step = signal<DraftStep>("empty");
-  readonly #look = signal<Look | null>(null);
+  readonly #look = signal<TypePreview | null>(null);
   readonly #model = signal<TypeModel | null>(null);
   readonly #errors = signal<readonly string[]>([]);
   readonly #trouble = signal("");
@@ -40,7 +40,7 @@ export class UploadDraft {
   /** Chosen files that a robot type does not use. */
   readonly left: ReadonlySignal<readonly string[]> = this.#left;
   readonly step: ReadonlySignal<DraftStep> = this.#step;
-  readonly look: ReadonlySignal<Look | null> = this.#look;
+  readonly look: ReadonlySignal<TypePreview | null> = this.#look;
   readonly model: ReadonlySignal<TypeModel | null> = this.#model;
   /** The error of the last attempt, such as an unreachable server. */
   readonly trouble: ReadonlySignal<string> = this.#trouble;
@@ -99,7 +99,7 @@ export class UploadDraft {
       return;
     }
     try {
-      let look = await this.#types.look(folder);
+      let look = await this.#types.createPreview(folder);
       if (this.#past(round)) {
         void this.#forget(look);
         return;
@@ -111,7 +111,7 @@ export class UploadDraft {
       while (look.robot_type.upload?.state === "checking") {
         await new Promise((resolve) => setTimeout(resolve, ASK_EVERY_MS));
         if (this.#past(round)) return;
-        look = await this.#types.lookAgain(look.id);
+        look = await this.#types.preview(look.id);
         if (this.#past(round)) return;
       }
       const errors = look.robot_type.upload?.errors ?? [];
@@ -136,7 +136,7 @@ export class UploadDraft {
     this.#trouble.value = "";
     this.#to("saving");
     try {
-      let saved = await this.#types.save(look.id);
+      let saved = await this.#types.savePreview(look.id);
       while (saved.upload?.state === "checking") {
         await new Promise((resolve) => setTimeout(resolve, ASK_EVERY_MS));
         if (this.#past(round)) return;
@@ -164,9 +164,9 @@ export class UploadDraft {
     this.#dropLook();
   }
 
-  async #modelOf(look: Look): Promise<TypeModel | null> {
+  async #modelOf(look: TypePreview): Promise<TypeModel | null> {
     try {
-      return await this.#types.lookModel(look.id);
+      return await this.#types.previewModel(look.id);
     } catch (error) {
       // A model that cannot be drawn can still be valid; a warning reports it.
       if (error instanceof ApiError && error.code === "model-unknown") return null;
@@ -236,9 +236,9 @@ export class UploadDraft {
     if (look !== null) void this.#forget(look);
   }
 
-  async #forget(look: Look): Promise<void> {
+  async #forget(look: TypePreview): Promise<void> {
     try {
-      await this.#types.drop(look.id);
+      await this.#types.deletePreview(look.id);
     } catch {
       // The server deletes it later.
     }

@@ -2,15 +2,15 @@
 import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
 import { sentence } from "../../../shared/api/http";
-import { now, onThisClock } from "../../../shared/lib/clock";
-import type { Invitation, InvitationMade, InvitationWanted, Share, SharedRole, Target } from "../../../shared/api/sharing";
+import { now, toPageClock } from "../../../shared/lib/clock";
+import type { Invitation, CreatedInvitation, InvitationSettings, Share, SharedRole, Target } from "../../../shared/api/sharing";
 
 /** The shortest that the server takes [s]. */
 const SHORTEST_S = 10;
 
 /** What is left of a time that the server has set [s]; `null`: it has no end. */
 export function secondsLeft(expiresAt: string | null): number | null {
-  return expiresAt === null ? null : Math.floor((onThisClock(Date.parse(expiresAt)) - now()) / 1000);
+  return expiresAt === null ? null : Math.floor((toPageClock(Date.parse(expiresAt)) - now()) / 1000);
 }
 
 /** All methods that change something throw `ApiError`; then nothing has changed here. */
@@ -81,7 +81,7 @@ export class ShareList {
     await this.put(share.account.name, share.role, left === null ? null : Math.max(left, SHORTEST_S));
   }
 
-  async invite(wanted: InvitationWanted): Promise<InvitationMade> {
+  async invite(wanted: InvitationSettings): Promise<CreatedInvitation> {
     const made = await this.#api.invite(this.#target, wanted);
     await this.refresh();
     return made;
