@@ -61,7 +61,7 @@ class Action:
         queued_until_ms: End of the queueing time [ms since 1970]; 0: was never queued.
         turn_ms: When it left the queue [ms since 1970].
         times: Status → time [ms since 1970]; ``published`` by the cloud clock, later ones by the agent clock.
-        heard: Status → time of reception in the cloud, by the cloud clock [ms since 1970].
+        received: Status → time of reception in the cloud, by the cloud clock [ms since 1970].
         sequence: Sequence number of the newest ack.
         cancel_id: Id of the command that cancels it; empty: not cancelled.
         once: Key of the row with its idempotency key, or empty.
@@ -87,7 +87,7 @@ class Action:
     sequence: int = -1
     cancel_id: str = ""
     once: str = ""
-    heard: dict[str, int] = field(default_factory=dict)
+    received: dict[str, int] = field(default_factory=dict)
     session: str = ""
     timeout_ms: int = 0
     queued_until_ms: int = 0
@@ -113,7 +113,7 @@ class Action:
 class AckReport:
     """An ack of an action. ``output`` is the complete output of the script so far.
 
-    ``heard_ms``: reception in the cloud, by the cloud clock [ms since 1970]; 0: unknown.
+    ``received_ms``: reception in the cloud, by the cloud clock [ms since 1970]; 0: unknown.
     """
 
     status: Status
@@ -123,7 +123,7 @@ class AckReport:
     progress: float | None = None
     output: str = ""
     result: dict[str, Any] = field(default_factory=dict)
-    heard_ms: int = 0
+    received_ms: int = 0
 
 
 def apply_report(action: Action, report: AckReport) -> Action:
@@ -131,18 +131,18 @@ def apply_report(action: Action, report: AckReport) -> Action:
     if action.status.terminal or action.status is Status.QUEUED:
         return action  # a queued action was never sent, so this ack is not genuine
     times = action.times if report.status.value in action.times else {**action.times, report.status.value: report.at_ms}
-    heard, first_ms = action.heard, action.heard.get(report.status.value)
-    if report.heard_ms and (first_ms is None or report.heard_ms < first_ms):
+    received, first_ms = action.received, action.received.get(report.status.value)
+    if report.received_ms and (first_ms is None or report.received_ms < first_ms):
         # Several processes may receive the same ack: the earliest time counts.
-        heard = {**heard, report.status.value: report.heard_ms}
+        received = {**received, report.status.value: report.received_ms}
     if report.sequence <= action.sequence and report.status.rank <= action.status.rank:
-        same = times is action.times and heard is action.heard
-        return action if same else replace(action, times=times, heard=heard)
+        same = times is action.times and received is action.received
+        return action if same else replace(action, times=times, received=received)
     newest = report.sequence > action.sequence or report.status.terminal
     return replace(
         action,
         times=times,
-        heard=heard,
+        received=received,
         sequence=max(action.sequence, report.sequence),
         status=report.status if report.status.rank >= action.status.rank else action.status,
         progress=report.progress if newest and report.progress is not None else action.progress,

@@ -29,7 +29,7 @@ class AccountEvent(StrEnum):
     """Audited operations on an account. For operations on control see ``control_events.Fact``."""
 
     SIGNED_IN = "signed-in"
-    SIGN_IN_REFUSED = "sign-in-refused"
+    SIGN_IN_REJECTED = "sign-in-rejected"
     SIGNED_OUT = "signed-out"
     ACCOUNT_MADE = "account-made"
     PASSWORD_SET = "password-set"  # noqa: S105 (the name of a deed)
@@ -38,7 +38,7 @@ class AccountEvent(StrEnum):
     SIGNING_KEY_ROTATED = "signing-key-rotated"
     SPACE_MADE = "space-made"
     AGENT_CLAIMED = "agent-claimed"
-    CLAIM_REFUSED = "claim-refused"
+    CLAIM_REJECTED = "claim-rejected"
     AGENT_UNPAIRED = "agent-unpaired"
     AGENT_MOVED = "agent-moved"
     DEVICE_RENAMED = "device-renamed"

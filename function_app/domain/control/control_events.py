@@ -22,12 +22,12 @@ class Fact(StrEnum):
     EXPIRED = "control-expired"
     ENDED = "control-ended"
     REQUESTED = "control-requested"
-    REQUEST_REFUSED = "control-request-refused"
+    REQUEST_DENIED = "control-request-denied"
     REQUEST_WITHDRAWN = "control-request-withdrawn"
-    REQUEST_LAPSED = "control-request-lapsed"
+    REQUEST_EXPIRED = "control-request-expired"
     STOP_ORDERED = "stop-ordered"
     RESET_ORDERED = "stop-reset-ordered"
-    ORDER_REFUSED = "order-refused"
+    COMMAND_REJECTED = "command-rejected"
     SHARED = "shared"
     UNSHARED = "unshared"
 
@@ -62,7 +62,7 @@ def timed_out(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
         return
     asked = lease.request
     if asked is not None and asked.outcome == "open" and asked.current_outcome(lease, now_ms) == "expired":
-        yield _of_request(asked, Fact.REQUEST_LAPSED, asked.expires_ms, f"The request of {asked.by} timed out.")
+        yield _of_request(asked, Fact.REQUEST_EXPIRED, asked.expires_ms, f"The request of {asked.by} timed out.")
     if lease.account and not lease.action and not lease.is_live(now_ms):
         message = f"The lease of {lease.holder} expired."
         yield _of_lease(lease, Fact.EXPIRED, lease.expires_ms, message, {"holder": lease.holder})
@@ -77,7 +77,7 @@ def lease_changes(before: Lease | None, after: Lease, *, by: str, now_ms: int) -
         and before.request is not None
         and (after.request is None or after.request.id != before.request.id)
     ):
-        yield from (late for late in timed_out(before, now_ms) if late.fact is Fact.REQUEST_LAPSED)
+        yield from (late for late in timed_out(before, now_ms) if late.fact is Fact.REQUEST_EXPIRED)
     yield from _of_change(before, after, by=by, now_ms=now_ms)
     yield from _of_asking(before, after, by=by, now_ms=now_ms)
 
@@ -119,7 +119,7 @@ def _of_asking(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> I
         message = f"{asked.by} asked {after.holder} for control."
         yield _of_request(asked, Fact.REQUESTED, now_ms, message)
     elif asked.outcome == "rejected":
-        yield _of_request(asked, Fact.REQUEST_REFUSED, now_ms, f"{by} kept control; {asked.by} had asked for it.")
+        yield _of_request(asked, Fact.REQUEST_DENIED, now_ms, f"{by} kept control; {asked.by} had asked for it.")
     elif asked.outcome == "withdrawn":
         yield _of_request(asked, Fact.REQUEST_WITHDRAWN, now_ms, f"{asked.by} no longer asks for control.")
 

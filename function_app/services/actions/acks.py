@@ -62,8 +62,8 @@ class ActionAcks:
         parts = split_command(ack.id)
         if parts is None or parts[0] != device_id(topic.agent, topic.device):
             raise ProtocolError(f"'{ack.id}' is not a command of {topic.agent}/{topic.device}")
-        heard = report(ack, self._clock.now_ms())
-        stored = await self._queues.change(ack.id, lambda action: apply_report(action, heard))
+        ack_report = report(ack, self._clock.now_ms())
+        stored = await self._queues.change(ack.id, lambda action: apply_report(action, ack_report))
         if stored is None:
             await self._answer(topic.agent, ack)
         elif ack.status.terminal and Status.PUBLISHED.value in stored.action.times:
@@ -153,18 +153,18 @@ class ActionAcks:
 
 
 def _applied(action: Action, reports: Iterable[AckReport]) -> Action:
-    for heard in reports:
-        action = apply_report(action, heard)
+    for ack_report in reports:
+        action = apply_report(action, ack_report)
     return action
 
 
-def report(ack: Ack, heard_ms: int) -> AckReport:
+def report(ack: Ack, received_ms: int) -> AckReport:
     """The ack as a domain report. A result that is nested too deeply is dropped."""
     return AckReport(
         status=Status(ack.status.value),
         sequence=ack.sequence,
         at_ms=ack.at_ms,
-        heard_ms=heard_ms,
+        received_ms=received_ms,
         reason=None if ack.reason is None else msgspec.to_builtins(ack.reason),
         progress=ack.progress,
         output=ack.output,

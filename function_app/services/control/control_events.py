@@ -153,7 +153,7 @@ class ControlEvents:
         try:
             await self.record(
                 device,
-                Fact.ORDER_REFUSED,
+                Fact.COMMAND_REJECTED,
                 message,
                 caller=caller,
                 severity="warning",

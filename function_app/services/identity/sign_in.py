@@ -119,7 +119,7 @@ class SignIn:
         if row is None:
             address = whence.address if whence else ""
             await self._audit_log.record_rejection(
-                CLOUD, AccountEvent.SIGN_IN_REFUSED, None, code="link-unknown", address=address
+                CLOUD, AccountEvent.SIGN_IN_REJECTED, None, code="link-unknown", address=address
             )
             raise refused
         try:

@@ -74,7 +74,7 @@ class Claim:
 
     async def _refused(self, caller: Identity, problem: Problem, address: str) -> None:
         await self._audit_log.record_rejection(
-            caller.account, AccountEvent.CLAIM_REFUSED, caller, code=problem.code, address=address
+            caller.account, AccountEvent.CLAIM_REJECTED, caller, code=problem.code, address=address
         )
 
     async def _redeem(self, caller: Identity, code: str | None, space: str) -> Agent | None:

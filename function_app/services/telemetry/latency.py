@@ -243,10 +243,10 @@ def _times(action: Action) -> dict[str, tuple[int, float]]:
     """Latencies of an action, as differences of one clock each. Negative differences are skipped."""
     result: dict[str, tuple[int, float]] = {}
     published_ms = action.times.get("published")
-    if published_ms is not None and action.heard:
-        result["command-answered"] = (published_ms, min(action.heard.values()) - published_ms)
-        if "started" in action.heard:
-            result["command-started"] = (published_ms, action.heard["started"] - published_ms)
+    if published_ms is not None and action.received:
+        result["command-answered"] = (published_ms, min(action.received.values()) - published_ms)
+        if "started" in action.received:
+            result["command-started"] = (published_ms, action.received["started"] - published_ms)
     if {"received", "started"} <= set(action.times):
         result["received-started"] = (action.issued_ms, action.times["started"] - action.times["received"])
     return {path: sample for path, sample in result.items() if 0 <= sample[1] <= histogram.LONGEST_MS}

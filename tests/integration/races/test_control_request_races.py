@@ -20,7 +20,7 @@ RAISES = {"accept", "take over", "reset"}
 """Operations that give the next epoch."""
 ENDS = {
     "control-handed-over": "accepted",
-    "control-request-refused": "rejected",
+    "control-request-denied": "rejected",
     "control-request-withdrawn": "withdrawn",
 }
 

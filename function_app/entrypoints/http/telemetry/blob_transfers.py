@@ -45,4 +45,4 @@ def router(transfers: Transfers | None) -> APIRouter:
 
 
 def _problem(error: TransferRefused) -> Problem:
-    return Problem("transfer-refused", error.status, "This address cannot be used so", str(error))
+    return Problem("transfer-rejected", error.status, "This address cannot be used so", str(error))

@@ -26,7 +26,7 @@ export function entryText(record: AuditRecord, names: Names): string {
   switch (event) {
     case "signed-in":
       return says.signedIn(who, says.how[text(data, "how")] ?? "");
-    case "sign-in-refused":
+    case "sign-in-rejected":
       return says.refusedSignIn;
     case "signed-out":
       return record.key === "" ? says.signedOut(who) : says.keyEnded(who);
@@ -42,7 +42,7 @@ export function entryText(record: AuditRecord, names: Names): string {
       return says.spaceMade(who, text(data, "name"));
     case "agent-claimed":
       return says.claimed(who, on, thing(text(data, "space"), names));
-    case "claim-refused":
+    case "claim-rejected":
       return says.claimRefused(who);
     case "agent-unpaired":
       return says.unpaired(who, on);

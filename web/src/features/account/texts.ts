@@ -121,7 +121,7 @@ export const texts = {
     usesLeft: (count: number): string => `${format.count(count, "use")} left`,
     kinds: {
       "signed-in": "Signed in",
-      "sign-in-refused": "Sign-in rejected",
+      "sign-in-rejected": "Sign-in rejected",
       "signed-out": "Signed out",
       "account-made": "Account created",
       "password-set": "Password set",
@@ -129,7 +129,7 @@ export const texts = {
       "api-key-revoked": "API key revoked",
       "space-made": "Space created",
       "agent-claimed": "Agent paired",
-      "claim-refused": "Claim code rejected",
+      "claim-rejected": "Claim code rejected",
       "agent-unpaired": "Agent unpaired",
       "agent-moved": "Agent moved",
       "device-renamed": "Device renamed",
@@ -150,12 +150,12 @@ export const texts = {
       "control-expired": "Control expired",
       "control-ended": "Control ended",
       "control-requested": "Control requested",
-      "control-request-refused": "Control request rejected",
+      "control-request-denied": "Control request denied",
       "control-request-withdrawn": "Control request withdrawn",
-      "control-request-lapsed": "Control request expired",
+      "control-request-expired": "Control request expired",
       "stop-ordered": "Stop",
       "stop-reset-ordered": "Stop reset",
-      "order-refused": "Command rejected",
+      "command-rejected": "Command rejected",
     } as Readonly<Record<string, string>>,
     /** One sentence for each kind whose record has no text of its own. */
     says: {

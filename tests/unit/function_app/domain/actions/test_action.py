@@ -173,7 +173,7 @@ def test_the_next_check_is_later_and_not_after_the_deadline(status: Status, afte
 
 
 def test_the_earliest_reception_of_an_ack_counts() -> None:
-    early, later, last = (AckReport(Status.RECEIVED, 1, 1_000_100, heard_ms=at_ms) for at_ms in (30, 50, 70))
+    early, later, last = (AckReport(Status.RECEIVED, 1, 1_000_100, received_ms=at_ms) for at_ms in (30, 50, 70))
     action = applied(NEW, [later, early])
-    assert action.heard == {"received": 30}
+    assert action.received == {"received": 30}
     assert apply_report(action, last) is action

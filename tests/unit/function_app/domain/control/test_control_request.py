@@ -57,7 +57,7 @@ def test_a_request_ends_with_its_time_or_its_lease() -> None:
         (
             request_control(HELD),
             control_request.refuse(request_control(HELD), ANNA, request="r1", now_ms=START),
-            [Fact.REQUEST_REFUSED],
+            [Fact.REQUEST_DENIED],
         ),
         (
             request_control(HELD),
@@ -75,13 +75,13 @@ def test_timeouts_are_recorded_with_the_next_change_and_their_own_time() -> None
     asked = request_control(HELD)
     late = START + 60_000
     taken = lease.acquire(asked, CLEO, lease_ms=1_000, now_ms=late)
-    assert facts_of(asked, taken, late) == [Fact.REQUEST_LAPSED, Fact.EXPIRED, Fact.TAKEN]
+    assert facts_of(asked, taken, late) == [Fact.REQUEST_EXPIRED, Fact.EXPIRED, Fact.TAKEN]
     lapsed, expired, _ = lease_changes(asked, taken, by="cleo", now_ms=late)
     assert (lapsed.at_ms, expired.at_ms) == (START + 10_000, START + 60_000)
     assert list(timed_out(asked, late)) == [lapsed, expired], "the timer creates the same event"
     assert list(timed_out(None, late)) == list(timed_out(taken, late)) == []
     second = request_control(asked, CLEO, now_ms=START + 10_000, request="r2")
-    assert facts_of(asked, second, START + 10_000) == [Fact.REQUEST_LAPSED, Fact.REQUESTED]
+    assert facts_of(asked, second, START + 10_000) == [Fact.REQUEST_EXPIRED, Fact.REQUESTED]
 
 
 def test_an_event_names_the_former_holder() -> None:

@@ -42,10 +42,10 @@ class TestWhatIsRecorded:
         assert [row for row in rows if "sign" not in row[0]] == [
             ("agent-claimed", "done", anna.session, robot.id),
             ("control-taken", "done", anna.session, device),
-            ("order-refused", "rejected", again.session, device),
+            ("command-rejected", "rejected", again.session, device),
             ("stop-ordered", "done", anna.session, device),
             ("stop-reset-ordered", "done", anna.session, device),
-            ("claim-refused", "rejected", anna.session, ""),
+            ("claim-rejected", "rejected", anna.session, ""),
             ("agent-unpaired", "done", anna.session, robot.id),
         ]
         stop = next(item for item in items if item["event"] == "stop-ordered")
@@ -63,7 +63,7 @@ class TestWhatIsRecorded:
         assert cloud.request("POST", f"{API}/auth/sign-in", json={"link": "x" * 43}).status_code == 401
         again = cloud.sign_in("anna")
         again.post("/auth/sign-out")
-        assert kinds(anna) == ["signed-out", "signed-in", *["sign-in-refused"] * 2, "password-set", "signed-in"]
+        assert kinds(anna) == ["signed-out", "signed-in", *["sign-in-rejected"] * 2, "password-set", "signed-in"]
         after = cloud.run(cloud.functions.audit_reader.head(CLOUD))
         assert after is not None
         assert after.seq == before.seq + 2, "one for the unknown name, one for the link"
@@ -88,7 +88,7 @@ class TestWhatIsRecorded:
             ("invited", "anna"),
             ("invitation-redeemed", "bert"),
             ("shared", "anna"),
-            ("order-refused", "bert"),
+            ("command-rejected", "bert"),
         ]
         assert not [kind for kind in kinds(bert) if "sign" not in kind]
         assert verdict(cloud, anna.account) == ""
@@ -121,7 +121,7 @@ class TestWhatIsRecorded:
     def test_a_repeated_refusal_is_recorded_every_ten_seconds(self, cloud: Cloud) -> None:
         for pause_s in (0, 0, 0, 0, 11):
             cloud.clock.advance(pause_s)
-            cloud.run(cloud.functions.audit_log.record_rejection(OWNER, "sign-in-refused", None, address="192.0.2.1"))
+            cloud.run(cloud.functions.audit_log.record_rejection(OWNER, "sign-in-rejected", None, address="192.0.2.1"))
         head = cloud.run(cloud.functions.audit_reader.head(OWNER))
         assert head is not None
         assert head.seq == 2

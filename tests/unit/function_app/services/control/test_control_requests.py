@@ -85,7 +85,7 @@ def test_an_accepted_request_gives_the_requester_the_next_epoch(
     problem(anna.take_lease(robot.device, epoch=1), 409, "lease-lost")
     problem(anna.post("/mqtt/credentials", body), 409, "lease-lost")
     assert other.post("/mqtt/credentials", body | {"epoch": 2}).status_code == 200
-    assert events(anna, robot)[3:] == ["order-refused"] * 2
+    assert events(anna, robot)[3:] == ["command-rejected"] * 2
 
 
 def test_after_a_rejection_control_may_be_requested_again(anna: Person, other: Person, robot: Robot) -> None:
@@ -97,7 +97,7 @@ def test_after_a_rejection_control_may_be_requested_again(anna: Person, other: P
     assert lease(other, robot)["request"] is None
     assert lease(anna, robot)["mine"] is True
     assert create(other, robot) != request
-    kinds = ["control-taken", "control-requested", "control-request-refused", "control-requested"]
+    kinds = ["control-taken", "control-requested", "control-request-denied", "control-requested"]
     assert events(anna, robot) == kinds
 
 
@@ -123,11 +123,11 @@ def test_an_unanswered_request_expires(cloud: Cloud, anna: Person, other: Person
     assert (shown["epoch"], shown["mine"], shown["request"]) == (1, True, None)
     cloud.clock.advance(11)
     cloud.sweep()
-    assert events(anna, robot) == ["control-taken", "control-requested", "control-request-lapsed"]
+    assert events(anna, robot) == ["control-taken", "control-requested", "control-request-expired"]
     assert create(other, robot) != request
     cloud.clock.advance(100)
     cloud.sweep()
-    assert sorted(events(anna, robot)[3:]) == ["control-expired", "control-request-lapsed", "control-requested"]
+    assert sorted(events(anna, robot)[3:]) == ["control-expired", "control-request-expired", "control-requested"]
 
 
 def test_one_request_is_open_at_a_time_and_only_the_holder_answers(cloud: Cloud, other: Person, robot: Robot) -> None:
@@ -217,7 +217,7 @@ def test_only_an_owner_takes_over_and_a_viewer_has_no_control(
         problem(other.take_lease(robot.device), 409, "lease-held")
         assert outcome(other, request) == "open"
     assert lease(anna, robot)["epoch"] == 1
-    assert "order-refused" in events(anna, robot)
+    assert "command-rejected" in events(anna, robot)
 
 
 def test_a_requester_without_permission_gets_no_control(
@@ -248,13 +248,13 @@ def test_refusals_are_recorded_once_and_do_not_depend_on_the_record(
     for _ in range(5):
         problem(other.take_lease(robot.device), 409, "lease-held")
         problem(other.start(robot.device), 409, "lease-held")
-    assert events(anna, robot) == ["control-taken", "order-refused", "order-refused"]
+    assert events(anna, robot) == ["control-taken", "command-rejected", "command-rejected"]
     cloud.clock.advance(10)
     problem(other.take_lease(robot.device), 409, "lease-held")
     item = anna.get(f"/devices/{robot.device}/events").json()["items"][0]
     assert item["data"] == {"caller": "anna", "wanted": "take control", "code": "lease-held"}
     assert item["severity"] == "warning"
-    assert events(anna, robot).count("order-refused") == 3
+    assert events(anna, robot).count("command-rejected") == 3
 
     async def full(*_: object) -> None:
         raise StoreError("The disk is full.")

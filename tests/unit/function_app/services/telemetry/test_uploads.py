@@ -104,8 +104,8 @@ def test_an_upload_may_be_larger_than_any_request_body(cloud: Cloud, anna: Perso
 
 def test_what_is_not_what_was_announced_is_not_registered(cloud: Cloud, anna: Person, robot: Robot) -> None:
     begun = begin(anna, robot, sha256="0" * 64)
-    problem(send(cloud, begun, PICTURE[1:]), 403, "transfer-refused")
-    problem(send(cloud, begun, PICTURE, **{"Content-Type": "text/html"}), 403, "transfer-refused")
+    problem(send(cloud, begun, PICTURE[1:]), 403, "transfer-rejected")
+    problem(send(cloud, begun, PICTURE, **{"Content-Type": "text/html"}), 403, "transfer-rejected")
     problem(complete(anna, robot, begun["id"]), 409, "upload-missing")
     assert send(cloud, begun, PICTURE).status_code == 201
     problem(complete(anna, robot, begun["id"]), 409, "upload-mismatch")
@@ -172,7 +172,7 @@ def test_unsigned_addresses_are_refused(cloud: Cloud, anna: Person, robot: Robot
     begun = begin(anna, robot)
     for token in ("x", "a.b.c", anna.token, begun["url"].rpartition("/")[2][:-4], "%00", "é"):
         for method in ("GET", "PUT"):
-            problem(cloud.request(method, f"{API}/blobs/{token}", content=b"x"), 403, "transfer-refused")
+            problem(cloud.request(method, f"{API}/blobs/{token}", content=b"x"), 403, "transfer-rejected")
 
 
 def test_captures_come_newest_first_in_pages(cloud: Cloud, anna: Person, robot: Robot) -> None:
