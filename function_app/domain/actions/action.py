@@ -42,9 +42,9 @@ class Status(StrEnum):
 
 
 RETRY_MS = 1_000
-"""Interval after which an unanswered command is published again."""
+"""Interval after which an unacknowledged command is published again."""
 GRACE_MS = 3_000
-"""Allowed delay of an ack. Only after it does an unanswered command count as expired."""
+"""Allowed delay of an ack. Then an unacknowledged command counts as expired."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +64,13 @@ class Action:
         received: Status → time of reception in the cloud, by the cloud clock [ms since 1970].
         sequence: Sequence number of the newest ack.
         cancel_id: Id of the command that cancels it; empty: not cancelled.
-        once: Key of the row with its idempotency key, or empty.
+        idempotency_key: Key of the row with its idempotency key, or empty.
     """
 
     id: str
     device: str
     account: str
-    who: str
+    caller: str
     pairing: str
     request: dict[str, Any]
     epoch: int
@@ -86,7 +86,7 @@ class Action:
     result: dict[str, Any] = field(default_factory=dict)
     sequence: int = -1
     cancel_id: str = ""
-    once: str = ""
+    idempotency_key: str = ""
     received: dict[str, int] = field(default_factory=dict)
     session: str = ""
     timeout_ms: int = 0
@@ -176,9 +176,9 @@ def end(action: Action, status: Status, code: str, message: str, now_ms: int) ->
     )
 
 
-def reached(action: Action, wanted: Status) -> bool:
-    """Whether a wait for ``wanted`` is over."""
-    return action.status.terminal or action.status.rank >= wanted.rank
+def reached(action: Action, status: Status) -> bool:
+    """Whether the action has reached ``status``, or can no longer reach it because it has ended."""
+    return action.status.terminal or action.status.rank >= status.rank
 
 
 def next_check_ms(action: Action, now_ms: int) -> int:
@@ -202,7 +202,7 @@ class NextStep(StrEnum):
 
 
 def next_step(action: Action, now_ms: int) -> NextStep:
-    """The next step of the timer. An unanswered command is republished until its time to live ends.
+    """The next step of the timer. An unacknowledged command is republished until its time to live ends.
 
     The device drops duplicates by id. After a cancellation the cancel command is republished instead.
     """

@@ -35,7 +35,7 @@ DROPPED: Final = {
     UNSHARED: (Status.FAILED, "The device is no longer shared with the account that started it."),
     KEY_ENDED: (
         Status.FAILED,
-        "The API key that started it was revoked, expired or may no longer operate this device. Create a new key.",
+        "The API key that started it was revoked, has expired, or may not operate this device. Create a new key.",
     ),
     SIGNED_OUT: (Status.FAILED, "The session that started it has signed out. Start it again."),
 }
@@ -58,7 +58,7 @@ class ActionQueue:
 
     @property
     def empty(self) -> bool:
-        """Whether there is nothing to do."""
+        """Whether no action waits and no dropped action must be ended."""
         return not self.actions and not self.dropped
 
     def contains(self, action: str) -> bool:
@@ -79,16 +79,18 @@ class ActionQueue:
     def without(self, action: str) -> "ActionQueue":
         """The queue without ``action``, after it was started or ended."""
         actions = tuple(other for other in self.actions if other != action)
-        return replace(self, actions=actions, dropped={id_: why for id_, why in self.dropped.items() if id_ != action})
+        return replace(
+            self, actions=actions, dropped={id_: code for id_, code in self.dropped.items() if id_ != action}
+        )
 
-    def with_cancelled(self, actions: Collection[str], why: str) -> "ActionQueue":
+    def with_cancelled(self, actions: Collection[str], code: str) -> "ActionQueue":
         """The queue with some actions cancelled; the same object if none of them waits."""
-        lost = [action for action in self.actions if action in actions]
-        if not lost:
+        cancelled = [action for action in self.actions if action in actions]
+        if not cancelled:
             return self
-        kept = tuple(action for action in self.actions if action not in lost)
-        return replace(self, actions=kept, dropped={**self.dropped, **dict.fromkeys(lost, why)})
+        remaining = tuple(action for action in self.actions if action not in cancelled)
+        return replace(self, actions=remaining, dropped={**self.dropped, **dict.fromkeys(cancelled, code)})
 
-    def with_all_cancelled(self, why: str) -> "ActionQueue":
+    def with_all_cancelled(self, code: str) -> "ActionQueue":
         """The queue with all actions cancelled; the same object if none waits."""
-        return self.with_cancelled(self.actions, why)
+        return self.with_cancelled(self.actions, code)

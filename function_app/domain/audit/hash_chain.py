@@ -32,7 +32,7 @@ class AccountEvent(StrEnum):
     SIGN_IN_REJECTED = "sign-in-rejected"
     SIGNED_OUT = "signed-out"
     ACCOUNT_MADE = "account-made"
-    PASSWORD_SET = "password-set"  # noqa: S105 (the name of a deed)
+    PASSWORD_SET = "password-set"  # noqa: S105 (an event, not a password)
     API_KEY_MADE = "api-key-made"
     API_KEY_REVOKED = "api-key-revoked"
     SIGNING_KEY_ROTATED = "signing-key-rotated"
@@ -56,14 +56,14 @@ class AccountEvent(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A record to append. ``on`` names the target; ``data`` is plain JSON."""
+    """A record to append. ``data`` is plain JSON."""
 
     id: str
     at_ms: int
-    what: str
+    event: str
     outcome: Outcome = "done"
-    on: str = ""
-    who: str = ""
+    target: str = ""
+    actor: str = ""
     account: str = ""
     session: str = ""
     key: str = ""
@@ -74,10 +74,10 @@ class Entry:
         return {
             "id": self.id,
             "at_ms": self.at_ms,
-            "what": self.what,
+            "event": self.event,
             "outcome": self.outcome,
-            "on": self.on,
-            "who": self.who,
+            "target": self.target,
+            "actor": self.actor,
             "account": self.account,
             "session": self.session,
             "key": self.key,
@@ -97,7 +97,7 @@ class Head:
 
 
 def entry(
-    what: str,
+    event: str,
     caller: Identity | None,
     *,
     entry_id: str,
@@ -106,9 +106,9 @@ def entry(
     outcome: Outcome = "done",
     **data: Any,
 ) -> Entry:
-    """An entry for an operation of ``caller`` (``None``: an unknown caller, or the cloud itself)."""
-    by = {} if caller is None else {"who": caller.name, "account": caller.account, "session": caller.session}
-    return Entry(entry_id, at_ms, what, outcome, on, **by, key="" if caller is None else caller.key, data=data)
+    """An entry for an operation of ``caller`` on the target ``on``; ``None``: an unknown caller, or the cloud."""
+    by = {} if caller is None else {"actor": caller.name, "account": caller.account, "session": caller.session}
+    return Entry(entry_id, at_ms, event, outcome, on, **by, key="" if caller is None else caller.key, data=data)
 
 
 def genesis(chain: str) -> Head:

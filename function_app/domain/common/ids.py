@@ -5,7 +5,7 @@ import secrets
 
 ID = re.compile(r"\A[A-Za-z0-9_-]{1,64}\Z")
 DEVICE_NAME = re.compile(r"\A[A-Za-z0-9_-]{1,32}\Z")
-"""Name of a device at its agent. The limit keeps action ids, which contain the name, within 64 characters."""
+"""Name of a device at its agent. Action ids contain it, so the limit keeps them within 64 characters."""
 AGENT_LENGTH = 10
 SUFFIX_LENGTH = 20
 CLAIM_ALPHABET = "BCDFGHJKLMNPQRSTVWXZ"

@@ -40,7 +40,7 @@ def unauthorized(detail: str) -> Problem:
 
 
 def forbidden(detail: str) -> Problem:
-    """The caller is authenticated but not allowed to do this."""
+    """The caller is authenticated but lacks the permission."""
     return Problem("forbidden", 403, "Not allowed", detail)
 
 
@@ -55,8 +55,10 @@ def invalid(detail: str, *, code: str = "invalid", **extras: Any) -> Problem:
 
 
 def busy_store() -> Problem:
-    """Too many concurrent writers changed the same row."""
-    return Problem("busy", 503, "Busy", "Too many requests changed this at once. Try again.", retry_after_s=1)
+    """Too many concurrent requests changed the same row."""
+    return Problem(
+        "busy", 503, "Busy", "Too many concurrent requests changed this resource. Try again.", retry_after_s=1
+    )
 
 
 def broker_unavailable(detail: str) -> Problem:

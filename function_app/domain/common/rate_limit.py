@@ -1,8 +1,7 @@
 """Rate limiting with the generic cell rate algorithm, whose whole state is one timestamp.
 
 Each request advances a theoretical arrival time. A request that is further ahead of the clock than a burst allows must
-wait (ATM Forum, Traffic Management 4.0, 1996). Libraries for this algorithm keep their state in Redis or in own
-threads.
+wait (ATM Forum, Traffic Management 4.0, 1996). Existing libraries store the state in Redis or run their own threads.
 """
 
 from dataclasses import dataclass

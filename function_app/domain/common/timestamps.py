@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 LAST_MS = 9_999_999_999_999
 """Latest accepted time, in the year 2286 [ms since 1970]: thirteen digits sort as text."""
 NEVER_MS = 2**53
-"""Expiry time of what does not expire [ms since 1970]."""
+"""Expiry time that means "does not expire" [ms since 1970]."""
 
 
 def rfc3339(at_ms: int) -> str:

@@ -60,9 +60,11 @@ def timed_out(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
     """Transitions due to timeouts: an expired lease, an unanswered request."""
     if lease is None:
         return
-    asked = lease.request
-    if asked is not None and asked.outcome == "open" and asked.current_outcome(lease, now_ms) == "expired":
-        yield _of_request(asked, Fact.REQUEST_EXPIRED, asked.expires_ms, f"The request of {asked.by} timed out.")
+    request = lease.request
+    if request is not None and request.outcome == "open" and request.current_outcome(lease, now_ms) == "expired":
+        yield _of_request(
+            request, Fact.REQUEST_EXPIRED, request.expires_ms, f"The control request of {request.by} expired."
+        )
     if lease.account and not lease.action and not lease.is_live(now_ms):
         message = f"The lease of {lease.holder} expired."
         yield _of_lease(lease, Fact.EXPIRED, lease.expires_ms, message, {"holder": lease.holder})
@@ -79,7 +81,7 @@ def lease_changes(before: Lease | None, after: Lease, *, by: str, now_ms: int) -
     ):
         yield from (late for late in timed_out(before, now_ms) if late.fact is Fact.REQUEST_EXPIRED)
     yield from _of_change(before, after, by=by, now_ms=now_ms)
-    yield from _of_asking(before, after, by=by, now_ms=now_ms)
+    yield from _of_request_change(before, after, by=by, now_ms=now_ms)
 
 
 def control_ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> ControlEvent:
@@ -90,20 +92,20 @@ def control_ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> Cont
 
 
 def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
-    had = before.holder if before is not None and before.is_live(now_ms) else ""
+    previous = before.holder if before is not None and before.is_live(now_ms) else ""
     if before is not None and after.epoch == before.epoch:
-        if had and not after.account and not before.action:
-            yield _of_lease(after, Fact.RELEASED, now_ms, f"{by} gave control back.", {"holder": had})
+        if previous and not after.account and not before.action:
+            yield _of_lease(after, Fact.RELEASED, now_ms, f"{by} released control.", {"holder": previous})
         return
-    data = {"holder": after.holder} | ({"from": had} if had else {})
-    asked = after.request
+    data = {"holder": after.holder} | ({"from": previous} if previous else {})
+    request = after.request
     if not after.account:
-        yield _of_lease(after, Fact.RESET_ORDERED, now_ms, f"{by} ordered the reset of Stop.", {"caller": by, **data})
-    elif asked is not None and asked.outcome == "accepted" and asked.epoch == after.epoch - 1:
+        yield _of_lease(after, Fact.RESET_ORDERED, now_ms, f"{by} reset the Stop.", {"caller": by, **data})
+    elif request is not None and request.outcome == "accepted" and request.epoch == after.epoch - 1:
         message = f"{by} handed control over to {after.holder}."
-        yield _of_lease(after, Fact.HANDED_OVER, now_ms, message, {"request": asked.id, **data})
+        yield _of_lease(after, Fact.HANDED_OVER, now_ms, message, {"request": request.id, **data})
     elif after.reason:
-        message = f"{after.holder} took control from {had}: {after.reason}"
+        message = f"{after.holder} took control from {previous}: {after.reason}"
         data = {"reason": after.reason, **data}
         yield _of_lease(after, Fact.TAKEN_OVER, now_ms, message, data, severity="warning")
     else:
@@ -111,17 +113,19 @@ def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> I
         yield _of_lease(after, Fact.TAKEN, now_ms, f"{after.holder} took control.", data)
 
 
-def _of_asking(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
-    asked, existing = after.request, before.request if before is not None else None
-    if asked is None or asked == existing:
+def _of_request_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
+    request, existing = after.request, before.request if before is not None else None
+    if request is None or request == existing:
         return
-    if asked.outcome == "open":
-        message = f"{asked.by} asked {after.holder} for control."
-        yield _of_request(asked, Fact.REQUESTED, now_ms, message)
-    elif asked.outcome == "rejected":
-        yield _of_request(asked, Fact.REQUEST_DENIED, now_ms, f"{by} kept control; {asked.by} had asked for it.")
-    elif asked.outcome == "withdrawn":
-        yield _of_request(asked, Fact.REQUEST_WITHDRAWN, now_ms, f"{asked.by} no longer asks for control.")
+    if request.outcome == "open":
+        message = f"{request.by} requested control from {after.holder}."
+        yield _of_request(request, Fact.REQUESTED, now_ms, message)
+    elif request.outcome == "rejected":
+        yield _of_request(
+            request, Fact.REQUEST_DENIED, now_ms, f"{by} rejected the request of {request.by} for control."
+        )
+    elif request.outcome == "withdrawn":
+        yield _of_request(request, Fact.REQUEST_WITHDRAWN, now_ms, f"{request.by} withdrew the control request.")
 
 
 def _of_lease(
@@ -136,6 +140,6 @@ def _of_lease(
     return ControlEvent(f"{fact}-{lease.epoch}", fact, at_ms, message, {"epoch": lease.epoch, **data}, severity)
 
 
-def _of_request(asked: ControlRequest, fact: Fact, at_ms: int, message: str) -> ControlEvent:
-    data = {"request": asked.id, "requester": asked.by, "epoch": asked.epoch}
-    return ControlEvent(f"{fact}-{asked.id}", fact, at_ms, message, data)
+def _of_request(request: ControlRequest, fact: Fact, at_ms: int, message: str) -> ControlEvent:
+    data = {"request": request.id, "requester": request.by, "epoch": request.epoch}
+    return ControlEvent(f"{fact}-{request.id}", fact, at_ms, message, data)

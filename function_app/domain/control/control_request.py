@@ -29,12 +29,11 @@ def request_control(
     if existing is not None and existing.current_outcome(lease, now_ms) == "open":
         if existing.requested_by(caller):
             return lease
-        detail = (
-            f"{existing.by} asks for control already. Wait for the answer, or until {rfc3339(existing.expires_ms)}."
-        )
-        extras = {"requester": existing.by, "expires_at": rfc3339(existing.expires_ms)}
+        expires_at = rfc3339(existing.expires_ms)
+        detail = f"{existing.by} has already requested control. Wait for the response, or until {expires_at}."
+        extras = {"requester": existing.by, "expires_at": expires_at}
         raise Problem("lease-requested", 409, "Another request is open", detail, extras=extras)
-    asked = ControlRequest(
+    control_request = ControlRequest(
         id=request,
         epoch=lease.epoch,
         account=caller.account,
@@ -42,11 +41,11 @@ def request_control(
         by=caller.name,
         holder_account=lease.account,
         holder_session=lease.session,
-        asked_ms=now_ms,
+        requested_ms=now_ms,
         expires_ms=now_ms + within_ms,
         lease_ms=lease_ms,
     )
-    return replace(lease, request=asked)
+    return replace(lease, request=control_request)
 
 
 def accept(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
@@ -54,50 +53,50 @@ def accept(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) 
 
     Raises ``request-unknown``, ``forbidden`` or ``control-request-closed``.
     """
-    current, asked = _to_answer(lease, caller, request)
-    if not _still(current, asked, "accepted", now_ms):
+    current, control_request = _find_for_holder(lease, caller, request)
+    if not _is_open(current, control_request, "accepted", now_ms):
         return current
     return Lease(
         epoch=current.epoch + 1,
-        account=asked.account,
-        session=asked.session,
-        holder=asked.by,
-        expires_ms=now_ms + asked.lease_ms,
-        lease_ms=asked.lease_ms,
+        account=control_request.account,
+        session=control_request.session,
+        holder=control_request.by,
+        expires_ms=now_ms + control_request.lease_ms,
+        lease_ms=control_request.lease_ms,
         pairing=current.pairing,
-        request=replace(asked, outcome="accepted"),
+        request=replace(control_request, outcome="accepted"),
     )
 
 
-def refuse(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
+def reject(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
     """The lease with the request rejected; unchanged if already rejected.
 
     Raises ``request-unknown``, ``forbidden`` or ``control-request-closed``.
     """
-    current, asked = _to_answer(lease, caller, request)
-    if not _still(current, asked, "rejected", now_ms):
+    current, control_request = _find_for_holder(lease, caller, request)
+    if not _is_open(current, control_request, "rejected", now_ms):
         return current
-    return replace(current, request=replace(asked, outcome="rejected"))
+    return replace(current, request=replace(control_request, outcome="rejected"))
 
 
 def withdraw(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
-    """The lease with the request withdrawn; unchanged if the request is over, unless it was accepted.
+    """The lease with the request withdrawn; unchanged if it already ended, unless it was accepted.
 
     Raises ``request-unknown``, ``forbidden`` or ``control-request-closed``.
     """
-    current, asked = find(lease, request)
-    if not asked.requested_by(caller):
+    current, control_request = find(lease, request)
+    if not control_request.requested_by(caller):
         raise forbidden("Only the session that requested control may withdraw the request.")
-    how = asked.current_outcome(current, now_ms)
-    if how == "accepted":
-        raise _over(how)
-    if how != "open":
+    outcome = control_request.current_outcome(current, now_ms)
+    if outcome == "accepted":
+        raise _closed(outcome)
+    if outcome != "open":
         return current
-    return replace(current, request=replace(asked, outcome="withdrawn"))
+    return replace(current, request=replace(control_request, outcome="withdrawn"))
 
 
 def find(lease: Lease | None, request: str) -> tuple[Lease, ControlRequest]:
-    """The lease and the request with this id. The last request stays available after it is over.
+    """The lease and the request with this id. The last request can be read after it has ended.
 
     Raises ``request-unknown``.
     """
@@ -106,19 +105,19 @@ def find(lease: Lease | None, request: str) -> tuple[Lease, ControlRequest]:
     return lease, lease.request
 
 
-def _to_answer(lease: Lease | None, caller: Identity, request: str) -> tuple[Lease, ControlRequest]:
-    current, asked = find(lease, request)
-    if not asked.addressed_to(caller):
+def _find_for_holder(lease: Lease | None, caller: Identity, request: str) -> tuple[Lease, ControlRequest]:
+    current, control_request = find(lease, request)
+    if not control_request.addressed_to(caller):
         raise forbidden("Only the session that holds the lease may answer the request.")
-    return current, asked
+    return current, control_request
 
 
-def _still(lease: Lease, asked: ControlRequest, wanted: Outcome, now_ms: int) -> bool:
+def _is_open(lease: Lease, control_request: ControlRequest, answer: Outcome, now_ms: int) -> bool:
     """Whether the request can still be answered; ``False`` if it already has this answer."""
-    how = asked.current_outcome(lease, now_ms)
-    if how not in {"open", wanted}:
-        raise _over(how)
-    return how == "open"
+    outcome = control_request.current_outcome(lease, now_ms)
+    if outcome not in {"open", answer}:
+        raise _closed(outcome)
+    return outcome == "open"
 
 
 _ENDS: dict[Outcome, str] = {
@@ -130,5 +129,6 @@ _ENDS: dict[Outcome, str] = {
 }
 
 
-def _over(how: Outcome) -> Problem:
-    return Problem("control-request-closed", 409, "The request is over", _ENDS[how], extras={"outcome": how})
+def _closed(outcome: Outcome) -> Problem:
+    detail = _ENDS[outcome]
+    return Problem("control-request-closed", 409, "The request is closed", detail, extras={"outcome": outcome})

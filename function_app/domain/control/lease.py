@@ -32,7 +32,7 @@ class ControlRequest:
     by: str
     holder_account: str
     holder_session: str
-    asked_ms: int
+    requested_ms: int
     expires_ms: int
     lease_ms: int
     outcome: Outcome = "open"
@@ -62,7 +62,7 @@ class Lease:
         action: Id of the action for which the lease was created automatically.
         pairing: Pairing of the agent. A lease of an earlier pairing is ignored.
         reason: Why it was taken over from another holder.
-        request: The last request for control, open or over.
+        request: The last request for control, open or closed.
     """
 
     epoch: int
@@ -92,8 +92,8 @@ class Lease:
         """The last request, which ends with this lease."""
         if self.request is None:
             return None
-        how = self.request.current_outcome(self, now_ms)
-        return replace(self.request, outcome="ended" if how == "open" else how)
+        outcome = self.request.current_outcome(self, now_ms)
+        return replace(self.request, outcome="ended" if outcome == "open" else outcome)
 
 
 MIN_MS = 1_000
@@ -117,9 +117,9 @@ def acquire(
 ) -> Lease:
     """A lease for ``caller`` with the next epoch. Raises ``lease-held``: another session is the holder.
 
-    The current holder also gets a new epoch. This way a holder acquires control again after the device ended the lease
-    (hold, Stop, restart), which the cloud may not know. ``action`` is the only action that the lease is for; ``over``
-    the reason for a takeover, which only owners may request.
+    The current holder also gets a new epoch, because the device may have ended the lease (hold, Stop, restart) without
+    knowledge of the cloud. ``action`` is the only action that the lease is for; ``over`` is the reason for a takeover,
+    which only owners may request.
     """
     taken = lease is not None and lease.held_by_other(caller, now_ms)
     if lease is not None and taken and not over:

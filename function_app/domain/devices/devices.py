@@ -13,7 +13,7 @@ POLL_SILENT_MS = 45_000
 POLL_MARK_MS = 15_000
 """Minimum interval between two stored polls of an agent."""
 
-_MOST_LEAVING = 16
+_MAX_DEPARTURES = 16
 """Departures accumulate only while a broker is unreachable; beyond this limit the oldest are dropped."""
 
 Transport = Literal["mqtt", "http", "xmpp"]
@@ -125,7 +125,7 @@ def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) 
 
 def rename(agent: Agent, name: str, label: str | None) -> Agent:
     """The agent with a new label for one device; ``None`` restores the agent's own label."""
-    others = {existing: given for existing, given in agent.labels.items() if existing != name}
+    others = {other: text for other, text in agent.labels.items() if other != name}
     return replace(agent, labels=others if label is None else {**others, name: label})
 
 
@@ -165,7 +165,7 @@ def _leaves(agent: Agent, why: Literal["unpaired", "moved", "removed"], names: l
     if agent.account is None or agent.space is None or not names:
         return agent
     leaving = Departure(why, agent.account, agent.space, agent.pairing, tuple(names))
-    return replace(agent, leaving=(*agent.leaving, leaving)[-_MOST_LEAVING:])
+    return replace(agent, leaving=(*agent.leaving, leaving)[-_MAX_DEPARTURES:])
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +175,7 @@ class Link:
     Attributes:
         session: Number of the agent's connection; increases with each connection.
         seen_ms: When the cloud received it [ms since 1970, cloud clock].
-        polled: The agent polls; it sends no message when it stops.
+        polled: The agent uses HTTP polling, so it sends no message when it stops.
         pairing: Pairing of the agent at that time.
     """
 
@@ -225,7 +225,7 @@ def polled(existing: Link | None, now_ms: int, pairing: str) -> Link | None:
 
     A poll overrides any earlier "offline".
     """
-    created = existing is not None and now_ms - existing.seen_ms < POLL_MARK_MS and existing.pairing == pairing
-    if existing is not None and existing.online and existing.polled and created:
+    recent = existing is not None and now_ms - existing.seen_ms < POLL_MARK_MS and existing.pairing == pairing
+    if existing is not None and existing.online and existing.polled and recent:
         return None
     return Link(online=True, session=existing.session if existing else 0, seen_ms=now_ms, polled=True, pairing=pairing)

@@ -1,4 +1,4 @@
-"""Invitations: a share or a transfer for the holder of a secret."""
+"""Invitations: an offered share or transfer, which an account redeems with a secret."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -25,7 +25,7 @@ class Invitation:
         share_s: Duration of the share [s]; 0: unlimited.
         pairing: Pairing of the agent; empty for a space.
         account: The only account that may redeem it; empty: any holder of the secret.
-        takers: Accounts that have redeemed it. Each may do so once, so a removed account cannot return.
+        takers: Accounts that have redeemed it. Each account may redeem it once, so a removed account cannot return.
         taken_by: For a transfer: the account that accepted it.
         taken_space: For a transfer: the space of that account that receives the agents.
     """

@@ -2,7 +2,7 @@
 
 There are four detectors: *level* (beyond a limit), *trend* (moving towards a limit), *change* (a lasting shift,
 Page-Hinkley) and *outlier* (far from its baseline). Distances are measured relative to the observed noise and to the
-distance from the limits. A joint that warms by ten kelvin at work is normal; a joint that does not stop warming is not.
+distance from the limits. A joint may warm by ten kelvin while it works; a joint that does not stop warming is a fault.
 Without noise there is no scale, and no detector triggers.
 """
 
@@ -80,14 +80,14 @@ class Limits:
 
 SPAN = 10
 """Minutes in the window of a trend; the window before it shows whether the trend lasts."""
-SURE = 4.0
+SIGNIFICANT = 4.0
 """A slope is significant beyond this number of standard errors."""
 SLOWING = 0.9
 """A slope below this share of the previous slope is decaying."""
 PROVEN = 0.75
 """A trend is proven if the previous slope was at least this share of the current one."""
 SOON = 1 / 4
-"""Share of the horizon for a new trend, which may still be a warm-up."""
+"""Share of the horizon for a new trend, which may be a warm-up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ class Trend:
     Attributes:
         per_s: Slope [unit/s].
         limit_in_s: Time until it reaches a limit [s]; ``None``: never.
-        proven: It has lasted longer than its window.
+        proven: The trend has lasted longer than its window.
     """
 
     per_s: float
@@ -115,7 +115,7 @@ def trend(minutes: Sequence[float], limits: Limits) -> Trend | None:
         return None
     now = theil_sen(minutes[-SPAN:], MINUTE_MS / 1000)
     limit = limits.highest if now.per_s > 0 else limits.lowest
-    if abs(now.per_s) <= SURE * now.error_per_s or now.per_s == 0 or limit is None:
+    if abs(now.per_s) <= SIGNIFICANT * now.error_per_s or now.per_s == 0 or limit is None:
         return Trend(now.per_s)
     left = limit - now.end
     if left * now.per_s <= 0:
@@ -124,7 +124,7 @@ def trend(minutes: Sequence[float], limits: Limits) -> Trend | None:
         return Trend(now.per_s, left / now.per_s)
     before = theil_sen(minutes[-2 * SPAN : -SPAN], MINUTE_MS / 1000)
     share = now.per_s / before.per_s if before.per_s else math.inf
-    slower = abs(before.per_s) - abs(now.per_s) > SURE / 2 * math.hypot(now.error_per_s, before.error_per_s)
+    slower = abs(before.per_s) - abs(now.per_s) > SIGNIFICANT / 2 * math.hypot(now.error_per_s, before.error_per_s)
     if 0 < share < SLOWING and slower:
         decay_s = SPAN * MINUTE_MS / 1000 / -math.log(share)
         # The slope applies to the middle of its window.
@@ -139,7 +139,7 @@ class DetectorState:
 
     Attributes:
         seen_ms: Start of the newest window [ms since 1970].
-        value: Its mean.
+        value: Mean of that window.
         minutes: Means of the newest whole minutes.
         minute: Sum and count of the windows of the current minute.
         slope_per_s: Slope [unit/s].

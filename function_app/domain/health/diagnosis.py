@@ -31,8 +31,8 @@ class Rule:
     Attributes:
         label: Display name.
         unit: Display unit.
-        advice: What to do about a fault.
-        listed: The robot type lists the field. Findings on other fields are informational.
+        advice: Instruction for the operator.
+        listed: Whether the robot type lists the field. Findings on other fields are informational.
     """
 
     label: str
@@ -68,7 +68,7 @@ def diagnose(rule: Rule, stream: str, name: str, watch: DetectorState) -> Report
     kind = (
         LEVEL
         if watch.breach.on
-        else next(previous for previous in (TREND, LEVEL, CHANGE, OUTLIER) if previous in result)
+        else next(candidate for candidate in (TREND, LEVEL, CHANGE, OUTLIER) if candidate in result)
     )
     severity = Severity.ERROR if watch.breach.on else Severity.WARNING if rule.listed else Severity.INFO
     limit = _limit(kind, rule.limits, watch)
@@ -77,7 +77,7 @@ def diagnose(rule: Rule, stream: str, name: str, watch: DetectorState) -> Report
         source=Source.DETECTOR,
         kind=kind,
         severity=severity,
-        message=f"{_words(kind, rule, name, watch, limit)} {rule.advice or 'Check the device.'}",
+        message=f"{_describe(kind, rule, name, watch, limit)} {rule.advice or 'Check the device.'}",
         stream=stream,
         field=name,
         value=watch.value,
@@ -98,21 +98,22 @@ def _limit(kind: str, limits: Limits, watch: DetectorState) -> float | None:
     return high if abs(watch.value - high) < abs(watch.value - low) else low
 
 
-def _words(kind: str, rule: Rule, name: str, watch: DetectorState, limit: float | None) -> str:
+def _describe(kind: str, rule: Rule, name: str, watch: DetectorState, limit: float | None) -> str:
     part = name.partition(".")[2]
     what = f"{rule.label} ({part.replace('_', ' ')})" if part else rule.label
     value = _show(watch.value, rule.unit)
     if kind == LEVEL:
-        bound = "its limit of" if watch.breach.on else "the warning at"
+        bound = "its limit of" if watch.breach.on else "the warning limit of"
         return f"{what} is {value}, beyond {bound} {_show(limit or 0.0, rule.unit)}."
     if kind == TREND:
         slope = watch.slope_per_s or 0.0
-        way = "rises" if slope > 0 else "falls"
-        left = "now" if not watch.limit_in_s else f"in about {max(1, round(watch.limit_in_s / 60))} min"
-        pace = _show(abs(slope) * 60, rule.unit)
-        return f"{what} is {value} and {way} by {pace} a minute: {left} it reaches {_show(limit or 0.0, rule.unit)}."
+        verb = "rises" if slope > 0 else "falls"
+        when = "now" if not watch.limit_in_s else f"in about {max(1, round(watch.limit_in_s / 60))} min"
+        per_minute = _show(abs(slope) * 60, rule.unit)
+        bound = _show(limit or 0.0, rule.unit)
+        return f"{what} is {value} and {verb} by {per_minute} per minute. It reaches {bound} {when}."
     if kind == CHANGE:
-        return f"{what} has settled at {value}; it was {_show(watch.settled_at or 0.0, rule.unit)} before."
+        return f"{what} has changed to {value} from {_show(watch.settled_at or 0.0, rule.unit)}."
     return f"{what} is {value}, far from the usual {_show(watch.baseline.mean, rule.unit)}."
 
 

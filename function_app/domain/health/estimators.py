@@ -23,8 +23,7 @@ class PageHinkley:
     """Cumulative sums about a running mean, upwards and downwards.
 
     For up to one day of values this equals ``river.drift.PageHinkley`` with ``alpha=1``. The default ``alpha`` of river
-    forgets the sums within 10,000 values, so daily warming would count as change. Here the mean forgets values older
-    than one day instead.
+    decays the sums within 10,000 values, so daily warming would count as change. Here the mean covers one day instead.
     """
 
     count: int = 0
@@ -49,7 +48,8 @@ def page_hinkley(previous: PageHinkley, value: float, *, delta: float, threshold
 class Baseline:
     """Exponentially weighted mean and mean absolute deviation, robust against single outliers.
 
-    ``count`` values are in the mean (at most ``MEMORY``), ``varied`` in the deviation: those unlike their predecessor.
+    ``count`` is the number of values in the mean (at most ``MEMORY``); ``varied`` counts those that differ from their
+    predecessor, which are in the deviation.
     """
 
     count: int = 0
@@ -71,7 +71,7 @@ def learn(previous: Baseline, value: float, *, scale: float, repeated: bool) -> 
     """The baseline after one more value.
 
     ``scale`` is the lower bound of the standard deviation. ``repeated``: the value equals its predecessor; a stuck
-    sensor is not a sensor without noise.
+    sensor must not reduce the noise estimate.
     """
     count = min(previous.count + 1, MEMORY)
     shift = value - previous.mean

@@ -1,7 +1,7 @@
 """The life cycle of a fault: ``raised → acknowledged → cleared``. It may clear without acknowledgement.
 
 A device has at most one open fault per code: a repeated report refers to the same fault. A fault that occurs again
-after it was cleared is a new fault with a higher count.
+after clearing is a new fault with a higher count.
 """
 
 from dataclasses import dataclass, replace
@@ -31,12 +31,12 @@ class Source(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A report of a fault that exists now.
+    """A report of an active fault.
 
     Attributes:
-        code: Code for programs; one open fault for each.
+        code: Code for programs; a device has at most one open fault for each code.
         kind: Detector: ``level``, ``trend``, ``change``, ``outlier``; or ``reported``, ``silent``.
-        message: What is wrong and what to do.
+        message: Description of the fault, and an instruction.
         value: Measured value; ``baseline``: usual value; ``limit``: allowed limit.
     """
 

@@ -47,7 +47,7 @@ class Identity:
         key: Id of the API key; empty for a person. An API key has its own session.
         most: Highest role, regardless of ownership and shares.
         only: Allowed devices (ids) and spaces (``space:<id>``); empty: all.
-        until_ms: End of the session or key [ms since 1970]; nothing granted lasts longer.
+        until_ms: End of the session or key [ms since 1970]; all grants end by then.
     """
 
     account: str
@@ -58,9 +58,9 @@ class Identity:
     only: tuple[str, ...] = ()
     until_ms: int = NEVER_MS
 
-    def lifetime_s(self, wanted_s: int, now_ms: int) -> int:
-        """The lifetime of a grant that may last ``wanted_s`` [s], limited by the session; at least 1 s."""
-        return max(1, min(wanted_s, (self.until_ms - now_ms) // 1000))
+    def lifetime_s(self, requested_s: int, now_ms: int) -> int:
+        """The lifetime of a grant [s]: ``requested_s``, limited by the end of the session; at least 1 s."""
+        return max(1, min(requested_s, (self.until_ms - now_ms) // 1000))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Password rules: a minimum length, and no passwords that are guessed first.
+"""Password rules: a minimum length, and no common passwords.
 
 Follows NIST SP 800-63B: a minimum length and a list of common passwords, without rules about character classes. The
 minimum is higher than eight characters because a stolen table can be searched offline.
@@ -49,7 +49,7 @@ def normalize(password: str) -> str:
 def weakness(password: str, *, name: str) -> str:
     """Why a password, in normal form, is too weak for the account ``name``, as a sentence; empty: it is accepted."""
     if len(password) < LEAST:
-        return f"A password has at least {LEAST} characters; a sentence of a few words is a good one."
+        return f"A password has at least {LEAST} characters; use a sentence of several words."
     if len(password) > MOST:
         return f"A password has at most {MOST} characters."
     lower = password.casefold()
@@ -57,15 +57,15 @@ def weakness(password: str, *, name: str) -> str:
         return f"A password has at least {_DIFFERENT} different characters."
     straight = lower.replace(" ", "")
     if any(straight in row * 2 or straight[::-1] in row * 2 for row in _ROWS):
-        return "This password is one row of keys, which is guessed first."
+        return "This password is a row of keys or letters, which is easy to guess. Choose another."
     for text in (lower, lower.translate(_AS_LETTERS)):
-        words = {_once(word) for word in _LETTERS.findall(text)}
+        words = {_shortest_unit(word) for word in _LETTERS.findall(text)}
         if words and words <= _COMMON | {normalize(name).casefold()}:
-            return "This password is made of words that are guessed first. Choose others, or add some."
+            return "This password consists of common words. Choose other words, or add some."
     return ""
 
 
-def _once(word: str) -> str:
-    """The word without repetitions."""
-    again = (word + word).find(word, 1)
-    return word[:again]
+def _shortest_unit(word: str) -> str:
+    """The part whose repetitions form the word."""
+    period = (word + word).find(word, 1)
+    return word[:period]

@@ -72,11 +72,11 @@ class TypeHead:
         return not self.deleted and version >= max(self.since, self.ready)
 
 
-def next_version(head: TypeHead | None, wanted: int, robot_type: str) -> TypeHead:
+def next_version(head: TypeHead | None, requested: int, robot_type: str) -> TypeHead:
     """The type with one more version: the requested number if it is new."""
     if head is None:
-        return TypeHead(robot_type, last=wanted, since=wanted)
-    version = max(head.last + 1, wanted)
+        return TypeHead(robot_type, last=requested, since=requested)
+    version = max(head.last + 1, requested)
     if head.deleted:
         return TypeHead(robot_type, last=version, since=version)
     return replace(head, last=version)

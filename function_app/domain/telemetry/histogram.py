@@ -1,8 +1,8 @@
 """Mergeable latency histograms with quantiles of bounded relative error.
 
 The buckets follow DDSketch (Masson, Rim, Lee: "DDSketch", VLDB 2019): powers of ``GAMMA``, so every value is within
-``ERROR`` of its bucket. Only counts are stored, so merging is addition. The ``ddsketch`` library uses own objects and
-protobuf; rows need plain numbers.
+``ERROR`` of its bucket. Only counts are stored, so merging is addition. The ``ddsketch`` library stores its own
+objects as protobuf; rows need plain numbers.
 """
 
 import math
@@ -52,10 +52,10 @@ class Histogram:
         rank = max(1, math.ceil(share * self.count))
         if rank == self.count:
             return self.max_ms
-        seen = 0
+        total = 0
         for bucket, count in zip(self.buckets, self.counts, strict=True):
-            seen += count
-            if seen >= rank:
+            total += count
+            if total >= rank:
                 return min(self.max_ms, max(self.min_ms, _middle_ms(bucket)))
         return self.max_ms
 

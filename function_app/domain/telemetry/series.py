@@ -106,7 +106,7 @@ def merge(one: Samples, other: Samples) -> Samples:
         one, other = other, one
     merged = Samples(one.at_ms + other.at_ms)
     for name in dict.fromkeys((*one.columns, *other.columns)):
-        left, right = (each.columns.get(name) or _nothing(len(each)) for each in (one, other))
+        left, right = (each.columns.get(name) or _missing(len(each)) for each in (one, other))
         merged.columns[name] = left + right
     if one.at_ms[-1] > other.at_ms[0]:
         order = sorted(range(len(merged)), key=merged.at_ms.__getitem__)
@@ -198,7 +198,7 @@ class Bucket:
         fields = self.fields
         for name, new in other.fields.items():
             old = fields.get(name)
-            fields[name] = new if old is None else _together(old, new)
+            fields[name] = new if old is None else _merged(old, new)
 
     def data(self) -> dict[str, Any]:
         """The row data."""
@@ -213,20 +213,20 @@ def bucket(data: Mapping[str, Any]) -> Bucket:
 def summarize(samples: Samples) -> Bucket:
     """The aggregate of samples."""
     times = samples.at_ms
-    made = Bucket(len(times))
+    result = Bucket(len(times))
     for name, values in samples.columns.items():
         total = sum(values)
         if total == total:  # noqa: PLR0124 (no NaN among them)
-            made.fields[name] = Summary(len(values), total, min(values), max(values), values[-1], times[-1])
+            result.fields[name] = Summary(len(values), total, min(values), max(values), values[-1], times[-1])
             continue
-        there = [index for index, value in enumerate(values) if not math.isnan(value)]
-        if there:
-            some = [values[index] for index in there]
-            made.fields[name] = Summary(len(some), sum(some), min(some), max(some), some[-1], times[there[-1]])
-    return made
+        present = [index for index, value in enumerate(values) if not math.isnan(value)]
+        if present:
+            some = [values[index] for index in present]
+            result.fields[name] = Summary(len(some), sum(some), min(some), max(some), some[-1], times[present[-1]])
+    return result
 
 
-def _together(one: Summary, other: Summary) -> Summary:
+def _merged(one: Summary, other: Summary) -> Summary:
     last = one if one.last_ms > other.last_ms else other
     return Summary(
         one.samples + other.samples,
@@ -238,11 +238,11 @@ def _together(one: Summary, other: Summary) -> Summary:
     )
 
 
-def _nothing(count: int) -> "array[float]":
+def _missing(count: int) -> "array[float]":
     return array("d", [_NAN]) * count
 
 
-# ---------------------------------------------------------------- how long, how fine
+# ---------------------------------------------------------------- retention and resolution
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -262,15 +262,17 @@ class RetentionPolicy:
         """Minimum time that rows of a level are stored after the end of their day; ``None``: without limit."""
         if level == RAW:
             return self.raw_ms
-        kept_ms = self.levels_ms.get(level.name)
-        return None if kept_ms is None else max(kept_ms, self.raw_ms)
+        retention_ms = self.levels_ms.get(level.name)
+        return None if retention_ms is None else max(retention_ms, self.raw_ms)
 
 
 def finest_level(first_ms: int, last_ms: int, *, points: int, now_ms: int, keep: RetentionPolicy) -> Level:
     """The finest level with at most ``points`` buckets in the time span, whose rows still exist."""
     for level in LEVELS:
         covering = (floor(last_ms - 1, level.span_ms) - floor(first_ms, level.span_ms)) // level.span_ms + 1
-        kept_ms = keep.of(level)
-        if covering <= points and (kept_ms is None or floor(first_ms, DAY.span_ms) + DAY.span_ms + kept_ms > now_ms):
+        retention_ms = keep.of(level)
+        if covering <= points and (
+            retention_ms is None or floor(first_ms, DAY.span_ms) + DAY.span_ms + retention_ms > now_ms
+        ):
             return level
     return LEVELS[-1]

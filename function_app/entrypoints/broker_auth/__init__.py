@@ -1,1 +1,1 @@
-"""Broker auth."""
+"""Authentication of MQTT clients for managed brokers."""

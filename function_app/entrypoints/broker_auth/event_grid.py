@@ -1,8 +1,8 @@
-"""The webhook of an Event Grid namespace: who may connect as whom, and what may be said and heard there.
+"""The authentication webhook of an Event Grid namespace: which MQTT clients may connect, and their topics.
 
-The namespace sends each CONNECT's client id, user name and password (base 64) with a token of its own identity. It is
-answered 200 with a decision, 401 where it is not the namespace that asks, 404 where another broker is in use. An error
-admits no client; the client receives "server unavailable".
+The namespace sends client id, user name and password (base64) of each CONNECT, with a token of its own identity. The
+response is 200 with a decision, 401 if the caller is not the namespace, or 404 if another broker is configured. After
+an error no client is admitted; the client receives "server unavailable".
 """
 
 import base64
@@ -14,19 +14,19 @@ import msgspec
 from function_app.bootstrap import Functions
 
 MAX_BYTES = 65_536
-"""A whole CONNECT with its certificates."""
+"""Maximum size of a request: a CONNECT with its certificates."""
 _OK, _UNAUTHORIZED, _NOT_FOUND = 200, 401, 404
-_DENIED = {"decision": "deny", "errorReason": "not a CONNECT that can be read"}
+_DENIED = {"decision": "deny", "errorReason": "the request is not a valid CONNECT"}
 
 
 @runtime_checkable
-class _Admits(Protocol):
+class _ConnectAuthorizer(Protocol):
     async def known(self, token: str) -> bool: ...
 
     async def admit(self, *, username: str, password: str, client_id: str) -> dict[str, Any]: ...
 
 
-class _Asked(msgspec.Struct, frozen=True, rename="camel"):
+class _ConnectRequest(msgspec.Struct, frozen=True, rename="camel"):
     client_id: str = ""
     user_name: str | None = None
     password: str | None = None
@@ -39,15 +39,15 @@ async def admit(functions: Functions, authorization: str, body: bytes) -> tuple[
         StoreError: The state cannot be read; the namespace then admits no client.
     """
     access = functions.access
-    if not isinstance(access, _Admits):
+    if not isinstance(access, _ConnectAuthorizer):
         return _NOT_FOUND, {}
     scheme, _, token = authorization.partition(" ")
     if scheme.lower() != "bearer" or len(body) > MAX_BYTES or not await access.known(token.strip()):
         return _UNAUTHORIZED, {}
     try:
-        asked = msgspec.json.decode(body, type=_Asked)
-        password = base64.b64decode(asked.password or "", validate=True).decode()
+        connect = msgspec.json.decode(body, type=_ConnectRequest)
+        password = base64.b64decode(connect.password or "", validate=True).decode()
     except (msgspec.MsgspecError, binascii.Error, UnicodeDecodeError, RecursionError):
         return _OK, _DENIED
-    answer = await access.admit(username=asked.user_name or "", password=password, client_id=asked.client_id)
-    return _OK, answer
+    decision = await access.admit(username=connect.user_name or "", password=password, client_id=connect.client_id)
+    return _OK, decision

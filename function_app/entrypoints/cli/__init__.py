@@ -11,7 +11,7 @@ AsyncCommand = Callable[[Functions, argparse.Namespace], Awaitable[int | None]]
 
 
 def with_functions(command: AsyncCommand) -> Callable[[argparse.Namespace], int]:
-    """A command that gets the services of the settings in the environment, and closes them at its end."""
+    """A command that receives services built from the environment's settings. They are closed when it ends."""
 
     async def run(options: argparse.Namespace) -> int:
         functions = bootstrap.build(settings.read())

@@ -18,7 +18,7 @@ _MIN_OVERLAP_HOURS = 24
 
 def add_commands(commands: Any) -> None:
     """Add ``rotate-keys``."""
-    text = "create a new signing key; the current key stays valid for a while"
+    text = "create a new signing key; the current key stays valid for an overlap period"
     rotate = commands.add_parser("rotate-keys", help=text, description=text)
     rotate.add_argument(
         "--learn-minutes",
@@ -38,7 +38,7 @@ def add_commands(commands: Any) -> None:
     rotate.add_argument(
         "--leaked",
         action="store_true",
-        help="end the current key at once; all users must sign in again and all agents must repin",
+        help="end the current key immediately; all users must sign in again and all agents must repin",
     )
     rotate.set_defaults(run=with_functions(_rotate))
 
@@ -53,17 +53,19 @@ async def _rotate(functions: Functions, options: argparse.Namespace) -> None:
     if learn_ms >= overlap_ms:
         raise SettingsError("--learn-minutes must be less than --overlap-hours")
     try:
-        news = await functions.keys.rotate(learn_ms=learn_ms, overlap_ms=overlap_ms, leaked=options.leaked)
+        rotated = await functions.keys.rotate(learn_ms=learn_ms, overlap_ms=overlap_ms, leaked=options.leaked)
     except RotationRefused as error:
         raise SettingsError(
-            f"agents are still fetching the last new key, until {rfc3339(error.until_ms)}; wait, or use --leaked"
+            f"agents fetch the previous new key until {rfc3339(error.until_ms)}; wait until then, or use --leaked"
         ) from error
-    new = news.pins[-1]
+    new = rotated.pins[-1]
     await functions.audit_log.record(CLOUD, AccountEvent.SIGNING_KEY_ROTATED, None, on=new.id, leaked=options.leaked)
     print(f"new key {new.id}, number {new.serial}")
     if options.leaked:
-        print("all former keys have ended; sign in again, and run `python -m device_agent repin` at every agent")
+        print("all previous keys have ended; sign in again, and run `python -m device_agent repin` on every agent")
     else:
-        ends_ms = max(pin.until_ms for pin in news.pins)
+        ends_ms = max(pin.until_ms for pin in rotated.pins)
         print(f"commands are signed with it in {options.learn_minutes} minutes; agents fetch it until then")
-        print(f"the former key is accepted until {rfc3339(ends_ms)}; an agent that is offline until then must `repin`")
+        print(
+            f"the previous key is accepted until {rfc3339(ends_ms)}; an agent that is offline until then must `repin`"
+        )

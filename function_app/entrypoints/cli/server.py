@@ -13,7 +13,7 @@ from function_app.entrypoints.hosts import uvicorn, worker
 from function_app.settings import SettingsError
 
 _WORKER_NICE = 5
-"""Storage may wait; HTTP responses, and an agent on the same machine, may not."""
+"""HTTP responses, and an agent on the same machine, have priority over storage."""
 
 
 def add_commands(commands: Any) -> None:
@@ -39,7 +39,7 @@ def _serve(_: argparse.Namespace) -> int:
 
 
 async def _check(functions: Functions) -> None:
-    """Report unusable tables or keys at the start instead of at the first request."""
+    """Report unavailable tables or keys at the start instead of at the first request."""
     await functions.health.require_tables()
     await functions.keys.current()
     await functions.tables.close()
@@ -58,9 +58,9 @@ async def _work(functions: Functions, _: argparse.Namespace) -> None:
 
 async def _xmpp(functions: Functions, _: argparse.Namespace) -> None:
     try:
-        from function_app.entrypoints.xmpp import speak  # noqa: PLC0415 (slixmpp is optional)
+        from function_app.entrypoints.xmpp import run_gateway  # noqa: PLC0415 (slixmpp is optional)
 
-        await speak(functions)
+        await run_gateway(functions)
     except ModuleNotFoundError as error:
         raise SettingsError(f"the XMPP gateway needs the Python package {error.name}; run `make env`") from error
 

@@ -1,1 +1,1 @@
-"""Hosts."""
+"""Programs that host the functions: AWS Lambda, Azure Functions, uvicorn, and the local worker."""

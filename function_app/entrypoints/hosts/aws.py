@@ -1,7 +1,7 @@
-"""AWS Lambda: one handler for HTTP, for what devices say, for who connects to the broker, and for the timer.
+"""AWS Lambda: one handler for HTTP, device messages, broker authentication and the timer.
 
-The functions, and the event loop that their connections belong to, are made at the first event and live as long as the
-instance. The loop only runs during an invocation: between two the instance is frozen, for milliseconds or for an hour.
+The first event creates the services and the event loop of their connections. Both are reused until the instance ends.
+The loop runs only during an invocation; between invocations the instance is frozen, for milliseconds or for an hour.
 """
 
 import asyncio
@@ -17,17 +17,17 @@ from function_app.entrypoints.http import create_app
 from function_app.entrypoints.ingest.cloud_events import from_iot_rule, from_queue
 
 _SCHEDULES = frozenset({"aws.events", "aws.scheduler"})
-"""EventBridge's rules and its scheduler, where they give no input of their own."""
+"""Sources of timer events from EventBridge rules and schedules without custom input."""
 _TEXT = ("text/", "application/json", "application/problem+json", "application/javascript", "image/svg+xml")
-"""What goes out as it is; the gateway takes everything else in base64."""
-_SHOWN = 200
+"""Content types that are returned as text; the gateway requires base64 for all others."""
+_MAX_LOGGED = 200
 
 
 def handler(event: dict[str, Any], context: Any) -> Any:
-    """One invocation. An error is the gateway's 500, or makes Amazon deliver the event again.
+    """Handle one invocation. After an error the gateway responds with 500, or AWS delivers the event again.
 
     Raises:
-        ValueError: The event is none that the functions know.
+        ValueError: The event has an unknown type.
     """
     loop = _loop()
     if "requestContext" in event:
@@ -40,13 +40,13 @@ def handler(event: dict[str, Any], context: Any) -> Any:
         return loop.run_until_complete(from_iot_rule(_functions(), event))
     if event.get("source") in _SCHEDULES:
         return loop.run_until_complete(_functions().scheduler.run_due_jobs())
-    raise ValueError(f"an event with the fields {str(sorted(event))[:_SHOWN]} is for none of the functions")
+    raise ValueError(f"unknown event with the fields {str(sorted(event))[:_MAX_LOGGED]}")
 
 
 @functools.cache
 def _loop() -> asyncio.AbstractEventLoop:
     loop = asyncio.new_event_loop()
-    asyncio.set_event_loop(loop)  # where Mangum looks for it
+    asyncio.set_event_loop(loop)  # Mangum uses the current loop
     return loop
 
 

@@ -1,4 +1,4 @@
-"""The functions under uvicorn, on one machine."""
+"""The HTTP server for one machine: uvicorn."""
 
 import socket
 
@@ -9,10 +9,10 @@ from function_app.bootstrap import Functions
 from function_app.entrypoints.http import create_app
 
 KEEP_ALIVE_S = 75
-"""uvicorn's own 5 s would cost a waiting client a new connection each time."""
+"""Longer than the default of 5 s, so that long-polling clients keep their connection."""
 
 
-class PortTaken(Exception):  # noqa: N818 (an answer for a terminal)
+class PortTaken(Exception):  # noqa: N818 (a message for the terminal)
     """Another program uses the address."""
 
 
@@ -20,7 +20,7 @@ def serve(functions: Functions) -> None:
     """Run until SIGINT or SIGTERM.
 
     Raises:
-        PortTaken: With a sentence that says what to do.
+        PortTaken: The address is in use. The message says how to choose another.
     """
     listener = listen(functions.settings.host, functions.settings.port)
     tls = functions.settings.tls
@@ -30,7 +30,7 @@ def serve(functions: Functions) -> None:
         access_log=False,
         log_level="warning",
         server_header=False,
-        proxy_headers=False,  # whom to believe about addresses is a setting
+        proxy_headers=False,  # TELESCOPE_TRUSTED_PROXIES applies instead
         timeout_graceful_shutdown=3,
         ssl_certfile=None if tls is None else tls.certificate,
         ssl_keyfile=None if tls is None else tls.key,
@@ -43,11 +43,11 @@ def listen(host: str, port: int) -> socket.socket:
     """A socket bound to the address.
 
     Raises:
-        PortTaken: With a sentence that says what to do.
+        PortTaken: The address is in use. The message says how to choose another.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # The protocol by its number: asyncio sets TCP_NODELAY only on what says that it is TCP. Without it every answer
-    # waits 40 ms for the client's delayed acknowledgement.
+    # asyncio sets TCP_NODELAY only if the protocol is explicitly TCP. Without it, each response waits 40 ms for the
+    # client's delayed acknowledgement.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

@@ -1,4 +1,4 @@
-"""The local worker: ingest from the broker, and the timer. One process; any number may run."""
+"""The local worker: stores messages from the broker and runs timers. Several workers may run concurrently."""
 
 import asyncio
 import logging
@@ -19,12 +19,12 @@ async def work(functions: Functions) -> None:
     """Run until SIGINT or SIGTERM.
 
     Raises:
-        StoreError: The tables cannot be used, at the start.
+        StoreError: The tables are not available at the start.
     """
-    ending = asyncio.Event()
+    stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ending.set)
+        loop.add_signal_handler(number, stopping.set)
     await functions.health.require_tables()
 
     async def handle(topic: str, payload: bytes) -> None:
@@ -41,7 +41,7 @@ async def work(functions: Functions) -> None:
         asyncio.create_task(_sweep(functions)),
         asyncio.create_task(_check_models(functions)),
     ]
-    waiting = asyncio.create_task(ending.wait())
+    waiting = asyncio.create_task(stopping.wait())
     done, _ = await asyncio.wait([*tasks, waiting], return_when=asyncio.FIRST_COMPLETED)
     for task in (*tasks, waiting):
         task.cancel()
@@ -51,10 +51,10 @@ async def work(functions: Functions) -> None:
 
 
 async def check_models(functions: Functions, *, drain: bool) -> None:
-    """Check uploaded models, for ever or until none is left.
+    """Check uploaded models, until none is left (``drain``) or without end.
 
     Raises:
-        CompilerMissingError: This machine cannot.
+        CompilerMissingError: MuJoCo is not installed.
     """
     functions.model_checks.require()
     while True:
@@ -62,7 +62,7 @@ async def check_models(functions: Functions, *, drain: bool) -> None:
             busy = await functions.model_checks.run()
         except CompilerMissingError:
             raise
-        except Exception:  # noqa: BLE001 (one bad upload must not end the checker; after some tries it is refused)
+        except Exception:  # noqa: BLE001 (the checker survives an invalid upload, which is rejected after a few attempts)
             _log.exception("model checks")
             busy = False
         if drain and not busy:
@@ -71,11 +71,11 @@ async def check_models(functions: Functions, *, drain: bool) -> None:
 
 
 async def _check_models(functions: Functions) -> None:
-    """A worker without MuJoCo does all the rest."""
+    """Check models if MuJoCo is installed; a worker without it runs the other tasks."""
     try:
         await check_models(functions, drain=False)
     except CompilerMissingError as error:
-        _log.warning("uploaded models are not checked by this worker: %s", error)
+        _log.warning("this worker does not check uploaded models: %s", error)
         await asyncio.Event().wait()
 
 
@@ -83,6 +83,6 @@ async def _sweep(functions: Functions) -> None:
     while True:
         try:
             await functions.scheduler.run_due_jobs()
-        except Exception:  # noqa: BLE001 (one bad round must not end the timer)
+        except Exception:  # noqa: BLE001 (the timer continues after a failed run)
             _log.exception("timer")
         await asyncio.sleep(SWEEP_EVERY_S)

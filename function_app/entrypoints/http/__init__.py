@@ -1,4 +1,4 @@
-"""The HTTP API: FastAPI routes over the services, one file for each resource."""
+"""The HTTP API: FastAPI routes, one module for each resource."""
 
 from function_app.entrypoints.http.app import create_app
 

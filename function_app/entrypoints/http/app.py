@@ -1,4 +1,4 @@
-"""The HTTP application: routes, problems, security headers, and the console beside them."""
+"""The HTTP application: API routes, error responses, security headers, and the console."""
 
 import logging
 from collections.abc import AsyncIterator, Sequence
@@ -52,10 +52,10 @@ _MODULES = (
     robot_types, previews, movements, script_editor, mqtt_credentials, xmpp, latency, faults, events, diagnostics,
     series, uploads, health_check,
 )  # fmt: skip
-"""In the order of the API's description."""
+"""In the order of the OpenAPI document."""
 _log = logging.getLogger(__name__)
 _WRONG_METHOD = 405
-_TITLES = {404: "Nothing here", _WRONG_METHOD: "Not this method"}
+_TITLES = {404: "Not found", _WRONG_METHOD: "Method not allowed"}
 
 
 def create_app(functions: Functions) -> FastAPI:
@@ -63,7 +63,7 @@ def create_app(functions: Functions) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        # A warm start where the host runs it; nothing depends on it, for some hosts never do.
+        # Only shortens the first request: some hosts do not run the lifespan.
         await functions.bus.start()
         yield
         await functions.close()
@@ -71,7 +71,7 @@ def create_app(functions: Functions) -> FastAPI:
     app = FastAPI(
         title="Telescope",
         version=VERSION,
-        description="Operate robots, and the rooms they stand in, from anywhere.",
+        description="Operate robots and the rooms around them from anywhere.",
         openapi_url=f"{PREFIX}/openapi.json",
         docs_url=None,
         redoc_url=None,
@@ -89,20 +89,20 @@ def create_app(functions: Functions) -> FastAPI:
     app.add_exception_handler(StoreError, _on_store)
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_http)
-    # What no route knows at all; a mount would also swallow a wrong method, which is a 405.
+    # As default instead of a mount: a mount would also receive requests with a wrong method, which must return 405.
     app.router.default = Console(functions.settings.console)
     app.add_middleware(_Addresses, limits=functions.rate_limiter, proxies=functions.settings.trusted_proxies)
     app.add_middleware(
         _Headers,
         clock=functions.clock,
         websocket_url=functions.settings.websocket_url,
-        secure=_by_name(functions.settings.public_url),
+        secure=_requires_hsts(functions.settings.public_url),
     )
     return app
 
 
-def _by_name(url: str) -> bool:
-    """Whether to send HSTS for this host. Not for ``localhost``, where other programs serve pages too."""
+def _requires_hsts(url: str) -> bool:
+    """Whether to send HSTS for this host. Not for ``localhost``, where other programs serve pages, too."""
     parts = urlsplit(url)
     return parts.scheme == "https" and parts.hostname != "localhost"
 
@@ -114,14 +114,14 @@ def _document(app: FastAPI, index: RouteIndex, kinds: Sequence[Any]) -> None:
                 title=app.title, version=app.version, description=app.description, routes=index.routes
             )
             components = document.setdefault("components", {})
-            # What the framework's own validation would say never leaves: refusals are problem details.
+            # Replaces the framework's schemas: all errors are problem details.
             components["schemas"] = schemas(kinds)
             _drop_validation_errors(document)
             components["securitySchemes"] = {
                 ACCOUNT_SCHEMES[0]: {"type": "http", "scheme": "bearer", "bearerFormat": "JWT"},
                 ACCOUNT_SCHEMES[1]: {"type": "apiKey", "in": "cookie", "name": COOKIE},
                 KEY_SCHEME: {"type": "http", "scheme": "bearer", "description": "An API key, `ts_…`."},
-                AGENT_SCHEME: {"type": "http", "scheme": "bearer", "description": "A JWT that the agent's key signed."},
+                AGENT_SCHEME: {"type": "http", "scheme": "bearer", "description": "A JWT signed by the agent's key."},
             }
             app.openapi_schema = document
         return app.openapi_schema
@@ -134,7 +134,7 @@ def _document(app: FastAPI, index: RouteIndex, kinds: Sequence[Any]) -> None:
 
 
 def _drop_validation_errors(document: dict[str, Any]) -> None:
-    """The framework adds its own 422 wherever a route has parameters: text in a path is never refused that way."""
+    """Remove the 422 response that the framework adds to every route with parameters: path text is always valid."""
     for operations in document["paths"].values():
         for operation in operations.values():
             if JSON in operation["responses"].get("422", {}).get("content", {}):
@@ -142,45 +142,45 @@ def _drop_validation_errors(document: dict[str, Any]) -> None:
 
 
 async def _on_problem(_request: Request, error: Exception) -> Response:
-    assert isinstance(error, Problem)  # noqa: S101 (registered for nothing else)
+    assert isinstance(error, Problem)  # noqa: S101 (registered only for this class)
     return problem(error)
 
 
 async def _on_store(_request: Request, error: Exception) -> Response:
     _log.error("%s", error)
     return problem(
-        store_unavailable("The tables are unavailable. The log of this server contains the reason. Try again later.")
+        store_unavailable("The tables are unavailable. The server's log contains the reason. Try again later.")
     )
 
 
 async def _on_validation(_request: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)  # noqa: S101 (registered for nothing else)
+    assert isinstance(error, RequestValidationError)  # noqa: S101 (registered only for this class)
     first = error.errors()[0]
     place = ".".join(str(part) for part in first["loc"])
     return problem(invalid(f"{place}: {first['msg']}."))
 
 
 async def _on_http(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)  # noqa: S101 (registered for nothing else)
+    assert isinstance(error, HTTPException)  # noqa: S101 (registered only for this class)
     title = _TITLES.get(error.status_code, str(error.detail))
     detail = f"{request.method} {request.url.path[:200]}: {str(error.detail).rstrip('.')}."
-    answer = problem(Problem("http", error.status_code, title, detail))
+    response = problem(Problem("http", error.status_code, title, detail))
     for name, value in (error.headers or {}).items():
-        answer.headers[name] = value
+        response.headers[name] = value
     if error.status_code == _WRONG_METHOD:
-        answer.headers["Allow"] = ", ".join(_methods(request))
-    return answer
+        response.headers["Allow"] = ", ".join(_methods(request))
+    return response
 
 
 def _methods(request: Request) -> list[str]:
-    """Methods of the path. The framework names those of one route only."""
+    """Methods of the path. The framework lists those of one route only."""
     index: RouteIndex = request.app.state.route_index
     routes = index.on_path(request.scope)
     return sorted({method for route in routes if route.path == routes[0].path for method in route.methods or ()})
 
 
 class _Addresses:
-    """Applies the rate limit per client address, before any other work."""
+    """Applies the rate limit per client address before all other processing."""
 
     def __init__(self, app: ASGIApp, *, limits: RateLimiter, proxies: int) -> None:
         self._app = app
@@ -194,8 +194,8 @@ class _Addresses:
             try:
                 if address:
                     self._limits.admit("address", address)
-            except Problem as refused:
-                await problem(refused)(scope, receive, send)
+            except Problem as rejection:
+                await problem(rejection)(scope, receive, send)
                 return
         await self._app(scope, receive, send)
 

@@ -107,6 +107,6 @@ def _freed(action: Action, control: ControlRows) -> list[Write]:
     if control.lease is not None and control.lease.action == action.id:
         free = release(control.lease, now_ms=action.ended_ms)
         writes.append(control.write_lease(action.device, free))
-        caller = Identity(action.account, action.who, action.session)
+        caller = Identity(action.account, action.caller, action.session)
         writes += lease_change(action.device, control.lease, free, caller=caller, now_ms=action.ended_ms)
     return writes

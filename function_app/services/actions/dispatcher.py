@@ -68,7 +68,7 @@ class ActionDispatcher:
             PermissionEnded: The device has another owner or is gone, share or key have ended or changed, or the account
                 has signed out.
         """
-        caller = await self._devices.current_identity(Identity(action.account, action.who, action.session))
+        caller = await self._devices.current_identity(Identity(action.account, action.caller, action.session))
         device, _ = (None, None) if caller is None else await self._devices.find_with_link(caller, action.device)
         if caller is not None and device is not None and device.pairing == action.pairing and device.role.may_operate:
             return caller, device
@@ -97,7 +97,7 @@ class ActionDispatcher:
             task: Task = msgspec.convert(action.request, Task)
             return task
         # A shared device runs its owner's movements, so the author's store contains the script.
-        owner = Identity(action.pinned["author"] or action.account, action.who, "")
+        owner = Identity(action.pinned["author"] or action.account, action.caller, "")
         source = await self._movements.pinned_source(owner, action.request["name"], action.pinned)
         if source is None:
             raise MovementUnavailable

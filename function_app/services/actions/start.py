@@ -145,7 +145,7 @@ class StartAction:
             id=action_id,
             device=device.id,
             account=caller.account,
-            who=caller.name,
+            caller=caller.name,
             pairing=device.pairing,
             request=asked,
             epoch=0,
@@ -153,7 +153,7 @@ class StartAction:
             ttl_ms=min(request.ttl_ms, request.timeout_ms),
             deadline_ms=now_ms + request.timeout_ms,
             pinned=pinned,
-            once=key,
+            idempotency_key=key,
             session=caller.session,
             timeout_ms=request.timeout_ms,
         )
@@ -241,7 +241,7 @@ class StartAction:
             control = await apply_ended_epoch(self._tables, device, control, caller, now_ms)
             if now_ms - draft.created_ms > ABANDON_MS:
                 raise busy_store()
-            earlier = await self._earlier(device, request, draft.once) if draft.once else None
+            earlier = await self._earlier(device, request, draft.idempotency_key) if draft.idempotency_key else None
             if earlier is not None:
                 return earlier, False
             before = control.action or next(iter((*control.queue.actions, *control.queue.dropped)), "")
@@ -266,9 +266,9 @@ class StartAction:
                 writes += lease_change(
                     device.id, control.lease, lease, caller=caller, now_ms=now_ms, owner=device.owner
                 )
-            if action.once:
+            if action.idempotency_key:
                 data = {"action": action.id, "request": request.fingerprint()}
-                writes.append(Write("create", Row(device.id, action.once, data)))
+                writes.append(Write("create", Row(device.id, action.idempotency_key, data)))
             rows = await self._tables.batch(records.CONTROL, writes)
             return StoredAction(action, rows[0]), True
 

@@ -223,7 +223,7 @@ class AuditLog:
         try:
             await self._batches.add(owner, [_Job(fields, waiting=waiting)])
         except (Problem, StoreError) as error:
-            _log.warning("audit of %s: %s", entry.what, error)
+            _log.warning("audit of %s: %s", entry.event, error)
             with contextlib.suppress(Conflict, StoreError):
                 await self._tables.replace(records.AUDIT, replace(waiting, data=fields))
 

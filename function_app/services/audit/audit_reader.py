@@ -30,8 +30,8 @@ _MOST_NAMES: Final = 1_000
 class AuditFilter:
     """A filter by kind, target and time span (``None``: all)."""
 
-    what: str | None = None
-    on: str | None = None
+    event: str | None = None
+    target: str | None = None
     since_ms: int | None = None
     until_ms: int | None = None
 
@@ -39,8 +39,8 @@ class AuditFilter:
         """Whether ``record`` matches."""
         at_ms = record["at_ms"]
         return (
-            self.what in {None, record["what"]}
-            and self.on in {None, record["on"]}
+            self.event in {None, record["event"]}
+            and self.target in {None, record["target"]}
             and (self.since_ms is None or at_ms >= self.since_ms)
             and (self.until_ms is None or at_ms < self.until_ms)
         )
@@ -65,7 +65,7 @@ class AuditReader:
         self._keys = keys
 
     async def read(
-        self, caller: Identity, wanted: AuditFilter, *, cursor: str | None, limit: int
+        self, caller: Identity, audit_filter: AuditFilter, *, cursor: str | None, limit: int
     ) -> tuple[list[Mapping[str, Any]], str | None]:
         """Records of the caller's chain, newest first, and the cursor of the next page.
 
@@ -90,7 +90,7 @@ class AuditReader:
             )
             for row in reversed(page.rows):
                 newest = int(row.key.rpartition(":")[2]) - 1
-                if wanted.fits(row.data):
+                if audit_filter.fits(row.data):
                     result.append(row.data)
                     if len(result) == limit:
                         break

@@ -194,7 +194,7 @@ def _entry(device: str, event: Mapping[str, Any], by: Mapping[str, str], outcome
 def _by(caller: Identity | None) -> dict[str, str]:
     if caller is None:
         return {}
-    return {"who": caller.name, "account": caller.account, "session": caller.session, "key": caller.key}
+    return {"actor": caller.name, "account": caller.account, "session": caller.session, "key": caller.key}
 
 
 def _name(device: str) -> str:

@@ -125,9 +125,9 @@ class ControlRequests:
         Raises ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed`` or ``busy``.
         """
         device = await self._devices.get(caller, device_id)
-        async with self._control_events.recording_rejections(device, caller, "refuse control"):
+        async with self._control_events.recording_rejections(device, caller, "reject a control request"):
             require_operator(device)
-            before, lease = await self._change(caller, device, rules.refuse, request)
+            before, lease = await self._change(caller, device, rules.reject, request)
         if before is not lease:
             await self._drop(caller, device, lease, request)
         return rules.find(lease, request)

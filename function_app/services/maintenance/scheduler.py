@@ -213,9 +213,9 @@ class Scheduler:
         if where is None:
             return
         await self._retention.delete_row_at(records.CONTROL, *where, due_ms=action.ended_ms + self._keep_actions_ms)
-        if action.once:
+        if action.idempotency_key:
             await self._retention.delete_row_at(
-                records.CONTROL, where[0], action.once, due_ms=action.created_ms + KEEP_ONCE_MS
+                records.CONTROL, where[0], action.idempotency_key, due_ms=action.created_ms + KEEP_ONCE_MS
             )
 
     async def _publish(self, result: StoredAction, now_ms: int) -> None:
@@ -238,7 +238,7 @@ class Scheduler:
         device = await self._dispatcher.device(action)
         if device is not None:
             order = CancelAction(action=action.id)
-            await self._command_sender.try_send(device, order, caller=action.who, epoch=action.epoch)
+            await self._command_sender.try_send(device, order, caller=action.caller, epoch=action.epoch)
 
     async def _forget_expired(self) -> None:
         """Delete expired claim codes and sign-in links, a limited number per run."""

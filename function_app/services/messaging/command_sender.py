@@ -73,7 +73,7 @@ class CommandSender:
             device,
             action.id,
             request,
-            caller=action.who,
+            caller=action.caller,
             epoch=action.epoch,
             issued_ms=action.issued_ms,
             ttl_ms=action.ttl_ms,

@@ -82,7 +82,7 @@ def check_one_chain(place: Place, records: int) -> None:
 
     async def look(functions: Functions) -> None:
         await later(functions)
-        found = Counter(record["on"] for record in await everything(functions))
+        found = Counter(record["target"] for record in await everything(functions))
         assert found == {f"{writer}-{number}": 1 for writer in range(WRITERS) for number in range(records)}
         assert (await functions.audit_reader.verify(OWNER)).broken == ""
 
@@ -125,7 +125,7 @@ async def prepare(functions: Functions, step: int) -> tuple[str, str, str]:
 async def check_records(functions: Functions, who: Identity, agent: str, before: int) -> None:
     await later(functions)
     records = (await everything(functions, who.account))[before:]
-    changes = Counter((each["what"], each["data"].get("epoch")) for each in records)
+    changes = Counter((each["event"], each["data"].get("epoch")) for each in records)
     assert all(count == 1 for count in changes.values()), changes
     row = await functions.tables.get(store.AGENTS, agent, "agent")
     assert row is not None

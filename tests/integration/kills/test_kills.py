@@ -39,7 +39,7 @@ async def repeat(functions: Functions, work: Work, scene: Scene) -> None:
         await work(functions, scene)
     if work in {start_once, join_queue}:
         rows = await rows_of(functions, records.CONTROL, scene.device)
-        keyed = [key for key, data in rows.items() if key.startswith("action:") and data["once"]]
+        keyed = [key for key, data in rows.items() if key.startswith("action:") and data["idempotency_key"]]
         assert len(keyed) == 1, "one idempotency key gives one action, also after a kill"
 
 

@@ -14,12 +14,12 @@ from function_app.services.accounts.api_keys import ApiKeyRequest
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
-    """The routes. None of them takes a key: a key makes no keys."""
+    """The routes. They reject API keys: an API key cannot create another."""
     routes = Routes("accounts")
 
     @routes.add("GET /api-keys", "List API keys", schemas.ApiKeyList)
     async def list_api_keys(request: Request) -> Response:
-        """Newest first, without secrets. Expired keys stay listed for 30 days."""
+        """Returns keys without their secrets, newest first. Expired keys stay listed for 30 days."""
         caller = await auth.account(request)
         now_ms = functions.clock.now_ms()
         items = tuple(_show(key, now_ms) for key in await functions.api_keys.of(caller.account))
@@ -36,8 +36,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         """
         caller = await auth.account(request)
         payload: schemas.ApiKeyRequest = await read(request, schemas.ApiKeyRequest)
-        wanted = ApiKeyRequest(label=payload.name, most=Role(payload.role), only=payload.only, days=payload.days)
-        key, token = await functions.api_keys.make(caller, wanted)
+        key_request = ApiKeyRequest(label=payload.name, most=Role(payload.role), only=payload.only, days=payload.days)
+        key, token = await functions.api_keys.make(caller, key_request)
         body = schemas.ApiKeyCreated(api_key=_show(key, functions.clock.now_ms()), token=token)
         return json_response(body, 201, {"Cache-Control": "no-store"})
 

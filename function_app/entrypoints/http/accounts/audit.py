@@ -13,7 +13,7 @@ from function_app.entrypoints.http.framework.routing import Cursor, Limit, Route
 from function_app.services.audit.audit_reader import AuditFilter
 
 Target = Annotated[
-    str | None, Query(max_length=200, description="Only records about the device, agent, … with this id.")
+    str | None, Query(max_length=200, description="Only records about the target with this id, such as a device.")
 ]
 Event = Annotated[str | None, Query(max_length=60, description="Only records of this event, such as `control-taken`.")]
 
@@ -32,22 +32,22 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         cursor: Cursor = None,
         limit: Limit = 100,
     ) -> Response:
-        """Records of the account and its devices, for every actor.
+        """Returns records of the account and its devices, of all actors, newest first.
 
-        They cover control changes, rejected requests, Stops, claims, shares, keys and sign-ins. Each hash covers the
-        record before it.
+        Records cover control changes, rejected requests, Stops, claims, shares, keys and sign-ins. Each hash also
+        covers the previous record.
         """
         caller = await auth.account(request)
-        wanted = AuditFilter(what=event, on=target, since_ms=since, until_ms=until)
-        records, following = await functions.audit_reader.read(caller, wanted, cursor=cursor, limit=limit)
+        audit_filter = AuditFilter(event=event, target=target, since_ms=since, until_ms=until)
+        records, following = await functions.audit_reader.read(caller, audit_filter, cursor=cursor, limit=limit)
         items = tuple(
             schemas.AuditRecordOut(
                 seq=record["seq"],
                 at=rfc3339(record["at_ms"]),
-                event=record["what"],
-                target=record["on"],
+                event=record["event"],
+                target=record["target"],
                 outcome=record["outcome"],
-                actor=record["who"],
+                actor=record["actor"],
                 account=record["account"],
                 session=record["session"],
                 key=record["key"],

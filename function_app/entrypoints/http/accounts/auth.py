@@ -6,8 +6,8 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.problems import forbidden
 from function_app.domain.identity.accounts import Identity
 from function_app.entrypoints.http.accounts import schemas
-from function_app.entrypoints.http.accounts.cookies import clear_session, signed_in, whence
-from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, refuse_other_sites
+from function_app.entrypoints.http.accounts.cookies import clear_session, sign_in_origin, signed_in
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, reject_cross_site
 from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.framework.schemas import AccountRef
@@ -29,9 +29,9 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     )
     async def sign_in(request: Request) -> Response:
         """Returns an access token for programs and sets a cookie for the console."""
-        refuse_other_sites(request)
+        reject_cross_site(request)
         payload: schemas.LinkSignInRequest = await read(request, schemas.LinkSignInRequest)
-        return signed_in(settings, await functions.sign_in.redeem(payload.link, whence(request, settings)))
+        return signed_in(settings, await functions.sign_in.redeem(payload.link, sign_in_origin(request, settings)))
 
     @routes.add(
         "POST /auth/password",
@@ -42,10 +42,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="anonymous",
     )
     async def sign_in_by_password(request: Request) -> Response:
-        """Like a one-time link. Failed attempts are counted per name and per client address."""
-        refuse_other_sites(request)
+        """Returns the same as a one-time link. Failed attempts are limited per name and per client address."""
+        reject_cross_site(request)
         payload: schemas.PasswordSignInRequest = await read(request, schemas.PasswordSignInRequest)
-        done = await functions.passwords.sign_in(payload.name, payload.password, whence(request, settings))
+        done = await functions.passwords.sign_in(payload.name, payload.password, sign_in_origin(request, settings))
         return signed_in(settings, done)
 
     @routes.add(
@@ -61,19 +61,19 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
         If another account takes the last use of the invitation first, the new account exists without shares.
         """
-        refuse_other_sites(request)
+        reject_cross_site(request)
         payload: schemas.AccountRequest = await read(request, schemas.AccountRequest)
-        known = await functions.invitations.look(payload.invitation)
-        if known.invitation.account:
+        invitation = await functions.invitations.look(payload.invitation)
+        if invitation.invitation.account:
             raise forbidden("This invitation is for an existing account. Sign in with that account to redeem it.")
         account = await functions.passwords.register(payload.name, payload.password)
-        done = await functions.sessions.begin(account, "password", whence(request, settings))
-        await functions.invitations.redeem(Identity(account.id, account.name, done.session), known)
+        done = await functions.sessions.begin(account, "password", sign_in_origin(request, settings))
+        await functions.invitations.redeem(Identity(account.id, account.name, done.session), invitation)
         return signed_in(settings, done, 201)
 
     @routes.add("POST /auth/token", "Renew the access token", schemas.AccessToken, caller="page")
     async def renew_token(request: Request) -> Response:
-        """For programs that keep the cookie. An access token lasts 15 min, the session 12 h.
+        """For programs that store the cookie. An access token is valid for 15 min, the session for 12 h.
 
         Requires the cookie and the session's CSRF token in ``X-CSRF-Token``. An access token cannot renew itself.
         """
@@ -81,7 +81,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         token, lifetime_s = await functions.sessions.access_token(caller)
         body = schemas.AccessToken(
             access_token=token,
-            token_type="Bearer",  # noqa: S106 (a scheme's name)
+            token_type="Bearer",  # noqa: S106 (the name of the scheme)
             expires_in_s=lifetime_s,
         )
         return json_response(body, headers={"Cache-Control": "no-store"})
@@ -94,13 +94,13 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /spaces", "List spaces", schemas.SpaceList)
     async def list_spaces(request: Request) -> Response:
-        """The account's own spaces, which accept agents, and spaces shared with it."""
+        """Returns the account's own spaces, which accept agents, and spaces that are shared with it."""
         views = await functions.spaces.list(await auth.account(request))
         return json_response(schemas.SpaceList(items=tuple(_space(view) for view in views), cursor=None))
 
     @routes.add("POST /spaces", "Create a space", {201: schemas.SpaceOut}, 409, body=schemas.SpaceRequest)
     async def create_space(request: Request) -> Response:
-        """Agents can be claimed into it."""
+        """Creates a space of the account, into which agents can be claimed."""
         caller = await auth.account(request)
         payload: schemas.SpaceRequest = await read(request, schemas.SpaceRequest)
         space = await functions.sign_in.add_space(caller, payload.name)

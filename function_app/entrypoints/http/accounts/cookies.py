@@ -17,7 +17,7 @@ def set_session(settings: Settings, done: SignedIn) -> str:
 
 
 def clear_session(settings: Settings) -> str:
-    """``Set-Cookie`` of none."""
+    """``Set-Cookie`` that deletes the session cookie."""
     return _session(settings, "", 0)
 
 
@@ -27,10 +27,10 @@ def secure(settings: Settings) -> str:
 
 
 def signed_in(settings: Settings, done: SignedIn, status: int = 200) -> Response:
-    """An access token for programs, and a cookie for the page."""
+    """The response to a sign-in: an access token for programs, and a cookie for the page."""
     body = schemas.SignedIn(
         access_token=done.access_token,
-        token_type="Bearer",  # noqa: S106 (a scheme's name)
+        token_type="Bearer",  # noqa: S106 (the name of the scheme)
         expires_in_s=done.expires_in_s,
         account=AccountRef(id=done.account.id, name=done.account.name),
         session=done.session,
@@ -39,7 +39,7 @@ def signed_in(settings: Settings, done: SignedIn, status: int = 200) -> Response
     return json_response(body, status, {"Set-Cookie": set_session(settings, done), "Cache-Control": "no-store"})
 
 
-def whence(request: Request, settings: Settings) -> SignInOrigin:
+def sign_in_origin(request: Request, settings: Settings) -> SignInOrigin:
     """Client address and user agent of a sign-in."""
     return SignInOrigin(client_address(request, settings.trusted_proxies), request.headers.get("user-agent", ""))
 

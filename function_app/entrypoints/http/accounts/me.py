@@ -5,7 +5,7 @@ from fastapi import Request, Response
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.accounts import schemas
-from function_app.entrypoints.http.accounts.cookies import whence
+from function_app.entrypoints.http.accounts.cookies import sign_in_origin
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, bearer
 from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
@@ -17,7 +17,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /accounts/me", "Get the signed-in account", schemas.AccountOut)
     async def me(request: Request) -> Response:
-        """The account and session of the token or cookie. With a cookie also the CSRF token."""
+        """Returns the account and session of the token or cookie; for a cookie also the CSRF token."""
         caller, csrf = (await auth.account(request), None) if bearer(request) else await auth.page(request)
         body = schemas.AccountOut(id=caller.account, name=caller.name, session=caller.session, csrf_token=csrf)
         return json_response(body, headers={"Cache-Control": "no-store"})
@@ -26,19 +26,19 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         "PUT /accounts/me/password", "Set or change the password", None, (409, 429), body=schemas.PasswordRequest
     )
     async def put_password(request: Request) -> Response:
-        """Ends every other session.
+        """Ends all other sessions.
 
         The old password is not required within 10 minutes of signing in with a one-time link.
         """
         caller = await auth.account(request)
         payload: schemas.PasswordRequest = await read(request, schemas.PasswordRequest)
-        place = whence(request, functions.settings)
-        await functions.passwords.put(caller, payload.password, old=payload.old_password, whence=place)
+        origin = sign_in_origin(request, functions.settings)
+        await functions.passwords.put(caller, payload.password, old=payload.old_password, whence=origin)
         return empty()
 
     @routes.add("GET /accounts/me/sessions", "List sign-in sessions", schemas.SessionList)
     async def list_sessions(request: Request) -> Response:
-        """Active sessions, newest first."""
+        """Returns active sessions, newest first."""
         caller = await auth.account(request)
         items = tuple(
             schemas.SessionOut(
@@ -56,7 +56,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("DELETE /accounts/me/sessions", "End all other sessions", schemas.SessionsEnded)
     async def end_other_sessions(request: Request) -> Response:
-        """The session of the request stays."""
+        """Ends all sessions except that of the request."""
         return json_response(schemas.SessionsEnded(ended=await functions.sign_out.others(await auth.account(request))))
 
     @routes.add("DELETE /accounts/me/sessions/{session}", "End a session", None, 404)

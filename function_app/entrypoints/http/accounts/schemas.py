@@ -9,18 +9,18 @@ from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, 
 
 
 class LinkSignInRequest(Request, frozen=True, kw_only=True):
-    """The token of a one-time link."""
+    """The secret of a one-time link."""
 
     link: Annotated[str, Meta(min_length=1, max_length=200)]
 
 
 NewPassword = Annotated[
-    str, Meta(max_length=1000, description="At least 12 characters, and none that is guessed first.")
+    str, Meta(max_length=1000, description="At least 12 characters; common passwords are rejected.")
 ]
 
 
 class PasswordSignInRequest(Request, frozen=True, kw_only=True):
-    """A local account's name and password."""
+    """Name and password of a local account."""
 
     name: Name
     password: Annotated[str, Meta(min_length=1, max_length=1000)]
@@ -34,7 +34,7 @@ class PasswordRequest(Request, frozen=True, kw_only=True):
 
 
 class AccountRequest(Request, frozen=True, kw_only=True):
-    """A new account. ``name`` is the sign-in name, and visible to other accounts."""
+    """A new account. ``name`` is the sign-in name. Other accounts can see it."""
 
     invitation: Annotated[str, Meta(min_length=1, max_length=200)]
     name: Annotated[str, Meta(pattern=r"^[^\s\x00-\x1f\x7f]([^\x00-\x1f\x7f]{0,58}[^\s\x00-\x1f\x7f])?$")]
@@ -80,7 +80,7 @@ class OidcSignInOut(Response, frozen=True, kw_only=True):
 
 
 class AccessToken(Response, frozen=True, kw_only=True):
-    """The next access token of a session."""
+    """A new access token of a session."""
 
     access_token: str
     token_type: Literal["Bearer"]
@@ -88,7 +88,7 @@ class AccessToken(Response, frozen=True, kw_only=True):
 
 
 class AccountOut(Response, frozen=True, kw_only=True):
-    """The signed-in account. ``csrf_token``: for requests with the cookie; ``null`` for a bearer token."""
+    """The signed-in account. ``csrf_token`` is required in requests with the cookie; null for a bearer token."""
 
     id: str
     name: str
@@ -109,7 +109,7 @@ class SessionOut(Response, frozen=True, kw_only=True):
 
 
 class SessionList(Response, frozen=True, kw_only=True):
-    """Sign-in sessions, the newest first."""
+    """Active sign-in sessions, newest first."""
 
     items: tuple[SessionOut, ...]
     cursor: str | None
@@ -137,7 +137,7 @@ class SpaceOut(Response, frozen=True, kw_only=True):
 
 
 class SpaceList(Response, frozen=True, kw_only=True):
-    """Spaces."""
+    """Spaces of the account, and spaces shared with it."""
 
     items: tuple[SpaceOut, ...]
     cursor: str | None
@@ -147,7 +147,7 @@ Target = Annotated[str, Meta(pattern="^(space:)?[A-Za-z0-9_-]{1,64}$")]
 
 
 class ApiKeyRequest(Request, frozen=True, kw_only=True):
-    """A new key. ``only``: ids of devices, and ``space:<id>``; empty: everything that the account may see."""
+    """A new API key. ``only``: ids of devices, and ``space:<id>``; empty: all devices that the account can access."""
 
     name: Annotated[str, Meta(min_length=1, max_length=60)]
     role: Literal["operator", "viewer"]
@@ -156,7 +156,7 @@ class ApiKeyRequest(Request, frozen=True, kw_only=True):
 
 
 class ApiKeyOut(Response, frozen=True, kw_only=True):
-    """A key without its secret. ``last_used_at`` has a resolution of one hour."""
+    """An API key without its secret. ``last_used_at`` has a resolution of one hour."""
 
     id: str
     name: str
@@ -169,24 +169,24 @@ class ApiKeyOut(Response, frozen=True, kw_only=True):
 
 
 class ApiKeyCreated(Response, frozen=True, kw_only=True):
-    """A new key. ``token`` is returned only once."""
+    """A new API key. ``token`` is returned only once."""
 
     api_key: ApiKeyOut
     token: str
 
 
 class ApiKeyList(Response, frozen=True, kw_only=True):
-    """Keys."""
+    """API keys, newest first."""
 
     items: tuple[ApiKeyOut, ...]
     cursor: str | None
 
 
 class AuditRecordOut(Response, frozen=True, kw_only=True):
-    """One audit record. ``hash`` covers it and the hash of the record before it.
+    """One audit record. ``hash`` covers the record and the hash of the previous record.
 
-    ``account``, ``session`` and ``key`` (an API key) identify the actor. All are empty if the cloud itself
-    or an unknown caller acted.
+    ``account``, ``session`` and ``key`` (an API key) identify the actor. All are empty if the actor is the cloud or
+    unknown.
     """
 
     seq: int

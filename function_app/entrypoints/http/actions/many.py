@@ -24,31 +24,31 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         {200: schemas.BatchActionOut, 202: schemas.BatchActionOut, 207: schemas.BatchActionOut},
         body=schemas.BatchActionRequest,
     )
-    async def start_actions(request: Request, once: Key = None) -> Response:
-        """200: all have reached ``wait_for`` or have ended. 202: some have not yet. 207: some were rejected.
+    async def start_actions(request: Request, idempotency_key: Key = None) -> Response:
+        """200: all actions have reached ``wait_for`` or have ended. 202: some have not. 207: some were rejected.
 
         The idempotency key applies to each device separately.
         """
         caller = await auth.account(request)
         payload: schemas.BatchActionRequest = await read(request, schemas.BatchActionRequest)
         if len(set(payload.devices)) != len(payload.devices):
-            raise invalid("A device is named twice.")
+            raise invalid("The list devices contains a device twice.")
         if not payload.epochs.keys() <= set(payload.devices):
-            raise invalid("epochs names a device that devices does not.")
+            raise invalid("The field epochs contains a device that is not in devices.")
         requests = {device: payload.for_device(device) for device in payload.devices}
-        found = await functions.start_many.start(caller, requests, idempotency_key=once or "")
-        items = await asyncio.gather(*(item(each) for each in found))
-        refused = any(isinstance(each.result, Problem) for each in found)
-        there = all(each.reached for each in found)
-        return json_response(schemas.BatchActionOut(items=tuple(items)), 207 if refused else 200 if there else 202)
+        results = await functions.start_many.start(caller, requests, idempotency_key=idempotency_key or "")
+        items = await asyncio.gather(*(item(each) for each in results))
+        rejected = any(isinstance(each.result, Problem) for each in results)
+        reached = all(each.reached for each in results)
+        return json_response(schemas.BatchActionOut(items=tuple(items)), 207 if rejected else 200 if reached else 202)
 
-    async def item(found: StartResult) -> schemas.BatchActionItem:
-        if isinstance(found.result, Problem):
-            refusal = problem_item(found.result)
-            return schemas.BatchActionItem(device=found.device, status=refusal.status, action=None, problem=refusal)
-        status = 200 if found.reached else 202
+    async def item(start: StartResult) -> schemas.BatchActionItem:
+        if isinstance(start.result, Problem):
+            problem = problem_item(start.result)
+            return schemas.BatchActionItem(device=start.device, status=problem.status, action=None, problem=problem)
+        status = 200 if start.reached else 202
         return schemas.BatchActionItem(
-            device=found.device, status=status, action=await show_action(functions, found.result), problem=None
+            device=start.device, status=status, action=await show_action(functions, start.result), problem=None
         )
 
     return routes

@@ -13,16 +13,16 @@ MAX_DEVICES = 100
 
 
 class ReasonOut(Response, frozen=True, kw_only=True):
-    """Why an action ended as it did."""
+    """Why an action ended."""
 
     code: str
     message: str
 
 
 class ActionOut(Response, frozen=True, kw_only=True):
-    """An action. ``times``: ``<status>_ms`` → milliseconds since 1970. ``queue_position``: 1 is the next one.
+    """An action. ``times``: ``<status>_ms`` → milliseconds since 1970. ``queue_position``: 1 is next.
 
-    ``epoch`` is 0 while it waits for a lease of its own.
+    ``epoch`` is 0 while a queued action has no lease.
     """
 
     id: str
@@ -71,7 +71,7 @@ class BatchActionRequest(ActionOptions, frozen=True, kw_only=True):
 
 
 class BatchActionItem(Response, frozen=True, kw_only=True):
-    """What became of it on one device: the action, or why there is none; ``status`` as for one device."""
+    """The result for one device: the action, or the problem. ``status`` is the same as for a single device."""
 
     device: str
     status: int
@@ -80,25 +80,25 @@ class BatchActionItem(Response, frozen=True, kw_only=True):
 
 
 class BatchActionOut(Response, frozen=True, kw_only=True):
-    """One item for each device, in the order asked."""
+    """One item for each device, in the order of the request."""
 
     items: tuple[BatchActionItem, ...]
 
 
 class StopRequest(Request, frozen=True, kw_only=True):
-    """Why."""
+    """The reason for the Stop; optional."""
 
     reason: Text = ""
 
 
 class StopConfirmation(Response, frozen=True, kw_only=True):
-    """Whether the device has confirmed within a second."""
+    """Whether the device has confirmed within one second."""
 
     confirmed: bool
 
 
 class StopItem(Response, frozen=True, kw_only=True):
-    """What became of it on one device; ``status`` and ``problem`` as for one device."""
+    """The result for one device. ``status`` and ``problem`` are the same as for a single device."""
 
     device: str
     status: int

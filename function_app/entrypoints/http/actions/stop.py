@@ -18,7 +18,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         "POST /devices/{device}/stop", "Stop a device", schemas.StopConfirmation, 404, optional_body=schemas.StopRequest
     )
     async def stop_device(request: Request, device: str) -> Response:
-        """Needs no lease. The Stop latches until it is reset."""
+        """Requires no lease. The Stop stays latched until it is reset."""
         caller = await auth.account(request)
         payload = await read_or(request, schemas.StopRequest, schemas.StopRequest())
         return json_response(
@@ -27,7 +27,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("POST /devices/{device}/stop/reset", "Reset a Stop", schemas.StopConfirmation, 404)
     async def reset_stop(request: Request, device: str) -> Response:
-        """Nothing resumes: control must be taken again. One device at a time, by a person who has inspected it."""
+        """Motion does not resume; control must be acquired again.
+
+        Only for one device, and only by a person, who must have inspected it. API keys are rejected.
+        """
         caller = await auth.account(request)
         return json_response(schemas.StopConfirmation(confirmed=await functions.stop.reset(caller, device)))
 
@@ -39,7 +42,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         optional_body=schemas.StopRequest,
     )
     async def stop_space(request: Request, space: str) -> Response:
-        """200: all devices that the caller may operate have confirmed. 207: some have not; each item has its status."""
+        """Stops all devices that the caller may operate. 207: some have not confirmed; each item has its status."""
         caller = await auth.account(request)
         payload = await read_or(request, schemas.StopRequest, schemas.StopRequest())
         return _all(await functions.stop.stop_many(caller, payload.reason, space=space))
@@ -51,7 +54,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         optional_body=schemas.StopRequest,
     )
     async def stop_all(request: Request) -> Response:
-        """200: all devices that the caller may operate have confirmed. 207: some have not; each item has its status."""
+        """Stops all devices that the caller may operate. 207: some have not confirmed; each item has its status."""
         caller = await auth.account(request)
         payload = await read_or(request, schemas.StopRequest, schemas.StopRequest())
         return _all(await functions.stop.stop_many(caller, payload.reason))
@@ -59,12 +62,12 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     return routes
 
 
-def _all(found: list[StopResult]) -> Response:
-    items = tuple(_item(each) for each in found)
+def _all(results: list[StopResult]) -> Response:
+    items = tuple(_item(result) for result in results)
     return json_response(schemas.StopOut(items=items), 200 if all(item.confirmed for item in items) else 207)
 
 
-def _item(found: StopResult) -> schemas.StopItem:
-    refusal = None if found.problem is None else problem_item(found.problem)
-    status = 200 if refusal is None else refusal.status
-    return schemas.StopItem(device=found.device, status=status, confirmed=found.confirmed, problem=refusal)
+def _item(result: StopResult) -> schemas.StopItem:
+    problem = None if result.problem is None else problem_item(result.problem)
+    status = 200 if problem is None else problem.status
+    return schemas.StopItem(device=result.device, status=status, confirmed=result.confirmed, problem=problem)

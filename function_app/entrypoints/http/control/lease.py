@@ -13,43 +13,43 @@ from function_app.entrypoints.http.framework.authentication import RequestAuthen
 from function_app.entrypoints.http.framework.responses import empty, json_response, read_or
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
 
-EpochQuery = Annotated[int, Query(ge=1, le=2**53, description="The epoch to give back.")]
+EpochQuery = Annotated[int, Query(ge=1, le=2**53, description="The epoch of the lease to release.")]
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("control")
-    _holding(routes, functions, auth)
-    _asking(routes, functions, auth)
+    _lease_routes(routes, functions, auth)
+    _request_routes(routes, functions, auth)
     return routes
 
 
-def _holding(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
+def _lease_routes(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
     @routes.add("GET /devices/{device}/lease", "Get the lease of a device", schemas.LeaseStatus, 404)
     async def get_lease(request: Request, device: str) -> Response:
-        """The active lease with its open control request, or null."""
+        """Returns the active lease with its open control request, or null."""
         caller = await auth.account(request)
         lease = await functions.leases.get(caller, device)
         return json_response(schemas.LeaseStatus(lease=lease_out(lease, caller, functions.clock.now_ms())))
 
     @routes.add(
         "POST /devices/{device}/lease",
-        "Take, renew or take over control",
+        "Acquire, renew or take over control",
         schemas.LeaseGranted,
         (404, 409),
         optional_body=schemas.LeaseRequest,
     )
     async def take_lease(request: Request, device: str) -> Response:
-        """Without ``epoch``: takes control with a new epoch. With it: renews that epoch.
+        """Without ``epoch``: acquires a lease with a new epoch. With ``epoch``: renews that lease.
 
-        ``take_over`` takes control from its holder: the device holds position, and the holder sees the ``reason``.
-        Owners only.
+        ``take_over`` takes control from the current holder: the device holds its position, and the holder receives the
+        ``reason``. Owners only.
         """
         caller = await auth.account(request)
         payload = await read_or(request, schemas.LeaseRequest, schemas.LeaseRequest())
         over = payload.reason.strip() if payload.take_over else ""
         if payload.take_over and (not over or payload.epoch is not None):
-            raise invalid("take_over wants a reason, which the one who had control will read, and no epoch.")
+            raise invalid("take_over requires a reason, which is sent to the previous holder, and excludes epoch.")
         lease, confirmed = await functions.leases.acquire(
             caller, device, epoch=payload.epoch, lease_ms=payload.lease_ms, wait_ms=payload.wait_ms, over=over
         )
@@ -64,12 +64,12 @@ def _holding(routes: Routes, functions: Functions, auth: RequestAuthenticator) -
 
     @routes.add("DELETE /devices/{device}/lease", "Release control", None, (404, 409, 422))
     async def release_lease(request: Request, device: str, epoch: EpochQuery) -> Response:
-        """The device holds position, and setpoint credentials of this epoch end. A requester may take control then."""
+        """The device holds its position. Credentials for setpoints of this epoch are revoked."""
         await functions.leases.release(await auth.account(request), device, epoch=epoch)
         return empty()
 
 
-def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
+def _request_routes(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
     @routes.add(
         "POST /devices/{device}/lease/requests",
         "Request control",
@@ -78,12 +78,12 @@ def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) ->
         optional_body=schemas.NewControlRequest,
     )
     async def request_control(request: Request, device: str) -> Response:
-        """Asks the lease holder.
+        """Requests control from the lease holder.
 
-        The device shows the request in its ``state``. A repeated request returns the open one (200).
+        The device publishes the request in its ``state``. A repeated request returns the open one (200).
 
-        Without a response within ``within_ms`` the request expires and the holder keeps control. It also ends with the
-        lease. The outcome can be read until the next request.
+        Without a response within ``within_ms`` the request expires; the lease does not change. The request also ends
+        with the lease. Its outcome can be read until the next request.
         """
         caller = await auth.account(request)
         payload = await read_or(request, schemas.NewControlRequest, schemas.NewControlRequest())
@@ -94,14 +94,14 @@ def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) ->
         body = schemas.ControlRequestCreated(
             request=control_request_out(control_request, lease, caller, now_ms), confirmed=confirmed
         )
-        where = {"Location": f"{PREFIX}/devices/{device}/lease/requests/{control_request.id}"}
-        return json_response(body, 201 if created else 200, where)
+        headers = {"Location": f"{PREFIX}/devices/{device}/lease/requests/{control_request.id}"}
+        return json_response(body, 201 if created else 200, headers)
 
     @routes.add(
         "GET /devices/{device}/lease/requests/{request_id}", "Get a control request", schemas.ControlRequestOut, 404
     )
     async def get_control_request(request: Request, device: str, request_id: str) -> Response:
-        """The last request of a device can be read, with any outcome."""
+        """Returns the last control request of a device, open or closed."""
         caller = await auth.account(request)
         lease, control_request = await functions.control_requests.get(caller, device, request_id)
         return json_response(control_request_out(control_request, lease, caller, functions.clock.now_ms()))
@@ -114,7 +114,7 @@ def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) ->
         optional_body=schemas.AcceptControlRequest,
     )
     async def accept_control_request(request: Request, device: str, request_id: str) -> Response:
-        """Only for the lease holder. One write gives the requester the next epoch; the device holds position."""
+        """Lease holder only. The requester gets a lease with the next epoch; the device holds its position."""
         caller = await auth.account(request)
         payload = await read_or(request, schemas.AcceptControlRequest, schemas.AcceptControlRequest())
         lease, control_request, confirmed = await functions.control_requests.accept(
@@ -135,13 +135,13 @@ def _asking(routes: Routes, functions: Functions, auth: RequestAuthenticator) ->
         (404, 409),
     )
     async def reject_control_request(request: Request, device: str, request_id: str) -> Response:
-        """Only for the lease holder."""
+        """Lease holder only. The lease does not change."""
         caller = await auth.account(request)
         lease, control_request = await functions.control_requests.reject(caller, device, request_id)
         return json_response(control_request_out(control_request, lease, caller, functions.clock.now_ms()))
 
     @routes.add("DELETE /devices/{device}/lease/requests/{request_id}", "Withdraw a control request", None, (404, 409))
     async def withdraw_control_request(request: Request, device: str, request_id: str) -> Response:
-        """Only for the requester. 409 if it was accepted: the requester then holds the lease and must release it."""
+        """Requester only. 409 if it was accepted: the requester then holds the lease and must release it."""
         await functions.control_requests.withdraw(await auth.account(request), device, request_id)
         return empty()

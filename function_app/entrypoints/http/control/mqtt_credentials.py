@@ -27,14 +27,13 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="account or agent",
     )
     async def mqtt_credentials(request: Request) -> Response:
-        """Short-lived, for viewing, for setpoints under a lease, or for an agent's own devices."""
+        """Returns short-lived credentials for viewing, for setpoints under a lease, or for an agent's own devices."""
         payload: Any = await read(request, schemas.MqttCredentialsRequest)
         agent = await auth.agent(request) if isinstance(payload, schemas.AgentCredentialsRequest) else None
         issued = await _issue(request, payload, agent)
-        wanted = agent is not None and functions.certificates.wanted
-        certificate_after_ms = agent.claimed_ms if agent is not None and wanted else None
+        certificate_after_ms = agent.claimed_ms if agent is not None and functions.certificates.wanted else None
         settings = functions.settings
-        news = await functions.keys.news() if agent is not None else None
+        keys = await functions.keys.news() if agent is not None else None
         body = schemas.MqttCredentialsOut(
             client_id=issued.client_id,
             username=issued.credentials.username,
@@ -51,8 +50,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             ),
             websocket_url=settings.websocket_url,
             server_time_ms=functions.clock.now_ms(),
-            key_statements=() if news is None else news.statements,
-            signing_key="" if news is None else news.signing,
+            key_statements=() if keys is None else keys.statements,
+            signing_key="" if keys is None else keys.signing,
         )
         return json_response(body, headers={"Cache-Control": "no-store"})
 

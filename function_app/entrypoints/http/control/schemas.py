@@ -8,11 +8,11 @@ from device_agent.protocol import Id
 from function_app.entrypoints.http.framework.schemas import Epoch, LeaseMs, Moment, Request, Response, WaitMs
 
 WithinMs = Annotated[int, Meta(ge=1_000, le=120_000)]
-Why = Annotated[str, Meta(max_length=200)]
+TakeoverReason = Annotated[str, Meta(max_length=200)]
 
 
 class ControlRequestOut(Response, frozen=True, kw_only=True):
-    """A request for control. ``mine``: from the caller's session. ``epoch``: epoch of the requested lease.
+    """A control request. ``mine``: it is from the caller's session. ``epoch``: epoch of the requested lease.
 
     ``ended``: the requested lease ended in another way.
     """
@@ -38,16 +38,16 @@ class LeaseOut(Response, frozen=True, kw_only=True):
 
 
 class LeaseRequest(Request, frozen=True, kw_only=True):
-    """Without ``epoch``: take. With it: renew that epoch.
+    """Without ``epoch``: acquire a new lease. With ``epoch``: renew that lease.
 
-    ``take_over``: take control from its holder. Owners only; requires a ``reason``.
+    ``take_over``: take control from the current holder. Owners only; requires a ``reason``.
     """
 
     lease_ms: LeaseMs = 30_000
     epoch: Epoch | None = None
     wait_ms: WaitMs = 1_000
     take_over: bool = False
-    reason: Why = ""
+    reason: TakeoverReason = ""
 
 
 class LeaseGranted(Response, frozen=True, kw_only=True):
@@ -61,13 +61,13 @@ class LeaseGranted(Response, frozen=True, kw_only=True):
 
 
 class LeaseStatus(Response, frozen=True, kw_only=True):
-    """The live lease of a device, if any."""
+    """The active lease of a device; null if it is free."""
 
     lease: LeaseOut | None
 
 
 class NewControlRequest(Request, frozen=True, kw_only=True):
-    """Time for the holder's response, and the requested duration of the lease [ms]."""
+    """A control request. ``within_ms``: time for the response. ``lease_ms``: duration of the requested lease."""
 
     within_ms: WithinMs = 30_000
     lease_ms: LeaseMs = 30_000
@@ -75,14 +75,14 @@ class NewControlRequest(Request, frozen=True, kw_only=True):
 
 
 class ControlRequestCreated(Response, frozen=True, kw_only=True):
-    """The caller's request. ``confirmed``: the device shows it to all viewers."""
+    """The caller's request. ``confirmed``: the device has published it in its ``state``."""
 
     request: ControlRequestOut
     confirmed: bool
 
 
 class AcceptControlRequest(Request, frozen=True, kw_only=True):
-    """How long to wait for the device."""
+    """``wait_ms``: maximum time to wait for the device's acknowledgement."""
 
     wait_ms: WaitMs = 1_000
 
@@ -96,25 +96,28 @@ class ControlRequestAccepted(Response, frozen=True, kw_only=True):
 
 
 class ViewCredentialsRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="view"):
-    """To see every device and to stop those one may operate."""
+    """Credentials to receive data of all devices of the account, and to stop those that it may operate."""
 
 
 class ControlCredentialsRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="control"):
-    """To send setpoints under a lease."""
+    """Credentials to send setpoints under a lease."""
 
     device: Id
     epoch: Epoch
 
 
 class AgentCredentialsRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="agent"):
-    """To publish for an agent's own devices."""
+    """Credentials of an agent for its own devices."""
 
 
 MqttCredentialsRequest = ViewCredentialsRequest | ControlCredentialsRequest | AgentCredentialsRequest
 
 
 class TcpAddress(Response, frozen=True, kw_only=True):
-    """Address of the broker for MQTT. It requires agent certificates issued after ``certificate_after_ms``."""
+    """Address of the broker for MQTT over TCP.
+
+    ``certificate_after_ms``: the broker requires agent certificates issued after this time [ms since 1970]; null: none.
+    """
 
     host: str
     port: int
@@ -123,7 +126,7 @@ class TcpAddress(Response, frozen=True, kw_only=True):
 
 
 class MqttCredentialsOut(Response, frozen=True, kw_only=True):
-    """Credentials, and the topics that they grant. For an agent also updates of the server's signing keys."""
+    """Credentials and their topics. For an agent also the statements that rotate the server's signing keys."""
 
     client_id: str
     username: str

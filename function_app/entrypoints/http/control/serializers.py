@@ -1,4 +1,4 @@
-"""Leases and control requests as the API shows them."""
+"""Converts leases and control requests to API responses."""
 
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.control.lease import ControlRequest, Lease
@@ -7,7 +7,7 @@ from function_app.entrypoints.http.control.schemas import ControlRequestOut, Lea
 
 
 def lease_out(lease: Lease | None, caller: Identity, now_ms: int) -> LeaseOut | None:
-    """A live lease with its open control request."""
+    """The response for an active lease with its open control request."""
     if lease is None:
         return None
     request = None if lease.request is None else control_request_out(lease.request, lease, caller, now_ms)
@@ -22,13 +22,13 @@ def lease_out(lease: Lease | None, caller: Identity, now_ms: int) -> LeaseOut | 
 
 
 def control_request_out(request: ControlRequest, lease: Lease, caller: Identity, now_ms: int) -> ControlRequestOut:
-    """A control request with its outcome at ``now_ms``."""
+    """The response for a control request, with its outcome at ``now_ms``."""
     return ControlRequestOut(
         id=request.id,
         requester=request.by,
         epoch=request.epoch,
         mine=request.requested_by(caller),
-        requested_at=rfc3339(request.asked_ms),
+        requested_at=rfc3339(request.requested_ms),
         expires_at=rfc3339(request.expires_ms),
         outcome=request.current_outcome(lease, now_ms),
     )

@@ -10,8 +10,8 @@ from function_app.entrypoints.http.framework.authentication import RequestAuthen
 from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
 
-_AGAIN_MS = 10_000
-"""How soon a page that looks at a device is to say so again."""
+_VIEWER_REFRESH_MS = 10_000
+"""Interval at which a page must renew its viewer registration."""
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
@@ -20,23 +20,23 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /devices", "List devices", schemas.DeviceList, 422)
     async def list_devices(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
-        """With presence, newest state and lease. A page holds the devices of up to ``limit`` agents."""
+        """Returns devices with presence, newest state and lease. A page has the devices of up to ``limit`` agents."""
         caller = await auth.account(request)
-        views, following = await functions.devices.views(caller, cursor=cursor, limit=limit)
+        views, next_cursor = await functions.devices.views(caller, cursor=cursor, limit=limit)
         items = tuple(device_out(view, caller, functions.clock.now_ms()) for view in views)
-        return json_response(schemas.DeviceList(items=items, cursor=following))
+        return json_response(schemas.DeviceList(items=items, cursor=next_cursor))
 
     @routes.add("GET /devices/{device}", "Get a device", schemas.DeviceOut, 404)
     async def get_device(request: Request, device: str) -> Response:
-        """With presence, newest state and lease."""
+        """Returns the device with presence, newest state and lease."""
         caller = await auth.account(request)
         return json_response(device_out(await functions.devices.view(caller, device), caller, functions.clock.now_ms()))
 
-    _named_and_seen(routes, functions, auth)
+    _label_and_viewer_routes(routes, functions, auth)
     return routes
 
 
-def _named_and_seen(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
+def _label_and_viewer_routes(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
     @routes.add(
         "PUT /devices/{device}/label",
         "Rename a device",
@@ -45,7 +45,7 @@ def _named_and_seen(routes: Routes, functions: Functions, auth: RequestAuthentic
         body=schemas.RenameDeviceRequest,
     )
     async def rename_device(request: Request, device: str) -> Response:
-        """Owners only. After a transfer the device has its agent's label again."""
+        """Owners only. A transfer of the agent restores the label that the agent reports."""
         caller = await auth.account(request)
         payload: schemas.RenameDeviceRequest = await read(request, schemas.RenameDeviceRequest)
         label = None if payload.label is None else " ".join(payload.label.split())
@@ -54,9 +54,9 @@ def _named_and_seen(routes: Routes, functions: Functions, auth: RequestAuthentic
 
     @routes.add("PUT /devices/{device}/viewers", "Register as a viewer and list other viewers", schemas.ViewersOut, 404)
     async def add_viewer(request: Request, device: str) -> Response:
-        """For every account that may see the device.
+        """For all accounts with access to the device.
 
-        The registration lasts 25 s; repeating it within 5 s changes nothing.
+        A registration expires after 25 s. A repetition within 5 s has no effect.
         """
         caller = await auth.account(request)
         others = tuple(
@@ -68,10 +68,10 @@ def _named_and_seen(routes: Routes, functions: Functions, auth: RequestAuthentic
             )
             for other in await functions.viewers.mark(caller, device)
         )
-        return json_response(schemas.ViewersOut(items=others, refresh_ms=_AGAIN_MS))
+        return json_response(schemas.ViewersOut(items=others, refresh_ms=_VIEWER_REFRESH_MS))
 
     @routes.add("DELETE /devices/{device}/viewers", "Unregister as a viewer", None, 404)
     async def remove_viewer(request: Request, device: str) -> Response:
-        """For this sign-in session. A registration ends after 25 s without renewal."""
+        """Ends the registration of this sign-in session."""
         await functions.viewers.leave(await auth.account(request), device)
         return empty()

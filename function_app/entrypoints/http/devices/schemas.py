@@ -13,7 +13,7 @@ LABEL_PATTERN = r"^[^\x00-\x08\x0e-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x08\x0e-\
 
 
 class DeviceOut(Response, frozen=True, kw_only=True):
-    """A device. ``role``: what the caller may do with it; ``state``: the newest ``state`` message of the device."""
+    """A device. ``role``: the caller's role. ``state``: the newest ``state`` message of the device."""
 
     id: str
     name: str
@@ -32,20 +32,20 @@ class DeviceOut(Response, frozen=True, kw_only=True):
 
 
 class DeviceList(Response, frozen=True, kw_only=True):
-    """Devices, agent by agent."""
+    """Devices, grouped by agent."""
 
     items: tuple[DeviceOut, ...]
     cursor: str | None
 
 
 class RenameDeviceRequest(Request, frozen=True, kw_only=True):
-    """The new label, without surrounding blanks; null: the label of the agent."""
+    """The new label; surrounding whitespace is removed. null: restore the label that the agent reports."""
 
     label: Annotated[str, Meta(min_length=1, max_length=80, pattern=LABEL_PATTERN)] | None
 
 
 class ViewerOut(Response, frozen=True, kw_only=True):
-    """A viewer of a device. ``mine``: the caller's own account, in another session."""
+    """A viewer of a device. ``mine``: the caller's account in another session."""
 
     name: str
     role: Literal["owner", "operator", "viewer"]
@@ -54,7 +54,7 @@ class ViewerOut(Response, frozen=True, kw_only=True):
 
 
 class ViewersOut(Response, frozen=True, kw_only=True):
-    """Other current viewers, longest first. Repeat the request within ``refresh_ms``."""
+    """Other current viewers, earliest registration first. Repeat the request within ``refresh_ms``."""
 
     items: tuple[ViewerOut, ...]
     refresh_ms: int

@@ -1,4 +1,4 @@
-"""Devices as the API shows them."""
+"""Converts devices to API responses."""
 
 import msgspec
 
@@ -12,7 +12,7 @@ from function_app.services.devices.device_access import DeviceView
 
 
 def device_out(view: DeviceView, caller: Identity, now_ms: int) -> DeviceOut:
-    """A device with its presence, newest state and lease."""
+    """The response for a device with its presence, newest state and lease."""
     device = view.device
     return response_from(
         device,

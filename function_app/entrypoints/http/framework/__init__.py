@@ -1,1 +1,1 @@
-"""What all routes share: registration, lookup, authentication, responses."""
+"""Route registration and lookup, authentication, and responses."""

@@ -9,7 +9,7 @@ from typing import Final
 FOR_KEYS: Final = frozenset(
     {
         "me",
-        # Devices, and what is known of them.
+        # Devices and their data.
         "list_devices",
         "get_device",
         "list_streams",
@@ -23,7 +23,7 @@ FOR_KEYS: Final = frozenset(
         "list_uploads",
         "get_upload",
         "mqtt_credentials",
-        # Control and actions. Not the reset of a Stop, which requires a person who has inspected the device.
+        # Control and actions. A person must inspect the device before the reset of a Stop.
         "get_lease",
         "take_lease",
         "release_lease",
@@ -40,7 +40,7 @@ FOR_KEYS: Final = frozenset(
         "stop_device",
         "stop_space",
         "stop_all",
-        # What a robot can do. Not scripts or models.
+        # Robot types and movements, without scripts and models.
         "list_robot_types",
         "get_robot_type",
         "list_movements",
@@ -48,4 +48,4 @@ FOR_KEYS: Final = frozenset(
         "list_device_movements",
     }
 )
-"""Operations, by their names in the API's description."""
+"""Operation ids of the OpenAPI document."""

@@ -1,4 +1,4 @@
-"""The API's reference as one page of plain HTML: no script, no style sheet, nothing from elsewhere."""
+"""The API reference as one page of plain HTML, without scripts, style sheets or external resources."""
 
 import json
 from html import escape
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def reference(document: dict[str, Any]) -> str:
-    """The page for an OpenAPI document."""
+    """The HTML page for an OpenAPI document."""
     info = document["info"]
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
@@ -33,9 +33,11 @@ def _operation(method: str, path: str, operation: dict[str, Any]) -> list[str]:
     ]
     caller = " or ".join(name for scheme in operation.get("security", []) for name in scheme)
     parts.append(f"<p>Caller: {escape(caller) or 'anyone'}</p>")
-    given = [f"<code>{escape(item['name'])}</code> ({escape(item['in'])})" for item in operation.get("parameters", [])]
-    if given:
-        parts.append(f"<p>Parameters: {', '.join(given)}</p>")
+    parameters = [
+        f"<code>{escape(item['name'])}</code> ({escape(item['in'])})" for item in operation.get("parameters", [])
+    ]
+    if parameters:
+        parts.append(f"<p>Parameters: {', '.join(parameters)}</p>")
     if "requestBody" in operation:
         parts.append(f"<p>Body: {_schema(operation['requestBody']['content'])}</p>")
     parts.append("<ul>")

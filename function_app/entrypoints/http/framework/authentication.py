@@ -1,4 +1,4 @@
-"""Who calls: a bearer token, an API key, or the page's cookie."""
+"""Authentication of requests by bearer token, API key or session cookie."""
 
 import hmac
 import re
@@ -17,11 +17,11 @@ from function_app.services.identity.rate_limiter import RateLimiter
 COOKIE = "telescope_session"
 CSRF_HEADER = "X-CSRF-Token"
 _STOP = re.compile(r"/api/v1/((devices|spaces)/[^/]+/)?stop")
-_READING = frozenset({"GET", "HEAD", "OPTIONS"})
+_SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 class RequestAuthenticator:
-    """Finds out who makes a request."""
+    """Authenticates requests and applies rate limits per caller."""
 
     def __init__(self, authenticator: Authenticator, api_keys: ApiKeys, limits: RateLimiter) -> None:
         self._authenticator = authenticator
@@ -29,49 +29,47 @@ class RequestAuthenticator:
         self._limits = limits
 
     async def account(self, request: Request) -> Identity:
-        """The account that asks, itself or by an API key.
+        """The account of the caller: a person or an API key.
 
         Raises:
-            Problem: ``unauthorized``; ``csrf-token`` for a changing request by cookie without the session's token;
-                ``forbidden`` for an API key, where only people may ask.
+            Problem: ``unauthorized``; ``csrf-token`` for a changing request with a cookie but without its CSRF token;
+                ``forbidden`` for an API key in an operation that rejects API keys.
         """
         token = bearer(request)
         if token.startswith(KEY_PREFIX):
-            who = await self._api_keys.identify(token)
+            caller = await self._api_keys.identify(token)
             if not takes_keys(request.scope.get("route")):
-                raise forbidden("An API key may not do this. Sign in, and do it yourself.")
+                raise forbidden("This operation rejects API keys. Sign in as a person.")
         elif token:
-            who = await self._authenticator.person(token, API)
+            caller = await self._authenticator.person(token, API)
         else:
-            who, _ = await self.page(request)
+            caller, _ = await self.page(request)
         if not is_stop(request):
-            self._limits.admit("key" if who.key else "account", who.key or who.account)
-        return who
+            self._limits.admit("key" if caller.key else "account", caller.key or caller.account)
+        return caller
 
     async def page(self, request: Request) -> tuple[Identity, str]:
-        """The account that asks by a page's cookie, and the session's CSRF token.
+        """The account of the session cookie, and the session's CSRF token.
 
-        Browsers also send the cookie with requests that pages of other sites make. A changing request must therefore
-        carry the CSRF token. Only this site's page can read the token (``accounts/me``).
+        Browsers also send the cookie with requests of other sites' pages. A changing request must therefore contain the
+        CSRF token, which only pages of this site can read (``accounts/me``).
 
         Raises:
             Problem: ``unauthorized``; ``csrf-token``.
         """
         cookie = request.cookies.get(COOKIE)
         if not cookie:
-            raise unauthorized("Give an access token (Authorization: Bearer …), or sign in.")
-        who, csrf = await self._authenticator.page(cookie)
-        if request.method not in _READING:
-            shown = request.headers.get(CSRF_HEADER, "")
-            if not csrf or not hmac.compare_digest(shown.encode(), csrf.encode()):
-                detail = (
-                    f"A changing request by cookie needs the session's token in {CSRF_HEADER}; accounts/me tells it."
-                )
-                raise Problem("csrf-token", 403, "The CSRF token is not this session's", detail)
-        return who, csrf
+            raise unauthorized("Send an access token (Authorization: Bearer …), or sign in.")
+        caller, csrf = await self._authenticator.page(cookie)
+        if request.method not in _SAFE_METHODS:
+            received = request.headers.get(CSRF_HEADER, "")
+            if not csrf or not hmac.compare_digest(received.encode(), csrf.encode()):
+                detail = f"A changing request with a cookie requires the CSRF token of accounts/me in {CSRF_HEADER}."
+                raise Problem("csrf-token", 403, "The CSRF token is missing or invalid", detail)
+        return caller, csrf
 
     async def agent(self, request: Request) -> Agent:
-        """The enrolled agent that asks.
+        """The enrolled agent that sent the request.
 
         Raises:
             Problem: ``unauthorized``.
@@ -81,7 +79,7 @@ class RequestAuthenticator:
         return agent
 
     async def enrolling(self, request: Request, public_key: str) -> str:
-        """The id of an agent that may be new, once its token is verified with ``public_key``.
+        """The id of a new or enrolled agent whose token was verified with ``public_key``.
 
         Raises:
             Problem: ``unauthorized``.
@@ -89,7 +87,7 @@ class RequestAuthenticator:
         return await self._authenticator.enrolling(bearer(request), public_key)
 
 
-def refuse_other_sites(request: Request) -> None:
+def reject_cross_site(request: Request) -> None:
     """Reject requests from pages of other sites, so that they cannot sign a user in to another account.
 
     Browsers send the origin of the page (``Sec-Fetch-Site``); programs do not.
@@ -98,15 +96,15 @@ def refuse_other_sites(request: Request) -> None:
         Problem: ``forbidden``.
     """
     if request.headers.get("sec-fetch-site", "same-origin") not in {"same-origin", "none"}:
-        raise forbidden("Sign in on the page of this server itself.")
+        raise forbidden("Sign in on a page of this server.")
 
 
 def is_stop(request: Request) -> bool:
-    """Whether the request orders a Stop. Rate limits do not apply to it."""
+    """Whether the request is a Stop. Rate limits do not apply to it."""
     return request.method == "POST" and _STOP.fullmatch(request.url.path) is not None
 
 
 def bearer(request: Request) -> str:
-    """The bearer token, or empty."""
+    """The bearer token; empty if there is none."""
     scheme, _, token = request.headers.get("authorization", "").partition(" ")
     return token.strip() if scheme.lower() == "bearer" else ""

@@ -1,4 +1,4 @@
-"""The address of a client, by which failed attempts are counted."""
+"""The client address, for rate limits and the audit log."""
 
 import ipaddress
 
@@ -11,18 +11,18 @@ _IPV6_NETWORK = 64
 def client_address(request: Request, proxies: int) -> str:
     """The client's address; empty if unknown.
 
-    Each of the operator's ``proxies`` appends the address of its client to ``X-Forwarded-For``. Earlier entries are
-    written by the client and not trusted. A host that states no address of the connection is a proxy itself.
+    Each of the operator's ``proxies`` appends the address of its client to ``X-Forwarded-For``. Earlier entries
+    come from the client and are not trusted. A host that does not state the address of the connection is a proxy.
     """
     peer = request.client.host if request.client is not None else ""
     if not peer:
         proxies = max(1, proxies)
     added = [part for line in request.headers.getlist("x-forwarded-for") for part in line.split(",")]
-    return _read(added[-proxies] if 0 < proxies <= len(added) else peer)
+    return _normalize(added[-proxies] if 0 < proxies <= len(added) else peer)
 
 
-def _read(text: str) -> str:
-    """An address with or without a port, as one that can be compared; empty for what is none."""
+def _normalize(text: str) -> str:
+    """The address without a port, in a form that can be compared; empty for an invalid address."""
     text = text.strip()
     if text.startswith("["):
         text = text[1:].partition("]")[0]

@@ -1,4 +1,4 @@
-"""Answers and problems as HTTP responses; request bodies as structs."""
+"""Converts structs and problems to HTTP responses, and request bodies to structs."""
 
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -10,7 +10,7 @@ from function_app.domain.common.problems import Problem, invalid
 from function_app.entrypoints.http.framework.schemas import Problem as ProblemOut
 
 MAX_BODY = 1_000_000
-"""Bytes of a request's body."""
+"""Default maximum size of a request body [bytes]."""
 _LENGTH_DIGITS = 20
 JSON = "application/json"
 PROBLEM_JSON = "application/problem+json"
@@ -21,22 +21,22 @@ _decoders: dict[Any, msgspec.json.Decoder[Any]] = {}
 
 
 def json_response(body: Any, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
-    """A JSON answer."""
+    """A JSON response."""
     return Response(_encode(body), status, headers, media_type=JSON)
 
 
 def content(body: bytes, media_type: str, name: str) -> Response:
-    """A file to keep. Never shown in the page: people upload them."""
+    """A file download. Browsers must not display it, because files are untrusted uploads."""
     return Response(body, headers={"Content-Disposition": f'attachment; filename="{name}"'}, media_type=media_type)
 
 
 def empty(headers: Mapping[str, str] | None = None) -> Response:
-    """Done, nothing to say."""
+    """A response without content (204)."""
     return Response(status_code=204, headers=headers)
 
 
 def problem(error: Problem) -> Response:
-    """A refusal."""
+    """An error response with problem details."""
     body = {
         "type": problem_type(error),
         "title": error.title,
@@ -51,20 +51,20 @@ def problem(error: Problem) -> Response:
 
 
 def problem_type(error: Problem) -> str:
-    """The URI that names the kind of problem."""
+    """The URI of the problem type."""
     return f"/problems/{error.code}"
 
 
 def problem_item(error: Problem) -> ProblemOut:
-    """A problem of one item of a list."""
+    """The problem of one item in a response with several items."""
     return ProblemOut(type=problem_type(error), title=error.title, status=error.status, detail=error.detail)
 
 
 async def read(request: Request, kind: Any, *, limit: int = MAX_BODY) -> Any:
-    """The request's body, of at most ``limit`` bytes, as ``kind``.
+    """The request body, of at most ``limit`` bytes, decoded as ``kind``.
 
     Raises:
-        Problem: ``too-large``, ``invalid`` with the place and what is wrong there.
+        Problem: ``too-large``; ``invalid``, with the JSON path of the error.
     """
     body = await _bytes(request, limit)
     decoder = _decoders.get(kind)
@@ -73,24 +73,24 @@ async def read(request: Request, kind: Any, *, limit: int = MAX_BODY) -> Any:
     try:
         return decoder.decode(body)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise invalid(f"The body is not what is asked for: {error}.") from error
+        raise invalid(f"The body does not match the schema: {error}.") from error
 
 
-async def read_or(request: Request, kind: type[T], otherwise: T) -> T:
-    """As ``read``; ``otherwise`` where the body is empty."""
+async def read_or(request: Request, kind: type[T], default: T) -> T:
+    """The request body as in ``read``, or ``default`` if the body is empty."""
     if not await _bytes(request):
-        return otherwise
-    found: T = await read(request, kind)
-    return found
+        return default
+    decoded: T = await read(request, kind)
+    return decoded
 
 
 async def _bytes(request: Request, limit: int = MAX_BODY) -> bytes:
     declared = request.headers.get("content-length", "0")
     if declared.isdecimal() and (len(declared) > _LENGTH_DIGITS or int(declared) > limit):
         raise _too_large(limit)
-    kept: bytes | None = getattr(request.state, "body", None)
-    if kept is not None:
-        return kept
+    cached: bytes | None = getattr(request.state, "body", None)
+    if cached is not None:
+        return cached
     parts = []
     length = 0
     async for part in request.stream():
@@ -104,4 +104,4 @@ async def _bytes(request: Request, limit: int = MAX_BODY) -> bytes:
 
 
 def _too_large(limit: int) -> Problem:
-    return Problem("too-large", 413, "Too large", f"A request's body has at most {limit} bytes here.")
+    return Problem("too-large", 413, "Too large", f"The body of this request may have at most {limit} bytes.")

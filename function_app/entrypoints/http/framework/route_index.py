@@ -14,16 +14,16 @@ class _Node:
 
     literals: dict[str, "_Node"] = field(default_factory=dict)
     parameter: "_Node | None" = None
-    ending: list[int] = field(default_factory=list)
+    complete: list[int] = field(default_factory=list)
     open_ended: list[int] = field(default_factory=list)
-    """Routes whose last parameter takes the rest of the path (``{name:path}``)."""
+    """Routes whose last parameter matches the rest of the path (``{name:path}``)."""
 
 
 class RouteIndex(BaseRoute):
-    """Stands for many routes: finds the one for a request in one walk over the path's segments.
+    """Selects the route of a request in one pass over the path segments.
 
-    The result is the same as trying all routes in order: the first route that takes the path and the method, else the
-    first that takes the path (405).
+    The result equals a sequential search: the first route that matches path and method, otherwise the first that
+    matches the path (405).
     """
 
     def __init__(self, routes: Iterable[APIRoute]) -> None:
@@ -43,7 +43,7 @@ class RouteIndex(BaseRoute):
             else:
                 node.parameter = node.parameter or _Node()
                 node = node.parameter
-        node.ending.append(number)
+        node.complete.append(number)
 
     def on_path(self, scope: Scope) -> list[APIRoute]:
         """Routes for the request's path, of any method, in the order of registration."""
@@ -63,7 +63,7 @@ class RouteIndex(BaseRoute):
                     following.append(node.parameter)
             nodes = following
         for node in nodes:
-            numbers += node.ending
+            numbers += node.complete
         return [self.routes[number] for number in sorted(numbers)]
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:

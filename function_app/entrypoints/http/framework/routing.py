@@ -18,12 +18,14 @@ PREFIX = "/api/v1"
 VERSION = "0.1.0"
 Cursor = Annotated[str | None, Query(max_length=2000, description="Cursor of the previous page.")]
 Since = Annotated[
-    int | None, Query(alias="from", ge=0, le=LAST_MS, description="From here [ms since 1970]; the beginning.")
+    int | None,
+    Query(alias="from", ge=0, le=LAST_MS, description="First time, inclusive [ms since 1970]. Default: no limit."),
 ]
 Until = Annotated[
-    int | None, Query(alias="to", ge=0, le=LAST_MS, description="To before here [ms since 1970]; the end.")
+    int | None,
+    Query(alias="to", ge=0, le=LAST_MS, description="Last time, exclusive [ms since 1970]. Default: no limit."),
 ]
-Limit = Annotated[int, Query(ge=1, le=1000, description="Maximum number of items in a page.")]
+Limit = Annotated[int, Query(ge=1, le=1000, description="Maximum number of items on a page.")]
 
 REF = "#/components/schemas/{name}"
 ACCOUNT_SCHEMES = ("accessToken", "sessionCookie")
@@ -35,14 +37,14 @@ _MEANINGS = {
     202: "Accepted; still in progress",
     204: "Done; no content",
     303: "Redirect with GET",
-    207: "Partly rejected; each item has its status",
+    207: "Partial success; each item has its status",
     401: "Not signed in",
     403: "Not allowed",
     404: "Not found",
     409: "Conflict with the current state",
     413: "The body is too large",
     422: "Invalid request",
-    429: "Too many requests or attempts; see Retry-After",
+    429: "Too many requests; see Retry-After",
     503: "The store or the broker is unavailable; see Retry-After",
 }
 
@@ -70,9 +72,9 @@ class Routes:
 
         Args:
             route: HTTP method and path below the API's prefix, such as ``GET /devices``.
-            summary: One line.
+            summary: Summary in the OpenAPI document. The description is the docstring of the handler.
             responses: Status → struct of the body (``None``: no body; text: the media type of a file). A struct or text
-                alone: status 200; ``None`` alone: status 204.
+                without a mapping: status 200; ``None``: status 204.
             problems: Error statuses in addition to 401, 413, 422, 429 and 503, which follow from the other arguments.
             body: Struct of the request's body.
             optional_body: The same, if the body may be empty.
@@ -81,19 +83,19 @@ class Routes:
         """
         method, path = route.split()
         kind = optional_body if body is None else body
-        refusals = {*((problems,) if isinstance(problems, int) else problems), 429, 503}
+        error_statuses = {*((problems,) if isinstance(problems, int) else problems), 429, 503}
         if caller != "anonymous":
-            refusals.add(401)
+            error_statuses.add(401)
         if caller not in {"anonymous", "agent"}:
-            refusals.add(403)  # a missing role or CSRF token, or an operation that rejects API keys
+            error_statuses.add(403)  # a missing role or CSRF token, or an operation that rejects API keys
         if kind is not None:
-            refusals |= {413, 422}
+            error_statuses |= {413, 422}
         if not isinstance(responses, Mapping):
             responses = {204 if responses is None else 200: responses}
         documented: dict[int | str, dict[str, Any]] = {
             status: self._success(status, response) for status, response in responses.items()
         }
-        for status in sorted(refusals):
+        for status in sorted(error_statuses):
             documented[status] = {
                 "description": _MEANINGS[status],
                 "content": {PROBLEM_JSON: {"schema": _reference(common.Problem)}},

@@ -1,10 +1,12 @@
-"""Base classes and types that all schemas share."""
+"""Base classes and common types of the schemas."""
 
 from typing import Annotated, Any, TypeVar
 
 from msgspec import Meta, Struct
 
-Moment = Annotated[str, Meta(description="RFC 3339, UTC, with milliseconds", examples=["2026-01-31T12:00:00.000Z"])]
+Moment = Annotated[
+    str, Meta(description="RFC 3339 time in UTC with milliseconds", examples=["2026-01-31T12:00:00.000Z"])
+]
 Epoch = Annotated[int, Meta(ge=1, le=2**53)]
 DeviceName = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$")]
 Name = Annotated[str, Meta(min_length=1, max_length=200)]
@@ -13,15 +15,15 @@ WaitMs = Annotated[int, Meta(ge=0, le=30_000)]
 
 
 class Request(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Read strictly."""
+    """Base class of request bodies. Unknown fields are rejected."""
 
 
 class Response(Struct, frozen=True, kw_only=True):
-    """Written as it is."""
+    """Base class of response bodies."""
 
 
 class Problem(Response, frozen=True, kw_only=True):
-    """RFC 9457. ``type`` ends in a stable code; further members depend on it."""
+    """Problem details (RFC 9457). ``type`` ends with a stable code, which determines further members."""
 
     type: str
     title: str
@@ -30,7 +32,7 @@ class Problem(Response, frozen=True, kw_only=True):
 
 
 class AccountRef(Response, frozen=True, kw_only=True):
-    """An account, as others see it."""
+    """Id and name of an account."""
 
     id: str
     name: str
@@ -40,6 +42,6 @@ R = TypeVar("R", bound=Response)
 
 
 def response_from(source: object, kind: type[R], /, **more: Any) -> R:
-    """A response with the equally named attributes of ``source``, and with the fields in ``more``."""
+    """A response with the attributes of ``source`` that have the same names, and the fields in ``more``."""
     names = (name for name in kind.__struct_fields__ if name not in more and hasattr(source, name))
     return kind(**{name: getattr(source, name) for name in names}, **more)

@@ -17,9 +17,11 @@ START = 1_000_000
 HELD = lease.acquire(None, ANNA, lease_ms=60_000, now_ms=START, pairing="p")
 
 
-def request_control(known: Lease | None, who: Identity = BERT, *, now_ms: int = START, request: str = "r1") -> Lease:
+def request_control(
+    current: Lease | None, caller: Identity = BERT, *, now_ms: int = START, request: str = "r1"
+) -> Lease:
     return control_request.request_control(
-        known, who, request=request, within_ms=10_000, lease_ms=20_000, now_ms=now_ms
+        current, caller, request=request, within_ms=10_000, lease_ms=20_000, now_ms=now_ms
     )
 
 
@@ -27,9 +29,9 @@ def facts_of(before: Lease | None, after: Lease, now_ms: int = START) -> list[Fa
     return [event.fact for event in lease_changes(before, after, by="dora", now_ms=now_ms)]
 
 
-def outcome(known: Lease, now_ms: int) -> str:
-    assert known.request is not None
-    return known.request.current_outcome(known, now_ms)
+def outcome(current: Lease, now_ms: int) -> str:
+    assert current.request is not None
+    return current.request.current_outcome(current, now_ms)
 
 
 def test_a_request_ends_with_its_time_or_its_lease() -> None:
@@ -56,7 +58,7 @@ def test_a_request_ends_with_its_time_or_its_lease() -> None:
         (None, lease.invalidate(None, pairing="p", now_ms=START), [Fact.RESET_ORDERED]),
         (
             request_control(HELD),
-            control_request.refuse(request_control(HELD), ANNA, request="r1", now_ms=START),
+            control_request.reject(request_control(HELD), ANNA, request="r1", now_ms=START),
             [Fact.REQUEST_DENIED],
         ),
         (
@@ -72,23 +74,23 @@ def test_each_change_has_its_events(before: Lease | None, after: Lease, facts: l
 
 
 def test_timeouts_are_recorded_with_the_next_change_and_their_own_time() -> None:
-    asked = request_control(HELD)
+    requested = request_control(HELD)
     late = START + 60_000
-    taken = lease.acquire(asked, CLEO, lease_ms=1_000, now_ms=late)
-    assert facts_of(asked, taken, late) == [Fact.REQUEST_EXPIRED, Fact.EXPIRED, Fact.TAKEN]
-    lapsed, expired, _ = lease_changes(asked, taken, by="cleo", now_ms=late)
-    assert (lapsed.at_ms, expired.at_ms) == (START + 10_000, START + 60_000)
-    assert list(timed_out(asked, late)) == [lapsed, expired], "the timer creates the same event"
+    taken = lease.acquire(requested, CLEO, lease_ms=1_000, now_ms=late)
+    assert facts_of(requested, taken, late) == [Fact.REQUEST_EXPIRED, Fact.EXPIRED, Fact.TAKEN]
+    request_expired, lease_expired, _ = lease_changes(requested, taken, by="cleo", now_ms=late)
+    assert (request_expired.at_ms, lease_expired.at_ms) == (START + 10_000, START + 60_000)
+    assert list(timed_out(requested, late)) == [request_expired, lease_expired], "the timer creates the same event"
     assert list(timed_out(None, late)) == list(timed_out(taken, late)) == []
-    second = request_control(asked, CLEO, now_ms=START + 10_000, request="r2")
-    assert facts_of(asked, second, START + 10_000) == [Fact.REQUEST_EXPIRED, Fact.REQUESTED]
+    second = request_control(requested, CLEO, now_ms=START + 10_000, request="r2")
+    assert facts_of(requested, second, START + 10_000) == [Fact.REQUEST_EXPIRED, Fact.REQUESTED]
 
 
 def test_an_event_names_the_former_holder() -> None:
     over = lease.acquire(HELD, BERT, lease_ms=1_000, now_ms=START, over="needed")
-    (told,) = lease_changes(HELD, over, by="bert", now_ms=START)
-    assert told.data == {"epoch": 2, "holder": "bert", "from": "anna", "reason": "needed"}
-    assert told.event("arm") | {"data": {}} == {
+    (event,) = lease_changes(HELD, over, by="bert", now_ms=START)
+    assert event.data == {"epoch": 2, "holder": "bert", "from": "anna", "reason": "needed"}
+    assert event.event("arm") | {"data": {}} == {
         "id": "control-taken-over-2",
         "device": "arm",
         "at_ms": START,
@@ -97,35 +99,35 @@ def test_an_event_names_the_former_holder() -> None:
         "message": "bert took control from anna: needed",
         "data": {},
     }
-    left = control_ended(HELD, Lease(epoch=2), why="moved", now_ms=START)
-    assert (left.fact, left.data) == (Fact.ENDED, {"epoch": 2, "holder": "anna", "reason": "moved"})
+    ended = control_ended(HELD, Lease(epoch=2), why="moved", now_ms=START)
+    assert (ended.fact, ended.data) == (Fact.ENDED, {"epoch": 2, "holder": "anna", "reason": "moved"})
 
 
 Step = tuple[str, Identity, int]
-STEPS = ("take", "over", "renew", "release", "reset", "ask", "accept", "refuse", "withdraw")
+STEPS = ("take", "over", "renew", "release", "reset", "request", "accept", "reject", "withdraw")
 
 
-def act(what: str, known: Lease | None, who: Identity, *, now_ms: int, request_id: str) -> Lease:
-    request = known.request.id if known is not None and known.request is not None else "none"
-    epoch = known.epoch if known is not None else 1
-    match what:
+def act(step: str, current: Lease | None, caller: Identity, *, now_ms: int, request_id: str) -> Lease:
+    request = current.request.id if current is not None and current.request is not None else "none"
+    epoch = current.epoch if current is not None else 1
+    match step:
         case "take" | "over":
-            over = "why" if what == "over" else ""
-            after = lease.acquire(known, who, lease_ms=20_000, now_ms=now_ms, pairing="p", over=over)
+            over = "why" if step == "over" else ""
+            after = lease.acquire(current, caller, lease_ms=20_000, now_ms=now_ms, pairing="p", over=over)
         case "renew":
-            after = lease.renew(known, who, epoch=epoch, lease_ms=20_000, now_ms=now_ms)
+            after = lease.renew(current, caller, epoch=epoch, lease_ms=20_000, now_ms=now_ms)
         case "release":
-            after = lease.release(lease.require_held(known, who, epoch=epoch, now_ms=now_ms), now_ms=now_ms)
+            after = lease.release(lease.require_held(current, caller, epoch=epoch, now_ms=now_ms), now_ms=now_ms)
         case "reset":
-            after = lease.invalidate(known, pairing="p", now_ms=now_ms)
-        case "ask":
-            after = request_control(known, who, now_ms=now_ms, request=request_id)
+            after = lease.invalidate(current, pairing="p", now_ms=now_ms)
+        case "request":
+            after = request_control(current, caller, now_ms=now_ms, request=request_id)
         case "accept":
-            after = control_request.accept(known, who, request=request, now_ms=now_ms)
-        case "refuse":
-            after = control_request.refuse(known, who, request=request, now_ms=now_ms)
+            after = control_request.accept(current, caller, request=request, now_ms=now_ms)
+        case "reject":
+            after = control_request.reject(current, caller, request=request, now_ms=now_ms)
         case _:
-            after = control_request.withdraw(known, who, request=request, now_ms=now_ms)
+            after = control_request.withdraw(current, caller, request=request, now_ms=now_ms)
     return after
 
 
@@ -135,37 +137,39 @@ def act(what: str, known: Lease | None, who: Identity, *, now_ms: int, request_i
     )
 )
 def test_requests_have_one_outcome_and_control_passes_only_by_consent(steps: list[Step]) -> None:
-    known: Lease | None = None
+    current: Lease | None = None
     now_ms, number = START, 0
-    told: list[ControlEvent] = []
+    events: list[ControlEvent] = []
     ends: dict[str, str] = {}
-    for what, who, later_ms in steps:
+    for step, caller, later_ms in steps:
         now_ms += later_ms
         number += 1
-        before = known
+        before = current
         try:
-            known = act(what, before, who, now_ms=now_ms, request_id=f"r{number}")
+            current = act(step, before, caller, now_ms=now_ms, request_id=f"r{number}")
         except Problem:
             continue
-        if known is not before:
-            told += lease_changes(before, known, by=who.name, now_ms=now_ms)
-        _check_step(before, known, what, who, now_ms)
-        if known.request is not None and (end := known.request.current_outcome(known, now_ms)) != "open":
-            assert ends.setdefault(known.request.id, end) == end, "it had another outcome before"
-    ids = [event.id for event in told]
+        if current is not before:
+            events += lease_changes(before, current, by=caller.name, now_ms=now_ms)
+        _check_step(before, current, step, caller, now_ms)
+        if current.request is not None and (end := current.request.current_outcome(current, now_ms)) != "open":
+            assert ends.setdefault(current.request.id, end) == end, "the outcome is final"
+    ids = [event.id for event in events]
     assert len(ids) == len(set(ids)), "an event was created twice"
-    assert not [each for each in told if each.fact is Fact.HANDED_OVER and ends[each.data["request"]] != "accepted"]
+    assert not [each for each in events if each.fact is Fact.HANDED_OVER and ends[each.data["request"]] != "accepted"]
 
 
-def _check_step(before: Lease | None, after: Lease, what: str, who: Identity, now_ms: int) -> None:
+def _check_step(before: Lease | None, after: Lease, step: str, caller: Identity, now_ms: int) -> None:
     if before is None:
         return
     assert after.epoch - before.epoch in {0, 1}
-    passed = (
+    transferred = (
         before.is_live(now_ms) and after.account and (after.account, after.session) != (before.account, before.session)
     )
-    if passed:
-        assert after.epoch == before.epoch + 1, "fenced"
-        assert what == "over" or (what == "accept" and before.held_by(who)), "only the holder or an owner passes it on"
-    if what in {"ask", "refuse", "withdraw"}:
+    if transferred:
+        assert after.epoch == before.epoch + 1, "a new holder has a new epoch"
+        assert step == "over" or (step == "accept" and before.held_by(caller)), (
+            "only the holder or an owner transfers control"
+        )
+    if step in {"request", "reject", "withdraw"}:
         assert replace(after, request=None) == replace(before, request=None)

@@ -151,7 +151,7 @@ def test_a_repeated_write_is_recorded_once(cloud: Cloud, monkeypatch: pytest.Mon
         for _ in range(2):
             await functions.audit_log.append_all(OWNER, [repeated])
         page = await functions.tables.query(store.AUDIT, OWNER, first="record:", last="record;", limit=1000)
-        return [str(row.data["what"]) for row in page.rows]
+        return [str(row.data["event"]) for row in page.rows]
 
     assert sorted(cloud.run(work())) == ["changed", "did 0", "did 1", "did 2", "repeated"]
     assert len(lost) > 2

@@ -49,7 +49,7 @@ def outcome(person: Person, request: str) -> str:
 def events(person: Person, robot: Robot) -> list[str]:
     """Kinds of control events, oldest first."""
     items = person.get(f"/devices/{robot.device}/events").json()["items"]
-    return [item["kind"] for item in reversed(items) if item["kind"].startswith(("control", "order"))]
+    return [item["kind"] for item in reversed(items) if item["kind"].startswith(("control", "command"))]
 
 
 def test_an_accepted_request_gives_the_requester_the_next_epoch(
