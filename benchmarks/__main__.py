@@ -39,12 +39,12 @@ def run(name: str, *, quick: bool) -> Report:
     started_s = time.monotonic()
     suite: Any = importlib.import_module(f"benchmarks.suites.{name}")
 
-    def say(line: str) -> None:
+    def log(line: str) -> None:
         print(f"{name:10} {time.monotonic() - started_s:6.0f} s  {line}", flush=True)
 
-    report: Report = suite.run(quick=quick, say=say)
+    report: Report = suite.run(quick=quick, log=log)
     save(report, QUICK if quick else RESULTS)
-    say(f"done, {sum(claim.holds for claim in report.claims)} of {len(report.claims)} claims hold")
+    log(f"done, {sum(claim.holds for claim in report.claims)} of {len(report.claims)} claims hold")
     return report
 
 

@@ -48,10 +48,10 @@ def setpoints(controller: Controller, kind: RobotType) -> Iterator[None]:
             target = _random_target(kind, chance)
         if period % SETPOINT_PERIODS == 0:
             sequence += 1
-            asked = Setpoint(
+            setpoint = Setpoint(
                 epoch=1, sequence=sequence, echo_tick_ms=now_ms, sent_ms=0.0, target=JointTarget(position_rad=target)
             )
-            controller.accept_setpoint(asked, now_s=now_ms / 1000, tick_ms=now_ms + LOOP_AGE_MS)
+            controller.accept_setpoint(setpoint, now_s=now_ms / 1000, tick_ms=now_ms + LOOP_AGE_MS)
         yield
 
 
@@ -65,7 +65,7 @@ def moves(controller: Controller, kind: RobotType) -> Iterator[None]:
             try:
                 move = controller.start_joint_goal(tenure, _random_target(kind, chance), speed=1.0)
             except Refused:
-                continue  # the target collides: take another one
+                continue  # the target collides: choose another one
         yield
 
 
@@ -73,13 +73,13 @@ def measure(kind: RobotType, shape: RobotGeometry | None, source: Source) -> lis
     """Returns the processor time of each step with motion [ms]."""
     controller = Controller(kind, LeaseGate(), geometry=shape)
     controller.start_at([kind.home_rad[joint.name] for joint in kind.joints])
-    found = []
+    durations_ms = []
     for period, _ in enumerate(source(controller, kind)):
-        began = time.thread_time()
+        started_s = time.thread_time()
         controller.update(period * kind.period_ms / 1000)
         if controller.moving:
-            found.append((time.thread_time() - began) * 1000)
-    return found
+            durations_ms.append((time.thread_time() - started_s) * 1000)
+    return durations_ms
 
 
 def main() -> None:
@@ -88,12 +88,12 @@ def main() -> None:
     kind = robot_type.load(ROBOTS / name)
     shape = geometry.load(kind, ROBOTS / name)
     print(f"{name}, a period of {kind.period_ms} ms; ms of processor time")
-    print(f"{'':28}{'p50':>8}{'p95':>8}{'p99':>8}{'max':>8}")
+    print(f"{'':34}{'p50':>8}{'p95':>8}{'p99':>8}{'max':>8}")
     for label, source in (("setpoints", setpoints), ("moves", moves)):
-        for known, looked_at in ((None, "ranges only"), (shape, "with its shape")):
-            times = measure(kind, known, source)
+        for checked, description in ((None, "ranges only"), (shape, "with collision checks")):
+            times = measure(kind, checked, source)
             marks = "".join(f"{percentile(times, mark):8.3f}" for mark in (0.5, 0.95, 0.99, 1))
-            print(f"{label + ', ' + looked_at:28}{marks}")
+            print(f"{label + ', ' + description:34}{marks}")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.agent.laboratory [SECONDS] [--broker amqtt]`` starts the product in its own folder and on its own
 ports. All robots run movements continuously; each publishes joints at 50 Hz, and two colour cameras deliver ten
-pictures of 320x240 per second. After a warm-up of 30 s it measures for ``SECONDS`` (60) and prints
+images of 320x240 pixels per second. After a warm-up of 30 s it measures for ``SECONDS`` (60) and prints
 
 - the real-time factor of the simulation and the lost simulated time;
 - the processor time of each part of the agent in per cent of one core (``/proc/self/task``);
@@ -41,17 +41,17 @@ MOVEMENTS = {"ur5": "slow_square", "nao": "wave", "qbo": "patrol", "hanson": "lo
 PARTS = (
     ("physics", ("mujoco-world",)),
     ("control loops", ("-loop",)),
-    ("drawing for cameras", ("renderer", "llvmpipe")),
+    ("camera rendering", ("renderer", "llvmpipe")),
     ("perception", ("perception",)),
-    ("sensors, JPEG", ("-sensing",)),
-    ("robots' other streams", ("-reporter",)),
+    ("sensors, JPEG", ("-sensing", "-camera")),
+    ("other streams of the robots", ("-stream",)),
     ("network", ("mqtt", "outbox", "paho")),
-    ("orders, journal, events", ("-commands", "action-", "script-")),
+    ("commands, journal, events", ("-commands", "action-", "script-")),
 )
-OTHER = "else"
+OTHER = "other"
 DIVIDER = "--"
 """Separates the options of the benchmark from those of the agent."""
-TOLD_PERCENT = 0.3
+SHOWN_PERCENT = 0.3
 _TICKS_S = os.sysconf("SC_CLK_TCK")
 _MARKS = (0.5, 0.95, 0.99, 1.0)
 
@@ -63,14 +63,14 @@ def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
     """Runs the agent with an observer of its threads."""
     gaps: dict[str, list[float]] = {}
     last: dict[str, float] = {}
-    step = Controller.update
+    update = Controller.update
 
-    def timed(controller: Controller, *given: Any, **named: Any) -> ControlOutput:
+    def timed(controller: Controller, *args: Any, **kwargs: Any) -> ControlOutput:
         name, at_s = threading.current_thread().name, time.monotonic()
         if name in last:
             gaps.setdefault(name, []).append(at_s - last[name])
         last[name] = at_s
-        return step(controller, *given, **named)
+        return update(controller, *args, **kwargs)
 
     Controller.update = timed  # type: ignore[method-assign,assignment]
     control_loop.IDLE_RATE_HZ = TELEMETRY_HZ
@@ -82,28 +82,30 @@ def _watch(report: Path, for_s: float, gaps: dict[str, list[float]]) -> None:
     time.sleep(WARM_UP_S)
     world = world_registry.get_world(ROOMS.folder(ROOM))
     gaps.clear()
-    before, busy, began_s = _threads(), _busy_s(), time.monotonic()
+    before, busy, started_s = _threads(), _busy_s(), time.monotonic()
     first, process_s = world.snapshot(), time.process_time()
     time.sleep(for_s)
-    last, took_s = world.snapshot(), time.monotonic() - began_s
+    last, duration_s = world.snapshot(), time.monotonic() - started_s
     after = _threads()
     used_s = time.process_time() - process_s
     cost: dict[str, float] = {}
     for name, spent_s in after.items():
         part = _part(name)
         cost[part] = cost.get(part, 0.0) + spent_s - before.get(name, 0.0)
-    named = {
-        name: (spent - before.get(name, 0.0)) / took_s * 100 for name, spent in after.items() if _part(name) == OTHER
+    other_percent = {
+        name: (spent - before.get(name, 0.0)) / duration_s * 100
+        for name, spent in after.items()
+        if _part(name) == OTHER
     }
-    named["threads that ended"] = (used_s - sum(cost.values())) / took_s * 100
+    other_percent["threads that ended"] = (used_s - sum(cost.values())) / duration_s * 100
     cost[OTHER] = used_s - sum(spent for part, spent in cost.items() if part != OTHER)
     result = {
-        "factor": (last.time_s - first.time_s) / took_s,
+        "factor": (last.time_s - first.time_s) / duration_s,
         "lost_ms": last.lag_ms - first.lag_ms,
-        "cost_percent": {part: spent_s / took_s * 100 for part, spent_s in cost.items()},
-        "else_percent": {name: percent for name, percent in named.items() if percent >= TOLD_PERCENT},
-        "agent_percent": used_s / took_s * 100,
-        "others_percent": (_busy_s() - busy - used_s) / took_s * 100,
+        "cost_percent": {part: spent_s / duration_s * 100 for part, spent_s in cost.items()},
+        "other_percent": {name: percent for name, percent in other_percent.items() if percent >= SHOWN_PERCENT},
+        "agent_percent": used_s / duration_s * 100,
+        "others_percent": (_busy_s() - busy - used_s) / duration_s * 100,
         "gaps_ms": {
             name: [len(each), *([round(percentile(each, mark) * 1000, 2) for mark in _MARKS])]
             for name, each in sorted(gaps.items())
@@ -116,15 +118,15 @@ def _watch(report: Path, for_s: float, gaps: dict[str, list[float]]) -> None:
 def _threads() -> dict[str, float]:
     """Returns the processor time of each thread by name [s]; native threads have the name that their library sets."""
     names = {thread.native_id: thread.name for thread in threading.enumerate()}
-    found: dict[str, float] = {}
+    seconds: dict[str, float] = {}
     for task in Path("/proc/self/task").iterdir():
         try:
             before, _, after = (task / "stat").read_text(encoding="ascii").rpartition(")")
         except OSError:  # the thread has ended
             continue
         spent, name = after.split(), names.get(int(task.name), before.partition("(")[2])
-        found[name] = found.get(name, 0.0) + (int(spent[11]) + int(spent[12])) / _TICKS_S
-    return found
+        seconds[name] = seconds.get(name, 0.0) + (int(spent[11]) + int(spent[12])) / _TICKS_S
+    return seconds
 
 
 def _busy_s() -> float:
@@ -137,7 +139,7 @@ def _part(thread: str) -> str:
     return next((part for part, names in PARTS if any(name in thread for name in names)), OTHER)
 
 
-# ------------------------------------------------------------ beside it
+# ------------------------------------------------------------ in the benchmark's process
 
 
 class Laboratory(local.LocalStack):
@@ -151,37 +153,37 @@ class Laboratory(local.LocalStack):
 
     def _run(self, name: str, *arguments: str) -> Any:
         if name == "agent":
-            own = ("benchmarks.agent.laboratory", str(self._for_s), "--agent", str(self._report))
-            arguments = ("-m", *own, DIVIDER, *arguments[2:])
+            module = ("benchmarks.agent.laboratory", str(self._for_s), "--agent", str(self._report))
+            arguments = ("-m", *module, DIVIDER, *arguments[2:])
         return super()._run(name, *arguments)
 
-    def operate(self, ending: threading.Event) -> None:
+    def operate(self, stopping: threading.Event) -> None:
         """Keeps all robots in motion."""
         link = self._sign_in_link().partition("#sign-in=")[2].split()[0]
         signed_in = self._call("POST", "/auth/sign-in", {"link": link})["access_token"]
-        wanted = {"name": "benchmark", "role": "operator", "days": 1}
-        self._token = self._call("POST", "/api-keys", wanted, signed_in)["token"]
-        while not ending.wait(1.0):
+        request = {"name": "benchmark", "role": "operator", "days": 1}
+        self._token = self._call("POST", "/api-keys", request, signed_in)["token"]
+        while not stopping.wait(1.0):
             for device in self._call("GET", "/devices", token=self._token)["items"]:
                 if device["robot_type"] in MOVEMENTS:
-                    asked = {"request": {"kind": "run_movement", "name": MOVEMENTS[device["robot_type"]]}}
+                    body = {"request": {"kind": "run_movement", "name": MOVEMENTS[device["robot_type"]]}}
                     # The server rejects an action while the robot moves.
                     with contextlib.suppress(ValueError, OSError):
-                        self._call("POST", f"/devices/{device['id']}/actions", asked, self._token)
+                        self._call("POST", f"/devices/{device['id']}/actions", body, self._token)
 
 
-def show(found: dict[str, Any], for_s: float, broker: str) -> None:
+def show(result: dict[str, Any], for_s: float, broker: str) -> None:
     """Prints the results."""
     print(f"{platform.python_version()}, {os.cpu_count()} cores, {broker}, {for_s:.0f} s")
-    print(f"real-time factor {found['factor']:.4f}, {found['lost_ms']:.0f} ms of simulated time lost")
-    for part, percent in sorted(found["cost_percent"].items(), key=lambda entry: -entry[1]):
+    print(f"real-time factor {result['factor']:.4f}, {result['lost_ms']:.0f} ms of simulated time lost")
+    for part, percent in sorted(result["cost_percent"].items(), key=lambda entry: -entry[1]):
         print(f"  {part:28}{percent:6.1f} % of a core")
-    for name, percent in found["else_percent"].items():
+    for name, percent in result["other_percent"].items():
         print(f"    of which {name:19}{percent:6.1f} %")
-    print(f"  {'the agent in all':28}{found['agent_percent']:6.1f} %")
-    print(f"  {'all else on the machine':28}{found['others_percent']:6.1f} %")
+    print(f"  {'agent, total':28}{result['agent_percent']:6.1f} %")
+    print(f"  {'other programs':28}{result['others_percent']:6.1f} %")
     print(f"{'ms between two decisions':30}{'n':>8}{'p50':>8}{'p95':>8}{'p99':>8}{'max':>8}")
-    for name, (count, *marks) in found["gaps_ms"].items():
+    for name, (count, *marks) in result["gaps_ms"].items():
         print(f"  {name:28}{count:8}" + "".join(f"{mark:8.2f}" for mark in marks))
 
 
@@ -189,32 +191,32 @@ def measure(for_s: float, broker: str, port: int) -> None:
     """Starts the product, measures and stops it."""
     with tempfile.TemporaryDirectory(prefix="ts-bench-lab-") as folder:
         report = Path(folder) / "report.json"
-        wanted = {"HOME": folder, "PORT": str(port), "BROKER": broker, "ROOM": ROOM}
-        chosen = settings.read(os.environ | {f"TELESCOPE_{name}": value for name, value in wanted.items()})
+        values = {"HOME": folder, "PORT": str(port), "BROKER": broker, "ROOM": ROOM}
+        chosen = settings.read(os.environ | {f"TELESCOPE_{name}": value for name, value in values.items()})
         laboratory = Laboratory(chosen, report, for_s)
-        ending = threading.Event()
+        stopping = threading.Event()
         try:
             laboratory.start()
-            operator = threading.Thread(target=laboratory.operate, args=(ending,), name="operator", daemon=True)
+            operator = threading.Thread(target=laboratory.operate, args=(stopping,), name="operator", daemon=True)
             operator.start()
-            patience_s = time.monotonic() + WARM_UP_S + for_s + 60
+            deadline_s = time.monotonic() + WARM_UP_S + for_s + 60
             while not report.is_file():
-                if time.monotonic() > patience_s:
+                if time.monotonic() > deadline_s:
                     sys.exit(f"no report; see {folder}")
                 time.sleep(0.5)
             time.sleep(0.5)
             show(json.loads(report.read_text()), for_s, broker)
         finally:
-            ending.set()
+            stopping.set()
             laboratory.stop()
 
 
 def main() -> int:
     """Runs the command line."""
-    parser = argparse.ArgumentParser(description="The whole laboratory in real time.")
+    parser = argparse.ArgumentParser(description="Measure the laboratory in real time.")
     parser.add_argument("seconds", type=float, nargs="?", default=60.0)
     parser.add_argument("--broker", choices=["amqtt", "mosquitto"], default="amqtt")
-    parser.add_argument("--port", type=int, default=8600, help="and the next two")
+    parser.add_argument("--port", type=int, default=8600, help="first of three ports")
     parser.add_argument("--agent", type=Path, help=argparse.SUPPRESS)
     own = sys.argv[1 : sys.argv.index(DIVIDER)] if DIVIDER in sys.argv else sys.argv[1:]
     chosen = parser.parse_args(own)

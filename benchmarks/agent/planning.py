@@ -24,17 +24,17 @@ from device_agent.runtime.planning.motion_planner import MotionPlanner
 ROBOTS = Path(__file__).resolve().parents[2] / "robots"
 NAMES = ("ur5", "nao", "qbo", "hanson")
 POST_SIZE_M, POST_M = (0.04, 0.35, 0.0), (-0.249, -0.414, 0.35)
-BEYOND_RAD = 1.6
-"""Targets of the arm's first joint; the post is half way."""
+TARGET_RAD = 1.6
+"""Target of the arm's first joint [rad]; the post is halfway."""
 _MARKS = (0.5, 0.95, 0.99, 1.0)
 
 
 class Loop:
     """Control loop of one robot without a driver; records when each period runs and how long it takes."""
 
-    def __init__(self, kind: RobotType, shape: MujocoGeometry, ending: threading.Event) -> None:
+    def __init__(self, kind: RobotType, shape: MujocoGeometry, stopping: threading.Event) -> None:
         self._kind = kind
-        self._ending = ending
+        self._stopping = stopping
         self._controller = Controller(kind, LeaseGate(), geometry=shape)
         home = [kind.home_rad[joint.name] for joint in kind.joints]
         self._controller.start_at(home)
@@ -46,7 +46,7 @@ class Loop:
     def _run(self) -> None:
         period_s, joint = self._kind.period_ms / 1000, self._kind.joints[0].name
         due_s, turn, move = time.monotonic(), 0, None
-        while not self._ending.is_set():
+        while not self._stopping.is_set():
             now_s = time.monotonic()
             self.late_s.append(max(0.0, now_s - due_s))
             if move is None or move.finished.is_set():
@@ -58,7 +58,7 @@ class Loop:
 
 
 def scene(folder: Path) -> Path:
-    """Returns the scene: the arm's table with a post."""
+    """Writes a scene of the arm's table with a post and returns its path."""
     kind = robot_type.load(folder)
     spec = mujoco.MjSpec.from_file(str(folder / kind.scene))
     spec.worldbody.add_geom(name="post", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=POST_SIZE_M, pos=POST_M)
@@ -69,31 +69,31 @@ def scene(folder: Path) -> Path:
 
 def measure(for_s: float, *, planning: bool) -> None:
     """Runs the loops for a time and prints the result."""
-    ending = threading.Event()
+    stopping = threading.Event()
     loops = {}
     for name in NAMES:
         kind = robot_type.load(ROBOTS / name)
-        loops[name] = Loop(kind, MujocoGeometry(kind, ROBOTS / name / kind.scene), ending)
+        loops[name] = Loop(kind, MujocoGeometry(kind, ROBOTS / name / kind.scene), stopping)
     kind = robot_type.load(ROBOTS / "ur5")
     path = scene(ROBOTS / "ur5")
     try:
         shape = MujocoGeometry(kind, path)
         home = [kind.home_rad[joint.name] for joint in kind.joints]
-        took_s: list[float] = []
+        durations_s: list[float] = []
         if planning:  # the first plan starts the planner process
-            MotionPlanner(kind, shape).plan(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
+            MotionPlanner(kind, shape).plan(home, [TARGET_RAD, *home[1:]], speed=1.0, ended=stopping.is_set)
         for loop in loops.values():
             loop.thread.start()
-        began_s, seed = time.monotonic(), 0
-        while (now_s := time.monotonic()) - began_s < for_s:
+        started_s, seed = time.monotonic(), 0
+        while (now_s := time.monotonic()) - started_s < for_s:
             if not planning:
                 time.sleep(0.1)
                 continue
             seed += 1
-            MotionPlanner(kind, shape, seed=seed).plan(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
-            took_s.append(time.monotonic() - now_s)
+            MotionPlanner(kind, shape, seed=seed).plan(home, [TARGET_RAD, *home[1:]], speed=1.0, ended=stopping.is_set)
+            durations_s.append(time.monotonic() - now_s)
             time.sleep(0.2)
-        ending.set()
+        stopping.set()
     finally:
         path.unlink()
     for loop in loops.values():
@@ -102,19 +102,20 @@ def measure(for_s: float, *, planning: bool) -> None:
     for name, loop in loops.items():
         late_ms = " ".join(f"{percentile(loop.late_s, mark) * 1000:8.2f}" for mark in _MARKS)
         print(f"  {name:8} {len(loop.late_s):6} periods, late p50, p95, p99, max ms {late_ms}")
-    if took_s:
-        print(f"  {len(took_s)} plans, p50 {percentile(took_s, 0.5) * 1000:.0f} ms, max {max(took_s) * 1000:.0f} ms")
-        print(f"  memory of the program that plans: {_planner_mb():.0f} MB")
+    if durations_s:
+        p50_ms, max_ms = percentile(durations_s, 0.5) * 1000, max(durations_s) * 1000
+        print(f"  {len(durations_s)} plans, p50 {p50_ms:.0f} ms, max {max_ms:.0f} ms")
+        print(f"  memory of the planner process: {_planner_mb():.0f} MB")
 
 
 def _planner_mb() -> float:
     """Returns the resident memory of the child processes [MB]."""
-    found = 0.0
+    total = 0.0
     for task in Path("/proc/self/task").iterdir():
         for child in (task / "children").read_text(encoding="ascii").split():
             status = Path(f"/proc/{child}/status").read_text(encoding="ascii")
-            found += float(status.partition("VmRSS:")[2].split()[0]) / 1024
-    return found
+            total += float(status.partition("VmRSS:")[2].split()[0]) / 1024
+    return total
 
 
 def main() -> None:

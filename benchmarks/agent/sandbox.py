@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.agent.sandbox [RUNS]`` prints percentiles over 300 runs per kind [ms].
 
-- *start*: from the request to the first message of the script, without and with a process that is ready;
+- *start*: from the request to the first message of the script, without and with a prepared process;
 - *stop*: from the kill signal to the end of the process and the release of its memory.
 """
 
@@ -15,14 +15,16 @@ from benchmarks.reporting.report import percentile
 from device_agent.ports.sandbox import Limits, SandboxProcess
 from device_agent.sandbox.host import SandboxHost
 
-_STUBBORN = "import signal\nfor n in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP): signal.signal(n, signal.SIG_IGN)\n"
-_GREEDY = "kept = []\ntry:\n    while True: kept.append(bytearray(b'x' * 2**20))\nexcept MemoryError: pass\n"
+_IGNORE_TERM = (
+    "import signal\nfor n in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP): signal.signal(n, signal.SIG_IGN)\n"
+)
+_FILL_MEMORY = "blocks = []\ntry:\n    while True: blocks.append(bytearray(b'x' * 2**20))\nexcept MemoryError: pass\n"
 _UNTIL_READY_S = 0.7
 SCRIPTS = {
     "a script that waits": "print(1)\nwait(600)",
-    "one that imports NumPy": "import numpy\nprint(numpy.zeros(3))\nwait(600)",
-    "one that ignores SIGTERM and computes": f"{_STUBBORN}print(1)\nwhile True: pass",
-    "one that has filled its memory": f"{_GREEDY}print(1)\nwhile True: pass",
+    "a script that imports NumPy": "import numpy\nprint(numpy.zeros(3))\nwait(600)",
+    "a script that ignores SIGTERM and computes": f"{_IGNORE_TERM}print(1)\nwhile True: pass",
+    "a script that has filled its memory": f"{_FILL_MEMORY}print(1)\nwhile True: pass",
 }
 
 
@@ -44,14 +46,14 @@ def measure(
     starts, stops = [], []
     for _ in range(runs):
         time.sleep(pause_s)
-        begun_s = time.perf_counter()
+        started_s = time.perf_counter()
         with contextlib.closing(sandbox.open(Limits(), untrusted=untrusted)) as process:
             first_line(process, source)
-            starts.append((time.perf_counter() - begun_s) * 1000)
+            starts.append((time.perf_counter() - started_s) * 1000)
             stopped_s = time.perf_counter()
             process.kill()
             if not process.wait(10):
-                raise RuntimeError("it does not die")
+                raise RuntimeError("the script did not end")
             stops.append((time.perf_counter() - stopped_s) * 1000)
     return starts, stops
 
@@ -65,20 +67,20 @@ def percentiles(values: list[float]) -> str:
 def main(runs: int = 300) -> None:
     """Runs all measurements."""
     sandbox = SandboxHost()
-    begun_s = time.perf_counter()
+    started_s = time.perf_counter()
     sandbox.start()
-    print(f"warm parent ready after {(time.perf_counter() - begun_s) * 1000:.0f} ms; {runs} runs each [ms]")
+    print(f"warm parent ready after {(time.perf_counter() - started_s) * 1000:.0f} ms; {runs} runs each [ms]")
     for untrusted in (False, True):
         with contextlib.closing(sandbox.open(Limits(), untrusted=untrusted)):
             pass  # the first run starts the zygote
-        where = "bubblewrap: " if untrusted else ""
+        prefix = "bubblewrap: " if untrusted else ""
         for name, source in SCRIPTS.items():
             starts, stops = measure(sandbox, source, runs, untrusted=untrusted)
-            print(f"{where + name:50} start {percentiles(starts)}")
-            print(f"{'':50} stop  {percentiles(stops)}")
+            print(f"{prefix + name:58} start {percentiles(starts)}")
+            print(f"{'':58} stop  {percentiles(stops)}")
         waits = SCRIPTS["a script that waits"]
         starts, _ = measure(sandbox, waits, max(1, runs // 6), untrusted=untrusted, pause_s=_UNTIL_READY_S)
-        print(f"{where + 'a script that waits, where one is ready':50} start {percentiles(starts)}")
+        print(f"{prefix + 'a script that waits, in a prepared process':58} start {percentiles(starts)}")
     sandbox.close()
 
 

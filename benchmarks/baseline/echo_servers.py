@@ -17,17 +17,17 @@ from paho.mqtt.enums import CallbackAPIVersion
 HOST = "127.0.0.1"
 
 
-def send_at_once(_client: Any, _userdata: Any, opened: Any) -> None:
+def disable_nagle(_client: Any, _userdata: Any, connection: Any) -> None:
     """Disables Nagle's algorithm; paho calls it as ``on_socket_open``."""
-    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 async def _tcp(port: int) -> None:
-    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def reply(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while data := await reader.read(65_536):
             writer.write(data)
 
-    async with await asyncio.start_server(answer, HOST, port) as server:
+    async with await asyncio.start_server(reply, HOST, port) as server:
         print("ready", flush=True)
         await server.serve_forever()
 
@@ -65,12 +65,12 @@ async def _http(port: int) -> None:
     await serve(app, port)
 
 
-def _mqtt(port: int, *words: str) -> None:
-    client_id, user, password, topic, reply_topic, qos_text, size_text = words
+def _mqtt(port: int, *arguments: str) -> None:
+    client_id, user, password, topic, reply_topic, qos_text, size_text = arguments
     qos, size = int(qos_text), int(size_text)
     client = paho.Client(CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv311)
     client.username_pw_set(user, password)
-    client.on_socket_open = send_at_once
+    client.on_socket_open = disable_nagle
 
     def reply(_client: paho.Client, _userdata: Any, message: paho.MQTTMessage) -> None:
         client.publish(reply_topic, message.payload.ljust(size), qos)
@@ -85,14 +85,14 @@ def _mqtt(port: int, *words: str) -> None:
     client.loop_forever()
 
 
-def main(kind: str, port: str, *more: str) -> None:
+def main(kind: str, port: str, *arguments: str) -> None:
     """Serves until the process is terminated."""
     if kind == "tcp":
         asyncio.run(_tcp(int(port)))
     elif kind == "http":
         asyncio.run(_http(int(port)))
     else:
-        _mqtt(int(port), *more)
+        _mqtt(int(port), *arguments)
 
 
 if __name__ == "__main__":

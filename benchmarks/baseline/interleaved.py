@@ -11,7 +11,7 @@ from benchmarks.reporting.report import Table, percentile
 
 Exchange = Callable[[], float | None]
 """One round trip. It may return its own duration [ms] if it contains other work. An exception ends the run."""
-SHARES: Final = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "most": 1.0}
+SHARES: Final = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
 
 
 def measure_interleaved(
@@ -35,7 +35,7 @@ def measure_interleaved(
         for _ in range(warm_up):
             exchange()
     generator, order = random.Random(1), list(paths)
-    with _no_collector():
+    with _without_garbage_collection():
         for _ in range(rounds):
             generator.shuffle(order)
             for name in order:
@@ -51,7 +51,7 @@ def measure_interleaved(
 
 
 @contextlib.contextmanager
-def _no_collector() -> Iterator[None]:
+def _without_garbage_collection() -> Iterator[None]:
     gc.disable()
     try:
         yield
@@ -59,15 +59,15 @@ def _no_collector() -> Iterator[None]:
         gc.enable()
 
 
-def table(title: str, durations_ms: Mapping[str, list[float]], *, against: str = "", note: str = "") -> Table:
-    """Returns a table of percentiles per path; with ``against``, also the ratio of medians to that path."""
-    columns = ["path", "n", *(f"{name} ms" for name in SHARES)] + ([f"× {against}"] if against else [])
+def table(title: str, durations_ms: Mapping[str, list[float]], *, reference: str = "", note: str = "") -> Table:
+    """Returns a table of percentiles per path; with ``reference``, also the ratio of medians to that path."""
+    columns = ["path", "n", *(f"{name} ms" for name in SHARES)] + ([f"× {reference}"] if reference else [])
     rows: list[list[str | float | int | None]] = []
     for name, samples in durations_ms.items():
         row: list[str | float | int | None] = [name, len(samples)]
         row += [percentile(samples, share) for share in SHARES.values()]
-        if against:
-            row.append(percentile(samples, 0.5) / percentile(durations_ms[against], 0.5))
+        if reference:
+            row.append(percentile(samples, 0.5) / percentile(durations_ms[reference], 0.5))
         rows.append(row)
     return Table(title=title, columns=columns, rows=rows, note=note)
 

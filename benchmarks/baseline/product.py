@@ -1,4 +1,4 @@
-"""Starts the product as ``make up`` does, with reference programs beside it and clients with any permissions."""
+"""Starts the product as ``make up`` does, with reference programs and clients with any permissions."""
 
 import contextlib
 import http.client
@@ -17,7 +17,7 @@ import msgspec
 import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 
-from benchmarks.baseline.echo_servers import HOST, send_at_once
+from benchmarks.baseline.echo_servers import HOST, disable_nagle
 from device_agent.protocol import JointTarget, Setpoint, codec
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.security.grants import Grant
@@ -59,7 +59,7 @@ class MeasuredProduct:
         """TCP port of the broker."""
         return self.machine.port + 1
 
-    def rights(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> tuple[str, str, str]:
+    def credentials(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> tuple[str, str, str]:
         """Returns client id, user name and password of a new client with exactly these permissions."""
         self._number += 1
         return broker_credentials(self._cloud, f"bench-{self._number}", publish, subscribe)
@@ -67,7 +67,7 @@ class MeasuredProduct:
     def connect(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = (), qos: int = 0) -> "MqttClient":
         """Returns a connected and subscribed client."""
         return MqttClient(
-            self.mqtt_port, *self.rights(publish=publish, subscribe=subscribe), subscribe=subscribe, qos=qos
+            self.mqtt_port, *self.credentials(publish=publish, subscribe=subscribe), subscribe=subscribe, qos=qos
         )
 
 
@@ -103,7 +103,7 @@ class MqttClient:
         self._ready = threading.Event()
         self.client = paho.Client(CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv311)
         self.client.username_pw_set(user, password)
-        self.client.on_socket_open = send_at_once
+        self.client.on_socket_open = disable_nagle
         self.client.on_message = lambda _c, _u, message: self.on_payload(bytes(message.payload))
         self.client.on_connect = self._connected
         self.client.on_subscribe = lambda *_: self._ready.set()
@@ -128,7 +128,7 @@ class MqttClient:
 
     def __exit__(self, *_: object) -> None:
         self.client.disconnect()
-        with contextlib.suppress(AttributeError):  # paho's thread may end by itself at the same moment
+        with contextlib.suppress(AttributeError):  # paho's thread may end at the same time
             self.client.loop_stop()
 
 
@@ -159,22 +159,22 @@ class StreamingOperator:
         self.device = product.api.device(name)
         self._path = f"/devices/{self.device['id']}/lease"
         self._telemetry_changed = threading.Condition()
-        self._newest: _TelemetryFields | None = None
+        self._latest_telemetry: _TelemetryFields | None = None
         self._sequence = 0
         self._next_s = 0.0
-        self._ending = threading.Event()
+        self._stopping = threading.Event()
         topic = self.device["topic"]
         self.mqtt = product.connect(publish=(f"{topic}/ctl/+",), subscribe=(f"{topic}/tele/joints",))
         self.mqtt.on_payload = self._on_telemetry
-        granted = product.api.post(self._path, {"lease_ms": LEASE_MS, "wait_ms": 5000})
-        self.epoch: int = granted["epoch"]
+        lease = product.api.post(self._path, {"lease_ms": LEASE_MS, "wait_ms": 5000})
+        self.epoch: int = lease["epoch"]
         self._topic = f"{topic}/ctl/{self.epoch}"
         self._renewal = threading.Thread(target=self._renew, daemon=True)
         self._renewal.start()
         with self._telemetry_changed:
-            self._telemetry_changed.wait_for(lambda: self._newest is not None, TIMEOUT_S)
+            self._telemetry_changed.wait_for(lambda: self._latest_telemetry is not None, TIMEOUT_S)
         joints = [each.name for each in robot_type.load(ROOT / "robots" / self.device["robot_type"]).joints]
-        self.target_rad: dict[str, float] = dict(zip(joints, self._latest().commanded_rad, strict=True))
+        self.target_rad: dict[str, float] = dict(zip(joints, self._require_telemetry().commanded_rad, strict=True))
 
     def exchange(self) -> float:
         """Sends a setpoint at the console's rate and returns the time until telemetry reports it as applied [ms].
@@ -189,7 +189,7 @@ class StreamingOperator:
             setpoint = Setpoint(
                 epoch=self.epoch,
                 sequence=self._sequence,
-                echo_tick_ms=self._latest().tick_ms,
+                echo_tick_ms=self._require_telemetry().tick_ms,
                 sent_ms=time.monotonic() * 1000,
                 target=JointTarget(position_rad=self.target_rad),
             )
@@ -217,30 +217,30 @@ class StreamingOperator:
         connection.request("GET", f"/api/v1/actions/{action['id']}?wait_ms=10000")
         return duration_ms
 
-    def _latest(self) -> _TelemetryFields:
-        if self._newest is None:
+    def _require_telemetry(self) -> _TelemetryFields:
+        if self._latest_telemetry is None:
             raise TimeoutError("the robot publishes no telemetry")
-        return self._newest
+        return self._latest_telemetry
 
     def _applied(self) -> bool:
-        newest = self._newest
-        return newest is not None and newest.epoch == self.epoch and newest.setpoint_sequence >= self._sequence
+        latest = self._latest_telemetry
+        return latest is not None and latest.epoch == self.epoch and latest.setpoint_sequence >= self._sequence
 
     def _on_telemetry(self, payload: bytes) -> None:
-        newest = codec.decode(payload, _TelemetryFields)
+        latest = codec.decode(payload, _TelemetryFields)
         with self._telemetry_changed:
-            self._newest, self.received = newest, payload
+            self._latest_telemetry, self.received = latest, payload
             self._telemetry_changed.notify()
 
     def _renew(self) -> None:
-        while not self._ending.wait(LEASE_MS / 4000):
+        while not self._stopping.wait(LEASE_MS / 4000):
             self._product.api.post(self._path, {"lease_ms": LEASE_MS, "epoch": self.epoch})
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ending.set()
+        self._stopping.set()
         self._renewal.join(TIMEOUT_S)
         self._product.api.http.delete(self._path, params={"epoch": self.epoch})
         self.mqtt.__exit__()

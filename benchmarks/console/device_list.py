@@ -25,35 +25,35 @@ OWN: Final = 1
 DRAWN_WITHIN_MS: Final = 1000.0
 FILTERED_WITHIN_MS: Final = 100.0
 """Limit from a key press to the result of the search [ms]."""
-WORD_MS: Final = 5.0
+MESSAGE_MS: Final = 5.0
 """Limit per state message [ms]: 200 devices with one message per second each would otherwise occupy the page."""
-LISTENS_S: Final = 10.0
-SAID_HZ: Final = 20.0
+OBSERVED_S: Final = 10.0
+STATE_HZ: Final = 20.0
 """State messages per second of all devices: three times the rate of devices without changes (one per 30 s)."""
-_SEARCHES: Final = ("7", "ur5", "device 1", "device 13", "nothing like it", "")
+_SEARCHES: Final = ("7", "ur5", "device 1", "device 13", "no match", "")
 
 # From navigation to the last row, after layout and paint.
 _OPEN: Final = """(count) => new Promise((resolve) => {
-    const began = performance.now();
-    const look = () => {
+    const start = performance.now();
+    const check = () => {
         const rows = document.querySelectorAll("[data-testid=device-row]");
-        if (rows.length < count) requestAnimationFrame(look);
-        else requestAnimationFrame(() => setTimeout(() => resolve(performance.now() - began)));
+        if (rows.length < count) requestAnimationFrame(check);
+        else requestAnimationFrame(() => setTimeout(() => resolve(performance.now() - start)));
     };
     location.hash = "#/";
-    look();
+    check();
 })"""
 _SEARCH: Final = """(words) => new Promise((resolve) => {
     const field = document.querySelector("[data-testid=search]");
     field.value = words;
-    const began = performance.now();
+    const start = performance.now();
     field.dispatchEvent(new Event("input", {bubbles: true}));
-    requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(() => resolve(performance.now() - began))));
+    requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(() => resolve(performance.now() - start))));
 })"""
 _ONLINE: Final = "() => document.querySelectorAll('[data-testid=device-row] [data-status=online]').length"
 
 
-def speak(robot: Robot, name: str, mode: Mode) -> None:
+def publish_state(robot: Robot, name: str, mode: Mode) -> None:
     """Publishes the state of one device."""
     state = State(device=name, at_ms=wall_ms(), tick_ms=tick_ms(), mode=mode, epoch=0)
     if robot.link is None:
@@ -61,49 +61,49 @@ def speak(robot: Robot, name: str, mode: Mode) -> None:
     robot.link.publish(robot.topic(topics.STATE, name), codec.encode(state), retain=True)
 
 
-def show_list(browser: Browser, machine: Machine, count: int) -> bool:
+def measure_list(browser: Browser, machine: Machine, count: int) -> bool:
     """Measures the list and returns True if it is drawn and searched within the limits."""
     with pair_minimal_agents(machine, count) as robots, pages(browser, machine) as (page,):
-        everyone = [(robot, name) for robot in robots for name in robot.names]
-        for robot, name in everyone:
-            speak(robot, name, Mode.IDLE)
+        devices = [(robot, name) for robot in robots for name in robot.names]
+        for robot, name in devices:
+            publish_state(robot, name, Mode.IDLE)
         page.reload()
         expected = count + OWN
-        wait_until(lambda: page.evaluate(_ONLINE) >= count, "every device to be heard", 120)
+        wait_until(lambda: page.evaluate(_ONLINE) >= count, "every device to be online", 120)
         session = page.context.new_cdp_session(page)
         session.send("Performance.enable")
         print(f"{expected} devices behind {len(robots) + 1} agents; load {os.getloadavg()[0]:.1f}")
-        drawn_ms = _opened(page, expected)
+        drawn_ms = _open_ms(page, expected)
         filtered_ms = [page.evaluate(_SEARCH, words) for words in _SEARCHES]
-        rest_ms = _busy_ms(session, lambda: page.wait_for_timeout(1000 * LISTENS_S))
-        said = 0
+        idle_ms = _busy_ms(session, lambda: page.wait_for_timeout(1000 * OBSERVED_S))
+        published = 0
 
-        def all_speak() -> None:
-            nonlocal said
-            until_s = time.monotonic() + LISTENS_S
+        def publish_all() -> None:
+            nonlocal published
+            until_s = time.monotonic() + OBSERVED_S
             while time.monotonic() < until_s:
-                robot, name = everyone[said % count]
-                speak(robot, name, Mode.STREAMING if (said // count) % 2 == 0 else Mode.IDLE)
-                said += 1
-                page.wait_for_timeout(1000 / SAID_HZ)
+                robot, name = devices[published % count]
+                publish_state(robot, name, Mode.STREAMING if (published // count) % 2 == 0 else Mode.IDLE)
+                published += 1
+                page.wait_for_timeout(1000 / STATE_HZ)
 
         page.evaluate(WATCH_FRAMES)
-        word_ms = (_busy_ms(session, all_speak) - rest_ms) / said
+        message_ms = (_busy_ms(session, publish_all) - idle_ms) / published
         longest_ms = max(page.evaluate(TAKE_FRAMES)["gaps"])
-    return _verdict(drawn_ms, filtered_ms, word_ms, rest_ms, longest_ms)
+    return _report(drawn_ms, filtered_ms, message_ms, idle_ms, longest_ms)
 
 
-def _opened(page: Page, count: int) -> float:
+def _open_ms(page: Page, count: int) -> float:
     """Returns the time to draw the list after navigation from another page, median of five [ms]."""
-    found: list[float] = []
+    durations_ms: list[float] = []
     for _ in range(5):
         page.evaluate("() => { location.hash = '#/robot-types'; }")
         wait_until(lambda: page.get_by_test_id("device-row").count() == 0, "another page", 30)
-        found.append(page.evaluate(_OPEN, count))
-    return statistics.median(found)
+        durations_ms.append(page.evaluate(_OPEN, count))
+    return statistics.median(durations_ms)
 
 
-def _busy_ms(session: CDPSession, what: Callable[[], None]) -> float:
+def _busy_ms(session: CDPSession, call: Callable[[], None]) -> float:
     """Returns the time that the page's main thread is busy during a call [ms]."""
 
     def busy() -> float:
@@ -111,19 +111,21 @@ def _busy_ms(session: CDPSession, what: Callable[[], None]) -> float:
         return 1000 * float(metrics["TaskDuration"])
 
     before = busy()
-    what()
+    call()
     return busy() - before
 
 
-def _verdict(drawn_ms: float, filtered_ms: Sequence[float], word_ms: float, rest_ms: float, longest_ms: float) -> bool:
+def _report(drawn_ms: float, filtered_ms: Sequence[float], message_ms: float, idle_ms: float, frame_ms: float) -> bool:
     rows = (
-        ("the list is drawn, median of 5", drawn_ms, DRAWN_WITHIN_MS),
-        ("a search is drawn, the slowest", max(filtered_ms), FILTERED_WITHIN_MS),
-        ("one word of a device", word_ms, WORD_MS),
+        ("drawing the list, median of 5", drawn_ms, DRAWN_WITHIN_MS),
+        ("drawing a search, slowest", max(filtered_ms), FILTERED_WITHIN_MS),
+        ("one state message", message_ms, MESSAGE_MS),
     )
-    for what, took, most in rows:
-        print(f"{what:32}{took:9.1f} ms, {'within' if took <= most else 'MORE THAN'} {most:.0f} ms")
+    for name, measured_ms, limit_ms in rows:
+        print(
+            f"{name:32}{measured_ms:9.1f} ms, {'within' if measured_ms <= limit_ms else 'MORE THAN'} {limit_ms:.0f} ms"
+        )
     print(f"each search: {', '.join(f'{each:.0f}' for each in filtered_ms)} ms")
-    print(f"nothing said: the page is at work {rest_ms / (10 * LISTENS_S):.1f} % of the time")
-    print(f"{SAID_HZ:.0f} words a second: longest frame {longest_ms:.0f} ms; load {os.getloadavg()[0]:.1f}")
-    return all(took <= most for _, took, most in rows)
+    print(f"without messages, the page is busy {idle_ms / (10 * OBSERVED_S):.1f} % of the time")
+    print(f"{STATE_HZ:.0f} messages per second: longest frame {frame_ms:.0f} ms; load {os.getloadavg()[0]:.1f}")
+    return all(measured_ms <= limit_ms for _, measured_ms, limit_ms in rows)

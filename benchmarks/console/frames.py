@@ -20,22 +20,22 @@ from tests.harness.network.brokers import wait_until
 
 ROBOTS: Final = 10
 WARM_UP_S: Final = 20.0
-LONGEST_FRAME_MS: Final = 100.0
-GROWS_MB_MIN: Final = 0.2
-"""Growth rate after the first minute that counts as a leak."""
-MORE: Final = 1.1
+MAX_FRAME_MS: Final = 100.0
+MAX_GROWTH_MB_MIN: Final = 0.2
+"""Growth after the first minute above which memory counts as leaking [MB/min]."""
+MAX_RATIO: Final = 1.1
 """Allowed ratio of nodes and listeners at the end to those after the first minute."""
 
 # Records the time of each frame, and for long frames the browser's attribution.
 WATCH_FRAMES: Final = """() => {
     const frames = (window.benchFrames = {gaps: [], long: []});
     let last = performance.now();
-    const look = (now) => {
+    const record = (now) => {
         frames.gaps.push(now - last);
         last = now;
-        requestAnimationFrame(look);
+        requestAnimationFrame(record);
     };
-    requestAnimationFrame(look);
+    requestAnimationFrame(record);
     new PerformanceObserver((list) => {
         for (const each of list.getEntries()) {
             const until = each.startTime + each.duration;
@@ -85,9 +85,13 @@ def steady(every_minute: Sequence[MemorySample]) -> bool:
     slope = 0.0
     if len(every_minute) > 1:
         slope = statistics.linear_regression(range(len(every_minute)), [each.heap_mb for each in every_minute]).slope
-    stays = slope <= GROWS_MB_MIN and last.nodes <= MORE * first.nodes and last.listeners <= MORE * first.listeners
-    print(f"memory {'steady' if stays else 'GROWS'}: {slope:+.3f} MB a minute over {len(every_minute) - 1} minutes")
-    return stays
+    level = (
+        slope <= MAX_GROWTH_MB_MIN
+        and last.nodes <= MAX_RATIO * first.nodes
+        and last.listeners <= MAX_RATIO * first.listeners
+    )
+    print(f"memory {'steady' if level else 'GROWS'}: {slope:+.3f} MB per minute over {len(every_minute) - 1} minutes")
+    return level
 
 
 def open_together(page: Page, machine: Machine, ids: Sequence[str]) -> None:
@@ -97,47 +101,47 @@ def open_together(page: Page, machine: Machine, ids: Sequence[str]) -> None:
     wait_until(lambda: [frames > 0 for frames in page.evaluate(DRAWN)] == [True] * len(ids), "every twin")
 
 
-def show_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:
+def measure_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:
     """Measures ten arms and returns True if frame intervals and memory are within the limits."""
     with start_kinematic_arms(machine, ROBOTS) as ids, pages(browser, machine) as (page,):
         session = page.context.new_cdp_session(page)
         page.evaluate(WATCH_FRAMES)
-        began_s = time.monotonic()
+        started_s = time.monotonic()
         open_together(page, machine, ids)
-        print(f"{len(ids)} arms, opened in {time.monotonic() - began_s:.1f} s; load {os.getloadavg()[0]:.1f}")
+        print(f"{len(ids)} arms, opened in {time.monotonic() - started_s:.1f} s; load {os.getloadavg()[0]:.1f}")
         _show_frames("while opening, not counted", page.evaluate(TAKE_FRAMES))
         time.sleep(WARM_UP_S)
-        _show_frames(f"the {WARM_UP_S:.0f} s after, not counted", page.evaluate(TAKE_FRAMES))
+        _show_frames(f"the {WARM_UP_S:.0f} s afterwards, not counted", page.evaluate(TAKE_FRAMES))
         print(f"at the start of the minute: {memory_samples(session)}")
         before = sum(page.evaluate(DRAWN))
         page.evaluate(TAKE_FRAMES)  # the forced collection takes time that does not belong to the page
         time.sleep(60)
         taken = page.evaluate(TAKE_FRAMES)
         drawn = sum(page.evaluate(DRAWN)) - before
-        quick = _show_minute(taken, drawn / 60)
+        is_smooth = _show_minute(taken, drawn / 60)
         every_minute = [memory_samples(session)]
         print(f"after minute 1: {every_minute[0]}", flush=True)
         for minute in range(2, round(minutes) + 1):
             time.sleep(60)
             every_minute.append(memory_samples(session))
             print(f"after minute {minute}: {every_minute[-1]}", flush=True)
-        return steady(every_minute) and quick
+        return steady(every_minute) and is_smooth
 
 
 def _show_minute(taken: dict[str, Any], drawn_hz: float) -> bool:
     longest = _show_frames("the minute", taken)
-    print(f"twins drawn: {drawn_hz:.0f} a second together; load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    print(f"twins drawn: {drawn_hz:.0f} per second in total; load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     for each in sorted(taken["long"], key=lambda frame: -float(frame["duration"]))[:3]:
         print("  {duration:.0f} ms, of which drawing {drawing:.0f}, layout {layout:.0f}; {scripts}".format(**each))
-    quick = longest <= LONGEST_FRAME_MS
-    print(f"longest frame {longest:.0f} ms, {'within' if quick else 'MORE THAN'} {LONGEST_FRAME_MS:.0f} ms", flush=True)
-    return quick
+    is_smooth = longest <= MAX_FRAME_MS
+    print(f"longest frame {longest:.0f} ms, {'within' if is_smooth else 'MORE THAN'} {MAX_FRAME_MS:.0f} ms", flush=True)
+    return is_smooth
 
 
 def _show_frames(when: str, taken: dict[str, Any]) -> float:
     gaps: list[float] = sorted(taken["gaps"]) or [float("inf")]
-    marks = [gaps[round((len(gaps) - 1) * share)] for share in (0.5, 0.95, 0.99, 1.0)]
-    late = sum(gap > LONGEST_FRAME_MS for gap in gaps)
-    said = "p50 {:.0f}, p95 {:.0f}, p99 {:.0f}, max {:.0f}".format(*marks)
-    print(f"{when}: {len(gaps)} frames, ms apart: {said}; longer than {LONGEST_FRAME_MS:.0f}: {late}", flush=True)
-    return marks[-1]
+    percentiles = [gaps[round((len(gaps) - 1) * share)] for share in (0.5, 0.95, 0.99, 1.0)]
+    late = sum(gap > MAX_FRAME_MS for gap in gaps)
+    intervals = "p50 {:.0f}, p95 {:.0f}, p99 {:.0f}, max {:.0f}".format(*percentiles)
+    print(f"{when}: {len(gaps)} frames, ms apart: {intervals}; over {MAX_FRAME_MS:.0f}: {late}", flush=True)
+    return percentiles[-1]

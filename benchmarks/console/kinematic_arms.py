@@ -26,7 +26,8 @@ RATE_HZ: Final = 20.0
 SWING_S: Final = 9.0
 SIDE_RAD: Final = 0.9
 PAN: Final = 0
-AGENT_HAS: Final = 5
+"""Index of the joint that swings."""
+ARMS_PER_AGENT: Final = 5
 STATE_EVERY_S: Final = 10.0
 
 
@@ -42,18 +43,18 @@ class _Pattern:
 @contextlib.contextmanager
 def start_kinematic_arms(machine: Machine, count: int) -> Iterator[list[str]]:
     """Runs arms of the demo account with telemetry at ``RATE_HZ`` and yields their device ids."""
-    over = threading.Event()
-    with pair_minimal_agents(machine, count, AGENT_HAS) as robots:
+    stopping = threading.Event()
+    with pair_minimal_agents(machine, count, ARMS_PER_AGENT) as robots:
         pattern = _pattern(machine)
-        everyone = [(robot, name) for robot in robots for name in robot.names]
-        for robot, name in everyone:
-            _introduce(robot, name, pattern)
-        thread = threading.Thread(target=_swing, args=(everyone, pattern, over))
+        arms = [(robot, name) for robot in robots for name in robot.names]
+        for robot, name in arms:
+            _publish_description(robot, name, pattern)
+        thread = threading.Thread(target=_swing, args=(arms, pattern, stopping))
         thread.start()
         try:
             yield [device for robot in robots for device in robot.devices]
         finally:
-            over.set()
+            stopping.set()
             thread.join()
 
 
@@ -64,48 +65,48 @@ def _pattern(machine: Machine) -> _Pattern:
         issued = api.post("/mqtt/credentials", {"purpose": "view"})
     login = Credentials(issued["username"], issued["password"])
     with Client(issued["client_id"], login, port=issued["tcp"]["port"]).open() as client:
-        wanted = [f"{topic}/{kind}" for kind in ("desc", "desc/twin", "tele/joints")]
-        client.subscribe(*wanted)
-        found: dict[str, bytes] = {}
+        filters = [f"{topic}/{kind}" for kind in ("desc", "desc/twin", "tele/joints")]
+        client.subscribe(*filters)
+        payloads: dict[str, bytes] = {}
 
         def complete() -> bool:
-            found.update({message.topic: message.payload for message in client.pending()})
-            return found.keys() >= set(wanted)
+            payloads.update({message.topic: message.payload for message in client.pending()})
+            return payloads.keys() >= set(filters)
 
-        wait_until(complete, "what the arm says of itself")
-    description, twin, joints = (found[each] for each in wanted)
+        wait_until(complete, "the description of the arm")
+    description, twin, joints = (payloads[each] for each in filters)
     return _Pattern(
         codec.decode(description, Description), codec.decode(twin, Twin), codec.decode(joints, JointTelemetry)
     )
 
 
-def _introduce(robot: Robot, name: str, pattern: _Pattern) -> None:
-    def say(kind: str, message: msgspec.Struct, more: str = "") -> None:
-        topic = topics.device(robot.space, robot.id, name, kind, more)
+def _publish_description(robot: Robot, name: str, pattern: _Pattern) -> None:
+    def publish(kind: str, message: msgspec.Struct, suffix: str = "") -> None:
+        topic = topics.device(robot.space, robot.id, name, kind, suffix)
         robot.publish(topic, msgspec.structs.replace(message, device=name), retain=True)
 
-    say(topics.DESC, pattern.description)
-    say(topics.DESC, pattern.twin, topics.TWIN)
-    _tell_state(robot, name)
+    publish(topics.DESC, pattern.description)
+    publish(topics.DESC, pattern.twin, topics.TWIN)
+    _publish_state(robot, name)
 
 
-def _tell_state(robot: Robot, name: str) -> None:
+def _publish_state(robot: Robot, name: str) -> None:
     state = State(device=name, at_ms=wall_ms(), tick_ms=tick_ms(), mode=Mode.IDLE, epoch=0)
     robot.publish(topics.device(robot.space, robot.id, name, topics.STATE), state, retain=True)
 
 
-def _swing(everyone: list[tuple[Robot, str]], pattern: _Pattern, over: threading.Event) -> None:
+def _swing(arms: list[tuple[Robot, str]], pattern: _Pattern, stopping: threading.Event) -> None:
     """Publishes positions until the end; each arm lags slightly behind the previous one."""
-    next_s = began_s = time.monotonic()
+    next_s = started_s = time.monotonic()
     for sequence in itertools.count(1):
-        for place, (robot, name) in enumerate(everyone):
-            phase = 2 * math.pi * (time.monotonic() - began_s) / SWING_S - place
-            told = _at(pattern.joints, SIDE_RAD * math.sin(phase), sequence)
+        for index, (robot, name) in enumerate(arms):
+            phase = 2 * math.pi * (time.monotonic() - started_s) / SWING_S - index
+            telemetry = _at(pattern.joints, SIDE_RAD * math.sin(phase), sequence)
             topic = topics.device(robot.space, robot.id, name, topics.TELE, topics.JOINTS)
             if robot.link is not None:
-                robot.link.publish(topic, codec.encode(told), qos=0)
+                robot.link.publish(topic, codec.encode(telemetry), qos=0)
         next_s = max(next_s + 1 / RATE_HZ, time.monotonic())
-        if over.wait(next_s - time.monotonic()):
+        if stopping.wait(next_s - time.monotonic()):
             return
 
 

@@ -14,7 +14,7 @@ from tests.harness.cloud.cloud import connect_to_broker
 if TYPE_CHECKING:
     from tests.harness.cloud.cloud import Cloud, Person
 
-AGENT_HAS: Final = 20
+DEVICES_PER_AGENT: Final = 20
 
 
 class _Clock:
@@ -48,7 +48,7 @@ class _Owner:
 
 
 @contextlib.contextmanager
-def pair_minimal_agents(machine: Machine, count: int, each: int = AGENT_HAS) -> Iterator[list[Robot]]:
+def pair_minimal_agents(machine: Machine, count: int, each: int = DEVICES_PER_AGENT) -> Iterator[list[Robot]]:
     """Runs connected agents with a total number of devices, paired with the demo account."""
     with contextlib.ExitStack() as stack, machine.api() as api:
         functions = _Functions(machine)

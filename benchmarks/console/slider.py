@@ -21,18 +21,18 @@ from typing import Any, Final
 
 from playwright.sync_api import Page, expect, sync_playwright
 
-from benchmarks.console.device_list import show_list
-from benchmarks.console.frames import show_fleet
+from benchmarks.console.device_list import measure_list
+from benchmarks.console.frames import measure_fleet
 from tests.harness.browser.browser import PATIENCE_MS, chromium, pages
 from tests.harness.browser.product import Machine, Trace, start_machine
 from tests.harness.network.brokers import wait_until
 
 JOINT: Final = "elbow"
-PARTS: Final = ("input", "published", "commanded", "moved", "told", "drawn")
+PARTS: Final = ("input", "published", "commanded", "moved", "received", "drawn")
 """Parts in order: handled by the page, published, at the simulation, moving, telemetry received, drawn."""
-MOST_MS: Final = 60.0
+MAX_MEDIAN_MS: Final = 60.0
 """Target for the median from press to simulated motion [ms]."""
-MOVES_RAD_S: Final = 0.002
+MOVING_RAD_S: Final = 0.002
 """Velocity above which a simulated joint counts as moving: 0.1 °/s."""
 
 # Observes the page from outside; its messages and drawing stay unchanged.
@@ -43,15 +43,15 @@ WATCH: Final = """() => {
     const text = (data) => new TextDecoder("latin1").decode(data);
     const Native = window.WebSocket;
     window.WebSocket = class extends Native {
-        constructor(...given) {
-            super(...given);
+        constructor(...args) {
+            super(...args);
             this.addEventListener("message", ({data}) => {
-                if (!(data instanceof ArrayBuffer) || marks.published === undefined || marks.told !== undefined) return;
-                const said = text(data);
-                if (!said.includes("/tele/joints")) return;
-                const speeds = /"velocity_rad_s":\\[([^\\]]*)\\]/.exec(said);
-                if (speeds === null || !speeds[1].split(",").some((each) => Math.abs(Number(each)) > MOVES)) return;
-                first("told");
+                if (!(data instanceof ArrayBuffer) || !marks.published || marks.received) return;
+                const packet = text(data);
+                if (!packet.includes("/tele/joints")) return;
+                const speeds = /"velocity_rad_s":\\[([^\\]]*)\\]/.exec(packet);
+                if (speeds === null || !speeds[1].split(",").some((each) => Math.abs(Number(each)) > MOVING)) return;
+                first("received");
             });
         }
         send(data) {
@@ -65,15 +65,15 @@ WATCH: Final = """() => {
     addEventListener("input", () => first("input"), {capture: true});
     window.benchDrawn = () => {
         const box = document.querySelector("[data-testid=view-3d]");
-        const drawn = () => { if (marks.told !== undefined) first("drawn"); };
+        const drawn = () => { if (marks.received !== undefined) first("drawn"); };
         new MutationObserver(drawn).observe(box, {attributeFilter: ["data-frames"]});
     };
     window.benchArm = () => {
         for (const name of Object.keys(marks)) delete marks[name];
         marks.armed = true;
-        let ahead = Infinity;
-        for (let tries = 0; tries < 2000; tries += 1) ahead = Math.min(ahead, at() - Date.now());
-        marks.ahead = ahead;
+        let offset = Infinity;
+        for (let tries = 0; tries < 2000; tries += 1) offset = Math.min(offset, at() - Date.now());
+        marks.offset = offset;
     };
 }"""
 
@@ -87,7 +87,7 @@ class Press:
 
 def watch(page: Page) -> None:
     """Installs the observer; it is active from the next page load."""
-    page.add_init_script(f"({WATCH.replace('MOVES', str(MOVES_RAD_S))})()")
+    page.add_init_script(f"({WATCH.replace('MOVING', str(MOVING_RAD_S))})()")
 
 
 def presses(page: Page, machine: Machine, count: int) -> list[Press]:
@@ -99,32 +99,32 @@ def presses(page: Page, machine: Machine, count: int) -> list[Press]:
     page.evaluate("() => benchDrawn()")
     slider = page.get_by_test_id(f"slider-{JOINT}")
     slider.scroll_into_view_if_needed()
-    found: list[Press] = []
+    results: list[Press] = []
     for index in range(3 * count):
-        if len(found) == count:
+        if len(results) == count:
             break
-        _take(page)
-        wait_until(lambda: _speed(trace) < MOVES_RAD_S, "rest", 20)
+        _acquire_control(page)
+        wait_until(lambda: _speed(trace) < MOVING_RAD_S, "rest", 20)
         page.wait_for_timeout(
             300 + 37 * (index % 7)
         )  # a robot at rest publishes every 50 ms; sample every phase of that period
         if (press := _press(page, trace, 0.55 if index % 2 else 0.6)) is not None:
-            found.append(press)
-    return found
+            results.append(press)
+    return results
 
 
-def _take(page: Page) -> None:
+def _acquire_control(page: Page) -> None:
     """Acquires control again if late setpoints on a busy machine ended the lease."""
     state, slider = page.get_by_test_id("control-state"), page.get_by_test_id(f"slider-{JOINT}")
 
-    def may() -> bool:
+    def is_controlled() -> bool:
         button = page.get_by_test_id("take-control")
         if state.get_attribute("data-state") != "mine" and button.count() and button.is_enabled():
             button.click()
             page.wait_for_timeout(300)
         return slider.is_enabled()
 
-    wait_until(may, "control", 60)
+    wait_until(is_controlled, "control", 60)
 
 
 def _press(page: Page, trace: Trace, share: float) -> Press | None:
@@ -138,22 +138,22 @@ def _press(page: Page, trace: Trace, share: float) -> Press | None:
     page.mouse.up()
     marks: dict[str, float] = {}
 
-    def whole() -> bool:
+    def is_complete() -> bool:
         marks.update(page.evaluate("() => benchMarks"))
         return "drawn" in marks
 
     try:
-        wait_until(whole, "the twin to be drawn", 5)
+        wait_until(is_complete, "the twin to be drawn", 5)
     except AssertionError:
         return None
     page.wait_for_timeout(100)
-    at: dict[str, float] = {name: marks[name] - marks["ahead"] for name in marks if name not in ("ahead", "armed")}
+    at: dict[str, float] = {name: marks[name] - marks["offset"] for name in marks if name not in ("offset", "armed")}
     rows = [row for row in trace.rows() if row["tick_ms"] > before["tick_ms"]]
-    told = next((row for row in rows if row["target"][JOINT] != before["target"][JOINT]), None)
-    moved = next((row for row in rows if abs(row["qvel"][JOINT]) > MOVES_RAD_S), None)
-    if told is None or moved is None:
+    commanded = next((row for row in rows if row["target"][JOINT] != before["target"][JOINT]), None)
+    moved = next((row for row in rows if abs(row["qvel"][JOINT]) > MOVING_RAD_S), None)
+    if commanded is None or moved is None:
         return None
-    at |= {"commanded": told["at_ms"], "moved": moved["at_ms"]}
+    at |= {"commanded": commanded["at_ms"], "moved": moved["at_ms"]}
     return Press({part: at[part] - at["pressed"] for part in PARTS})
 
 
@@ -161,30 +161,32 @@ def _speed(trace: Trace) -> float:
     return abs(float(trace.now()["qvel"][JOINT]))
 
 
-def show(found: Sequence[Press]) -> bool:
+def show(results: Sequence[Press]) -> bool:
     """Prints the result and returns True if the target is met."""
-    print(f"{platform.python_version()}, {os.cpu_count()} cores, {len(found)} presses of the {JOINT}'s slider")
-    print(f"{'ms':14}{'since the press: p50':>22}{'p95':>8}{'max':>8}{'since the part before: p50':>30}")
+    print(f"{platform.python_version()}, {os.cpu_count()} cores, {len(results)} presses of the slider of {JOINT}")
+    print(f"{'ms':14}{'since the press: p50':>22}{'p95':>8}{'max':>8}{'since the previous part: p50':>30}")
     before = "pressed"
     for part in PARTS:
-        whole = sorted(press.at_ms[part] for press in found)
-        step = [press.at_ms[part] - press.at_ms.get(before, 0.0) for press in found]
-        marks = (statistics.median(whole), whole[round((len(whole) - 1) * 0.95)], whole[-1])
-        print(f"{part:14}{marks[0]:22.1f}{marks[1]:8.1f}{marks[2]:8.1f}{statistics.median(step):30.1f}")
+        times = sorted(press.at_ms[part] for press in results)
+        step = [press.at_ms[part] - press.at_ms.get(before, 0.0) for press in results]
+        percentiles = (statistics.median(times), times[round((len(times) - 1) * 0.95)], times[-1])
+        print(
+            f"{part:14}{percentiles[0]:22.1f}{percentiles[1]:8.1f}{percentiles[2]:8.1f}{statistics.median(step):30.1f}"
+        )
         before = part
-    median = statistics.median(press.at_ms["moved"] for press in found)
-    good = median <= MOST_MS
-    print(f"slider to simulated motion: {median:.1f} ms, {'within' if good else 'MORE THAN'} {MOST_MS:.0f} ms")
-    return good
+    median = statistics.median(press.at_ms["moved"] for press in results)
+    reached = median <= MAX_MEDIAN_MS
+    print(f"slider to simulated motion: {median:.1f} ms, {'within' if reached else 'MORE THAN'} {MAX_MEDIAN_MS:.0f} ms")
+    return reached
 
 
 def main() -> int:
     """Runs the command line."""
-    parser = argparse.ArgumentParser(description="How quick the console is.")
+    parser = argparse.ArgumentParser(description="Measure the latency of the console.")
     parser.add_argument("--samples", type=int, default=40)
     parser.add_argument("--fleet", action="store_true", help="ten arms on one page")
-    parser.add_argument("--minutes", type=float, default=10.0, help="with --fleet: how long memory is looked at")
-    parser.add_argument("--devices", type=int, default=0, help="the list of so many devices")
+    parser.add_argument("--minutes", type=float, default=10.0, help="with --fleet: duration of the memory measurement")
+    parser.add_argument("--devices", type=int, default=0, help="measure a list with this number of devices")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="ts-bench-console-") as name:
         folder = Path(name)
@@ -194,12 +196,12 @@ def main() -> int:
             chromium(playwright) as browser,
         ):
             if chosen.fleet:
-                return 0 if show_fleet(browser, machine, chosen.minutes) else 1
+                return 0 if measure_fleet(browser, machine, chosen.minutes) else 1
             if chosen.devices:
-                return 0 if show_list(browser, machine, chosen.devices) else 1
+                return 0 if measure_list(browser, machine, chosen.devices) else 1
             with pages(browser, machine) as (page,):
-                found = measure(page, machine, chosen.samples)
-            return 0 if show(found) else 1
+                results = measure(page, machine, chosen.samples)
+            return 0 if show(results) else 1
 
 
 def measure(page: Page, machine: Machine, count: int) -> list[Press]:

@@ -8,15 +8,15 @@ from typing import Final, Self
 import httpx
 import msgspec
 
-from benchmarks.faults.processes import ORDERED, ProductProcesses
+from benchmarks.faults.processes import ACTION_ARM, ProductProcesses
 
 STEP_RAD: Final = 0.002
 """Action number n moves the wrist to n times this angle, so the simulation's trace identifies the action."""
-_ENDS: Final = ("done", "failed", "expired", "cancelled")
+_TERMINAL: Final = ("done", "failed", "expired", "cancelled")
 _TTL_MS: Final = 4000
-_GIVE_UP_S: Final = 20.0
-_AGAIN_S: Final = 0.2
-_REST_S: Final = 0.1
+_TIMEOUT_S: Final = 20.0
+_RETRY_S: Final = 0.2
+_PAUSE_S: Final = 0.1
 
 
 class RequestedAction(msgspec.Struct):
@@ -30,8 +30,8 @@ class RequestedAction(msgspec.Struct):
 
     number: int
     fault: str
-    given_ms: float
-    action: str = ""
+    requested_ms: float
+    id: str = ""
     status: str = ""
     done_ms: float = 0.0
 
@@ -41,109 +41,109 @@ class ActionLoad:
 
     Attributes:
         fault: Fault that is active now.
-        given: All requested actions.
+        actions: All requested actions.
     """
 
-    def __init__(self, ground: ProductProcesses) -> None:
-        self._ground = ground
-        self._http = httpx.Client(base_url=ground.api, timeout=3, headers=dict(ground.http.headers))
-        self._ending = threading.Event()
+    def __init__(self, product: ProductProcesses) -> None:
+        self._product = product
+        self._http = httpx.Client(base_url=product.api, timeout=3, headers=dict(product.http.headers))
+        self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self.fault = "none"
-        self.given: list[RequestedAction] = []
+        self.actions: list[RequestedAction] = []
 
     def __enter__(self) -> Self:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ending.set()
-        self._thread.join(_GIVE_UP_S)
+        self._stopping.set()
+        self._thread.join(_TIMEOUT_S)
         self._http.close()
 
     def done_since(self, at_ms: float) -> float | None:
         """Returns the completion time of the first action requested after a time, or None."""
-        found = [each.done_ms for each in list(self.given) if each.given_ms >= at_ms and each.status == "done"]
-        return min(found, default=None)
+        times_ms = [each.done_ms for each in list(self.actions) if each.requested_ms >= at_ms and each.status == "done"]
+        return min(times_ms, default=None)
 
     def settle(self) -> None:
         """Waits until all accepted actions have a terminal status or the timeout expires."""
-        for order in self.given:
-            deadline_s = time.monotonic() + _GIVE_UP_S
-            while order.action and order.status not in _ENDS and time.monotonic() < deadline_s:
-                self._follow(order)
+        for action in self.actions:
+            deadline_s = time.monotonic() + _TIMEOUT_S
+            while action.id and action.status not in _TERMINAL and time.monotonic() < deadline_s:
+                self._poll(action)
 
     def _run(self) -> None:
         number = 0
-        while not self._ending.is_set():
+        while not self._stopping.is_set():
             number += 1
-            order = RequestedAction(number, self.fault, time.monotonic() * 1000)
-            self.given.append(order)
-            self._give(order)
-            self._ending.wait(_REST_S)
+            action = RequestedAction(number, self.fault, time.monotonic() * 1000)
+            self.actions.append(action)
+            self._request(action)
+            self._stopping.wait(_PAUSE_S)
 
-    def _give(self, order: RequestedAction) -> None:
+    def _request(self, action: RequestedAction) -> None:
         """Repeats the request with the same idempotency key until a response arrives."""
         body = {
-            "request": {"kind": "move_joints", "position_rad": {"wrist_3": order.number * STEP_RAD}},
+            "request": {"kind": "move_joints", "position_rad": {"wrist_3": action.number * STEP_RAD}},
             "ttl_ms": _TTL_MS,
             "timeout_ms": 5000,
             "wait_for": "done",
             "wait_ms": 2000,
         }
-        deadline_s = time.monotonic() + _GIVE_UP_S
-        while not self._ending.is_set() and time.monotonic() < deadline_s:
+        deadline_s = time.monotonic() + _TIMEOUT_S
+        while not self._stopping.is_set() and time.monotonic() < deadline_s:
             try:
-                path = f"{self._ground.device(ORDERED)}/actions"
-                answer = self._http.post(path, json=body, headers={"Idempotency-Key": f"order-{order.number}"})
+                path = f"{self._product.device(ACTION_ARM)}/actions"
+                response = self._http.post(path, json=body, headers={"Idempotency-Key": f"action-{action.number}"})
             except httpx.HTTPError:
-                self._ending.wait(_AGAIN_S)
+                self._stopping.wait(_RETRY_S)
                 continue
-            if answer.is_success:
-                self._note(order, answer.json())
-                while order.status not in _ENDS and not self._ending.is_set() and time.monotonic() < deadline_s:
-                    self._follow(order)
+            if response.is_success:
+                self._update(action, response.json())
+                while action.status not in _TERMINAL and not self._stopping.is_set() and time.monotonic() < deadline_s:
+                    self._poll(action)
                 return
-            if answer.is_client_error:  # rejected: the previous action has not ended, or the arm is offline
+            if response.is_client_error:  # rejected: the previous action has not ended, or the arm is offline
                 return
-            self._ending.wait(_AGAIN_S)
+            self._stopping.wait(_RETRY_S)
 
-    def _follow(self, order: RequestedAction) -> None:
+    def _poll(self, action: RequestedAction) -> None:
         try:
-            answer = self._http.get(f"/actions/{order.action}", params={"wait_ms": 1000})
+            response = self._http.get(f"/actions/{action.id}", params={"wait_ms": 1000})
         except httpx.HTTPError:
-            time.sleep(_AGAIN_S)
+            time.sleep(_RETRY_S)
             return
-        if answer.is_success:
-            self._note(order, answer.json())
+        if response.is_success:
+            self._update(action, response.json())
 
     @staticmethod
-    def _note(order: RequestedAction, action: Mapping[str, str]) -> None:
-        order.action, order.status = action["id"], action["status"]
-        if order.status == "done":
-            order.done_ms = time.monotonic() * 1000
+    def _update(action: RequestedAction, resource: Mapping[str, str]) -> None:
+        action.id, action.status = resource["id"], resource["status"]
+        if action.status == "done":
+            action.done_ms = time.monotonic() * 1000
 
 
-def lost(orders: list[RequestedAction]) -> list[RequestedAction]:
+def lost(actions: list[RequestedAction]) -> list[RequestedAction]:
     """Returns the accepted actions without a terminal status."""
-    return [each for each in orders if each.action and each.status not in _ENDS]
+    return [each for each in actions if each.id and each.status not in _TERMINAL]
 
 
-def duplicated(orders: list[RequestedAction], begun: Mapping[str, int]) -> list[RequestedAction]:
-    """Returns the actions that started more than once. ``begun``: action → number of starts."""
-    return [each for each in orders if begun.get(each.action, 0) > 1]
+def duplicated(actions: list[RequestedAction], starts: Mapping[str, int]) -> list[RequestedAction]:
+    """Returns the actions that started more than once. ``starts``: action → number of starts."""
+    return [each for each in actions if starts.get(each.id, 0) > 1]
 
 
-def went_back(wrist_rad: list[float]) -> int:
+def count_returns(wrist_rad: list[float]) -> int:
     """Counts returns of the wrist to the target of an earlier action, from the simulation's trace.
 
     A target counts if the wrist rests there for three lines. A return to zero is a restart of the simulation.
     """
-    newest = found = 0
+    newest = returns = 0
     for one, two, three in zip(wrist_rad, wrist_rad[1:], wrist_rad[2:], strict=False):
         number = round(one / STEP_RAD)
         if abs(one - two) > 1e-8 or abs(two - three) > 1e-8 or abs(one - number * STEP_RAD) > 1e-6:  # noqa: PLR2004
             continue
-        found += 0 < number < newest
+        returns += 0 < number < newest
         newest = number
-    return found
+    return returns

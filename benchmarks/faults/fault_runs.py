@@ -10,9 +10,9 @@ from typing import Final
 
 import msgspec
 
-from benchmarks.faults.action_load import ActionLoad, went_back
-from benchmarks.faults.operator import FULL, FaultOperator
-from benchmarks.faults.processes import ORDERED, STREAMED, ProductProcesses
+from benchmarks.faults.action_load import ActionLoad, count_returns
+from benchmarks.faults.operator import FULL_SPEED, FaultOperator
+from benchmarks.faults.processes import ACTION_ARM, STREAMING_ARM, ProductProcesses
 from tests.faults import cuts
 from tests.faults.cuts import Bench, Mend
 from tests.faults.judge import Verdict, judge
@@ -31,16 +31,16 @@ _CUTS: Final = {
     "broker killed": "broker killed",
     "functions killed": "functions killed",
 }
-_TOLD: Final = ("agent's link cut", "broker killed")
-"""The agent notices these faults itself, so times count from the cut and not from the last setpoint."""
+_DETECTED_BY_AGENT: Final = ("agent's link cut", "broker killed")
+"""The agent detects these faults, so times count from the cut and not from the last setpoint."""
 _SHUFFLED: Final = "all sent twice, out of order"
 _AGENT_KILLED: Final = "agent killed"
 _DISK_FULL: Final = "agent's disk full"
-_TRIES: Final = 8
+_ATTEMPTS: Final = 8
 _RTT_MS: Final = 100.0
 _LOSS: Final = 0.02
-_RECOVERS_S: Final = 60.0
-_LOOK_MS: Final = 400.0
+_RECOVERY_TIMEOUT_S: Final = 60.0
+_BEFORE_CUT_MS: Final = 400.0
 
 
 class FaultResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -51,7 +51,7 @@ class FaultResult(msgspec.Struct, frozen=True, kw_only=True):
             the trace ends with the agent.
         recovery_s: Time from the repair until a new lease moves the arm and the other arm completes a new action.
         moved_again: True if anything moved between the stop and a new lease.
-        undone: Number of setpoints applied after a newer one.
+        reordered: Number of setpoints applied after a newer one.
     """
 
     fault: str
@@ -59,22 +59,22 @@ class FaultResult(msgspec.Struct, frozen=True, kw_only=True):
     stop_ms: float | None
     recovery_s: float
     moved_again: bool
-    undone: int = 0
+    reordered: int = 0
 
 
 class FaultRuns(Bench):
     """Runs one fault at a time."""
 
-    def __init__(self, ground: ProductProcesses, orders: ActionLoad, *, seed: int) -> None:
-        super().__init__(ground, seed=seed)
-        self.ground = ground
-        self.orders = orders
+    def __init__(self, product: ProductProcesses, load: ActionLoad, *, seed: int) -> None:
+        super().__init__(product, seed=seed)
+        self.product = product
+        self.load = load
         self.arm, self._wrist = self.arms
         self.arms = [self.arm]
-        self._mended_ms = 0.0
+        self._repaired_ms = 0.0
         self._faults: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
-            "100 ms of round trip": (lambda: self._network(rtt_ms=_RTT_MS), self._network),
-            "2 % lost, sent again after 200 ms": (lambda: self._network(loss=_LOSS), self._network),
+            "100 ms round trip": (lambda: self._network(rtt_ms=_RTT_MS), self._network),
+            "2 % packet loss, retransmitted after 200 ms": (lambda: self._network(loss=_LOSS), self._network),
             "agent's clock an hour ahead": (lambda: self._clock(signal.SIGUSR1), lambda: self._clock(signal.SIGUSR2)),
             "agent's clock an hour back": (lambda: self._clock(signal.SIGUSR2), lambda: self._clock(signal.SIGUSR1)),
             _DISK_FULL: (lambda: self._disk(full=True), lambda: self._disk(full=False)),
@@ -92,33 +92,35 @@ class FaultRuns(Bench):
 
     def round(self, fault: str) -> FaultResult:
         """Runs one fault until recovery."""
-        self.orders.fault = fault
-        verdict, undone = None, 0
+        self.load.fault = fault
+        verdict, reordered = None, 0
         if fault in _CUTS:
             verdict = self._cut(_CUTS[fault])
         elif fault == _SHUFFLED:
-            verdict, undone = self._shuffled()
+            verdict, reordered = self._shuffled()
         elif fault == _AGENT_KILLED:
             self._kill_agent()
         else:
-            verdict = self._while_wrong(*self._faults[fault], noted=fault == _DISK_FULL)
+            verdict = self._during_fault(*self._faults[fault], by_recorder=fault == _DISK_FULL)
         return FaultResult(
             fault=fault,
-            broker=self.ground.kind,
-            stop_ms=None if verdict is None else round(verdict.cut_ms if fault in _TOLD else verdict.rest_ms, 1),
+            broker=self.product.kind,
+            stop_ms=None
+            if verdict is None
+            else round(verdict.cut_ms if fault in _DETECTED_BY_AGENT else verdict.rest_ms, 1),
             recovery_s=round(self._recover(), 2),
             moved_again=verdict is not None and verdict.moved_again,
-            undone=undone,
+            reordered=reordered,
         )
 
-    def wrist_went_back(self) -> int:
+    def count_repeated_actions(self) -> int:
         """Counts repeated actions of the other arm in the trace."""
-        return went_back([row.target_rad[-1] for row in self._wrist.record.read()])
+        return count_returns([row.target_rad[-1] for row in self._wrist.record.read()])
 
     # ------------------------------------------------------------ rounds
 
     def _cut(self, cut: str) -> Verdict:
-        for _ in range(_TRIES):
+        for _ in range(_ATTEMPTS):
             if cut in cuts.OPERATOR:
                 found = self._operator_round(self.arm, cut, self.chance).verdict
             else:
@@ -133,20 +135,20 @@ class FaultRuns(Bench):
     def _cut_all(self, cut: str) -> Mend:
         return self._timed(super()._cut_all(cut))
 
-    def _timed(self, mend: Mend) -> Mend:
-        """Records the time of the repair; a fault that repairs itself starts to do so at once."""
-        self._mended_ms = now_ms()
+    def _timed(self, repair: Mend) -> Mend:
+        """Records the time of the repair; for a fault without repair, the time of the fault."""
+        self._repaired_ms = now_ms()
 
         def timed() -> None:
-            if mend is not cuts.mends_itself:
-                self._mended_ms = now_ms()
-            mend()
+            if repair is not cuts.mends_itself:
+                self._repaired_ms = now_ms()
+            repair()
 
         return timed
 
-    def _while_wrong(self, begin: Callable[[], object], mend: Callable[[], object], *, noted: bool) -> Verdict:
-        """Kills the operator while a fault is active; ``noted``: the trace has ended, use the recorded periods."""
-        for _ in range(_TRIES):
+    def _during_fault(self, begin: Callable[[], object], repair: Callable[[], object], *, by_recorder: bool) -> Verdict:
+        """Kills the operator during a fault; ``by_recorder``: the trace has ended, use the recorded periods."""
+        for _ in range(_ATTEMPTS):
             while not self.arm.set_in_motion():
                 pass
             begin()
@@ -156,12 +158,14 @@ class FaultRuns(Bench):
             cut_ms = now_ms()
             time.sleep(0.7)
             since_ms = self.arm.last_setpoint_ms(cut_ms)
-            if noted:
-                found = judge(self.ground.noted.rows(STREAMED, cut_ms - _LOOK_MS), cut_ms=cut_ms, since_ms=since_ms)
+            if by_recorder:
+                found = judge(
+                    self.product.recorder.rows(STREAMING_ARM, cut_ms - _BEFORE_CUT_MS), cut_ms=cut_ms, since_ms=since_ms
+                )
             else:
                 found = self.arm.verdict(_KILLED, cut_ms, since_ms)
-            self._mended_ms = now_ms()
-            mend()
+            self._repaired_ms = now_ms()
+            repair()
             self.arm.leave()
             if found.in_motion:
                 break
@@ -170,56 +174,60 @@ class FaultRuns(Bench):
     def _shuffled(self) -> tuple[Verdict, int]:
         """Sends setpoints twice and out of order, and repeats commands to the other arm in reversed pairs."""
         self.arm.leave()
-        topic = f"{self.ground.topic(ORDERED)}/cmd"
-        began_ms = now_ms()
+        topic = f"{self.product.topic(ACTION_ARM)}/cmd"
+        started_ms = now_ms()
         with (
-            self.ground.allowed("bench-again", publish=(topic,), subscribe=(topic,)) as line,
-            FaultOperator(self.ground, FULL, shuffled=True) as hand,
+            self.product.allowed("bench-repeat", publish=(topic,), subscribe=(topic,)) as client,
+            FaultOperator(self.product, FULL_SPEED, shuffled=True) as operator,
         ):
-            heard: list[bytes] = []
-            line.on_payload = heard.append
-            hand.await_motion()
+            commands: list[bytes] = []
+            client.on_payload = commands.append
+            operator.await_motion()
             time.sleep(self.chance.uniform(0.8, 1.2))
-            line.on_payload = lambda _payload: None
-            for first in range(0, len(heard), 2):
-                for payload in reversed(heard[first : first + 2]):
-                    line.client.publish(topic, payload, 1)
-            hand.let_go()
+            client.on_payload = lambda _payload: None
+            for first in range(0, len(commands), 2):
+                for payload in reversed(commands[first : first + 2]):
+                    client.client.publish(topic, payload, 1)
+            operator.stop_streaming()
             cut_ms = now_ms()
             time.sleep(0.7)
-        self._mended_ms = now_ms()
+        self._repaired_ms = now_ms()
         verdict = self.arm.verdict(_KILLED, cut_ms, self.arm.last_setpoint_ms(cut_ms))
-        taken = [each.sequence for each in self.ground.noted.since(STREAMED, began_ms) if each.epoch == hand.epoch]
-        return verdict, sum(later < earlier for earlier, later in pairwise(taken))
+        sequences = [
+            each.sequence
+            for each in self.product.recorder.since(STREAMING_ARM, started_ms)
+            if each.epoch == operator.epoch
+        ]
+        return verdict, sum(later < earlier for earlier, later in pairwise(sequences))
 
     def _kill_agent(self) -> None:
         while not self.arm.set_in_motion():
             pass
-        self.ground.signal(self.ground.agent, signal.SIGKILL)
+        self.product.signal(self.product.agent, signal.SIGKILL)
         time.sleep(0.3)
-        self._mended_ms = now_ms()
-        self.ground.revive(self.ground.agent)
+        self._repaired_ms = now_ms()
+        self.product.revive(self.product.agent)
 
     def _recover(self) -> float:
         while not self.arm.set_in_motion():
             pass
         moving_ms = now_ms()
-        wait_until(lambda: self.orders.done_since(self._mended_ms), "an order to be done again", _RECOVERS_S)
-        done_ms = self.orders.done_since(self._mended_ms)
+        wait_until(lambda: self.load.done_since(self._repaired_ms), "a new completed action", _RECOVERY_TIMEOUT_S)
+        done_ms = self.load.done_since(self._repaired_ms)
         assert done_ms is not None
-        return (max(moving_ms, done_ms) - self._mended_ms) / 1000
+        return (max(moving_ms, done_ms) - self._repaired_ms) / 1000
 
     # ------------------------------------------------------------ fault injection
 
     def _network(self, *, rtt_ms: float = 0.0, loss: float = 0.0) -> None:
-        self.ground.network.set(rtt_ms=rtt_ms, loss=loss)
+        self.product.network.set(rtt_ms=rtt_ms, loss=loss)
 
     def _clock(self, number: int) -> None:
         """Sends the signal to the agent's own process."""
-        os.kill(self.ground.pid(self.ground.agent), number)
+        os.kill(self.product.pid(self.product.agent), number)
 
     def _disk(self, *, full: bool) -> None:
         """Limits the file size of the agent to zero, so each write fails as on a full disk."""
-        process = self.ground.pid(self.ground.agent)
+        process = self.product.pid(self.product.agent)
         _, hard = resource.prlimit(process, resource.RLIMIT_FSIZE)
         resource.prlimit(process, resource.RLIMIT_FSIZE, (0 if full else hard, hard))

@@ -17,7 +17,7 @@ from tests.harness.network.brokers import BrokerKind
 from tests.harness.network.delay import start_delay
 from tests.harness.network.proxy import Proxy
 
-STREAMED, ORDERED = "arm0", "arm1"
+STREAMING_ARM, ACTION_ARM = "arm0", "arm1"
 """The streaming operator controls one arm, the action load the other."""
 _WATCHDOG_S = 0.3
 
@@ -26,7 +26,7 @@ class ProductProcesses(Stack):
     """A ``Stack`` whose agent also connects through a simulated network (``tests.harness.network.delay``).
 
     Attributes:
-        noted: Recorded control periods of the agent.
+        recorder: Recorded control periods of the agent.
         network: Simulated network between the agent and the broker.
         owner: HTTP client with a sign-in session, for requests that an API key may not make.
     """
@@ -36,8 +36,8 @@ class ProductProcesses(Stack):
     def __init__(self, kind: BrokerKind) -> None:
         super().__init__(kind, 2, watchdog_s=_WATCHDOG_S)
         self.kind = kind
-        self.noted = Recorder(self.home / "noted.socket")
-        self._closing.callback(self.noted.close)
+        self.recorder = Recorder(self.home / "recorder.socket")
+        self._closing.callback(self.recorder.close)
 
     def begin(self) -> None:
         """Starts all processes."""
@@ -49,9 +49,9 @@ class ProductProcesses(Stack):
         self.owner.cookies.clear()
         self.cloud = self._closing.enter_context(Cloud(settings.read(self._environment)))
 
-    def _proxy(self, behind: int, heard: Callable[[bytes], None]) -> Proxy:
+    def _proxy(self, behind: int, received: Callable[[bytes], None]) -> Proxy:
         self.network = self._closing.enter_context(start_delay(behind, rtt_ms=0))
-        return super()._proxy(self.network.ports[behind], heard)
+        return super()._proxy(self.network.ports[behind], received)
 
     def device(self, name: str) -> str:
         """Returns the HTTP path of a device."""
@@ -62,12 +62,12 @@ class ProductProcesses(Stack):
         return f"ts/v1/{self.space}/{self.agent_id}/{name}"
 
     @contextlib.contextmanager
-    def issued(self, wanted: dict[str, Any], *topics: str) -> Iterator[MqttClient]:
+    def issued(self, request: dict[str, Any], *topics: str) -> Iterator[MqttClient]:
         """Connects a client with credentials from the API."""
-        given = self.post("/mqtt/credentials", **wanted)
-        who = (given["client_id"], given["username"], given["password"])
-        with MqttClient(self.port + 1, *who, subscribe=topics, qos=0) as line:
-            yield line
+        issued = self.post("/mqtt/credentials", **request)
+        login = (issued["client_id"], issued["username"], issued["password"])
+        with MqttClient(self.port + 1, *login, subscribe=topics, qos=0) as client:
+            yield client
 
     @contextlib.contextmanager
     def allowed(
@@ -76,8 +76,8 @@ class ProductProcesses(Stack):
         """Connects a client with exactly these permissions, which the API would not issue."""
         with MqttClient(
             self.port + 1, *broker_credentials(self.cloud, name, publish, subscribe), subscribe=subscribe, qos=1
-        ) as line:
-            yield line
+        ) as client:
+            yield client
 
     def restart_agent_without_proxies(self) -> None:
         """Restarts the agent with a direct connection to the broker."""
@@ -87,16 +87,16 @@ class ProductProcesses(Stack):
         deadline_s = time.monotonic() + 60
         while not all(each["online"] for each in self.devices()):
             if time.monotonic() > deadline_s:
-                raise TimeoutError("the agent does not come back")
+                raise TimeoutError("the devices did not come online after the restart")
             time.sleep(0.1)
 
 
 @contextlib.contextmanager
 def start(kind: BrokerKind) -> Iterator[ProductProcesses]:
     """Runs the product with two arms."""
-    ground = ProductProcesses(kind)
+    product = ProductProcesses(kind)
     try:
-        ground.begin()
-        yield ground
+        product.begin()
+        yield product
     finally:
-        ground.close()
+        product.close()

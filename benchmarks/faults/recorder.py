@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from tests.faults.judge import Row
 
-_NEWEST = 4000
+_CAPACITY = 4000
 """Number of periods in half a minute."""
 
 
@@ -32,34 +32,34 @@ class Recorder:
     """Receives reports until it is closed.
 
     Attributes:
-        begun: Action → number of starts; 1 is correct.
+        starts: Action → number of starts; 1 is correct.
     """
 
     def __init__(self, path: Path) -> None:
-        self.begun: Counter[str] = Counter()
+        self.starts: Counter[str] = Counter()
         self._periods: dict[str, list[Period]] = {}
         self._lock = threading.Lock()
-        self._line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-        self._line.bind(str(path))
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        self._socket.bind(str(path))
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
 
     def _listen(self) -> None:
         with contextlib.suppress(OSError):
-            while words := self._line.recv(400).decode().split():
+            while words := self._socket.recv(400).decode().split():
                 with self._lock:
-                    self._take(words)
+                    self._record(words)
 
-    def _take(self, words: list[str]) -> None:
-        if words[0] == "begun":
-            self.begun[words[2]] += 1
+    def _record(self, words: list[str]) -> None:
+        if words[0] == "started":
+            self.starts[words[2]] += 1
             return
         _, name, at_ms, mode, moved, epoch, sequence = words
-        kept = self._periods.setdefault(name, [])
-        kept.append(Period(float(at_ms), mode, float(moved), int(epoch), int(sequence)))
-        if len(kept) > 2 * _NEWEST:
-            del kept[:_NEWEST]
+        periods = self._periods.setdefault(name, [])
+        periods.append(Period(float(at_ms), mode, float(moved), int(epoch), int(sequence)))
+        if len(periods) > 2 * _CAPACITY:
+            del periods[:_CAPACITY]
 
     def since(self, name: str, at_ms: float) -> list[Period]:
         """Returns the periods of one device since a time."""
@@ -68,14 +68,14 @@ class Recorder:
 
     def rows(self, name: str, since_ms: float) -> list[Row]:
         """Returns the same as trace rows: one joint with the accumulated motion."""
-        gone_rad, rows = 0.0, []
+        total_rad, rows = 0.0, []
         for each in self.since(name, since_ms):
-            gone_rad += each.moved_rad
-            rows.append(Row(each.at_ms, (gone_rad,)))
+            total_rad += each.moved_rad
+            rows.append(Row(each.at_ms, (total_rad,)))
         return rows
 
     def close(self) -> None:
         """Stops receiving."""
-        self._line.shutdown(socket.SHUT_RDWR)
+        self._socket.shutdown(socket.SHUT_RDWR)
         self._thread.join()
-        self._line.close()
+        self._socket.close()

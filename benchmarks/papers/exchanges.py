@@ -1,4 +1,4 @@
-"""One message from a sender through a server to a receiver, for each transport of a robot command.
+"""One message from a sender through a server to a receiver, for each transport.
 
 Each function yields an exchange, which sends one setpoint and returns when the receiver has it. Sender and receiver are
 separate connections in this process, so one clock measures both; servers run in their own processes.
@@ -43,21 +43,21 @@ def mqtt(stack: contextlib.ExitStack, ports: Ports, broker: RunningBroker, trans
     """MQTT with QoS 0, as used for setpoints."""
     port = ports[broker.port(transport)]
     topic = f"{_TOPIC}/{port}"  # TCP and WebSocket of one broker are two paths and use separate topics
-    heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
-    def line(name: str) -> Client:
-        rights = broker.grant(f"{name}-{port}", publish=(topic,), subscribe=(topic,), lifetime_s=3600)
-        client = Client(rights.client_id, broker.issue(rights), port=port, transport=transport)
+    def open_client(name: str) -> Client:
+        grant = broker.grant(f"{name}-{port}", publish=(topic,), subscribe=(topic,), lifetime_s=3600)
+        client = Client(grant.client_id, broker.issue(grant), port=port, transport=transport)
         return stack.enter_context(client.open())
 
-    sender, receiver = line("sender"), line("receiver")
-    receiver.paho.on_message = lambda _c, _u, message: heard.put(bytes(message.payload))
+    sender, receiver = open_client("sender"), open_client("receiver")
+    receiver.paho.on_message = lambda _c, _u, message: received.put(bytes(message.payload))
     receiver.subscribe(topic, qos=0)
 
     def exchange() -> None:
-        _require_none(heard)
+        _require_empty(received)
         sender.publish(topic, SETPOINT, qos=0)
-        heard.get(timeout=TIMEOUT_S)
+        received.get(timeout=TIMEOUT_S)
 
     return exchange
 
@@ -77,22 +77,22 @@ def web_socket(stack: contextlib.ExitStack, ports: Ports, port: int) -> Exchange
 
 def xmpp(stack: contextlib.ExitStack, ports: Ports, port: int) -> Exchange:
     """An XMPP message between two users of Prosody."""
-    heard: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    received: queue.SimpleQueue[Any] = queue.SimpleQueue()
     sender = stack.enter_context(_XmppUser(ports[port], _CLOUD, lambda _: None))
-    receiver = stack.enter_context(_XmppUser(ports[port], _ROBOT, heard.put))
+    receiver = stack.enter_context(_XmppUser(ports[port], _ROBOT, received.put))
     stanza = stanzas.message(receiver.jid, _TOPIC, SETPOINT)
 
     def exchange() -> None:
-        _require_none(heard)
+        _require_empty(received)
         sender.send(stanza)
-        heard.get(timeout=TIMEOUT_S)
+        received.get(timeout=TIMEOUT_S)
 
     return exchange
 
 
-def _require_none(heard: "queue.SimpleQueue[Any]") -> None:
-    if not heard.empty():
-        raise RuntimeError("a message came that was not sent: what is measured would be another's")
+def _require_empty(received: "queue.SimpleQueue[Any]") -> None:
+    if not received.empty():
+        raise RuntimeError("received a message of an earlier exchange")
 
 
 class _XmppUser:
@@ -109,11 +109,11 @@ class _XmppUser:
     async def _open(self) -> None:
         self._stream = Stream(self._login, message=self._received, presence=lambda _: None)
         await self._stream.open()
-        self._staying = asyncio.create_task(self._stream.stay())
+        self._reader = asyncio.create_task(self._stream.stay())
 
     async def _close(self) -> None:
-        self._staying.cancel()
-        await asyncio.gather(self._staying, return_exceptions=True)
+        self._reader.cancel()
+        await asyncio.gather(self._reader, return_exceptions=True)
         await self._stream.close()
 
     def send(self, stanza: str) -> None:

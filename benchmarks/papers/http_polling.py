@@ -26,41 +26,41 @@ from tests.harness.cloud.polling import PollingRobot, Site
 from tests.harness.network.brokers import HOST, Message, wait_until
 
 PERIOD_S: Final = 3.0
-_HELD_MS: Final = 5_000
+_WAIT_MS: Final = 5_000
 
 
-def pairs(port: int, count: int, *, in_step: bool, seed: int) -> list[float]:
+def pairs(port: int, count: int, *, in_phase: bool, seed: int) -> list[float]:
     """Runs pairs of sender and receiver with one message each and returns the durations [ms].
 
     Args:
         port: Port of the web server or of its delay proxy.
         count: Number of pairs.
-        in_step: Send right after an empty poll; otherwise at a random time between two polls.
+        in_phase: Send right after an empty poll; otherwise at a random time between two polls.
         seed: Seed of the random times.
     """
-    chance, found, lock = random.Random(seed), list[float](), threading.Lock()
+    chance, durations_ms, lock = random.Random(seed), list[float](), threading.Lock()
 
-    def run(name: str, begin_s: float, later_s: float) -> None:
-        time.sleep(begin_s)
-        asked_s = time.monotonic()
-        _ask(port, "GET", name)
-        time.sleep(later_s)
+    def run(name: str, delay_s: float, send_delay_s: float) -> None:
+        time.sleep(delay_s)
+        poll_s = time.monotonic()
+        _request(port, "GET", name)
+        time.sleep(send_delay_s)
         sent_s = time.monotonic()
-        putting = threading.Thread(target=_ask, args=(port, "PUT", name, SETPOINT))
-        putting.start()
+        sender = threading.Thread(target=_request, args=(port, "PUT", name, SETPOINT))
+        sender.start()
         while True:
-            asked_s += PERIOD_S
-            time.sleep(max(0.0, asked_s - time.monotonic()))
-            if _ask(port, "GET", name) is not None:
+            poll_s += PERIOD_S
+            time.sleep(max(0.0, poll_s - time.monotonic()))
+            if _request(port, "GET", name) is not None:
                 break
         with lock:
-            found.append((time.monotonic() - sent_s) * 1000)
-        putting.join()
+            durations_ms.append((time.monotonic() - sent_s) * 1000)
+        sender.join()
 
     threads = [
         threading.Thread(
             target=run,
-            args=(f"{seed}-{in_step}-{number}", number / count, 0.0 if in_step else chance.uniform(0, PERIOD_S)),
+            args=(f"{seed}-{in_phase}-{number}", number / count, 0.0 if in_phase else chance.uniform(0, PERIOD_S)),
         )
         for number in range(count)
     ]
@@ -68,24 +68,24 @@ def pairs(port: int, count: int, *, in_step: bool, seed: int) -> list[float]:
         each.start()
     for each in threads:
         each.join()
-    if len(found) != count:
-        raise RuntimeError(f"{count - len(found)} of {count} pollers have failed")
-    return found
+    if len(durations_ms) != count:
+        raise RuntimeError(f"{count - len(durations_ms)} of {count} pollers failed")
+    return durations_ms
 
 
-def _ask(port: int, method: str, name: str, body: bytes | None = None) -> Any:
-    with contextlib.closing(http.client.HTTPConnection(HOST, port, timeout=TIMEOUT_S)) as line:
-        line.connect()
-        line.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        line.request(method, f"/messages/{name}", body, {"Content-Type": "application/json"})
-        return json.loads(line.getresponse().read())
+def _request(port: int, method: str, name: str, body: bytes | None = None) -> Any:
+    with contextlib.closing(http.client.HTTPConnection(HOST, port, timeout=TIMEOUT_S)) as connection:
+        connection.connect()
+        connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.request(method, f"/messages/{name}", body, {"Content-Type": "application/json"})
+        return json.loads(connection.getresponse().read())
 
 
 class _Receiver(PollingRobot):
     """A receiver that uses HTTP only and records each message on arrival."""
 
     def __init__(self, site: Site) -> None:
-        super().__init__(site, wait_ms=_HELD_MS)
+        super().__init__(site, wait_ms=_WAIT_MS)
         self.arrived: queue.SimpleQueue[float] = queue.SimpleQueue()
         self.reports = lambda _: (AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE)
 
@@ -98,7 +98,7 @@ def long_poll(stack: contextlib.ExitStack, ports: Mapping[int, int], processes: 
     """Telescope's HTTP transport: an action through the functions until the long-polling agent receives it."""
     port = ports[processes.endpoints["server"].port]
     robot = _Receiver(Site(f"http://{HOST}:{port}"))
-    stack.callback(robot.cloud.close)  # type: ignore[attr-defined]  # a Site's
+    stack.callback(robot.cloud.close)  # type: ignore[attr-defined]  # set by Site
     robot.pair(processes.anna)
     stack.enter_context(robot)
     robot.connect()
@@ -109,10 +109,10 @@ def long_poll(stack: contextlib.ExitStack, ports: Mapping[int, int], processes: 
     body = json.dumps({"request": {"kind": "move_joints", "position_rad": {"elbow": 0.1}}}).encode()
 
     def exchange() -> float:
-        began = time.perf_counter()
+        started_s = time.perf_counter()
         started = caller.request("POST", f"/api/v1/devices/{device}/actions", body)
-        took_ms = (robot.arrived.get(timeout=TIMEOUT_S) - began) * 1000
+        duration_ms = (robot.arrived.get(timeout=TIMEOUT_S) - started_s) * 1000
         caller.request("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
-        return took_ms
+        return duration_ms
 
     return exchange

@@ -1,7 +1,7 @@
 """Servers of the other transports, each in its own process, which prints ``ready`` when it accepts requests.
 
 ``python -m benchmarks.papers.relays web PORT``: stores and returns the newest message over HTTP, for a polling robot;
-it also accepts every user for an XMPP server that asks it. ``… socket PORT``: parses each JSON message over WebSocket
+it also confirms every user that an XMPP server verifies. ``… socket PORT``: parses each JSON message over WebSocket
 and sends it to all other clients.
 """
 
@@ -42,17 +42,17 @@ async def _socket(port: int) -> None:
     from websockets.asyncio.server import ServerConnection
     from websockets.asyncio.server import serve as listen
 
-    there: set[ServerConnection] = set()
+    clients: set[ServerConnection] = set()
 
     async def relay(connection: ServerConnection) -> None:
-        there.add(connection)
+        clients.add(connection)
         try:
             async for text in connection:
                 message = json.dumps(json.loads(text))
-                for other in there - {connection}:
+                for other in clients - {connection}:
                     await other.send(message)
         finally:
-            there.discard(connection)
+            clients.discard(connection)
 
     async with listen(relay, HOST, port, compression=None) as server:
         print("ready", flush=True)

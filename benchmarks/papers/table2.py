@@ -30,11 +30,11 @@ SAMPLES: Final = len(HTTP)
 SHOWN_RTT_MS: Final = 30
 """Transports whose samples are listed individually."""
 LOSS: Final = 0.02
-OURS: Final = "MQTT, mosquitto"
+MOSQUITTO: Final = "MQTT, mosquitto"
 EMBEDDED: Final = "MQTT, amqtt"
-IN_STEP: Final = "HTTP, polled every 3 s in step"
+IN_PHASE: Final = "HTTP, polled every 3 s in phase"
 ANY_PHASE: Final = "HTTP, polled every 3 s"
-HELD: Final = "HTTP, our long poll"
+LONG_POLL: Final = "HTTP, Telescope's long poll"
 ROUNDS: Final = 5
 """Rounds per transport."""
 
@@ -51,7 +51,7 @@ class Servers:
 
     @property
     def mosquitto(self) -> RunningBroker:
-        """Port of the product."""
+        """Broker of the product."""
         return self.processes.broker.running
 
     @property
@@ -83,14 +83,14 @@ def conditions(*, quick: bool) -> list[Condition]:
     return found + [Condition(rtt_ms, LOSS, each) for rtt_ms, each in lossy.items()]
 
 
-def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
+def measure(report: Report, *, quick: bool, log: Callable[[str], None]) -> None:
     """Adds tables, charts and one target per round trip to the report."""
-    say("Table 2: starting")
+    log("Table 2: starting")
     found: dict[Condition, dict[str, list[float]]] = {}
-    with tempfile.TemporaryDirectory() as folder, servers(Path(folder)) as there:
+    with tempfile.TemporaryDirectory() as folder, servers(Path(folder)) as running:
         for condition in conditions(quick=quick):
-            found[condition] = with_condition(there, condition, quick=quick)
-            say(
+            found[condition] = with_condition(running, condition, quick=quick)
+            log(
                 f"Table 2: {condition.name}: "
                 + ", ".join(f"{name} {median(each):.4g}" for name, each in found[condition].items())
             )
@@ -111,48 +111,50 @@ def servers(folder: Path) -> Iterator[Servers]:
         yield Servers(processes, amqtt, prosody.port, web, relay)
 
 
-def with_condition(there: Servers, condition: Condition, *, quick: bool) -> dict[str, list[float]]:
+def with_condition(running: Servers, condition: Condition, *, quick: bool) -> dict[str, list[float]]:
     """Measures all transports interleaved over one network. A quick run omits MQTT over WebSocket."""
     with contextlib.ExitStack() as stack:
-        ports: Mapping[int, int] = {port: port for port in there.ports}
+        ports: Mapping[int, int] = {port: port for port in running.ports}
         if condition.rtt_ms or condition.loss:
-            way = stack.enter_context(start_delay(*there.ports, rtt_ms=condition.rtt_ms))
-            ports = way.ports
-        ways = _ways(stack, ports, there, quick=quick)
-        slow: dict[str, Exchange] = {HELD: http_polling.long_poll(stack, ports, there.processes)}
+            network = stack.enter_context(start_delay(*running.ports, rtt_ms=condition.rtt_ms))
+            ports = network.ports
+        transports = _transports(stack, ports, running, quick=quick)
+        long_poll: dict[str, Exchange] = {LONG_POLL: http_polling.long_poll(stack, ports, running.processes)}
         if condition.loss:
-            way.set(rtt_ms=condition.rtt_ms, loss=condition.loss)
-        waiting = _poll(stack, ports[there.web])
-        found = measure_interleaved(ways, rounds=ROUNDS, each=condition.each, warm_up=3)
-        found |= measure_interleaved(slow, rounds=ROUNDS, each=max(2, condition.each // 5), warm_up=1)
-        return found | {name: each.result() for name, each in waiting.items()}
+            network.set(rtt_ms=condition.rtt_ms, loss=condition.loss)
+        polls = _poll(stack, ports[running.web])
+        found = measure_interleaved(transports, rounds=ROUNDS, each=condition.each, warm_up=3)
+        found |= measure_interleaved(long_poll, rounds=ROUNDS, each=max(2, condition.each // 5), warm_up=1)
+        return found | {name: each.result() for name, each in polls.items()}
 
 
-def _ways(stack: contextlib.ExitStack, ports: Mapping[int, int], there: Servers, *, quick: bool) -> dict[str, Exchange]:
-    brokers = {OURS: there.mosquitto, EMBEDDED: there.amqtt}
+def _transports(
+    stack: contextlib.ExitStack, ports: Mapping[int, int], running: Servers, *, quick: bool
+) -> dict[str, Exchange]:
+    brokers = {MOSQUITTO: running.mosquitto, EMBEDDED: running.amqtt}
     found = {name: exchanges.mqtt(stack, ports, broker) for name, broker in brokers.items()}
     if not quick:
         for name, broker in brokers.items():
             found[f"{name}, over WebSocket"] = exchanges.mqtt(stack, ports, broker, "websockets")
     return found | {
-        "WebSocket, JSON relay": exchanges.web_socket(stack, ports, there.relay),
-        "XMPP, Prosody": exchanges.xmpp(stack, ports, there.prosody),
+        "WebSocket, JSON relay": exchanges.web_socket(stack, ports, running.relay),
+        "XMPP, Prosody": exchanges.xmpp(stack, ports, running.prosody),
     }
 
 
 def _poll(stack: contextlib.ExitStack, port: int) -> dict[str, Future[list[float]]]:
     pool = stack.enter_context(ThreadPoolExecutor(2))
     return {
-        IN_STEP: pool.submit(http_polling.pairs, port, SAMPLES, in_step=True, seed=1),
-        ANY_PHASE: pool.submit(http_polling.pairs, port, SAMPLES, in_step=False, seed=2),
+        IN_PHASE: pool.submit(http_polling.pairs, port, SAMPLES, in_phase=True, seed=1),
+        ANY_PHASE: pool.submit(http_polling.pairs, port, SAMPLES, in_phase=False, seed=2),
     }
 
 
 def show(report: Report, found: Mapping[Condition, Mapping[str, list[float]]]) -> None:
     """Adds the results beside the published values."""
     shown = next(taken for each, taken in found.items() if each.rtt_ms == SHOWN_RTT_MS and not each.loss)
-    report.tables.append(_one_by_one(shown))
-    report.tables += [_long(condition, taken) for condition, taken in found.items()]
+    report.tables.append(_first_samples(shown))
+    report.tables += [_all_samples(condition, taken) for condition, taken in found.items()]
     report.charts.append(_chart(found))
     report.claims += [claim(condition, taken) for condition, taken in found.items() if not condition.loss]
 
@@ -162,14 +164,14 @@ def claim(condition: Condition, taken: Mapping[str, list[float]]) -> Claim:
     others = {name: median(each) for name, each in taken.items() if not name.startswith("MQTT")}
     best = min(others, key=lambda name: others[name])
     return Claim(
-        f"Table 2 at {condition.rtt_ms} ms of round trip: our MQTT (mosquitto), to the fastest other way ({best})",
-        median(taken[OURS]) / others[best],
+        f"Table 2 at {condition.rtt_ms} ms round trip: MQTT (mosquitto), to the fastest other transport ({best})",
+        median(taken[MOSQUITTO]) / others[best],
         1.0,
         "×",
     )
 
 
-def _one_by_one(taken: Mapping[str, list[float]]) -> Table:
+def _first_samples(taken: Mapping[str, list[float]]) -> Table:
     rows: list[list[Cell]] = [
         [
             index + 1,
@@ -182,24 +184,24 @@ def _one_by_one(taken: Mapping[str, list[float]]) -> Table:
     means = [statistics.fmean(each[:SAMPLES]) for each in (HTTP, XMPP, *taken.values())]
     rows.append(["average", *means])
     return Table(
-        title=f"Table 2: 20 messages one by one [ms], printed and over {SHOWN_RTT_MS} ms of round trip",
-        columns=["sample", "printed: HTTP", "printed: XMPP", *taken],
+        title=f"Table 2: 20 messages [ms], published and over {SHOWN_RTT_MS} ms round trip",
+        columns=["sample", "published: HTTP", "published: XMPP", *taken],
         rows=rows,
-        note="One way: from the sender through a server to the receiver, who each have this round trip to the server. "
-        "The paper's server stood in Singapore; how far away that was it does not say. "
+        note="One way, from the sender through a server to the receiver; each has this round trip to the server. "
+        "The paper's server was in Singapore; the paper does not state the distance. "
         + " ".join((http_polling.__doc__ or "").split("\n\n")[1].split()),
     )
 
 
-def _long(condition: Condition, taken: Mapping[str, list[float]]) -> Table:
+def _all_samples(condition: Condition, taken: Mapping[str, list[float]]) -> Table:
     best = min(median(each) for name, each in taken.items() if not name.startswith("MQTT"))
     rows: list[list[Cell]] = [
         [name, len(each), *(percentile(each, share) for share in SHARES.values()), median(each) / best]
         for name, each in taken.items()
     ]
     return Table(
-        title=f"The same at length, {condition.name}{'' if condition.rtt_ms else ' (loopback)'}",
-        columns=["way", "n", *(f"{share} ms" for share in SHARES), "× the fastest that is not MQTT"],
+        title=f"All samples, {condition.name}{'' if condition.rtt_ms else ' (loopback)'}",
+        columns=["transport", "n", *(f"{share} ms" for share in SHARES), "× the fastest that is not MQTT"],
         rows=rows,
         note=_why(condition, taken),
     )
@@ -209,10 +211,10 @@ def _why(condition: Condition, taken: Mapping[str, list[float]]) -> str:
     """Explains the order of the transports."""
     if condition.loss:
         return (
-            "A stall delays all following data of the same connection. Polling is hardly affected, because it waits "
-            "anyway."
+            "A stall delays all following data of the same connection. Polling is hardly affected, because the "
+            "polling period dominates."
         )
-    slower = [name for name in (OURS, EMBEDDED) if median(taken[name]) > claim_best(taken)]
+    slower = [name for name in (MOSQUITTO, EMBEDDED) if median(taken[name]) > best_median(taken)]
     note = (
         f"A setpoint of {len(exchanges.SETPOINT)} bytes, one way. A message over an open connection takes half a "
         "round trip plus processing. Telescope's long poll delivers a whole action (identity, role, rows, signature), "
@@ -220,13 +222,13 @@ def _why(condition: Condition, taken: Mapping[str, list[float]]) -> str:
     )
     if slower:
         note += (
-            f" Slower than the fastest other way: {', '.join(slower)}. A WebSocket relay forwards text to all other "
-            "clients; a broker checks topic and permissions of each message, and amqtt does so in Python."
+            f" Slower than the fastest other transport: {', '.join(slower)}. A WebSocket relay forwards text to all "
+            "other clients; a broker checks topic and permissions of each message, and amqtt does so in Python."
         )
     return note
 
 
-def claim_best(taken: Mapping[str, list[float]]) -> float:
+def best_median(taken: Mapping[str, list[float]]) -> float:
     """Returns the median of the fastest transport without MQTT [ms]."""
     return min(median(each) for name, each in taken.items() if not name.startswith("MQTT"))
 
@@ -240,6 +242,6 @@ def _chart(found: Mapping[Condition, Mapping[str, list[float]]]) -> Chart:
         y_label="ms",
         x=[condition.name for condition in found],
         series={name: [median(taken[name]) for taken in found.values()] for name in names},
-        marks={"printed: HTTP": statistics.fmean(HTTP), "printed: XMPP": statistics.fmean(XMPP)},
+        marks={"published: HTTP": statistics.fmean(HTTP), "published: XMPP": statistics.fmean(XMPP)},
         log=True,
     )

@@ -15,7 +15,7 @@ HOME_RAD: Final = tuple(KIND.home_rad[name] for name in NAMES)
 
 
 class PeerArm:
-    """Applies each setpoint and reports it at once, without lease, limits, watchdog or Stop."""
+    """Applies each setpoint and reports it immediately, without lease, limits, watchdog or Stop."""
 
     def __init__(self) -> None:
         self._driver = mujoco.create(KIND, FOLDER, {}, "ur5")
@@ -29,36 +29,36 @@ class PeerArm:
         """
         if not isinstance(setpoint.target, JointTarget):
             raise TypeError("this arm takes joint targets")
-        wanted = setpoint.target.position_rad
-        seen = self._driver.observe()
-        applied = self._driver.send([wanted[name] for name in NAMES])
+        target_rad = setpoint.target.position_rad
+        observation = self._driver.observe()
+        applied = self._driver.send([target_rad[name] for name in NAMES])
         return JointTelemetry(
             tick_ms=tick_ms(),
             at_ms=wall_ms(),
             sequence=setpoint.sequence,
             mode=Mode.IDLE,
-            position_rad=_told(seen.position_rad),
-            velocity_rad_s=_told(seen.velocity_rad_s),
-            effort_nm=_told(seen.effort_nm),
-            commanded_rad=_told(applied),
-            frames=seen.frames,
+            position_rad=_rounded(observation.position_rad),
+            velocity_rad_s=_rounded(observation.velocity_rad_s),
+            effort_nm=_rounded(observation.effort_nm),
+            commanded_rad=_rounded(applied),
+            frames=observation.frames,
             epoch=setpoint.epoch,
             setpoint_sequence=setpoint.sequence,
             setpoint_sent_ms=setpoint.sent_ms,
         )
 
-    def obey(self, payload: bytes) -> bytes:
+    def apply_encoded(self, payload: bytes) -> bytes:
         """Applies an encoded setpoint of the Telescope protocol and returns encoded telemetry."""
         return codec.encode(self.apply(codec.decode(payload, Setpoint)))
 
 
-def _told(values: tuple[float, ...]) -> tuple[float, ...]:
+def _rounded(values: tuple[float, ...]) -> tuple[float, ...]:
     """Rounds to the digits that the agent publishes; longer text would cost more."""
     return tuple(round(value, 6) for value in values)
 
 
 def setpoint(sequence: int, sent_ms: float) -> Setpoint:
-    """Returns a setpoint that holds the present position."""
+    """Returns a setpoint that holds the home position."""
     return Setpoint(
         epoch=1,
         sequence=sequence,

@@ -1,7 +1,7 @@
 """A server of the rosbridge protocol without ROS: ``subscribe`` and ``publish`` between WebSocket clients.
 
-A real rosbridge_server also converts each message and sends it through ROS; this cost is omitted in its favour. As in
-the original, messages are parsed and serialized again, Nagle's algorithm is off and compression is disabled.
+A real rosbridge_server also converts each message and sends it through ROS; this cost is omitted.
+As in the original, messages are parsed and serialized again, Nagle's algorithm and compression are disabled.
 """
 
 import asyncio
@@ -15,7 +15,7 @@ from benchmarks.baseline.echo_servers import HOST
 
 
 class Bridge:
-    """Keeps the subscriptions of the clients."""
+    """Forwards published messages to the subscribed clients."""
 
     def __init__(self) -> None:
         self._subscribers: dict[str, set[ServerConnection]] = {}
@@ -24,18 +24,18 @@ class Bridge:
         """Serves one client until it disconnects."""
         with contextlib.suppress(ConnectionClosed):
             async for text in client:
-                await self._take(client, msgspec.json.decode(text))
+                await self._handle(client, msgspec.json.decode(text))
         for each in self._subscribers.values():
             each.discard(client)
 
-    async def _take(self, client: ServerConnection, message: dict[str, object]) -> None:
+    async def _handle(self, client: ServerConnection, message: dict[str, object]) -> None:
         topic = str(message.get("topic"))
         if message["op"] == "subscribe":
             self._subscribers.setdefault(topic, set()).add(client)
         elif message["op"] == "publish":
-            told = msgspec.json.encode({"op": "publish", "topic": topic, "msg": message["msg"]})
+            text = msgspec.json.encode({"op": "publish", "topic": topic, "msg": message["msg"]})
             for each in tuple(self._subscribers.get(topic, ())):
-                await each.send(told, text=True)
+                await each.send(text, text=True)
 
 
 async def run(port: int) -> None:

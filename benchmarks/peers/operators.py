@@ -17,8 +17,8 @@ from benchmarks.peers.robots import CONTROL, JOINTS, METHOD, ROS_TYPE, zenoh_pee
 from device_agent.protocol import JointTelemetry, codec
 
 _PROGRAM: Final = "benchmarks.peers.robots"
-_OURS: Final = 1
-"""Ids of our channel and subscription in Foxglove frames."""
+_CHANNEL_ID: Final = 1
+"""Id of the client's channel and subscription in Foxglove frames."""
 _DATA: Final = 1
 """First byte of a Foxglove message frame."""
 
@@ -32,16 +32,16 @@ class PeerOperator:
 
     def __init__(self, send: Callable[[int], None]) -> None:
         self._send = send
-        self._seen = threading.Condition()
+        self._telemetry_received = threading.Condition()
         self._applied = 0
         self._sequence = 0
         self._next_s = 0.0
 
-    def hear(self, applied: int) -> None:
+    def on_applied(self, applied: int) -> None:
         """Records the newest applied setpoint. Thread-safe."""
-        with self._seen:
+        with self._telemetry_received:
             self._applied = applied
-            self._seen.notify()
+            self._telemetry_received.notify()
 
     def exchange(self) -> float:
         """Runs one exchange and returns its duration [ms].
@@ -52,26 +52,26 @@ class PeerOperator:
         time.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = time.monotonic() + PERIOD_S
         began = time.perf_counter()
-        with self._seen:
+        with self._telemetry_received:
             self._sequence += 1
             self._send(self._sequence)
-            if not self._seen.wait_for(lambda: self._applied >= self._sequence, TIMEOUT_S):
-                raise TimeoutError(f"setpoint {self._sequence} is not seen again")
+            if not self._telemetry_received.wait_for(lambda: self._applied >= self._sequence, TIMEOUT_S):
+                raise TimeoutError(f"setpoint {self._sequence} is not reported by telemetry")
         return (time.perf_counter() - began) * 1000
 
     def settle(self) -> Exchange:
-        """Returns the exchange after a first success; a channel may open before the other end knows it."""
-        ends_s = time.monotonic() + TIMEOUT_S
-        while time.monotonic() < ends_s:
-            with self._seen:
+        """Returns the exchange after a first success; a channel may open before the other end is connected."""
+        deadline_s = time.monotonic() + TIMEOUT_S
+        while time.monotonic() < deadline_s:
+            with self._telemetry_received:
                 self._sequence += 1
                 self._send(self._sequence)
-                if self._seen.wait_for(lambda: self._applied >= self._sequence, 0.2):
+                if self._telemetry_received.wait_for(lambda: self._applied >= self._sequence, 0.2):
                     return self.exchange
-        raise TimeoutError("the robot does not answer")
+        raise TimeoutError("the robot sends no telemetry")
 
 
-def _asked(sequence: int) -> bytes:
+def _encoded(sequence: int) -> bytes:
     return codec.encode(setpoint(sequence, time.monotonic() * 1000))
 
 
@@ -97,7 +97,9 @@ def rosbridge() -> Iterator[Exchange]:
             control.publish({"header": {"seq": sequence, "stamp": stamp}, "name": NAMES, "position": HOME_RAD})
 
         operator = PeerOperator(send)
-        roslibpy.Topic(ros, "/" + JOINTS, ROS_TYPE).subscribe(lambda told: operator.hear(told["header"]["seq"]))
+        roslibpy.Topic(ros, "/" + JOINTS, ROS_TYPE).subscribe(
+            lambda message: operator.on_applied(message["header"]["seq"])
+        )
         yield operator.settle()
         ros.close()
 
@@ -110,32 +112,32 @@ def zenoh() -> Iterator[Exchange]:
     port = free_port()
     with start_peer(_PROGRAM, "zenoh", str(port)), library.open(zenoh_peer(connect=port)) as session:
         control = session.declare_publisher(CONTROL, express=True)
-        operator = PeerOperator(lambda sequence: control.put(_asked(sequence)))
-        session.declare_subscriber(JOINTS, lambda told: operator.hear(_applied(told.payload.to_bytes())))
+        operator = PeerOperator(lambda sequence: control.put(_encoded(sequence)))
+        session.declare_subscriber(JOINTS, lambda sample: operator.on_applied(_applied(sample.payload.to_bytes())))
         yield operator.settle()
 
 
 @contextlib.contextmanager
 def grpc() -> Iterator[Exchange]:
-    """Opens one gRPC stream."""
+    """gRPC: one bidirectional stream."""
     import grpc as library
 
     port = free_port()
-    asked: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    setpoints: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     with start_peer(_PROGRAM, "grpc", str(port)), library.insecure_channel(f"{HOST}:{port}") as channel:
-        told = channel.stream_stream("/" + "/".join(METHOD))(iter(asked.get, None), wait_for_ready=True)
-        operator = PeerOperator(lambda sequence: asked.put(_asked(sequence)))
+        telemetry = channel.stream_stream("/" + "/".join(METHOD))(iter(setpoints.get, None), wait_for_ready=True)
+        operator = PeerOperator(lambda sequence: setpoints.put(_encoded(sequence)))
 
         def listen() -> None:
             with contextlib.suppress(library.RpcError):  # end of the stream
-                for payload in told:
-                    operator.hear(_applied(payload))
+                for payload in telemetry:
+                    operator.on_applied(_applied(payload))
 
         listening = threading.Thread(target=listen)
         listening.start()
         yield operator.settle()
-        asked.put(None)
-        told.cancel()
+        setpoints.put(None)
+        telemetry.cancel()
         listening.join(TIMEOUT_S)
 
 
@@ -151,31 +153,33 @@ def foxglove() -> Iterator[Exchange]:
         start_peer(_PROGRAM, "foxglove", str(port)),
         connect(
             f"ws://{HOST}:{port}", subprotocols=[Subprotocol("foxglove.sdk.v1")], compression=None, close_timeout=1
-        ) as line,
+        ) as connection,
     ):
-        channel = _channel(line)
-        mine = {"id": _OURS, "topic": f"/{CONTROL}", "encoding": "json", "schemaName": ""}
-        line.send(json.dumps({"op": "advertise", "channels": [mine]}))
-        line.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": _OURS, "channelId": channel}]}))
-        operator = PeerOperator(lambda sequence: line.send(struct.pack("<BI", _DATA, _OURS) + _asked(sequence)))
+        channel = _channel(connection)
+        channel_info = {"id": _CHANNEL_ID, "topic": f"/{CONTROL}", "encoding": "json", "schemaName": ""}
+        connection.send(json.dumps({"op": "advertise", "channels": [channel_info]}))
+        connection.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": _CHANNEL_ID, "channelId": channel}]}))
+        operator = PeerOperator(
+            lambda sequence: connection.send(struct.pack("<BI", _DATA, _CHANNEL_ID) + _encoded(sequence))
+        )
 
         def listen() -> None:
             with contextlib.suppress(ConnectionClosed):
-                for frame in line:
+                for frame in connection:
                     if isinstance(frame, bytes) and frame[0] == _DATA:
-                        operator.hear(_applied(frame[1 + 4 + 8 :]))
+                        operator.on_applied(_applied(frame[1 + 4 + 8 :]))
 
         listening = threading.Thread(target=listen)
         listening.start()
         yield operator.settle()
-        line.close()
+        connection.close()
         listening.join(TIMEOUT_S)
 
 
-def _channel(line: Any) -> int:
+def _channel(connection: Any) -> int:
     """Returns the id of the joints' channel that the server advertises."""
     while True:
-        said = json.loads(line.recv(TIMEOUT_S))
-        for each in said.get("channels", ()) if said["op"] == "advertise" else ():
+        message = json.loads(connection.recv(TIMEOUT_S))
+        for each in message.get("channels", ()) if message["op"] == "advertise" else ():
             if each["topic"] == f"/{JOINTS}":
                 return int(each["id"])

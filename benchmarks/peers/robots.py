@@ -30,61 +30,61 @@ def rosbridge(port: int) -> None:
     joints = roslibpy.Topic(ros, "/" + JOINTS, ROS_TYPE)
     control = roslibpy.Topic(ros, "/" + CONTROL, ROS_TYPE)
     joints.advertise()
-    control.subscribe(lambda asked: joints.publish(to_ros(arm.apply(from_ros(asked)))))
+    control.subscribe(lambda message: joints.publish(to_ros(arm.apply(from_ros(message)))))
     _ready()
 
 
-def from_ros(asked: Mapping[str, Any]) -> Setpoint:
+def from_ros(message: Mapping[str, Any]) -> Setpoint:
     """Converts a ``JointState`` to a setpoint."""
-    wanted = JointTarget(position_rad=dict(zip(asked["name"], asked["position"], strict=True)))
-    return Setpoint(epoch=1, sequence=asked["header"]["seq"], echo_tick_ms=0, sent_ms=0.0, target=wanted)
+    target = JointTarget(position_rad=dict(zip(message["name"], message["position"], strict=True)))
+    return Setpoint(epoch=1, sequence=message["header"]["seq"], echo_tick_ms=0, sent_ms=0.0, target=target)
 
 
-def to_ros(told: JointTelemetry) -> dict[str, Any]:
+def to_ros(telemetry: JointTelemetry) -> dict[str, Any]:
     """Converts telemetry to a ``JointState``."""
-    seconds, rest_ms = divmod(told.at_ms, 1000)
+    seconds, rest_ms = divmod(telemetry.at_ms, 1000)
     return {
-        "header": {"seq": told.setpoint_sequence, "stamp": {"secs": seconds, "nsecs": rest_ms * 1_000_000}},
+        "header": {"seq": telemetry.setpoint_sequence, "stamp": {"secs": seconds, "nsecs": rest_ms * 1_000_000}},
         "name": NAMES,
-        "position": told.position_rad,
-        "velocity": told.velocity_rad_s,
-        "effort": told.effort_nm,
+        "position": telemetry.position_rad,
+        "velocity": telemetry.velocity_rad_s,
+        "effort": telemetry.effort_nm,
     }
 
 
 def zenoh(port: int) -> None:
-    """A listening peer; no router in between."""
+    """Serves the robot as a listening peer without a router."""
     import zenoh as library
 
     with library.open(zenoh_peer(listen=port)) as session:
         arm, joints = PeerArm(), session.declare_publisher(JOINTS, express=True)
-        session.declare_subscriber(CONTROL, lambda asked: joints.put(arm.obey(asked.payload.to_bytes())))
+        session.declare_subscriber(CONTROL, lambda sample: joints.put(arm.apply_encoded(sample.payload.to_bytes())))
         _ready()
 
 
 def zenoh_peer(*, listen: int = 0, connect: int = 0) -> Any:
-    """A configuration with TCP on loopback only and without discovery."""
+    """Returns a configuration with TCP on loopback only and without discovery."""
     import zenoh as library
 
-    chosen = library.Config()
+    config = library.Config()
     for part, port in (("listen/endpoints", listen), ("connect/endpoints", connect)):
-        chosen.insert_json5(part, json.dumps([f"tcp/{HOST}:{port}"] if port else []))
-    chosen.insert_json5("mode", '"peer"')
-    chosen.insert_json5("scouting/multicast/enabled", "false")
-    return chosen
+        config.insert_json5(part, json.dumps([f"tcp/{HOST}:{port}"] if port else []))
+    config.insert_json5("mode", '"peer"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return config
 
 
 def grpc(port: int) -> None:
-    """A bidirectional stream, bytes each way, which spares it protobuf's work."""
+    """Serves the robot over a bidirectional stream of bytes, without the cost of protobuf."""
 
     async def serve() -> None:
         import grpc as library
 
         arm = PeerArm()
 
-        async def drive(asked: AsyncIterator[bytes], _context: Any) -> AsyncIterator[bytes]:
-            async for payload in asked:
-                yield arm.obey(payload)
+        async def drive(setpoints: AsyncIterator[bytes], _context: Any) -> AsyncIterator[bytes]:
+            async for payload in setpoints:
+                yield arm.apply_encoded(payload)
 
         server = library.aio.server()
         service, method = METHOD
@@ -99,7 +99,7 @@ def grpc(port: int) -> None:
 
 
 def foxglove(port: int) -> None:
-    """The SDK's server, to which clients publish; it tells on a channel of its own."""
+    """Serves the robot with the SDK's server: clients publish setpoints, and a channel carries telemetry."""
     import foxglove as library
     from foxglove.websocket import Capability
 
@@ -108,7 +108,7 @@ def foxglove(port: int) -> None:
     class Listener(library.ServerListener):  # type: ignore[misc]
         def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None:
             del client, client_channel_id
-            joints.log(arm.obey(data))
+            joints.log(arm.apply_encoded(data))
 
     library.start_server(
         name="arm",

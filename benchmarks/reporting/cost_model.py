@@ -24,18 +24,18 @@ Known = Mapping[str, Any]
 def demand(assumed: Known, robots: int, hz: float, message_bytes: float) -> dict[str, float]:
     """Returns the load of a fleet, by resource."""
     steady_hz = hz + 1 / assumed["state_every_s"]["value"]
-    answers = assumed["commands_a_day"]["value"] * (assumed["answers_a_command"]["value"] + 1) / 86_400
+    acks = assumed["commands_a_day"]["value"] * (assumed["answers_a_command"]["value"] + 1) / 86_400
     stores = min(hz, 1 / assumed["stored_every_s"]["value"])
-    good_s = assumed["credentials_good_s"]["value"] * assumed["credentials_renewed_at"]["value"]
+    lifetime_s = assumed["credentials_good_s"]["value"] * assumed["credentials_renewed_at"]["value"]
     return {
         "connections": robots,
-        "in_per_s": robots * (steady_hz + answers),
-        "in_bytes_per_s": robots * (steady_hz + answers) * message_bytes,
-        "out_per_s": robots * (steady_hz + answers) * assumed["subscribers"]["value"],
+        "in_per_s": robots * (steady_hz + acks),
+        "in_bytes_per_s": robots * (steady_hz + acks) * message_bytes,
+        "out_per_s": robots * (steady_hz + acks) * assumed["subscribers"]["value"],
         "retained": robots * assumed["retained_a_robot"]["value"],
         "stores_per_s": robots * stores,
         "write_units_per_s": robots * stores * assumed["rows_a_store"]["value"] * assumed["write_units_a_row"]["value"],
-        "credentials_per_s": robots / good_s,
+        "credentials_per_s": robots / lifetime_s,
     }
 
 
@@ -73,7 +73,7 @@ def write() -> None:
     PAGE.write_text("\n".join(lines()) + "\n", encoding="utf-8")
 
 
-def keep(swarm: Known) -> None:
+def save(swarm: Known) -> None:
     """Replaces the stored measurements and writes the page."""
     (SCALE / "swarm.json").write_text(json.dumps(swarm, indent=1) + "\n", encoding="utf-8")
     write()
@@ -199,16 +199,16 @@ def _throughput_units(facts: Known, robots: int, hz: float, size: float) -> int:
 def _own_broker(swarm: Known, facts: Known) -> Iterator[str]:
     steps = swarm["credentials"]["steps"]
     slope, assumed = slope_s(steps), facts["assumed"]
-    good_s = assumed["credentials_good_s"]["value"]
-    renewed_s = good_s * assumed["credentials_renewed_at"]["value"]
+    lifetime_s = assumed["credentials_good_s"]["value"]
+    renewed_s = lifetime_s * assumed["credentials_renewed_at"]["value"]
     # Renewed credentials stay registered until they expire.
-    known = good_s / renewed_s
+    known = lifetime_s / renewed_s
     most = math.sqrt(renewed_s / (slope * known))
-    seen = ", ".join(f"{step['processor_ms_each']:g} ms at {step['known']}" for step in steps)
+    measured = ", ".join(f"{step['processor_ms_each']:g} ms at {step['known']}" for step in steps)
     yield "## mosquitto on a site"
     yield ""
     yield "mosquitto's dynamic security plugin writes its whole file at each change, in the thread that forwards messages. One more agent costs"
-    yield f"{slope * 1e6:,.0f} µs of processor time for each known agent ({seen})."
+    yield f"{slope * 1e6:,.0f} µs of processor time for each known agent ({measured})."
     yield f"Evenly spread renewals alone saturate this thread at {most:,.0f} agents, and use a tenth of it at {most * math.sqrt(0.1):,.0f} agents."
     yield f"After a restart of the site, {1000:,} agents that connect one after another occupy it for {slope * 1000**2 / 2:,.0f} s, with few other messages."
     yield "Simultaneous starts are therefore limited earlier than the message rate. The embedded broker reads signed tokens and writes nothing."
@@ -241,16 +241,16 @@ def _money(facts: Known, size: float) -> Iterator[str]:
     yield "consoles that watch, function time and calls, storage and traffic. AWS does not charge for a keep-alive every 30 s. An agent"
     yield "sends one every 4 s; the source does not state its price."
     yield ""
-    answers = assumed["answers_a_command"]["value"]
+    acks = assumed["answers_a_command"]["value"]
     yield "### Cost of a million commands"
     yield ""
     yield "One API call, one message to the robot, its acks, and one function call for each ack:"
     yield ""
-    yield f"- AWS: {1 + answers} x {prices['AWS_CALLS']['value']} + {2 + answers} x {prices['AWS_MESSAGES']['value']} + {answers} x AWS_RULES + {1 + answers} x FUNCTION_SECONDS + tables"
-    aws = (1 + answers) * prices["AWS_CALLS"]["value"] + (2 + answers) * prices["AWS_MESSAGES"]["value"]
-    yield f"  = **{aws:.2f} $** + {answers} x AWS_RULES + {1 + answers} x FUNCTION_SECONDS + tables"
-    azure = (1 + answers) * prices["AZURE_CALLS"]["value"]
-    yield f"- Azure: **{azure:.2f} $** + {2 + 2 * answers} x AZURE_OPERATIONS + {1 + answers} x FUNCTION_SECONDS + tables"
+    yield f"- AWS: {1 + acks} x {prices['AWS_CALLS']['value']} + {2 + acks} x {prices['AWS_MESSAGES']['value']} + {acks} x AWS_RULES + {1 + acks} x FUNCTION_SECONDS + tables"
+    aws = (1 + acks) * prices["AWS_CALLS"]["value"] + (2 + acks) * prices["AWS_MESSAGES"]["value"]
+    yield f"  = **{aws:.2f} $** + {acks} x AWS_RULES + {1 + acks} x FUNCTION_SECONDS + tables"
+    azure = (1 + acks) * prices["AZURE_CALLS"]["value"]
+    yield f"- Azure: **{azure:.2f} $** + {2 + 2 * acks} x AZURE_OPERATIONS + {1 + acks} x FUNCTION_SECONDS + tables"
     yield ""
 
 

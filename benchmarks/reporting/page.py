@@ -41,7 +41,7 @@ def _claims(reports: list[Report]) -> Iterator[str]:
             sign = "≥" if claim.at_least else "≤"
             mark = "" if claim.holds else " **not reached**"
             target = f"{sign} {claim.bound:g} {claim.unit}"
-            measured = f"{claim.seen:.3g} {claim.unit}{mark}"
+            measured = f"{claim.measured:.3g} {claim.unit}{mark}"
             yield f"| {claim.text} | {target} | {measured} | [{report.suite}](#{_anchor(report)}) |"
     yield ""
 

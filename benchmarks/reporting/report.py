@@ -46,18 +46,18 @@ class Chart(msgspec.Struct, frozen=True, kw_only=True):
     log: bool = False
 
 
-class Claim(msgspec.Struct, frozen=True):
+class Claim(msgspec.Struct, frozen=True, rename={"measured": "seen"}):
     """A target and its measured value.
 
     Attributes:
         text: What is measured.
-        seen: Measured value.
+        measured: Measured value.
         bound: Largest allowed value; the smallest one if ``at_least`` is set.
         unit: Unit of both values; ``×`` for a ratio.
     """
 
     text: str
-    seen: float
+    measured: float
     bound: float
     unit: str
     at_least: bool = False
@@ -65,12 +65,12 @@ class Claim(msgspec.Struct, frozen=True):
     @property
     def holds(self) -> bool:
         """True if the measured value meets the bound."""
-        return self.seen >= self.bound if self.at_least else self.seen <= self.bound
+        return self.measured >= self.bound if self.at_least else self.measured <= self.bound
 
     def line(self) -> str:
         """Returns the target and the measured value as one line of text."""
         sign = "≥" if self.at_least else "≤"
-        return f"{self.text}: {self.seen:.3g} {self.unit} (target {sign} {self.bound:g})"
+        return f"{self.text}: {self.measured:.3g} {self.unit} (target {sign} {self.bound:g})"
 
 
 class Report(msgspec.Struct, kw_only=True):

@@ -1,4 +1,4 @@
-"""How far one machine goes: brokers, agents, functions, and what each more robot or connection costs.
+"""Capacity of one machine: brokers, agents, functions, and the cost of an additional robot or connection.
 
-``limits.json`` and ``swarm.json`` are what ``benchmarks.reporting.cost_model`` computes ``docs/results/scale.md`` from.
+``benchmarks.reporting.cost_model`` computes ``docs/results/scale.md`` from ``limits.json`` and ``swarm.json``.
 """

@@ -1,7 +1,7 @@
-"""What it costs mosquitto to be told of one more agent: its dynamic security writes down all it knows at each change.
+"""Processor time of mosquitto to register one more agent.
 
-Two commands, a role and a client, are two times all of it: the plugin offers nothing that would be one. Processor time,
-and not the clock's.
+The dynamic security plugin writes its whole file at each change. Registration needs two commands (a role and a client),
+so the file is written twice; the plugin has no combined command.
 """
 
 import secrets
@@ -16,29 +16,32 @@ from tests.harness.network.brokers import start_broker
 
 STEP: Final = 100
 QUICK: Final = 100
-WHOLE: Final = 600
+FULL: Final = 600
 
 
-def measure(most: int) -> list[dict[str, float]]:
+def measure(count: int) -> list[dict[str, float]]:
     """Adds 100 agents at a time up to a number."""
-    found: list[dict[str, float]] = []
+    steps: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as folder, start_broker("mosquitto", Path(folder)) as broker:
         before_s = processor_s(broker.process.pid)
-        for known in range(1, most + 1):
-            grant = grants.agent_grant("space", f"agent{known}", token_id=secrets.token_hex(8), lifetime_s=3600)
+        for registered in range(1, count + 1):
+            grant = grants.agent_grant("space", f"agent{registered}", token_id=secrets.token_hex(8), lifetime_s=3600)
             broker.issue(grant)
-            if known % STEP == 0:
+            if registered % STEP == 0:
                 now_s = processor_s(broker.process.pid)
-                found.append({"known": known, "processor_ms_each": round((now_s - before_s) / STEP * 1000, 2)})
+                steps.append({"known": registered, "processor_ms_each": round((now_s - before_s) / STEP * 1000, 2)})
                 before_s = now_s
-    return found
+    return steps
 
 
 def table(steps: list[dict[str, float]]) -> Table:
     """Returns the table of results."""
-    note = """Rights for one more agent, after so many: mosquitto's dynamic security writes all of them to its file at
-each of two commands. What that means for a site: [scale.md](scale.md)."""
+    note = """Cost of registering one more agent: mosquitto's dynamic security plugin writes its whole file at each of
+two commands. [scale.md](scale.md) shows the effect on a site."""
     rows: list[list[Cell]] = [[int(step["known"]), step["processor_ms_each"]] for step in steps]
     return Table(
-        title="mosquitto's rights", columns=["agents known", "ms of a core for each more"], rows=rows, note=note
+        title="mosquitto: registered agents",
+        columns=["registered agents", "ms of a core for one more"],
+        rows=rows,
+        note=note,
     )

@@ -44,17 +44,17 @@ class HttpLoad(msgspec.Struct):
 
 
 class HttpLoadResult(msgspec.Struct):
-    """Result; ``refused`` counts responses other than 2xx by status, ``refusal`` is the last of them."""
+    """Result; ``rejected`` counts responses other than 2xx by status; ``last_error`` is the last of them."""
 
     count: int
     per_s: float
     p50_ms: float
     p99_ms: float
-    refused: dict[str, int]
-    refusal: str
-    answer_bytes: int
+    rejected: dict[str, int]
+    last_error: str
+    response_bytes: int
     processor_s: float
-    took_s: float
+    duration_s: float
 
 
 class RawHttpConnection(asyncio.Protocol):
@@ -63,22 +63,22 @@ class RawHttpConnection(asyncio.Protocol):
     def __init__(self, requests: list[bytes]) -> None:
         self._requests = requests
         self._next = 0
-        self._came = bytearray()
-        self._began_s = self._ends_s = 0.0
+        self._buffer = bytearray()
+        self._started_s = self._deadline_s = 0.0
         self._transport: asyncio.Transport
         self.done: asyncio.Future[None]
         self.begin(0.0)
 
-    def begin(self, ends_s: float) -> None:
+    def begin(self, deadline_s: float) -> None:
         """Resets the counts and sends requests until a time."""
-        self.taken: list[float] = []
-        self.refused: dict[str, int] = {}
-        self.refusal = ""
+        self.durations_s: list[float] = []
+        self.rejected: dict[str, int] = {}
+        self.last_error = ""
         self.bytes = 0
-        self._ends_s = ends_s
+        self._deadline_s = deadline_s
         self.done = asyncio.get_running_loop().create_future()
-        if ends_s:
-            self._ask()
+        if deadline_s:
+            self._send()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Handles the connection (asyncio protocol)."""
@@ -88,76 +88,76 @@ class RawHttpConnection(asyncio.Protocol):
     def connection_lost(self, _error: Exception | None) -> None:
         """Treats a lost connection as the end of the run."""
         if not self.done.done():
-            self.done.set_exception(ConnectionError("the server has hung up"))
+            self.done.set_exception(ConnectionError("the server closed the connection"))
 
     def data_received(self, data: bytes) -> None:
-        """Handles a part of a response, usually the whole."""
-        self._came += data
-        head = self._came.find(b"\r\n\r\n")
+        """Handles a response or a part of it."""
+        self._buffer += data
+        head = self._buffer.find(b"\r\n\r\n")
         if head < 0:
             return
-        length = _LENGTH.search(self._came, 0, head)
-        if len(self._came) < head + 4 + (int(length[1]) if length else 0):
+        length = _LENGTH.search(self._buffer, 0, head)
+        if len(self._buffer) < head + 4 + (int(length[1]) if length else 0):
             return
         now_s = time.perf_counter()
-        if self._came[_STATUS][:1] == b"2":
-            self.taken.append(now_s - self._began_s)
+        if self._buffer[_STATUS][:1] == b"2":
+            self.durations_s.append(now_s - self._started_s)
         else:
-            status = self._came[_STATUS].decode()
-            self.refused[status] = self.refused.get(status, 0) + 1
-            self.refusal = self._came[head + 4 :].decode(errors="replace")
-        self.bytes = len(self._came) - head - 4
-        self._came.clear()
-        if now_s < self._ends_s:
-            self._ask()
+            status = self._buffer[_STATUS].decode()
+            self.rejected[status] = self.rejected.get(status, 0) + 1
+            self.last_error = self._buffer[head + 4 :].decode(errors="replace")
+        self.bytes = len(self._buffer) - head - 4
+        self._buffer.clear()
+        if now_s < self._deadline_s:
+            self._send()
         else:
             self.done.set_result(None)
 
-    def _ask(self) -> None:
+    def _send(self) -> None:
         request = self._requests[self._next % len(self._requests)]
         self._next += 1
-        self._began_s = time.perf_counter()
+        self._started_s = time.perf_counter()
         self._transport.write(request)
 
 
-async def send_request(lines: list[RawHttpConnection], seconds: float) -> HttpLoadResult:
+async def run_load(connections: list[RawHttpConnection], seconds: float) -> HttpLoadResult:
     """Runs all connections concurrently, each as fast as responses arrive."""
-    spent_s, began_s = time.process_time(), time.perf_counter()
-    for line in lines:
-        line.begin(began_s + seconds)
-    await asyncio.gather(*(line.done for line in lines))
-    took_s = time.perf_counter() - began_s
-    taken = [each for line in lines for each in line.taken]
-    refused: dict[str, int] = {}
-    for line in lines:
-        for status, count in line.refused.items():
-            refused[status] = refused.get(status, 0) + count
+    spent_s, started_s = time.process_time(), time.perf_counter()
+    for connection in connections:
+        connection.begin(started_s + seconds)
+    await asyncio.gather(*(connection.done for connection in connections))
+    duration_s = time.perf_counter() - started_s
+    durations_s = [each for connection in connections for each in connection.durations_s]
+    rejected: dict[str, int] = {}
+    for connection in connections:
+        for status, count in connection.rejected.items():
+            rejected[status] = rejected.get(status, 0) + count
     return HttpLoadResult(
-        count=len(taken),
-        per_s=len(taken) / took_s,
-        p50_ms=percentile(taken or [0.0], 0.5) * 1000,
-        p99_ms=percentile(taken or [0.0], 0.99) * 1000,
-        refused=refused,
-        refusal=next((line.refusal for line in lines if line.refusal), ""),
-        answer_bytes=max(line.bytes for line in lines),
+        count=len(durations_s),
+        per_s=len(durations_s) / duration_s,
+        p50_ms=percentile(durations_s or [0.0], 0.5) * 1000,
+        p99_ms=percentile(durations_s or [0.0], 0.99) * 1000,
+        rejected=rejected,
+        last_error=next((each.last_error for each in connections if each.last_error), ""),
+        response_bytes=max(each.bytes for each in connections),
         processor_s=time.process_time() - spent_s,
-        took_s=took_s,
+        duration_s=duration_s,
     )
 
 
 async def run() -> None:
     """Runs until standard input ends."""
     loop = asyncio.get_running_loop()
-    asked = msgspec.json.decode(sys.stdin.readline(), type=HttpLoad)
-    requests, lines = [each.encode() for each in asked.requests], []
-    for number in range(asked.connections):
-        own = requests[number :: asked.connections] or requests
-        port = asked.ports[number % len(asked.ports)]
-        _, line = await loop.create_connection(lambda own=own: RawHttpConnection(own), HOST, port)  # type: ignore[misc]
-        lines.append(line)
+    load = msgspec.json.decode(sys.stdin.readline(), type=HttpLoad)
+    requests, connections = [each.encode() for each in load.requests], []
+    for number in range(load.connections):
+        own = requests[number :: load.connections] or requests
+        port = load.ports[number % len(load.ports)]
+        _, connection = await loop.create_connection(lambda own=own: RawHttpConnection(own), HOST, port)  # type: ignore[misc]
+        connections.append(connection)
     print("ready", flush=True)
     while seconds := await asyncio.to_thread(sys.stdin.readline):
-        print(msgspec.json.encode(await send_request(lines, float(seconds))).decode(), flush=True)
+        print(msgspec.json.encode(await run_load(connections, float(seconds))).decode(), flush=True)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from device_agent.ports.driver import Observation
 from device_agent.protocol import Pose, Twin
 from device_agent.protocol.manifests.robot_type import RobotType
 
-_SOMEWHERE: Final[Pose] = (0.123456, 0.234567, 0.345678, 0.707107, 0.0, 0.707107, 0.0)
+_POSE: Final[Pose] = (0.123456, 0.234567, 0.345678, 0.707107, 0.0, 0.707107, 0.0)
 
 
 class LightArm:
@@ -18,8 +18,8 @@ class LightArm:
 
     def __init__(self, kind: RobotType) -> None:
         self._position_rad = tuple(kind.home_rad[joint.name] for joint in kind.joints)
-        self._still = (0.0,) * len(kind.joints)
-        self._frames = (_SOMEWHERE,) * len(kind.frames)
+        self._zeros = (0.0,) * len(kind.joints)
+        self._frames = (_POSE,) * len(kind.frames)
 
     def connect(self) -> None:
         """Implements the port."""
@@ -30,7 +30,7 @@ class LightArm:
 
     def observe(self) -> Observation:
         """Implements the port."""
-        return Observation(self._position_rad, self._still, self._still, self._frames)
+        return Observation(self._position_rad, self._zeros, self._zeros, self._frames)
 
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
         """Implements the port."""

@@ -15,7 +15,7 @@ import msgspec
 
 from benchmarks.baseline.product import TIMEOUT_S, MeasuredProduct
 from benchmarks.reporting.report import Cell, Table
-from benchmarks.scale.brokers import answer, program
+from benchmarks.scale.brokers import program, request
 from benchmarks.scale.functions import FunctionsUnderTest, Load
 from benchmarks.scale.http_load import Request
 from benchmarks.scale.processes import processor_s, resident_mb
@@ -26,7 +26,7 @@ from tests.harness.browser.product import Api
 from tests.harness.paths import ROOT
 
 QUICK: Final = ((100, 5.0, 0.02),)
-WHOLE: Final = ((100, 5.0, 0.02), (300, 5.0, 0.02), (1000, 2.0, 0.07))
+FULL: Final = ((100, 5.0, 0.02), (300, 5.0, 0.02), (1000, 2.0, 0.07))
 """Number of agents, measurements per second and agent, and interval between two connects [s]."""
 EVERY_S: Final = 1.0
 ARMS: Final = 60
@@ -34,18 +34,18 @@ ARMS: Final = 60
 ARMS_HZ: Final = 20.0
 """An agent notices its arrival at the next measurement."""
 COLUMNS: Final = [
-    "agents", "Hz", "made known in s", "connected", "connects/s", "messages/s", "lost", "p50 ms", "p99 ms", "most ms",
-    "broker, % of a core", "swarm, %", "broker MB", "functions MB", "swarm kB an agent",
+    "agents", "Hz", "registered in s", "connected", "connects/s", "messages/s", "lost", "p50 ms", "p99 ms", "max ms",
+    "broker, % of a core", "load test, %", "broker MB", "functions MB", "load test, kB per agent",
 ]  # fmt: skip
 
 
 class LoadTestResult(msgspec.Struct):
     """Result of one run. ``figures`` is the summary of the load generator."""
 
-    known_s: float
+    registered_s: float
     connects_per_s: float
     figures: dict[str, Any]
-    heard: SubscriberResult
+    received: SubscriberResult
     broker_percent: float
     broker_mb: float
     functions_mb: float
@@ -61,26 +61,26 @@ class LoadTestResult(msgspec.Struct):
     @property
     def lost(self) -> int:
         """Measurements that the subscriber did not receive."""
-        return self.measured - self.heard.count
+        return self.measured - self.received.count
 
     def row(self) -> list[Cell]:
         """Returns the row for the results page."""
-        told, heard = self.figures, self.heard
+        figures, received = self.figures, self.received
         return [
-            told["agents"], told["rate_hz"], self.known_s, told["most_connected"], self.connects_per_s,
-            told["out_per_s"], self.lost, heard.p50_ms, heard.p99_ms, heard.most_ms,
-            self.broker_percent, 100 * told["cpu_share"],
-            self.broker_mb, self.functions_mb, told["memory_bytes_per_agent"] / 1000,
+            figures["agents"], figures["rate_hz"], self.registered_s, figures["most_connected"], self.connects_per_s,
+            figures["out_per_s"], self.lost, received.p50_ms, received.p99_ms, received.max_ms,
+            self.broker_percent, 100 * figures["cpu_share"],
+            self.broker_mb, self.functions_mb, figures["memory_bytes_per_agent"] / 1000,
         ]  # fmt: skip
 
-    def kept(self) -> dict[str, Any]:
+    def cost_model_values(self) -> dict[str, Any]:
         """Returns the values for the cost model."""
         return {
             "broker": "mosquitto",
             "on": datetime.now(UTC).date().isoformat(),
             **self.figures,
             "measured": self.measured,
-            "subscriber_heard": self.heard.count,
+            "subscriber_heard": self.received.count,
             "lost_share": round(self.lost / max(self.measured, 1), 6),
             "load_before": self.load_before,
             "load_after": self.load_after,
@@ -91,26 +91,26 @@ class LoadTest:
     """A load generator that runs for some seconds, with one subscriber.
 
     Args:
-        stand: The product.
+        product: The product.
         home: Folder of the agents' keys; a later run with the same folder uses the same agents.
     """
 
-    def __init__(self, stand: MeasuredProduct, home: Path) -> None:
-        self._stand = stand
+    def __init__(self, product: MeasuredProduct, home: Path) -> None:
+        self._product = product
         self._home = home
 
     @contextlib.contextmanager
-    def living(self, count: int, rate_hz: float, seconds: float, gap_s: float) -> Iterator["subprocess.Popen[str]"]:
+    def running(self, count: int, rate_hz: float, seconds: float, gap_s: float) -> Iterator["subprocess.Popen[str]"]:
         """Runs the load generator while it connects and publishes."""
         with subprocess.Popen(
             [
-                sys.executable, "-m", "device_agent", "load-test", "--cloud", self._stand.machine.url,
+                sys.executable, "-m", "device_agent", "load-test", "--cloud", self._product.machine.url,
                 "--home", str(self._home / "keys"), "--count", str(count), "--rate-hz", str(rate_hz),
                 "--spread-s", str(count * gap_s), "--seconds", str(count * gap_s + seconds), "--every-s", str(EVERY_S),
                 "--json", str(self._home / "figures.json"),
             ],
             cwd=ROOT,
-            env={**os.environ, "TELESCOPE_SIGN_IN": self._stand.machine.sign_in_link()},
+            env={**os.environ, "TELESCOPE_SIGN_IN": self._product.machine.sign_in_link()},
             stdout=subprocess.PIPE,
             text=True,
         ) as process:  # fmt: skip
@@ -118,30 +118,30 @@ class LoadTest:
                 yield process
             finally:
                 process.terminate()
-                process.communicate()  # it announces its end
+                process.communicate()  # the program prints a summary when it ends
 
     def run(self, count: int, rate_hz: float, gap_s: float, seconds: float) -> LoadTestResult:
         """Measures the run from the first key to the last message."""
-        everything = topics.device(topics.ANY, topics.ANY, DEVICE, topics.TELE, topics.ANY)
-        ear = SubscriberOptions(
-            self._stand.mqtt_port, *self._stand.rights(subscribe=(everything,)), everything, wall=True
+        topic_filter = topics.device(topics.ANY, topics.ANY, DEVICE, topics.TELE, topics.ANY)
+        subscriber = SubscriberOptions(
+            self._product.mqtt_port, *self._product.credentials(subscribe=(topic_filter,)), topic_filter, wall=True
         )
-        broker = self._stand.machine.pid("infra.mosquitto")
-        load, began_s = os.getloadavg()[0], time.monotonic()
-        with program("subscriber", ear) as listener, self.living(count, rate_hz, seconds, gap_s) as process:
+        broker = self._product.machine.pid("infra.mosquitto")
+        load, started_s = os.getloadavg()[0], time.monotonic()
+        with program("subscriber", subscriber) as listener, self.running(count, rate_hz, seconds, gap_s) as process:
             progress = _Progress(process, count)
-            known_s = progress.first_s - began_s
+            registered_s = progress.first_s - started_s
             progress.wait()
-            before_s, all_s = processor_s(broker), time.monotonic()
-            megabytes = resident_mb(broker), resident_mb(self._stand.machine.pid("function_app serve"))
+            before_s, connected_s = processor_s(broker), time.monotonic()
+            megabytes = resident_mb(broker), resident_mb(self._product.machine.pid("function_app serve"))
             process.wait(TIMEOUT_S + count * gap_s + seconds)
-            percent = 100 * (processor_s(broker) - before_s) / (time.monotonic() - all_s)
-            heard = msgspec.json.decode(answer(listener, "now"), type=SubscriberResult)
+            percent = 100 * (processor_s(broker) - before_s) / (time.monotonic() - connected_s)
+            received = msgspec.json.decode(request(listener, "now"), type=SubscriberResult)
         return LoadTestResult(
-            known_s=known_s,
-            connects_per_s=count / (progress.all_s - progress.first_s) if progress.all_s else 0.0,
+            registered_s=registered_s,
+            connects_per_s=count / (progress.last_s - progress.first_s) if progress.last_s else 0.0,
             figures=json.loads((self._home / "figures.json").read_text()),
-            heard=heard,
+            received=received,
             broker_percent=percent,
             broker_mb=megabytes[0],
             functions_mb=megabytes[1],
@@ -155,22 +155,22 @@ class _Progress:
 
     def __init__(self, process: "subprocess.Popen[str]", count: int) -> None:
         self._process = process
-        self._all = f"{count} of {count} connected"
-        self.all_s = 0.0
+        self._complete = f"{count} of {count} connected"
+        self.last_s = 0.0
         line = self._line()
         while line and "connected" not in line:
             line = self._line()
         self.first_s = time.monotonic() - EVERY_S
-        self._look(line)
+        self._update(line)
 
     def wait(self) -> None:
         """Waits until all agents are connected or the program has ended."""
-        while not self.all_s and (line := self._line()):
-            self._look(line)
+        while not self.last_s and (line := self._line()):
+            self._update(line)
 
-    def _look(self, line: str) -> None:
-        if self._all in line:
-            self.all_s = time.monotonic()
+    def _update(self, line: str) -> None:
+        if self._complete in line:
+            self.last_s = time.monotonic()
 
     def _line(self) -> str:
         assert self._process.stdout is not None
@@ -178,30 +178,32 @@ class _Progress:
 
 
 def actions(
-    site: FunctionsUnderTest, stand: MeasuredProduct, home: Path, *, seconds: float, processes: tuple[int, ...]
+    site: FunctionsUnderTest, product: MeasuredProduct, home: Path, *, seconds: float, processes: tuple[int, ...]
 ) -> list[Load]:
-    """Measures accepted actions per second for arms that reach each target at once."""
+    """Measures accepted actions per second for arms that reach each target immediately."""
     found = []
     longest_s = len(processes) * (seconds + 1) + TIMEOUT_S
-    with contextlib.ExitStack() as stack, LoadTest(stand, home).living(ARMS, ARMS_HZ, longest_s, 0.02) as process:
+    with contextlib.ExitStack() as stack, LoadTest(product, home).running(ARMS, ARMS_HZ, longest_s, 0.02) as process:
         _Progress(process, ARMS).wait()
-        devices = _there(stand)
+        devices = _online_arms(product)
         request = {"kind": "move_joints", "position_rad": {"joint_1": 0.0}}
         body = json.dumps({"request": request, "wait_for": "done", "wait_ms": 10_000})
-        asked = [Request("POST", f"/api/v1/devices/{device}/actions", stand.token, body) for device in devices[:ARMS]]
+        requests = [
+            Request("POST", f"/api/v1/devices/{device}/actions", product.token, body) for device in devices[:ARMS]
+        ]
         for count in processes:
             site.grow(count)
-            ask = site.ask("POST actions", count, asked, stack)
-            ask(0.5)
-            found.append(ask(seconds))
+            run = site.clients("POST actions", count, requests, stack)
+            run(0.5)
+            found.append(run(seconds))
     return found
 
 
-def _there(stand: MeasuredProduct) -> list[str]:
+def _online_arms(product: MeasuredProduct) -> list[str]:
     """Returns the ids of the arms that are online; the list also contains agents of earlier runs."""
     found: list[str] = []
     query: dict[str, Any] = {"limit": 1000}
-    with Api(stand.machine) as owner:
+    with Api(product.machine) as owner:
         while True:
             page = owner.get("/devices", **query)
             found += [each["id"] for each in page["items"] if each["name"] == DEVICE and each["online"]]
@@ -212,10 +214,9 @@ def _there(stand: MeasuredProduct) -> list[str]:
 
 def table(runs: list[LoadTestResult]) -> Table:
     """Returns the table of results."""
-    note = """`python -m device_agent load-test`: agents that are real ones on the wire, in one process, without
-physics, at the product over mosquitto; one subscriber to all that they measure. *Made known*: keys, enrolment
-and claim of those that were not known yet, over HTTP. *Connects*: credentials and the connection, at the pace
-that the swarm was given, or slower; mosquitto writes all the rights that it knows to its file at each new one,
-and passes nothing on meanwhile: p50 to most, from an agent's measurement to the subscriber, are of the whole
-run, with connecting. Processor time is of the seconds after."""
-    return Table(title="A swarm", columns=COLUMNS, rows=[run.row() for run in runs], note=note)
+    note = """`python -m device_agent load-test`: agents with the real protocol in one process, without physics, at the
+product over mosquitto, with one subscriber to all measurements. *Registered*: keys, enrolment and claims of new agents
+over HTTP. *Connects*: credentials and connection at the configured pace or slower. mosquitto writes its whole
+permission file at each new agent and forwards no messages during the write. p50 to max are from an agent's measurement
+to the subscriber over the whole run, including connecting. Processor time is that of the time after connecting."""
+    return Table(title="Load-test agents", columns=COLUMNS, rows=[run.row() for run in runs], note=note)

@@ -14,22 +14,21 @@ from benchmarks.baseline.product import TIMEOUT_S
 _CONNECT, _CONNACK, PUBLISH, _SUBSCRIBE, _SUBACK = 0x10, 0x20, 0x30, 0x82, 0x90
 _CLEAN_WITH_LOGIN: Final = 0xC2
 _KEEP_ALIVE_S: Final = 3600
-_REFUSED: Final = 0x80
-_MORE: Final = 0x80
+_CONTINUATION: Final = 0x80
 
 
 def packet(kind: int, body: bytes) -> bytes:
-    """Encodes with a length prefix."""
+    """Encodes a packet."""
     length, head = len(body), bytearray([kind])
     while True:
-        length, low = divmod(length, _MORE)
-        head.append(low | (_MORE if length else 0))
+        length, low = divmod(length, _CONTINUATION)
+        head.append(low | (_CONTINUATION if length else 0))
         if not length:
             return bytes(head) + body
 
 
 def text(value: str) -> bytes:
-    """Encodes with a length prefix."""
+    """Encodes a string with a length prefix."""
     encoded = value.encode()
     return struct.pack("!H", len(encoded)) + encoded
 
@@ -39,10 +38,10 @@ def packets(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
     while len(buffer) > 1:
         length, shift, at = 0, 0, 1
         while at < len(buffer):
-            length |= (buffer[at] & ~_MORE) << shift
+            length |= (buffer[at] & ~_CONTINUATION) << shift
             shift += 7
             at += 1
-            if not buffer[at - 1] & _MORE:
+            if not buffer[at - 1] & _CONTINUATION:
                 break
         else:
             return
@@ -64,33 +63,33 @@ def connect(port: int, client: str, user: str, password: str) -> socket.socket:
     Raises:
         ConnectionError: The broker rejected the connection.
     """
-    line = socket.create_connection((HOST, port), TIMEOUT_S)
-    line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connection = socket.create_connection((HOST, port), TIMEOUT_S)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     head = text("MQTT") + struct.pack("!BBH", 4, _CLEAN_WITH_LOGIN, _KEEP_ALIVE_S)
-    line.sendall(packet(_CONNECT, head + text(client) + text(user) + text(password)))
-    _expect(line, _CONNACK)
-    return line
+    connection.sendall(packet(_CONNECT, head + text(client) + text(user) + text(password)))
+    _expect(connection, _CONNACK)
+    return connection
 
 
-def subscribe(line: socket.socket, topic: str) -> None:
+def subscribe(connection: socket.socket, topic: str) -> None:
     """Subscribes with QoS 0.
 
     Raises:
         ConnectionError: The broker rejected the subscription.
     """
-    line.sendall(packet(_SUBSCRIBE, struct.pack("!H", 1) + text(topic) + b"\0"))
-    _expect(line, _SUBACK)
+    connection.sendall(packet(_SUBSCRIBE, struct.pack("!H", 1) + text(topic) + b"\0"))
+    _expect(connection, _SUBACK)
 
 
-def _expect(line: socket.socket, wanted: int) -> None:
+def _expect(connection: socket.socket, expected: int) -> None:
     """Reads the acknowledgement, which ends with 0 on success."""
-    heard = bytearray()
+    buffer = bytearray()
     while True:
-        came = line.recv(1024)
-        if not came:
-            raise ConnectionError("the broker has hung up")
-        heard += came
-        for kind, body in packets(heard):
-            if kind == wanted and not body[-1]:
+        data = connection.recv(1024)
+        if not data:
+            raise ConnectionError("the broker closed the connection")
+        buffer += data
+        for kind, body in packets(buffer):
+            if kind == expected and not body[-1]:
                 return
-            raise ConnectionError(f"the broker refuses: {kind:#x} {body!r}")
+            raise ConnectionError(f"the broker rejected the request: {kind:#x} {body!r}")

@@ -1,7 +1,7 @@
 """Robots that only publish: ``python -m benchmarks.scale.publishers``.
 
 The program reads one line of JSON (``PublisherOptions``), connects and prints ``ready``. For each further line with a
-rate and a time it publishes and prints ``PublisherResult`` as JSON. A saturated broker makes it late.
+rate and a time it publishes and prints ``PublisherResult`` as JSON. A saturated broker delays the program.
 """
 
 import random
@@ -43,7 +43,7 @@ class PublisherResult(msgspec.Struct):
 
     sent: int
     late_ms: float
-    took_s: float
+    duration_s: float
     processor_s: float
     message_bytes: int
 
@@ -55,7 +55,7 @@ def telemetry() -> bytes:
     def some(count: int) -> tuple[float, ...]:
         return tuple(round(chance.uniform(-2, 2), 6) for _ in range(count))
 
-    told = JointTelemetry(
+    message = JointTelemetry(
         tick_ms=tick_ms(),
         at_ms=wall_ms(),
         sequence=12_345,
@@ -68,32 +68,32 @@ def telemetry() -> bytes:
         epoch=7,
         setpoint_sent_ms=-1.0,
     )
-    return codec.encode(told)
+    return codec.encode(message)
 
 
-def publish(lines: list[tuple[socket.socket, str]], rate_hz: float, seconds: float) -> PublisherResult:
+def publish(connections: list[tuple[socket.socket, str]], rate_hz: float, seconds: float) -> PublisherResult:
     """Publishes for all robots in turn, each at ``rate_hz``."""
     before, after = telemetry().split(SENT + b"-1.0")
-    made = [(line, mqtt_packets.text(topic) + before + SENT) for line, topic in lines]
-    count, gap_s = round(len(made) * rate_hz * seconds), 1 / (len(made) * rate_hz)
+    streams = [(connection, mqtt_packets.text(topic) + before + SENT) for connection, topic in connections]
+    count, gap_s = round(len(streams) * rate_hz * seconds), 1 / (len(streams) * rate_hz)
     late, clock = [], time.monotonic
-    spent_s, began_s = time.process_time(), clock()
+    spent_s, started_s = time.process_time(), clock()
     size = 0
     for number in range(count):
-        due_s = began_s + number * gap_s
+        due_s = started_s + number * gap_s
         now_s = clock()
         if now_s < due_s:
             time.sleep(due_s - now_s)
             now_s = clock()
-        line, start = made[number % len(made)]
+        connection, start = streams[number % len(streams)]
         packet = mqtt_packets.packet(mqtt_packets.PUBLISH, b"%b%.3f%b" % (start, now_s * 1000, after))
-        line.sendall(packet)
+        connection.sendall(packet)
         size = len(packet)
         late.append(now_s - due_s)
     return PublisherResult(
         sent=count,
         late_ms=percentile(late, 0.99) * 1000,
-        took_s=clock() - began_s,
+        duration_s=clock() - started_s,
         processor_s=time.process_time() - spent_s,
         message_bytes=size,
     )
@@ -102,13 +102,13 @@ def publish(lines: list[tuple[socket.socket, str]], rate_hz: float, seconds: flo
 def main() -> None:
     """Runs until standard input ends."""
     fleet = msgspec.json.decode(sys.stdin.readline(), type=PublisherOptions)
-    lines = [
+    connections = [
         (mqtt_packets.connect(fleet.port, each.client, each.user, each.password), each.topic) for each in fleet.robots
     ]
     print("ready", flush=True)
     for line in sys.stdin:
         rate_hz, seconds = map(float, line.split())
-        print(msgspec.json.encode(publish(lines, rate_hz, seconds)).decode(), flush=True)
+        print(msgspec.json.encode(publish(connections, rate_hz, seconds)).decode(), flush=True)
 
 
 if __name__ == "__main__":

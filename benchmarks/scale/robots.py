@@ -22,7 +22,7 @@ from tests.harness.paths import ROOT
 Kind = Literal["light", "simulated"]
 PERIOD_MS: Final = 8.0
 """Control period of the UR5."""
-WHOLE: Final[tuple[tuple[Kind, float, int, tuple[int, ...]], ...]] = (
+FULL: Final[tuple[tuple[Kind, float, int, tuple[int, ...]], ...]] = (
     ("light", 50.0, 1, (1, 8, 32, 64)),
     ("light", 20.0, 1, (64,)),
     ("light", 50.0, 2, (32,)),
@@ -37,10 +37,10 @@ QUICK: Final[tuple[tuple[Kind, float, int, tuple[int, ...]], ...]] = (
 )
 CHARTED_HZ: Final = 50.0
 _SETTLE_S: Final = 2.0
-_WATCH_S: Final = 3.0
+_OBSERVE_S: Final = 3.0
 COLUMNS: Final = [
-    "agents × robots", "", "telemetry Hz", "agents, % of a core", "late p50 ms", "late p99 ms", "most ms", "in time",
-    "an agent's MB", "MB a robot",
+    "agents × robots", "", "telemetry Hz", "agents, % of a core", "late p50 ms", "late p99 ms", "max ms", "in time",
+    "MB per agent", "MB per robot",
 ]  # fmt: skip
 
 
@@ -51,70 +51,70 @@ class AgentProcess(msgspec.Struct):
     rate_hz: float
     agents: int
     count: int
-    seen: LoopStatistics
+    statistics: LoopStatistics
     percent: float
     mb: float
 
     @property
     def in_time(self) -> bool:
         """True if 99 % of the decisions are less than one period late."""
-        return self.seen.late_p99_ms < PERIOD_MS
+        return self.statistics.late_p99_ms < PERIOD_MS
 
     def row(self, alone_mb: float | None) -> list[Cell]:
         """Returns the row for the results page; ``alone_mb`` is the memory of an agent with one robot."""
         each = None if alone_mb is None or self.count == 1 else (self.mb - alone_mb) / (self.count - 1)
         return [
             f"{self.agents} × {self.count}", self.kind, self.rate_hz, self.percent,
-            max(0.0, self.seen.late_p50_ms), self.seen.late_p99_ms, self.seen.late_most_ms,
+            max(0.0, self.statistics.late_p50_ms), self.statistics.late_p99_ms, self.statistics.late_max_ms,
             "yes" if self.in_time else "no", self.mb, each,
         ]  # fmt: skip
 
 
-def measure(stand: MeasuredProduct, *, quick: bool, say: Callable[[str], None]) -> list[AgentProcess]:
+def measure(product: MeasuredProduct, *, quick: bool, log: Callable[[str], None]) -> list[AgentProcess]:
     """Adds robots until they are late."""
     found: list[AgentProcess] = []
-    for kind, rate_hz, agents, counts in QUICK if quick else WHOLE:
+    for kind, rate_hz, agents, counts in QUICK if quick else FULL:
         for count in counts:
-            found.append(crew(stand, kind, rate_hz, agents, count))
-            say(
+            found.append(run_agents(product, kind, rate_hz, agents, count))
+            log(
                 f"{agents} × {count} {kind} robots at {rate_hz:g} Hz: {found[-1].percent:.0f} % of a core, "
-                f"late p99 {found[-1].seen.late_p99_ms:.1f} ms"
+                f"late p99 {found[-1].statistics.late_p99_ms:.1f} ms"
             )
             if not found[-1].in_time:
                 break
     return found
 
 
-def crew(stand: MeasuredProduct, kind: Kind, rate_hz: float, agents: int, count: int) -> AgentProcess:
+def run_agents(product: MeasuredProduct, kind: Kind, rate_hz: float, agents: int, count: int) -> AgentProcess:
     """Runs agents with a number of robots each and observes them for some seconds."""
     with contextlib.ExitStack() as stack:
         homes = [Path(stack.enter_context(tempfile.TemporaryDirectory())) for _ in range(agents)]
         for home in homes:
-            pair(stand, home, kind, count)
+            pair(product, home, kind, count)
         processes = [stack.enter_context(running(home, rate_hz)) for home in homes]
         pool = stack.enter_context(ThreadPoolExecutor(agents))
 
-        def together(seconds: float) -> list[LoopStatistics]:
-            return list(pool.map(lambda process: watch(process, seconds), processes))
+        def observe_all(seconds: float) -> list[LoopStatistics]:
+            return list(pool.map(lambda process: observe(process, seconds), processes))
 
-        together(_SETTLE_S)
-        before_s, began_s = sum(processor_s(each.pid) for each in processes), time.monotonic()
-        seen = max(together(_WATCH_S), key=lambda each: each.late_p99_ms)
-        percent = 100 * (sum(processor_s(each.pid) for each in processes) - before_s) / (time.monotonic() - began_s)
-        return AgentProcess(kind, rate_hz, agents, count, seen, percent, resident_mb(processes[0].pid))
+        observe_all(_SETTLE_S)
+        before_s, started_s = sum(processor_s(each.pid) for each in processes), time.monotonic()
+        statistics = max(observe_all(_OBSERVE_S), key=lambda each: each.late_p99_ms)
+        percent = 100 * (sum(processor_s(each.pid) for each in processes) - before_s) / (time.monotonic() - started_s)
+        return AgentProcess(kind, rate_hz, agents, count, statistics, percent, resident_mb(processes[0].pid))
 
 
-def pair(stand: MeasuredProduct, home: Path, kind: Kind, count: int) -> None:
+def pair(product: MeasuredProduct, home: Path, kind: Kind, count: int) -> None:
     """Enrols an agent and claims it with the demo account; an API key may not claim."""
     driver = f":{LIGHT}" if kind == "light" else ""
     devices = [word for number in range(count) for word in ("--device", f"arm_{number}=ur5{driver}")]
-    server = ("--server", stand.machine.url, "--name", "AgentProcess", "--no-wait", "--no-qr")
-    made = subprocess.run(
+    server = ("--server", product.machine.url, "--name", "bench", "--no-wait", "--no-qr")
+    output = subprocess.run(
         [*program(20.0), "enroll", "--home", str(home), *server, *devices],
         cwd=ROOT, capture_output=True, text=True, check=True, stdin=subprocess.DEVNULL,
     )  # fmt: skip
-    words = made.stdout.split()
-    with Api(stand.machine) as owner:
+    words = output.stdout.split()
+    with Api(product.machine) as owner:
         owner.post("/agents/claim", {"code": words[words.index("code") + 1]})
 
 
@@ -127,32 +127,32 @@ def program(rate_hz: float) -> list[str]:
 def running(home: Path, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
     """Starts the agent and returns when its robots run."""
     with (
-        (home / "log").open("w") as log,
+        (home / "log").open("w") as log_file,
         subprocess.Popen(
             [*program(rate_hz), "run", "--home", str(home)],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=log,
+            stderr=log_file,
             text=True,
         ) as process,
     ):
         try:
-            said(process, "running")
+            wait_for_line(process, "running")
             yield process
         finally:
             process.terminate()
 
 
-def watch(process: "subprocess.Popen[str]", seconds: float) -> LoopStatistics:
+def observe(process: "subprocess.Popen[str]", seconds: float) -> LoopStatistics:
     """Observes the control loops from now on."""
     assert process.stdin is not None
     process.stdin.write(f"{seconds}\n")
     process.stdin.flush()
-    return msgspec.json.decode(said(process, "seen").partition(" ")[2], type=LoopStatistics)
+    return msgspec.json.decode(wait_for_line(process, "statistics").partition(" ")[2], type=LoopStatistics)
 
 
-def said(process: "subprocess.Popen[str]", beginning: str) -> str:
+def wait_for_line(process: "subprocess.Popen[str]", prefix: str) -> str:
     """Returns the next line with a prefix.
 
     Raises:
@@ -160,9 +160,9 @@ def said(process: "subprocess.Popen[str]", beginning: str) -> str:
     """
     assert process.stdout is not None
     for line in process.stdout:
-        if line.startswith(beginning):
+        if line.startswith(prefix):
             return line
-    raise RuntimeError(f"the agent ended with {process.wait()}")
+    raise RuntimeError(f"the agent ended with exit code {process.wait()}")
 
 
 def chart(found: list[AgentProcess]) -> Chart | None:
@@ -172,7 +172,7 @@ def chart(found: list[AgentProcess]) -> Chart | None:
     kinds = {each.kind for each in one}
     if len(counts) <= len(kinds):
         return None
-    late = {(each.kind, each.count): each.seen.late_p99_ms for each in one}
+    late = {(each.kind, each.count): each.statistics.late_p99_ms for each in one}
     return Chart(
         title=f"Control periods of one agent, telemetry at {CHARTED_HZ:g} Hz",
         kind="bar",
@@ -191,10 +191,10 @@ def ceilings(found: list[AgentProcess]) -> list[str]:
     for each in found:
         tried.setdefault((each.agents, each.kind, each.rate_hz), []).append(each)
     return [
-        f"Of one agent's, {max((each.count for each in crews if each.in_time), default=0)} {kind} ones were in time at "
+        f"One agent had {max((each.count for each in series if each.in_time), default=0)} {kind} robots in time at "
         f"{rate_hz:g} Hz."
-        for (agents, kind, rate_hz), crews in tried.items()
-        if agents == 1 and len(crews) > 1
+        for (agents, kind, rate_hz), series in tried.items()
+        if agents == 1 and len(series) > 1
     ]
 
 
@@ -207,4 +207,4 @@ which a control period exceeds 8 ms; a robot is in time if 99 % of its periods a
 functions and mosquitto run on the same machine and store the telemetry."""
     note = " ".join([note, *ceilings(found)])
     rows = [each.row(alone.get(each.kind)) for each in found]
-    return Table(title="Robots of one agent", columns=COLUMNS, rows=rows, note=note)
+    return Table(title="Robots per agent", columns=COLUMNS, rows=rows, note=note)

@@ -15,8 +15,8 @@ from benchmarks.reporting.report import percentile
 from benchmarks.scale import mqtt_packets
 from benchmarks.scale.publishers import SENT
 
-_QUIET_S: Final = 0.5
-_AT_ONCE: Final = 262_144
+_IDLE_S: Final = 0.5
+_BUFFER_BYTES: Final = 262_144
 MEASURED: Final = b'"at_ms":'
 """Marks the time of a measurement on the wall clock [ms]."""
 
@@ -39,44 +39,46 @@ class SubscriberResult(msgspec.Struct):
     count: int
     p50_ms: float
     p99_ms: float
-    most_ms: float
+    max_ms: float
     processor_s: float
 
 
 class Listener:
     """Receives messages in its own thread."""
 
-    def __init__(self, asked: SubscriberOptions) -> None:
-        self._clock, self._mark = (time.time, MEASURED) if asked.wall else (time.monotonic, SENT)
-        self._line = mqtt_packets.connect(asked.port, asked.client, asked.user, asked.password)
-        mqtt_packets.subscribe(self._line, asked.topic)
-        self._line.settimeout(None)
-        self._taken: list[float] = []
+    def __init__(self, options: SubscriberOptions) -> None:
+        self._clock, self._mark = (time.time, MEASURED) if options.wall else (time.monotonic, SENT)
+        self._connection = mqtt_packets.connect(options.port, options.client, options.user, options.password)
+        mqtt_packets.subscribe(self._connection, options.topic)
+        self._connection.settimeout(None)
+        self._delays_ms: list[float] = []
         self._spent_s = time.process_time()
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
         buffer = bytearray()
-        while came := self._line.recv(_AT_ONCE):
+        while data := self._connection.recv(_BUFFER_BYTES):
             now_ms = self._clock() * 1000
-            buffer += came
+            buffer += data
             for kind, body in mqtt_packets.packets(buffer):
                 if kind & 0xF0 == mqtt_packets.PUBLISH:
-                    self._taken.append(now_ms - said_ms(body, self._mark))
+                    self._delays_ms.append(now_ms - timestamp_ms(body, self._mark))
 
-    def heard(self) -> SubscriberResult:
+    def take_result(self) -> SubscriberResult:
         """Returns the result since the last call."""
-        known = -1
-        while known != len(self._taken):
-            known = len(self._taken)
-            time.sleep(_QUIET_S)
-        taken, self._taken = self._taken, []
+        count = -1
+        while count != len(self._delays_ms):
+            count = len(self._delays_ms)
+            time.sleep(_IDLE_S)
+        delays_ms, self._delays_ms = self._delays_ms, []
         spent_s, self._spent_s = time.process_time() - self._spent_s, time.process_time()
-        found = taken or [0.0]
-        return SubscriberResult(len(taken), percentile(found, 0.5), percentile(found, 0.99), max(found), spent_s)
+        samples = delays_ms or [0.0]
+        return SubscriberResult(
+            len(delays_ms), percentile(samples, 0.5), percentile(samples, 0.99), max(samples), spent_s
+        )
 
 
-def said_ms(body: bytes, mark: bytes) -> float:
+def timestamp_ms(body: bytes, mark: bytes) -> float:
     """Returns the time behind a marker in a message [ms]."""
     return float(body[body.rindex(mark) + len(mark) :].split(b",", 1)[0])
 
@@ -86,7 +88,7 @@ def main() -> None:
     listener = Listener(msgspec.json.decode(sys.stdin.readline(), type=SubscriberOptions))
     print("ready", flush=True)
     for _ in sys.stdin:
-        print(msgspec.json.encode(listener.heard()).decode(), flush=True)
+        print(msgspec.json.encode(listener.take_result()).decode(), flush=True)
 
 
 if __name__ == "__main__":

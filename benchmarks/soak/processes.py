@@ -20,7 +20,7 @@ _PARTS: Final = (
 CHILDREN: Final = "agent's children"
 STARTER: Final = "starter"
 PARTS: Final = ("functions", "worker", "broker", "agent", CHILDREN, STARTER)
-TOGETHER: Final = "all, without the children"
+TOTAL: Final = "total without the agent's children"
 _KB: Final = 1024
 
 
@@ -50,50 +50,50 @@ class ProcessWatcher:
     Args:
         root: Process id of the program that starts the others.
         every_s: Interval between samples.
-        file: CSV file that receives each sample at once, so a killed run keeps its samples.
+        file: CSV file that receives each sample immediately, so that a killed run keeps its samples.
     """
 
     def __init__(self, root: int, *, every_s: float, file: Path) -> None:
         self._root = root
         self._every_s = every_s
         self._file = file
-        self._began_s = time.monotonic()
-        self._ending = threading.Event()
+        self._started_s = time.monotonic()
+        self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self.samples: list[Sample] = []
 
     def _run(self) -> None:
         self._file.parent.mkdir(parents=True, exist_ok=True)
-        with self._file.open("w", encoding="utf-8") as out:
-            print(",".join(Sample.__struct_fields__), file=out, flush=True)
-            while not self._ending.wait(self._every_s):
-                for sample in look(self._root, time.monotonic() - self._began_s):
+        with self._file.open("w", encoding="utf-8") as output:
+            print(",".join(Sample.__struct_fields__), file=output, flush=True)
+            while not self._stopping.wait(self._every_s):
+                for sample in sample_parts(self._root, time.monotonic() - self._started_s):
                     self.samples.append(sample)
-                    print(",".join(map(str, msgspec.structs.astuple(sample))), file=out)
-                out.flush()
+                    print(",".join(map(str, msgspec.structs.astuple(sample))), file=output)
+                output.flush()
 
     def __enter__(self) -> Self:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ending.set()
+        self._stopping.set()
         self._thread.join()
 
 
-def look(root: int, at_s: float) -> Iterator[Sample]:
+def sample_parts(root: int, at_s: float) -> Iterator[Sample]:
     """Samples all parts now."""
     members: dict[str, list[int]] = {}
     for process, part in _family(root).items():
         members.setdefault(part, []).append(process)
     for part, processes in members.items():
-        held = [found for each in processes if (found := _held(each)) is not None]
-        if held:
-            rss, pss, own, descriptors, threads = map(sum, zip(*held, strict=True))
+        usages = [usage for each in processes if (usage := _usage(each)) is not None]
+        if usages:
+            rss, pss, own, descriptors, threads = map(sum, zip(*usages, strict=True))
             yield Sample(
                 at_s=round(at_s, 1),
                 part=part,
-                processes=len(held),
+                processes=len(usages),
                 rss_mb=round(rss / _KB, 3),
                 pss_mb=round(pss / _KB, 3),
                 own_mb=round(own / _KB, 3),
@@ -104,26 +104,26 @@ def look(root: int, at_s: float) -> Iterator[Sample]:
 
 def _family(root: int) -> dict[int, str]:
     """Returns the process ids of the product and the part of each."""
-    parent_of, found = parents(), {root: STARTER}
+    parent_of, parts = parents(), {root: STARTER}
     for process in family(root)[1:]:  # parents come first
-        found[process] = _part(process, found.get(parent_of.get(process, root), STARTER))
-    return found
+        parts[process] = _part(process, parts.get(parent_of.get(process, root), STARTER))
+    return parts
 
 
-def _part(process: int, above: str) -> str:
+def _part(process: int, parent: str) -> str:
     """Derives the part from the command line; children of the agent or the broker count as their parent."""
     try:
         command = Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
     except OSError:
         command = ""
-    if above in ("agent", CHILDREN):
+    if parent in ("agent", CHILDREN):
         return CHILDREN
-    if above != STARTER:
-        return above
+    if parent != STARTER:
+        return parent
     return next((part for words, part in _PARTS if words in command), STARTER)
 
 
-def _held(process: int) -> tuple[int, int, int, int, int] | None:
+def _usage(process: int) -> tuple[int, int, int, int, int] | None:
     """Returns resident, proportional and anonymous memory [kB], descriptors and threads; None if it has ended."""
     folder = Path(f"/proc/{process}")
     try:

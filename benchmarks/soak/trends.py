@@ -9,13 +9,13 @@ import msgspec
 import numpy as np
 
 from benchmarks.reporting.report import percentile
-from benchmarks.soak.processes import CHILDREN, PARTS, TOGETHER, Sample
+from benchmarks.soak.processes import CHILDREN, PARTS, TOTAL, Sample
 
 _Z_95: Final = 1.96
 _POINTS: Final = 60
 """Largest number of medians per series: adjacent samples are not independent, so they are combined."""
-_LEAST_POINTS: Final = 4
-_LEAST: Final = 0.1
+_MIN_POINTS: Final = 4
+_LOW_SHARE: Final = 0.1
 _SUMS: Final = ("processes", "rss_mb", "pss_mb", "own_mb", "descriptors", "threads")
 
 
@@ -59,50 +59,50 @@ def theil_sen(at_s: Sequence[float], values: Sequence[float]) -> Slope:
         ValueError: There are too few points.
     """
     count = len(at_s)
-    if count < _LEAST_POINTS:
+    if count < _MIN_POINTS:
         raise ValueError(f"{count} points are too few for a slope")
-    times, seen = np.asarray(at_s), np.asarray(values)
-    one, other = np.triu_indices(count, 1)
-    pairs = (seen[other] - seen[one]) / (times[other] - times[one])
+    times, measured = np.asarray(at_s), np.asarray(values)
+    first, second = np.triu_indices(count, 1)
+    pairs = (measured[second] - measured[first]) / (times[second] - times[first])
     pairs.sort()
     spread = _Z_95 * math.sqrt(count * (count - 1) * (2 * count + 5) / 18)
     low = max(0, round((len(pairs) - spread) / 2) - 1)
     high = min(len(pairs) - 1, round((len(pairs) + spread) / 2))
-    to_percent = 3600 * 100 / float(np.median(seen))
+    to_percent = 3600 * 100 / float(np.median(measured))
     return Slope(*(float(each) * to_percent for each in (np.median(pairs), pairs[low], pairs[high])))
 
 
-def drawn_together(at_s: Sequence[float], values: Sequence[float]) -> tuple[list[float], list[float]]:
+def reduced_to_medians(at_s: Sequence[float], values: Sequence[float]) -> tuple[list[float], list[float]]:
     """Returns medians of intervals of equal length."""
     size = max(1, math.ceil(len(at_s) / _POINTS))
-    stretches = [slice(begin, begin + size) for begin in range(0, len(at_s), size)]
-    return [statistics.median(at_s[each]) for each in stretches], [
-        statistics.median(values[each]) for each in stretches
+    intervals = [slice(begin, begin + size) for begin in range(0, len(at_s), size)]
+    return [statistics.median(at_s[each]) for each in intervals], [
+        statistics.median(values[each]) for each in intervals
     ]
 
 
 def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: float = 0.1) -> list[DescriptorTrend]:
     """Returns the values of each part and their total. ``end_share``: share of samples used at both ends."""
     samples = list(samples)
-    samples += together(samples)
+    samples += totals(samples)
     found = []
-    for part in (*PARTS, TOGETHER):
+    for part in (*PARTS, TOTAL):
         mine = [each for each in samples if each.part == part and each.at_s >= warm_up_s]
-        if len(mine) < _LEAST_POINTS:
+        if len(mine) < _MIN_POINTS:
             continue
         at_s = [each.at_s for each in mine]
         few = max(1, round(len(mine) * end_share))
 
         def ends(values: list[int], few: int = few) -> tuple[float, float]:
-            return percentile(values[:few], _LEAST), percentile(values[-few:], _LEAST)
+            return percentile(values[:few], _LOW_SHARE), percentile(values[-few:], _LOW_SHARE)
 
         rss, own = [each.rss_mb for each in mine], [each.own_mb for each in mine]
         descriptors, threads = [each.descriptors for each in mine], [each.threads for each in mine]
         found.append(
             DescriptorTrend(
                 part=part,
-                rss=theil_sen(*drawn_together(at_s, rss)),
-                own=theil_sen(*drawn_together(at_s, own)),
+                rss=theil_sen(*reduced_to_medians(at_s, rss)),
+                own=theil_sen(*reduced_to_medians(at_s, own)),
                 rss_mb=percentile(rss, 0.5),
                 own_mb=percentile(own, 0.5),
                 first_descriptors=ends(descriptors)[0],
@@ -115,13 +115,13 @@ def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: flo
     return found
 
 
-def together(samples: Iterable[Sample]) -> list[Sample]:
+def totals(samples: Iterable[Sample]) -> list[Sample]:
     """Returns the totals of each sampling; the number of the agent's children varies."""
-    looks: dict[float, list[Sample]] = {}
+    samplings: dict[float, list[Sample]] = {}
     for each in samples:
         if each.part != CHILDREN:
-            looks.setdefault(each.at_s, []).append(each)
+            samplings.setdefault(each.at_s, []).append(each)
     return [
-        Sample(at_s=at_s, part=TOGETHER, **{name: sum(getattr(each, name) for each in found) for name in _SUMS})
-        for at_s, found in looks.items()
+        Sample(at_s=at_s, part=TOTAL, **{name: sum(getattr(each, name) for each in found) for name in _SUMS})
+        for at_s, found in samplings.items()
     ]

@@ -1,4 +1,4 @@
-"""Benchmark suites, each a module with ``run(quick, say) -> Report``, in the order of the results page."""
+"""Benchmark suites, each a module with ``run(quick, log) -> Report``, in the order of the results page."""
 
 from typing import Final
 

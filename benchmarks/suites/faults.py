@@ -13,24 +13,24 @@ from device_agent.protocol.manifests import robot_type
 from tests.harness.network.brokers import BROKERS
 from tests.harness.paths import ROOT
 
-_STOP_MOST_MS: Final = 10.0
-_WATCHDOG_MOST_MS: Final = 350.0
-_RECOVERY_MOST_S: Final = 10.0
+_MAX_STOP_MS: Final = 10.0
+_MAX_WATCHDOG_MS: Final = 350.0
+_MAX_RECOVERY_S: Final = 10.0
 _ROUNDS: Final = 2
 _STOPS: Final = 20
 _QUICK_STOPS: Final = 5
-_RECORD: Final = "all orders, by the record"
+_TRACE: Final = "all actions, from the trace"
 _FULL_RAD_S: Final = 1.1
 """Maximum streaming speed of the arm."""
 _RAMP_S: Final = 0.01
 """Time until braking reaches its full deceleration (``joint_motion.py``)."""
-_WORDS: Final = dict(zip(SPEEDS, ("at rest", "at 0.1 rad/s", "at full speed of 1.1 rad/s"), strict=True))
+_SPEED_TEXTS: Final = dict(zip(SPEEDS, ("at rest", "at 0.1 rad/s", "at full speed of 1.1 rad/s"), strict=True))
 _ABOUT: Final = """Two simulated UR5 share one agent. Operators, agent, functions, worker and broker are separate
 processes; proxies between them inject the faults. An operator moves one arm back and forth at up to 1.1 rad/s. The
 other arm receives one action after another over HTTP; a request keeps its idempotency key until a response arrives.
 Each run injects a fault, repairs it and acquires control again."""
 _FAULTS_NOTE: Final = """*Stop*: time from the last setpoint at the agent to the first line of the simulation's trace
-(every 10 ms) without commanded motion. For a cut link or a killed broker, which the agent notices, it counts from the
+(every 10 ms) without commanded motion. For a cut link or a killed broker, which the agent detects, it counts from the
 cut; for killed functions, from the end of the lease; for a full disk, which ends the trace, by control periods. If
 the fault alone does not stop the arm (delay, loss, clock, disk, reordered messages), the operator is killed or stops
 streaming during the fault. A killed agent ends its simulation. *Recovery*: time from the repair (restart after a
@@ -41,12 +41,12 @@ full disk is a limit of 0 bytes on the growth of the agent's files."""
 _STOP_NOTE: Final = """Time from just before the operator's publish or request to a control period ({period:g} ms), on
 one clock and without proxies. *Braking*: the first period computed under the Stop. *Zero*: the first period without
 commanded motion. The braking ramp between them follows from the arm's limits: at most {braking:g} rad/s², reached
-within {ramp:g} ms. From 1.1 rad/s it takes at least {least:.0f} ms, so a Stop at full speed cannot reach zero within
+within {ramp:g} ms. From 1.1 rad/s it takes at least {minimum:.0f} ms, so a Stop at full speed cannot reach zero within
 10 ms."""
 
-_TRIED: Final = Table(
-    title="Stop, before and after",
-    columns=["what was changed", "message → braking: p99 ms", "POST → braking: p99 ms"],
+_HISTORY: Final = Table(
+    title="Stop: effect of changes",
+    columns=["change", "message → braking: p99 ms", "POST → braking: p99 ms"],
     rows=[
         ["before: a Stop waits for the next control period", 13.4, 15.5],
         ["a Stop starts a period at once; its message is published before signing", 6.62, 10.9],
@@ -57,85 +57,85 @@ since the previous period, so the arm never moves faster.""",
 )
 
 
-def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+def run(*, quick: bool, log: Callable[[str], None]) -> Report:
     """Runs all faults on both brokers; a quick run divides the faults between the brokers."""
-    found: list[FaultResult] = []
+    results: list[FaultResult] = []
     stops: list[StopResult] = []
-    orders: dict[tuple[str, str], tuple[int, int, int]] = {}
+    counts: dict[tuple[str, str], tuple[int, int, int]] = {}
     for number, kind in enumerate(BROKERS):
-        say(f"{kind}: starting")
-        with start(kind) as ground:
-            with ActionLoad(ground) as given:
-                rounds = FaultRuns(ground, given, seed=number)
+        log(f"{kind}: starting")
+        with start(kind) as product:
+            with ActionLoad(product) as load:
+                rounds = FaultRuns(product, load, seed=number)
                 chosen = rounds.names[number::2] if quick else rounds.names * _ROUNDS
                 for fault in chosen:
-                    found.append(rounds.round(fault))
-                    say(_told(found[-1]))
-            given.settle()
-            again = rounds.wrist_went_back()
+                    results.append(rounds.round(fault))
+                    log(_line(results[-1]))
+            load.settle()
+            repeated = rounds.count_repeated_actions()
             rounds.close()
-            for fault in {each.fault for each in given.given}:
-                mine = [each for each in given.given if each.fault == fault]
-                accepted = sum(bool(each.action) for each in mine)
-                orders[kind, fault] = accepted, len(lost(mine)), len(duplicated(mine, ground.noted.begun))
-            orders[kind, _RECORD] = 0, 0, again
-            ground.restart_agent_without_proxies()
-            with StopRuns(ground, seed=number) as made:
-                stops += series(made, _QUICK_STOPS if quick else _STOPS, say)
+            for fault in {each.fault for each in load.actions}:
+                mine = [each for each in load.actions if each.fault == fault]
+                accepted = sum(bool(each.id) for each in mine)
+                counts[kind, fault] = accepted, len(lost(mine)), len(duplicated(mine, product.recorder.starts))
+            counts[kind, _TRACE] = 0, 0, repeated
+            product.restart_agent_without_proxies()
+            with StopRuns(product, seed=number) as stop_runs:
+                stops += series(stop_runs, _QUICK_STOPS if quick else _STOPS, log)
     report = Report(suite="faults", title="Faults", about=[_ABOUT], quick=quick)
-    report.tables = [faults_table(found, orders), stops_table(stops), _TRIED]
+    report.tables = [faults_table(results, counts), stops_table(stops), _HISTORY]
     report.charts = [_chart(stops)]
-    report.claims = claims(found, stops, orders)
+    report.claims = claims(results, stops, counts)
     return report
 
 
-def _told(found: FaultResult) -> str:
-    stop = "" if found.stop_ms is None else f"rest after {found.stop_ms:.0f} ms, "
-    return f"{found.broker}: {found.fault}: {stop}recovered in {found.recovery_s:.1f} s"
+def _line(result: FaultResult) -> str:
+    stop = "" if result.stop_ms is None else f"rest after {result.stop_ms:.0f} ms, "
+    return f"{result.broker}: {result.fault}: {stop}recovered in {result.recovery_s:.1f} s"
 
 
-Counted = dict[tuple[str, str], tuple[int, int, int]]
+Counts = dict[tuple[str, str], tuple[int, int, int]]
 """(broker, fault) → accepted, lost and duplicated actions."""
 
 
-def faults_table(found: list[FaultResult], orders: Counted) -> Table:
+def faults_table(results: list[FaultResult], counts: Counts) -> Table:
     """Returns one row per fault and broker."""
-    columns = ["fault", "broker", "rounds", "stop ms: most", "recovery s: most", "orders", "lost", "doubled"]
+    columns = ["fault", "broker", "rounds", "stop ms: max", "recovery s: max", "actions", "lost", "duplicated"]
     rows: list[list[Cell]] = []
-    for fault in dict.fromkeys(each.fault for each in found):
+    for fault in dict.fromkeys(each.fault for each in results):
         for kind in BROKERS:
-            mine = [each for each in found if (each.fault, each.broker) == (fault, kind)]
+            mine = [each for each in results if (each.fault, each.broker) == (fault, kind)]
             if not mine:
                 continue
             stop = max((each.stop_ms for each in mine if each.stop_ms is not None), default=None)
-            accepted, gone, twice = orders.get((kind, fault), (0, 0, 0))
+            accepted, lost_count, duplicates = counts.get((kind, fault), (0, 0, 0))
             recovery = max(each.recovery_s for each in mine)
-            twice += sum(each.undone for each in mine)
-            rows.append([fault, kind, len(mine), stop, recovery, accepted, gone, twice])
-    records = [(kind, orders[kind, _RECORD]) for kind in BROKERS if (kind, _RECORD) in orders]
-    rows += [[_RECORD, kind, None, None, None, None, None, again] for kind, (_, _, again) in records]
-    return Table(title="What breaks", columns=columns, rows=rows, note=_FAULTS_NOTE)
+            duplicates += sum(each.reordered for each in mine)
+            rows.append([fault, kind, len(mine), stop, recovery, accepted, lost_count, duplicates])
+    traces = [(kind, counts[kind, _TRACE]) for kind in BROKERS if (kind, _TRACE) in counts]
+    rows += [[_TRACE, kind, None, None, None, None, None, repeated] for kind, (_, _, repeated) in traces]
+    return Table(title="Faults and recovery", columns=columns, rows=rows, note=_FAULTS_NOTE)
 
 
-def _select(stops: Iterable[StopResult], **wanted: str) -> list[StopResult]:
-    return [each for each in stops if all(getattr(each, name) == value for name, value in wanted.items())]
+def _select(stops: Iterable[StopResult], **values: str) -> list[StopResult]:
+    return [each for each in stops if all(getattr(each, name) == value for name, value in values.items())]
 
 
 def stops_table(stops: list[StopResult]) -> Table:
     """Returns one row per speed, method and broker."""
     columns = [
-        "arm", "way", "broker", "n", "at rad/s", "braking ms: p50", "p99", "most", "zero ms: p50", "p99", "most"
+        "arm", "method", "broker", "n", "at rad/s", "braking ms: p50", "p99", "max", "zero ms: p50", "p99", "max"
     ]  # fmt: skip
     rows: list[list[Cell]] = []
     for speed in SPEEDS:
-        for way in (MESSAGE, CALL):
+        for method in (MESSAGE, CALL):
             for kind in BROKERS:
-                mine = _select(stops, speed=speed, way=way, broker=kind)
+                mine = _select(stops, speed=speed, method=method, broker=kind)
                 if not mine:
                     continue
-                row: list[Cell] = [speed, way, kind, len(mine), percentile([each.at_rad_s for each in mine], 0.5)]
-                for taken in ([each.braking_ms for each in mine], [each.zero_ms for each in mine]):
-                    row += [percentile(taken, share) for share in (0.5, 0.99, 1.0)]
+                row: list[Cell] = [speed, method, kind, len(mine), percentile([each.at_rad_s for each in mine], 0.5)]
+                for samples in ([each.braking_ms for each in mine], [each.zero_ms for each in mine]):
+                    row += [percentile(samples, share) for share in (0.5, 0.99, 1.0)]
                 rows.append(row)
     return Table(title="Stop", columns=columns, rows=rows, note=_note())
 
@@ -143,9 +143,9 @@ def stops_table(stops: list[StopResult]) -> Table:
 def _note() -> str:
     """Returns the note with the arm's limits: a trapezoidal deceleration takes the plateau and one ramp."""
     arm = robot_type.load(ROOT / "robots" / "ur5")
-    least_s = _FULL_RAD_S / arm.braking_rad_s2 + _RAMP_S
+    minimum_s = _FULL_RAD_S / arm.braking_rad_s2 + _RAMP_S
     return _STOP_NOTE.format(
-        period=arm.period_ms, braking=arm.braking_rad_s2, ramp=_RAMP_S * 1000, least=least_s * 1000
+        period=arm.period_ms, braking=arm.braking_rad_s2, ramp=_RAMP_S * 1000, minimum=minimum_s * 1000
     )
 
 
@@ -155,44 +155,44 @@ def _chart(stops: list[StopResult]) -> Chart:
         series[f"zero, {speed}"] = [each.zero_ms for each in _select(stops, speed=speed)]
     return Chart(
         title="From Stop to braking, and to zero commanded velocity", kind="cdf", x_label="ms",
-        y_label="share of StopRuns", x=[], series=series,
+        y_label="share of Stops", x=[], series=series,
     )  # fmt: skip
 
 
-def claims(found: list[FaultResult], stops: list[StopResult], orders: Counted) -> list[Claim]:
+def claims(results: list[FaultResult], stops: list[StopResult], counts: Counts) -> list[Claim]:
     """Returns the targets."""
-    made: list[Claim] = []
-    for way in (MESSAGE, CALL):
-        mine = _select(stops, way=way)
+    stop_claims: list[Claim] = []
+    for method in (MESSAGE, CALL):
+        mine = _select(stops, method=method)
         braking = percentile([each.braking_ms for each in mine], 0.99)
-        text = f"Stop by {way} → braking begins, p99 of {len(mine)}"
-        made.append(Claim(text, braking, _STOP_MOST_MS, "ms"))
+        text = f"Stop by {method} → braking begins, p99 of {len(mine)}"
+        stop_claims.append(Claim(text, braking, _MAX_STOP_MS, "ms"))
     for speed in SPEEDS:
-        zero = [each.zero_ms for each in _select(stops, way=MESSAGE, speed=speed)]
-        text = f"Stop by {MESSAGE} → zero commanded velocity, arm {_WORDS[speed]}, p99 of {len(zero)}"
-        made.append(Claim(text, percentile(zero, 0.99), _STOP_MOST_MS, "ms"))
-    rest = [math.inf if each.moved_again else each.stop_ms for each in found if each.stop_ms is not None]
-    slowest = max(found, key=lambda each: each.recovery_s)
-    accepted = sum(each[0] for each in orders.values())
-    undone = sum(each.undone for each in found)
+        zero = [each.zero_ms for each in _select(stops, method=MESSAGE, speed=speed)]
+        text = f"Stop by {MESSAGE} → zero commanded velocity, arm {_SPEED_TEXTS[speed]}, p99 of {len(zero)}"
+        stop_claims.append(Claim(text, percentile(zero, 0.99), _MAX_STOP_MS, "ms"))
+    rest = [math.inf if each.moved_again else each.stop_ms for each in results if each.stop_ms is not None]
+    slowest = max(results, key=lambda each: each.recovery_s)
+    accepted = sum(each[0] for each in counts.values())
+    reordered = sum(each.reordered for each in results)
     return [
-        *made,
+        *stop_claims,
         Claim(
-            f"last fresh setpoint → zero commanded velocity, and rest until a new lease, most of {len(rest)}",
+            f"last fresh setpoint → zero commanded velocity, and rest until a new lease, max of {len(rest)}",
             max(rest),
-            _WATCHDOG_MOST_MS,
+            _MAX_WATCHDOG_MS,
             "ms",
         ),
         Claim(
             f"recovery after each fault, slowest: {slowest.fault} over {slowest.broker}",
             slowest.recovery_s,
-            _RECOVERY_MOST_S,
+            _MAX_RECOVERY_S,
             "s",
         ),
-        Claim(f"lost, of {accepted} orders", sum(each[1] for each in orders.values()), 0, "orders"),
+        Claim(f"lost, of {accepted} actions", sum(each[1] for each in counts.values()), 0, "actions"),
         Claim(
             "duplicated: actions executed twice, setpoints applied after newer ones",
-            sum(each[2] for each in orders.values()) + undone,
+            sum(each[2] for each in counts.values()) + reordered,
             0,
             "times",
         ),

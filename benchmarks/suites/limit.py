@@ -24,17 +24,17 @@ from benchmarks.baseline.product import (
 from benchmarks.reporting.report import Claim, Report, Table
 from tests.harness.network.brokers import BROKERS
 
-SETPOINT_MOST: Final = 1.5
-ACTION_MOST: Final = 2.5
+MAX_SETPOINT_RATIO: Final = 1.5
+MAX_ACTION_RATIO: Final = 2.5
 _ABOUT: Final = """A simulated UR5, its agent, the broker, the functions and the client are separate processes.
 *Setpoint* is the time from the operator's publish to the telemetry that reports it as applied; the arm is at rest.
 *Action* is the time from `POST actions` to the response `started`: identity, role, row write, signature, publish, the
 agent's checks and journal, acknowledgement. An echo process answers the reference exchanges: with MQTT QoS 0 a real
 setpoint by as many bytes as telemetry has, otherwise 150 bytes of JSON. All exchanges are 25 ms apart, like an
 operator's setpoints. After such a pause processors wake up and caches are cold: 0.3 ms back to back become 0.8 ms."""
-_TRIED: Final = Table(
-    title="Before and after, with mosquitto",
-    columns=["what was changed", "setpoint: p50 ms", "×", "action: p50 ms", "×"],
+_HISTORY: Final = Table(
+    title="Effect of changes, with mosquitto",
+    columns=["change", "setpoint: p50 ms", "×", "action: p50 ms", "×"],
     rows=[
         ["before", 17.8, 17.3, 11.4, 4.1],
         ["telemetry is published with setpoints; the receiving thread runs the period", 2.3, 2.3, None, None],
@@ -53,79 +53,80 @@ _TRIED: Final = Table(
             None,
             3.2,
         ],
-        ["acceptance is acknowledged at once", 1.16, 1.7, 6.1, 3.1],
+        ["acceptance is acknowledged immediately", 1.16, 1.7, 6.1, 3.1],
     ],
     note="""Each row was measured after its change, including the changes above it, on a machine with other load:
 medians and target ratios of one run each (2026-11-22). A setpoint waited for periodic telemetry and for the control
 period; the agent itself took 0.7 ms, half of it unnecessary arithmetic. An action waited three times for the disk (0.7
 to 1.5 ms each). With uvloop and httptools one process answers 1.4 to 2 times as many reads, and a bare FastAPI 1.9 to
-2.4 times as many; they are not used. In the last rows: the worker processed each message at once and delayed waiting
-requests, another thread wrote the agent's messages, and motion waited for the disk after its start was sent.""",
+2.4 times as many; they are not used. In the last rows: the worker processed each message immediately and delayed
+waiting requests, another thread wrote the agent's messages, and motion waited for the disk after its start
+was sent.""",
 )
-_TOPICS: Final = ("bench/limit/there", "bench/limit/back")
+_TOPICS: Final = ("bench/limit/request", "bench/limit/reply")
 
 
-def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+def run(*, quick: bool, log: Callable[[str], None]) -> Report:
     """Measures both brokers; on each, all paths run interleaved."""
-    report = Report(suite="limit", title="Against the limit", quick=quick, about=[_ABOUT])
+    report = Report(suite="limit", title="Lower bounds", quick=quick, about=[_ABOUT])
     rounds, each = (6, 25) if quick else (20, 50)
     for kind in BROKERS:
-        say(f"{kind}: starting")
-        with tempfile.TemporaryDirectory() as folder, start(Path(folder), kind) as stand, paths(stand) as found:
+        log(f"{kind}: starting")
+        with tempfile.TemporaryDirectory() as folder, start(Path(folder), kind) as product, paths(product) as found:
             taken = measure_interleaved(found, rounds=rounds, each=each, pause_s=PERIOD_S)
         _judge(report, kind, taken)
         for claim in report.claims[-2:]:
-            say(claim.line())
-    report.tables.append(_TRIED)
+            log(claim.line())
+    report.tables.append(_HISTORY)
     return report
 
 
 def _judge(report: Report, kind: str, taken: dict[str, list[float]]) -> None:
-    report.tables.append(table(f"Over {kind}", taken, against="MQTT, QoS 0"))
+    report.tables.append(table(f"Over {kind}", taken, reference="MQTT, QoS 0"))
     mqtt, echo = median(taken["MQTT, QoS 0"]), median(taken["HTTP"])
     report.claims += [
         Claim(
-            f"setpoint → applied → seen again, to a bare round trip over {kind}",
+            f"setpoint until telemetry reports it as applied, to a bare round trip over {kind}",
             median(taken["setpoint"]) / mqtt,
-            SETPOINT_MOST,
+            MAX_SETPOINT_RATIO,
             "×",
         ),
         Claim(
             f"`POST actions` until started, to bare HTTP and a bare round trip over {kind}",
             median(taken["action"]) / (median(taken["MQTT, QoS 1"]) + echo),
-            ACTION_MOST,
+            MAX_ACTION_RATIO,
             "×",
         ),
     ]
 
 
 @contextlib.contextmanager
-def paths(stand: MeasuredProduct) -> Iterator[dict[str, Exchange]]:
+def paths(product: MeasuredProduct) -> Iterator[dict[str, Exchange]]:
     """Yields all exchanges with open connections."""
     with contextlib.ExitStack() as stack:
         tcp, web = free_port(), free_port()
         stack.enter_context(start_peer("benchmarks.baseline.echo_servers", "tcp", str(tcp)))
         stack.enter_context(start_peer("benchmarks.baseline.echo_servers", "http", str(web)))
-        found: dict[str, Exchange] = {"TCP": _tcp(stack, tcp), "HTTP": _http(stack, web)}
-        hand = stack.enter_context(StreamingOperator(stand))
-        hand.exchange()
-        found["MQTT, QoS 0"] = mqtt(stack, stand, 0, hand.sent, len(hand.received))
-        found["MQTT, QoS 1"] = mqtt(stack, stand, 1)
-        found["setpoint"] = hand.exchange
-        caller = stack.enter_context(HttpConnection(stand.machine.port, {"Authorization": f"Bearer {stand.token}"}))
-        found["action"] = partial(hand.run_action, caller)
-        yield found
+        exchanges: dict[str, Exchange] = {"TCP": _tcp(stack, tcp), "HTTP": _http(stack, web)}
+        operator = stack.enter_context(StreamingOperator(product))
+        operator.exchange()
+        exchanges["MQTT, QoS 0"] = mqtt(stack, product, 0, operator.sent, len(operator.received))
+        exchanges["MQTT, QoS 1"] = mqtt(stack, product, 1)
+        exchanges["setpoint"] = operator.exchange
+        caller = stack.enter_context(HttpConnection(product.machine.port, {"Authorization": f"Bearer {product.token}"}))
+        exchanges["action"] = partial(operator.run_action, caller)
+        yield exchanges
 
 
 def _tcp(stack: contextlib.ExitStack, port: int) -> Exchange:
-    line = stack.enter_context(socket.create_connection((HOST, port), TIMEOUT_S))
-    line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connection = stack.enter_context(socket.create_connection((HOST, port), TIMEOUT_S))
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def exchange() -> None:
-        line.sendall(PAYLOAD)
-        left = len(PAYLOAD)
-        while left:
-            left -= len(line.recv(left))
+        connection.sendall(PAYLOAD)
+        remaining = len(PAYLOAD)
+        while remaining:
+            remaining -= len(connection.recv(remaining))
 
     return exchange
 
@@ -140,27 +141,27 @@ def _http(stack: contextlib.ExitStack, port: int) -> Exchange:
 
 
 def mqtt(
-    stack: contextlib.ExitStack, stand: MeasuredProduct, qos: int, payload: bytes = PAYLOAD, answer_bytes: int = 0
+    stack: contextlib.ExitStack, product: MeasuredProduct, qos: int, payload: bytes = PAYLOAD, reply_bytes: int = 0
 ) -> Exchange:
     """Returns an exchange with another process over MQTT; the reply is the payload, padded if requested."""
-    there, back = (f"{topic}/{qos}" for topic in _TOPICS)
-    rights = stand.rights(publish=(back,), subscribe=(there,))
+    request_topic, reply_topic = (f"{topic}/{qos}" for topic in _TOPICS)
+    credentials = product.credentials(publish=(reply_topic,), subscribe=(request_topic,))
     stack.enter_context(
         start_peer(
             "benchmarks.baseline.echo_servers",
             "mqtt",
-            str(stand.mqtt_port),
-            *rights,
-            there,
-            back,
+            str(product.mqtt_port),
+            *credentials,
+            request_topic,
+            reply_topic,
             str(qos),
-            str(answer_bytes),
+            str(reply_bytes),
         )
     )
-    line = stack.enter_context(stand.connect(publish=(there,), subscribe=(back,), qos=qos))
+    client = stack.enter_context(product.connect(publish=(request_topic,), subscribe=(reply_topic,), qos=qos))
 
     def exchange() -> None:
-        line.client.publish(there, payload, qos)
-        line.received.get(timeout=TIMEOUT_S)
+        client.client.publish(request_topic, payload, qos)
+        client.received.get(timeout=TIMEOUT_S)
 
     return exchange

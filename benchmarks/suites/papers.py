@@ -12,10 +12,10 @@ segments arrives one retransmission time later (200 ms plus a round trip, as on 
 it."""
 
 
-def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+def run(*, quick: bool, log: Callable[[str], None]) -> Report:
     """Runs the measurements of both papers."""
-    report = Report(suite="papers", title="The papers' figures", quick=quick, about=[_ABOUT])
-    table2.measure(report, quick=quick, say=say)
-    figure5.measure(report, quick=quick, say=say)
-    figure6.measure(report, quick=quick, say=say)
+    report = Report(suite="papers", title="Comparison with the papers", quick=quick, about=[_ABOUT])
+    table2.measure(report, quick=quick, log=log)
+    figure5.measure(report, quick=quick, log=log)
+    figure6.measure(report, quick=quick, log=log)
     return report

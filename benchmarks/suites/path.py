@@ -16,41 +16,41 @@ from tests.harness.network.brokers import BROKERS
 
 ROBOT: Final = "ur5"
 JOINT: Final = "wrist_3"
-SWINGS_RAD: Final = 0.02
+SWING_RAD: Final = 0.02
 _WARM_UP: Final = 5
 _WITHIN_S: Final = 10.0
-ASKED: Final = "asked"
-ANSWERED: Final = "answered"
+REQUESTED: Final = "requested"
+RESPONDED: Final = "responded"
 Steps = tuple[tuple[str, str], ...]
 """(timestamp name, description of the part that ends there)."""
 ACTION: Final[Steps] = (
-    ("http-in", "HTTP in"),
+    ("http-in", "HTTP request"),
     ("identified", "identity"),
     ("writing", "role, robot, lease, plan"),
-    ("written", "row's write"),
-    ("publishing", "still allowed, signature"),
-    ("heard:cmd", "publish, broker, to the agent"),
+    ("written", "row write"),
+    ("publishing", "permission check, signature"),
+    ("received:cmd", "publish, broker, to the agent"),
     ("checked", "agent: signature, journal, checks"),
-    ("ack-said:started", "agent: begins, journal"),
-    ("ack-heard:started", "ack: broker, to the functions"),
-    ("http-out", "answer's row"),
-    (ANSWERED, "HTTP out, to the caller"),
+    ("ack-published:started", "agent: start, journal"),
+    ("ack-received:started", "ack: broker, to the functions"),
+    ("http-out", "response's row"),
+    (RESPONDED, "HTTP response to the caller"),
 )
 MOTION: Final[Steps] = (
-    ("http-in", "HTTP in"),
+    ("http-in", "HTTP request"),
     ("publishing", "functions: identity, role, row, signature"),
-    ("heard:cmd", "publish, broker, to the agent"),
+    ("received:cmd", "publish, broker, to the agent"),
     ("checked", "agent: signature, journal, checks"),
     ("driver", "control loop, driver"),
     ("moves:ur5", "simulation, to the first motion"),
 )
 SETPOINT: Final[Steps] = (
-    ("heard:ctl", "publish, broker, to the agent"),
-    ("taken", "agent: decode, checks"),
-    ("decided", "control loop: waits, decides"),
-    ("driver", "driver applies"),
-    ("telemetry", "telemetry: measured, encoded"),
-    (ANSWERED, "broker, to the operator, decoded"),
+    ("received:ctl", "publish, broker, to the agent"),
+    ("setpoint-accepted", "agent: decode, checks"),
+    ("decided", "control loop: wait, decision"),
+    ("driver", "driver applies the setpoint"),
+    ("telemetry", "telemetry: measure, encode"),
+    (RESPONDED, "broker, to the operator, decode"),
 )
 _ABOUT: Final = """Each program sends timestamps on the common clock of the machine's processes. A part is the time
 between two consecutive timestamps, so the parts of one exchange add up to its duration. The product contains no
@@ -58,16 +58,16 @@ tracing: the benchmark wraps public functions, which costs about ten microsecond
 simulated UR5; an action moves its wrist by one degree. All connections use loopback."""
 
 
-def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+def run(*, quick: bool, log: Callable[[str], None]) -> Report:
     """Measures both brokers."""
-    report = Report(suite="path", title="The path by parts", quick=quick, about=[_ABOUT])
+    report = Report(suite="path", title="Latency by stage", quick=quick, about=[_ABOUT])
     count = 28 if quick else 200
     found: dict[str, dict[str, Parts]] = {}
     for kind in BROKERS:
-        say(f"{kind}: starting")
-        with tempfile.TemporaryDirectory() as folder, start(Path(folder), kind, {ROBOT: JOINT}) as stand:
-            found[kind] = take(stand, count)
-        say(", ".join(f"{path} {percentile(whole(each), 0.5):.3g} ms" for path, each in found[kind].items()))
+        log(f"{kind}: starting")
+        with tempfile.TemporaryDirectory() as folder, start(Path(folder), kind, {ROBOT: JOINT}) as product:
+            found[kind] = measure(product, count)
+        log(", ".join(f"{path} {percentile(totals(each), 0.5):.3g} ms" for path, each in found[kind].items()))
     show(report, found)
     return report
 
@@ -76,54 +76,58 @@ Parts = list[dict[str, float]]
 """One dictionary per exchange: part → duration [ms]."""
 
 
-def take(stand: TracedProduct, count: int) -> dict[str, Parts]:
+def measure(product: TracedProduct, count: int) -> dict[str, Parts]:
     """Measures actions and setpoints alternately; incomplete exchanges are left out."""
     found: dict[str, Parts] = {"action": [], "first motion": [], "setpoint": []}
-    with StreamingOperator(stand, ROBOT) as hand, stand.caller() as caller:
-        home_rad = hand.target_rad[JOINT]
+    with StreamingOperator(product, ROBOT) as operator, product.caller() as caller:
+        home_rad = operator.target_rad[JOINT]
         for index in range(count + _WARM_UP):
-            to_rad = home_rad + (0.0 if index % 2 else SWINGS_RAD)
-            marks = list(_act(stand, caller, hand, to_rad))
-            taken: dict[str, dict[str, float] | None] = {}
-            taken["action"], taken["first motion"] = parts(marks, ACTION), parts(marks, MOTION)
-            hand.target_rad[JOINT] = to_rad
-            hand.exchange()  # streaming resumes after the action
+            to_rad = home_rad + (0.0 if index % 2 else SWING_RAD)
+            marks = list(_run_action(product, caller, operator, to_rad))
+            stages: dict[str, dict[str, float] | None] = {}
+            stages["action"], stages["first motion"] = parts(marks, ACTION), parts(marks, MOTION)
+            operator.target_rad[JOINT] = to_rad
+            operator.exchange()  # streaming resumes after the action
             time.sleep(0.1 + 0.003 * (index % 7))  # sample every phase of the control period
-            taken["setpoint"] = parts(_set(stand, hand), SETPOINT)
-            for name, one in taken.items():
+            stages["setpoint"] = parts(_send_setpoint(product, operator), SETPOINT)
+            for name, one in stages.items():
                 if one is not None and index >= _WARM_UP:
                     found[name].append(one)
     for name, each in found.items():
         if len(each) < count / 2:
-            raise RuntimeError(f"{name}: only {len(each)} of {count} were told whole; has a traced function moved?")
+            raise RuntimeError(
+                f"{name}: only {len(each)} of {count} exchanges are complete; check the traced functions"
+            )
     return found
 
 
-def _act(stand: TracedProduct, caller: HttpConnection, hand: StreamingOperator, to_rad: float) -> Iterator[Timestamp]:
+def _run_action(
+    product: TracedProduct, caller: HttpConnection, operator: StreamingOperator, to_rad: float
+) -> Iterator[Timestamp]:
     """Runs one action and yields its timestamps."""
     request = {"kind": "move_joints", "position_rad": {JOINT: to_rad}}
-    asked = {"request": request, "epoch": hand.epoch, "wait_for": "started", "wait_ms": 10_000}
-    body = json.dumps(asked).encode()
-    stand.marks.drain()
-    stand.marks.until(f"rests:{ROBOT}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
+    body = {"request": request, "epoch": operator.epoch, "wait_for": "started", "wait_ms": 10_000}
+    payload = json.dumps(body).encode()
+    product.marks.drain()
+    product.marks.until(f"rests:{ROBOT}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
     time.sleep(random.uniform(0.0, 0.01))  # sample every phase of the control period
-    began_ns = time.monotonic_ns()
-    yield Timestamp(ASKED, began_ns)
-    started = caller.request("POST", f"/api/v1/devices/{hand.device['id']}/actions", body)
-    yield Timestamp(ANSWERED, time.monotonic_ns())
-    yield from stand.marks.until(f"moves:{ROBOT}", since_ns=began_ns, within_s=_WITHIN_S)
+    started_ns = time.monotonic_ns()
+    yield Timestamp(REQUESTED, started_ns)
+    started = caller.request("POST", f"/api/v1/devices/{operator.device['id']}/actions", payload)
+    yield Timestamp(RESPONDED, time.monotonic_ns())
+    yield from product.marks.until(f"moves:{ROBOT}", since_ns=started_ns, within_s=_WITHIN_S)
     caller.request("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
 
 
-def _set(stand: TracedProduct, hand: StreamingOperator) -> list[Timestamp]:
+def _send_setpoint(product: TracedProduct, operator: StreamingOperator) -> list[Timestamp]:
     """Sends one setpoint and returns its timestamps until telemetry reports it."""
-    stand.marks.drain()
-    began_ns = time.monotonic_ns()
-    took_ms = hand.exchange()
-    answered = Timestamp(ANSWERED, time.monotonic_ns())
+    product.marks.drain()
+    started_ns = time.monotonic_ns()
+    duration_ms = operator.exchange()
+    responded = Timestamp(RESPONDED, time.monotonic_ns())
     # `exchange` may have waited before it sent the setpoint.
-    asked = Timestamp(ASKED, max(began_ns, answered.at_ns - round(took_ms * 1e6)))
-    return [asked, *stand.marks.drain(), answered]
+    requested = Timestamp(REQUESTED, max(started_ns, responded.at_ns - round(duration_ms * 1e6)))
+    return [requested, *product.marks.drain(), responded]
 
 
 def parts(marks: Sequence[Timestamp], steps: Steps) -> dict[str, float] | None:
@@ -132,18 +136,18 @@ def parts(marks: Sequence[Timestamp], steps: Steps) -> dict[str, float] | None:
     The timestamp of a step is the first one of its name after the previous step.
     """
     marks = sorted(marks, key=lambda mark: mark.at_ns)
-    at_ns = next(mark.at_ns for mark in marks if mark.name == ASKED)
-    found: dict[str, float] = {}
-    for name, what in steps:
+    at_ns = next(mark.at_ns for mark in marks if mark.name == REQUESTED)
+    durations: dict[str, float] = {}
+    for name, description in steps:
         following = next((mark.at_ns for mark in marks if mark.name == name and mark.at_ns >= at_ns), None)
         if following is None:
             return None
-        found[what] = (following - at_ns) / 1e6
+        durations[description] = (following - at_ns) / 1e6
         at_ns = following
-    return found
+    return durations
 
 
-def whole(found: Parts) -> list[float]:
+def totals(found: Parts) -> list[float]:
     """Returns the total duration of each exchange [ms]."""
     return [sum(each.values()) for each in found]
 
@@ -151,7 +155,7 @@ def whole(found: Parts) -> list[float]:
 _TITLES: Final = {
     "action": "`POST actions` until started",
     "first motion": "`POST actions` until the simulated joint moves",
-    "setpoint": "A setpoint until it is seen in telemetry",
+    "setpoint": "A setpoint until telemetry reports it",
 }
 
 
@@ -168,25 +172,27 @@ def show(report: Report, found: dict[str, dict[str, Parts]]) -> None:
                 x_label="ms, medians of the parts",
                 y_label="",
                 x=[*names],
-                series={kind: [_middle(each[path], name) for name in names] for kind, each in found.items()},
+                series={kind: [_median(each[path], name) for name in names] for kind, each in found.items()},
             )
         )
 
 
 def _table(title: str, found: Parts) -> Table:
-    total = percentile(whole(found), 0.5)
+    total = percentile(totals(found), 0.5)
     rows: list[list[Cell]] = []
     for part in found[0]:
-        middle = _middle(found, part)
-        rows.append([part, middle, percentile([each[part] for each in found], 0.95), round(100 * middle / total, 1)])
-    summed = sum(_middle(found, part) for part in found[0])
+        median_ms = _median(found, part)
+        rows.append(
+            [part, median_ms, percentile([each[part] for each in found], 0.95), round(100 * median_ms / total, 1)]
+        )
+    summed = sum(_median(found, part) for part in found[0])
     rows += [
         ["sum of the medians", summed, None, round(100 * summed / total, 1)],
-        ["the whole", total, percentile(whole(found), 0.95), 100.0],
+        ["total", total, percentile(totals(found), 0.95), 100.0],
     ]
-    columns = ["part", "p50 ms", "p95 ms", "% of the whole"]
+    columns = ["part", "p50 ms", "p95 ms", "% of total"]
     return Table(title=f"{title}, n = {len(found)}", columns=columns, rows=rows)
 
 
-def _middle(found: Parts, part: str) -> float:
+def _median(found: Parts, part: str) -> float:
     return percentile([each[part] for each in found], 0.5)

@@ -12,7 +12,7 @@ from benchmarks.peers import operators, safety
 from benchmarks.reporting.report import Chart, Claim, Report, percentile
 from tests.harness.network.brokers import BROKERS
 
-OURS: Final = "Telescope, mosquitto"
+TELESCOPE: Final = "Telescope, mosquitto"
 ROSBRIDGE: Final = "rosbridge-style, roslibpy"
 PEERS: Final = {
     ROSBRIDGE: operators.rosbridge,
@@ -23,7 +23,7 @@ PEERS: Final = {
 _ABOUT: Final = """A setpoint for six joints until telemetry reports it as applied, 40 per second like the console.
 Robot, operator and server are separate processes on loopback. The robot is the same simulated UR5 with the same driver.
 Telescope is the product as `make up` starts it, with lease, loop age, limits, self-collision check and recording. The
-other programs use their own library, apply each setpoint and report it at once."""
+other programs use their own library, apply each setpoint and report it immediately."""
 _HOW: Final = """rosbridge: `roslibpy` at both ends and a server of the rosbridge protocol without ROS, which costs
 less than a real one. zenoh: two peers over TCP without a router, `express`. gRPC: a bidirectional stream of bytes
 with asyncio at the robot, without protobuf. Foxglove: the SDK's server at the robot, to which the operator publishes.
@@ -31,32 +31,32 @@ zenoh, gRPC and Foxglove connect both ends directly: no server can check permiss
 Telescope and rosbridge use a third process."""
 
 
-def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+def run(*, quick: bool, log: Callable[[str], None]) -> Report:
     """Measures all protocols interleaved."""
     rounds, each = (6, 25) if quick else (14, 50)
-    say("starting everything")
+    log("starting all programs")
     with paths() as found:
-        say("taking turns")
+        log("measuring interleaved")
         taken = measure_interleaved(found, rounds=rounds, each=each)
-    report = Report(suite="peers", title="Peers at the same work", quick=quick, about=[_ABOUT, _HOW])
-    report.tables += [table("Setpoint → applied → seen again", taken, against=OURS), safety.table()]
+    report = Report(suite="peers", title="Comparable protocols", quick=quick, about=[_ABOUT, _HOW])
+    report.tables += [table("Setpoint until reported as applied", taken, reference=TELESCOPE), safety.table()]
     report.charts.append(_chart(taken))
     report.claims.append(
         Claim(
-            "setpoint → applied → seen again over mosquitto, to the rosbridge-style peer",
-            median(taken[OURS]) / median(taken[ROSBRIDGE]),
+            "setpoint until reported as applied over mosquitto, to the rosbridge-style peer",
+            median(taken[TELESCOPE]) / median(taken[ROSBRIDGE]),
             1.0,
             "×",
         )
     )
-    say(report.claims[0].line())
+    log(report.claims[0].line())
     return report
 
 
 def _chart(taken: dict[str, list[float]]) -> Chart:
     shares = {"median": 0.5, "p95": 0.95, "p99": 0.99}
     return Chart(
-        title="Setpoint → applied → seen again",
+        title="Setpoint until reported as applied",
         kind="bar",
         x_label="",
         y_label="ms",
@@ -69,11 +69,11 @@ def _chart(taken: dict[str, list[float]]) -> Chart:
 def paths() -> Iterator[dict[str, Exchange]]:
     """Yields the exchanges of two products and four protocols, all connected."""
     with contextlib.ExitStack() as stack:
-        found: dict[str, Exchange] = {}
+        exchanges: dict[str, Exchange] = {}
         for kind in reversed(BROKERS):
             home = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            stand = stack.enter_context(start(home, kind))
-            found[f"Telescope, {kind}"] = stack.enter_context(StreamingOperator(stand)).exchange
+            product = stack.enter_context(start(home, kind))
+            exchanges[f"Telescope, {kind}"] = stack.enter_context(StreamingOperator(product)).exchange
         for name, open_peer in PEERS.items():
-            found[name] = stack.enter_context(open_peer())
-        yield found
+            exchanges[name] = stack.enter_context(open_peer())
+        yield exchanges

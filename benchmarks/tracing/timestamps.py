@@ -13,7 +13,7 @@ from typing import Final, NamedTuple, Self
 from benchmarks.baseline.echo_servers import HOST
 
 VARIABLE: Final = "TELESCOPE_BENCH_MARKS"
-_MOST_BYTES: Final = 200
+_MAX_BYTES: Final = 200
 
 
 class Timestamp(NamedTuple):
@@ -35,13 +35,13 @@ class TimestampReceiver:
 
     def drain(self) -> list[Timestamp]:
         """Returns the timestamps received since the last call, ordered by time."""
-        found: list[Timestamp] = []
+        timestamps: list[Timestamp] = []
         while True:
             try:
-                name, at_ns = self._socket.recv(_MOST_BYTES).decode().split()
+                name, at_ns = self._socket.recv(_MAX_BYTES).decode().split()
             except BlockingIOError:
-                return sorted(found, key=lambda mark: mark.at_ns)
-            found.append(Timestamp(name, int(at_ns)))
+                return sorted(timestamps, key=lambda mark: mark.at_ns)
+            timestamps.append(Timestamp(name, int(at_ns)))
 
     def until(self, name: str, *, since_ns: int, within_s: float) -> list[Timestamp]:
         """Waits for an event and returns all timestamps from then on.
@@ -49,15 +49,17 @@ class TimestampReceiver:
         Raises:
             TimeoutError: The event did not occur in time.
         """
-        found: list[Timestamp] = []
+        timestamps: list[Timestamp] = []
         deadline_s = time.monotonic() + within_s
-        while not any(mark.name == name for mark in found):
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0:
-                raise TimeoutError(f"no mark '{name}' in {within_s:g} s, only {', '.join(mark.name for mark in found)}")
-            select.select([self._socket], [], [], left_s)
-            found += [mark for mark in self.drain() if mark.at_ns >= since_ns]
-        return sorted(found, key=lambda mark: mark.at_ns)
+        while not any(mark.name == name for mark in timestamps):
+            remaining_s = deadline_s - time.monotonic()
+            if remaining_s <= 0:
+                raise TimeoutError(
+                    f"no timestamp '{name}' in {within_s:g} s, only {', '.join(mark.name for mark in timestamps)}"
+                )
+            select.select([self._socket], [], [], remaining_s)
+            timestamps += [mark for mark in self.drain() if mark.at_ns >= since_ns]
+        return sorted(timestamps, key=lambda mark: mark.at_ns)
 
     def __enter__(self) -> Self:
         return self
@@ -67,14 +69,14 @@ class TimestampReceiver:
 
 
 class TimestampSender:
-    """Sends timestamps to the port that the environment names."""
+    """Sends timestamps to the port in the environment variable."""
 
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect((HOST, int(os.environ[VARIABLE])))
 
-    def tell(self, name: str) -> None:
-        """Sends an event with the present time."""
+    def send(self, name: str) -> None:
+        """Sends an event with the current time."""
         self._socket.send(f"{name} {time.monotonic_ns()}".encode())
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The product with one simulated robot and tracing, with simulated networks before the operator and the agent."""
+"""The product with one simulated robot and tracing, with a simulated network for the operator and the agent."""
 
 import contextlib
 from collections.abc import Iterator, Mapping
@@ -22,26 +22,26 @@ class TracedProduct(MeasuredProduct):
     """
 
     def __init__(
-        self, machine: Machine, kind: BrokerKind, cloud: Cloud, *, marks: TimestampReceiver, way: DelayedNetwork
+        self, machine: Machine, kind: BrokerKind, cloud: Cloud, *, marks: TimestampReceiver, network: DelayedNetwork
     ) -> None:
         super().__init__(machine, kind, cloud)
         self.marks = marks
-        self._way = way
-        self._far = False
+        self._network = network
+        self._delayed = False
 
-    def place(self, *, rtt_ms: float) -> None:
-        """Sets the network delay of operator and agent; it applies to connections of the operator from now on."""
-        self._way.set(rtt_ms=rtt_ms)
-        self._far = rtt_ms > 0
+    def set_delay(self, *, rtt_ms: float) -> None:
+        """Sets the network delay of operator and agent; it applies to new connections of the operator."""
+        self._network.set(rtt_ms=rtt_ms)
+        self._delayed = rtt_ms > 0
 
     @property
     def mqtt_port(self) -> int:
         """Port at which the operator reaches the broker."""
-        return self._way.ports[super().mqtt_port] if self._far else super().mqtt_port
+        return self._network.ports[super().mqtt_port] if self._delayed else super().mqtt_port
 
     def caller(self) -> HttpConnection:
         """Returns an open connection of the operator to the API."""
-        port = self._way.ports[self.machine.port] if self._far else self.machine.port
+        port = self._network.ports[self.machine.port] if self._delayed else self.machine.port
         return HttpConnection(port, {"Authorization": f"Bearer {self.token}"})
 
 
@@ -49,7 +49,7 @@ class TracedProduct(MeasuredProduct):
 def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) -> Iterator[TracedProduct]:
     """Runs the product with one robot in its own scene, or a whole room if ``more`` has ``TELESCOPE_ROOM``.
 
-    The agent reaches server and broker through a delay proxy, which adds no delay before ``place`` is called.
+    The agent reaches server and broker through a delay proxy, which adds no delay before ``set_delay`` is called.
 
     Args:
         home: Folder of the product.
@@ -60,20 +60,22 @@ def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) 
     port = free_ports()
     with contextlib.ExitStack() as stack:
         marks = stack.enter_context(TimestampReceiver())
-        way = stack.enter_context(start_delay(port, port + 1, rtt_ms=0))
-        wanted = {
+        network = stack.enter_context(start_delay(port, port + 1, rtt_ms=0))
+        variables = {
             "TELESCOPE_BROKER": kind,
             "TELESCOPE_RATE_KEY": "0",
             "TELESCOPE_RATE_ACCOUNT": "0",
             traced_programs.DEVICE: next(iter(joints)),
             traced_programs.JOINTS: ",".join(f"{robot}:{each}" for robot, each in joints.items()),
-            traced_programs.WAYS: ",".join(f"{each}={way.ports[each]}" for each in way.ports),
+            traced_programs.PORTS: ",".join(f"{each}={network.ports[each]}" for each in network.ports),
             **marks.settings,
             **more,
         }
-        machine = stack.enter_context(start_program("benchmarks.tracing.traced_programs machine", home, port, wanted))
+        machine = stack.enter_context(
+            start_program("benchmarks.tracing.traced_programs machine", home, port, variables)
+        )
         if machine.process.poll() is not None:
             raise RuntimeError("".join(machine.lines))
-        given = {"TELESCOPE_HOME": str(home), "TELESCOPE_PORT": str(machine.port), **wanted}
-        cloud = stack.enter_context(Cloud(settings.read(given)))
-        yield TracedProduct(machine, kind, cloud, marks=marks, way=way)
+        environment = {"TELESCOPE_HOME": str(home), "TELESCOPE_PORT": str(machine.port), **variables}
+        cloud = stack.enter_context(Cloud(settings.read(environment)))
+        yield TracedProduct(machine, kind, cloud, marks=marks, network=network)

@@ -5,7 +5,7 @@ import statistics
 import pytest
 
 from benchmarks.papers import figure5, figure6, table2
-from benchmarks.papers.table2 import EMBEDDED, OURS, Condition
+from benchmarks.papers.table2 import EMBEDDED, MOSQUITTO, Condition
 from benchmarks.peers import operators
 from benchmarks.peers.arm import HOME_RAD, NAMES, setpoint
 from benchmarks.peers.robots import from_ros, to_ros
@@ -24,9 +24,9 @@ def test_table_2_has_the_published_means() -> None:
 
 @pytest.mark.parametrize(("ours_ms", "holds"), [(2.0, True), (3.3, False)])
 def test_table_2_compares_with_the_fastest_transport_other_than_mqtt(ours_ms: float, holds: bool) -> None:
-    samples = {OURS: [ours_ms], EMBEDDED: [1.0], "XMPP, Prosody": [4.0], "WebSocket, JSON relay": [3.0]}
+    samples = {MOSQUITTO: [ours_ms], EMBEDDED: [1.0], "XMPP, Prosody": [4.0], "WebSocket, JSON relay": [3.0]}
     claim = table2.claim(Condition(15, 0.0, 1), samples)
-    assert (claim.seen, claim.holds) == (ours_ms / 3.0, holds)
+    assert (claim.measured, claim.holds) == (ours_ms / 3.0, holds)
     assert "WebSocket" in claim.text
 
 
@@ -37,14 +37,14 @@ def test_all_runs_have_every_round_trip_time(quick: bool) -> None:
     assert 0 not in {each.rtt_ms for each in conditions if each.loss}
 
 
-def test_figure_6_claims_mean_and_maximum_of_the_announcement(report: Report) -> None:
-    figure6.judge(report, {figure6.ANNOUNCED: [16.0, 18.0, 41.0], "another": [99.0]})
-    assert [(claim.seen, claim.holds) for claim in report.claims] == [(25.0, False), (41.0, False)]
+def test_figure_6_claims_mean_and_maximum_of_the_enrolment(report: Report) -> None:
+    figure6.judge(report, {figure6.ENROLLED: [16.0, 18.0, 41.0], "another": [99.0]})
+    assert [(claim.measured, claim.holds) for claim in report.claims] == [(25.0, False), (41.0, False)]
     assert report.tables[0].rows[0][2:5] == [63.0, 36.0, 103.0]
 
 
 def test_figure_5_claims_every_distant_robot_but_no_laboratory(report: Report) -> None:
-    found: figure5.Found = {}
+    found: figure5.Samples = {}
     for robot in figure5.ROBOTS:
         for what in (figure5.SCRIPT, figure5.ACTION, figure5.SETPOINT):
             slow = 60.0 if what == figure5.SCRIPT and robot.name == "nao" else 24.0
@@ -52,7 +52,7 @@ def test_figure_5_claims_every_distant_robot_but_no_laboratory(report: Report) -
             found[robot.label, what, 0] = [figure5.Sample(1.0, 2.0)]
         found[f"{robot.label}, {figure5.LABORATORY}", figure5.ACTION, figure5.RTT_MS] = [figure5.Sample(500.0, 500.0)]
     figure5.show(report, found)
-    assert [(claim.seen, claim.holds) for claim in report.claims] == [(24.0, True)] * 5 + [(60.0, False)]
+    assert [(claim.measured, claim.holds) for claim in report.claims] == [(24.0, True)] * 5 + [(60.0, False)]
     assert report.charts[0].series[figure5.SCRIPT] == [24.0, 60.0, 24.0, 24.0]
 
 
@@ -72,7 +72,7 @@ def test_peers_receive_the_same_setpoint() -> None:
 
 
 def operator_with_response(offset: int) -> operators.PeerOperator:
-    operator = operators.PeerOperator(lambda sequence: operator.hear(sequence + offset))
+    operator = operators.PeerOperator(lambda sequence: operator.on_applied(sequence + offset))
     return operator
 
 

@@ -30,13 +30,13 @@ def connection(rtt_ms: float, loss: float = 0.0) -> Iterator[tuple[socket.socket
 
 
 def seconds_to_receive(data: bytes, sender: socket.socket, receiver: socket.socket) -> float:
-    began_s = time.monotonic()
+    started_s = time.monotonic()
     sender.sendall(data)
     received = b""
     while len(received) < len(data):
         received += receiver.recv(len(data) - len(received))
     assert received == data
-    return time.monotonic() - began_s
+    return time.monotonic() - started_s
 
 
 def test_data_is_delayed_and_arrives_in_order_before_the_end() -> None:

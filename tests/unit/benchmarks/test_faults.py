@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.faults.action_load import STEP_RAD, RequestedAction, duplicated, lost, went_back
+from benchmarks.faults.action_load import STEP_RAD, RequestedAction, count_returns, duplicated, lost
 from benchmarks.faults.fault_runs import FaultResult
 from benchmarks.faults.recorder import Period, Recorder
 from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, StopResult, evaluate
@@ -17,7 +17,7 @@ def requested(number: int, status: str) -> RequestedAction:
     return RequestedAction(number, "none", 0.0, f"a{number}" if status else "", status)
 
 
-def test_accepted_actions_without_an_end_are_lost_and_those_that_began_twice_duplicated() -> None:
+def test_accepted_actions_without_an_end_are_lost_and_actions_with_two_starts_are_duplicated() -> None:
     actions = [requested(1, "done"), requested(2, "started"), requested(3, ""), requested(4, "expired")]
     assert lost(actions) == [actions[1]]
     assert duplicated(actions, {"a1": 1, "a4": 2}) == [actions[3]]
@@ -32,17 +32,17 @@ def test_accepted_actions_without_an_end_are_lost_and_those_that_began_twice_dup
     ],
 )
 def test_a_repeated_earlier_move_is_found_in_the_record(steps: tuple[float, ...], count: int) -> None:
-    assert went_back([number * STEP_RAD for number in steps for _ in range(5)]) == count
-    assert went_back([each * 1e-4 for each in range(100)]) == 0, "positions on the way are not targets"
+    assert count_returns([number * STEP_RAD for number in steps for _ in range(5)]) == count
+    assert count_returns([each * 1e-4 for each in range(100)]) == 0, "positions on the method are not targets"
 
 
-def stopped(*moved: float, braking_from: int, way: str = MESSAGE, speed: str = "full speed") -> StopResult:
+def stopped(*moved: float, braking_from: int, method: str = MESSAGE, speed: str = "full speed") -> StopResult:
     before = [Period(992.0, "streaming", 0.008, 1, 1)]
     after = [
         Period(1008.0 + 8 * index, "stopped" if index >= braking_from else "streaming", each, 1, 1)
         for index, each in enumerate(moved)
     ]
-    return evaluate(before, after, sent_ms=1000.0, broker="amqtt", way=way, speed=speed)
+    return evaluate(before, after, sent_ms=1000.0, broker="amqtt", method=method, speed=speed)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,9 @@ def test_motion_after_a_stop_fails_the_claim_of_rest() -> None:
         FaultResult(fault="x", broker="amqtt", stop_ms=280.0, recovery_s=1.0, moved_again=again)
         for again in (False, True)
     ]
-    stops = [stopped(0.0, 0.0, braking_from=0, way=way, speed=speed) for way in (MESSAGE, CALL) for speed in SPEEDS]
+    stops = [
+        stopped(0.0, 0.0, braking_from=0, method=method, speed=speed) for method in (MESSAGE, CALL) for speed in SPEEDS
+    ]
     actions = {("amqtt", "x"): (10, 0, 1)}
     holds = {claim.text.partition(",")[0]: claim.holds for claim in claims(results, stops, actions)}
     assert not holds["last fresh setpoint → zero commanded velocity"]
@@ -76,10 +78,10 @@ def test_motion_after_a_stop_fails_the_claim_of_rest() -> None:
 def test_the_recorder_receives_periods_of_the_agent(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "s")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
-        for text in ("begun arm1 x", "period arm0 10.5 streaming 0.001 3 7", "period arm0 18.5 stopped 0.002 3 7"):
+        for text in ("started arm1 x", "period arm0 10.5 streaming 0.001 3 7", "period arm0 18.5 stopped 0.002 3 7"):
             line.sendto(text.encode(), str(tmp_path / "s"))
     wait_until(lambda: len(recorder.since("arm0", 0.0)) > 1, "two periods")
-    assert recorder.begun == {"x": 1}
+    assert recorder.starts == {"x": 1}
     assert recorder.since("arm0", 11.0) == [Period(18.5, "stopped", 0.002, 3, 7)]
     assert [row.target_rad for row in recorder.rows("arm0", 0.0)] == [(0.001,), (0.003,)]
     recorder.close()

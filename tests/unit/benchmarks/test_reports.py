@@ -7,11 +7,11 @@ from benchmarks.baseline.interleaved import measure_interleaved, table
 from benchmarks.reporting import cost_model, page
 from benchmarks.reporting.report import Claim, Report, Table, format_cell, load, percentile, save
 
-HOLDS = Claim(text="quick", seen=1.4, bound=1.5, unit="×")
-FAILS = Claim(text="many", seen=0.3, bound=0.4, unit="of it", at_least=True)
+HOLDS = Claim(text="quick", measured=1.4, bound=1.5, unit="×")
+FAILS = Claim(text="many", measured=0.3, bound=0.4, unit="of it", at_least=True)
 REPORT = Report(
     suite="limit",
-    title="Against the limit",
+    title="Lower bounds",
     about=["Description."],
     quick=True,
     claims=[HOLDS, FAILS],
@@ -32,7 +32,7 @@ def test_a_claim_that_does_not_hold_is_marked() -> None:
     text = page.text([REPORT])
     assert "| quick | ≤ 1.5 × | 1.4 × |" in text
     assert "| many | ≥ 0.4 of it | 0.3 of it **not reached** |" in text
-    assert "[limit](#against-the-limit)" in text
+    assert "[limit](#lower-bounds)" in text
     assert "| a | 1,200 | 0.0123 | – |" in text
 
 
@@ -62,7 +62,7 @@ def test_interleaved_paths_run_in_each_round_and_may_return_their_own_time() -> 
     assert samples["a"] == [2.0] * 6
     assert len(samples["b"]) == 6
     assert sorted(order[2:6]) == ["a", "a", "b", "b"]
-    assert [row[-1] for row in table("T", {"a": [2.0], "b": [3.0]}, against="a").rows] == [1.0, 1.5]
+    assert [row[-1] for row in table("T", {"a": [2.0], "b": [3.0]}, reference="a").rows] == [1.0, 1.5]
 
 
 def test_load_grows_with_the_number_of_robots() -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.soak.processes import CHILDREN, STARTER, TOGETHER, ProcessWatcher, Sample, look
-from benchmarks.soak.trends import after_warm_up, drawn_together, theil_sen
+from benchmarks.soak.processes import CHILDREN, STARTER, TOTAL, ProcessWatcher, Sample, sample_parts
+from benchmarks.soak.trends import after_warm_up, reduced_to_medians, theil_sen
 from tests.harness.network.brokers import wait_until
 
 MINUTES = range(50)
@@ -32,7 +32,7 @@ def test_the_slope_ignores_outliers_and_noise() -> None:
 
 
 def test_long_series_are_reduced_to_medians() -> None:
-    times, values = drawn_together([float(each) for each in range(600)], [1.0] * 599 + [1000.0])
+    times, values = reduced_to_medians([float(each) for each in range(600)], [1.0] * 599 + [1000.0])
     assert len(times) == len(values) == 60
     assert max(values) == 1.0
 
@@ -40,28 +40,28 @@ def test_long_series_are_reduced_to_medians() -> None:
 def test_growth_counts_after_the_warm_up() -> None:
     leaking = [sample(float(at), descriptors=20 + at // 60) for at in range(0, 3600, 5)]
     warming = [sample(float(at), part="broker", mb=10 if at < 600 else 30) for at in range(0, 3600, 5)]
-    found = {each.part: each for each in after_warm_up([*leaking, *warming], 600)}
-    assert found["agent"].more_descriptors > 30
-    assert (found["broker"].more_descriptors, found["broker"].own.percent_per_h) == (0, 0)
+    trends = {each.part: each for each in after_warm_up([*leaking, *warming], 600)}
+    assert trends["agent"].more_descriptors > 30
+    assert (trends["broker"].more_descriptors, trends["broker"].own.percent_per_h) == (0, 0)
 
 
-def test_permanent_parts_are_also_evaluated_together() -> None:
+def test_permanent_parts_are_also_evaluated_in_total() -> None:
     series = {"agent": 100.0, "broker": 20.0, CHILDREN: 50.0}
     samples = [sample(float(at), part=part, mb=mb) for at in range(0, 600, 5) for part, mb in series.items()]
     samples += [sample(float(at), part="worker", mb=30 + at / 60) for at in range(0, 600, 5)]
-    together = {each.part: each for each in after_warm_up(samples, 0)}[TOGETHER]
-    assert together.own_mb == pytest.approx(155, abs=1)
-    assert together.own.percent_per_h == pytest.approx(60 / 155 * 100, rel=0.02)
+    total = {each.part: each for each in after_warm_up(samples, 0)}[TOTAL]
+    assert total.own_mb == pytest.approx(155, abs=1)
+    assert total.own.percent_per_h == pytest.approx(60 / 155 * 100, rel=0.02)
 
 
 def test_a_process_is_sampled_with_its_children() -> None:
     program = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'input()'])"
     with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE) as process:
-        wait_until(lambda: [each.processes for each in look(process.pid, 1.0)] == [2], "the child")
-        (found,) = look(process.pid, 1.0)
-        assert found.part == STARTER
-        assert found.rss_mb >= found.pss_mb >= found.own_mb > 1
-        assert found.descriptors > 3
+        wait_until(lambda: [each.processes for each in sample_parts(process.pid, 1.0)] == [2], "the child")
+        (sampled,) = sample_parts(process.pid, 1.0)
+        assert sampled.part == STARTER
+        assert sampled.rss_mb >= sampled.pss_mb >= sampled.own_mb > 1
+        assert sampled.descriptors > 3
 
 
 def test_samples_are_written_during_the_run(tmp_path: Path) -> None:

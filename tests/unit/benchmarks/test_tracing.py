@@ -9,12 +9,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from benchmarks.suites.path import ANSWERED, ASKED, parts, whole
+from benchmarks.suites.path import REQUESTED, RESPONDED, parts, totals
 from benchmarks.tracing import traced_programs
 from benchmarks.tracing.timestamps import VARIABLE, Timestamp, TimestampReceiver, TimestampSender
 from tests.harness.paths import ROOT
 
-STEPS = (("in", "there"), ("out", "work"), (ANSWERED, "back"))
+STEPS = (("in", "there"), ("out", "work"), (RESPONDED, "back"))
 
 
 def test_timestamps_are_received_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -22,35 +22,35 @@ def test_timestamps_are_received_in_order(monkeypatch: pytest.MonkeyPatch) -> No
         for name, value in receiver.settings.items():
             monkeypatch.setenv(name, value)
         with closing(TimestampSender()) as sender:
-            began_ns = time.monotonic_ns()
-            sender.tell("one")
-            sender.tell("two")
+            started_ns = time.monotonic_ns()
+            sender.send("one")
+            sender.send("two")
             first, second = receiver.drain()
             assert (first.name, second.name) == ("one", "two")
-            assert began_ns <= first.at_ns <= second.at_ns <= time.monotonic_ns()
-            sender.tell("new")
-            assert [each.name for each in receiver.until("new", since_ns=began_ns, within_s=1)] == ["new"]
-            sender.tell("early")
-            with pytest.raises(TimeoutError, match="no mark 'early'"):
+            assert started_ns <= first.at_ns <= second.at_ns <= time.monotonic_ns()
+            sender.send("new")
+            assert [each.name for each in receiver.until("new", since_ns=started_ns, within_s=1)] == ["new"]
+            sender.send("early")
+            with pytest.raises(TimeoutError, match="no timestamp 'early'"):
                 receiver.until("early", since_ns=time.monotonic_ns(), within_s=0.01)
 
 
 def test_parts_run_from_each_step_to_the_next_and_add_up() -> None:
     marks = [
         Timestamp("out", 500_000),  # of the previous exchange
-        Timestamp(ASKED, 1_000_000),
+        Timestamp(REQUESTED, 1_000_000),
         Timestamp("in", 3_000_000),
         Timestamp("else", 3_500_000),
         Timestamp("out", 6_000_000),
         Timestamp("in", 7_000_000),
-        Timestamp(ANSWERED, 10_000_000),
+        Timestamp(RESPONDED, 10_000_000),
     ]
     found = parts(marks, STEPS)
     assert found == {"there": 2.0, "work": 3.0, "back": 4.0}
-    assert whole([found]) == [9.0]
+    assert totals([found]) == [9.0]
 
 
-@pytest.mark.parametrize("names", [[ASKED, "in", ANSWERED], [ASKED, "out", "in", ANSWERED]])
+@pytest.mark.parametrize("names", [[REQUESTED, "in", RESPONDED], [REQUESTED, "out", "in", RESPONDED]])
 def test_incomplete_and_unordered_exchanges_have_no_parts(names: list[str]) -> None:
     assert parts([Timestamp(name, number) for number, name in enumerate(names)], STEPS) is None
 
@@ -70,7 +70,7 @@ def test_motion_is_reported_once_and_rest_after_a_delay() -> None:
     motion = traced_programs.Motion("arm", reports.append)
     for speed, times in ((1e-6, 25), (1e-4, 3), (0.01, 3), (1e-6, 24), (0.01, 2), (1e-6, 50), (1e-4, 1)):
         for _ in range(times):
-            motion.see(speed)
+            motion.update(speed)
     assert reports == ["rests:arm", "moves:arm", "fast:arm", "rests:arm", "rests:arm", "moves:arm"]
 
 
@@ -82,6 +82,6 @@ def test_a_wrapped_function_is_reported_and_called() -> None:
         return "done"
 
     owner = SimpleNamespace(call=call)
-    traced_programs._wrap(owner, "call", traced_programs._told_first(calls.append))
+    traced_programs._wrap(owner, "call", traced_programs._mark_before(calls.append))
     assert owner.call(1, two=2) == "done"
     assert calls == [1, (1, 2)]
