@@ -46,7 +46,7 @@ def keyframes(page: Page) -> list[dict[str, Any]]:
 def save(page: Page, name: str) -> None:
     page.get_by_test_id("kf-name").fill(name)
     page.get_by_test_id("kf-save").click()
-    expect(page.get_by_test_id("kf-said")).to_contain_text("Saved as version")
+    expect(page.get_by_test_id("kf-save-status")).to_contain_text("Saved as version")
 
 
 def run(page: Page) -> None:
@@ -69,14 +69,14 @@ def test_keyframes_of_an_arm_are_edited_saved_and_run(drawing_browser: Browser, 
         slider.focus()
         for _ in range(2):
             page.keyboard.press("PageUp")
-        page.get_by_test_id("kf-lasts").fill("0.3")
-        page.get_by_test_id("kf-lasts").press("Enter")
+        page.get_by_test_id("kf-interval").fill("0.3")
+        page.get_by_test_id("kf-interval").press("Enter")
         problem = page.get_by_test_id("kf-problem-too-fast")
         expect(problem).to_contain_text("would exceed its")
         expect(page.get_by_test_id("kf-run")).to_be_disabled()
         page.get_by_test_id("kf-name").fill("kf-turn")
         assert_good_page(page, "keyframes-too-fast")
-        problem.get_by_test_id("kf-mend").click()
+        problem.get_by_test_id("kf-fix").click()
         expect(page.get_by_test_id("kf-problems")).to_have_attribute("data-count", "0")
         assert number(page, "kf-marker-2", "time") > 0.6
 
@@ -139,7 +139,7 @@ def opened_again(page: Page, laboratory: Machine, made: list[dict[str, Any]]) ->
         changed = {"source": saved["source"] + "robot.home()\n"}
         assert api.http.put(path, json=changed).is_success
     page.reload()
-    expect(page.get_by_test_id("kf-by-hand")).to_be_visible()
+    expect(page.get_by_test_id("kf-manual-script")).to_be_visible()
     with laboratory.api() as api:
         assert api.http.delete("/robot-types/ur5/movements/kf-turn").is_success
 
@@ -187,8 +187,8 @@ def test_the_same_editor_serves_every_robot(
     with pages(drawing_browser, laboratory) as (page,):
         open_editor(page, laboratory, name)
         page.get_by_test_id("kf-add").click()
-        page.get_by_test_id("kf-lasts").fill("1.5")
-        page.get_by_test_id("kf-lasts").press("Enter")
+        page.get_by_test_id("kf-interval").fill("1.5")
+        page.get_by_test_id("kf-interval").press("Enter")
         set_joint(page, joint, deg)
         field = page.get_by_test_id(deed)
         if deed == "kf-drive":
@@ -226,7 +226,7 @@ def test_keyframes_are_made_for_a_robot_type_without_a_robot(browser: Browser, l
         for part in ("kf-run", "kf-record", "stop"):
             assert ann.get_by_test_id(part).count() == 0, f"{part}: there is no robot"
         ann.get_by_test_id("kf-save").click()
-        expect(ann.get_by_test_id("kf-said")).to_have_attribute("data-version", "1")
+        expect(ann.get_by_test_id("kf-save-status")).to_have_attribute("data-version", "1")
         assert_good_page(ann, "keyframes-type")
         # The movement's page opens it as keyframes again; no robot has moved.
         ann.goto(f"{laboratory.url}/#/movements/nao/at_ease")

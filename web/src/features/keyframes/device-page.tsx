@@ -73,7 +73,7 @@ function OfDevice({ api, fleet, account, device, name }: OfDeviceProps) {
               twin={device.twin.value}
               measured={measuredPose(device)}
               // A new movement starts at the robot's measured pose, so wait for it unless the robot is offline.
-              waits={measuredPose(device) === null && device.reach.value !== "offline"}
+              waitsForPose={measuredPose(device) === null && device.reach.value !== "offline"}
               session={session}
               address={(saved) => keyframesAddress(device.id, saved)}
             />

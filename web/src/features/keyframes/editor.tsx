@@ -2,7 +2,7 @@
 import type { DeviceSession } from "../devices/model";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import { begun, Drafts, Editor } from "./model/editor";
+import { newMovement, Drafts, Editor } from "./model/editor";
 import type { Positions, Robot } from "./model/keyframes";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import { texts } from "./texts";
@@ -14,7 +14,7 @@ import type { MovementReference } from "./load-movement";
 import { ProblemList, Timeline } from "./timeline";
 import { PreviewTwin } from "./preview-twin";
 
-interface DeskProps {
+interface KeyframeEditorProps {
   api: Api;
   /** The movement's name; empty: a new one. */
   name: string;
@@ -27,7 +27,7 @@ interface DeskProps {
   /** The initial pose of a new movement if no pose is measured. */
   home?: Positions;
   /** Whether a new movement must wait for the measured pose. */
-  waits: boolean;
+  waitsForPose: boolean;
   /** `null`: without a robot, so recording and running are unavailable. */
   session: DeviceSession | null;
   /** The address of the editor for a movement's name. */
@@ -36,33 +36,33 @@ interface DeskProps {
 
 const drafts = new Drafts(localStorage);
 
-export function KeyframeEditor(props: DeskProps) {
-  const { api, session, name: first, source, robotType, robot, twin, measured, waits, address } = props;
-  const begin = measured ?? props.home ?? null;
-  const [name, setName] = useState(first);
+export function KeyframeEditor(props: KeyframeEditorProps) {
+  const { api, session, name: initialName, source, robotType, robot, twin, measured, waitsForPose, address } = props;
+  const startPose = measured ?? props.home ?? null;
+  const [name, setName] = useState(initialName);
   const [version, setVersion] = useState(source.version);
   const [editor, setEditor] = useState<Editor | null>(null);
-  const draftOf = useRef(first);
+  const draftName = useRef(initialName);
   const [restored, setRestored] = useState(false);
-  const [unkept, setUnkept] = useState(false);
-  const ready = robot !== null && (!waits || source.saved !== null);
+  const [draftFailed, setDraftFailed] = useState(false);
+  const ready = robot !== null && (!waitsForPose || source.saved !== null);
 
   // Created once: later changes of the robot or the connection must not affect the edited movement.
   useEffect(() => {
     if (!ready || editor !== null) return;
-    const draft = drafts.read(robotType, first);
+    const draft = drafts.read(robotType, initialName);
     setRestored(draft !== null && JSON.stringify(draft) !== JSON.stringify(source.saved));
-    const from = { saved: source.saved, draft, fresh: begun(robot, begin) };
-    setEditor(new Editor(robot, from, (movement) => setUnkept(!drafts.keep(robotType, draftOf.current, movement))));
+    const from = { saved: source.saved, draft, initial: newMovement(robot, startPose) };
+    setEditor(new Editor(robot, from, (movement) => setDraftFailed(!drafts.storeDraft(robotType, draftName.current, movement))));
   }, [ready, editor]);
   useEffect(() => () => editor?.dispose(), [editor]);
   useKeys(editor);
 
   if (editor === null) return <p class="quiet">{texts.waiting}</p>;
-  const onSaved = (saved: string, at: number): void => {
-    draftOf.current = saved;
+  const onSaved = (saved: string, newVersion: number): void => {
+    draftName.current = saved;
     setName(saved);
-    setVersion(at);
+    setVersion(newVersion);
     setRestored(false);
     history.replaceState(null, "", address(saved));
   };
@@ -74,16 +74,16 @@ export function KeyframeEditor(props: DeskProps) {
           <button
             type="button"
             onClick={() => {
-              if (source.saved === null) editor.change(begun(editor.robot, begin));
+              if (source.saved === null) editor.change(newMovement(editor.robot, startPose));
               else editor.revert();
               setRestored(false);
             }}
           >
-            {source.saved === null ? texts.beginAnew : texts.revert}
+            {source.saved === null ? texts.startOver : texts.revert}
           </button>
         </p>
       )}
-      {unkept && <p class="notice warn">{texts.unkept}</p>}
+      {draftFailed && <p class="notice warn">{texts.draftNotStored}</p>}
       <div class="desk kf-desk">
         <div class="column">
           <PreviewTwin twin={twin} device={session?.device ?? null} editor={editor} />
@@ -100,18 +100,18 @@ export function KeyframeEditor(props: DeskProps) {
   );
 }
 
-/** Undo and redo by keys, except in text fields, which have their own. */
+/** Keyboard shortcuts for undo and redo. Text fields use those of the browser. */
 function useKeys(editor: Editor | null): void {
   useEffect(() => {
     if (editor === null) return undefined;
-    const press = (event: KeyboardEvent): void => {
+    const onKeyDown = (event: KeyboardEvent): void => {
       const typing = event.target instanceof HTMLInputElement && event.target.type === "text";
       if (typing || !(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== "z") return;
       event.preventDefault();
       if (event.shiftKey) editor.redo();
       else editor.undo();
     };
-    addEventListener("keydown", press);
-    return () => removeEventListener("keydown", press);
+    addEventListener("keydown", onKeyDown);
+    return () => removeEventListener("keydown", onKeyDown);
   }, [editor]);
 }

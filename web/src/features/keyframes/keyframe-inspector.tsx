@@ -1,4 +1,4 @@
-/** The selected keyframe: its time, joint positions and steps. */
+/** The selected keyframe: its time, joint positions and actions. */
 import { supports } from "./model/problems";
 import { JointSlider } from "../steering";
 import { Card } from "../../shared/ui/card";
@@ -15,7 +15,7 @@ interface KeyframeCardProps {
 }
 
 export function KeyframeInspector({ editor, measured }: KeyframeCardProps) {
-  const index = editor.chosen.value;
+  const index = editor.selected.value;
   const movement = editor.movement.value;
   const keyframe = movement.keyframes[index];
   if (keyframe === undefined) return null;
@@ -29,10 +29,10 @@ export function KeyframeInspector({ editor, measured }: KeyframeCardProps) {
         title={measured === null ? texts.notLive : undefined}
         onClick={() => measured !== null && editor.change(setPose(movement, index, measured, editor.robot))}
       >
-        {texts.takePose}
+        {texts.useCurrentPose}
       </button>
       <Joints editor={editor} index={index} keyframe={keyframe} measured={measured} />
-      <DeedFields editor={editor} index={index} keyframe={keyframe} />
+      <ActionFields editor={editor} index={index} keyframe={keyframe} />
     </Card>
   );
 }
@@ -52,11 +52,11 @@ function TimeFields({ editor, index, keyframe }: PartProps) {
     <div class="row kf-times">
       <NumberField id="kf-time" label={texts.time} value={keyframe.time_s} digits={2} onSet={set} />
       <NumberField
-        id="kf-lasts"
-        label={texts.lasts}
+        id="kf-interval"
+        label={texts.interval}
         value={keyframe.time_s - before.time_s}
         digits={2}
-        onSet={(lasts) => set(before.time_s + lasts)}
+        onSet={(interval_s) => set(before.time_s + interval_s)}
       />
       <label class="check">
         <input type="checkbox" checked={shifting} onChange={(event) => setShifting(event.currentTarget.checked)} />
@@ -78,8 +78,8 @@ interface NumberFieldProps {
 function NumberField({ id, label, value, digits, onSet }: NumberFieldProps) {
   const [typed, setTyped] = useState<string | null>(null);
   const commit = (): void => {
-    const wanted = Number(typed?.replace(",", "."));
-    if (typed !== null && typed.trim() !== "" && Number.isFinite(wanted)) onSet(wanted);
+    const value = Number(typed?.replace(",", "."));
+    if (typed !== null && typed.trim() !== "" && Number.isFinite(value)) onSet(value);
     setTyped(null);
   };
   return (
@@ -105,39 +105,39 @@ function Joints({ editor, index, keyframe, measured }: PartProps & { measured: P
   const { robot } = editor;
   const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));
   const pose = editor.poseAtKeyframe(index);
-  const wrong = new Set(editor.problems.value.flatMap(({ keyframe: at, joint }) => (at === index && joint !== null ? [joint] : [])));
+  const invalid = new Set(editor.problems.value.flatMap(({ keyframe: at, joint }) => (at === index && joint !== null ? [joint] : [])));
   return (
-    <div class="kf-joints" role="group" aria-label={texts.joints} tabIndex={0} onPointerUp={() => editor.settle()}>
+    <div class="kf-joints" role="group" aria-label={texts.joints} tabIndex={0} onPointerUp={() => editor.endGesture()}>
       {robot.joints
         .filter(({ name }) => !followers.has(name))
         .map((joint) => (
-          <JointOf
+          <JointField
             key={joint.name}
             editor={editor}
             index={index}
             joint={joint}
-            here={joint.name in keyframe.position_rad}
+            isSet={joint.name in keyframe.position_rad}
             target={keyframe.position_rad[joint.name] ?? pose[joint.name]}
             measured={measured?.[joint.name]}
-            wrong={wrong.has(joint.name)}
+            invalid={invalid.has(joint.name)}
           />
         ))}
     </div>
   );
 }
 
-interface JointOfProps {
+interface JointFieldProps {
   editor: Editor;
   index: number;
   joint: Joint;
   /** Whether this keyframe sets the joint's position; otherwise it is interpolated. */
-  here: boolean;
+  isSet: boolean;
   target: number | undefined;
   measured: number | undefined;
-  wrong: boolean;
+  invalid: boolean;
 }
 
-function JointOf({ editor, index, joint, here, target, measured, wrong }: JointOfProps) {
+function JointField({ editor, index, joint, isSet, target, measured, invalid }: JointFieldProps) {
   const set = (position: number | null): void =>
     editor.change(
       setPosition(editor.movement.value, index, joint, position, editor.robot),
@@ -145,50 +145,50 @@ function JointOf({ editor, index, joint, here, target, measured, wrong }: JointO
     );
   const start = (joint.lower_rad + joint.upper_rad) / 2;
   return (
-    <div class={`kf-joint ${here ? "" : "passes"} ${wrong ? "wrong" : ""}`}>
+    <div class={`kf-joint ${isSet ? "" : "interpolated"} ${invalid ? "invalid" : ""}`}>
       <JointSlider joint={joint} targetRad={target ?? start} measuredRad={measured} onSet={set} />
       <label class="check small quiet">
         <input
           type="checkbox"
-          data-testid={`kf-here-${joint.name}`}
-          aria-label={texts.hereFor(joint.label)}
-          checked={here}
+          data-testid={`kf-set-${joint.name}`}
+          aria-label={texts.positionSetFor(joint.label)}
+          checked={isSet}
           onChange={(event) => set(event.currentTarget.checked ? (target ?? start) : null)}
         />
-        {here ? texts.here : texts.passes}
+        {isSet ? texts.positionSet : texts.interpolated}
       </label>
     </div>
   );
 }
 
-/** Further steps at the keyframe, limited to the robot's capabilities. */
-function DeedFields({ editor, index, keyframe }: PartProps) {
+/** Actions at the keyframe that the robot supports. */
+function ActionFields({ editor, index, keyframe }: PartProps) {
   const { robot } = editor;
-  const set = <D extends ActionKind>(deed: D, value: KeyframeActions[D] | undefined): void =>
-    editor.change(setAction(editor.movement.value, index, deed, value), `${index}-${deed}`);
+  const set = <D extends ActionKind>(action: D, value: KeyframeActions[D] | undefined): void =>
+    editor.change(setAction(editor.movement.value, index, action, value), `${index}-${action}`);
   const named = [
     ["posture", robot.postures],
     ["behaviour", robot.behaviours],
     ["express", robot.expressions],
   ] as const;
-  const { say, drive, go_to: place } = keyframe;
-  if (!Object.keys(texts.deeds).some((deed) => supports(robot, deed as ActionKind))) return null;
+  const { say, drive, go_to: goal } = keyframe;
+  if (!Object.keys(texts.actions).some((action) => supports(robot, action as ActionKind))) return null;
   return (
-    <fieldset class="kf-deeds" onFocusOut={() => editor.settle()}>
-      <legend>{texts.deedsTitle}</legend>
-      <p class="quiet small">{texts.deedsNote}</p>
+    <fieldset class="kf-keyframe-actions" onFocusOut={() => editor.endGesture()}>
+      <legend>{texts.actionsTitle}</legend>
+      <p class="quiet small">{texts.actionsNote}</p>
       {named.map(
-        ([deed, names]) =>
-          supports(robot, deed) && (
-            <div class="field" key={deed}>
-              <label for={`kf-${deed}`}>{texts.deeds[deed]}</label>
+        ([action, names]) =>
+          supports(robot, action) && (
+            <div class="field" key={action}>
+              <label for={`kf-${action}`}>{texts.actions[action]}</label>
               <select
-                id={`kf-${deed}`}
-                data-testid={`kf-${deed}`}
-                value={keyframe[deed] ?? ""}
-                onChange={(event) => set(deed, event.currentTarget.value === "" ? undefined : event.currentTarget.value)}
+                id={`kf-${action}`}
+                data-testid={`kf-${action}`}
+                value={keyframe[action] ?? ""}
+                onChange={(event) => set(action, event.currentTarget.value === "" ? undefined : event.currentTarget.value)}
               >
-                <option value="">{texts.nothing}</option>
+                <option value="">{texts.none}</option>
                 {names.map((name) => (
                   <option key={name}>{name}</option>
                 ))}
@@ -198,7 +198,7 @@ function DeedFields({ editor, index, keyframe }: PartProps) {
       )}
       {supports(robot, "say") && (
         <div class="field">
-          <label for="kf-say">{texts.deeds.say}</label>
+          <label for="kf-say">{texts.actions.say}</label>
           <input
             id="kf-say"
             type="text"
@@ -211,7 +211,7 @@ function DeedFields({ editor, index, keyframe }: PartProps) {
       )}
       {supports(robot, "drive") && (
         <Toggle
-          deed="drive"
+          action="drive"
           on={drive !== undefined}
           onToggle={(on) => set("drive", on ? { forward_m_s: 0.1, turn_rad_s: 0, duration_s: 2 } : undefined)}
         >
@@ -243,17 +243,17 @@ function DeedFields({ editor, index, keyframe }: PartProps) {
         </Toggle>
       )}
       {supports(robot, "go_to") && (
-        <Toggle deed="go_to" on={place !== undefined} onToggle={(on) => set("go_to", on ? { x_m: 0, y_m: 0 } : undefined)}>
-          {place !== undefined && (
+        <Toggle action="go_to" on={goal !== undefined} onToggle={(on) => set("go_to", on ? { x_m: 0, y_m: 0 } : undefined)}>
+          {goal !== undefined && (
             <div class="row">
-              <NumberField id="kf-x" label={texts.x} value={place.x_m} digits={2} onSet={(x_m) => set("go_to", { ...place, x_m })} />
-              <NumberField id="kf-y" label={texts.y} value={place.y_m} digits={2} onSet={(y_m) => set("go_to", { ...place, y_m })} />
+              <NumberField id="kf-x" label={texts.x} value={goal.x_m} digits={2} onSet={(x_m) => set("go_to", { ...goal, x_m })} />
+              <NumberField id="kf-y" label={texts.y} value={goal.y_m} digits={2} onSet={(y_m) => set("go_to", { ...goal, y_m })} />
               <NumberField
                 id="kf-yaw"
                 label={texts.yaw}
-                value={degrees(place.yaw_rad ?? 0)}
+                value={degrees(goal.yaw_rad ?? 0)}
                 digits={0}
-                onSet={(yaw) => set("go_to", { ...place, yaw_rad: round(radians(yaw)) })}
+                onSet={(yaw) => set("go_to", { ...goal, yaw_rad: round(radians(yaw)) })}
               />
             </div>
           )}
@@ -268,18 +268,18 @@ function round(value: number): number {
 }
 
 interface ToggleProps {
-  deed: "drive" | "go_to";
+  action: "drive" | "go_to";
   on: boolean;
   onToggle: (on: boolean) => void;
   children: preact.ComponentChildren;
 }
 
-function Toggle({ deed, on, onToggle, children }: ToggleProps) {
+function Toggle({ action, on, onToggle, children }: ToggleProps) {
   return (
     <div class="field">
       <label class="check">
-        <input type="checkbox" data-testid={`kf-${deed}`} checked={on} onChange={(event) => onToggle(event.currentTarget.checked)} />
-        {texts.deeds[deed]}
+        <input type="checkbox" data-testid={`kf-${action}`} checked={on} onChange={(event) => onToggle(event.currentTarget.checked)} />
+        {texts.actions[action]}
       </label>
       {children}
     </div>

@@ -11,58 +11,58 @@ import { movementAddress } from "../../shared/routing/routes";
 
 /** `saved` is `null` for a new movement. */
 export interface MovementReference {
-  kind: "there";
+  kind: "loaded";
   saved: Movement | null;
   version: number;
 }
 
-type Source = { kind: "loading" } | MovementReference | { kind: "by-hand" } | { kind: "failed"; why: string };
+type Source = { kind: "loading" } | MovementReference | { kind: "manual-script" } | { kind: "failed"; reason: string };
 
-interface Reading {
+interface LoadState {
   source: Source;
-  again: () => void;
+  reload: () => void;
 }
 
-export function useMovementSource(api: Api, robotType: string, name: string): Reading {
-  const [source, setSource] = useState<Source>(name === "" ? { kind: "there", saved: null, version: 0 } : { kind: "loading" });
-  const [tries, setTries] = useState(0);
+export function useMovementSource(api: Api, robotType: string, name: string): LoadState {
+  const [source, setSource] = useState<Source>(name === "" ? { kind: "loaded", saved: null, version: 0 } : { kind: "loading" });
+  const [attempt, setAttempt] = useState(0);
   useEffect(() => {
     if (name === "") return undefined;
-    let wanted = true;
-    void load(api, robotType, name).then((found) => wanted && setSource(found));
+    let active = true;
+    void load(api, robotType, name).then((found) => active && setSource(found));
     return () => {
-      wanted = false;
+      active = false;
     };
-  }, [api, robotType, name, tries]);
-  return { source, again: () => setTries(tries + 1) };
+  }, [api, robotType, name, attempt]);
+  return { source, reload: () => setAttempt(attempt + 1) };
 }
 
-interface LoadedProps extends Reading {
+interface LoadedProps extends LoadState {
   robotType: string;
   name: string;
   children: (source: MovementReference) => ComponentChildren;
 }
 
-export function LoadMovement({ source, again, robotType, name, children }: LoadedProps) {
+export function LoadMovement({ source, reload, robotType, name, children }: LoadedProps) {
   switch (source.kind) {
     case "loading":
       return <p class="quiet">{common.loading}</p>;
     case "failed":
       return (
         <p class="notice bad" role="alert">
-          {source.why}{" "}
-          <button type="button" onClick={again}>
+          {source.reason}{" "}
+          <button type="button" onClick={reload}>
             {common.tryAgain}
           </button>
         </p>
       );
-    case "by-hand":
+    case "manual-script":
       return (
-        <p class="notice warn" role="alert" data-testid="kf-by-hand">
-          {texts.byHand(name)} <a href={movementAddress(robotType, name)}>{texts.toCode}</a>
+        <p class="notice warn" role="alert" data-testid="kf-manual-script">
+          {texts.manualScript(name)} <a href={movementAddress(robotType, name)}>{texts.toCode}</a>
         </p>
       );
-    case "there":
+    case "loaded":
       return <>{children(source)}</>;
   }
 }
@@ -70,11 +70,11 @@ export function LoadMovement({ source, again, robotType, name, children }: Loade
 async function load(api: Api, robotType: string, name: string): Promise<Source> {
   try {
     const found = await api.library.get(robotType, name);
-    const read = readScript(found.source);
-    if (read.kind !== "keyframes") return { kind: "by-hand" };
-    return { kind: "there", saved: read.movement, version: found.built_in ? 0 : found.version };
+    const parsed = readScript(found.source);
+    if (parsed.kind !== "keyframes") return { kind: "manual-script" };
+    return { kind: "loaded", saved: parsed.movement, version: found.built_in ? 0 : found.version };
   } catch (error) {
-    if (error instanceof ApiError && error.status === 404) return { kind: "there", saved: null, version: 0 };
-    return { kind: "failed", why: sentence(error) };
+    if (error instanceof ApiError && error.status === 404) return { kind: "loaded", saved: null, version: 0 };
+    return { kind: "failed", reason: sentence(error) };
   }
 }

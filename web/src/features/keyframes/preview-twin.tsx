@@ -1,4 +1,4 @@
-/** The movement on the robot's twin, with the measured pose as a shadow. */
+/** The movement on the robot's twin, with the measured pose as a ghost. */
 import type { DeviceStore } from "../devices/model";
 import { type LiveScene, useScene } from "../twin";
 import { Card } from "../../shared/ui/card";
@@ -19,7 +19,7 @@ export function measuredPose(device: DeviceStore): Positions | null {
 
 interface TwinProps {
   twin: KnownTwin | null;
-  /** The device whose measured pose is the shadow; `null`: none. */
+  /** The device whose measured pose is shown as a ghost; `null`: none. */
   device: DeviceStore | null;
   editor: Editor;
 }
@@ -46,7 +46,7 @@ export function PreviewTwin({ twin, device, editor }: TwinProps) {
         {twin === null && <p class="over quiet">{texts.viewWaiting}</p>}
         {said !== "" && <p class="over notice">{said}</p>}
         <p class={`tag ${playing ? "kf-preview" : ""}`}>
-          {playing ? texts.previewing : texts.numberOf(editor.chosen.value + 1, count)}
+          {playing ? texts.previewing : texts.numberOf(editor.selected.value + 1, count)}
         </p>
       </div>
       <p class="quiet small kf-legend">
@@ -72,14 +72,14 @@ function usePreviewClock(editor: Editor): void {
   const playing = editor.playing.value;
   useEffect(() => {
     if (!playing) return undefined;
-    let before: number | null = null;
-    let asked = 0;
+    let previous: number | null = null;
+    let frameRequest = 0;
     const step = (time: number): void => {
-      editor.tick(before === null ? 0 : (time - before) / 1000);
-      before = time;
-      asked = requestAnimationFrame(step);
+      editor.tick(previous === null ? 0 : (time - previous) / 1000);
+      previous = time;
+      frameRequest = requestAnimationFrame(step);
     };
-    asked = requestAnimationFrame(step);
-    return () => cancelAnimationFrame(asked);
+    frameRequest = requestAnimationFrame(step);
+    return () => cancelAnimationFrame(frameRequest);
   }, [editor, playing]);
 }

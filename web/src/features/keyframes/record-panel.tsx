@@ -16,27 +16,27 @@ interface RecordProps {
 }
 
 const [WIDTH, HEIGHT] = [600, 120];
-const MOST_POINTS = 300;
+const MAX_POINTS = 300;
 
 export function RecordPanel({ device, editor }: RecordProps) {
   const recorder = useMemo(() => new Recorder(), []);
   const running = recorder.running.value;
-  const take = recorder.take.value;
+  const recording = recorder.recording.value;
   useEffect(() => {
-    const ends = [
+    const disposers = [
       effect(() => {
         const newest = device.telemetry.value;
-        if (newest !== null) recorder.hear(newest.message);
+        if (newest !== null) recorder.addTelemetry(newest.message);
       }),
       effect(() => {
-        for (const event of device.events.value.slice(0, 1)) recorder.hearEvent(event);
+        for (const event of device.events.value.slice(0, 1)) recorder.addEvent(event);
       }),
     ];
     return () => {
-      for (const end of ends) end();
+      for (const dispose of disposers) dispose();
     };
   }, [recorder, device]);
-  const lasts = take.samples.at(-1)?.time_s ?? 0;
+  const duration_s = recording.samples.at(-1)?.time_s ?? 0;
   return (
     <Card title={texts.record} class="kf-record">
       <p class="quiet small">{texts.recordNote}</p>
@@ -51,43 +51,43 @@ export function RecordPanel({ device, editor }: RecordProps) {
           {running ? texts.stopRecording : texts.startRecording}
         </button>
         {running && !device.live.value && <span class="notice warn">{texts.recordingGap}</span>}
-        <span role="status" class="quiet" data-testid="kf-recorded" data-samples={take.samples.length}>
-          {take.samples.length > 0 && texts.recorded(take.samples.length, lasts, take.gaps.length)}
+        <span role="status" class="quiet" data-testid="kf-recorded" data-samples={recording.samples.length}>
+          {recording.samples.length > 0 && texts.recorded(recording.samples.length, duration_s, recording.gaps.length)}
         </span>
       </div>
-      {!running && take.samples.length > 1 && (
-        <Trim key={lasts} take={take} lasts={lasts} editor={editor} onDone={() => recorder.forget()} />
+      {!running && recording.samples.length > 1 && (
+        <Trim key={duration_s} recording={recording} duration_s={duration_s} editor={editor} onDone={() => recorder.clear()} />
       )}
     </Card>
   );
 }
 
 interface TrimProps {
-  take: Recording;
-  lasts: number;
+  recording: Recording;
+  duration_s: number;
   editor: Editor;
   onDone: () => void;
 }
 
-function Trim({ take, lasts, editor, onDone }: TrimProps) {
+function Trim({ recording, duration_s, editor, onDone }: TrimProps) {
   const [from, setFrom] = useState(0);
-  const [to, setTo] = useState(lasts);
+  const [to, setTo] = useState(duration_s);
   const [tolerance, setTolerance] = useState(2);
-  const made = useMemo(
-    () => keyframesOf(trim(take, from, to), radians(tolerance), editor.robot),
-    [take, from, to, tolerance, editor],
+  const keyframes = useMemo(
+    () => keyframesOf(trim(recording, from, to), radians(tolerance), editor.robot),
+    [recording, from, to, tolerance, editor],
   );
-  const use = (): void => {
-    editor.change({ ...editor.movement.value, keyframes: made });
-    editor.choose(0);
+  const apply = (): void => {
+    editor.change({ ...editor.movement.value, keyframes });
+    editor.select(0);
     onDone();
   };
   return (
     <>
-      <Curves take={take} lasts={lasts} from={from} to={to} made={made} editor={editor} />
+      <Curves recording={recording} duration_s={duration_s} from={from} to={to} keyframes={keyframes} editor={editor} />
       <div class="kf-trim">
-        <Handle id="kf-from" label={texts.trimFrom} value={from} most={lasts} onSet={(value) => setFrom(Math.min(value, to - 0.1))} />
-        <Handle id="kf-to" label={texts.trimTo} value={to} most={lasts} onSet={(value) => setTo(Math.max(value, from + 0.1))} />
+        <Handle id="kf-from" label={texts.trimFrom} value={from} most={duration_s} onSet={(value) => setFrom(Math.min(value, to - 0.1))} />
+        <Handle id="kf-to" label={texts.trimTo} value={to} most={duration_s} onSet={(value) => setTo(Math.max(value, from + 0.1))} />
         <label for="kf-tolerance">{texts.tolerance}</label>
         <input
           id="kf-tolerance"
@@ -103,14 +103,14 @@ function Trim({ take, lasts, editor, onDone }: TrimProps) {
         <output for="kf-tolerance">{format.degrees(tolerance)}</output>
       </div>
       <div class="row">
-        <button type="button" class="primary" data-testid="kf-use" disabled={made.length < 2} onClick={use}>
-          {texts.useThem(made.length)}
+        <button type="button" class="primary" data-testid="kf-use" disabled={keyframes.length < 2} onClick={apply}>
+          {texts.useKeyframes(keyframes.length)}
         </button>
         <button type="button" class="plain" onClick={onDone}>
           {texts.discard}
         </button>
       </div>
-      {take.gaps.length > 0 && <p class="notice warn">{texts.gapNote}</p>}
+      {recording.gaps.length > 0 && <p class="notice warn">{texts.gapNote}</p>}
     </>
   );
 }
@@ -144,37 +144,37 @@ function Handle({ id, label, value, most, onSet }: HandleProps) {
 }
 
 interface CurvesProps {
-  take: Recording;
-  lasts: number;
+  recording: Recording;
+  duration_s: number;
   from: number;
   to: number;
-  made: readonly Keyframe[];
+  keyframes: readonly Keyframe[];
   editor: Editor;
 }
 
 /** Each joint within its range, gaps, trimmed parts and the resulting keyframes. */
-function Curves({ take, lasts, from, to, made, editor }: CurvesProps) {
-  const x = (time: number): number => (time / lasts) * WIDTH;
+function Curves({ recording, duration_s, from, to, keyframes, editor }: CurvesProps) {
+  const x = (time: number): number => (time / duration_s) * WIDTH;
   const lines = useMemo(() => {
-    const every = Math.max(1, Math.floor(take.samples.length / MOST_POINTS));
-    const some = take.samples.filter((_, index) => index % every === 0);
+    const every = Math.max(1, Math.floor(recording.samples.length / MAX_POINTS));
+    const samples = recording.samples.filter((_, index) => index % every === 0);
     return editor.robot.joints.flatMap((_, index) => {
-      const places = some.map(({ position_rad }) => position_rad[index] ?? 0);
-      const [low, high] = [Math.min(...places), Math.max(...places)];
+      const positions = samples.map(({ position_rad }) => position_rad[index] ?? 0);
+      const [low, high] = [Math.min(...positions), Math.max(...positions)];
       if (degrees(high - low) < 0.5) return [];
-      const y = (place: number): number => HEIGHT - 8 - ((place - low) / (high - low)) * (HEIGHT - 16);
-      return [{ index, points: some.map(({ time_s }, at) => `${x(time_s).toFixed(1)},${y(places[at] ?? 0).toFixed(1)}`).join(" ") }];
+      const y = (position: number): number => HEIGHT - 8 - ((position - low) / (high - low)) * (HEIGHT - 16);
+      return [{ index, points: samples.map(({ time_s }, at) => `${x(time_s).toFixed(1)},${y(positions[at] ?? 0).toFixed(1)}`).join(" ") }];
     });
-  }, [take]);
+  }, [recording]);
   return (
     <svg class="kf-curves" viewBox={`0 0 ${WIDTH} ${HEIGHT}`} preserveAspectRatio="none" role="img" aria-label={texts.curves(lines.length)}>
-      {take.gaps.map((gap) => (
+      {recording.gaps.map((gap) => (
         <rect key={gap.from_s} class="gap" x={x(gap.from_s)} width={x(gap.to_s - gap.from_s)} y={0} height={HEIGHT} />
       ))}
       {lines.map(({ index, points }) => (
         <polyline key={index} class={`series-${(index % 8) + 1}`} points={points} />
       ))}
-      {made.map((one) => (
+      {keyframes.map((one) => (
         <line key={one.time_s} class="key" x1={x(one.time_s + from)} x2={x(one.time_s + from)} y1={0} y2={HEIGHT} />
       ))}
       <rect class="cut" x={0} width={x(from)} y={0} height={HEIGHT} />

@@ -1,4 +1,4 @@
-/** The keyframe editor of a robot type without a robot: only the drawing moves. */
+/** The keyframe editor of a robot type without a robot: only the model moves. */
 import { robotOf } from "./model/robot-of-type";
 import { useCallback, useMemo } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
@@ -20,7 +20,7 @@ export function TypeKeyframesPage({ api, robotType, name }: TypeKeyframesPagePro
   const model = useResource(useCallback(() => api.robotTypes.model(robotType), [api, robotType]));
   const robot = useMemo(() => (type.value === null ? null : robotOf(type.value)), [type.value]);
   const loaded = useMovementSource(api, robotType, name);
-  const trouble = type.error !== "" ? type : model;
+  const failed = type.error !== "" ? type : model;
   return (
     <main class="page kf-page" id="content">
       <div class="heading">
@@ -31,10 +31,10 @@ export function TypeKeyframesPage({ api, robotType, name }: TypeKeyframesPagePro
           {name !== "" && ` · ${name}`}
         </p>
       </div>
-      {trouble.error !== "" && (
+      {failed.error !== "" && (
         <p class="notice bad" role="alert">
-          {trouble.error}{" "}
-          <button type="button" onClick={trouble.reload}>
+          {failed.error}{" "}
+          <button type="button" onClick={failed.reload}>
             {common.tryAgain}
           </button>
         </p>
@@ -50,7 +50,7 @@ export function TypeKeyframesPage({ api, robotType, name }: TypeKeyframesPagePro
             twin={model.value?.twin ?? null}
             measured={null}
             home={type.value?.home_rad}
-            waits={type.value === null}
+            waitsForPose={type.value === null}
             session={null}
             address={(saved) => typeKeyframesAddress(robotType, saved)}
           />

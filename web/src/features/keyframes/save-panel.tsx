@@ -7,7 +7,7 @@ import { useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { Editor } from "./model/editor";
-import { LONGEST_SCRIPT, writeScript } from "./model/script-codec";
+import { MAX_SCRIPT_LENGTH, writeScript } from "./model/script-codec";
 import { MovementChanged } from "../../shared/api/movement-library";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
@@ -26,31 +26,31 @@ interface SaveProps {
 }
 
 export function SavePanel({ api, session, editor, robotType, name, version, onSaved }: SaveProps) {
-  const [wanted, setWanted] = useState(name);
+  const [enteredName, setEnteredName] = useState(name);
   const [busy, setBusy] = useState(false);
-  const [said, setSaid] = useState("");
-  const [newer, setNewer] = useState<number | null>(null);
+  const [message, setMessage] = useState("");
+  const [newerVersion, setNewerVersion] = useState<number | null>(null);
   const movement = editor.movement.value;
   const errors = editor.problems.value.filter(({ severity }) => severity === "error").length;
   const source = writeScript(movement);
-  const tooLong = source.length > LONGEST_SCRIPT;
-  const named = /^[A-Za-z0-9_-]{1,64}$/.test(wanted);
-  const changed = editor.changed.value || wanted !== name;
+  const tooLong = source.length > MAX_SCRIPT_LENGTH;
+  const validName = /^[A-Za-z0-9_-]{1,64}$/.test(enteredName);
+  const changed = editor.changed.value || enteredName !== name;
 
   /** Returns whether it was saved. */
-  const save = async (basedOn = wanted === name ? version : 0): Promise<boolean> => {
+  const save = async (basedOn = enteredName === name ? version : 0): Promise<boolean> => {
     setBusy(true);
-    setSaid("");
-    setNewer(null);
+    setMessage("");
+    setNewerVersion(null);
     try {
-      const made = await api.library.save(robotType, wanted, source, basedOn);
+      const saved = await api.library.save(robotType, enteredName, source, basedOn);
       editor.saved(movement);
-      onSaved(wanted, made.version);
-      setSaid(texts.savedAs(made.version));
+      onSaved(enteredName, saved.version);
+      setMessage(texts.savedAs(saved.version));
       return true;
     } catch (error) {
-      if (error instanceof MovementChanged) setNewer(error.version);
-      else setSaid(sentence(error));
+      if (error instanceof MovementChanged) setNewerVersion(error.version);
+      else setMessage(sentence(error));
       return false;
     } finally {
       setBusy(false);
@@ -66,11 +66,11 @@ export function SavePanel({ api, session, editor, robotType, name, version, onSa
             id="kf-name"
             type="text"
             data-testid="kf-name"
-            value={wanted}
+            value={enteredName}
             autocomplete="off"
             spellcheck={false}
             aria-describedby="kf-name-note"
-            onInput={(event) => setWanted(event.currentTarget.value)}
+            onInput={(event) => setEnteredName(event.currentTarget.value)}
           />
         </div>
         <div class="field kf-description">
@@ -82,37 +82,37 @@ export function SavePanel({ api, session, editor, robotType, name, version, onSa
             maxLength={200}
             value={movement.description}
             onInput={(event) => editor.change({ ...movement, description: event.currentTarget.value }, "description")}
-            onBlur={() => editor.settle()}
+            onBlur={() => editor.endGesture()}
           />
         </div>
       </div>
-      <p class={named || wanted === "" ? "quiet small" : "field-error"} id="kf-name-note">
+      <p class={validName || enteredName === "" ? "quiet small" : "field-error"} id="kf-name-note">
         {texts.nameNote}
       </p>
       <div class="row">
-        <button type="button" data-testid="kf-save" disabled={busy || !named || !changed || tooLong} onClick={() => void save()}>
+        <button type="button" data-testid="kf-save" disabled={busy || !validName || !changed || tooLong} onClick={() => void save()}>
           {busy ? texts.saving : texts.save}
         </button>
         {session !== null && (
-          <Run session={session} name={wanted} changed={changed} blocked={busy || !named || tooLong} errors={errors} save={save} />
+          <Run session={session} name={enteredName} changed={changed} blocked={busy || !validName || tooLong} errors={errors} save={save} />
         )}
       </div>
       {session === null && <p class="quiet small">{texts.runsOnDevice}</p>}
       {tooLong && <p class="field-error">{texts.tooLong}</p>}
-      <p role="status" data-testid="kf-said" data-version={version}>
-        {said}
+      <p role="status" data-testid="kf-save-status" data-version={version}>
+        {message}
       </p>
-      {newer !== null && (
+      {newerVersion !== null && (
         <p class="notice warn" role="alert">
-          {newer === 0 ? texts.deleted : texts.newer(newer)}{" "}
-          <button type="button" onClick={() => void save(newer)}>
-            {texts.saveOver}
+          {newerVersion === 0 ? texts.deleted : texts.newerVersion(newerVersion)}{" "}
+          <button type="button" onClick={() => void save(newerVersion)}>
+            {texts.overwrite}
           </button>
         </p>
       )}
       {session !== null && <RunStatusPanel device={session.device} control={session.control} actions={session.actions} />}
       <details>
-        <summary>{texts.seeScript}</summary>
+        <summary>{texts.showScript}</summary>
         <pre class="output kf-source" tabIndex={0} data-testid="kf-source">
           {source}
         </pre>
@@ -133,7 +133,7 @@ interface RunProps {
 
 function Run({ session, name, changed, blocked, errors, save }: RunProps) {
   const [speed, setSpeed] = useState(1);
-  const why = actionUnavailableReason(session.device, session.control);
+  const unavailable = actionUnavailableReason(session.device, session.control);
   const run = async (): Promise<void> => {
     if (changed && !(await save())) return;
     await session.actions.start({ kind: "run_movement", name, parameters: { speed } }, session.control.epoch);
@@ -144,7 +144,7 @@ function Run({ session, name, changed, blocked, errors, save }: RunProps) {
         type="button"
         class="primary"
         data-testid="kf-run"
-        disabled={blocked || errors > 0 || why !== ""}
+        disabled={blocked || errors > 0 || unavailable !== ""}
         onClick={() => void run()}
       >
         {changed ? texts.saveAndRun : texts.run}
@@ -159,8 +159,8 @@ function Run({ session, name, changed, blocked, errors, save }: RunProps) {
           ))}
         </select>
       </label>
-      {errors > 0 && <p class="quiet small">{texts.mendFirst}</p>}
-      {errors === 0 && why !== "" && <p class="quiet small">{why}</p>}
+      {errors > 0 && <p class="quiet small">{texts.fixFirst}</p>}
+      {errors === 0 && unavailable !== "" && <p class="quiet small">{unavailable}</p>}
     </>
   );
 }

@@ -37,10 +37,10 @@ export const texts = {
   redo: "Redo",
   checks: "Checks",
   checked: (count: number): string => (count === 0 ? "" : format.count(count, "problem")),
-  allGood: "✓ Within all joint limits",
+  noProblems: "✓ Within all joint limits",
   at: (index: number): string => `Keyframe ${index}`,
   robotChecks: "The robot checks for collisions before and during the motion.",
-  mendAll: "Stretch all to the required time",
+  fixAll: "Stretch all to the required time",
   more: (count: number): string => `And ${count} more.`,
   problem: ({ what }: Problem, joint: string): string => {
     switch (what.kind) {
@@ -54,8 +54,8 @@ export const texts = {
         return `This robot has no joint ${joint}.`;
       case "unknown-name":
         return `This robot has no “${what.name}”.`;
-      case "cannot":
-        return `This robot does not support: ${texts.deeds[what.deed].toLowerCase()}.`;
+      case "unsupported":
+        return `This robot does not support: ${texts.actions[what.action].toLowerCase()}.`;
       case "too-fast":
         return `${joint} would exceed its ${what.by} limit before this keyframe.`;
       case "times":
@@ -66,7 +66,7 @@ export const texts = {
         return "The text is too long: at most 500 characters.";
     }
   },
-  mend: ({ what }: Problem): string => {
+  fix: ({ what }: Problem): string => {
     switch (what.kind) {
       case "too-fast":
         return `Stretch to ${what.needs_s.toFixed(2)} s`;
@@ -80,7 +80,7 @@ export const texts = {
       case "mirrored":
       case "unknown-joint":
       case "unknown-name":
-      case "cannot":
+      case "unsupported":
       case "too-long-text":
         return "Remove";
     }
@@ -88,18 +88,18 @@ export const texts = {
   number: (index: number): string => `Keyframe ${index}`,
   first: "Start, at 0 s. The robot moves to this pose first, at half speed.",
   time: "Time [s]",
-  lasts: "Time since previous keyframe [s]",
+  interval: "Time since previous keyframe [s]",
   shifting: "moves later keyframes",
-  takePose: "Use current pose",
+  useCurrentPose: "Use current pose",
   joints: "Joints of this keyframe",
-  here: "set",
-  passes: "interpolated",
-  hereFor: (joint: string): string => `${joint} is set at this keyframe`,
-  deedsTitle: "Actions at this keyframe",
-  deedsNote: "Actions run one after the other; the keyframe time pauses meanwhile.",
-  nothing: "–",
-  deedMark: "✦",
-  deeds: {
+  positionSet: "set",
+  interpolated: "interpolated",
+  positionSetFor: (joint: string): string => `${joint} is set at this keyframe`,
+  actionsTitle: "Actions at this keyframe",
+  actionsNote: "Actions run one after the other; the keyframe time pauses meanwhile.",
+  none: "–",
+  actionMark: "✦",
+  actions: {
     posture: "Posture",
     behaviour: "Behaviour",
     express: "Expression",
@@ -122,31 +122,31 @@ export const texts = {
   saveAndRun: "Save and run",
   run: "Run on the robot",
   speed: "Speed",
-  mendFirst: "Correct all problems before you run it.",
+  fixFirst: "Correct all problems before you run it.",
   tooLong: "The movement exceeds the maximum script size: remove keyframes or joints.",
   savedAs: (version: number): string => `Saved as version ${version}.`,
-  newer: (version: number): string => `Version ${version} was saved in the meantime. Your changes are not lost.`,
+  newerVersion: (version: number): string => `Version ${version} was saved in the meantime. Your changes are not lost.`,
   deleted: "This movement was deleted in the meantime. Your changes are not lost.",
-  saveOver: "Overwrite with mine",
-  seeScript: "Generated script",
+  overwrite: "Overwrite with mine",
+  showScript: "Generated script",
   record: "Record",
   recordNote: "Records the joints while the robot moves, for example steered from another tab or by a movement. Base motion is not recorded.",
   startRecording: "● Record",
   stopRecording: "■ Stop recording",
   recordingGap: "No data from the robot. The recording continues when data arrives.",
-  recorded: (samples: number, lasts: number, gaps: number): string =>
-    `${samples} samples in ${lasts.toFixed(1)} s${gaps === 0 ? "" : `, with ${format.count(gaps, "gap")}`}`,
+  recorded: (samples: number, duration_s: number, gaps: number): string =>
+    `${samples} samples in ${duration_s.toFixed(1)} s${gaps === 0 ? "" : `, with ${format.count(gaps, "gap")}`}`,
   gapNote: "The yellow range has no data; the movement is interpolated linearly there.",
   curves: (count: number): string => `${count} moved joints over time`,
   trimFrom: "Start",
   trimTo: "End",
   tolerance: "Tolerance",
-  useThem: (count: number): string => `Use these ${count} keyframes`,
+  useKeyframes: (count: number): string => `Use these ${count} keyframes`,
   discard: "Discard recording",
   restored: "Unsaved draft restored.",
   revert: "Revert to saved",
-  beginAnew: "Start over",
-  unkept: "This browser does not store drafts. Save before you leave.",
-  byHand: (name: string): string => `The script “${name}” contains more than keyframes, so it cannot be edited here.`,
+  startOver: "Start over",
+  draftNotStored: "This browser does not store drafts. Save before you leave.",
+  manualScript: (name: string): string => `The script “${name}” contains more than keyframes, so it cannot be edited here.`,
   toCode: "Open in the code editor",
 };

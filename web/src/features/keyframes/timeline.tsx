@@ -3,7 +3,7 @@ import { stretchAll } from "./model/problems";
 import { Card } from "../../shared/ui/card";
 import { useRef } from "preact/hooks";
 import type { Editor } from "./model/editor";
-import { ACTION_KINDS, setTime, SHORTEST_S, type Keyframe, type Positions } from "./model/keyframes";
+import { ACTION_KINDS, setTime, MIN_INTERVAL_S, type Keyframe, type Positions } from "./model/keyframes";
 import { texts } from "./texts";
 
 interface TimelineProps {
@@ -12,12 +12,12 @@ interface TimelineProps {
 }
 
 const TICKS = [0.25, 0.5, 1, 2, 5, 10, 20, 60, 120];
-const MOST_TICKS = 9;
+const MAX_TICKS = 9;
 
 export function Timeline({ editor, measured }: TimelineProps) {
   const playing = editor.playing.value;
   const { keyframes } = editor.movement.value;
-  const asked = editor.plan.value.asked(editor.at.value);
+  const time_s = editor.plan.value.keyframeTime(editor.at.value);
   const last = keyframes.at(-1)?.time_s ?? 0;
   return (
     <Card title={texts.timeline} class="kf-timeline" aside={<History editor={editor} />}>
@@ -33,13 +33,13 @@ export function Timeline({ editor, measured }: TimelineProps) {
           {playing ? texts.pause : texts.play}
         </button>
         <span class="kf-clock" data-testid="kf-clock">
-          {texts.ofSeconds(asked, last)}
+          {texts.ofSeconds(time_s, last)}
         </span>
         <span class="quiet small">{texts.previewOnly}</span>
       </div>
-      <Track editor={editor} asked={asked} last={last} />
+      <Track editor={editor} time_s={time_s} last={last} />
       <div class="row kf-actions">
-        <button type="button" data-testid="kf-add" onClick={() => editor.add(editor.poseAtKeyframe(editor.chosen.value))}>
+        <button type="button" data-testid="kf-add" onClick={() => editor.add(editor.poseAtKeyframe(editor.selected.value))}>
           {texts.add}
         </button>
         <button
@@ -51,10 +51,10 @@ export function Timeline({ editor, measured }: TimelineProps) {
         >
           {texts.addMeasured}
         </button>
-        <button type="button" data-testid="kf-duplicate" onClick={() => editor.copy()}>
+        <button type="button" data-testid="kf-duplicate" onClick={() => editor.duplicateSelected()}>
           {texts.duplicate}
         </button>
-        <button type="button" data-testid="kf-delete" disabled={keyframes.length < 2} onClick={() => editor.drop()}>
+        <button type="button" data-testid="kf-delete" disabled={keyframes.length < 2} onClick={() => editor.deleteSelected()}>
           {texts.remove}
         </button>
       </div>
@@ -76,13 +76,13 @@ function History({ editor }: { editor: Editor }) {
   );
 }
 
-function Track({ editor, asked, last }: { editor: Editor; asked: number; last: number }) {
+function Track({ editor, time_s, last }: { editor: Editor; time_s: number; last: number }) {
   const track = useRef<HTMLDivElement>(null);
   const span = Math.max(2, last * 1.06);
   const { keyframes } = editor.movement.value;
-  const wrong = new Set(editor.problems.value.map(({ keyframe }) => keyframe));
+  const invalid = new Set(editor.problems.value.map(({ keyframe }) => keyframe));
   const fast = new Set(editor.problems.value.flatMap(({ keyframe, what }) => (what.kind === "too-fast" ? [keyframe] : [])));
-  const every = TICKS.find((step) => span / step <= MOST_TICKS) ?? 120;
+  const every = TICKS.find((step) => span / step <= MAX_TICKS) ?? 120;
   const ticks = Array.from({ length: Math.floor((0.96 * span) / every) + 1 }, (_, index) => index * every);
   const timeAt = (clientX: number): number => {
     const box = track.current?.getBoundingClientRect();
@@ -113,13 +113,13 @@ function Track({ editor, asked, last }: { editor: Editor; asked: number; last: n
           {keyframes.slice(1).map((one, index) => (
             <span
               key={index}
-              class={`kf-stretch ${fast.has(index + 1) ? "fast" : ""}`}
+              class={`kf-segment ${fast.has(index + 1) ? "fast" : ""}`}
               style={{ ...at(keyframes[index]?.time_s ?? 0), "--to": String(one.time_s / span) }}
             />
           ))}
         </div>
         {keyframes.map((one, index) => (
-          <Marker key={index} editor={editor} index={index} one={one} wrong={wrong.has(index)} style={at(one.time_s)} timeAt={timeAt} />
+          <Marker key={index} editor={editor} index={index} one={one} invalid={invalid.has(index)} style={at(one.time_s)} timeAt={timeAt} />
         ))}
         <div
           class="kf-playhead"
@@ -128,15 +128,15 @@ function Track({ editor, asked, last }: { editor: Editor; asked: number; last: n
           aria-label={texts.playhead}
           aria-valuemin={0}
           aria-valuemax={last}
-          aria-valuenow={asked}
-          aria-valuetext={texts.seconds(asked)}
+          aria-valuenow={time_s}
+          aria-valuetext={texts.seconds(time_s)}
           data-testid="kf-playhead"
-          style={at(asked)}
+          style={at(time_s)}
           onKeyDown={(event) => {
             const step = stepOf(event);
             if (step === null) return;
             event.preventDefault();
-            editor.scrub(Math.min(last, Math.max(0, asked + step)));
+            editor.scrub(Math.min(last, Math.max(0, time_s + step)));
           }}
         />
       </div>
@@ -148,49 +148,49 @@ interface MarkerProps {
   editor: Editor;
   index: number;
   one: Keyframe;
-  wrong: boolean;
+  invalid: boolean;
   style: Record<string, string>;
   timeAt: (clientX: number) => number;
 }
 
-function Marker({ editor, index, one, wrong, style, timeAt }: MarkerProps) {
+function Marker({ editor, index, one, invalid, style, timeAt }: MarkerProps) {
   const dragged = useRef(false);
-  const chosen = editor.chosen.value === index;
-  const done = ACTION_KINDS.filter((deed) => one[deed] !== undefined);
+  const selected = editor.selected.value === index;
+  const actions = ACTION_KINDS.filter((kind) => one[kind] !== undefined);
   const move = (time: number, gesture = ""): void => editor.change(setTime(editor.movement.value, index, time, false), gesture);
   return (
     <div
-      class={`kf-marker ${chosen ? "chosen" : ""} ${wrong ? "wrong" : ""}`}
+      class={`kf-marker ${selected ? "selected" : ""} ${invalid ? "invalid" : ""}`}
       style={style}
       role="slider"
       tabIndex={0}
-      aria-label={texts.marker(index + 1, wrong)}
+      aria-label={texts.marker(index + 1, invalid)}
       aria-valuemin={0}
       aria-valuemax={600}
       aria-valuenow={one.time_s}
       aria-valuetext={texts.seconds(one.time_s)}
-      aria-current={chosen}
+      aria-current={selected}
       data-testid={`kf-marker-${index + 1}`}
       data-time={one.time_s}
-      onFocus={() => editor.choose(index)}
+      onFocus={() => editor.select(index)}
       onPointerDown={(event) => {
         event.currentTarget.setPointerCapture(event.pointerId);
         dragged.current = false;
-        editor.choose(index);
+        editor.select(index);
       }}
       onPointerMove={(event) => {
         if (!event.currentTarget.hasPointerCapture(event.pointerId) || index === 0) return;
         const time = timeAt(event.clientX);
-        // A touch without motion does not move it.
-        if (!dragged.current && Math.abs(time - one.time_s) < SHORTEST_S) return;
+        // A click without motion does not move the keyframe.
+        if (!dragged.current && Math.abs(time - one.time_s) < MIN_INTERVAL_S) return;
         dragged.current = true;
         move(time, `time-${index}`);
       }}
-      onPointerUp={() => editor.settle()}
+      onPointerUp={() => editor.endGesture()}
       onKeyDown={(event) => {
         if (event.key === "Delete") {
           event.preventDefault();
-          editor.drop();
+          editor.deleteSelected();
           return;
         }
         const step = stepOf(event);
@@ -203,9 +203,9 @@ function Marker({ editor, index, one, wrong, style, timeAt }: MarkerProps) {
       <span class="kf-number" aria-hidden="true">
         {index + 1}
       </span>
-      {done.length > 0 && (
-        <span class="kf-does" aria-hidden="true">
-          {texts.deedMark}
+      {actions.length > 0 && (
+        <span class="kf-action-mark" aria-hidden="true">
+          {texts.actionMark}
         </span>
       )}
     </div>
@@ -220,7 +220,7 @@ function stepOf(event: KeyboardEvent): number | null {
   return null;
 }
 
-/** All problems, each with its remedy. */
+/** All problems, each with its fix. */
 export function ProblemList({ editor }: { editor: Editor }) {
   const found = editor.problems.value;
   const fast = found.filter(({ what }) => what.kind === "too-fast").length;
@@ -228,25 +228,25 @@ export function ProblemList({ editor }: { editor: Editor }) {
   return (
     <Card title={texts.checks} class="kf-problems" aside={<span class="quiet">{texts.checked(found.length)}</span>}>
       <div role="status" data-testid="kf-problems" data-count={found.length}>
-        {found.length === 0 && <p class="kf-good">{texts.allGood}</p>}
+        {found.length === 0 && <p class="kf-valid">{texts.noProblems}</p>}
         {found.length > 0 && (
           <ul class="kf-list">
             {found.slice(0, 12).map((problem, index) => (
               <li key={index} class={`notice ${problem.severity === "error" ? "bad" : "warn"}`} data-testid={`kf-problem-${problem.what.kind}`}>
-                <button type="button" class="plain" onClick={() => editor.choose(problem.keyframe)}>
+                <button type="button" class="plain" onClick={() => editor.select(problem.keyframe)}>
                   {texts.at(problem.keyframe + 1)}
                 </button>
                 <span>{texts.problem(problem, problem.joint === null ? "" : (labels.get(problem.joint) ?? problem.joint))}</span>
-                {problem.mend !== null && (
+                {problem.fix !== null && (
                   <button
                     type="button"
-                    data-testid="kf-mend"
+                    data-testid="kf-fix"
                     onClick={() => {
-                      const next = problem.mend?.(editor.movement.value);
+                      const next = problem.fix?.(editor.movement.value);
                       if (next !== undefined) editor.change(next);
                     }}
                   >
-                    {texts.mend(problem)}
+                    {texts.fix(problem)}
                   </button>
                 )}
               </li>
@@ -258,10 +258,10 @@ export function ProblemList({ editor }: { editor: Editor }) {
       {fast > 1 && (
         <button
           type="button"
-          data-testid="kf-mend-all"
+          data-testid="kf-fix-all"
           onClick={() => editor.change(stretchAll(editor.movement.value, editor.robot))}
         >
-          {texts.mendAll}
+          {texts.fixAll}
         </button>
       )}
       <p class="quiet small">{texts.robotChecks}</p>

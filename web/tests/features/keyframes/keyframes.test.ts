@@ -2,8 +2,8 @@ import { readFileSync } from "node:fs";
 import { describe, expect, test } from "vitest";
 import { addAfter, duplicate, remove, setPosition, setTime, normalize, type Keyframe, type Movement } from "../../../src/features/keyframes/model/keyframes";
 import { plan } from "../../../src/features/keyframes/model/plan";
-import { type Problem, placeOf, problems, stretchAll } from "../../../src/features/keyframes/model/problems";
-import { Recorder, trimmedGaps, keyframesOf, trim, type Sample } from "../../../src/features/keyframes/model/recording";
+import { type Problem, positionAt, problems, stretchAll } from "../../../src/features/keyframes/model/problems";
+import { Recorder, simplify, keyframesOf, trim, type Sample } from "../../../src/features/keyframes/model/recording";
 import { readMovement, readScript, writeScript } from "../../../src/features/keyframes/model/script-codec";
 import { UndoHistory } from "../../../src/shared/lib/undo-history";
 import type { KnownTelemetry } from "../../../src/shared/mqtt/parse-messages";
@@ -66,7 +66,7 @@ describe("edits", () => {
 });
 
 describe("checks", () => {
-  test("name keyframe and joint of each problem, and offer a remedy", () => {
+  test("name keyframe and joint of each problem, and offer a fix", () => {
     expect(problems(movement(frame(0, { yaw: 0 }), frame(1, { yaw: 0.5 }, { say: "hello" })), robot)).toEqual([]);
     const wrong = movement(
       frame(0, { yaw: 0 }),
@@ -84,23 +84,23 @@ describe("checks", () => {
       "3 right mirrored",
       "3 left late-joint",
       "4 - unknown-name",
-      "4 - cannot",
+      "4 - unsupported",
     ]);
-    const mended = found.reduce((now, { mend }) => mend?.(now) ?? now, wrong);
-    expect(kinds(problems(mended, robot))).toEqual([]);
-    expect(mended.keyframes[2]?.position_rad["pitch"]).toBeCloseTo(-0.4);
+    const fixed = found.reduce((now, { fix }) => fix?.(now) ?? now, wrong);
+    expect(kinds(problems(fixed, robot))).toEqual([]);
+    expect(fixed.keyframes[2]?.position_rad["pitch"]).toBeCloseTo(-0.4);
   });
 
-  test("state the time that a too fast stretch needs; one remedy suffices, or one for all stretches", () => {
+  test("state the time that a too fast segment needs; a fix exists for one and for all segments", () => {
     const fast = movement(frame(0, { yaw: 0 }), frame(0.2, { yaw: 1 }), frame(3, { yaw: 0 }));
     const [found] = problems(fast, robot);
     expect(kinds(problems(fast, robot))).toEqual(["1 yaw too-fast"]);
-    const mended = found?.mend?.(fast) ?? fast;
-    expect(problems(mended, robot)).toEqual([]);
+    const fixed = found?.fix?.(fast) ?? fast;
+    expect(problems(fixed, robot)).toEqual([]);
     const needs = found?.what.kind === "too-fast" ? found.what.needs_s : NaN;
     expect(needs > 0.7 && needs < 1).toBe(true);
-    expect(times(mended)).toEqual([0, needs, expect.closeTo(needs + 2.8) as number]);
-    // The robot itself would take as long.
+    expect(times(fixed)).toEqual([0, needs, expect.closeTo(needs + 2.8) as number]);
+    // The robot needs the same time.
     expect(plan(fast, robot).reached_s[1]).toBeCloseTo(needs, 1);
     const faster = movement(...[0, 1, 1.8, -1, 1].map((yaw, index) => frame(index / 10, { yaw, left: yaw / 4 })));
     expect(problems(stretchAll(faster, robot), robot)).toEqual([]);
@@ -110,7 +110,7 @@ describe("checks", () => {
     const wrong = movement(frame(1, { yaw: 0 }), frame(0.5, { yaw: 0.1 }), frame(9, { yaw: 0 }));
     const found = problems(wrong, robot);
     expect(kinds(found)).toEqual(["0 - times", "1 - times"]);
-    expect(times(found[0]?.mend?.(wrong) ?? wrong)).toEqual([0, 0.05, 8]);
+    expect(times(found[0]?.fix?.(wrong) ?? wrong)).toEqual([0, 0.05, 8]);
   });
 });
 
@@ -120,13 +120,13 @@ describe("the plan", () => {
     const found = plan(made, robot);
     expect(found.duration_s).toBeCloseTo(2.8);
     expect(found.at(1.4)["yaw"]).toBeCloseTo(0.5);
-    expect(found.asked(1.4)).toBeCloseTo(1);
-    expect(found.played(1.5)).toBeGreaterThan(2);
+    expect(found.keyframeTime(1.4)).toBeCloseTo(1);
+    expect(found.previewTime(1.5)).toBeGreaterThan(2);
   });
 
   test("interpolates joints that a keyframe does not name", () => {
     const made = movement(frame(0, { yaw: 0, left: 0 }), frame(1, { left: 0.1 }), frame(2, { yaw: 1, left: 0.2 }));
-    expect(placeOf(made, 1, "yaw")).toBeCloseTo(0.5);
+    expect(positionAt(made, 1, "yaw")).toBeCloseTo(0.5);
     expect(plan(made, robot).at(1)["yaw"]).toBeCloseTo(0.5);
     expect(plan(movement(frame(0, { yaw: 0.3 })), robot).at(7)).toEqual({ yaw: 0.3 });
   });
@@ -144,7 +144,7 @@ describe("the script", () => {
     expect(readMovement(JSON.parse(JSON.stringify(made)))).toEqual(made);
   });
 
-  test("is what the robot's own tests run", () => {
+  test("equals the fixture that the agent's tests run", () => {
     const reaches = movement(
       frame(0, { shoulder_pan: 0, shoulder_lift: -1.57, elbow: 1.57, wrist_1: -1.57, wrist_2: -1.57, wrist_3: 0 }),
       frame(0.8, { shoulder_pan: 0.3, elbow: 1.4 }),
@@ -155,14 +155,14 @@ describe("the script", () => {
   });
 
   test("escapes the description", () => {
-    const said = readScript(writeScript({ ...made, description: 'a """ b\nc \\' }));
-    expect(said.kind === "keyframes" && said.movement.description).toBe("a ''' b c /");
+    const parsed = readScript(writeScript({ ...made, description: 'a """ b\nc \\' }));
+    expect(parsed.kind === "keyframes" && parsed.movement.description).toBe("a ''' b c /");
   });
 
   test.each([
-    ["a line more", (source: string) => `${source}robot.home()\n`],
+    ["an additional line", (source: string) => `${source}robot.home()\n`],
     ["another speed", (source: string) => source.replace('"default": 1', '"default": 2')],
-    ["a number that is computed", (source: string) => source.replace("0.5", "1 / 2")],
+    ["a computed number", (source: string) => source.replace("0.5", "1 / 2")],
     ["an unknown key", (source: string) => source.replace('"express"', '"shout"')],
     ["an infinite time", (source: string) => source.replace("1.5", "1e999")],
     ["no keyframe", (source: string) => source.replace(/ {4}\{"time_s.*\n/gu, "")],
@@ -185,19 +185,19 @@ describe("a recording", () => {
 
   test("marks gaps, continues after a restart of the robot's clock, and contains speech", () => {
     const recorder = new Recorder();
-    recorder.hear(sample(0, 0));
+    recorder.addTelemetry(sample(0, 0));
     recorder.start();
-    for (const tick of [1000, 1050, 1100, 3100, 3150]) recorder.hear(sample(tick, tick / 1000));
-    recorder.hearEvent({ kind: "speech-started", at_ms: 1_003_150, data: { text: "hello" } } as never);
-    recorder.hear({ ...sample(20, 4), at_ms: 1_004_150 });
+    for (const tick of [1000, 1050, 1100, 3100, 3150]) recorder.addTelemetry(sample(tick, tick / 1000));
+    recorder.addEvent({ kind: "speech-started", at_ms: 1_003_150, data: { text: "hello" } } as never);
+    recorder.addTelemetry({ ...sample(20, 4), at_ms: 1_004_150 });
     recorder.stop();
-    recorder.hear(sample(5000, 9));
-    const take = recorder.take.value;
-    expect(take.samples.map(({ time_s }) => Number(time_s.toFixed(2)))).toEqual([0, 0.05, 0.1, 2.1, 2.15, 3.15]);
-    expect(take.gaps.map(({ from_s, to_s }) => [from_s.toFixed(2), to_s.toFixed(2)])).toEqual([["0.10", "2.10"], ["2.15", "3.15"]]);
-    expect(take.said[0]?.time_s).toBeCloseTo(2.15);
-    expect(trim(take, 2, 9).gaps).toHaveLength(1);
-    const keyframes = keyframesOf(trim(take, 2, 9), 0.01, robot);
+    recorder.addTelemetry(sample(5000, 9));
+    const recording = recorder.recording.value;
+    expect(recording.samples.map(({ time_s }) => Number(time_s.toFixed(2)))).toEqual([0, 0.05, 0.1, 2.1, 2.15, 3.15]);
+    expect(recording.gaps.map(({ from_s, to_s }) => [from_s.toFixed(2), to_s.toFixed(2)])).toEqual([["0.10", "2.10"], ["2.15", "3.15"]]);
+    expect(recording.speech[0]?.time_s).toBeCloseTo(2.15);
+    expect(trim(recording, 2, 9).gaps).toHaveLength(1);
+    const keyframes = keyframesOf(trim(recording, 2, 9), 0.01, robot);
     expect(keyframes[0]?.time_s).toBe(0);
     expect(keyframes.some(({ say }) => say === "hello")).toBe(true);
   });
@@ -207,14 +207,14 @@ describe("a recording", () => {
       const time_s = index / 20;
       return { time_s, position_rad: [Math.min(time_s, 5 - time_s) / 5, 0.3, 0, 0] };
     });
-    expect(trimmedGaps(samples, 0.01, new Set())).toEqual([0, 50, 100]);
-    const keyframes = keyframesOf({ samples, gaps: [], said: [] }, 0.01, robot);
+    expect(simplify(samples, 0.01, new Set())).toEqual([0, 50, 100]);
+    const keyframes = keyframesOf({ samples, gaps: [], speech: [] }, 0.01, robot);
     expect(times(movement(...keyframes))).toEqual([0, 2.5, 5]);
     expect(keyframes.slice(0, 2).map(({ position_rad }) => position_rad)).toEqual([{ yaw: 0, pitch: 0.3, left: 0 }, { yaw: 0.5 }]);
     expect(problems(movement(...keyframes), robot)).toEqual([]);
     const wobbly = samples.map((each, index) => ({ ...each, position_rad: [Math.sin(index / 8), 0, 0, 0] }));
-    const count = (tolerance: number): number => trimmedGaps(wobbly, tolerance, new Set()).length;
+    const count = (tolerance: number): number => simplify(wobbly, tolerance, new Set()).length;
     expect(count(0.1)).toBeLessThan(count(0.01));
-    expect(keyframesOf({ samples: [], gaps: [], said: [] }, 0.01, robot)).toEqual([]);
+    expect(keyframesOf({ samples: [], gaps: [], speech: [] }, 0.01, robot)).toEqual([]);
   });
 });

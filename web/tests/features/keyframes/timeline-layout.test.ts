@@ -14,15 +14,15 @@ interface Case {
 
 const cases = JSON.parse(readFileSync(new URL("../../../../tests/unit/device_agent/runtime/planning/timelines.json", import.meta.url), "utf8")) as Case[];
 
-/** The robot rests somewhere at first; in a plan that is the first keyframe. */
+/** The start pose of the robot is the first keyframe of the plan. */
 function movement({ start_rad, keyframes }: Case, robot: Robot): Movement {
   const start = Object.fromEntries(robot.joints.map(({ name }, index) => [name, start_rad[index] ?? 0]));
   delete start["right"];
-  const led = keyframes.map(({ time_s, position_rad: { right, ...others } }) => ({
+  const uncoupled = keyframes.map(({ time_s, position_rad: { right, ...others } }) => ({
     time_s,
     position_rad: { ...others, ...(right === undefined ? {} : { left: right / -0.5 }) },
   }));
-  return { description: "", keyframes: [{ time_s: 0, position_rad: start }, ...led] };
+  return { description: "", keyframes: [{ time_s: 0, position_rad: start }, ...uncoupled] };
 }
 
 test.each(cases)("$name: the plan equals the trajectory of the robot", (one) => {

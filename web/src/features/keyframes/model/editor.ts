@@ -11,18 +11,18 @@ type Storage = Pick<globalThis.Storage, "getItem" | "setItem" | "removeItem">;
 export class Editor {
   readonly robot: Robot;
   readonly #history: UndoHistory<Movement>;
-  readonly #chosen = signal(0);
+  readonly #selected = signal(0);
   readonly #at = signal(0);
   readonly #playing = signal(false);
   readonly #saved;
-  readonly #forget: () => void;
+  readonly #disposeEffect: () => void;
 
   readonly movement: ReadonlySignal<Movement>;
   readonly canUndo: ReadonlySignal<boolean>;
   readonly canRedo: ReadonlySignal<boolean>;
   readonly plan;
   readonly problems;
-  readonly chosen;
+  readonly selected;
   /** Preview position on the robot's time scale [s]. */
   readonly at: ReadonlySignal<number> = this.#at;
   readonly playing: ReadonlySignal<boolean> = this.#playing;
@@ -31,15 +31,15 @@ export class Editor {
   /** Joint positions at the preview position [rad]. */
   readonly pose;
 
-  /** `saved`: the cloud's version, `null`: none. `draft`: stored in this browser. `fresh`: used if both are absent. */
+  /** `saved`: the cloud's version, `null`: none. `draft`: stored in this browser. `initial`: used if both are absent. */
   constructor(
     robot: Robot,
-    from: { saved: Movement | null; draft: Movement | null; fresh: Movement },
-    keep: (movement: Movement | null) => void,
+    from: { saved: Movement | null; draft: Movement | null; initial: Movement },
+    storeDraft: (movement: Movement | null) => void,
   ) {
-    const { saved, draft, fresh } = from;
+    const { saved, draft, initial } = from;
     this.robot = robot;
-    const history = new UndoHistory(draft ?? saved ?? fresh);
+    const history = new UndoHistory(draft ?? saved ?? initial);
     this.#history = history;
     this.#saved = signal(saved);
     this.movement = history.now;
@@ -47,54 +47,54 @@ export class Editor {
     this.canRedo = history.canRedo;
     this.plan = computed(() => plan(history.now.value, robot));
     this.problems = computed(() => problems(history.now.value, robot));
-    this.chosen = computed(() => Math.min(this.#chosen.value, history.now.value.keyframes.length - 1));
+    this.selected = computed(() => Math.min(this.#selected.value, history.now.value.keyframes.length - 1));
     this.changed = computed(() => JSON.stringify(history.now.value) !== JSON.stringify(this.#saved.value));
     this.pose = computed(() => this.plan.value.at(this.#at.value));
     // An unedited movement is not stored as a draft.
-    this.#forget = effect(() => keep(this.changed.value && (draft !== null || this.canUndo.value) ? this.movement.value : null));
+    this.#disposeEffect = effect(() => storeDraft(this.changed.value && (draft !== null || this.canUndo.value) ? this.movement.value : null));
   }
 
   change(next: Movement, gesture = ""): void {
     this.#playing.value = false;
     this.#history.change(next, gesture);
-    this.#show();
+    this.#seekToSelected();
   }
 
   /** Ends a drag. */
-  settle(): void {
+  endGesture(): void {
     this.#history.endGesture();
   }
 
   undo(): void {
     this.#history.undo();
-    this.#show();
+    this.#seekToSelected();
   }
 
   redo(): void {
     this.#history.redo();
-    this.#show();
+    this.#seekToSelected();
   }
 
-  choose(index: number): void {
+  select(index: number): void {
     this.#playing.value = false;
-    this.#chosen.value = Math.max(0, Math.min(index, this.movement.value.keyframes.length - 1));
-    this.#show();
+    this.#selected.value = Math.max(0, Math.min(index, this.movement.value.keyframes.length - 1));
+    this.#seekToSelected();
   }
 
   /** Adds a keyframe with these positions after the selected one. */
   add(positions: Positions): void {
-    this.change(addAfter(this.movement.value, this.chosen.value, poseOf(positions, this.robot)));
-    this.choose(this.chosen.value + 1);
+    this.change(addAfter(this.movement.value, this.selected.value, poseOf(positions, this.robot)));
+    this.select(this.selected.value + 1);
   }
 
-  copy(): void {
-    this.change(duplicate(this.movement.value, this.chosen.value));
-    this.choose(this.chosen.value + 1);
+  duplicateSelected(): void {
+    this.change(duplicate(this.movement.value, this.selected.value));
+    this.select(this.selected.value + 1);
   }
 
-  drop(): void {
-    this.change(remove(this.movement.value, this.chosen.value));
-    this.choose(this.chosen.value);
+  deleteSelected(): void {
+    this.change(remove(this.movement.value, this.selected.value));
+    this.select(this.selected.value);
   }
 
   /** Every joint's position at a keyframe, including interpolated ones [rad]. */
@@ -103,9 +103,9 @@ export class Editor {
   }
 
   /** Moves the preview to a time on the scale of the keyframes [s]. */
-  scrub(asked_s: number): void {
+  scrub(time_s: number): void {
     this.#playing.value = false;
-    this.#at.value = this.plan.value.played(asked_s);
+    this.#at.value = this.plan.value.previewTime(time_s);
   }
 
   play(): void {
@@ -118,9 +118,9 @@ export class Editor {
   }
 
   /** Advances the preview by the elapsed time [s]. */
-  tick(passed_s: number): void {
+  tick(elapsed_s: number): void {
     if (!this.#playing.value) return;
-    this.#at.value = Math.min(this.#at.value + passed_s, this.plan.value.duration_s);
+    this.#at.value = Math.min(this.#at.value + elapsed_s, this.plan.value.duration_s);
     if (this.#at.value >= this.plan.value.duration_s) this.#playing.value = false;
   }
 
@@ -131,20 +131,20 @@ export class Editor {
   /** Reverts to the saved version; can be undone. */
   revert(): void {
     if (this.#saved.value !== null) this.change(this.#saved.value);
-    this.choose(0);
+    this.select(0);
   }
 
   dispose(): void {
-    this.#forget();
+    this.#disposeEffect();
   }
 
-  #show(): void {
-    this.#at.value = this.plan.value.reached_s[this.chosen.value] ?? 0;
+  #seekToSelected(): void {
+    this.#at.value = this.plan.value.reached_s[this.selected.value] ?? 0;
   }
 }
 
 /** A movement of one keyframe: the measured pose, or, if unknown, every joint at 0 or at the limit nearest to 0. */
-export function begun(robot: Robot, measured: Positions | null): Movement {
+export function newMovement(robot: Robot, measured: Positions | null): Movement {
   const positions = measured ?? poseAt(Object.fromEntries(robot.joints.map(({ name }) => [name, 0])), robot);
   return { description: "", keyframes: [{ time_s: 0, position_rad: poseOf(positions, robot) }] };
 }
@@ -166,7 +166,7 @@ export class Drafts {
   }
 
   /** Whether the draft was stored: storage can be full or forbidden. */
-  keep(robotType: string, name: string, movement: Movement | null): boolean {
+  storeDraft(robotType: string, name: string, movement: Movement | null): boolean {
     try {
       if (movement === null) this.#storage.removeItem(key(robotType, name));
       else this.#storage.setItem(key(robotType, name), JSON.stringify(movement));

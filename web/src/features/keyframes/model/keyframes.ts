@@ -1,4 +1,4 @@
-/** A movement as keyframes: joint positions and steps at times. All functions are pure and return new objects. */
+/** A movement as keyframes: joint positions and actions at times. All functions are pure and return new objects. */
 import { clamp } from "../../../shared/lib/angles";
 import type { KnownDescription } from "../../../shared/mqtt/parse-messages";
 import type { Joint } from "../../../shared/mqtt/protocol.generated";
@@ -17,7 +17,7 @@ interface Place {
   yaw_rad?: number;
 }
 
-/** Steps at a keyframe, executed in this order while the movement pauses. */
+/** Actions at a keyframe, executed in this order while the movement pauses. */
 export interface KeyframeActions {
   posture?: string;
   behaviour?: string;
@@ -33,7 +33,7 @@ export type ActionKind = (typeof ACTION_KINDS)[number];
 
 export interface Keyframe extends KeyframeActions {
   time_s: number;
-  /** Joints that are absent are interpolated. */
+  /** Absent joints are interpolated. */
   position_rad: Positions;
 }
 
@@ -50,20 +50,20 @@ export type Robot = Pick<
   "joints" | "mimic_joints" | "position_dependent_limits" | "postures" | "expressions" | "behaviours" | "capabilities" | "actions"
 >;
 
-export const LONGEST_S = 600;
+export const MAX_DURATION_S = 600;
 
 /** Minimum time between two keyframes [s]. */
-export const SHORTEST_S = 0.05;
+export const MIN_INTERVAL_S = 0.05;
 
 /** Maximum length of a keyframe's text that a robot accepts. */
-export const LONGEST_TEXT = 500;
+export const MAX_TEXT_LENGTH = 500;
 
 const STEP_RAD = 1e-4;
 
-/** Time the preview spends on a step of unknown duration, such as speech [s]. */
-export const DEED_S = 0.8;
+/** Preview duration of an action of unknown duration, such as speech [s]. */
+export const ACTION_PREVIEW_S = 0.8;
 
-export const SAME_RAD = 1e-6;
+export const TOLERANCE_RAD = 1e-6;
 
 /** A position rounded to the stored precision, within a range. */
 export function normalize(value: number, lower: number, upper: number): number {
@@ -74,7 +74,7 @@ export function normalize(value: number, lower: number, upper: number): number {
 }
 
 /** Rounds a time to hundredths of a second. */
-export function tidyTime(time: number): number {
+export function roundTime(time: number): number {
   return Number(time.toFixed(2));
 }
 
@@ -93,7 +93,7 @@ export function setPosition(movement: Movement, index: number, joint: Joint, pos
     const all = { ...old.position_rad };
     if (position === null) Reflect.deleteProperty(all, joint.name);
     else all[joint.name] = normalize(position, joint.lower_rad, joint.upper_rad);
-    return { ...old, position_rad: inOrder(all, robot) };
+    return { ...old, position_rad: inJointOrder(all, robot) };
   });
 }
 
@@ -104,31 +104,31 @@ export function setPose(movement: Movement, index: number, positions: Positions,
 
 export function poseOf(positions: Positions, robot: Robot): Positions {
   const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));
-  const counted = robot.joints.flatMap(({ name, lower_rad, upper_rad }) => {
+  const entries = robot.joints.flatMap(({ name, lower_rad, upper_rad }) => {
     const value = positions[name];
     return value === undefined || followers.has(name) ? [] : [[name, normalize(value, lower_rad, upper_rad)] as const];
   });
-  return Object.fromEntries(counted);
+  return Object.fromEntries(entries);
 }
 
-/** Sets or removes (`undefined`) a step at a keyframe. */
-export function setAction<D extends ActionKind>(movement: Movement, index: number, deed: D, value: KeyframeActions[D] | undefined): Movement {
+/** Sets or removes (`undefined`) an action at a keyframe. */
+export function setAction<D extends ActionKind>(movement: Movement, index: number, kind: D, value: KeyframeActions[D] | undefined): Movement {
   return withKeyframe(movement, index, (old) => {
-    const { time_s, position_rad, ...deeds } = old;
-    const next: KeyframeActions = { ...deeds };
-    if (value === undefined) Reflect.deleteProperty(next, deed);
-    else next[deed] = value;
+    const { time_s, position_rad, ...actions } = old;
+    const next: KeyframeActions = { ...actions };
+    if (value === undefined) Reflect.deleteProperty(next, kind);
+    else next[kind] = value;
     return { time_s, position_rad, ...actionsOf(next) };
   });
 }
 
-/** The steps of a keyframe, in order of execution. */
+/** The actions of a keyframe, in order of execution. */
 export function actionsOf(keyframe: KeyframeActions): KeyframeActions {
-  return Object.fromEntries(ACTION_KINDS.filter((deed) => keyframe[deed] !== undefined).map((deed) => [deed, keyframe[deed]]));
+  return Object.fromEntries(ACTION_KINDS.filter((kind) => keyframe[kind] !== undefined).map((kind) => [kind, keyframe[kind]]));
 }
 
 export function hasAction(keyframe: KeyframeActions): boolean {
-  return ACTION_KINDS.some((deed) => keyframe[deed] !== undefined);
+  return ACTION_KINDS.some((kind) => keyframe[kind] !== undefined);
 }
 
 /** Moves a keyframe in time between its neighbours, or with all later ones (`shifting`). The first one stays at 0. */
@@ -138,14 +138,14 @@ export function setTime(movement: Movement, index: number, time: number, shiftin
   const old = keyframes[index];
   if (before === undefined || old === undefined || !Number.isFinite(time)) return movement;
   const after = shifting ? undefined : keyframes[index + 1];
-  const latest = shifting ? LONGEST_S - ((keyframes.at(-1)?.time_s ?? 0) - old.time_s) : (after?.time_s ?? LONGEST_S + SHORTEST_S) - SHORTEST_S;
-  const moved = tidyTime(clamp(time, before.time_s + SHORTEST_S, Math.max(latest, before.time_s + SHORTEST_S)));
+  const latest = shifting ? MAX_DURATION_S - ((keyframes.at(-1)?.time_s ?? 0) - old.time_s) : (after?.time_s ?? MAX_DURATION_S + MIN_INTERVAL_S) - MIN_INTERVAL_S;
+  const moved = roundTime(clamp(time, before.time_s + MIN_INTERVAL_S, Math.max(latest, before.time_s + MIN_INTERVAL_S)));
   const shift = moved - old.time_s;
   return {
     ...movement,
     keyframes: keyframes.map((one, other) => {
       if (other === index) return { ...one, time_s: moved };
-      return shifting && other > index ? { ...one, time_s: tidyTime(one.time_s + shift) } : one;
+      return shifting && other > index ? { ...one, time_s: roundTime(one.time_s + shift) } : one;
     }),
   };
 }
@@ -155,11 +155,11 @@ export function addAfter(movement: Movement, index: number, positions: Positions
   const { keyframes } = movement;
   const [old, after] = [keyframes[index], keyframes[index + 1]];
   if (old === undefined) return movement;
-  const time_s = tidyTime(after === undefined ? old.time_s + 1 : (old.time_s + after.time_s) / 2);
+  const time_s = roundTime(after === undefined ? old.time_s + 1 : (old.time_s + after.time_s) / 2);
   const added: Keyframe = { time_s, position_rad: positions };
-  const room = after === undefined || after.time_s - old.time_s >= 2 * SHORTEST_S;
+  const fits = after === undefined || after.time_s - old.time_s >= 2 * MIN_INTERVAL_S;
   const next = { ...movement, keyframes: keyframes.toSpliced(index + 1, 0, added) };
-  return room ? next : setTime(next, index + 1, old.time_s + 1, true);
+  return fits ? next : setTime(next, index + 1, old.time_s + 1, true);
 }
 
 /** Duplicates a keyframe one second later; later keyframes are shifted. */
@@ -170,7 +170,7 @@ export function duplicate(movement: Movement, index: number): Movement {
   return setTime(next, index + 1, old.time_s + 1, true);
 }
 
-/** Removes a keyframe, except the last one. */
+/** Removes a keyframe unless it is the only one. */
 export function remove(movement: Movement, index: number): Movement {
   if (movement.keyframes.length < 2) return movement;
   return startAtZero({ ...movement, keyframes: movement.keyframes.toSpliced(index, 1) });
@@ -181,11 +181,11 @@ export function startAtZero(movement: Movement): Movement {
   const begin = movement.keyframes[0]?.time_s ?? 0;
   return {
     ...movement,
-    keyframes: movement.keyframes.map((one) => ({ ...one, time_s: tidyTime(one.time_s - begin) })),
+    keyframes: movement.keyframes.map((one) => ({ ...one, time_s: roundTime(one.time_s - begin) })),
   };
 }
 
-export function inOrder(positions: Positions, robot: Robot): Positions {
+export function inJointOrder(positions: Positions, robot: Robot): Positions {
   const known = robot.joints.map(({ name }) => name).filter((name) => name in positions);
   const others = Object.keys(positions).filter((name) => !known.includes(name));
   return Object.fromEntries([...known, ...others].map((name) => [name, positions[name] ?? NaN]));

@@ -2,7 +2,7 @@
 import { ACTION_KINDS, actionsOf, type ActionKind, type KeyframeActions, type Keyframe, type Movement } from "./keyframes";
 
 /** The server's limit [characters]. */
-export const LONGEST_SCRIPT = 65_536;
+export const MAX_SCRIPT_LENGTH = 65_536;
 const OPENS = "KEYFRAMES = [";
 const QUOTES = '"""';
 
@@ -37,14 +37,14 @@ function plain(text: string): string {
 }
 
 /** JSON of these types is valid Python. */
-function literal({ time_s, position_rad, ...deeds }: Keyframe): string {
+function literal({ time_s, position_rad, ...actionValues }: Keyframe): string {
   const spaced = (value: unknown): string => {
     if (typeof value !== "object" || value === null) return JSON.stringify(value);
     return `{${Object.entries(value)
       .map(([key, one]) => `${JSON.stringify(key)}: ${spaced(one)}`)
       .join(", ")}}`;
   };
-  return spaced({ time_s, position_rad, ...actionsOf(deeds) });
+  return spaced({ time_s, position_rad, ...actionsOf(actionValues) });
 }
 
 type ParsedScript = { kind: "keyframes"; movement: Movement } | { kind: "changed" } | { kind: "other" };
@@ -78,27 +78,27 @@ export function readMovement(value: unknown): Movement | null {
 }
 
 function keyframe(value: unknown): Keyframe {
-  const { time_s, position_rad, ...deeds } = object(value, "time_s", "position_rad", ...ACTION_KINDS);
-  const positions = Object.entries(object(position_rad)).map(([name, place]) => [name, number(place)] as const);
-  const done = Object.entries(deeds).map(([deed, how]) => [deed, deedOf(deed as ActionKind, how)] as const);
-  return { time_s: number(time_s), position_rad: Object.fromEntries(positions), ...(Object.fromEntries(done) as KeyframeActions) };
+  const { time_s, position_rad, ...actionValues } = object(value, "time_s", "position_rad", ...ACTION_KINDS);
+  const positions = Object.entries(object(position_rad)).map(([name, position]) => [name, number(position)] as const);
+  const actions = Object.entries(actionValues).map(([kind, value]) => [kind, parseAction(kind as ActionKind, value)] as const);
+  return { time_s: number(time_s), position_rad: Object.fromEntries(positions), ...(Object.fromEntries(actions) as KeyframeActions) };
 }
 
-function deedOf(deed: ActionKind, how: unknown): KeyframeActions[ActionKind] {
-  switch (deed) {
+function parseAction(kind: ActionKind, value: unknown): KeyframeActions[ActionKind] {
+  switch (kind) {
     case "drive": {
-      const { forward_m_s, turn_rad_s, duration_s } = object(how, "forward_m_s", "turn_rad_s", "duration_s");
+      const { forward_m_s, turn_rad_s, duration_s } = object(value, "forward_m_s", "turn_rad_s", "duration_s");
       return { forward_m_s: number(forward_m_s), turn_rad_s: number(turn_rad_s), duration_s: number(duration_s) };
     }
     case "go_to": {
-      const { x_m, y_m, yaw_rad } = object(how, "x_m", "y_m", "yaw_rad");
+      const { x_m, y_m, yaw_rad } = object(value, "x_m", "y_m", "yaw_rad");
       return { x_m: number(x_m), y_m: number(y_m), ...(yaw_rad === undefined ? {} : { yaw_rad: number(yaw_rad) }) };
     }
     case "posture":
     case "behaviour":
     case "express":
     case "say":
-      return text(how);
+      return text(value);
   }
 }
 

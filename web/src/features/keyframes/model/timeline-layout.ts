@@ -9,26 +9,26 @@ import type { Joint } from "../../../shared/mqtt/protocol.generated";
 
 type JointLimits = Pick<Joint, "max_velocity_rad_s" | "max_acceleration_rad_s2" | "max_jerk_rad_s3">;
 
-/** A joint's position [rad] at a keyframe. */
-export interface Stay {
-  number: number;
-  place: number;
+/** A joint's position [rad] at the keyframe `index`. */
+export interface Waypoint {
+  index: number;
+  position: number;
 }
 
 export type Limiting = "velocity" | "acceleration" | "jerk";
 
-interface Stretch {
+interface SegmentDemand {
   /** Required time relative to the available time; up to 1 is feasible. */
-  over: number;
+  timeRatio: number;
   by: Limiting;
 }
 
-/** Tolerance for rounding. */
-export const FITS = 1.0005;
-const LOOKS = 33;
-const TRIES = 100;
+/** Feasible up to 1; the rest is a rounding tolerance. */
+export const MAX_TIME_RATIO = 1.0005;
+const SAMPLE_COUNT = 33;
+const MAX_ITERATIONS = 100;
 
-type Parts = readonly [way: number, begin: number, end: number];
+type Parts = readonly [distance: number, begin: number, end: number];
 
 /** Rows: position, velocity, acceleration, jerk; columns: factors of the distance, the start and the end velocity. */
 function shape(u: number): readonly Parts[] {
@@ -41,23 +41,23 @@ function shape(u: number): readonly Parts[] {
   ];
 }
 
-const LOOK = Array.from({ length: LOOKS }, (_, index) => shape(index / (LOOKS - 1)));
+const SAMPLED_SHAPES = Array.from({ length: SAMPLE_COUNT }, (_, index) => shape(index / (SAMPLE_COUNT - 1)));
 
 function sum(row: Parts | undefined, parts: Parts): number {
   return row === undefined ? 0 : row[0] * parts[0] + row[1] * parts[1] + row[2] * parts[2];
 }
 
-/** One joint's curve through its positions. It rests before and after it. */
+/** One joint's curve through its positions. The joint is at rest before and after the curve. */
 export class Curve {
   readonly times: readonly number[];
-  readonly places: readonly number[];
+  readonly positions: readonly number[];
   readonly #speeds: readonly number[];
 
-  constructor(times: readonly number[], places: readonly number[]) {
+  constructor(times: readonly number[], positions: readonly number[]) {
     this.times = times;
-    this.places = places;
-    const slopes = places.slice(1).map((place, index) => (place - at(places, index)) / (at(times, index + 1) - at(times, index)));
-    this.#speeds = places.map((_, index) => {
+    this.positions = positions;
+    const slopes = positions.slice(1).map((position, index) => (position - at(positions, index)) / (at(times, index + 1) - at(times, index)));
+    this.#speeds = positions.map((_, index) => {
       const [before, after] = [slopes[index - 1] ?? 0, slopes[index] ?? 0];
       return before * after > 0 ? (2 * before * after) / (before + after) : 0;
     });
@@ -66,35 +66,35 @@ export class Curve {
   /** The position at a time [rad]. */
   at(time: number): number {
     const end = this.times.findIndex((one) => one > time);
-    if (end === 0) return at(this.places, 0);
-    if (end < 0) return at(this.places, this.places.length - 1);
-    const [from, to] = [at(this.places, end - 1), at(this.places, end)];
-    const lasts = at(this.times, end) - at(this.times, end - 1);
-    const row = shape((time - at(this.times, end - 1)) / lasts)[0];
+    if (end === 0) return at(this.positions, 0);
+    if (end < 0) return at(this.positions, this.positions.length - 1);
+    const [from, to] = [at(this.positions, end - 1), at(this.positions, end)];
+    const duration_s = at(this.times, end) - at(this.times, end - 1);
+    const row = shape((time - at(this.times, end - 1)) / duration_s)[0];
     return clamp(from + sum(row, this.#parts(end)), Math.min(from, to), Math.max(from, to));
   }
 
   /** The demand of each segment on a joint; the first segment ends at the second position. */
-  stretches(joint: JointLimits): Stretch[] {
-    return this.places.slice(1).map((_, index) => this.#stretch(index + 1, joint));
+  segmentDemands(joint: JointLimits): SegmentDemand[] {
+    return this.positions.slice(1).map((_, index) => this.#demand(index + 1, joint));
   }
 
-  #stretch(end: number, joint: JointLimits): Stretch {
+  #demand(end: number, joint: JointLimits): SegmentDemand {
     const parts = this.#parts(end);
-    const lasts = at(this.times, end) - at(this.times, end - 1);
-    const most = (order: number): number => Math.max(...LOOK.map((rows) => Math.abs(sum(rows[order], parts)))) / lasts ** order;
-    const all: Stretch[] = [
-      { by: "velocity", over: most(1) / joint.max_velocity_rad_s },
-      { by: "acceleration", over: Math.sqrt(most(2) / joint.max_acceleration_rad_s2) },
-      { by: "jerk", over: Math.cbrt(most(3) / joint.max_jerk_rad_s3) },
+    const duration_s = at(this.times, end) - at(this.times, end - 1);
+    const peak = (order: number): number => Math.max(...SAMPLED_SHAPES.map((rows) => Math.abs(sum(rows[order], parts)))) / duration_s ** order;
+    const all: SegmentDemand[] = [
+      { by: "velocity", timeRatio: peak(1) / joint.max_velocity_rad_s },
+      { by: "acceleration", timeRatio: Math.sqrt(peak(2) / joint.max_acceleration_rad_s2) },
+      { by: "jerk", timeRatio: Math.cbrt(peak(3) / joint.max_jerk_rad_s3) },
     ];
-    return all.reduce((worst, one) => (one.over > worst.over ? one : worst));
+    return all.reduce((worst, one) => (one.timeRatio > worst.timeRatio ? one : worst));
   }
 
   #parts(end: number): Parts {
-    const lasts = at(this.times, end) - at(this.times, end - 1);
-    const way = at(this.places, end) - at(this.places, end - 1);
-    return [way, at(this.#speeds, end - 1) * lasts, at(this.#speeds, end) * lasts];
+    const duration_s = at(this.times, end) - at(this.times, end - 1);
+    const distance = at(this.positions, end) - at(this.positions, end - 1);
+    return [distance, at(this.#speeds, end - 1) * duration_s, at(this.#speeds, end) * duration_s];
   }
 }
 
@@ -103,16 +103,16 @@ export function at(list: readonly number[], index: number): number {
 }
 
 /** Times from the gaps between them. */
-export function moments(gaps: readonly number[]): number[] {
+export function timesOf(gaps: readonly number[]): number[] {
   const found = [0];
   for (const gap of gaps) found.push((found.at(-1) ?? 0) + gap);
   return found;
 }
 
-export function curveOf(stays: readonly Stay[], times: readonly number[]): Curve {
+export function curveOf(waypoints: readonly Waypoint[], times: readonly number[]): Curve {
   return new Curve(
-    stays.map(({ number }) => at(times, number)),
-    stays.map(({ place }) => place),
+    waypoints.map(({ index }) => at(times, index)),
+    waypoints.map(({ position }) => position),
   );
 }
 
@@ -120,23 +120,23 @@ export function curveOf(stays: readonly Stay[], times: readonly number[]): Curve
  * The gaps between keyframes [s], extended where the limits require it. Extending one changes the velocity in others,
  * so this iterates.
  */
-export function fitted(gaps: readonly number[], tracks: readonly { joint: JointLimits; stays: readonly Stay[] }[]): number[] {
-  let now = [...gaps];
-  let longest = 1;
-  for (let tries = 0; tries < TRIES; tries += 1) {
-    const longer = now.map(() => 1);
-    const times = moments(now);
-    for (const { joint, stays } of tracks) {
-      curveOf(stays, times)
-        .stretches(joint)
-        .forEach(({ over }, index) => {
-          const [begin, end] = [stays[index]?.number ?? 0, stays[index + 1]?.number ?? 0];
-          for (let gap = begin; gap < end; gap += 1) longer[gap] = Math.max(at(longer, gap), over);
+export function extendGaps(gaps: readonly number[], tracks: readonly { joint: JointLimits; waypoints: readonly Waypoint[] }[]): number[] {
+  let extended = [...gaps];
+  let largestFactor = 1;
+  for (let iteration = 0; iteration < MAX_ITERATIONS; iteration += 1) {
+    const factors = extended.map(() => 1);
+    const times = timesOf(extended);
+    for (const { joint, waypoints } of tracks) {
+      curveOf(waypoints, times)
+        .segmentDemands(joint)
+        .forEach(({ timeRatio }, index) => {
+          const [begin, end] = [waypoints[index]?.index ?? 0, waypoints[index + 1]?.index ?? 0];
+          for (let gap = begin; gap < end; gap += 1) factors[gap] = Math.max(at(factors, gap), timeRatio);
         });
     }
-    longest = Math.max(1, ...longer);
-    if (longest <= FITS) return now;
-    now = now.map((gap, index) => gap * at(longer, index));
+    largestFactor = Math.max(1, ...factors);
+    if (largestFactor <= MAX_TIME_RATIO) return extended;
+    extended = extended.map((gap, index) => gap * at(factors, index));
   }
-  return now.map((gap) => gap * longest);
+  return extended.map((gap) => gap * largestFactor);
 }
