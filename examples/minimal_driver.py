@@ -1,4 +1,4 @@
-"""A driver plug-in for a robot whose motors reach every position at once.
+"""A driver plug-in for a robot whose motors reach every position immediately.
 
 Publish it in a package with the entry point ``minimal = "minimal_driver:create"`` in the group ``telescope.drivers``,
 and select it with ``driver = "minimal"`` in ``agent.toml``. ``device_agent/ports/driver.py`` documents each method.

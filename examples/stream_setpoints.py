@@ -1,7 +1,7 @@
 """Move one joint with streamed setpoints. Usage: ``python examples/stream_setpoints.py DEVICE JOINT POSITION_RAD``.
 
-Takes the lease, streams setpoints that echo the newest telemetry tick, and releases the lease. The robot stops by
-itself 300 ms after the last setpoint.
+Takes the lease, streams setpoints that echo the newest telemetry tick, and releases the lease. The robot stops
+automatically 300 ms after the last setpoint.
 """
 
 import json

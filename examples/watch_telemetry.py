@@ -15,7 +15,7 @@ device = find_device(options.device)
 messages: queue.Queue[tuple[str, bytes]] = queue.Queue()
 client = connect_to_broker({"purpose": "view"})
 client.on_message = lambda _client, _userdata, message: messages.put((message.topic, message.payload))
-# ``desc`` is retained, so the broker sends it at once.
+# ``desc`` is retained, so the broker sends it immediately.
 client.on_connect = lambda *_: client.subscribe([(topic(device, "desc"), 1), (topic(device, "tele/joints"), 0)])
 client.loop_start()
 

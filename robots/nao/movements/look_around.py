@@ -14,17 +14,17 @@ PARAMETERS = {
         "maximum": 5,
         "default": 0.5,
         "unit": "s",
-        "description": "How long to look each way",
+        "description": "Pause in each direction",
     },
 }
 
 speed = min(0.5, max(0.05, float(parameters.get("speed", 0.15))))
 pause_s = min(5.0, max(0.0, float(parameters.get("pause_s", 0.5))))
 
-ways = [(1.0, -0.1), (0.0, -0.35), (-1.0, -0.1), (0.0, 0.3)]
+directions = [(1.0, -0.1), (0.0, -0.35), (-1.0, -0.1), (0.0, 0.3)]
 robot.home(speed=0.3)
-for index, (yaw, pitch) in enumerate(ways):
+for index, (yaw, pitch) in enumerate(directions):
     robot.move_joints({"HeadYaw": yaw, "HeadPitch": pitch}, speed=speed)
     wait(pause_s)
-    progress((index + 1) / len(ways))
+    progress((index + 1) / len(directions))
 robot.home(speed=speed)

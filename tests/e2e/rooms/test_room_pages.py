@@ -62,7 +62,7 @@ def test_plan_camera_and_lamp_of_the_room(browser: Browser, laboratory: Machine)
         assert_good_page(ann, "plan")
 
         # A pin opens the page of its device.
-        ann.get_by_test_id("plan").get_by_role("link", name="Camera in the corner").click()
+        ann.get_by_test_id("plan").get_by_role("link", name="Corner camera").click()
         ann.get_by_test_id("camera-live").click()
         canvas = ann.get_by_test_id("camera-picture")
         wait_until(lambda: canvas.get_attribute("data-sequence") is not None, "a picture")
@@ -75,7 +75,7 @@ def test_plan_camera_and_lamp_of_the_room(browser: Browser, laboratory: Machine)
         # One page collects light values, the other switches the lamp.
         open_light(bob)
         ann.goto(f"{laboratory.url}/#/")
-        open_device(ann, "Lamps on the ceiling")
+        open_device(ann, "Ceiling lamps")
         before = lux(bob)
         ann.get_by_test_id("level-most").click()
         wait_until(lambda: lux(bob) > before + 20, f"more light than {before} lx")

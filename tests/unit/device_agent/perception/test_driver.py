@@ -67,7 +67,7 @@ def device(**more):
     return RoomDeviceManifest(
         name="perception",
         kind="perception",
-        label="What the room knows",
+        label="Room perception",
         driver="perception",
         streams=(Stream(name="positions", rate_hz=5.0),),
         options=options(**more),

@@ -90,7 +90,7 @@ def test_people_behind_a_closed_door_raise_a_fault_of_the_air_and_the_open_door_
         assert (warned["code"], warned["severity"]) == ("co2.co2_ppm", "warning")
         assert warned["message"].startswith("CO₂ in the air is ")
         assert warned["message"].endswith(
-            "Open door or window, or let fewer people in; below 400 ppm the sensor wants calibration."
+            "Open the door or a window, or reduce the number of people. Below 400 ppm, calibrate the sensor."
         )
         air.live(60)
         anna = cloud.sign_in("anna")
