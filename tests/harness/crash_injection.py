@@ -13,7 +13,7 @@ from tests.harness.cloud.cloud import Cloud, Person
 WRITES = frozenset({"create", "replace", "delete", "batch", "put", "append"})
 
 
-class Killed(Exception):  # noqa: N818 (an outcome that the test wants)
+class Killed(Exception):  # noqa: N818 (an outcome that tests expect)
     """The simulated process has ended."""
 
 

@@ -179,7 +179,7 @@ def race(place: Place, attempts: Attempts, shared: Any, racers: Sequence[Any]) -
 
     Args:
         place: The common store.
-        attempts: A function of a module that gives the attempts of one racer.
+        attempts: A function of a module that returns the attempts of one racer.
         shared: Passed to ``attempts``, with the racer.
         racers: Passed one to each process.
 

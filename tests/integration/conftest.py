@@ -22,13 +22,13 @@ OpenCloud = Callable[..., Cloud]
 
 @pytest.fixture
 def broker(request: pytest.FixtureRequest, brokers: Brokers) -> RunningBroker:
-    """The embedded one; a test that is parametrised with ``broker`` runs over others too."""
+    """The embedded broker by default; tests may parametrize ``broker``."""
     return brokers(getattr(request, "param", "amqtt"))
 
 
 @pytest.fixture
 def open_cloud(home: Path, broker: RunningBroker) -> Iterator[OpenCloud]:
-    """Opens instances of the functions over one home."""
+    """Opens instances of the functions with the same home folder."""
     if broker.kind == "mosquitto":
         (home / "mosquitto").mkdir()
         shutil.copy(broker.home / "service.password", home / "mosquitto")
@@ -50,7 +50,7 @@ def cloud(open_cloud: OpenCloud) -> Cloud:
 
 @pytest.fixture
 def pair(cloud: Cloud) -> Iterator[tuple[Person, Robot]]:
-    """Anna, and a robot of hers that is online."""
+    """Anna and her online robot."""
     with paired(cloud) as found:
         yield found
 
@@ -59,7 +59,7 @@ def pair(cloud: Cloud) -> Iterator[tuple[Person, Robot]]:
 def place(
     request: pytest.FixtureRequest, tmp_path: Path, emulators: Emulators, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Place]:
-    """An empty store of the kind that the test is parametrised with."""
+    """An empty store of the parametrized kind."""
     kind: StoreKind | Literal["memory"] = request.param
     now_ms, sent = time.time_ns() // 1_000_000, tmp_path / "sent"
     if kind == "memory":

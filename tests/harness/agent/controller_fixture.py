@@ -23,7 +23,7 @@ Target = JointTarget | JogTarget | DriveTarget
 
 
 class ControllerFixture:
-    """A controller with a clock of its own and an operator who answers the newest telemetry."""
+    """A controller with its own clock, and an operator whose setpoints refer to the newest telemetry."""
 
     def __init__(self, *, geometry: RobotGeometry | None = None, base: Base | None = None, **gate: int) -> None:
         self.controller = Controller(robot_type(base), LeaseGate(**gate), geometry=geometry)
@@ -107,7 +107,7 @@ class ControllerFixture:
 
 
 def leased(geometry: RobotGeometry | None = None) -> ControllerFixture:
-    """A controller whose operator has lease 1."""
+    """A controller with an operator who has lease 1."""
     fixture = ControllerFixture(geometry=geometry)
     fixture.grant(1)
     return fixture
@@ -128,11 +128,11 @@ def ignore_revocation(_: Refused) -> None:
 def interruptions() -> dict[str, Callable[[ControllerFixture], object]]:
     return {
         "stop": lambda fixture: fixture.stop(),
-        "link": lambda fixture: fixture.controller.interrupt(Refused("link_lost", "the link is gone")),
+        "link": lambda fixture: fixture.controller.interrupt(Refused("link_lost", "the link is lost")),
         "takeover": lambda fixture: fixture.grant(2),
         "release": lambda fixture: fixture.controller.release(epoch=1),
         "expiry": lambda fixture: fixture.run(6.0),
-        "fault": lambda fixture: fixture.controller.set_fault("no answer"),
+        "fault": lambda fixture: fixture.controller.set_fault("no response"),
     }
 
 

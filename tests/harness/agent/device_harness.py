@@ -64,7 +64,7 @@ class DeviceHarness:
     ) -> None:
         self.key = signing.generate()
         self.kind = kind or robot_type()
-        self.said: list[tuple[str, bytes]] = []
+        self.messages: list[tuple[str, bytes]] = []
         self.driver = driver or FakeDriver()
         self.journal = Journal(folder / "journal.db")
         self.journal.open(now_ms=wall_ms())
@@ -113,7 +113,7 @@ class DeviceHarness:
     ) -> bool:
         assert qos in {0, 1}
         assert retain == (topics.parse(topic).kind in {topics.DESC, topics.STATE})
-        self.said.append((topic, payload))
+        self.messages.append((topic, payload))
         if delivered is not None:
             delivered()
         return True
@@ -147,8 +147,8 @@ class DeviceHarness:
         self.receive(topics.CTL, codec.encode(setpoint), str(epoch))
 
     def published(self, kind: str, message: type[Any], name: str = "") -> list[Any]:
-        wanted = topics.device("s", "a", "arm", kind, name)
-        return [codec.decode(payload, message) for topic, payload in list(self.said) if topic == wanted]
+        expected = topics.device("s", "a", "arm", kind, name)
+        return [codec.decode(payload, message) for topic, payload in list(self.messages) if topic == expected]
 
     def acks(self, command: str) -> list[Ack]:
         return [ack for ack in self.published(topics.ACK, Ack) if ack.id == command]
@@ -190,14 +190,14 @@ class DeviceHarness:
         return [event for event in self.published(topics.EVENT, Event) if event.kind == kind]
 
     def telemetry(self) -> JointTelemetry:
-        seen: JointTelemetry = eventually(lambda: self.published(topics.TELE, JointTelemetry, "joints")[-1:])[0]
-        return seen
+        newest: JointTelemetry = eventually(lambda: self.published(topics.TELE, JointTelemetry, "joints")[-1:])[0]
+        return newest
 
 
 def signed_movement(
     source: str, key: Ed25519PrivateKey, *, version: int = 1, author: str = SHIPPED, robot_type: str = "toy"
 ) -> RunMovement:
-    """As the cloud sends it."""
+    """A command to run this movement, signed as by the cloud."""
     digest = hashlib.sha256(source.encode()).hexdigest()
     text = signing.movement_text(robot_type, "dance", version, digest)
     return RunMovement(
@@ -218,9 +218,9 @@ def eventually(probe: Callable[[], Any]) -> Any:
         if found := probe():
             return found
         time.sleep(0.01)
-    pytest.fail("it never happened")
+    pytest.fail(f"the condition did not hold within {WITHIN_S} s")
 
 
-def shown(harness: DeviceHarness, wanted: Callable[[State], Any]) -> State:
-    found: State = eventually(lambda: [s for s in harness.published(topics.STATE, State)[-1:] if wanted(s)])[0]
+def wait_for_state(harness: DeviceHarness, expected: Callable[[State], Any]) -> State:
+    found: State = eventually(lambda: [s for s in harness.published(topics.STATE, State)[-1:] if expected(s)])[0]
     return found

@@ -1,5 +1,5 @@
-// An OpenID Connect provider for the tests. The first line of its standard input says what it is to be:
-// {port, client: {...}, keys: [JWK, …]}; it prints its address once it listens, and ends with its standard input.
+// An OpenID Connect provider for tests. The first line of its standard input is its configuration:
+// {port, client: {...}, keys: [JWK, …]}; it prints its address when it listens, and exits when standard input ends.
 import { createServer } from "node:http";
 import { createInterface } from "node:readline";
 import Provider from "oidc-provider";

@@ -20,7 +20,7 @@ class Proxy:
 
     Args:
         behind: Port of the server.
-        heard: Called with data for clients before it is forwarded.
+        on_data: Called with data for clients before it is forwarded.
 
     Attributes:
         port: Port for clients.
@@ -28,11 +28,11 @@ class Proxy:
         arrivals: Data since ``acknowledge_late``: time [s], whether from the server, content.
     """
 
-    def __init__(self, behind: int, heard: Callable[[bytes], None] | None = None) -> None:
+    def __init__(self, behind: int, on_data: Callable[[bytes], None] | None = None) -> None:
         self.accepted = 0
         self.arrivals: list[tuple[float, bool, bytes]] = []
         self._late = False
-        self._heard = heard
+        self._on_data = on_data
         self._frozen = False
         self._behind = behind
         self._listener = socket.create_server((HOST, 0))
@@ -150,8 +150,8 @@ class Proxy:
             if self._late:
                 self.arrivals.append((time.perf_counter(), ready in self._servers, content))
                 _acknowledge_late(ready)
-            if self._heard is not None and ready in self._servers:
-                self._heard(content)
+            if self._on_data is not None and ready in self._servers:
+                self._on_data(content)
             with contextlib.suppress(OSError):
                 other.sendall(content)
             return
@@ -169,9 +169,9 @@ def _acknowledge_late(one: socket.socket) -> None:
 
 
 @contextlib.contextmanager
-def start_proxy(behind: int, heard: Callable[[bytes], None] | None = None) -> Iterator[Proxy]:
+def start_proxy(behind: int, on_data: Callable[[bytes], None] | None = None) -> Iterator[Proxy]:
     """A proxy in front of a local port."""
-    proxy = Proxy(behind, heard)
+    proxy = Proxy(behind, on_data)
     try:
         yield proxy
     finally:

@@ -1,4 +1,4 @@
-"""A real Prosody, an XMPP gateway beside the functions, and a fake robot that uses XMPP.
+"""A real Prosody, an XMPP gateway, and a fake robot that uses XMPP.
 
 with open_site(...) as site:                        # functions, HTTP, Prosody and one gateway
     with site.robot() as robot:
@@ -118,20 +118,20 @@ def served(cloud: Cloud, listener: socket.socket) -> Iterator[None]:
         running.result(PATIENCE_S)
 
 
-class Speaking:
+class Gateway:
     """An XMPP gateway in the functions' event loop."""
 
     def __init__(self, cloud: Cloud) -> None:
         self.cloud = cloud
 
         async def start() -> "tuple[XmppGateway, asyncio.Task[None]]":
-            speaker = XmppGateway(cloud.functions, xmpp_connection(cloud.functions), command_feed(cloud.functions))
-            return speaker, asyncio.create_task(speaker.run())
+            gateway = XmppGateway(cloud.functions, xmpp_connection(cloud.functions), command_feed(cloud.functions))
+            return gateway, asyncio.create_task(gateway.run())
 
-        self.speaker, self._task = cloud.run(start())
+        self.gateway, self._task = cloud.run(start())
 
     def serves(self, agent: str) -> bool:
-        return agent in self.speaker._served
+        return agent in self.gateway._served
 
     def end(self) -> None:
         async def stop() -> None:
@@ -148,11 +148,11 @@ class XmppSite:
     cloud: Cloud
     prosody: Prosody
     url: str
-    speaking: list[Speaking] = field(default_factory=list)
+    gateways: list[Gateway] = field(default_factory=list)
 
-    def speak(self) -> Speaking:
-        self.speaking.append(Speaking(self.cloud))
-        return self.speaking[-1]
+    def start_gateway(self) -> Gateway:
+        self.gateways.append(Gateway(self.cloud))
+        return self.gateways[-1]
 
     def robot(self, *names: str) -> "XmppRobot":
         return XmppRobot(self.cloud, names or ("arm",))
@@ -167,15 +167,15 @@ class XmppSite:
         assert client.connected.is_set(), client.answer
         return client
 
-    def person(self, who: Person) -> "XmppClient":
+    def person(self, person: Person) -> "XmppClient":
         """An XMPP client of a person."""
-        given = who.post("/xmpp/credentials", {"purpose": "view"}).json()
-        return self.client(who.account, given["password"])
+        issued = person.post("/xmpp/credentials", {"purpose": "view"}).json()
+        return self.client(person.account, issued["password"])
 
 
 @contextlib.contextmanager
 def open_site(
-    open_cloud: Callable[[Settings], Cloud], settings: Settings, folder: Path, *, speak: bool = True
+    open_cloud: Callable[[Settings], Cloud], settings: Settings, folder: Path, *, gateway: bool = True
 ) -> Iterator[XmppSite]:
     """Start the site.
 
@@ -183,7 +183,7 @@ def open_site(
         open_cloud: Creates the functions.
         settings: Their settings, without XMPP.
         folder: For Prosody's files.
-        speak: Whether to start a gateway.
+        gateway: Whether to start a gateway.
     """
     with contextlib.ExitStack() as stack:
         listener = stack.enter_context(socket.create_server((HOST, 0)))
@@ -192,12 +192,12 @@ def open_site(
         cloud = open_cloud(replace(settings, xmpp=Xmpp(domain=DOMAIN, host=HOST, port=prosody.port)))
         stack.enter_context(served(cloud, listener))
         site = XmppSite(cloud, prosody, url)
-        if speak:
-            site.speak()
+        if gateway:
+            site.start_gateway()
         try:
             yield site
         finally:
-            for each in site.speaking:
+            for each in site.gateways:
                 each.end()
 
 
@@ -208,16 +208,16 @@ class XmppRobot(Robot):
         setpoints: Received setpoints.
         changes: Link states reported by the transport.
         listen: Additional topics to subscribe to.
-        overheard: Messages received on those.
+        space_messages: Messages received on those.
     """
 
     def __init__(self, place: Any, names: tuple[str, ...]) -> None:
         super().__init__(place, names)
         self.setpoints: list[tuple[str, bytes]] = []
         self.changes: list[bool] = []
-        self.refused: list[str] = []
+        self.login_errors: list[str] = []
         self.listen: tuple[str, ...] = ()
-        self.overheard: list[tuple[str, bytes]] = []
+        self.space_messages: list[tuple[str, bytes]] = []
 
     def introduction(self, **changes: Any) -> dict[str, Any]:
         return super().introduction(**{"transport": "xmpp", **changes})
@@ -225,11 +225,11 @@ class XmppRobot(Robot):
     def access(self) -> XmppAccess:
         answer = self.request("POST", "/xmpp/credentials", json={"purpose": "agent"})
         if answer.status_code != 200:
-            self.refused.append(answer.text)
+            self.login_errors.append(answer.text)
             raise ValueError(answer.text)
-        given = answer.json()
-        login = Login(given["host"], given["port"], given["jid"], given["password"])
-        return XmppAccess(login, given["cloud"], given["lifetime_s"])
+        issued = answer.json()
+        login = Login(issued["host"], issued["port"], issued["jid"], issued["password"])
+        return XmppAccess(login, issued["cloud"], issued["lifetime_s"])
 
     def next_session(self) -> int:
         self.session += 1
@@ -246,7 +246,7 @@ class XmppRobot(Robot):
         if "/ctl/" in message.topic:
             self.setpoints.append((message.topic, message.payload))
         if "/tele/" in message.topic:
-            self.overheard.append((message.topic, message.payload))
+            self.space_messages.append((message.topic, message.payload))
         super().handle(message)
 
 
@@ -307,10 +307,10 @@ class XmppClient:
     def send(self, stanza: str) -> None:
         self._loop.call_soon_threadsafe(self.stream.send, stanza)
 
-    def there(self, user: str) -> bool:
+    def is_available(self, user: str) -> bool:
         """Whether the newest presence of this user is available."""
-        heard = [each for each in self.presences if each.get("from", "").startswith(f"{user}@")]
-        return bool(heard) and heard[-1].get("type") is None
+        presences = [each for each in self.presences if each.get("from", "").startswith(f"{user}@")]
+        return bool(presences) and presences[-1].get("type") is None
 
     def __enter__(self) -> Self:
         return self

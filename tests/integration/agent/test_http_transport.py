@@ -121,7 +121,7 @@ class Agent:
     def _check(self, _: CloudClient, **__: Any) -> None:
         self.checks += 1
         if not self.paired:
-            raise CloudError("this agent was un-paired")
+            raise CloudError("this agent was unpaired")
 
 
 @pytest.fixture
@@ -154,10 +154,10 @@ def agent(server: Server) -> Iterator[Agent]:
 def test_a_command_is_listed_until_its_acknowledgement_is_stored(server: Server, agent: Agent) -> None:
     server.waiting = ["one"]
     agent.start()
-    wait_until(lambda: any(poll.get("have") == ["one"] for poll in server.polls), "it to be listed")
+    wait_until(lambda: any(poll.get("have") == ["one"] for poll in server.polls), "the command to be listed")
     assert agent.received == ["one"]
     assert agent.ack("one")
-    wait_until(lambda: server.polls[-1].get("have") is None, "it to be listed no more")
+    wait_until(lambda: server.polls[-1].get("have") is None, "the acknowledged command to be removed")
     assert agent.received == ["one"]
 
 
@@ -182,7 +182,7 @@ def test_more_commands_than_can_be_listed_arrive_once_and_in_order(server: Serve
     agent.on_receive = agent.ack
     for command in list(agent.received):
         agent.ack(command)
-    wait_until(lambda: len(set(agent.received)) == 100, "the others")
+    wait_until(lambda: len(set(agent.received)) == 100, "the other commands")
     assert agent.received == commands
 
 
@@ -217,7 +217,7 @@ def test_an_invalid_message_does_not_affect_others(server: Server, agent: Agent)
     agent.start()
     server.on_batch = lambda batch: INVALID if any(each.get("n") == 3 for _, each in batch) else None
     delivered = agent.publish_events(7)
-    wait_until(lambda: sorted(set(delivered)) == [0, 1, 2, 4, 5, 6], "all the others")
+    wait_until(lambda: sorted(set(delivered)) == [0, 1, 2, 4, 5, 6], "all other messages")
     assert agent.changes == [True]
 
 

@@ -1,4 +1,4 @@
-"""A whole agent with the simulated UR5 keeps working during a rotation of the cloud's keys, and the old key expires."""
+"""A complete agent with the simulated UR5 works during a rotation of the cloud's keys, and the old key expires."""
 
 from collections.abc import Iterator
 from pathlib import Path

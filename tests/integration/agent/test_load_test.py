@@ -1,4 +1,4 @@
-"""The load test against the real functions and both brokers: simulated agents that speak the real protocol."""
+"""The load test against the real functions and both brokers, with simulated agents."""
 
 import json
 import os

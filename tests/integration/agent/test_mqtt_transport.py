@@ -91,7 +91,7 @@ class Link:
 
 @pytest.fixture
 def link(broker: RunningBroker) -> Iterator[Link]:
-    """A transport that is not yet started."""
+    """A transport before its start."""
     link = Link(broker)
     yield link
     link.transport.stop()
@@ -138,7 +138,7 @@ time.sleep(60)
 def test_credentials_are_renewed_before_they_expire_but_not_during_motion(
     link: Link, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # From the first second on, so that a slow machine does not reach the share at which renewal no longer waits.
+    # Motion starts immediately, so that a slow machine does not reach the share at which renewal no longer waits.
     monkeypatch.setattr(f"{MODULE}._REFRESH_AT", 1 / 120)
     link.lifetime_s = 120
     link.start()
@@ -222,7 +222,7 @@ def test_an_agent_too_busy_to_receive_does_not_treat_the_broker_as_silent(
         wait_until(lambda: link.received, "the command")
         end_s = time.monotonic() + 5
         while time.monotonic() < end_s:
-            assert link.publish(b"{}", qos=0), "its own messages keep the connection alive"
+            assert link.publish(b"{}", qos=0), "published messages must keep the connection alive"
             time.sleep(0.1)
     assert link.changes == [True]
 
@@ -245,7 +245,7 @@ def test_on_a_blocked_link_one_frame_of_each_camera_waits(fragile: Link, proxy: 
         accepted += publish("left", 100_000)
         time.sleep(0.001)
     assert accepted < 350
-    assert not any(publish("left", 100_000) for _ in range(20)), "a frame waits already"
+    assert not any(publish("left", 100_000) for _ in range(20)), "another frame is queued"
     assert publish("right", 1000), "frames of another camera are independent"
     proxy.thaw()
     wait_until(lambda: publish("left", 1000), "frames to be accepted again")

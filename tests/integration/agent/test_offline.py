@@ -79,7 +79,7 @@ def require_complete_measurements(agent: AgentProcess, killed_ms: int, back_ms: 
     times_ms = [each.at_ms for each in late]
     assert times_ms == sorted(times_ms)
     numbers = sorted({each.sequence for each in (*late, *agent.telemetry()) if each.at_ms < killed_ms})
-    assert max(after - before for before, after in pairwise(numbers)) < MAX_GAP, "while only the broker was dead"
+    assert max(after - before for before, after in pairwise(numbers)) < MAX_GAP, "while only the broker was down"
     assert any(killed_ms < at_ms < back_ms for at_ms in times_ms), "after the second start"
 
 

@@ -1,4 +1,4 @@
-"""A whole device: Qbo's driver in real time, a script in the sandbox, and sonar measurements for both."""
+"""Qbo with its driver in real time, a script in the sandbox, and sonar measurements for both."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +27,7 @@ def harness(tmp_path: Path) -> Iterator[DeviceHarness]:
     harness.stop()
 
 
-def test_it_approaches_until_its_sonars_measure_an_obstacle(harness: DeviceHarness) -> None:
+def test_qbo_approaches_until_its_sonars_measure_an_obstacle(harness: DeviceHarness) -> None:
     source = (FOLDER / "movements" / "come_near.py").read_text(encoding="utf-8")
     eventually(lambda: harness.published(topics.TELE, Measurements, "sonar"))
     script = harness.script("parameters = {'near_m': 1.65, 'speed_m_s': 0.2}\n" + source)
@@ -40,6 +40,6 @@ def test_it_approaches_until_its_sonars_measure_an_obstacle(harness: DeviceHarne
     odometry = [measured.values for measured in harness.published(topics.TELE, Measurements, "odometry")]
     furthest_m = max(float(values["x_m"]) for values in odometry)
     assert furthest_m == pytest.approx(2.0 - 0.156 - nearest_m, abs=0.06)
-    assert float(odometry[-1]["x_m"]) < furthest_m, "it moved back a little"
+    assert float(odometry[-1]["x_m"]) < furthest_m, "Qbo moved back"
     assert float(odometry[-1]["y_m"]) == pytest.approx(0.0, abs=0.01)
     assert harness.published(topics.TELE, Measurements, "health")

@@ -1,4 +1,4 @@
-"""Over a real broker, measurements of a room sensor slow and hold a moving arm, and so does their absence."""
+"""Measurements of a room sensor, and their absence, slow and hold a moving arm over a real broker."""
 
 import time
 from pathlib import Path
@@ -75,13 +75,13 @@ def test_presence_slows_then_holds_and_silence_holds(tmp_path: Path) -> None:
             wait_until(lambda: restrictions(agent) == {}, "a free room again")
             count = len(agent.telemetry())
             wait_until(lambda: len(agent.telemetry()) > count + 20, "more telemetry")
-            assert max(agent.speeds(since=count)) == 0, "nothing resumes by itself"
+            assert max(agent.speeds(since=count)) == 0, "the motion must not resume automatically"
 
             second = agent.move(-6.0, epoch=2)
             sensor.values = None
             silent_s = time.monotonic()
             assert end(agent, second) == failed
-            assert time.monotonic() - silent_s >= STALE_S - 0.5, "not before the measurement was stale"
+            assert time.monotonic() - silent_s >= STALE_S - 0.5, "the arm held before the measurement was stale"
             wait_until(lambda: agent.speeds()[-1] == 0, "the hold without measurements")
         expected = ("no measurement of", "distance_m < 2", "distance_m < 1", "is silent")
         wait_until(lambda: all(any(text in each for each in reasons(agent)) for text in expected), "events")

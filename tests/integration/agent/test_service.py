@@ -41,11 +41,11 @@ def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CloudProcess
 @pytest.fixture
 def folder() -> Iterator[Path]:
     """A folder that the unprivileged user owns and can reach."""
-    made = Path(tempfile.mkdtemp(prefix="telescope-"))
+    folder = Path(tempfile.mkdtemp(prefix="telescope-"))
     if os.geteuid() == 0:
-        os.chown(made, USER, USER)
-    yield made
-    shutil.rmtree(made)
+        os.chown(folder, USER, USER)
+    yield folder
+    shutil.rmtree(folder)
 
 
 def unprivileged(*arguments: str) -> list[str]:
@@ -64,7 +64,7 @@ def _reachable_python() -> Path:
         return Path(sys.executable)
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
     found = shutil.which(version, path="/usr/bin:/usr/local/bin")
-    assert found is not None, f"{real} can be run by root alone, and there is no other {version}"
+    assert found is not None, f"only root can run {real}, and no other {version} is installed"
     place = Path(tempfile.mkdtemp(prefix="telescope-python-"))
     atexit.register(shutil.rmtree, place)
     place.chmod(0o755)
@@ -115,7 +115,7 @@ def end_of(processes: CloudProcesses, device: str, request: Any) -> dict[str, An
 
 
 def findings(folder: Path) -> dict[str, str]:
-    """Findings of ``doctor`` by check; none of them is a problem."""
+    """Findings of ``doctor`` by check. Asserts that none is a problem."""
     done = program(folder, "-m", "device_agent", "doctor", "--json")
     assert "Traceback" not in done.stdout + done.stderr, done.stderr
     assert done.returncode == 0, done.stdout
@@ -146,16 +146,16 @@ class ServiceManager:
         self._socket.close()
 
 
-def test_it_runs_unprivileged_and_ends_on_a_signal(processes: CloudProcesses, folder: Path) -> None:
+def test_the_service_runs_unprivileged_and_ends_on_a_signal(processes: CloudProcesses, folder: Path) -> None:
     device = enroll(processes, folder, "--transport", "http")
     home, notify = folder / "agent", folder / "notify"
     with (
         contextlib.closing(ServiceManager(notify)) as manager,
         running(folder, "-m", "device_agent", NOTIFY_SOCKET=str(notify)) as process,
     ):
-        wait_until(lambda: any("STATUS=running" in text for text in manager.notifications), "it to be ready")
+        wait_until(lambda: any("STATUS=running" in text for text in manager.notifications), "the agent to be ready")
         wait_until(lambda: "WATCHDOG=1" in manager.notifications[-1], "the watchdog")
-        wait_until(lambda: online(processes, device), "it to be online")
+        wait_until(lambda: online(processes, device), "the agent to be online")
         assert end_of(processes, device, MOVE)["status"] == "done"
         script = end_of(processes, device, SCRIPT)
         assert (script["status"], script["output"].strip()) == ("done", "here"), script
@@ -169,7 +169,7 @@ def test_it_runs_unprivileged_and_ends_on_a_signal(processes: CloudProcesses, fo
 
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 0
-    wait_until(lambda: not online(processes, device), "it to be offline")
+    wait_until(lambda: not online(processes, device), "the agent to be offline")
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in home.iterdir()}
     assert stat.S_IMODE(home.stat().st_mode) == 0o700
     assert {"identity.pem", "agent.toml", "pairing.json", "journal.db"} <= modes.keys()
@@ -200,11 +200,13 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.parametrize("platform", ["win32", pytest.param("darwin", marks=pytest.mark.long)])
-def test_without_a_sandbox_it_runs_without_scripts(processes: CloudProcesses, folder: Path, platform: str) -> None:
+def test_without_a_sandbox_the_service_runs_without_scripts(
+    processes: CloudProcesses, folder: Path, platform: str
+) -> None:
     device = enroll(processes, folder, "--transport", "http" if platform == "win32" else "mqtt")
     source = ELSEWHERE.replace("PLATFORM", repr(platform))
     with running(folder, "-c", source) as process:
-        wait_until(lambda: online(processes, device) or process.poll() is not None, "it to be online")
+        wait_until(lambda: online(processes, device) or process.poll() is not None, "the agent to be online")
         assert process.poll() is None, (folder / "log").read_text()
         assert end_of(processes, device, MOVE)["status"] == "done"
         script = end_of(processes, device, SCRIPT)

@@ -1,4 +1,4 @@
-"""Brokers that ask the functions about each connection, as tests use them."""
+"""Brokers that authorize each connection by a webhook of the functions."""
 
 import base64
 import json
@@ -35,19 +35,19 @@ def encoded(text: str) -> str:
 
 
 class Gate(Protocol):
-    """One broker and its webhook, as both kinds of broker have it."""
+    """A broker and its webhook, with one interface for both kinds of broker."""
 
     cloud: Cloud
 
     def admits(self, credentials: Credentials, client_id: str) -> bool:
         """The webhook's response about a connection."""
 
-    def connect(self, wanted: Grant) -> Credentials:
+    def connect(self, grant: Grant) -> Credentials:
         """Connect with new credentials."""
 
-    def is_connected(self, wanted: Grant) -> bool: ...
+    def is_connected(self, grant: Grant) -> bool: ...
 
-    def ended(self, wanted: Grant) -> bool:
+    def ended(self, grant: Grant) -> bool:
         """Whether the connection ends in time."""
 
 
@@ -55,8 +55,8 @@ def access(gate: Gate) -> BrokerAccess:
     return gate.cloud.functions.access
 
 
-def issue(gate: Gate, wanted: Grant) -> Credentials:
-    return gate.cloud.run(access(gate).issue(wanted))
+def issue(gate: Gate, grant: Grant) -> Credentials:
+    return gate.cloud.run(access(gate).issue(grant))
 
 
 ARN = "arn:aws:lambda:eu-west-1:123456789012:function:telescope"
@@ -86,25 +86,25 @@ class IotGate:
     def __init__(self, cloud: Cloud, connections: Connections) -> None:
         self.cloud, self._connections = cloud, connections
 
-    def ask(self, username: str, password: str, client_id: str) -> dict[str, Any]:
+    def call_webhook(self, username: str, password: str, client_id: str) -> dict[str, Any]:
         client = {"username": username, "password": encoded(password), "clientId": client_id}
         event = {"protocols": ["tls", "mqtt"], "protocolData": {"mqtt": client}}
         return self.cloud.run(authorise(self.cloud.functions, event, ARN))
 
     def admits(self, credentials: Credentials, client_id: str) -> bool:
-        answer = self.ask(*credentials, client_id)
+        answer = self.call_webhook(*credentials, client_id)
         assert bool(answer["policyDocuments"]) == answer["isAuthenticated"]
         return bool(answer["isAuthenticated"])
 
-    def connect(self, wanted: Grant) -> Credentials:
-        self._connections.connected.add(wanted.client_id)
-        return issue(self, wanted)
+    def connect(self, grant: Grant) -> Credentials:
+        self._connections.connected.add(grant.client_id)
+        return issue(self, grant)
 
-    def is_connected(self, wanted: Grant) -> bool:
-        return wanted.client_id in self._connections.connected
+    def is_connected(self, grant: Grant) -> bool:
+        return grant.client_id in self._connections.connected
 
-    def ended(self, wanted: Grant) -> bool:
-        return not self.is_connected(wanted)
+    def ended(self, grant: Grant) -> bool:
+        return not self.is_connected(grant)
 
 
 class GridGate:
@@ -112,33 +112,33 @@ class GridGate:
         self.cloud, self.broker, self.grid = cloud, broker, grid
         self.clients: dict[str, Client] = {}
 
-    def ask(self, request: Any, *, authorization: str = f"Bearer {CALLER}") -> tuple[int, dict[str, Any]]:
+    def call_webhook(self, request: Any, *, authorization: str = f"Bearer {CALLER}") -> tuple[int, dict[str, Any]]:
         body = request if isinstance(request, bytes) else json.dumps(request).encode()
         return self.cloud.run(admit(self.cloud.functions, authorization, body))
 
-    def ask_about(self, credentials: Credentials, client_id: str) -> dict[str, Any]:
-        status, answer = self.ask(request_of(credentials, client_id))
+    def authorize(self, credentials: Credentials, client_id: str) -> dict[str, Any]:
+        status, answer = self.call_webhook(request_of(credentials, client_id))
         assert status == 200
         return answer
 
     def admits(self, credentials: Credentials, client_id: str) -> bool:
-        answer = self.ask_about(credentials, client_id)
+        answer = self.authorize(credentials, client_id)
         allowed = bool(answer["decision"] == "allow")
         assert allowed or set(answer) == {"decision", "errorReason"}
         assert self.broker.accepts(client_id, credentials) == allowed
         return allowed
 
-    def connect(self, wanted: Grant) -> Credentials:
-        credentials = self.broker.issue(wanted)
-        client = self.clients[wanted.client_id] = self.broker.connect(wanted.client_id, credentials)
+    def connect(self, grant: Grant) -> Credentials:
+        credentials = self.broker.issue(grant)
+        client = self.clients[grant.client_id] = self.broker.connect(grant.client_id, credentials)
         assert client.connected.is_set(), client.answer
         return credentials
 
-    def is_connected(self, wanted: Grant) -> bool:
-        return not self.clients[wanted.client_id].disconnected.is_set()
+    def is_connected(self, grant: Grant) -> bool:
+        return not self.clients[grant.client_id].disconnected.is_set()
 
-    def ended(self, wanted: Grant) -> bool:
-        return self.clients[wanted.client_id].ended()
+    def ended(self, grant: Grant) -> bool:
+        return self.clients[grant.client_id].ended()
 
 
 def request_of(credentials: Credentials, client_id: str) -> dict[str, Any]:

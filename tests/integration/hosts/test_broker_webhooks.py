@@ -1,7 +1,7 @@
-"""Brokers that ask the functions about each connection: Event Grid's webhook and the custom authoriser of AWS IoT Core.
+"""Brokers that authorize connections by the functions: Event Grid's webhook and AWS IoT Core's custom authorizer.
 
-Event Grid's namespace is a fake (``tests/fakes/event_grid.py``); connections to it and the functions' are real. Of
-IoT Core only the call that ends a connection (``DELETE /connections/<client id>``), which moto lacks, is faked.
+Event Grid's namespace is a fake (``tests/fakes/event_grid.py``) with real connections. For IoT Core, only the call that
+ends a connection (``DELETE /connections/<client id>``) is fake, because moto does not implement it.
 """
 
 import time
@@ -37,7 +37,7 @@ _numbers = count()
 
 @pytest.fixture
 def account() -> str:
-    """One that no other test uses."""
+    """An account that no other test uses."""
     return f"a{next(_numbers)}"
 
 
@@ -45,17 +45,17 @@ class WebhookSuite:
     """``gate`` is the broker under test."""
 
     def test_other_clients_are_rejected(self, gate: Gate, account: str) -> None:
-        wanted = grant(account)
-        right = issue(gate, wanted)
-        forged = grants.issue(wanted, signing.generate())
+        own = grant(account)
+        right = issue(gate, own)
+        forged = grants.issue(own, signing.generate())
         expired = grants.issue(grant(account, lifetime_s=-1), gate.cloud.run(gate.cloud.functions.keys.current()))
-        assert gate.admits(right, wanted.client_id)
+        assert gate.admits(right, own.client_id)
         for credentials, client_id in (
             (right, "watch-other"),
-            (Credentials("account:b:s2:watch", right.password), wanted.client_id),
-            (Credentials(right.username, forged), wanted.client_id),
-            (Credentials(right.username, expired), wanted.client_id),
-            (Credentials(right.username, ""), wanted.client_id),
+            (Credentials("account:b:s2:watch", right.password), own.client_id),
+            (Credentials(right.username, forged), own.client_id),
+            (Credentials(right.username, expired), own.client_id),
+            (Credentials(right.username, ""), own.client_id),
             (Credentials("", "x"), ""),
         ):
             assert not gate.admits(credentials, client_id), (credentials, client_id)
@@ -72,7 +72,7 @@ class WebhookSuite:
         assert gate.admits(others, other.client_id)
         assert gate.admits(issue(gate, mine), mine.client_id), "credentials issued afterwards work"
 
-    def test_a_client_id_is_revoked_alone(self, gate: Gate, account: str) -> None:
+    def test_revoking_a_client_id_affects_no_other_client(self, gate: Gate, account: str) -> None:
         mine, second = grant(account), grant(account, "second")
         old, valid = gate.connect(mine), gate.connect(second)
         gate.cloud.run(access(gate).revoke(client_id=mine.client_id))
@@ -101,17 +101,17 @@ class TestIotCore(WebhookSuite):
         return iot_gate
 
     def test_a_policy_allows_exactly_the_granted_topics(self, gate: IotGate, account: str) -> None:
-        wanted = grant(account)
-        username, password = issue(gate, wanted)
-        answer = gate.ask(f"{username}?x-amz-customauthorizer-name=telescope", password, wanted.client_id)
+        own = grant(account)
+        username, password = issue(gate, own)
+        answer = gate.call_webhook(f"{username}?x-amz-customauthorizer-name=telescope", password, own.client_id)
         assert answer["isAuthenticated"] is True
         assert 890 <= answer["disconnectAfterInSeconds"] <= 900
         text = "".join(answer["policyDocuments"])
-        assert f"arn:aws:iot:eu-west-1:123456789012:client/{wanted.client_id}" in text
+        assert f"arn:aws:iot:eu-west-1:123456789012:client/{own.client_id}" in text
         assert f"topicfilter/ts/v1/{account}/*/conn" in text
         assert "ctl" not in text
 
-    def test_expired_grants_are_forgotten(self, gate: IotGate, account: str) -> None:
+    def test_expired_grants_are_deleted(self, gate: IotGate, account: str) -> None:
         issue(gate, grant(account))
         access = gate.cloud.functions.access
         assert isinstance(access, IotBrokerAccess)
@@ -147,19 +147,19 @@ class TestEventGrid(WebhookSuite):
         grid_gate.clients.clear()
 
     def test_a_client_is_admitted_with_exactly_its_topics(self, gate: GridGate, account: str) -> None:
-        wanted = grant(account)
-        answer = gate.ask_about(issue(gate, wanted), wanted.client_id)
-        assert (answer["decision"], answer["clientAuthenticationName"]) == ("allow", wanted.client_id)
-        assert answer["expiration"] == wanted.expires_at
-        assert answer["attributes"] == topic_spaces.attributes(wanted)
+        own = grant(account)
+        answer = gate.authorize(issue(gate, own), own.client_id)
+        assert (answer["decision"], answer["clientAuthenticationName"]) == ("allow", own.client_id)
+        assert answer["expiration"] == own.expires_at
+        assert answer["attributes"] == topic_spaces.attributes(own)
         assert set(answer["attributes"].values()) == {"account", account}
 
     def test_an_invalid_request_is_denied(self, gate: GridGate, account: str) -> None:
-        wanted = grant(account)
-        credentials = issue(gate, wanted)
-        valid = request_of(credentials, wanted.client_id)
+        own = grant(account)
+        credentials = issue(gate, own)
+        valid = request_of(credentials, own.client_id)
         for request in (
-            {"clientId": wanted.client_id},
+            {"clientId": own.client_id},
             valid | {"password": "no base 64"},
             valid | {"password": credentials.password},
             valid | {"userName": 7},
@@ -167,11 +167,11 @@ class TestEventGrid(WebhookSuite):
             b"\xff",
             b"[" * 5_000,
         ):
-            status, answer = gate.ask(request)
+            status, answer = gate.call_webhook(request)
             assert (status, answer["decision"]) == (200, "deny"), request
         for authorization in ("Bearer other", "", f"Basic {CALLER}"):
-            assert gate.ask(valid, authorization=authorization) == (401, {})
-        assert gate.ask(b" " * 65_537) == (401, {})
+            assert gate.call_webhook(valid, authorization=authorization) == (401, {})
+        assert gate.call_webhook(b" " * 65_537) == (401, {})
 
     def test_no_client_is_admitted_if_the_grant_cannot_be_read(
         self, gate: GridGate, account: str, monkeypatch: pytest.MonkeyPatch
@@ -179,12 +179,12 @@ class TestEventGrid(WebhookSuite):
         async def fail(*_: Any) -> None:
             raise StoreError("the tables are not available")
 
-        wanted = grant(account)
-        credentials = issue(gate, wanted)
+        own = grant(account)
+        credentials = issue(gate, own)
         monkeypatch.setattr(gate.cloud.functions.tables, "get", fail)
         with pytest.raises(StoreError):
-            gate.ask_about(credentials, wanted.client_id)
-        assert not gate.broker.accepts(wanted.client_id, credentials)
+            gate.authorize(credentials, own.client_id)
+        assert not gate.broker.accepts(own.client_id, credentials)
 
     def test_the_client_that_ends_a_connection_has_no_rights(
         self, gate: GridGate, account: str, monkeypatch: pytest.MonkeyPatch
@@ -199,10 +199,10 @@ class TestEventGrid(WebhookSuite):
 
         monkeypatch.setattr(access, "_take", remember)
         gate.broker.revoke(client_id=f"w-{account}")
-        answer = gate.ask_about(used[0], f"w-{account}")
+        answer = gate.authorize(used[0], f"w-{account}")
         assert (answer["decision"], answer["attributes"]) == ("allow", {})
         assert answer["expiration"] <= time.time() + 60
-        assert gate.ask_about(used[0], "w-another")["decision"] == "deny"
+        assert gate.authorize(used[0], "w-another")["decision"] == "deny"
 
     def test_a_connection_ends_with_its_grant(self, gate: GridGate, account: str) -> None:
         expiring, renewed = grant(account), grant(account, "renewed")
@@ -216,19 +216,21 @@ class TestEventGrid(WebhookSuite):
     def test_a_client_that_was_admitted_during_its_revocation_is_disconnected_soon_after(
         self, gate: GridGate, account: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        wanted, later = grant(account), grant(account, "later")
-        credentials = issue(gate, wanted)
+        own, later = grant(account), grant(account, "later")
+        credentials = issue(gate, own)
         issue(gate, later)
-        allowed = gate.ask_about(credentials, wanted.client_id)
+        allowed = gate.authorize(credentials, own.client_id)
         gate.broker.revoke(principal=f"account:{account}")
         with monkeypatch.context() as patch:
             patch.setattr(gate.grid, "webhook", lambda _: allowed)
-            slow = gate.broker.connect(wanted.client_id, credentials)
+            slow = gate.broker.connect(own.client_id, credentials)
         gate.connect(later)
         with slow:
             assert slow.connected.is_set()
             gate.broker.expire()
-            assert not slow.disconnected.is_set(), "it is found later, when no client can still be connecting"
+            assert not slow.disconnected.is_set(), (
+                "the client is disconnected by a later check, when no client can still be connecting"
+            )
             gate.broker.run(gate.broker.access.expire(time.time() + SETTLE_S + 1))
             assert slow.ended()
         assert gate.is_connected(later), "credentials issued afterwards work"
@@ -236,15 +238,15 @@ class TestEventGrid(WebhookSuite):
     def test_an_unreachable_namespace_is_an_error_and_admits_no_client(
         self, gate: GridGate, account: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        wanted = grant(account)
-        credentials = gate.connect(wanted)
+        own = grant(account)
+        credentials = gate.connect(own)
         with monkeypatch.context() as patch:
             patch.setattr(gate.cloud.functions.access, "_take", SessionTakeover(host=HOST, port=1, tls=None))
             with pytest.raises(BrokerAccessError, match="cannot be reached"):
                 gate.broker.revoke(principal=f"account:{account}")
-        assert gate.ask_about(credentials, wanted.client_id)["decision"] == "deny"
+        assert gate.authorize(credentials, own.client_id)["decision"] == "deny"
         gate.broker.revoke(principal=f"account:{account}")
-        assert gate.ended(wanted)
+        assert gate.ended(own)
 
     def test_topics_that_are_never_granted_are_not_signed(self, gate: GridGate) -> None:
         with pytest.raises(BrokerAccessError, match="topic spaces"):
@@ -258,9 +260,7 @@ class TestEventGrid(WebhookSuite):
         assert not gate.broker.accepts(mine.client_id, issue(gate, grant(account)))
         assert gate.is_connected(mine)
 
-    def test_devices_beyond_the_limit_are_left_out_and_all_named_topics_work(
-        self, gate: GridGate, account: str
-    ) -> None:
+    def test_devices_beyond_the_limit_are_omitted_and_all_named_topics_work(self, gate: GridGate, account: str) -> None:
         anna, bert = gate.cloud.sign_in(f"anna{account}"), gate.cloud.sign_in(f"bert{account}")
         robot = gate.cloud.robot(*(f"arm{number}" for number in range(6)))
         robot.pair(anna)

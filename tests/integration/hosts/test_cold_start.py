@@ -1,4 +1,4 @@
-"""The first caller of a function waits for its imports: they stay near what FastAPI alone takes."""
+"""Imports delay the first request to a function; they take little longer than those of FastAPI."""
 
 import os
 import subprocess
@@ -10,9 +10,9 @@ import pytest
 from tests.harness.paths import ROOT
 
 LIMIT = 600 / 330
-"""Of the time that importing FastAPI takes."""
+"""Maximum import time as a multiple of FastAPI's."""
 MAX_ROUNDS = 30
-"""A busy machine gets more rounds: only the quickest of each import counts."""
+"""Maximum number of rounds on a busy machine; the shortest time of each import counts."""
 MEASURE = """
 import time
 startup_s = time.process_time()
@@ -29,7 +29,7 @@ def byte_code(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def importing_s(code: str, byte_code: Path, present: str = "") -> float:
-    """Processor time of a new Python that imports this [s], with the byte code of earlier runs."""
+    """Processor time in which a new Python process imports this [s], with the byte code of earlier runs."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     environment["PYTHONPYCACHEPREFIX"] = str(byte_code)
     command = [sys.executable, "-c", MEASURE.format(present=present, code=code)]
@@ -40,13 +40,13 @@ def importing_s(code: str, byte_code: Path, present: str = "") -> float:
     ("present", "code"),
     [
         ("", "import function_app.entrypoints.http, function_app.bootstrap"),
-        # Azure's worker has the binding classes before it looks for functions.
+        # Azure's worker imports the binding classes before it indexes functions.
         ("import azure.functions", "import function_app; function_app.app"),
         ("", "import function_app.entrypoints.hosts.aws"),
     ],
     ids=["application", "azure", "lambda"],
 )
-def test_the_cold_import_stays_near_fastapis_own(present: str, code: str, byte_code: Path) -> None:
+def test_the_cold_import_takes_little_longer_than_fastapis(present: str, code: str, byte_code: Path) -> None:
     importing_s(code, byte_code, present)  # writes the byte code
     code_s, fastapi_s = [], []
     for _ in range(MAX_ROUNDS):
@@ -58,7 +58,7 @@ def test_the_cold_import_stays_near_fastapis_own(present: str, code: str, byte_c
     pytest.fail(f"{code}: {ratio:.2f} times as long as FastAPI, more than {LIMIT:.2f}")
 
 
-def test_no_entry_loads_what_only_some_stores_or_other_programs_need() -> None:
+def test_no_entry_point_imports_modules_of_other_stores_or_programs() -> None:
     heavy = ("boto3", "botocore", "azure.data", "azure.storage", "azure.identity", "numpy", "jsonschema", "uvicorn")
     code = (
         "import sys, function_app.bootstrap, function_app.entrypoints.hosts.aws, function_app; function_app.app\n"

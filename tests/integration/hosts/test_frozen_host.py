@@ -98,7 +98,7 @@ def test_a_connection_that_survived_is_reused(
     assert proxy.accepted == accepted
 
 
-def test_a_connection_that_the_broker_must_have_closed_is_not_tried_first(
+def test_a_connection_that_the_broker_must_have_closed_is_not_used_first(
     frozen: Frozen, proxy: Proxy, robot: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connection, "DEAD_S", FREEZE_S - 0.05)
@@ -139,8 +139,8 @@ def test_a_lambda_instance_exchanges_messages_with_a_robot_after_each_freeze(tmp
                     robot.connect()
                     presence = Presence(online=True, session=robot.session, at_ms=client.clock.now_ms())
                     host.deliver(topics.conn(robot.space, robot.id), codec.encode(presence))
-                    asked = {"request": MOVE, "wait_ms": 10_000}
-                    action = anna.post(f"/devices/{robot.device}/actions", json=asked).json()
+                    body = {"request": MOVE, "wait_ms": 10_000}
+                    action = anna.post(f"/devices/{robot.device}/actions", json=body).json()
                     assert action["status"] == "started", action
                     done = robot.report(action["id"], AckStatus.DONE)
                     host.deliver(robot.topic(topics.ACK), codec.encode(done))

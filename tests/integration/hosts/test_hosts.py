@@ -1,4 +1,4 @@
-"""The same functions under each host: requests, the timer, and messages of devices."""
+"""The functions under each host: requests, the timer, and messages of devices."""
 
 import json
 from collections.abc import Iterator
@@ -83,8 +83,8 @@ def test_messages_of_devices_are_stored_and_the_timer_expires_actions(client: Ho
         client.host.deliver(topics.conn(robot.space, robot.id), b"nonsense")
         client.host.deliver("nonsense", b"")
 
-        begun = bert.post(f"/devices/{robot.device}/actions", json={"request": MOVE, "ttl_ms": 1_000})
-        action = f"/actions/{begun.json()['id']}"
+        response = bert.post(f"/devices/{robot.device}/actions", json={"request": MOVE, "ttl_ms": 1_000})
+        action = f"/actions/{response.json()['id']}"
 
         def ended() -> bool:
             client.host.tick()
@@ -106,7 +106,7 @@ def test_an_error_reaches_the_host_which_delivers_again(kind: HostKind, tmp_path
 
 
 def test_a_polling_robot_executes_actions(client: HostClient) -> None:
-    """It needs no broker, only HTTP."""
+    """A polling robot uses HTTP only."""
     with client.sign_in("anna") as anna, PollingRobot(client, wait_ms=0, pause_s=0.1) as robot:
         client.pair(anna, robot)
         robot.connect()

@@ -60,7 +60,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def server(home: Path) -> Iterator[int]:
-    """Its port."""
+    """Run the server; yields its port."""
     port = free_port()
     with start(home, port, "serve") as process:
         try:
@@ -102,7 +102,7 @@ def test_a_link_from_the_terminal_signs_in(home: Path, server: int, run_command:
     assert len(json.loads((home / "keys" / "public.json").read_text())) == 1
 
 
-def test_a_body_of_unknown_length_may_not_be_too_long(server: int) -> None:
+def test_a_body_of_unknown_length_is_limited(server: int) -> None:
     url = f"http://{LOOPBACK}:{server}{API}/auth/sign-in"
     parts = [bytes(MAX_BODY), b"x"]
     problem(httpx.post(url, content=iter(parts)), 413, "too-large")
@@ -124,14 +124,14 @@ def test_a_body_of_unknown_length_may_not_be_too_long(server: int) -> None:
             b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
         ),
     ],
-    ids=["no http", "version", "length", "half", "path", "device", "query", "websocket"],
+    ids=["not HTTP", "version", "length", "half", "path", "device", "query", "websocket"],
 )
 def test_an_invalid_request_does_not_disturb_the_server(server: int, request_: bytes) -> None:
     assert b" 500 " not in raw(server, request_).partition(b"\r\n")[0]
     assert httpx.get(f"http://{LOOPBACK}:{server}{API}/health").status_code == 200
 
 
-def test_responses_are_sent_at_once_on_every_accepted_connection() -> None:
+def test_responses_are_sent_without_delay_on_every_accepted_connection() -> None:
     """Nagle's algorithm and the client's delayed acknowledgement together cost 40 ms per response."""
 
     async def nodelay_of_accepted() -> int:
@@ -156,7 +156,7 @@ def test_responses_are_sent_at_once_on_every_accepted_connection() -> None:
 # ---------------------------------------------------------------- errors in the terminal
 
 
-def test_a_port_in_use_is_one_line_and_exit_code_3(tmp_path: Path, server: int) -> None:
+def test_a_port_in_use_is_reported_in_one_line_with_exit_code_3(tmp_path: Path, server: int) -> None:
     with start(tmp_path, server, "serve") as process:
         out, err = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, out) == (3, "")
@@ -174,7 +174,7 @@ def test_a_port_in_use_is_one_line_and_exit_code_3(tmp_path: Path, server: int) 
         ("serve", "keys/ring.json", "the signing keys in {file.parent} cannot be used"),
     ],
 )
-def test_a_damaged_file_is_one_line_and_left_as_it_is(
+def test_a_damaged_file_is_reported_in_one_line_and_unchanged(
     tmp_path: Path, run_command: RunCommand, command: str, file: str, expected: str
 ) -> None:
     damaged = tmp_path / file
@@ -186,7 +186,7 @@ def test_a_damaged_file_is_one_line_and_left_as_it_is(
     assert damaged.read_bytes() == b"no data " * 1000
 
 
-def test_a_missing_table_is_one_line_and_prepare_makes_it(
+def test_a_missing_table_is_reported_in_one_line_and_prepare_creates_it(
     tmp_path: Path, emulators: Emulators, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use_credentials(monkeypatch)

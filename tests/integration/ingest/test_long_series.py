@@ -24,12 +24,12 @@ from tests.harness.processes import Place
 PERIOD_MS = 50
 PER_WINDOW = WINDOW_MS // PERIOD_MS
 WINDOWS = 30
-"""Windows that are handed over at once: five minutes, as a robot that was off line does."""
+"""Windows in one batch: five minutes, as from a robot that was offline."""
 HOUR_MS = 3_600_000
 
 
 class CountingTables:
-    """Tables that count what is read."""
+    """Tables that count the rows read."""
 
     def __init__(self, tables: Tables) -> None:
         self._tables = tables
@@ -47,8 +47,8 @@ class CountingTables:
 
 
 @dataclass(slots=True)
-class Truth:
-    """What was measured in one hour, computed from the values themselves."""
+class Expected:
+    """Statistics of one hour, computed from the measured values."""
 
     count: int = 0
     sums: list[float] = field(default_factory=list)
@@ -64,8 +64,8 @@ class Truth:
         self.last = values[-1]
 
 
-def measured(begin_ms: int, windows: int, chance: random.Random) -> Iterator[tuple[int, Samples]]:
-    """Stretches of a slowly wandering joint at 20 Hz, each with its beginning."""
+def measured(begin_ms: int, windows: int, rng: random.Random) -> Iterator[tuple[int, Samples]]:
+    """Windows of a slow random walk of a joint at 20 Hz, each with its start time."""
     swing = [math.sin(number * math.tau / PER_WINDOW) for number in range(PER_WINDOW)]
     level = 0.0
     for first in range(0, windows, WINDOWS):
@@ -73,22 +73,22 @@ def measured(begin_ms: int, windows: int, chance: random.Random) -> Iterator[tup
         count = min(WINDOWS, windows - first) * PER_WINDOW
         values = array("d")
         for _ in range(count // PER_WINDOW):
-            level += chance.uniform(-0.01, 0.01)
+            level += rng.uniform(-0.01, 0.01)
             values.extend([level + each for each in swing])
         yield start_ms, Samples(array("q", range(start_ms, start_ms + count * PERIOD_MS, PERIOD_MS)), {"a": values})
 
 
-def build(cloud: Cloud, target: Target, days: float) -> dict[int, Truth]:
-    """Write ``days`` through the service, as time passes; the hours as they were."""
+def build(cloud: Cloud, target: Target, days: float) -> dict[int, Expected]:
+    """Write measurements of ``days`` through the service; returns the statistics of each hour."""
     writer = cloud.functions.telemetry_ingest._writer
     begin_ms = cloud.clock.now_ms() // DAY.span_ms * DAY.span_ms - 40 * DAY.span_ms
-    hours: dict[int, Truth] = {}
+    hours: dict[int, Expected] = {}
 
     async def write() -> None:
         for start_ms, samples in measured(begin_ms, round(days * DAY.span_ms / WINDOW_MS), random.Random(1)):  # noqa: S311
             cloud.clock.ahead_ms += start_ms + WINDOWS * WINDOW_MS - cloud.clock.now_ms()
             await writer.add(target, samples)
-            hours.setdefault(start_ms // HOUR_MS * HOUR_MS, Truth()).add(samples.columns["a"])
+            hours.setdefault(start_ms // HOUR_MS * HOUR_MS, Expected()).add(samples.columns["a"])
 
     asyncio.run_coroutine_threadsafe(write(), cloud.loop).result(1_500)
     return hours
@@ -106,19 +106,19 @@ def check_one_page(cloud: Cloud, days: float) -> None:
     tables = CountingTables(cloud.functions.tables)
     cloud.functions.series._tables = tables
 
-    # Of a month hours are the finest that a page has room for; of a shorter time they are asked for.
-    asked = {"points": 1000} if days > 7 else {"points": 1000, "resolution": "1h"}
-    answer = anna.get(f"/devices/{robot.device}/data/health", params=asked)
+    # For a month, a page has room for hours at most; a shorter query requests hours.
+    query = {"points": 1000} if days > 7 else {"points": 1000, "resolution": "1h"}
+    answer = anna.get(f"/devices/{robot.device}/data/health", params=query)
     page = answer.json()
     assert (page["resolution"], page["cursor"]) == ("1h", None)
     assert page["at_ms"] == sorted(hours)
     column = page["fields"]["a"]
     for index, at_ms in enumerate(page["at_ms"]):
-        truth = hours[at_ms]
-        assert column["count"][index] == truth.count
-        assert (column["min"][index], column["max"][index]) == (truth.low, truth.high)
-        assert column["last"][index] == truth.last
-        assert column["mean"][index] == pytest.approx(math.fsum(truth.sums) / truth.count, rel=1e-9, abs=1e-12)
+        expected = hours[at_ms]
+        assert column["count"][index] == expected.count
+        assert (column["min"][index], column["max"][index]) == (expected.low, expected.high)
+        assert column["last"][index] == expected.last
+        assert column["mean"][index] == pytest.approx(math.fsum(expected.sums) / expected.count, rel=1e-9, abs=1e-12)
     assert sum(column["count"]) == round(days * DAY.span_ms / PERIOD_MS)
     assert tables.queries == 1
     assert tables.rows == len(hours) <= 1000

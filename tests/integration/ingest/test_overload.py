@@ -9,7 +9,7 @@ from tests.harness.network.brokers import wait_until
 from tests.unit.function_app.services.telemetry.test_live_data import measure, streams
 
 
-def test_what_cannot_be_kept_until_it_is_stored_is_dropped_and_said(
+def test_measurements_beyond_the_queue_limit_are_dropped_and_logged(
     cloud: Cloud, pair: tuple[Person, Robot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(device_feed, "MAX_COLLECTED", 10)

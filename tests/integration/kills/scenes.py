@@ -21,7 +21,7 @@ MOVE = MoveJoints(position_rad={"elbow": 1.0})
 TERMINAL = {"done", "failed", "expired", "cancelled"}
 
 
-def asked(**more: Any) -> ActionRequest:
+def action_request(**more: Any) -> ActionRequest:
     return ActionRequest(
         request=MOVE, ttl_ms=1000 * TTL_S, timeout_ms=1000 * TIMEOUT_S, queue_ms=1000 * QUEUE_S, **more
     )
@@ -31,15 +31,15 @@ def asked(**more: Any) -> ActionRequest:
 class Scene:
     """A person and a robot with one device."""
 
-    who: Identity
+    operator: Identity
     public: str
     agent: str
     action: str = ""
-    """One that runs on it."""
+    """Id of a running action."""
     epoch: int = 0
-    """Of the lease that ``who`` holds."""
+    """Epoch of the lease that ``operator`` holds."""
     code: str = ""
-    """The claim code of an agent that is not claimed yet."""
+    """Claim code of an unclaimed agent."""
 
     @property
     def device(self) -> str:
@@ -50,11 +50,11 @@ async def person(functions: Functions, name: str) -> Identity:
     return Identity((await functions.sign_in.account(name)).id, name, f"session of {name}")
 
 
-async def paired(functions: Functions, who: Identity, **more: Any) -> Scene:
+async def paired(functions: Functions, operator: Identity, **more: Any) -> Scene:
     public = new_public_key()
     agent, code = await show_code(functions, public=public)
-    await functions.claim.claim(who, code, None)
-    return Scene(who, public, agent, **more)
+    await functions.claim.claim(operator, code, None)
+    return Scene(operator, public, agent, **more)
 
 
 async def idle(functions: Functions) -> Scene:
@@ -63,37 +63,39 @@ async def idle(functions: Functions) -> Scene:
 
 async def running(functions: Functions) -> Scene:
     scene = await idle(functions)
-    lease, _ = await functions.leases.acquire(scene.who, scene.device, epoch=None, lease_ms=600_000, wait_ms=0)
-    action, _ = await functions.start_action.start(scene.who, scene.device, asked(epoch=lease.epoch))
-    return Scene(scene.who, scene.public, scene.agent, action.id, lease.epoch)
+    lease, _ = await functions.leases.acquire(scene.operator, scene.device, epoch=None, lease_ms=600_000, wait_ms=0)
+    action, _ = await functions.start_action.start(scene.operator, scene.device, action_request(epoch=lease.epoch))
+    return Scene(scene.operator, scene.public, scene.agent, action.id, lease.epoch)
 
 
 async def queued(functions: Functions) -> Scene:
     scene = await running(functions)
     for _ in range(2):
-        await functions.start_action.start(scene.who, scene.device, asked(epoch=scene.epoch, policy="queue"))
+        await functions.start_action.start(
+            scene.operator, scene.device, action_request(epoch=scene.epoch, policy="queue")
+        )
     return scene
 
 
-async def asked_for(functions: Functions) -> Scene:
-    """Another session requests the lease that ``who`` holds; ``action`` is the request."""
+async def control_requested(functions: Functions) -> Scene:
+    """Another session requests the lease that ``operator`` holds; ``action`` is the id of the request."""
     scene = await running(functions)
-    other = Identity(scene.who.account, scene.who.name, "another session")
-    _, asked, _, _ = await functions.control_requests.create(
+    other = Identity(scene.operator.account, scene.operator.name, "another session")
+    _, control_request, _, _ = await functions.control_requests.create(
         other, scene.device, within_ms=60_000, lease_ms=9_000, wait_ms=0
     )
-    return Scene(scene.who, scene.public, scene.agent, asked.id, scene.epoch)
+    return Scene(scene.operator, scene.public, scene.agent, control_request.id, scene.epoch)
 
 
 async def unclaimed(functions: Functions) -> Scene:
     public = new_public_key()
     agent, code = await show_code(functions, public=public)
-    # Each robot another person: a claim that is killed counts as a try.
+    # Each robot has another owner, because a killed claim counts as an attempt.
     return Scene(await person(functions, f"owner of {agent}"), public, agent, code=code)
 
 
 async def start(functions: Functions, scene: Scene) -> None:
-    await functions.start_action.start(scene.who, scene.device, asked())
+    await functions.start_action.start(scene.operator, scene.device, action_request())
 
 
 async def start_refused(functions: Functions, scene: Scene) -> None:
@@ -101,18 +103,18 @@ async def start_refused(functions: Functions, scene: Scene) -> None:
         await start(functions, scene)
 
 
-async def start_once(functions: Functions, scene: Scene) -> None:
-    await functions.start_action.start(scene.who, scene.device, asked(), idempotency_key="key")
+async def start_with_key(functions: Functions, scene: Scene) -> None:
+    await functions.start_action.start(scene.operator, scene.device, action_request(), idempotency_key="key")
 
 
 async def join_queue(functions: Functions, scene: Scene) -> None:
     await functions.start_action.start(
-        scene.who, scene.device, asked(policy="queue", epoch=scene.epoch or None), idempotency_key="key"
+        scene.operator, scene.device, action_request(policy="queue", epoch=scene.epoch or None), idempotency_key="key"
     )
 
 
 async def cancel(functions: Functions, scene: Scene) -> None:
-    await functions.actions.cancel(scene.who, scene.action)
+    await functions.actions.cancel(scene.operator, scene.action)
 
 
 async def report_done(functions: Functions, scene: Scene) -> None:
@@ -124,34 +126,34 @@ async def report_failed(functions: Functions, scene: Scene) -> None:
 
 
 async def take(functions: Functions, scene: Scene) -> None:
-    await functions.leases.acquire(scene.who, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
+    await functions.leases.acquire(scene.operator, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
 
 
 async def release(functions: Functions, scene: Scene) -> None:
-    await functions.leases.release(scene.who, scene.device, epoch=scene.epoch)
+    await functions.leases.release(scene.operator, scene.device, epoch=scene.epoch)
 
 
 async def pass_control(functions: Functions, scene: Scene) -> None:
-    await functions.control_requests.accept(scene.who, scene.device, scene.action, wait_ms=0)
-    lease = await functions.leases.get(scene.who, scene.device)
+    await functions.control_requests.accept(scene.operator, scene.device, scene.action, wait_ms=0)
+    lease = await functions.leases.get(scene.operator, scene.device)
     assert lease is not None
     assert (lease.epoch, lease.session) == (scene.epoch + 1, "another session")
 
 
 async def stop(functions: Functions, scene: Scene) -> None:
-    await functions.stop.stop(scene.who, scene.device, "enough")
+    await functions.stop.stop(scene.operator, scene.device, "enough")
 
 
 async def unpair(functions: Functions, scene: Scene) -> None:
-    await functions.unpair.unpair(scene.who, scene.agent)
+    await functions.unpair.unpair(scene.operator, scene.agent)
 
 
 async def claim(functions: Functions, scene: Scene) -> None:
-    await functions.claim.claim(scene.who, scene.code, None)
+    await functions.claim.claim(scene.operator, scene.code, None)
 
 
 async def time_out(functions: Functions, _scene: Scene) -> None:
-    """The timer, when everything's time is over."""
+    """Run the timer after all time limits."""
     cast("SetClock", functions.clock).advance(TIMEOUT_S + QUEUE_S)
     await functions.scheduler.run_due_jobs()
 
@@ -167,18 +169,18 @@ async def report(functions: Functions, action: str, status: AckStatus) -> None:
 
 CASES: dict[str, tuple[Callable[[Functions], Awaitable[Scene]], Work, int]] = {
     "start": (idle, start, 4),
-    "start with a key": (idle, start_once, 4),
-    "start refused": (running, start_refused, 1),
+    "start with a key": (idle, start_with_key, 4),
+    "start rejected": (running, start_refused, 1),
     "join the queue": (queued, join_queue, 3),
-    "queue while it is idle": (idle, join_queue, 4),
+    "queue while idle": (idle, join_queue, 4),
     "cancel": (running, cancel, 2),
-    "the end, reported": (running, report_done, 1),
-    "the end before a queue": (queued, report_done, 4),
-    "the failure before a queue": (queued, report_failed, 4),
+    "report done": (running, report_done, 1),
+    "report done before a queue": (queued, report_done, 4),
+    "report failed before a queue": (queued, report_failed, 4),
     "take": (idle, take, 2),
     "take again": (running, take, 2),
     "release": (running, release, 2),
-    "hand over": (asked_for, pass_control, 3),
+    "hand over": (control_requested, pass_control, 3),
     "stop before a queue": (queued, stop, 4),
     "un-pair": (queued, unpair, 4),
     "claim": (unclaimed, claim, 4),
@@ -187,51 +189,51 @@ CASES: dict[str, tuple[Callable[[Functions], Awaitable[Scene]], Work, int]] = {
 
 
 async def rows_of(functions: Functions, table: str, partition: str) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
+    rows: dict[str, dict[str, Any]] = {}
     cursor = None
     while True:
         page = await functions.tables.query(table, partition, limit=1000, cursor=cursor)
-        found |= {row.key: dict(row.data) for row in page.rows}
+        rows |= {row.key: dict(row.data) for row in page.rows}
         cursor = page.cursor
         if cursor is None:
-            return found
+            return rows
 
 
 async def settle(functions: Functions) -> None:
-    """Let time pass, with rounds of the timer, until every promise must have been kept."""
+    """Advance time and run the timer until every time limit has passed."""
     clock = cast("SetClock", functions.clock)
     for step_s in (*([1.0] * (TIMEOUT_S + QUEUE_S + 4)), *([ORPHAN_MS / 2000 + 1] * 3)):
         clock.advance(step_s)
         await functions.scheduler.run_due_jobs()
-    notes = [key for shard in range(SHARDS) for key in await rows_of(functions, records.PENDING, str(shard))]
-    # A lease that lasts longer than this has one, for its end; a chain has one for the hour.
-    notes = [key for key in notes if ":anchor:" not in key]
-    leases = [key for key in notes if ":lease:" in key]
-    assert notes == leases
+    reminders = [key for shard in range(SHARDS) for key in await rows_of(functions, records.PENDING, str(shard))]
+    # A longer lease has a reminder of its end; an audit chain has an hourly one.
+    reminders = [key for key in reminders if ":anchor:" not in key]
+    leases = [key for key in reminders if ":lease:" in key]
+    assert reminders == leases
     assert len(leases) == len({key.rpartition(":")[2] for key in leases})
 
 
-async def look(functions: Functions, place: Place, scenes: list[Scene]) -> None:
-    """Nothing is left open, nothing ran that is not written, and every robot can be used."""
+async def check_scenes(functions: Functions, place: Place, scenes: list[Scene]) -> None:
+    """Assert that no action is open, that each sent command is stored, and that every robot can be used."""
     await settle(functions)
     sent = commands_sent(place)
     for command, payloads in sent.items():
-        assert len(payloads) == 1, f"{command} went out as different commands"
-    written = set()
+        assert len(payloads) == 1, f"{command} was sent with different contents"
+    stored = set()
     for scene in scenes:
         rows = await rows_of(functions, records.CONTROL, scene.device)
         for key, data in rows.items():
             if key.startswith("action:"):
                 assert data["status"] in TERMINAL, data
-                written.add(data["id"])
-            assert not key.startswith("event:"), "what happened is left untold"
+                stored.add(data["id"])
+            assert not key.startswith("event:"), "an event was not published"
         assert rows.get("now:slot", {"action": ""})["action"] == ""
         assert not rows.get("now:queue", {"actions": ()})["actions"]
-    assert actions_sent(sent) <= written, "nothing goes out that is not written"
+    assert actions_sent(sent) <= stored, "a command was sent without being stored"
     for scene in scenes:
         public, agent = scene.public, scene.agent
         _, code = await show_code(functions, public=public)
-        owner = scene.who
+        owner = scene.operator
         if code:
             owner = await person(functions, f"next owner of {agent}")
             await functions.claim.claim(owner, code, None)
@@ -239,7 +241,7 @@ async def look(functions: Functions, place: Place, scenes: list[Scene]) -> None:
         row = await functions.tables.get(records.AGENTS, agent, "agent")
         assert row is not None
         owner = Identity(row.data["account"], "former owner", owner.session)
-        action, _ = await functions.start_action.start(owner, scene.device, asked())
+        action, _ = await functions.start_action.start(owner, scene.device, action_request())
         assert action.status.value == "published"
         await report(functions, action.id, AckStatus.DONE)
         lease, _ = await functions.leases.acquire(owner, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
@@ -247,6 +249,6 @@ async def look(functions: Functions, place: Place, scenes: list[Scene]) -> None:
 
 
 def actions_sent(sent: dict[str, set[bytes]]) -> set[str]:
-    """Ids of those commands that run something."""
+    """Ids of the commands that start an action."""
     runs = (b'"kind":"move_joints"', b'"kind":"run_movement"')
     return {command for command, payloads in sent.items() if any(kind in one for kind in runs for one in payloads)}

@@ -62,8 +62,8 @@ async def write_many(functions: Functions, writer: int, records: int) -> None:
         )
 
 
-async def everything(functions: Functions, chain: str = OWNER) -> list[dict[str, Any]]:
-    """The records of a chain."""
+async def chain_records(functions: Functions, chain: str = OWNER) -> list[dict[str, Any]]:
+    """All records of a chain."""
     return [row for key, row in (await rows_of(functions, store.AUDIT, chain)).items() if key.startswith("record:")]
 
 
@@ -80,13 +80,13 @@ def check_one_chain(place: Place, records: int) -> None:
     for process in writing:
         assert not killed(process)
 
-    async def look(functions: Functions) -> None:
+    async def check_chain(functions: Functions) -> None:
         await later(functions)
-        found = Counter(record["target"] for record in await everything(functions))
-        assert found == {f"{writer}-{number}": 1 for writer in range(WRITERS) for number in range(records)}
+        counts = Counter(record["target"] for record in await chain_records(functions))
+        assert counts == {f"{writer}-{number}": 1 for writer in range(WRITERS) for number in range(records)}
         assert (await functions.audit_reader.verify(OWNER)).broken == ""
 
-    run_here(place, look)
+    run_here(place, check_chain)
 
 
 @pytest.mark.parametrize("place", ["local"], indirect=True)
@@ -107,24 +107,24 @@ def test_a_process_killed_at_any_step_leaves_no_change_without_its_record(place:
     """The tables show what changed; the chain has one record of each change, by its actor or by an unknown one."""
     for step in range(1, MOST_STEPS):
         account, agent, code = run_here(place, partial(prepare, step=step))
-        who = Identity(account, "anna", "s")
-        before = run_here(place, partial(everything, chain=account))
-        survived = not kill(place, change, who, agent, code, at=step)
-        run_here(place, partial(check_records, who=who, agent=agent, before=len(before)))
+        operator = Identity(account, "anna", "s")
+        before = run_here(place, partial(chain_records, chain=account))
+        survived = not kill(place, change, operator, agent, code, at=step)
+        run_here(place, partial(check_records, operator=operator, agent=agent, before=len(before)))
         if survived:
             return
     pytest.fail(f"more than {MOST_STEPS} steps")
 
 
 async def prepare(functions: Functions, step: int) -> tuple[str, str, str]:
-    """A new person each time, because a killed claim uses up one of the few attempts."""
+    """A new person each time, because a killed claim counts as one of the few attempts."""
     account = await functions.sign_in.account(f"anna {step}")
     return account.id, *await show_code(functions)
 
 
-async def check_records(functions: Functions, who: Identity, agent: str, before: int) -> None:
+async def check_records(functions: Functions, operator: Identity, agent: str, before: int) -> None:
     await later(functions)
-    records = (await everything(functions, who.account))[before:]
+    records = (await chain_records(functions, operator.account))[before:]
     changes = Counter((each["event"], each["data"].get("epoch")) for each in records)
     assert all(count == 1 for count in changes.values()), changes
     row = await functions.tables.get(store.AGENTS, agent, "agent")
@@ -135,24 +135,24 @@ async def check_records(functions: Functions, who: Identity, agent: str, before:
     lease = await functions.tables.get(store.CONTROL, f"{agent}-arm", "now:lease")
     epochs = set(range(1, 1 + (lease.data["epoch"] if lease else 0)))
     assert epochs <= {epoch for _, epoch in changes}, changes
-    assert not (await functions.tables.query(store.AUDIT, who.account, first="wait:", last="wait;")).rows
-    assert (await functions.audit_reader.verify(who.account)).broken == ""
+    assert not (await functions.tables.query(store.AUDIT, operator.account, first="wait:", last="wait;")).rows
+    assert (await functions.audit_reader.verify(operator.account)).broken == ""
 
 
-async def change(functions: Functions, who: Identity, agent: str, code: str) -> None:
-    await functions.claim.claim(who, code, None)
+async def change(functions: Functions, operator: Identity, agent: str, code: str) -> None:
+    await functions.claim.claim(operator, code, None)
     device = f"{agent}-arm"
-    lease, _ = await functions.leases.acquire(who, device, epoch=None, lease_ms=60_000, wait_ms=0)
-    await functions.leases.release(who, device, epoch=lease.epoch)
-    await functions.leases.acquire(who, device, epoch=None, lease_ms=60_000, wait_ms=0)
-    await functions.unpair.unpair(who, agent)
+    lease, _ = await functions.leases.acquire(operator, device, epoch=None, lease_ms=60_000, wait_ms=0)
+    await functions.leases.release(operator, device, epoch=lease.epoch)
+    await functions.leases.acquire(operator, device, epoch=None, lease_ms=60_000, wait_ms=0)
+    await functions.unpair.unpair(operator, agent)
 
 
 @pytest.mark.parametrize("place", ["memory"], indirect=True)
 def test_a_change_that_cannot_be_recorded_is_not_made(place: Place) -> None:
-    """The note of a change is its first write."""
+    """The audit record of a change is written first."""
 
-    async def look(functions: Functions) -> None:
+    async def check_chain(functions: Functions) -> None:
         account, agent, code = await prepare(functions, 0)
         create = functions.tables.create
 
@@ -168,4 +168,4 @@ def test_a_change_that_cannot_be_recorded_is_not_made(place: Place) -> None:
         assert row is not None
         assert row.data["account"] is None
 
-    run_here(place, look)
+    run_here(place, check_chain)

@@ -1,4 +1,4 @@
-"""Eight processes that request the same thing at the same moment, over one store: exactly one gets it."""
+"""Eight processes with one store send the same request at the same time: exactly one succeeds."""
 
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
@@ -22,13 +22,13 @@ LOST = {
     "lease": "lease-held",
     "claim": "claim-code-unknown",
     "link": "unauthorized",
-    "key": "done",  # the same request with one idempotency key: all get the one action
+    "key": "done",  # the same request with one idempotency key: all return the same action
 }
 
 
 @dataclass(frozen=True)
-class Prizes:
-    """One of each per round; each process claims for accounts of its own."""
+class Contested:
+    """One contested resource of each kind per round; each process claims for separate accounts."""
 
     owner: str
     slots: list[str]
@@ -39,11 +39,11 @@ class Prizes:
     links: list[str]
 
 
-async def prepare(functions: Functions, rounds: int) -> Prizes:
+async def prepare(functions: Functions, rounds: int) -> Contested:
     owner = await functions.sign_in.account("owner")
     devices = await claimed_devices(functions, Identity(owner.id, "owner", "s"), 3 * rounds)
     accounts = range(-(-rounds // WRONG_TRIES))
-    return Prizes(
+    return Contested(
         owner=owner.id,
         slots=devices[:rounds],
         leases=devices[rounds : 2 * rounds],
@@ -56,34 +56,34 @@ async def prepare(functions: Functions, rounds: int) -> Prizes:
     )
 
 
-def attempts(functions: Functions, prizes: Prizes, racer: int) -> Iterator[Callable[[], Awaitable[object]]]:
-    same = Identity(prizes.owner, "owner", "s")
-    own = Identity(prizes.owner, "owner", f"s{racer}")
+def attempts(functions: Functions, contested: Contested, racer: int) -> Iterator[Callable[[], Awaitable[object]]]:
+    same = Identity(contested.owner, "owner", "s")
+    own = Identity(contested.owner, "owner", f"s{racer}")
     start, acquire = functions.start_action.start, functions.leases.acquire
-    yield from (partial(start, same, device, START) for device in prizes.slots)
-    yield from (partial(acquire, own, device, epoch=None, lease_ms=60_000, wait_ms=0) for device in prizes.leases)
-    for number, code in enumerate(prizes.codes):
-        claimant = Identity(prizes.accounts[racer][number // WRONG_TRIES], "x", "s")
+    yield from (partial(start, same, device, START) for device in contested.slots)
+    yield from (partial(acquire, own, device, epoch=None, lease_ms=60_000, wait_ms=0) for device in contested.leases)
+    for number, code in enumerate(contested.codes):
+        claimant = Identity(contested.accounts[racer][number // WRONG_TRIES], "x", "s")
         yield partial(functions.claim.claim, claimant, code, None)
-    yield from (partial(functions.sign_in.redeem, link) for link in prizes.links)
-    yield from (partial(start, same, device, START, idempotency_key="one key") for device in prizes.keys)
+    yield from (partial(functions.sign_in.redeem, link) for link in contested.links)
+    yield from (partial(start, same, device, START, idempotency_key="one key") for device in contested.keys)
 
 
-async def look(functions: Functions, prizes: Prizes) -> None:
+async def check_tables(functions: Functions, contested: Contested) -> None:
     """The tables agree with the responses."""
-    who = Identity(prizes.owner, "owner", "s")
-    for device in (*prizes.slots, *prizes.keys):
-        actions, _ = await functions.actions.list(who, device, cursor=None, limit=10)
+    owner = Identity(contested.owner, "owner", "s")
+    for device in (*contested.slots, *contested.keys):
+        actions, _ = await functions.actions.list(owner, device, cursor=None, limit=10)
         assert [action.epoch for action in actions] == [1]
-    for device in prizes.leases:
-        lease = await functions.leases.get(who, device)
+    for device in contested.leases:
+        lease = await functions.leases.get(owner, device)
         assert lease is not None
         assert lease.epoch == 1
 
 
 def check_one_winner(place: Place, rounds: int) -> None:
-    prizes = run_here(place, partial(prepare, rounds=rounds))
-    outcomes = race(place, attempts, prizes, RACERS)
+    contested = run_here(place, partial(prepare, rounds=rounds))
+    outcomes = race(place, attempts, contested, RACERS)
     for kind, (name, lost) in enumerate(LOST.items()):
         winners = set()
         for number in range(kind * rounds, (kind + 1) * rounds):
@@ -91,7 +91,7 @@ def check_one_winner(place: Place, rounds: int) -> None:
             assert Counter(each[number] for each in outcomes.values()) == expected, f"{name}, round {number}"
             winners |= {racer for racer, each in outcomes.items() if each[number] == "done"}
         assert len(winners) > 1, f"{name}: one process won every round, so no race occurred"
-    run_here(place, partial(look, prizes=prizes))
+    run_here(place, partial(check_tables, contested=contested))
 
 
 @pytest.mark.parametrize("place", ["local"], indirect=True)
@@ -102,6 +102,6 @@ def test_one_of_eight_processes_wins(place: Place) -> None:
 @pytest.mark.long
 @pytest.mark.timeout(1_800)
 @pytest.mark.parametrize(("place", "rounds"), [("local", 1_000), ("azure", 200), ("aws", 100)], indirect=["place"])
-def test_one_of_eight_processes_wins_again_and_again(place: Place, rounds: int) -> None:
+def test_one_of_eight_processes_wins_in_many_rounds(place: Place, rounds: int) -> None:
     """The processes interleave, although moto answers requests one by one (``tests/harness/stores/aws.py``)."""
     check_one_winner(place, rounds)

@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class Site:
-    """Functions at a broker of their own, which can go away and come back."""
+    """Functions with a separate broker that can be stopped and restarted."""
 
     home: Path
     folder: Path
@@ -33,9 +33,11 @@ class Site:
     cloud: Cloud
     stack: contextlib.ExitStack
 
-    def come_back(self) -> None:
-        was, keys = self.broker, self.home / "keys" / "public.json"
-        again = start_broker(was.kind, self.folder, keys=keys, tcp_port=was.tcp_port, websocket_port=was.websocket_port)
+    def restart_broker(self) -> None:
+        previous, keys = self.broker, self.home / "keys" / "public.json"
+        again = start_broker(
+            previous.kind, self.folder, keys=keys, tcp_port=previous.tcp_port, websocket_port=previous.websocket_port
+        )
         self.broker = self.stack.enter_context(again)
 
 
@@ -54,8 +56,10 @@ def site(request: pytest.FixtureRequest, home: Path, tmp_path: Path) -> Iterator
 @pytest.mark.parametrize(
     ("site", "then"), [("amqtt", "offline"), ("mosquitto", "offline"), ("amqtt", "owner")], indirect=["site"]
 )
-def test_who_unshares_while_the_broker_is_away_is_told_so_at_once_and_nothing_is_lost(site: Site, then: str) -> None:
-    """``then``: who takes control before the broker is back."""
+def test_ending_a_share_while_the_broker_is_down_responds_immediately_and_takes_effect_later(
+    site: Site, then: str
+) -> None:
+    """``then``: the person who takes control before the broker is restarted."""
     cloud = site.cloud
     with paired(cloud) as (anna, robot):
         bert = cloud.sign_in("bert")
@@ -63,14 +67,14 @@ def test_who_unshares_while_the_broker_is_away_is_told_so_at_once_and_nothing_is
         anna.post(at, {"account": "bert", "role": "operator"})
         epoch = bert.take_lease(robot.device, lease_ms=600_000).json()["epoch"]
         running = bert.start(robot.device, epoch=epoch, wait_ms=10_000).json()["id"]
-        held = [
+        issued = [
             request_credentials(bert, purpose="view"),
             request_credentials(bert, purpose="control", device=robot.device, epoch=epoch),
         ]
         site.broker.stop()
-        asked_s = time.monotonic()
+        requested_s = time.monotonic()
         answer = anna.delete(f"{at}/{bert.account}")
-        _log.warning("%s is away: answered after %.1f s", site.broker.kind, time.monotonic() - asked_s)
+        _log.warning("%s is down: response after %.1f s", site.broker.kind, time.monotonic() - requested_s)
         assert answer.status_code == 202, answer.text
         assert "broker" in answer.json()["detail"]
         problem(bert.get(f"/devices/{robot.device}"), 404, "device-unknown")
@@ -78,18 +82,18 @@ def test_who_unshares_while_the_broker_is_away_is_told_so_at_once_and_nothing_is
         assert anna.action(running)["reason"]["code"] == "unshared"
         if then == "owner":
             assert anna.take_lease(robot.device).json()["epoch"] == epoch + 2
-        site.come_back()
+        site.restart_broker()
         if then == "offline":
             robot.connect()
 
-        def seen_to() -> bool:
+        def completed() -> bool:
             cloud.clock.advance(1)
             cloud.sweep()
             pages = (cloud.run(cloud.functions.tables.query(records.PENDING, str(n))) for n in range(SHARDS))
             return not any("share-changed" in row.key for page in pages for row in page.rows)
 
-        wait_until(seen_to, "the timer to have told the broker")
-        for client_id, credentials in held:
+        wait_until(completed, "the timer to revoke the credentials at the broker")
+        for client_id, credentials in issued:
             with site.broker.connect(client_id, credentials) as late:
                 assert not late.connected.is_set(), "revoked credentials"
         if then == "offline":
@@ -119,6 +123,6 @@ def test_an_unresponsive_broker_does_not_delay_requests(
     assert not page.disconnected.is_set()
     cloud.clock.advance(2)
     cloud.sweep()
-    wait_until(page.disconnected.is_set, "the cut")
+    wait_until(page.disconnected.is_set, "the end of the connection")
     page.close()
     assert anna.post(at, {"account": "bert", "role": "viewer"}).status_code == 200

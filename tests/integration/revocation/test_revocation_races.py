@@ -14,34 +14,34 @@ from tests.harness.network.brokers import BROKERS, RunningBroker, wait_until
 
 
 async def end_share(anna: Person, bert: Person, robot: Robot) -> None:
-    sharing, who = anna.cloud.functions.sharing, Identity(anna.account, anna.name, anna.session)
-    await sharing.end(who, await sharing.of(who, "device", robot.device), bert.account)
+    sharing, identity = anna.cloud.functions.sharing, Identity(anna.account, anna.name, anna.session)
+    await sharing.end(identity, await sharing.of(identity, "device", robot.device), bert.account)
 
 
 def unshare_at(
-    monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot], moment: Literal["seen", "written"]
+    monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot], moment: Literal["checked", "written"]
 ) -> None:
     """End the share during an operator's request: after the role check or after the write."""
     anna, bert, robot = operator
     functions = anna.cloud.functions
     target, name = {
-        "seen": (functions.start_action._reminders, "schedule"),
+        "checked": (functions.start_action._reminders, "schedule"),
         "written": (functions.devices, "require_still_allowed"),
     }[moment]
-    real = getattr(target, name)
-    once = itertools.count()
+    original = getattr(target, name)
+    calls = itertools.count()
 
-    async def meanwhile(*given: Any, **named: Any) -> Any:
-        if next(once) == 0:
+    async def meanwhile(*args: Any, **kwargs: Any) -> Any:
+        if next(calls) == 0:
             await end_share(anna, bert, robot)
-        return await real(*given, **named)
+        return await original(*args, **kwargs)
 
     monkeypatch.setattr(target, name, meanwhile)
 
 
-@pytest.mark.parametrize("moment", ["seen", "written"])
-def test_an_action_that_starts_while_its_device_is_unshared_never_reaches_it(
-    monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot], moment: Literal["seen", "written"]
+@pytest.mark.parametrize("moment", ["checked", "written"])
+def test_an_action_that_starts_while_the_share_ends_never_reaches_the_device(
+    monkeypatch: pytest.MonkeyPatch, operator: tuple[Person, Person, Robot], moment: Literal["checked", "written"]
 ) -> None:
     anna, bert, robot = operator
     unshare_at(monkeypatch, operator, moment)
@@ -59,7 +59,9 @@ def test_a_lease_acquired_while_the_share_ends_is_not_granted(
     unshare_at(monkeypatch, operator, "written")
     problem(bert.take_lease(robot.device), 404, "device-unknown")
     assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
-    wait_until(lambda: [command.epoch for command in robot.received(ReleaseLease)] == [2], "the end of it at the robot")
+    wait_until(
+        lambda: [command.epoch for command in robot.received(ReleaseLease)] == [2], "the end of the lease at the robot"
+    )
     assert robot.received(GrantLease) == []
     assert anna.take_lease(robot.device).json()["epoch"] == 3
 
@@ -78,24 +80,24 @@ def test_control_is_not_passed_to_an_operator_whose_share_ends(
 
 
 @pytest.mark.parametrize("broker", BROKERS, indirect=True)
-def test_credentials_that_are_made_while_their_device_is_unshared_are_no_good(
+def test_credentials_issued_while_the_share_ends_are_invalid(
     cloud: Cloud, monkeypatch: pytest.MonkeyPatch, broker: RunningBroker, operator: tuple[Person, Person, Robot]
 ) -> None:
     anna, bert, robot = operator
-    access, made = cloud.functions.access, []
-    real = access.issue
+    access, issued = cloud.functions.access, []
+    original = access.issue
 
     async def issue(grant: Any) -> Any:
-        given = await real(grant)
-        made.append((grant, given))
-        if len(made) == 1:
+        credentials = await original(grant)
+        issued.append((grant, credentials))
+        if len(issued) == 1:
             await end_share(anna, bert, robot)
-        return given
+        return credentials
 
     monkeypatch.setattr(access, "issue", issue)
     problem(bert.post("/mqtt/credentials", {"purpose": "view"}), 503, "busy")
-    ((grant, given),) = made
-    with broker.connect(grant.client_id, given) as client:
+    ((grant, credentials),) = issued
+    with broker.connect(grant.client_id, credentials) as client:
         assert not client.connected.is_set()
 
 

@@ -1,4 +1,4 @@
-"""Signing out, seen from the broker."""
+"""Effects of signing out on broker connections."""
 
 from collections.abc import Callable
 
@@ -23,7 +23,7 @@ def test_signing_out_ends_only_the_sessions_own_connections(
         assert there.subscribe(elsewhere.post("/mqtt/credentials", {"purpose": "view"}).json()["subscribe"][0]) == [1]
 
 
-def test_signing_out_works_while_the_broker_is_away(open_cloud: Callable[..., Cloud]) -> None:
+def test_signing_out_works_while_the_broker_is_down(open_cloud: Callable[..., Cloud]) -> None:
     anna = open_cloud(at=None).sign_in("anna")
     assert anna.post("/auth/sign-out").status_code == 204
     assert anna.get("/accounts/me").status_code == 401

@@ -1,4 +1,4 @@
-"""Fixtures of the robot type tests."""
+"""Fixtures of the tests of robot types."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +12,7 @@ from tests.integration.robot_types.lever import checking
 
 @pytest.fixture
 def cloud(home: Path) -> Iterator[Cloud]:
-    """The functions without a broker, and without a checker."""
+    """The functions without a broker and without a model checker."""
     with Cloud(settings(home), clock=MovingClock()) as cloud:
         yield cloud
 
@@ -30,6 +30,6 @@ def checker(cloud: Cloud) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def bert(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Person]:
-    """A person whose uploads are checked, shared by tests that leave only versions behind."""
+    """A person whose uploads are checked; shared by tests that only add versions."""
     with Cloud(settings(tmp_path_factory.mktemp("home")), clock=MovingClock()) as cloud, checking(cloud):
         yield cloud.sign_in("bert")

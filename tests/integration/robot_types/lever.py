@@ -1,4 +1,4 @@
-"""A robot type with one joint, and what the robot type tests do with it."""
+"""A robot type with one joint, and operations of the tests of robot types."""
 
 import asyncio
 import contextlib
@@ -70,16 +70,16 @@ def manifest(robot_type: str = "lever", **changes: str) -> str:
     return text
 
 
-def add(who: Person, robot_type: str = "lever", *, wait_ms: int = 30_000, text: str = "", **files: str) -> Any:
-    """Upload; ``lever__xml`` replaces ``lever.xml``."""
+def add(person: Person, robot_type: str = "lever", *, wait_ms: int = 30_000, text: str = "", **files: str) -> Any:
+    """Upload a robot type; ``lever__xml`` replaces ``lever.xml``."""
     changed = {name.replace("__", "."): content for name, content in files.items()}
     body = {"manifest": text or manifest(robot_type), "files": {**FILES, **changed}, "wait_ms": wait_ms}
-    return who.post("/robot-types", body)
+    return person.post("/robot-types", body)
 
 
 @contextlib.contextmanager
 def checking(cloud: Cloud, count: int = 1) -> Iterator[None]:
-    """Some checkers at work."""
+    """Run model checkers in the background."""
 
     async def start() -> list[asyncio.Task[None]]:
         return [asyncio.create_task(check_models(cloud.functions, drain=False)) for _ in range(count)]
@@ -105,7 +105,7 @@ def rows(cloud: Cloud, table: str, partition: str) -> list[str]:
 
 
 def check_all(cloud: Cloud) -> None:
-    """What a checker does, by hand."""
+    """Execute all pending model checks."""
     while cloud.run(cloud.functions.model_checks.run()):
         pass
 
@@ -116,8 +116,8 @@ def advance(cloud: Cloud, ms: int) -> None:
 
 
 @contextlib.contextmanager
-def dies_in(cloud: Cloud) -> Iterator[None]:
-    """A checker that is killed while it compiles: nothing it would have written then is written."""
+def killed_checker(cloud: Cloud) -> Iterator[None]:
+    """Simulate the kill of a checker during compilation, before it stores a result."""
 
     class KilledError(Exception):
         pass
@@ -131,19 +131,19 @@ def dies_in(cloud: Cloud) -> Iterator[None]:
 
 
 def stop_after(cloud: Cloud, patch: pytest.MonkeyPatch, writes: int) -> None:
-    """Let the functions end with the write of this number."""
+    """Simulate the kill of the functions after this number of writes."""
     left = writes
 
-    def counted(call: Callable[..., Any]) -> Callable[..., Any]:
-        async def made(*arguments: Any, **options: Any) -> Any:
+    def limited(call: Callable[..., Any]) -> Callable[..., Any]:
+        async def call_counted(*arguments: Any, **options: Any) -> Any:
             nonlocal left
             left -= 1
             if left < 0:
                 raise RuntimeError("killed")
             return await call(*arguments, **options)
 
-        return made
+        return call_counted
 
     for target, names in ((cloud.functions.tables, ("create", "replace", "batch")), (cloud.functions.blobs, ("put",))):
         for name in names:
-            patch.setattr(target, name, counted(getattr(target, name)))
+            patch.setattr(target, name, limited(getattr(target, name)))

@@ -1,4 +1,4 @@
-"""Uploads that are refused, and the reported reasons."""
+"""Rejected uploads and the reported reasons."""
 
 import base64
 
@@ -44,7 +44,7 @@ from tests.integration.robot_types.lever import FILES, LEVER, add, blobs, manife
         ("\x00\x01", ["lever.xml"]),
     ],
 )
-def test_what_mujoco_refuses_is_refused_in_its_words(bert: Person, xml: str, words: list[str]) -> None:
+def test_errors_of_mujoco_are_reported_unchanged(bert: Person, xml: str, words: list[str]) -> None:
     refused = problem(add(bert, lever__xml=xml), 422, "robot-type-rejected")
     text = " ".join(refused["errors"])
     for word in words:
@@ -52,7 +52,7 @@ def test_what_mujoco_refuses_is_refused_in_its_words(bert: Person, xml: str, wor
     assert "/tmp" not in text
 
 
-def test_wheels_that_its_model_does_not_have_are_refused(bert: Person) -> None:
+def test_wheels_without_an_actuator_in_the_model_are_rejected(bert: Person) -> None:
     wheels = '[simulation.wheels]\nleft = "shoulder"\nright = "wheel"\nradius_m = 0.05\ntrack_m = 0.3\n'
     refused = problem(add(bert, text=manifest() + wheels), 422, "robot-type-rejected")
     assert refused["errors"] == [
@@ -73,7 +73,7 @@ def test_wheels_that_its_model_does_not_have_are_refused(bert: Person) -> None:
         *(f"<compiler {value}/>" for value in ('meshdir="/usr"', 'texturedir=".."', 'assetdir="~"')),
     ],
 )
-def test_a_reference_out_of_the_folder_is_refused_unread(bert: Person, inside: str) -> None:
+def test_a_reference_outside_the_folder_is_rejected_without_reading_it(bert: Person, inside: str) -> None:
     before = blobs(bert.cloud)
     refused = problem(
         add(bert, lever__xml=LEVER.replace("<worldbody>", inside + "<worldbody>", 1)), 422, "robot-type-invalid"
@@ -82,13 +82,13 @@ def test_a_reference_out_of_the_folder_is_refused_unread(bert: Person, inside: s
     assert blobs(bert.cloud) == before
 
 
-def test_entities_are_refused(bert: Person) -> None:
+def test_entities_are_rejected(bert: Person) -> None:
     doctype = '<!DOCTYPE m [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>'
     problem(add(bert, lever__xml=doctype + LEVER), 422, "robot-type-invalid")
 
 
-def test_what_only_mujoco_can_read_is_never_good(bert: Person) -> None:
-    """Its parser takes more than ours: what ours cannot read it cannot have looked at."""
+def test_files_that_only_mujoco_can_parse_are_rejected(bert: Person) -> None:
+    """MuJoCo's parser accepts more than the checker's, which therefore cannot check the references in such files."""
     lenient = LEVER.replace('model="lever"', 'model="&nothing;"')
     refused = problem(add(bert, lever__xml=lenient), 422, "robot-type-rejected")
     assert "undefined entity" in refused["errors"][0]
@@ -102,7 +102,7 @@ def test_what_only_mujoco_can_read_is_never_good(bert: Person) -> None:
         "lever.xml/x.xml", "PK\x03\x04.xml",
     ],
 )  # fmt: skip
-def test_a_file_that_is_called_what_a_file_may_not_be_called_is_refused(bert: Person, name: str) -> None:
+def test_an_invalid_file_name_is_rejected(bert: Person, name: str) -> None:
     body = {"manifest": manifest(), "files": {**FILES, name: "<mujoco/>"}}
     problem(bert.post("/robot-types", body), 422, "robot-type-invalid")
 
@@ -120,7 +120,7 @@ def test_a_file_that_is_called_what_a_file_may_not_be_called_is_refused(bert: Pe
         ({"label": ""}, "label"), ({"label": "="}, "line"), ({"driver": '"mujoco"\nsurprise = 1'}, "surprise"),
     ],
 )  # fmt: skip
-def test_a_manifest_says_which_field_is_wrong(bert: Person, change: dict[str, str], words: str) -> None:
+def test_a_manifest_error_names_the_field(bert: Person, change: dict[str, str], words: str) -> None:
     refused = problem(add(bert, text=manifest(**change)), 422, "manifest-invalid")
     assert words in refused["detail"]
 
@@ -133,7 +133,7 @@ def test_sizes_are_limited(bert: Person) -> None:
         problem(bert.post("/robot-types", body), 422, "robot-type-invalid")
 
 
-def test_a_large_mesh_arrives(bert: Person) -> None:
+def test_a_large_mesh_is_accepted(bert: Person) -> None:
     body = {"manifest": manifest(), "files": {**FILES, "m.png": base64.b64encode(bytes(5_900_000)).decode()}}
     added = bert.post("/robot-types", {**body, "wait_ms": 30_000})
     assert added.status_code in {200, 201}, added.text

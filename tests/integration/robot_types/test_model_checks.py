@@ -29,7 +29,7 @@ from tests.integration.robot_types.lever import (
     blobs,
     check_all,
     checking,
-    dies_in,
+    killed_checker,
     manifest,
     rows,
     stop_after,
@@ -37,7 +37,9 @@ from tests.integration.robot_types.lever import (
 
 
 class TestChecker:
-    def test_without_one_the_upload_waits_and_is_refused_in_the_end(self, cloud: Cloud, anna: Person) -> None:
+    def test_without_a_checker_the_upload_waits_and_is_rejected_after_the_time_limit(
+        self, cloud: Cloud, anna: Person
+    ) -> None:
         added = add(anna, wait_ms=0)
         assert (added.status_code, added.json()["state"]) == (202, "checking")
         problem(anna.get("/robot-types/lever/archive"), 409, "robot-type-not-ready")
@@ -50,27 +52,27 @@ class TestChecker:
         shown = anna.get("/robot-types/lever").json()
         assert (shown["state"], shown["upload"]["errors"]) == ("rejected", [NO_CHECKER])
         check_all(cloud)
-        assert anna.get("/robot-types/lever").json()["state"] == "rejected", "a verdict stays"
+        assert anna.get("/robot-types/lever").json()["state"] == "rejected", "a result must not change"
         assert add(anna, wait_ms=0).json()["version"] == 2
         check_all(cloud)
         assert anna.get("/robot-types/lever").json()["state"] == "ready"
         assert rows(cloud, records.MODEL_CHECKS, "checks") == []
 
-    def test_one_that_is_killed_is_followed_by_another(self, cloud: Cloud, anna: Person) -> None:
+    def test_another_checker_continues_after_a_kill(self, cloud: Cloud, anna: Person) -> None:
         add(anna, wait_ms=0)
-        with dies_in(cloud):
+        with killed_checker(cloud):
             check_all(cloud)
-        assert rows(cloud, records.MODEL_CHECKS, "checks"), "the note outlives it"
+        assert rows(cloud, records.MODEL_CHECKS, "checks"), "the pending check must remain"
         check_all(cloud)
         assert anna.get("/robot-types/lever").json()["state"] == "checking", "another checker may still process it"
         advance(cloud, LEASE_MS)
         check_all(cloud)
         assert anna.get("/robot-types/lever").json()["state"] == "ready"
 
-    def test_a_model_that_kills_every_one_is_refused(self, cloud: Cloud, anna: Person) -> None:
+    def test_a_model_that_kills_every_checker_is_rejected(self, cloud: Cloud, anna: Person) -> None:
         add(anna, wait_ms=0)
         for _ in range(MAX_TRIES):
-            with dies_in(cloud):
+            with killed_checker(cloud):
                 check_all(cloud)
             cloud.clock.advance(LEASE_MS / 1000)
         check_all(cloud)
@@ -78,7 +80,7 @@ class TestChecker:
         assert shown["state"] == "rejected"
         assert "interrupted" in shown["upload"]["errors"][0]
 
-    def test_many_give_each_upload_one_verdict(
+    def test_concurrent_checkers_compile_each_upload_once(
         self, cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         compiled: list[str] = []
@@ -96,20 +98,20 @@ class TestChecker:
         ]
         with checking(cloud, 4):
             assert sorted(answer().status_code for answer in waiting) == [201] * 12 + [409]
-        assert sorted(compiled) == sorted(names), "of two uploads at once one is rejected"
+        assert sorted(compiled) == sorted(names), "one of two concurrent uploads must be rejected"
 
-    def test_while_one_is_busy_the_others_wait_for_their_turn(self, cloud: Cloud, anna: Person) -> None:
+    def test_uploads_wait_while_the_checker_is_busy(self, cloud: Cloud, anna: Person) -> None:
         add(anna, "first", wait_ms=0)
         add(anna, "second", wait_ms=0)
         cloud.clock.advance((GIVE_UP_MS - 1_000) / 1000)
-        with dies_in(cloud):
+        with killed_checker(cloud):
             cloud.run(cloud.functions.model_checks.run())
         advance(cloud, 1_000)
         assert anna.get("/robot-types/second").json()["state"] == "checking"
         check_all(cloud)
         assert anna.get("/robot-types/second").json()["state"] == "ready"
 
-    def test_one_without_mujoco_says_so_and_gives_the_note_back(
+    def test_a_checker_without_mujoco_fails_and_releases_the_check(
         self, cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         add(anna, wait_ms=0)
@@ -122,7 +124,7 @@ class TestChecker:
         check_all(cloud)
         assert anna.get("/robot-types/lever").json()["state"] == "ready"
 
-    def test_an_upload_that_is_cut_off_at_any_write_is_ended_and_leaves_nothing(
+    def test_an_upload_killed_at_any_write_ends_and_leaves_no_data(
         self, cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         cut = 0
@@ -152,24 +154,24 @@ class TestChecker:
 
 
 class TestProcesses:
-    """The checker as people run it: a program of its own over the same store."""
+    """The checker as a separate program with the same store."""
 
     def start(self, cloud: Cloud, *arguments: str) -> subprocess.Popen[bytes]:
         environment = {**os.environ, "TELESCOPE_HOME": str(cloud.functions.settings.home)}
         return subprocess.Popen([sys.executable, "-m", "function_app", "check-models", *arguments], env=environment)
 
-    def test_it_checks_what_is_there_and_ends(self, cloud: Cloud, anna: Person) -> None:
+    def test_the_checker_processes_all_pending_checks_and_exits(self, cloud: Cloud, anna: Person) -> None:
         add(anna, "first", wait_ms=0)
         add(anna, "second", wait_ms=0)
         assert self.start(cloud, "--drain").wait(PATIENCE_S) == 0
         assert [anna.get(f"/robot-types/{name}").json()["state"] for name in ("first", "second")] == ["ready", "ready"]
 
-    def test_what_a_killed_one_had_taken_is_checked_by_the_next(self, cloud: Cloud, anna: Person) -> None:
+    def test_the_next_checker_repeats_the_check_of_a_killed_one(self, cloud: Cloud, anna: Person) -> None:
         endless = LEVER.replace("<site", '<replicate count="1000000"><body/></replicate><site')
         add(anna, wait_ms=0, lever__xml=endless)
         running = self.start(cloud)
         try:
-            wait_until(lambda: taken(cloud), "the note to be taken")
+            wait_until(lambda: taken(cloud), "a checker to start the check")
         finally:
             running.kill()
             running.wait()
@@ -181,7 +183,7 @@ class TestProcesses:
 
 
 def taken(cloud: Cloud) -> bool:
-    """Whether a checker holds a note."""
+    """Whether a checker has started a check."""
     page = cloud.run(cloud.functions.tables.query(records.MODEL_CHECKS, "checks"))
     return any(note.data["until_ms"] for note in page.rows)
 
@@ -198,7 +200,7 @@ class TestLimits:
         ],
         ids=["bodies", "heights", "memory"],
     )
-    def test_a_model_that_would_eat_the_machine_is_refused(
+    def test_a_model_that_exceeds_resource_limits_is_rejected(
         self, cloud: Cloud, anna: Person, xml: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(cloud.functions.model_checks, "_compiler", MujocoCompiler(cpu_s=2, wall_s=20))
@@ -206,7 +208,7 @@ class TestLimits:
             refused = problem(add(anna, lever__xml=xml), 422, "robot-type-rejected")
         assert refused["errors"]
 
-    def test_a_child_that_waits_for_ever_is_ended(
+    def test_a_child_process_without_an_end_is_killed(
         self, cloud: Cloud, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         child = tmp_path / "child.py"
@@ -216,12 +218,12 @@ class TestLimits:
         found = cloud.run(compiler.check(manifests.parse(manifest()), {"lever.xml": b""}))
         assert "Simplify" in found.errors[0]
 
-    def test_the_child_reads_nothing_but_the_upload(self, cloud: Cloud, tmp_path: Path) -> None:
-        """Past the look at references: what the kernel itself refuses, where it can."""
+    def test_the_child_process_reads_only_the_upload(self, cloud: Cloud, tmp_path: Path) -> None:
+        """Without the check of references, the kernel denies access if it supports Landlock."""
         outside = tmp_path / "outside.xml"
         outside.write_text(LEVER)
         xml = f'<mujoco><include file="{outside}"/></mujoco>'.encode()
         compiler = MujocoCompiler()
         found = cloud.run(compiler.check(manifests.parse(manifest()), {"lever.xml": xml, "scene.xml": xml}))
-        # Where the kernel has no Landlock, the look at references has to do alone.
+        # Without Landlock, only the check of references protects files.
         assert bool(found.errors) == (ctypes.CDLL(None).syscall(444, None, 0, 1) > 0)

@@ -23,41 +23,41 @@ from tests.integration.robot_types.lever import (
     stop_after,
 )
 
-LOOKS = "/robot-type-previews"
+PREVIEWS = "/robot-type-previews"
 _SLOW_MS = 600_000
-"""No machine takes as long to compile the lever."""
+"""More than the compilation of the lever takes on any machine."""
 
 
-def look(
-    who: Person, text: str = "", *, wait_ms: int = 0, movements: dict[str, str] | None = None, **files: str
+def preview(
+    person: Person, text: str = "", *, wait_ms: int = 0, movements: dict[str, str] | None = None, **files: str
 ) -> Any:
-    """Look at the lever; ``lever__xml`` replaces ``lever.xml``."""
+    """Request a preview of the lever; ``lever__xml`` replaces ``lever.xml``."""
     changed = {name.replace("__", "."): content for name, content in files.items()}
     body = {"manifest": text or manifest(), "files": {**FILES, **changed}, "wait_ms": wait_ms}
-    return who.post(LOOKS, body | ({} if movements is None else {"movements": movements}))
+    return person.post(PREVIEWS, body | ({} if movements is None else {"movements": movements}))
 
 
-def checked(cloud: Cloud, who: Person, text: str = "", **more: Any) -> dict[str, Any]:
-    """A look with its verdict."""
-    begun = look(who, text, **more)
-    assert begun.status_code == 202, begun.text
+def checked(cloud: Cloud, person: Person, text: str = "", **more: Any) -> dict[str, Any]:
+    """Request a preview and wait for its result."""
+    response = preview(person, text, **more)
+    assert response.status_code == 202, response.text
     check_all(cloud)
-    found: dict[str, Any] = who.get(f"{LOOKS}/{begun.json()['id']}").json()
+    found: dict[str, Any] = person.get(f"{PREVIEWS}/{response.json()['id']}").json()
     return found
 
 
-def trials(cloud: Cloud, who: Person) -> list[str]:
-    return [key for key in rows(cloud, records.MEMBERS, who.account) if key.startswith("type-look:")]
+def previews(cloud: Cloud, person: Person) -> list[str]:
+    return [key for key in rows(cloud, records.MEMBERS, person.account) if key.startswith("type-look:")]
 
 
-class TestLook:
-    def test_one_is_seen_by_who_looks_and_is_no_robot_type_until_it_is_saved(self, cloud: Cloud, anna: Person) -> None:
+class TestPreview:
+    def test_a_preview_is_private_and_becomes_a_robot_type_when_saved(self, cloud: Cloud, anna: Person) -> None:
         with checking(cloud):
-            begun = look(anna, wait_ms=30_000)
-            assert begun.status_code == 201, begun.text
-            found = begun.json()
+            response = preview(anna, wait_ms=30_000)
+            assert response.status_code == 201, response.text
+            found = response.json()
             assert (found["robot_type"]["type"], found["robot_type"]["upload"]["state"]) == ("lever", "ready")
-            at = f"{LOOKS}/{found['id']}"
+            at = f"{PREVIEWS}/{found['id']}"
             twin = anna.get(f"{at}/twin").json()
             assert [body["name"] for body in twin["bodies"]] == ["base", "beam"]
             assert twin["bodies"][1]["joint"]["name"] == "shoulder"
@@ -72,29 +72,29 @@ class TestLook:
         assert shown["bodies"] == twin["bodies"]
         advance(cloud, 1)
         assert {name.split("/")[2] for name in blobs(cloud)} == {"lever"}
-        assert trials(cloud, anna) == []
+        assert previews(cloud, anna) == []
 
-    def test_it_becomes_the_next_version_of_one_that_is_there(self, cloud: Cloud, anna: Person) -> None:
+    def test_a_saved_preview_is_the_next_version_of_an_existing_type(self, cloud: Cloud, anna: Person) -> None:
         add(anna, wait_ms=0)
         check_all(cloud)
         found = checked(cloud, anna, manifest(label='"Better"'))
         assert anna.get("/robot-types/lever").json()["label"] == "Lever"
-        saved = anna.post(f"{LOOKS}/{found['id']}/save", {"wait_ms": 0})
+        saved = anna.post(f"{PREVIEWS}/{found['id']}/save", {"wait_ms": 0})
         assert saved.status_code == 202
         check_all(cloud)
         shown = anna.get("/robot-types/lever").json()
         assert (shown["version"], shown["label"]) == (2, "Better")
 
-    def test_built_in_ones_are_drawn_as_well(self, anna: Person) -> None:
+    def test_built_in_types_have_a_twin(self, anna: Person) -> None:
         twin = anna.get("/robot-types/ur5/twin").json()
         assert next(body["joint"]["name"] for body in twin["bodies"] if body["joint"]) == "shoulder_pan"
         assert twin["cameras"] == ["picture"]
-        problem(look(anna, manifest("ur5")), 409, "robot-type-built-in")
+        problem(preview(anna, manifest("ur5")), 409, "robot-type-built-in")
 
 
-class TestFindings:
-    def test_all_that_is_wrong_is_said_at_once(self, cloud: Cloud, anna: Person) -> None:
-        """A missing mesh, a limit wider than the joint's, torn XML and a script that is none."""
+class TestErrors:
+    def test_all_errors_are_reported_together(self, cloud: Cloud, anna: Person) -> None:
+        """A missing mesh, a limit wider than the joint's, invalid XML and an invalid script."""
         mesh = '<asset><mesh name="hand" file="hand.stl"/></asset><worldbody>'
         model = LEVER.replace("<worldbody>", mesh).replace(
             '<site name="tip"', '<geom type="mesh" mesh="hand" mass="0.1"/><site name="tip"'
@@ -114,21 +114,21 @@ class TestFindings:
             "scene.xml: mismatched tag: line 3",
         ):
             assert words in text, words
-        problem(anna.post(f"{LOOKS}/{found['id']}/save"), 422, "robot-type-rejected")
-        problem(anna.get(f"{LOOKS}/{found['id']}/twin"), 422, "robot-type-rejected")
+        problem(anna.post(f"{PREVIEWS}/{found['id']}/save"), 422, "robot-type-rejected")
+        problem(anna.get(f"{PREVIEWS}/{found['id']}/twin"), 422, "robot-type-rejected")
 
-    def test_what_can_be_said_without_compiling_is_said_at_once_too(self, anna: Person) -> None:
+    def test_errors_found_without_compilation_are_reported_in_the_response(self, anna: Person) -> None:
         outside = LEVER.replace("<worldbody>", '<include file="/etc/passwd"/><worldbody>', 1)
-        asked = look(
+        refused_response = preview(
             anna, manifest(model='"no.xml"'), lever__xml=outside, movements={"a b": "1", "up": "PARAMETERS = 3"}
         )
-        refused = problem(asked, 422, "manifest-invalid")
+        refused = problem(refused_response, 422, "manifest-invalid")
         text = "\n".join(refused["errors"])
         for words in ("robot.toml: model is 'no.xml'", "lever.xml: <include", "movements/a b.py", "up.py: Line 1"):
             assert words in text, words
-        assert trials(anna.cloud, anna) == []
+        assert previews(anna.cloud, anna) == []
 
-    def test_warnings_refuse_nothing(self, cloud: Cloud, anna: Person) -> None:
+    def test_warnings_do_not_reject(self, cloud: Cloud, anna: Person) -> None:
         idle = '<position name="idle" joint="shoulder" kp="1"/></actuator>'
         found = checked(cloud, anna, lever__xml=LEVER.replace("</actuator>", idle))
         upload = found["robot_type"]["upload"]
@@ -139,48 +139,48 @@ class TestFindings:
         ]
 
 
-class TestEnd:
-    def test_it_goes_by_itself(self, cloud: Cloud, anna: Person) -> None:
+class TestExpiry:
+    def test_a_preview_expires_and_the_timer_deletes_it(self, cloud: Cloud, anna: Person) -> None:
         found = checked(cloud, anna)
         advance(cloud, KEEP_LOOK_MS - _SLOW_MS)
-        assert anna.get(f"{LOOKS}/{found['id']}").status_code == 200
+        assert anna.get(f"{PREVIEWS}/{found['id']}").status_code == 200
         cloud.clock.advance(_SLOW_MS / 1000)
         anna = cloud.sign_in("anna")
-        problem(anna.get(f"{LOOKS}/{found['id']}"), 404, "robot-type-preview-unknown")
-        problem(anna.delete(f"{LOOKS}/{found['id']}"), 404, "robot-type-preview-unknown")
-        assert blobs(cloud), "only the timer deletes"
+        problem(anna.get(f"{PREVIEWS}/{found['id']}"), 404, "robot-type-preview-unknown")
+        problem(anna.delete(f"{PREVIEWS}/{found['id']}"), 404, "robot-type-preview-unknown")
+        assert blobs(cloud), "only the timer may delete files"
         advance(cloud, 1)
         assert blobs(cloud) == ()
-        assert trials(cloud, anna) == []
+        assert previews(cloud, anna) == []
         assert rows(cloud, records.ROBOT_TYPES, f"{anna.account}/~{found['id']}") == []
         advance(cloud, DAY_MS)
         assert rows(cloud, records.MODEL_CHECKS, "looks") == []
         anna = cloud.sign_in("anna")
         other = checked(cloud, anna)["id"]
-        assert anna.delete(f"{LOOKS}/{other}").status_code == 204
+        assert anna.delete(f"{PREVIEWS}/{other}").status_code == 204
         advance(cloud, 1)
         assert blobs(cloud) == ()
 
-    def test_one_too_many_ends_the_oldest(self, cloud: Cloud, anna: Person) -> None:
-        made = []
+    def test_a_preview_above_the_limit_replaces_the_oldest(self, cloud: Cloud, anna: Person) -> None:
+        created = []
         for _ in range(MAX_LOOKS + 2):
-            made.append(look(anna).json()["id"])
+            created.append(preview(anna).json()["id"])
             advance(cloud, 10)
-        alive = [name for name in made if anna.get(f"{LOOKS}/{name}").status_code == 200]
-        assert alive == made[2:]
-        assert len(trials(cloud, anna)) == MAX_LOOKS
+        existing = [name for name in created if anna.get(f"{PREVIEWS}/{name}").status_code == 200]
+        assert existing == created[2:]
+        assert len(previews(cloud, anna)) == MAX_LOOKS
 
     @pytest.mark.parametrize("saving", [False, True])
-    def test_one_that_is_cut_off_at_any_write_leaves_nothing(
+    def test_a_preview_killed_at_any_write_leaves_no_data(
         self, cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch, *, saving: bool
     ) -> None:
-        """Or, where it was being saved, what was saved: then it is a robot type, or can be saved again."""
+        """If it was being saved, the robot type exists or can be saved again."""
         cut = 0
         for after in range(1, 60):
             found = checked(cloud, anna)["id"] if saving else ""
             with monkeypatch.context() as patch:
                 stop_after(cloud, patch, after)
-                done = anna.post(f"{LOOKS}/{found}/save", {"wait_ms": 0}) if saving else look(anna)
+                done = anna.post(f"{PREVIEWS}/{found}/save", {"wait_ms": 0}) if saving else preview(anna)
             if done.status_code == 202:
                 break
             cut += 1
@@ -192,26 +192,26 @@ class TestEnd:
             check_all(cloud)
             advance(cloud, KEEP_LOOK_MS)
         anna = cloud.sign_in("anna")
-        assert trials(cloud, anna) == []
-        left = {name.split("/")[2] for name in blobs(cloud)}
-        assert left == ({"lever"} if saving else set())
+        assert previews(cloud, anna) == []
+        remaining = {name.split("/")[2] for name in blobs(cloud)}
+        assert remaining == ({"lever"} if saving else set())
         assert rows(cloud, records.MODEL_CHECKS, "checks") == []
         if saving:
             assert anna.get("/robot-types/lever").json()["state"] == "ready"
 
-    def test_a_drawing_that_a_deletion_overtook_is_not_left(self, cloud: Cloud, anna: Person) -> None:
-        """The checker compiles while the timer deletes: what it writes then goes with its note."""
-        found = look(anna).json()["id"]
+    def test_a_picture_is_deleted_if_the_preview_is_deleted_meanwhile(self, cloud: Cloud, anna: Person) -> None:
+        """The timer deletes the preview while the checker compiles; files written afterwards are deleted too."""
+        found = preview(anna).json()["id"]
         compiler = cloud.functions.model_checks._compiler
 
         class Slow:
-            async def check(self, *asked: Any) -> Any:
-                where = (await cloud.functions.tables.query(records.ROBOT_TYPES, f"{anna.account}/~{found}")).rows
-                for row in where:
+            async def check(self, *arguments: Any) -> Any:
+                stored = (await cloud.functions.tables.query(records.ROBOT_TYPES, f"{anna.account}/~{found}")).rows
+                for row in stored:
                     await cloud.functions.tables.delete(records.ROBOT_TYPES, row)
                 for name in await cloud.functions.blobs.list("robot-types/"):
                     await cloud.functions.blobs.delete(name)
-                return await compiler.check(*asked)
+                return await compiler.check(*arguments)
 
         cloud.functions.model_checks._compiler = Slow()  # type: ignore[assignment]
         check_all(cloud)

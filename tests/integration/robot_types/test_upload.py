@@ -19,15 +19,15 @@ from tests.integration.robot_types.lever import FILES, LEVER, TETRAHEDRON, add, 
 
 
 def claimed(robot: Robot, owner: Person) -> str:
-    """The id of a lever that belongs to the owner."""
+    """Claim a lever for the owner; returns its id."""
     lever = [{"name": "arm", "kind": "arm", "robot_type": "lever", "label": "Arm"}]
     code = robot.enroll(devices=lever).json()["claim_code"]
     return str(owner.post("/agents/claim", {"code": code}).json()["devices"][0]["id"])
 
 
 @pytest.mark.usefixtures("checker")
-class TestLife:
-    def test_it_says_what_keyframes_are_checked_by(self, anna: Person) -> None:
+class TestUse:
+    def test_a_type_contains_the_limits_for_keyframes(self, anna: Person) -> None:
         nao = anna.get("/robot-types/nao").json()
         assert set(nao["home_rad"]) == {joint["name"] for joint in nao["joints"]}
         assert {"take_posture", "run_behaviour", "drive"} <= set(nao["actions"])
@@ -37,7 +37,7 @@ class TestLife:
         ur5 = anna.get("/robot-types/ur5").json()
         assert (ur5["actions"], ur5["mimic_joints"], ur5["postures"]) == (["move_joints"], [], [])
 
-    def test_one_is_added_seen_and_used_like_a_built_in_one(self, cloud: Cloud, anna: Person) -> None:
+    def test_an_uploaded_type_is_listed_and_used_like_a_built_in_one(self, cloud: Cloud, anna: Person) -> None:
         added = add(anna)
         assert added.status_code == 201, added.text
         assert added.headers["location"] == "/api/v1/robot-types/lever"
@@ -56,7 +56,7 @@ class TestLife:
         assert started.status_code == 202, started.text
         assert started.json()["request"]["parameters"] == {"speed": 0.5}
 
-    def test_every_built_in_one_could_have_been_uploaded(self, anna: Person) -> None:
+    def test_every_built_in_type_can_be_uploaded(self, anna: Person) -> None:
         for folder in sorted(path.parent for path in UR5.parent.glob("*/robot.toml")):
             files = {
                 path.relative_to(folder).as_posix(): path.read_text()
@@ -69,7 +69,7 @@ class TestLife:
             added = anna.post("/robot-types", {"manifest": text, "files": files, "wait_ms": 30_000})
             assert added.status_code == 201, added.text
 
-    def test_it_is_downloaded_as_it_was_uploaded(self, tmp_path: Path, anna: Person) -> None:
+    def test_a_download_equals_the_upload(self, tmp_path: Path, anna: Person) -> None:
         mesh = base64.b64encode(TETRAHEDRON).decode()
         model = LEVER.replace(
             "<worldbody>", '<asset><mesh name="tip" file="meshes/tip.obj"/></asset><worldbody>'
@@ -90,7 +90,7 @@ class TestLife:
         for name in ("other.xml", "%2e%2e/1/lever.xml", "x" * 500, "a%00b"):
             problem(anna.get(f"/robot-types/lever/files/{name}"), 404, "file-unknown")
 
-    def test_uploading_again_makes_the_next_version(self, cloud: Cloud, anna: Person) -> None:
+    def test_another_upload_is_the_next_version(self, cloud: Cloud, anna: Person) -> None:
         add(anna)
         again = add(anna, text=manifest(label='"Better"'))
         assert (again.status_code, again.json()["version"], again.json()["label"]) == (200, 2, "Better")
@@ -99,13 +99,15 @@ class TestLife:
         assert jump.json()["version"] == 7
         assert add(anna, text=manifest(version="7")).json()["version"] == 8
         advance(cloud, GIVE_UP_MS)
-        assert len(rows(cloud, records.ROBOT_TYPES, f"{anna.account}/lever")) == 5, "a day for who has begun a download"
+        assert len(rows(cloud, records.ROBOT_TYPES, f"{anna.account}/lever")) == 5, (
+            "an old version must remain for a day, for running downloads"
+        )
         advance(cloud, DAY_MS + GIVE_UP_MS)
         assert rows(cloud, records.ROBOT_TYPES, f"{anna.account}/lever") == ["type", "version:00000008"]
         assert len(blobs(cloud)) == 4
         assert anna.cloud.sign_in("anna").get("/robot-types/lever").json()["version"] == 8
 
-    def test_a_refused_version_leaves_the_one_before_in_use(self, cloud: Cloud, anna: Person) -> None:
+    def test_a_rejected_version_does_not_replace_the_previous_one(self, cloud: Cloud, anna: Person) -> None:
         add(anna)
         refused = problem(add(anna, lever__xml=LEVER.replace('"shoulder"', '"hip"')), 422, "robot-type-rejected")
         assert refused["version"] == 2
@@ -121,7 +123,7 @@ class TestLife:
             "version:00000003",
         ]
 
-    def test_another_account_may_have_its_own_of_the_same_name(self, cloud: Cloud, anna: Person) -> None:
+    def test_another_account_may_use_the_same_name(self, cloud: Cloud, anna: Person) -> None:
         add(anna)
         bert = cloud.sign_in("bert")
         assert all(item["type"] != "lever" for item in bert.get("/robot-types").json()["items"])
@@ -150,7 +152,7 @@ class TestLife:
 
 @pytest.mark.usefixtures("checker")
 class TestDeletion:
-    def test_what_is_in_use_stays_and_says_who_uses_it(self, cloud: Cloud, anna: Person) -> None:
+    def test_a_type_in_use_cannot_be_deleted_and_its_users_are_named(self, cloud: Cloud, anna: Person) -> None:
         add(anna)
         anna.put("/robot-types/lever/movements/up", {"source": "1"})
         robot = cloud.robot()
@@ -165,7 +167,7 @@ class TestDeletion:
         problem(anna.get("/robot-types/lever"), 404, "robot-type-unknown")
         problem(anna.delete("/robot-types/lever"), 404, "robot-type-unknown")
 
-    def test_its_files_go_and_its_versions_are_never_used_twice(self, cloud: Cloud, anna: Person) -> None:
+    def test_files_are_deleted_and_version_numbers_are_never_reused(self, cloud: Cloud, anna: Person) -> None:
         add(anna)
         assert anna.delete("/robot-types/lever").status_code == 204
         again = add(anna)

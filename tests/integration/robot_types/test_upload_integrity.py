@@ -1,4 +1,4 @@
-"""Stored robot types are used only as they were checked."""
+"""Stored robot types are used only if unchanged since their check."""
 
 import copy
 from collections.abc import Callable
@@ -30,7 +30,7 @@ class TestSeal:
         edit(data)
         cloud.run(cloud.functions.tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, data, row.etag)))
 
-    def test_no_field_of_it_may_differ_and_no_other_seal_fits(self, cloud: Cloud, anna: Person, lever: Place) -> None:
+    def test_a_changed_field_or_another_seal_is_detected(self, cloud: Cloud, anna: Person, lever: Place) -> None:
         first = cloud.run(cloud.functions.tables.get(records.ROBOT_TYPES, lever.partition, "type"))
         assert first is not None
         good = copy.deepcopy(dict(first.data))
@@ -58,7 +58,7 @@ class TestSeal:
         check_all(cloud)
         self.change(cloud, Place(bert.account, "lever"), "type", lambda data: data.update(seal=good["seal"]))
         problem(bert.get("/robot-types/lever/files/robot.toml"), 409, "robot-type-damaged")
-        # An older version passed off as the newest.
+        # An older version in place of the newest.
         old = {"manifest": good["manifest"], "seal": good["seal"]}
         self.change(cloud, lever, "type", lambda data: data.update(old))
         problem(anna.get("/robot-types/lever/files/robot.toml"), 409, "robot-type-damaged")

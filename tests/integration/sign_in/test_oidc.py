@@ -43,15 +43,15 @@ def opened(home: Path, issuer: str, *, anyone: bool = True) -> Cloud:
 
 
 @pytest.fixture
-def here(home: Path, provider: str) -> Iterator[Cloud]:
-    """The functions with sign-in at the real provider."""
+def cloud_with_oidc(home: Path, provider: str) -> Iterator[Cloud]:
+    """Functions with sign-in at the real provider."""
     with opened(home, provider) as cloud:
         yield cloud
 
 
 @pytest.fixture
 def closed(home: Path, provider: str) -> Iterator[Cloud]:
-    """The same, where a newcomer has to be invited."""
+    """Functions in which new accounts require an invitation."""
     with opened(home, provider, anyone=False) as cloud:
         yield cloud
 
@@ -76,8 +76,8 @@ class Browser:
         assert invitation not in answer.text + str(answer.headers)
         return str(answer.json()["url"])
 
-    def back(self, place: httpx.URL) -> httpx.Response:
-        return self.cloud.run(self.page.get(place.raw_path.decode()))
+    def back(self, callback: httpx.URL) -> httpx.Response:
+        return self.cloud.run(self.page.get(callback.raw_path.decode()))
 
     def sign_in(self, name: str) -> httpx.Response:
         return self.back(sign_in_at_provider(self.start(), name))
@@ -86,15 +86,15 @@ class Browser:
         return self.cloud.run(self.page.get(f"{API}/accounts/me"))
 
 
-def failed(answer: httpx.Response, why: str) -> None:
-    """It leads to the page that says why, and to no session."""
-    assert (answer.status_code, answer.headers["location"]) == (303, f"{BASE}/#sign-in-failed=oidc-{why}")
+def failed(answer: httpx.Response, reason: str) -> None:
+    """Assert a redirect to the page with this reason, without a session."""
+    assert (answer.status_code, answer.headers["location"]) == (303, f"{BASE}/#sign-in-failed=oidc-{reason}")
     assert "set-cookie" not in answer.headers
 
 
-def test_repeated_sign_in_returns_the_same_account(here: Cloud) -> None:
-    local = here.sign_in("Name of anna")
-    browser, again, other = Browser(here), Browser(here), Browser(here)
+def test_repeated_sign_in_returns_the_same_account(cloud_with_oidc: Cloud) -> None:
+    local = cloud_with_oidc.sign_in("Name of anna")
+    browser, again, other = Browser(cloud_with_oidc), Browser(cloud_with_oidc), Browser(cloud_with_oidc)
     answer = browser.sign_in("anna")
     assert (answer.status_code, answer.headers["location"]) == (303, f"{BASE}/#/")
     assert "HttpOnly; SameSite=Strict" in answer.headers["set-cookie"]
@@ -102,8 +102,8 @@ def test_repeated_sign_in_returns_the_same_account(here: Cloud) -> None:
     assert me["name"] == "Name of anna"
     assert me["id"] != local.account, "an equal name is not the same account"
     assert me["csrf_token"]
-    assert len(here.run(browser.page.get(f"{API}/spaces")).json()["items"]) == 1
-    (session,) = here.run(browser.page.get(f"{API}/accounts/me/sessions")).json()["items"]
+    assert len(cloud_with_oidc.run(browser.page.get(f"{API}/spaces")).json()["items"]) == 1
+    (session,) = cloud_with_oidc.run(browser.page.get(f"{API}/accounts/me/sessions")).json()["items"]
     assert (session["method"], session["mine"]) == ("oidc", True)
     again.sign_in("anna")
     assert again.me().json()["id"] == me["id"]
@@ -112,13 +112,13 @@ def test_repeated_sign_in_returns_the_same_account(here: Cloud) -> None:
     headers = {"X-CSRF-Token": me["csrf_token"]}
     body = {"password": "correct horse battery"}
     problem(
-        here.run(browser.page.put(f"{API}/accounts/me/password", json=body, headers=headers)),
+        cloud_with_oidc.run(browser.page.put(f"{API}/accounts/me/password", json=body, headers=headers)),
         409,
         "password-not-managed-here",
     )
 
 
-class TestWhoMayCome:
+class TestNewAccounts:
     """The provider also authenticates users without an invitation."""
 
     @staticmethod
@@ -133,7 +133,7 @@ class TestWhoMayCome:
         with sqlite3.connect(cloud.functions.settings.home / "tables.sqlite") as tables:
             return {row for (row,) in tables.execute("SELECT part FROM rows WHERE tab = ?", (records.ACCOUNTS,))}
 
-    def test_a_stranger_gets_no_account_and_leaves_nothing(self, closed: Cloud) -> None:
+    def test_an_uninvited_user_gets_no_account_and_leaves_no_data(self, closed: Cloud) -> None:
         closed.sign_in("anna")
         before = self.accounts(closed)
         browser = Browser(closed)
@@ -143,7 +143,7 @@ class TestWhoMayCome:
         refused = closed.run(closed.functions.tables.query(records.AUDIT, CLOUD, first="record:", last="record;")).rows
         assert "oidc-uninvited" in {row.data["data"].get("code") for row in refused}
 
-    def test_who_was_invited_has_an_account_and_what_was_offered_and_comes_again(self, closed: Cloud) -> None:
+    def test_an_invited_user_gets_an_account_with_the_offered_role_and_signs_in_again(self, closed: Cloud) -> None:
         owner = closed.sign_in("anna")
         secret = self.invite(owner)
         browser = Browser(closed)
@@ -156,7 +156,7 @@ class TestWhoMayCome:
         again = Browser(closed)
         again.sign_in("bert")
         assert again.me().json()["id"] == me["id"]
-        # It had one use.
+        # The invitation is valid for one use.
         other = Browser(closed)
         problem(closed.run(other.page.post(START, json={"invitation": secret})), 404, "invitation-unknown")
         failed(other.sign_in("mallory"), "uninvited")
@@ -167,54 +167,58 @@ class TestWhoMayCome:
     ) -> None:
         owner, _ = closed.sign_in("anna"), closed.sign_in("carl")
         browser = Browser(closed)
-        place = sign_in_at_provider(browser.start_with(self.invite(owner, **limits)), "bert")
+        callback = sign_in_at_provider(browser.start_with(self.invite(owner, **limits)), "bert")
         closed.clock.advance(later_s)
-        failed(browser.back(place), "uninvited")
+        failed(browser.back(callback), "uninvited")
 
-    def test_another_sites_page_begins_nothing_with_an_invitation(self, closed: Cloud) -> None:
+    def test_a_page_of_another_site_cannot_start_a_sign_in_with_an_invitation(self, closed: Cloud) -> None:
         secret = self.invite(closed.sign_in("anna"))
         headers = {"Sec-Fetch-Site": "cross-site"}
         problem(closed.request("POST", START, json={"invitation": secret}, headers=headers), 403, "forbidden")
 
-    def test_where_anyone_may_come_a_stranger_has_an_empty_account(self, here: Cloud) -> None:
-        browser = Browser(here)
+    def test_without_required_invitations_a_new_user_gets_an_empty_account(self, cloud_with_oidc: Cloud) -> None:
+        browser = Browser(cloud_with_oidc)
         assert browser.sign_in("stranger").headers["location"] == f"{BASE}/#/"
-        assert here.run(browser.page.get(f"{API}/devices")).json()["items"] == []
+        assert cloud_with_oidc.run(browser.page.get(f"{API}/devices")).json()["items"] == []
 
 
-def test_the_browser_is_sent_with_what_makes_the_way_back_its_own(here: Cloud, provider: str) -> None:
-    answer = here.request("GET", START)
-    asked = {name: value for name, (value,) in parse_qs(urlsplit(answer.headers["location"]).query).items()}
+def test_the_redirect_contains_state_nonce_and_pkce_challenge(cloud_with_oidc: Cloud, provider: str) -> None:
+    answer = cloud_with_oidc.request("GET", START)
+    query = {name: value for name, (value,) in parse_qs(urlsplit(answer.headers["location"]).query).items()}
     assert answer.headers["location"].startswith(f"{provider}/auth?")
-    assert (asked["response_type"], asked["code_challenge_method"], asked["redirect_uri"]) == ("code", "S256", REDIRECT)
-    assert len({asked["state"], asked["nonce"], asked["code_challenge"]}) == 3
+    assert (query["response_type"], query["code_challenge_method"], query["redirect_uri"]) == ("code", "S256", REDIRECT)
+    assert len({query["state"], query["nonce"], query["code_challenge"]}) == 3
     cookie = answer.headers["set-cookie"]
     assert "Path=/api/v1/auth/oidc; Max-Age=600; HttpOnly; SameSite=Lax" in cookie
-    assert asked["state"] not in cookie
+    assert query["state"] not in cookie
 
 
-def test_the_page_is_told_how_one_may_sign_in(here: Cloud, cloud: Cloud) -> None:
+def test_the_api_lists_the_sign_in_methods(cloud_with_oidc: Cloud, cloud: Cloud) -> None:
     elsewhere = {"name": "The lab's", "url": START}
-    assert here.request("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "oidc": elsewhere}
+    assert cloud_with_oidc.request("GET", f"{API}/auth/methods").json() == {
+        "link": True,
+        "password": True,
+        "oidc": elsewhere,
+    }
     assert cloud.request("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "oidc": None}
     for path in (START, f"{CALLBACK}?code=x&state=y"):
         problem(cloud.request("GET", path), 404, "oidc-unknown")
 
 
-def test_a_way_back_is_good_once_and_in_the_browser_that_began(here: Cloud) -> None:
-    anna, mallory = Browser(here), Browser(here)
-    place = sign_in_at_provider(anna.start(), "anna")
-    failed(mallory.back(place), "expired")
+def test_a_callback_is_valid_once_and_only_in_the_same_browser(cloud_with_oidc: Cloud) -> None:
+    anna, mallory = Browser(cloud_with_oidc), Browser(cloud_with_oidc)
+    callback = sign_in_at_provider(anna.start(), "anna")
+    failed(mallory.back(callback), "expired")
     mallory.start()
-    failed(mallory.back(place), "expired")
-    assert anna.back(place).headers["location"] == f"{BASE}/#/"
-    failed(anna.back(place), "expired")
+    failed(mallory.back(callback), "expired")
+    assert anna.back(callback).headers["location"] == f"{BASE}/#/"
+    failed(anna.back(callback), "expired")
     assert anna.me().status_code == 200
 
 
-def test_a_code_of_another_sign_in_is_refused(here: Cloud) -> None:
+def test_a_code_of_another_sign_in_is_rejected(cloud_with_oidc: Cloud) -> None:
     """The PKCE verifier does not match, so the provider rejects the code."""
-    anna, mallory = Browser(here), Browser(here)
+    anna, mallory = Browser(cloud_with_oidc), Browser(cloud_with_oidc)
     first = sign_in_at_provider(anna.start(), "anna")
     stolen = sign_in_at_provider(mallory.start(), "mallory").copy_set_param("code", first.params["code"])
     failed(mallory.back(stolen), "rejected")
@@ -225,7 +229,7 @@ def test_a_code_of_another_sign_in_is_refused(here: Cloud) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "later_s", "why"),
+    ("change", "later_s", "reason"),
     [
         (lambda url: url.copy_set_param("iss", "https://evil.example"), 0, "rejected"),
         (lambda url: url.copy_remove_param("iss"), 0, "rejected"),
@@ -236,17 +240,17 @@ def test_a_code_of_another_sign_in_is_refused(here: Cloud) -> None:
     ],
     ids=["another issuer", "no issuer", "refused", "another state", "no state", "late"],
 )
-def test_a_wrong_way_back_is_refused(
-    here: Cloud, change: Callable[[httpx.URL], httpx.URL], later_s: float, why: str
+def test_an_invalid_callback_is_rejected(
+    cloud_with_oidc: Cloud, change: Callable[[httpx.URL], httpx.URL], later_s: float, reason: str
 ) -> None:
-    browser = Browser(here)
-    place = sign_in_at_provider(browser.start(), "anna")
-    here.clock.advance(later_s)
-    failed(browser.back(change(place)), why)
+    browser = Browser(cloud_with_oidc)
+    callback = sign_in_at_provider(browser.start(), "anna")
+    cloud_with_oidc.clock.advance(later_s)
+    failed(browser.back(change(callback)), reason)
     assert browser.me().status_code == 401
 
 
-def test_a_provider_with_new_keys_is_believed_at_once(home: Path, key: SigningKey) -> None:
+def test_new_keys_of_a_provider_are_accepted(home: Path, key: SigningKey) -> None:
     with contextlib.ExitStack() as stack:
         first = stack.enter_context(contextlib.ExitStack())
         issuer = first.enter_context(start_provider([key]))
@@ -254,7 +258,7 @@ def test_a_provider_with_new_keys_is_believed_at_once(home: Path, key: SigningKe
         Browser(cloud).sign_in("anna")
         first.close()
         failed_start = cloud.request("GET", START)
-        assert failed_start.status_code == 303, "what is known of a provider is kept for a while"
+        assert failed_start.status_code == 303, "the provider's discovery document must be cached"
         stack.enter_context(start_provider([new_key("two"), key], port=urlsplit(issuer).port or 0))
         cloud.clock.advance(11)
         browser = Browser(cloud)
@@ -262,7 +266,7 @@ def test_a_provider_with_new_keys_is_believed_at_once(home: Path, key: SigningKe
         assert browser.me().status_code == 200
 
 
-def test_a_provider_that_is_away_is_no_fault_of_the_caller(home: Path) -> None:
+def test_an_unreachable_provider_is_reported_as_unavailable(home: Path) -> None:
     with opened(home, "http://127.0.0.1:1") as cloud:
         answer = cloud.request("GET", START)
         problem(answer, 503, "oidc-unavailable")

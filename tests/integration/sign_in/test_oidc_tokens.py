@@ -30,8 +30,8 @@ Change = Callable[[dict[str, Any]], object]
 
 
 @pytest.fixture(scope="module")
-def strange() -> SigningKey:
-    """A key that the provider does not show, under the name of one that it does."""
+def unpublished_key() -> SigningKey:
+    """A key that the provider does not publish, with the id of a published one."""
     return new_key()
 
 
@@ -56,15 +56,15 @@ def claims(provider: FakeProvider, **changes: Any) -> dict[str, Any]:
     return {name: value for name, value in {**good, **changes}.items() if value is not None}
 
 
-def signed(said: dict[str, Any], key: SigningKey, **header: Any) -> str:
-    return jwt.encode(said, key.private, "RS256", headers={"kid": key.name, **header})
+def signed(claim_set: dict[str, Any], key: SigningKey, **header: Any) -> str:
+    return jwt.encode(claim_set, key.private, "RS256", headers={"kid": key.name, **header})
 
 
-def redeem(asked: HttpOidcProvider, issuer: str | None = None) -> Subject:
-    return asyncio.run(asked.redeem(code="c", verifier="v", nonce=NONCE, redirect=REDIRECT, issuer=issuer))
+def redeem(oidc_client: HttpOidcProvider, issuer: str | None = None) -> Subject:
+    return asyncio.run(oidc_client.redeem(code="c", verifier="v", nonce=NONCE, redirect=REDIRECT, issuer=issuer))
 
 
-def test_an_honest_token_is_believed(provider: FakeProvider, key: SigningKey) -> None:
+def test_a_valid_token_is_accepted(provider: FakeProvider, key: SigningKey) -> None:
     provider.token = signed(claims(provider), key)
     assert redeem(client(provider)) == Subject(provider.issuer, "anna", "anna")
     provider.token = signed(claims(provider, aud=[CLIENT_ID, "other"], azp=CLIENT_ID, name=" A\u0000nna\n"), key)
@@ -85,26 +85,30 @@ def test_an_honest_token_is_believed(provider: FakeProvider, key: SigningKey) ->
         {"iat": STARTED_S + 3600}, {"nbf": STARTED_S + 3600},
         {"sub": None}, {"sub": ""}, {"sub": "x" * 256},
     ],
-    # Named alike however late a process looks: tests that run side by side must have the same names in each.
+    # Test names must not contain the current time, because all xdist workers need the same names.
     ids=lambda changes: re.sub(r"\d{10}", "another time", json.dumps(changes)),
 )  # fmt: skip
-def test_a_token_of_other_claims_is_not(provider: FakeProvider, key: SigningKey, changes: dict[str, Any]) -> None:
+def test_a_token_with_invalid_claims_is_rejected(
+    provider: FakeProvider, key: SigningKey, changes: dict[str, Any]
+) -> None:
     provider.token = signed(claims(provider, **changes), key)
     with pytest.raises(OidcError):
         redeem(client(provider))
 
 
-def test_a_token_that_others_signed_is_not(provider: FakeProvider, key: SigningKey, strange: SigningKey) -> None:
-    said = claims(provider)
-    good = signed(said, key)
+def test_a_token_with_a_foreign_signature_is_rejected(
+    provider: FakeProvider, key: SigningKey, unpublished_key: SigningKey
+) -> None:
+    claim_set = claims(provider)
+    good = signed(claim_set, key)
     head, body, tail = good.split(".")
     for token in (
-        signed(said, strange),
-        signed(said, strange, kid="two"),
-        signed(said, strange, jwk=strange.jwk(), jku="http://127.0.0.1:1/keys"),
-        jwt.encode(said, "", "none", headers={"kid": key.name}),
-        jwt.encode(said, CLIENT_SECRET, "HS256", headers={"kid": key.name}),
-        jwt.encode(said, str(key.jwk()["n"]), "HS512", headers={"kid": key.name}),
+        signed(claim_set, unpublished_key),
+        signed(claim_set, unpublished_key, kid="two"),
+        signed(claim_set, unpublished_key, jwk=unpublished_key.jwk(), jku="http://127.0.0.1:1/keys"),
+        jwt.encode(claim_set, "", "none", headers={"kid": key.name}),
+        jwt.encode(claim_set, CLIENT_SECRET, "HS256", headers={"kid": key.name}),
+        jwt.encode(claim_set, str(key.jwk()["n"]), "HS512", headers={"kid": key.name}),
         f"{head}.{body}.",
         f"{head}.{body[:-4]}AAAA.{tail}",
         f"{head}.{body}.{tail[:-8]}AAAAAAAA",
@@ -120,37 +124,37 @@ def test_a_token_that_others_signed_is_not(provider: FakeProvider, key: SigningK
     assert redeem(client(provider)).id == "anna"
 
 
-def test_a_key_for_something_else_is_none(provider: FakeProvider, key: SigningKey) -> None:
+def test_a_key_of_another_type_or_use_is_not_used(provider: FakeProvider, key: SigningKey) -> None:
     provider.token = signed(claims(provider), key)
-    for shown in ({**key.jwk(), "use": "enc"}, {**key.jwk(), "alg": "PS256"}, {"kid": "one", "kty": "oct"}, "x",
+    for jwk in ({**key.jwk(), "use": "enc"}, {**key.jwk(), "alg": "PS256"}, {"kid": "one", "kty": "oct"}, "x",
                   {**key.jwk(), "n": "!"}, {**key.jwk(), "n": 1}, {**key.jwk(), "e": None}):  # fmt: skip
-        provider.keys = [shown]
+        provider.keys = [jwk]
         with pytest.raises(OidcError):
             redeem(client(provider))
 
 
-def test_an_unknown_key_has_the_keys_fetched_but_not_for_ever(
-    provider: FakeProvider, key: SigningKey, strange: SigningKey
+def test_an_unknown_key_id_reloads_the_keys_at_a_limited_rate(
+    provider: FakeProvider, key: SigningKey, unpublished_key: SigningKey
 ) -> None:
     clock = MovingClock()
-    asked = client(provider, clock=clock)
+    oidc_client = client(provider, clock=clock)
     provider.token = signed(claims(provider), key)
-    redeem(asked)
-    provider.token = signed(claims(provider), strange, kid="two")
+    redeem(oidc_client)
+    provider.token = signed(claims(provider), unpublished_key, kid="two")
     for _ in range(5):
         with pytest.raises(OidcError):
-            redeem(asked)
+            redeem(oidc_client)
     assert provider.paths.count("/keys") == 1
     clock.advance(11)
-    provider.keys.append({**strange.jwk(), "kid": "two"})
-    assert redeem(asked).id == "anna"
-    provider.keys = [{**strange.jwk(), "kid": "two"}]
+    provider.keys.append({**unpublished_key.jwk(), "kid": "two"})
+    assert redeem(oidc_client).id == "anna"
+    provider.keys = [{**unpublished_key.jwk(), "kid": "two"}]
     provider.token = signed(claims(provider), key)
-    assert redeem(asked).id == "anna", "a key is kept for an hour"
+    assert redeem(oidc_client).id == "anna", "a key must be cached for an hour"
     clock.advance(3_600)
     provider.token = signed(claims(provider, exp=int(time.time()) + 7_200), key)
     with pytest.raises(OidcError, match="does not show"):
-        redeem(asked)
+        redeem(oidc_client)
 
 
 @pytest.mark.parametrize(
@@ -162,14 +166,14 @@ def test_an_unknown_key_has_the_keys_fetched_but_not_for_ever(
     ],
     ids=json.dumps,
 )  # fmt: skip
-def test_a_provider_that_is_not_what_it_should_be_is_not_used(provider: FakeProvider, changes: dict[str, Any]) -> None:
+def test_an_invalid_discovery_document_is_rejected(provider: FakeProvider, changes: dict[str, Any]) -> None:
     provider.document |= changes
     with pytest.raises(OidcError):
         asyncio.run(client(provider).address(state="s", nonce="n", challenge="c", redirect=REDIRECT))
     assert provider.forms == []
 
 
-def test_a_client_without_a_secret_says_who_it_is(provider: FakeProvider, key: SigningKey) -> None:
+def test_a_client_without_a_secret_sends_its_id(provider: FakeProvider, key: SigningKey) -> None:
     provider.token = signed(claims(provider), key)
     redeem(client(provider, secret=""))
     provider.document["token_endpoint_auth_methods_supported"] = ["client_secret_post"]
@@ -180,7 +184,7 @@ def test_a_client_without_a_secret_says_who_it_is(provider: FakeProvider, key: S
     assert posted["client_secret"] == [CLIENT_SECRET]
 
 
-def test_a_refusal_and_too_long_an_answer_are_told_apart_from_a_token(provider: FakeProvider, key: SigningKey) -> None:
+def test_an_error_status_and_a_response_that_is_too_long_are_rejected(provider: FakeProvider, key: SigningKey) -> None:
     provider.token = signed(claims(provider), key)
     provider.status = 400
     with pytest.raises(OidcError, match="answered 400"):

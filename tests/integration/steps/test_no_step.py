@@ -1,7 +1,7 @@
-"""No connection holds a small message back for the 40 ms of a delayed acknowledgement (TCP_NODELAY missing).
+"""No connection delays a small message by the 40 ms of a delayed acknowledgement, as without TCP_NODELAY.
 
-Before each end stands a proxy that acknowledges as late as a kernel may. Two small messages go one after the other:
-with Nagle's algorithm the second cannot arrive before the first is acknowledged, so no pair is ever quick. A busy
+A proxy in front of each server delays TCP acknowledgements as a kernel may. The tests send pairs of small messages:
+with Nagle's algorithm the second cannot arrive before the first is acknowledged, so every pair is slow. A busy
 machine can delay any pair, but not all of them. Chromium always sets TCP_NODELAY.
 """
 
@@ -24,9 +24,9 @@ from tests.harness.network.proxy import Proxy, start_proxy
 
 PAIRS = 40
 APART_S = 0.003
-"""So that who sends does not put both into one packet."""
+"""Interval that prevents the sender from combining both messages in one packet [s]."""
 QUICK_MS = 30.0
-"""A delayed acknowledgement takes 36 ms at least: 40, and kernels count in steps of 4."""
+"""Below any delayed acknowledgement: 40 ms, which kernels measure in steps of 4 ms."""
 QUICK_SHARE = 0.25
 BAND_MS = 10.0
 SPIKE_SHARE = 0.2
@@ -35,7 +35,7 @@ Send = Callable[[bytes], object]
 
 
 def gaps_ms(proxy: Proxy, send: Send, *, from_server: bool) -> list[float]:
-    """From the arrival of the first message of each pair to that of the second."""
+    """Time between the arrivals of both messages of each pair."""
     proxy.acknowledge_late()
     found = []
     for number in range(PAIRS):
@@ -51,32 +51,32 @@ def gaps_ms(proxy: Proxy, send: Send, *, from_server: bool) -> list[float]:
 def arrival_s(proxy: Proxy, mark: bytes, *, from_server: bool) -> float:
     found: list[float] = []
 
-    def came() -> bool:
+    def arrived() -> bool:
         found[:] = [at_s for at_s, back, content in proxy.arrivals if back is from_server and mark in content]
         return bool(found)
 
-    wait_until(came, f"{mark!r} to arrive")
+    wait_until(arrived, f"{mark!r} to arrive")
     return found[0]
 
 
-def stepped(gaps: list[float]) -> bool:
-    """Whether hardly any pair is quick, or a fifth and more of them are heaped up where such a step is."""
+def delayed(gaps: list[float]) -> bool:
+    """Whether acknowledgements delay messages: few pairs are quick, or a fifth of them accumulate near 40 ms."""
 
     def share(low_ms: float, high_ms: float) -> float:
         return sum(low_ms <= each < high_ms for each in gaps) / len(gaps)
 
-    heap, before, behind = (share(begin, begin + BAND_MS) for begin in (36.0, 36.0 - BAND_MS, 36.0 + BAND_MS))
-    return share(0, QUICK_MS) < QUICK_SHARE or heap - max(before, behind) > SPIKE_SHARE
+    peak, before, after = (share(begin, begin + BAND_MS) for begin in (36.0, 36.0 - BAND_MS, 36.0 + BAND_MS))
+    return share(0, QUICK_MS) < QUICK_SHARE or peak - max(before, after) > SPIKE_SHARE
 
 
-@pytest.mark.parametrize("at_once", [False, True], ids=["Nagle", "TCP_NODELAY"])
-def test_the_measure_tells_a_step_from_none(at_once: bool) -> None:
+@pytest.mark.parametrize("no_delay", [False, True], ids=["Nagle", "TCP_NODELAY"])
+def test_the_measurement_detects_nagles_algorithm(no_delay: bool) -> None:
     with socket.create_server((HOST, 0)) as listener, start_proxy(listener.getsockname()[1]) as proxy:
         threading.Thread(target=swallow, args=(listener,), daemon=True).start()
         with socket.create_connection((HOST, proxy.port)) as opened:
-            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, at_once)
+            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, no_delay)
             gaps = gaps_ms(proxy, opened.sendall, from_server=False)
-    assert stepped(gaps) is not at_once, gaps
+    assert delayed(gaps) is not no_delay, gaps
 
 
 def swallow(listener: socket.socket) -> None:
@@ -86,9 +86,9 @@ def swallow(listener: socket.socket) -> None:
             pass
 
 
-def test_a_heap_among_quick_pairs_is_a_step_and_a_slow_machine_is_none() -> None:
-    assert stepped([1.0] * 30 + [41.0] * 10)
-    assert not stepped([float(each) for each in range(1, 80, 2)])
+def test_an_accumulation_among_quick_pairs_is_detected_and_a_slow_machine_is_not() -> None:
+    assert delayed([1.0] * 30 + [41.0] * 10)
+    assert not delayed([float(each) for each in range(1, 80, 2)])
 
 
 @contextlib.contextmanager
@@ -115,25 +115,25 @@ def link(request: pytest.FixtureRequest, start_processes: Callable[[Any], CloudP
         yield link.up()
 
 
-def test_an_agent_publishes_at_once(link: Link) -> None:
+def test_an_agent_publishes_without_delay(link: Link) -> None:
     assert link.proxy is not None
     topic = link.topic(topics.TELE, "joints")
     gaps = gaps_ms(link.proxy, lambda mark: link.transport.publish(topic, mark, qos=0), from_server=False)
-    assert not stepped(gaps), gaps
+    assert not delayed(gaps), gaps
 
 
-def test_an_agent_gets_setpoints_at_once(link: Link) -> None:
+def test_an_agent_receives_setpoints_without_delay(link: Link) -> None:
     assert link.proxy is not None
     topic = f"{link.topic(topics.CTL)}/1"
     with client(link.processes, "operator") as operator:
         wait_until(lambda: operator.publish(topic, b"{}", qos=0) and link.received, "the first setpoint")
         gaps = gaps_ms(link.proxy, lambda mark: operator.publish(topic, mark, qos=0), from_server=True)
-    assert not stepped(gaps), gaps
+    assert not delayed(gaps), gaps
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
 @pytest.mark.parametrize("kind", BROKERS)
-def test_a_broker_delivers_at_once(
+def test_a_broker_delivers_without_delay(
     start_processes: Callable[[BrokerKind], CloudProcesses], kind: BrokerKind, transport: Transport
 ) -> None:
     processes, topic = start_processes(kind), "ts/v1/lab/robot/arm/tele/joints"
@@ -144,11 +144,11 @@ def test_a_broker_delivers_at_once(
     ):
         page.subscribe(topic, qos=0)
         gaps = gaps_ms(proxy, lambda mark: robot.publish(topic, mark, qos=0), from_server=True)
-    assert not stepped(gaps), gaps
+    assert not delayed(gaps), gaps
 
 
-def test_the_functions_send_to_the_broker_at_once(start_processes: Callable[[BrokerKind], CloudProcesses]) -> None:
-    """Their messages are acknowledged one by one, which hides a step; so the options of their sockets are read."""
+def test_the_functions_publish_without_delay(start_processes: Callable[[BrokerKind], CloudProcesses]) -> None:
+    """Checks socket options, because messages that are acknowledged one by one hide the delay."""
     processes = start_processes("amqtt")
     processes.publish_retained("ts/v1/lab/robot/arm/state", b"{}")
     options = no_delay_options(processes.broker.port)
@@ -157,7 +157,7 @@ def test_the_functions_send_to_the_broker_at_once(start_processes: Callable[[Bro
 
 
 def no_delay_options(port: int) -> list[bool]:
-    """Of each connection of this process to a port, whether it sets TCP_NODELAY."""
+    """For each connection of this process to a port: whether TCP_NODELAY is set."""
     found = []
     for entry in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):  # no socket, not connected, or closed meanwhile
@@ -169,7 +169,7 @@ def no_delay_options(port: int) -> list[bool]:
     return found
 
 
-def test_the_functions_answer_over_http_at_once(start_processes: Callable[[BrokerKind], CloudProcesses]) -> None:
+def test_the_functions_respond_over_http_without_delay(start_processes: Callable[[BrokerKind], CloudProcesses]) -> None:
     """Head and body of a response are two writes."""
     with start_proxy(start_processes("amqtt").endpoints["server"].port) as proxy:
         proxy.acknowledge_late()
@@ -179,13 +179,13 @@ def test_the_functions_answer_over_http_at_once(start_processes: Callable[[Broke
             proxy.arrivals.clear()
             connection.request("GET", "/api/v1/health")
             assert connection.getresponse().read()
-            came_s = [at_s for at_s, back, _ in proxy.arrivals if back]
-            gaps.append((came_s[-1] - came_s[0]) * 1000)
+            arrivals_s = [at_s for at_s, back, _ in proxy.arrivals if back]
+            gaps.append((arrivals_s[-1] - arrivals_s[0]) * 1000)
         connection.close()
-    assert not stepped(gaps), gaps
+    assert not delayed(gaps), gaps
 
 
-def test_an_agent_sends_over_http_at_once(start_processes: Callable[[BrokerKind], CloudProcesses]) -> None:
+def test_an_agent_sends_over_http_without_delay(start_processes: Callable[[BrokerKind], CloudProcesses]) -> None:
     """Head and body of a request are two writes."""
     with Link(start_processes("amqtt"), {"transport": "http"}, through="server").start() as link:
         link.up()
@@ -198,4 +198,4 @@ def test_an_agent_sends_over_http_at_once(start_processes: Callable[[BrokerKind]
             body_s = arrival_s(link.proxy, mark, from_server=False)
             heads_s = [at_s for at_s, back, content in link.proxy.arrivals if not back and content.startswith(b"POST ")]
             gaps.append((body_s - max(at_s for at_s in heads_s if at_s <= body_s)) * 1000)
-    assert not stepped(gaps), gaps
+    assert not delayed(gaps), gaps

@@ -30,7 +30,7 @@ SOURCE = '"""Wave."""\nrobot.home()\n'
 def store(
     request: pytest.FixtureRequest, emulators: Emulators, monkeypatch: pytest.MonkeyPatch
 ) -> AzureStore | AwsStore | None:
-    """An empty one."""
+    """An empty store."""
     kind: StoreKind = request.param
     if kind == "aws":
         use_credentials(monkeypatch)

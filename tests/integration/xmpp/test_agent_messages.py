@@ -1,4 +1,4 @@
-"""An agent that speaks XMPP does all that one on MQTT does."""
+"""An agent over XMPP has the same functions as one over MQTT."""
 
 import time
 
@@ -19,7 +19,7 @@ def test_a_command_is_delivered_on_connect_and_repeated_with_the_same_bytes_unti
         robot.silent = True
         action = anna.start(robot.device).json()["id"]
         robot.connect()
-        wait_until(lambda: len(robot.payloads.get(action, ())) >= 2, "the command, twice")
+        wait_until(lambda: len(robot.payloads.get(action, ())) >= 2, "the repeated command")
         assert len(set(robot.payloads[action])) == 1
         robot.silent = False
         robot.report(action, AckStatus.DONE, result={"note": ODD})
@@ -32,14 +32,14 @@ def test_a_command_is_delivered_on_connect_and_repeated_with_the_same_bytes_unti
         wait_until(lambda: mailbox() == [], "an empty mailbox")
 
 
-def test_setpoints_and_stop_of_a_console_reach_it_over_the_broker(
+def test_setpoints_and_stop_of_a_console_reach_the_robot_over_the_broker(
     broker: RunningBroker, anna: Person, robot: XmppRobot
 ) -> None:
     lease = anna.take_lease(robot.device, wait_ms=10_000).json()
-    asked = {"purpose": "control", "device": robot.device, "epoch": lease["epoch"]}
-    given = anna.post("/mqtt/credentials", asked).json()
-    (topic,) = given["publish"]
-    with broker.connect(given["client_id"], (given["username"], given["password"])) as console:  # type: ignore[arg-type]
+    request = {"purpose": "control", "device": robot.device, "epoch": lease["epoch"]}
+    issued = anna.post("/mqtt/credentials", request).json()
+    (topic,) = issued["publish"]
+    with broker.connect(issued["client_id"], (issued["username"], issued["password"])) as console:  # type: ignore[arg-type]
         for sequence in range(1, 21):
             setpoint = Setpoint(
                 epoch=lease["epoch"],
@@ -51,15 +51,15 @@ def test_setpoints_and_stop_of_a_console_reach_it_over_the_broker(
             console.publish(topic, codec.encode(setpoint), qos=0)
             time.sleep(0.005)
         wait_until(lambda: len(robot.setpoints) >= 20, "every setpoint")
-    assert {found for found, _ in robot.setpoints} == {topic}
+    assert {received for received, _ in robot.setpoints} == {topic}
     assert [codec.decode(payload, Setpoint).sequence for _, payload in robot.setpoints] == list(range(1, 21))
-    given = anna.post("/mqtt/credentials", {"purpose": "view"}).json()
-    with broker.connect(given["client_id"], (given["username"], given["password"])) as console:  # type: ignore[arg-type]
+    issued = anna.post("/mqtt/credentials", {"purpose": "view"}).json()
+    with broker.connect(issued["client_id"], (issued["username"], issued["password"])) as console:  # type: ignore[arg-type]
         console.publish(robot.topic(topics.STOP), codec.encode(Stop(id="s1", caller="anna")))
         wait_until(lambda: any(stop.id == "s1" for stop in robot.stops), "the Stop")
 
 
-def test_it_hears_what_its_space_measures_where_it_asks_for_it_and_nothing_of_another(
+def test_a_robot_receives_only_subscribed_measurements_of_its_own_space(
     site: XmppSite, broker: RunningBroker, anna: Person
 ) -> None:
     bert = site.cloud.sign_in("bert")
@@ -73,11 +73,11 @@ def test_it_hears_what_its_space_measures_where_it_asks_for_it_and_nothing_of_an
 
         robot.listen = (tele(eye, "motion"), tele(foreign, "motion"), robot.topic(topics.STATE), "ts/v1/+/+/+/tele/+")
         robot.connect()
-        with site.watcher(broker) as someone:
+        with site.watcher(broker) as publisher:
             for of in (foreign, eye):
-                someone.publish(tele(of, "motion"), b'{"of": "%s"}' % of.id.encode(), qos=0)
-                someone.publish(tele(of, "warmth"), b"{}", qos=0)
-            wait_until(lambda: robot.overheard, "the measurement")
-            someone.publish(tele(eye, "motion"), b"last", qos=0)
-            wait_until(lambda: robot.overheard[-1][1] == b"last", "the last measurement")
-        assert {topic for topic, _ in robot.overheard} == {tele(eye, "motion")}
+                publisher.publish(tele(of, "motion"), b'{"of": "%s"}' % of.id.encode(), qos=0)
+                publisher.publish(tele(of, "warmth"), b"{}", qos=0)
+            wait_until(lambda: robot.space_messages, "the measurement")
+            publisher.publish(tele(eye, "motion"), b"last", qos=0)
+            wait_until(lambda: robot.space_messages[-1][1] == b"last", "the last measurement")
+        assert {topic for topic, _ in robot.space_messages} == {tele(eye, "motion")}

@@ -6,43 +6,43 @@ from tests.harness.network.brokers import wait_until
 from tests.harness.network.xmpp import XmppRobot, XmppSite, start_prosody
 
 
-def test_of_two_who_speak_one_may_go_and_no_agent_is_served_twice(
+def test_a_second_gateway_takes_over_and_no_agent_is_served_twice(
     site: XmppSite, anna: Person, robot: XmppRobot
 ) -> None:
-    second = site.speak()
+    second = site.start_gateway()
     try:
         robots = [robot]
         for number in range(3):
             other = site.robot(f"arm{number}")
             other.pair(anna)
             robots.append(other.connect())
-        first = site.speaking[0]
+        first = site.gateways[0]
         for each in robots:
             assert first.serves(each.id) != second.serves(each.id)
         first.end()
-        site.speaking.remove(first)
-        wait_until(lambda: all(second.serves(each.id) for each in robots), "all at the second")
+        site.gateways.remove(first)
+        wait_until(lambda: all(second.serves(each.id) for each in robots), "all agents at the second gateway")
         for each in robots:
-            wait_until(lambda each=each: each.changes[-1], "its link")  # type: ignore[misc]
+            wait_until(lambda each=each: each.changes[-1], "the link")  # type: ignore[misc]
             assert anna.take_lease(each.device, wait_ms=10_000).json()["confirmed"]
-            assert all(len(payloads) == 1 for payloads in each.payloads.values()), "each command once"
+            assert all(len(payloads) == 1 for payloads in each.payloads.values()), "a command was sent twice"
     finally:
         for each in robots[1:]:
             each.__exit__()
 
 
 def test_a_stop_without_a_gateway_is_delivered_later(site: XmppSite, anna: Person, robot: XmppRobot) -> None:
-    site.speaking.pop().end()
-    wait_until(lambda: robot.changes[-1] is False, "the loss: the cloud is not there")
+    site.gateways.pop().end()
+    wait_until(lambda: robot.changes[-1] is False, "the loss of the link")
     wait_until(lambda: not anna.get(f"/devices/{robot.device}").json()["online"], "offline")
     assert anna.post(f"/devices/{robot.device}/stop").json() == {"confirmed": False}
-    site.speak()
-    wait_until(lambda: robot.changes[-1] is True, "the way back")
-    wait_until(lambda: robot.received(StopDevice), "the Stop that waited")
+    site.start_gateway()
+    wait_until(lambda: robot.changes[-1] is True, "the new link")
+    wait_until(lambda: robot.received(StopDevice), "the delayed Stop")
     assert robot.session >= 2
 
 
-def test_after_a_killed_server_all_find_together_and_go_on(site: XmppSite, anna: Person, robot: XmppRobot) -> None:
+def test_all_connections_recover_after_the_server_was_killed(site: XmppSite, anna: Person, robot: XmppRobot) -> None:
     robot.silent = True
     action = anna.start(robot.device).json()["id"]
     wait_until(lambda: robot.received(MoveJoints), "the command")
@@ -52,12 +52,12 @@ def test_after_a_killed_server_all_find_together_and_go_on(site: XmppSite, anna:
     robot.silent = False
     with start_prosody(site.prosody.home, f"{site.url}/api/v1/xmpp/verify", port=site.prosody.port) as again:
         site.prosody.process = again.process
-        wait_until(lambda: robot.changes[-1] is True, "the way back")
+        wait_until(lambda: robot.changes[-1] is True, "the new link")
         assert waiting().status_code == 200
         wait_until(lambda: robot.received(StopDevice), "the Stop")
         wait_until(lambda: anna.get(f"/devices/{robot.device}").json()["online"], "online again")
         robot.report(action, AckStatus.STARTED)
         robot.report(action, AckStatus.DONE)
         assert anna.action(action, wait_ms=10_000, wait_for="done")["status"] == "done"
-        assert len(robot.received(MoveJoints)) == 1, "once, however often it came"
+        assert len(robot.received(MoveJoints)) == 1, "the repeated command ran twice"
         assert len(set(robot.payloads[action])) == 1

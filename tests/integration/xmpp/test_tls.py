@@ -31,8 +31,8 @@ def _far_away(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Login, "local", property(lambda _: False))
 
 
-def refusal(port: int, trusted: Path | None, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Why a login is rejected. No server runs, so a login that reaches the password check is rejected there."""
+def login_error(port: int, trusted: Path | None, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The error of a login. No HTTP server runs, so a login that reaches the password check is rejected there."""
     if trusted is not None:
         monkeypatch.setattr(ssl, "create_default_context", _trusting(trusted))
 
@@ -48,52 +48,52 @@ def refusal(port: int, trusted: Path | None, monkeypatch: pytest.MonkeyPatch) ->
     return str(error.value)
 
 
-def watched(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, str]]:
-    """What is sent from now on, and whether under TLS."""
+def record_sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, str]]:
+    """Record data sent from now on, and whether it is sent under TLS."""
     sent: list[tuple[bool, str]] = []
-    was = xmpp_stream._Client.send_raw
+    original = xmpp_stream._Client.send_raw
 
     def send_raw(self: Any, data: Any) -> None:
         sent.append((self.transport.get_extra_info("ssl_object") is not None, str(data)))
-        was(self, data)
+        original(self, data)
 
     monkeypatch.setattr(xmpp_stream._Client, "send_raw", send_raw)
     return sent
 
 
-def test_with_a_trusted_certificate_the_password_is_asked_for_under_tls(
+def test_with_a_trusted_certificate_the_password_is_sent_under_tls(
     server: tuple[Prosody, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prosody, pem = server
-    sent = watched(monkeypatch)
-    assert "rejects the password" in refusal(prosody.port, pem, monkeypatch)
+    sent = record_sent(monkeypatch)
+    assert "rejects the password" in login_error(prosody.port, pem, monkeypatch)
     (auth,) = [secure for secure, data in sent if "<auth" in data]
     assert auth is True
 
 
 def test_an_untrusted_certificate_is_rejected(server: tuple[Prosody, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "certificate" in refusal(server[0].port, None, monkeypatch)
+    assert "certificate" in login_error(server[0].port, None, monkeypatch)
 
 
 @pytest.mark.parametrize("server", ["another.localhost"], indirect=True)
 def test_a_trusted_certificate_of_another_name_is_refused(
     server: tuple[Prosody, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "certificate" in refusal(server[0].port, server[1], monkeypatch)
+    assert "certificate" in login_error(server[0].port, server[1], monkeypatch)
 
 
-def test_a_server_without_tls_is_not_told_a_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sent = watched(monkeypatch)
+def test_no_password_is_sent_to_a_server_without_tls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sent = record_sent(monkeypatch)
     with start_prosody(tmp_path / "prosody", NOWHERE) as prosody:
-        assert "no TLS" in refusal(prosody.port, None, monkeypatch)
+        assert "no TLS" in login_error(prosody.port, None, monkeypatch)
     assert not any("<auth" in data for _, data in sent)
 
 
 def _trusting(pem: Path) -> Any:
-    made = ssl.create_default_context
+    original = ssl.create_default_context
 
     def context(*arguments: Any, **options: Any) -> ssl.SSLContext:
-        trusting = made(*arguments, **options)
+        trusting = original(*arguments, **options)
         trusting.load_verify_locations(pem)
         return trusting
 
@@ -101,4 +101,4 @@ def _trusting(pem: Path) -> Any:
 
 
 def _nothing(_: Any) -> None:
-    """No program listens."""
+    """A port without a listener."""

@@ -31,7 +31,7 @@ from device_agent.protocol import (
 from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
 from device_agent.runtime.control.controller import Controller
-from tests.harness.agent.device_harness import WITHIN_S, DeviceHarness, eventually, shown
+from tests.harness.agent.device_harness import WITHIN_S, DeviceHarness, eventually, wait_for_state
 from tests.unit.device_agent.runtime.conftest import MakeDevice
 
 
@@ -104,7 +104,7 @@ def test_streaming_needs_the_lease_and_moves_the_device(harness: DeviceHarness) 
     assert harness.driver.position[1] > 0.1
     assert harness.telemetry().epoch == 1
     assert harness.telemetry().setpoint_sequence > 1
-    lease = shown(harness, lambda state: state.lease).lease
+    lease = wait_for_state(harness, lambda state: state.lease).lease
     assert lease is not None
     assert lease.holder == "ann"
 
@@ -113,7 +113,7 @@ def test_stop_needs_no_lease_and_survives_a_restart(harness: DeviceHarness, make
     running = harness.running(harness.script("wait(600)"), epoch=1)
     harness.receive_stop()
     assert harness.end_code(running) == "stopped"
-    stop = shown(harness, lambda state: state.mode is Mode.STOPPED).stop
+    stop = wait_for_state(harness, lambda state: state.mode is Mode.STOPPED).stop
     assert stop is not None
     assert stop.caller == "bob"
     harness.done(grant("eve"), epoch=2)
@@ -203,7 +203,7 @@ def test_state_shows_a_control_request_until_it_is_withdrawn(harness: DeviceHarn
     assert harness.failed(request, epoch=1).code == "no_lease"
     harness.done(grant(reason="needed in the lab"), epoch=1)
     harness.done(request, epoch=1)
-    lease = shown(harness, lambda state: state.lease and state.lease.request).lease
+    lease = wait_for_state(harness, lambda state: state.lease and state.lease.request).lease
     assert lease is not None
     assert lease.request is not None
     assert (lease.holder, lease.reason) == ("ann", "needed in the lab")
@@ -211,7 +211,7 @@ def test_state_shows_a_control_request_until_it_is_withdrawn(harness: DeviceHarn
     assert 0 < lease.request.expires_in_ms <= 30_000
     harness.done(grant(), epoch=1)
     harness.done(WithdrawRequest(request="r1"), epoch=1)
-    lease = shown(harness, lambda state: state.lease and not state.lease.request).lease
+    lease = wait_for_state(harness, lambda state: state.lease and not state.lease.request).lease
     assert lease is not None
     assert lease.reason == "needed in the lab", "a renewal keeps it"
 
@@ -230,6 +230,6 @@ def test_a_new_epoch_is_journalled_before_it_is_applied_and_its_end_is_shown(
     for epoch in (4, 4, 7):
         harness.done(grant(), epoch=epoch)
     assert written == [4, 4, 7]
-    assert shown(harness, lambda state: state.lease and state.epoch == 7).ended_epoch < 7
+    assert wait_for_state(harness, lambda state: state.lease and state.epoch == 7).ended_epoch < 7
     harness.done(ReleaseLease(), epoch=7)
-    assert shown(harness, lambda state: not state.lease).ended_epoch == 7
+    assert wait_for_state(harness, lambda state: not state.lease).ended_epoch == 7

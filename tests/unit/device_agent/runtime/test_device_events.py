@@ -24,7 +24,7 @@ from device_agent.protocol import (
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.security import signing
 from tests.fakes.drivers import FakeDriver
-from tests.harness.agent.device_harness import DeviceHarness, eventually, shown
+from tests.harness.agent.device_harness import DeviceHarness, eventually, wait_for_state
 from tests.unit.device_agent.runtime.conftest import MakeDevice
 
 
@@ -112,11 +112,11 @@ def test_driver_failure_and_recovery_are_events_and_faults(harness: DeviceHarnes
     harness.driver.broken = True
     assert "switched on" in event(harness, EventKind.DRIVER_FAILED).message
     assert event(harness, EventKind.LEASE_ENDED).data["code"] == "fault"
-    assert "switched on" in shown(harness, lambda state: state.faults).faults[0].message
+    assert "switched on" in wait_for_state(harness, lambda state: state.faults).faults[0].message
     assert harness.failed(MoveJoints(position_rad={"elbow": 0.2}), epoch=2).code == "fault"
     harness.driver.broken = False
     assert event(harness, EventKind.DRIVER_RECOVERED)
-    shown(harness, lambda state: not state.faults)
+    wait_for_state(harness, lambda state: not state.faults)
     harness.done(MoveJoints(position_rad={"elbow": 0.1}), epoch=3)
 
 
@@ -177,7 +177,7 @@ def test_an_interlock_without_reading_holds_and_is_published(make_device: MakeDe
     rule = InterlockRule(device="sensors-pir", stream="presence", field="present", equals=True)
     harness = make_device(interlocks=(rule,))
     assert event(harness, EventKind.INTERLOCK_ENGAGED).data["interlock"] == rule.name
-    state = shown(harness, lambda state: state.restrictions)
+    state = wait_for_state(harness, lambda state: state.restrictions)
     assert [(each.source, each.speed) for each in state.restrictions] == [(rule.name, 0.0)]
     assert harness.published(topics.DESC, Description)[0].interlocks == (rule.description,)
     grant(harness)

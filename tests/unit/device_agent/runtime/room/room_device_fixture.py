@@ -119,7 +119,7 @@ class RoomDeviceHarness(DeviceHarness):
 
     def pictures(self) -> list[bytes]:
         camera = topics.device("s", "a", "arm", topics.CAM, "garden")
-        return [payload for topic, payload in self.said if topic == camera]
+        return [payload for topic, payload in self.messages if topic == camera]
 
 
 def await_growth(items: Callable[[], list[Any]], by: int = 3) -> None:

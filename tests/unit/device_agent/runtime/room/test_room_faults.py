@@ -5,7 +5,7 @@ from unittest import mock
 from device_agent.config.interlock_rule import InterlockRule
 from device_agent.protocol import CollectData, Mode, ResetStop, SetControl, StopDevice, TakePicture
 from device_agent.protocol.codec import MAX_BYTES
-from tests.harness.agent.device_harness import eventually, shown
+from tests.harness.agent.device_harness import eventually, wait_for_state
 from tests.unit.device_agent.runtime.room.conftest import MakeRoomDevice
 from tests.unit.device_agent.runtime.room.room_device_fixture import RoomDeviceHarness, await_growth
 
@@ -14,7 +14,7 @@ SET = SetControl(control="opening", value=0.1)
 
 def test_a_picture_that_is_too_large_is_a_fault_with_advice(harness: RoomDeviceHarness) -> None:
     harness.sensor.picture = bytes(MAX_BYTES)
-    assert "smaller pictures" in shown(harness, lambda state: state.faults).faults[0].message
+    assert "smaller pictures" in wait_for_state(harness, lambda state: state.faults).faults[0].message
 
 
 def test_stop_holds_until_reset_while_streams_continue(harness: RoomDeviceHarness) -> None:
@@ -31,23 +31,23 @@ def test_stop_holds_until_reset_while_streams_continue(harness: RoomDeviceHarnes
 
 def test_a_sensor_error_is_a_fault_until_the_sensor_responds(make_room_device: MakeRoomDevice) -> None:
     harness = make_room_device(broken="not connected")
-    assert shown(harness, lambda state: state.faults).faults[0].message == "not connected"
+    assert wait_for_state(harness, lambda state: state.faults).faults[0].message == "not connected"
     harness.sensor.broken = ""
-    shown(harness, lambda state: not state.faults)
+    wait_for_state(harness, lambda state: not state.faults)
     await_growth(harness.measured)
     harness.sensor.broken = "no answer on the bus; is it plugged in?"
-    state = shown(harness, lambda state: state.faults)
+    state = wait_for_state(harness, lambda state: state.faults)
     assert (state.mode, state.faults[0].message) == (Mode.FAULT, harness.sensor.broken)
     assert harness.failed(TakePicture()).code == "fault"
     harness.sensor.broken = ""
-    shown(harness, lambda state: not state.faults)
+    wait_for_state(harness, lambda state: not state.faults)
     harness.done(TakePicture())
 
 
 def test_an_unexpected_driver_error_is_a_fault_and_the_loop_continues(harness: RoomDeviceHarness) -> None:
     with mock.patch.object(harness.sensor, "read", side_effect=ZeroDivisionError):
-        assert "internal error" in shown(harness, lambda state: state.faults).faults[0].message
-    shown(harness, lambda state: not state.faults)
+        assert "internal error" in wait_for_state(harness, lambda state: state.faults).faults[0].message
+    wait_for_state(harness, lambda state: not state.faults)
     await_growth(harness.measured)
 
 

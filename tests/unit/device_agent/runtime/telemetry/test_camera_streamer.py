@@ -53,7 +53,9 @@ def test_a_device_describes_and_streams_its_cameras(make_device: MakeDevice) -> 
     harness = make_device(kind=robot_type(cameras=(EYES,)), driver=CameraDriver())
     described: Description = eventually(lambda: harness.published(topics.DESC, Description))[0]
     assert described.cameras == (EYES,)
-    payload = eventually(lambda: [payload for topic, payload in list(harness.said) if topic.endswith("/cam/eyes")])[0]
+    payload = eventually(lambda: [payload for topic, payload in list(harness.messages) if topic.endswith("/cam/eyes")])[
+        0
+    ]
     first = camera_frames.decode(payload)
     assert (first.sequence, first.width, first.height, first.jpeg) == (1, 4, 3, JPEG)
 

@@ -1,4 +1,4 @@
-"""An agent that runs follows its owner into another space, and another owner, without being started anew."""
+"""A running agent follows a move to another space and a change of its owner without a restart."""
 
 import asyncio
 import contextlib
@@ -22,7 +22,7 @@ CODE = re.compile(r"claim code (\S+)  ")
 
 @contextlib.contextmanager
 def served(cloud: Cloud) -> Iterator[str]:
-    """The functions' address, for a process of its own."""
+    """Serve the functions for a separate process; yields the address."""
     listener = socket.create_server(("127.0.0.1", 0))
     server = uvicorn.Server(uvicorn.Config(cloud.app, log_level="warning", lifespan="off"))
     running = asyncio.run_coroutine_threadsafe(server.serve(sockets=[listener]), cloud.loop)
@@ -35,7 +35,7 @@ def served(cloud: Cloud) -> Iterator[str]:
 
 @contextlib.contextmanager
 def agent(home: Path) -> Iterator[None]:
-    """The agent's own program."""
+    """The agent's program."""
     log = (home / "log").open("w")
     process = subprocess.Popen(
         [sys.executable, "-m", "device_agent", "run", "--home", str(home)], cwd=ROOT, stdout=log, stderr=log
@@ -50,7 +50,7 @@ def agent(home: Path) -> Iterator[None]:
 
 
 def enroll(home: Path, *more: str) -> str:
-    """Its claim code."""
+    """Enroll the agent; returns its claim code."""
     done = subprocess.run(
         [sys.executable, "-m", "device_agent", "enroll", "--home", str(home), "--no-wait", *more],
         cwd=ROOT,
@@ -64,18 +64,18 @@ def enroll(home: Path, *more: str) -> str:
 
 
 def runs_in(person: Person, device: str, space: str) -> None:
-    """See that the device is there, in this space, and does what it is asked to."""
+    """Assert that the device is online in this space and executes an action."""
 
-    def there() -> bool:
-        shown = person.get(f"/devices/{device}").json()
-        return bool(shown["online"] and shown["space"] == space)
+    def available() -> bool:
+        body = person.get(f"/devices/{device}").json()
+        return bool(body["online"] and body["space"] == space)
 
-    wait_until(there, "the agent to be back", timeout_s=MOST_S)
+    wait_until(available, "the agent to be online again", timeout_s=MOST_S)
     answer = person.start(device, request=NUDGE, wait_ms=30_000, wait_for="done")
     assert answer.json()["status"] == "done", answer.json()
 
 
-def test_it_follows_to_another_space_and_to_another_owner(cloud: Cloud, tmp_path: Path) -> None:
+def test_an_agent_follows_to_another_space_and_to_another_owner(cloud: Cloud, tmp_path: Path) -> None:
     anna, bert = cloud.sign_in("anna"), cloud.sign_in("bert")
     home = tmp_path / "agent"
     with served(cloud) as url:
@@ -88,8 +88,8 @@ def test_it_follows_to_another_space_and_to_another_owner(cloud: Cloud, tmp_path
             assert anna.put(f"/agents/{claimed['agent']}/space", {"space": attic}).status_code == 200
             runs_in(anna, device, attic)
             assert anna.delete(f"/agents/{claimed['agent']}").status_code == 204
-            wait_until(lambda: CODE.search((home / "log").read_text()), "it to show a new code", timeout_s=MOST_S)
-            theirs = bert.post("/agents/claim", {"code": CODE.findall((home / "log").read_text())[-1]})
-            assert theirs.status_code == 200, theirs.text
-            runs_in(bert, device, theirs.json()["space"])
+            wait_until(lambda: CODE.search((home / "log").read_text()), "a new claim code", timeout_s=MOST_S)
+            claimed_again = bert.post("/agents/claim", {"code": CODE.findall((home / "log").read_text())[-1]})
+            assert claimed_again.status_code == 200, claimed_again.text
+            runs_in(bert, device, claimed_again.json()["space"])
             assert anna.get(f"/devices/{device}").status_code == 404
