@@ -56,7 +56,7 @@ class LoadTestResult(msgspec.Struct):
     def measured(self) -> int:
         """Sent measurements: all messages with QoS 0."""
         counts: dict[str, int] = self.figures["counts"]
-        return counts["out"] - counts["asked"]
+        return counts["out"] - counts["out_qos1"]
 
     @property
     def lost(self) -> int:

@@ -9,10 +9,10 @@ import requests
 
 from device_agent.load_generator.options import LoadTestError
 
-_WITHIN_S = 20.0
-_TRIES = 6
-_LONGEST_WAIT_S = 30.0
-_UNAUTHORIZED, _BUSY, _SERVER_ERROR = 401, 429, 500
+_TIMEOUT_S = 20.0
+_ATTEMPTS = 6
+_MAX_WAIT_S = 30.0
+_UNAUTHORIZED, _TOO_MANY_REQUESTS, _SERVER_ERROR = 401, 429, 500
 
 
 class Account:
@@ -20,9 +20,9 @@ class Account:
 
     Args:
         server: Base address.
-        sign_in: A one-time sign-in link, or what stands in it after ``#sign-in=``; used once, when first needed.
-        token: An access token, instead.
-        ca: The authority that alone may speak for an ``https`` server.
+        sign_in: One-time sign-in link, or its part after ``#sign-in=``. It is redeemed at the first request.
+        token: Access token; replaces ``sign_in``.
+        ca: The only certificate authority to accept for an ``https`` server.
     """
 
     def __init__(self, server: str, *, sign_in: str = "", token: str = "", ca: Path | None = None) -> None:
@@ -38,12 +38,12 @@ class Account:
         """Redeem a claim code.
 
         Raises:
-            LoadTestError: The server rejects the claim, or there is no session.
-            OSError: Not reached.
+            LoadTestError: The server rejects the claim, or no account is configured.
+            OSError: The server cannot be reached.
         """
         with self._lock:
-            self._enter()
-            self._ask("/agents/claim", {"code": code})
+            self._sign_in()
+            self._request("/agents/claim", {"code": code})
 
     def close(self) -> None:
         """Sign out, if this object has signed in."""
@@ -52,7 +52,7 @@ class Account:
                 self._post("/auth/sign-out", {})
             self._http.close()
 
-    def _enter(self) -> None:
+    def _sign_in(self) -> None:
         if self._token:
             return
         if not self._link:
@@ -61,27 +61,27 @@ class Account:
                 "or an access token in TELESCOPE_TOKEN"
             )
         link, self._link = self._link, ""
-        given = self._ask("/auth/sign-in", {"link": link})
-        self._token, self._csrf = str(given["access_token"]), str(given["csrf_token"])
+        session = self._request("/auth/sign-in", {"link": link})
+        self._token, self._csrf = str(session["access_token"]), str(session["csrf_token"])
 
-    def _ask(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
-        """The response; retries after a 429 response."""
-        for _ in range(_TRIES):
-            answer = self._post(path, body)
-            if answer.status_code == _UNAUTHORIZED and self._csrf and path != "/auth/token":
-                self._token = str(self._ask("/auth/token", {})["access_token"])
+    def _request(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
+        """Send a request; retries after a 429 or 5xx response."""
+        for _ in range(_ATTEMPTS):
+            response = self._post(path, body)
+            if response.status_code == _UNAUTHORIZED and self._csrf and path != "/auth/token":
+                self._token = str(self._request("/auth/token", {})["access_token"])
                 continue
-            if answer.status_code != _BUSY and answer.status_code < _SERVER_ERROR:
+            if response.status_code != _TOO_MANY_REQUESTS and response.status_code < _SERVER_ERROR:
                 break
-            time.sleep(_wait_s(answer))
+            time.sleep(_retry_after_s(response))
         try:
-            found = answer.json()
+            content = response.json()
         except ValueError as error:
-            raise LoadTestError(f"{self._base}{path} responded without JSON: is it a Telescope server?") from error
-        if not answer.ok or not isinstance(found, dict):
-            detail = found.get("detail") if isinstance(found, dict) else None
-            raise LoadTestError(f"the server rejects {path}: {detail or answer.reason}")
-        return found
+            raise LoadTestError(f"{self._base}{path} did not return JSON: is it a Telescope server?") from error
+        if not response.ok or not isinstance(content, dict):
+            detail = content.get("detail") if isinstance(content, dict) else None
+            raise LoadTestError(f"the server rejects {path}: {detail or response.reason}")
+        return content
 
     def _post(self, path: str, body: dict[str, Any]) -> requests.Response:
         headers = {"Authorization": f"Bearer {self._token}"} if self._token else {}
@@ -92,7 +92,7 @@ class Account:
                 self._base + path,
                 json=body,
                 headers=headers,
-                timeout=_WITHIN_S,
+                timeout=_TIMEOUT_S,
                 allow_redirects=False,
                 verify=self._verify,
             )
@@ -100,6 +100,6 @@ class Account:
             raise OSError(f"{self._base} cannot be reached: {error}") from error
 
 
-def _wait_s(answer: requests.Response) -> float:
-    said = answer.headers.get("Retry-After", "")
-    return min(float(said), _LONGEST_WAIT_S) if said.isdecimal() else 1.0
+def _retry_after_s(response: requests.Response) -> float:
+    value = response.headers.get("Retry-After", "")
+    return min(float(value), _MAX_WAIT_S) if value.isdecimal() else 1.0

@@ -24,7 +24,7 @@ from device_agent.transports.http import responses
 from device_agent.transports.http.client import CloudClient, CloudError
 
 T = TypeVar("T")
-_TRIES = 8
+_ATTEMPTS = 8
 FILE = "keys.json"
 
 
@@ -35,19 +35,19 @@ class Keys:
         self._path = folder / FILE
 
     def first(self, count: int) -> list[Ed25519PrivateKey]:
-        """The requested number of keys: saved ones, and new ones, which are saved.
+        """The first ``count`` keys; missing ones are generated and saved.
 
         Raises:
-            LoadTestError: The file is not one of these.
-            ConfigError: It cannot be written.
-            OSError: It cannot be read.
+            LoadTestError: The file is not a key file.
+            ConfigError: The file cannot be written.
+            OSError: The file cannot be read.
         """
-        known = self._read()
-        missing = count - len(known)
+        keys = self._read()
+        missing = count - len(keys)
         if missing > 0:
-            known += [signing.generate().private_bytes_raw() for _ in range(missing)]
-            private_file.write(self._path, msgspec.json.encode([base64.b64encode(key).decode() for key in known]))
-        return [Ed25519PrivateKey.from_private_bytes(key) for key in known[:count]]
+            keys += [signing.generate().private_bytes_raw() for _ in range(missing)]
+            private_file.write(self._path, msgspec.json.encode([base64.b64encode(key).decode() for key in keys]))
+        return [Ed25519PrivateKey.from_private_bytes(key) for key in keys[:count]]
 
     def _read(self) -> list[bytes]:
         if not self._path.exists():
@@ -64,60 +64,65 @@ class Keys:
 class Enrollment:
     """Enrolls and claims agents. Blocks; runs in a thread pool."""
 
-    def __init__(self, plan: LoadOptions, kind: RobotType, clock: CloudClock) -> None:
-        self._plan = plan
-        self._kind = kind
+    def __init__(self, options: LoadOptions, robot_type: RobotType, clock: CloudClock) -> None:
+        self._options = options
+        self._robot_type = robot_type
         self._clock = clock
-        self._account = Account(plan.cloud, sign_in=plan.sign_in, token=plan.token, ca=plan.ca)
+        self._account = Account(options.cloud, sign_in=options.sign_in, token=options.token, ca=options.ca)
 
-    def api(self, key: Ed25519PrivateKey) -> CloudClient:
+    def client(self, key: Ed25519PrivateKey) -> CloudClient:
         """HTTP API client of one agent."""
-        return CloudClient(self._plan.cloud, key, self._clock, ca=self._plan.ca)
+        return CloudClient(self._options.cloud, key, self._clock, ca=self._options.ca)
 
-    def all(self, keys: list[Ed25519PrivateKey], pool: Executor, tell: Callable[[str], None]) -> list[Pairing]:
+    def enroll_all(self, keys: list[Ed25519PrivateKey], pool: Executor, report: Callable[[str], None]) -> list[Pairing]:
         """Pairings of all agents.
 
         Raises:
-            LoadTestError: There is no account, or the server rejects the claims.
-            CloudError: The server refuses one.
-            OSError: Not reached.
+            LoadTestError: No account is configured, or the server rejects a claim.
+            CloudError: The server rejects an enrollment.
+            OSError: The server cannot be reached.
         """
-        pairings, told_s = [], time.monotonic()
-        asked = [pool.submit(self._one, number, key) for number, key in enumerate(keys, start=1)]
+        pairings, reported_s = [], time.monotonic()
+        pending = [pool.submit(self._enroll, number, key) for number, key in enumerate(keys, start=1)]
         try:
-            for number, future in enumerate(asked, start=1):
+            for number, future in enumerate(pending, start=1):
                 pairings.append(future.result())
-                if time.monotonic() - told_s > self._plan.every_s:
-                    told_s = time.monotonic()
-                    tell(f"{number} of {len(keys)} agents are known to the server")
+                if time.monotonic() - reported_s > self._options.every_s:
+                    reported_s = time.monotonic()
+                    report(f"{number} of {len(keys)} agents are enrolled")
         finally:
-            for future in asked:
+            for future in pending:
                 future.cancel()
         self._account.close()
         return pairings
 
-    def _one(self, number: int, key: Ed25519PrivateKey) -> Pairing:
-        api = self.api(key)
-        device = {"name": DEVICE, "kind": self._kind.kind, "robot_type": self._kind.type, "label": f"Arm {number}"}
+    def _enroll(self, number: int, key: Ed25519PrivateKey) -> Pairing:
+        client = self.client(key)
+        device = {
+            "name": DEVICE,
+            "kind": self._robot_type.kind,
+            "robot_type": self._robot_type.type,
+            "label": f"Arm {number}",
+        }
         claim = _with_retry(
-            lambda: api.enroll(
+            lambda: client.enroll(
                 name=f"load-{number:05d}", software=pairing_monitor.SOFTWARE, transport="mqtt", devices=[device]
             )
         )
         if claim.code is not None:
             self._account.claim(claim.code)
-        return pairing_monitor.pairing_of(responses.read(_with_retry(api.enrollment), responses.Claimed))
+        return pairing_monitor.pairing_of(responses.read(_with_retry(client.enrollment), responses.Claimed))
 
 
 def _with_retry(call: Callable[[], T]) -> T:
     """Retry while the server is overloaded.
 
     Raises:
-        CloudError: It refuses, or still has.
-        OSError: Not reached.
+        CloudError: The server rejects the request, or remains overloaded.
+        OSError: The server cannot be reached.
     """
     back_off = BackOff()
-    for _ in range(_TRIES):
+    for _ in range(_ATTEMPTS):
         back_off.attempt()
         try:
             return call()

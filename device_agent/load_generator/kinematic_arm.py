@@ -1,4 +1,4 @@
-"""A kinematic arm without dynamics: joints move at constant speed and stop at once."""
+"""A kinematic arm without dynamics: joints move at constant speed and stop immediately."""
 
 import math
 from collections.abc import Sequence
@@ -17,18 +17,18 @@ def robot_type(name: str, joints: int, rate_hz: float) -> RobotType:
     names = [f"joint_{number}" for number in range(1, joints + 1)]
     return RobotType(
         type=name,
-        label=f"Arm of a swarm, {joints} joints",
+        label=f"Load-test arm, {joints} joints",
         kind="arm",
         version=1,
-        description="Only figures: no mass, no shape.",
+        description="Kinematic only: without mass and shape.",
         model="",
         scene="",
         driver="load-generator",
         period_ms=20,
         joints=tuple(
             Joint(
-                name=each,
-                label=each.replace("_", " ").capitalize(),
+                name=joint,
+                label=joint.replace("_", " ").capitalize(),
                 lower_rad=-RANGE_RAD,
                 upper_rad=RANGE_RAD,
                 max_velocity_rad_s=SPEED_RAD_S,
@@ -36,7 +36,7 @@ def robot_type(name: str, joints: int, rate_hz: float) -> RobotType:
                 max_jerk_rad_s3=60.0,
                 max_effort_nm=10.0,
             )
-            for each in names
+            for joint in names
         ),
         frames=(),
         home_rad=dict.fromkeys(names, 0.0),
@@ -47,37 +47,37 @@ def robot_type(name: str, joints: int, rate_hz: float) -> RobotType:
     )
 
 
-class Shape:
+class ArmType:
     """Properties that all simulated arms share.
 
     Attributes:
-        kind: Their type.
-        envelope: Where joints may be: the real agent's own code, without a shape to collide with.
-        speeds_rad_s: How fast each joint turns at most, shape (n,).
+        robot_type: Robot type of all arms.
+        limits: Position limits of the real agent, without collision checks.
+        max_velocity_rad_s: Maximum velocity of each joint, shape (n,).
     """
 
-    def __init__(self, kind: RobotType) -> None:
-        self.kind = kind
-        self.envelope = MotionLimits(kind, None)
-        self.speeds_rad_s = tuple(joint.max_velocity_rad_s for joint in kind.joints)
+    def __init__(self, robot_type: RobotType) -> None:
+        self.robot_type = robot_type
+        self.limits = MotionLimits(robot_type, None)
+        self.max_velocity_rad_s = tuple(joint.max_velocity_rad_s for joint in robot_type.joints)
 
 
 class Arm:
     """One arm. Callers provide the time.
 
     Attributes:
-        position_rad: Where it is, shape (n,).
-        velocity_rad_s: How fast it turned when it was last looked at, shape (n,).
-        target_rad: Where it is going, shape (n,).
+        position_rad: Current positions, shape (n,).
+        velocity_rad_s: Mean velocities between the last two updates, shape (n,).
+        target_rad: Target positions, shape (n,).
     """
 
-    __slots__ = ("_at_s", "_most_rad_s", "_speed", "_until_s", "position_rad", "target_rad", "velocity_rad_s")
+    __slots__ = ("_at_s", "_max_velocity_rad_s", "_speed", "_until_s", "position_rad", "target_rad", "velocity_rad_s")
 
-    def __init__(self, shape: Shape, now_s: float) -> None:
-        self.position_rad = [shape.kind.home_rad[joint.name] for joint in shape.kind.joints]
+    def __init__(self, arm_type: ArmType, now_s: float) -> None:
+        self.position_rad = [arm_type.robot_type.home_rad[joint.name] for joint in arm_type.robot_type.joints]
         self.target_rad = list(self.position_rad)
         self.velocity_rad_s = [0.0] * len(self.position_rad)
-        self._most_rad_s = shape.speeds_rad_s
+        self._max_velocity_rad_s = arm_type.max_velocity_rad_s
         self._speed = 0.0
         self._at_s = now_s
         self._until_s = math.inf
@@ -87,32 +87,32 @@ class Arm:
         """Whether the arm has reached its target."""
         return self.position_rad == self.target_rad
 
-    def go(self, target_rad: Sequence[float], *, speed: float, until_s: float = math.inf) -> None:
-        """Move towards a target, shape (n,) [rad], with a share of the joint speed, until a time at most [s]."""
+    def move(self, target_rad: Sequence[float], *, speed: float, until_s: float = math.inf) -> None:
+        """Move towards a target, shape (n,) [rad], at a share of the joint speed; stop at ``until_s`` [s]."""
         self.target_rad = list(target_rad)
         self._speed = speed
         self._until_s = until_s
 
     def hold(self) -> None:
-        """Stop at once."""
+        """Stop immediately."""
         self.target_rad = list(self.position_rad)
 
     def advance(self, now_s: float) -> None:
         """Advance the joints to the current time."""
         moving_s = max(0.0, min(now_s, self._until_s) - self._at_s)
-        passed_s = now_s - self._at_s
+        elapsed_s = now_s - self._at_s
         self._at_s = now_s
-        if passed_s <= 0:
+        if elapsed_s <= 0:
             return
         for index, target in enumerate(self.target_rad):
-            here = self.position_rad[index]
-            if here == target:
+            position = self.position_rad[index]
+            if position == target:
                 self.velocity_rad_s[index] = 0.0
                 continue
-            step = self._most_rad_s[index] * self._speed * moving_s
-            there = target if abs(target - here) <= step else here + math.copysign(step, target - here)
-            self.position_rad[index] = there
-            self.velocity_rad_s[index] = (there - here) / passed_s
+            step = self._max_velocity_rad_s[index] * self._speed * moving_s
+            reached = target if abs(target - position) <= step else position + math.copysign(step, target - position)
+            self.position_rad[index] = reached
+            self.velocity_rad_s[index] = (reached - position) / elapsed_s
         if now_s >= self._until_s:
             self.hold()
             self.velocity_rad_s = [0.0] * len(self.position_rad)

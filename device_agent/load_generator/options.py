@@ -22,7 +22,7 @@ class LoadTestError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadOptions:
-    """Options of one run; the help texts of ``add_options`` describe them. No ``json`` file: print only."""
+    """Options of one run; see the help texts of ``add_options``. Without ``json``, results are only printed."""
 
     cloud: str
     count: int = 100
@@ -65,8 +65,8 @@ class LoadOptions:
 
     def may_connect_to(self, host: str) -> bool:
         """Whether the host was named as server or broker."""
-        named = {urlsplit(self.cloud).hostname, self.broker} - {None, ""}
-        return host in named or (host in _LOOPBACK and bool(named & _LOOPBACK))
+        permitted = {urlsplit(self.cloud).hostname, self.broker} - {None, ""}
+        return host in permitted or (host in _LOOPBACK and bool(permitted & _LOOPBACK))
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -116,7 +116,7 @@ def parse_options(options: argparse.Namespace) -> LoadOptions:
     Raises:
         LoadTestError: An option is wrong.
     """
-    plan = LoadOptions(
+    load_options = LoadOptions(
         cloud=options.cloud,
         broker=options.broker,
         ca=options.ca,
@@ -132,5 +132,5 @@ def parse_options(options: argparse.Namespace) -> LoadOptions:
         json=options.json,
         every_s=max(options.every_s, 0.1),
     )
-    plan.check()
-    return plan
+    load_options.check()
+    return load_options

@@ -12,9 +12,9 @@ from typing import Any
 import msgspec
 
 from device_agent.load_generator.agent import LoadAgent
-from device_agent.load_generator.connection import Dialect
+from device_agent.load_generator.connection import ProtocolVersion
 from device_agent.load_generator.enrollment import Enrollment, Keys
-from device_agent.load_generator.kinematic_arm import Shape, robot_type
+from device_agent.load_generator.kinematic_arm import ArmType, robot_type
 from device_agent.load_generator.metrics import Metrics
 from device_agent.load_generator.options import LoadOptions, LoadTestError
 from device_agent.ports.clock import CloudClock
@@ -22,163 +22,177 @@ from device_agent.ports.clock import CloudClock
 _THREADS = 8
 """Threads for blocking calls: HTTP and connection setup."""
 _SPARE_FILES = 64
-_AT_ONCE = 32
-"""Number of robots that publish before received data is read."""
-_LAG_EVERY_S = 0.05
-_LOOK_EVERY_S = 1.0
-_END_WITHIN_S = 10.0
+_BATCH = 32
+"""Number of robots that publish before the event loop handles received data."""
+_LAG_PERIOD_S = 0.05
+_POLL_PERIOD_S = 1.0
+_STOP_TIMEOUT_S = 10.0
 
 
-def run(plan: LoadOptions) -> int:
+def run(options: LoadOptions) -> int:
     """Run the load test. Returns the exit code: 0 if all agents were connected at the same time.
 
     Raises:
         LoadTestError: The load test cannot start.
-        CloudError: The server refuses an agent.
-        OSError: The server is not reached, or a file cannot be written.
+        CloudError: The server rejects an agent.
+        OSError: The server cannot be reached, or a file cannot be written.
     """
-    _allow_files(plan.count + _SPARE_FILES)
-    before_bytes = _memory_bytes()
+    _allow_files(options.count + _SPARE_FILES)
+    baseline_bytes = _memory_bytes()
     clock = CloudClock()
-    kind = robot_type(plan.type, plan.joints, plan.rate_hz)
-    register = Enrollment(plan, kind, clock)
+    arm_robot_type = robot_type(options.type, options.joints, options.rate_hz)
+    enrollment = Enrollment(options, arm_robot_type, clock)
     with ThreadPoolExecutor(_THREADS, "load-test") as pool:
-        keys = Keys(plan.home).first(plan.count)
-        pairings = register.all(keys, pool, _tell)
-        figures = Metrics(plan.count)
+        keys = Keys(options.home).first(options.count)
+        pairings = enrollment.enroll_all(keys, pool, _print)
+        metrics = Metrics(options.count)
 
-        async def together() -> None:
-            shape, dialect = Shape(kind), Dialect()
-            members = [
+        async def run_agents() -> None:
+            arm_type, version = ArmType(arm_robot_type), ProtocolVersion()
+            agents = [
                 LoadAgent(
-                    plan, register.api(key), pairing, shape, clock=clock, dialect=dialect, figures=figures, pool=pool
+                    options,
+                    enrollment.client(key),
+                    pairing,
+                    arm_type,
+                    clock=clock,
+                    version=version,
+                    metrics=metrics,
+                    pool=pool,
                 )
                 for key, pairing in zip(keys, pairings, strict=True)
             ]
-            await _Crowd(plan, members, figures, before_bytes).live()
+            await _LoadTest(options, agents, metrics, baseline_bytes).run()
 
-        asyncio.run(together())
-    found = {"rate_hz": plan.rate_hz, "joints": plan.joints, **figures.summary(_memory_bytes() - before_bytes)}
-    _write(plan, found)
-    return 0 if figures.most_connected == plan.count else 1
+        asyncio.run(run_agents())
+    results = {
+        "rate_hz": options.rate_hz,
+        "joints": options.joints,
+        **metrics.summary(_memory_bytes() - baseline_bytes),
+    }
+    _write(options, results)
+    return 0 if metrics.most_connected == options.count else 1
 
 
-class _Crowd:
-    """All agents of one run."""
+class _LoadTest:
+    """Runs all agents in one event loop."""
 
-    def __init__(self, plan: LoadOptions, members: Sequence[LoadAgent], figures: Metrics, before_bytes: int) -> None:
-        self._plan = plan
-        self._members = members
-        self._figures = figures
-        self._before_bytes = before_bytes
+    def __init__(
+        self, options: LoadOptions, agents: Sequence[LoadAgent], metrics: Metrics, baseline_bytes: int
+    ) -> None:
+        self._options = options
+        self._agents = agents
+        self._metrics = metrics
+        self._baseline_bytes = baseline_bytes
         self._ending = asyncio.Event()
 
-    async def live(self) -> None:
+    async def run(self) -> None:
         """Connect, publish telemetry, and stop after the duration."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, self._ending.set)
-        gap_s = self._plan.spread_s / len(self._members)
-        lives = [asyncio.ensure_future(member.run(i * gap_s)) for i, member in enumerate(self._members)]
-        rounds = [asyncio.ensure_future(each) for each in (self._beat(), self._look(), self._lag(), self._report())]
+        gap_s = self._options.spread_s / len(self._agents)
+        runs = [asyncio.ensure_future(agent.run(i * gap_s)) for i, agent in enumerate(self._agents)]
+        periodic = [
+            asyncio.ensure_future(task)
+            for task in (self._publish_telemetry(), self._poll(), self._measure_lag(), self._report())
+        ]
         try:
-            await self._until_the_end()
-            for each in rounds:
-                if each.done():
-                    each.result()
+            await self._wait_for_end()
+            for task in periodic:
+                if task.done():
+                    task.result()
         finally:
-            for each in rounds:
-                each.cancel()
-            for member in self._members:
-                member.stop()
-            await asyncio.wait(lives, timeout=_END_WITHIN_S)
-            for each in lives:
-                each.cancel()
-            await asyncio.gather(*lives, *rounds, return_exceptions=True)
+            for task in periodic:
+                task.cancel()
+            for agent in self._agents:
+                agent.stop()
+            await asyncio.wait(runs, timeout=_STOP_TIMEOUT_S)
+            for task in runs:
+                task.cancel()
+            await asyncio.gather(*runs, *periodic, return_exceptions=True)
 
-    async def _until_the_end(self) -> None:
+    async def _wait_for_end(self) -> None:
         try:
-            async with asyncio.timeout(self._plan.spread_s):
+            async with asyncio.timeout(self._options.spread_s):
                 await self._ending.wait()
         except TimeoutError:
-            self._figures.steady()
+            self._metrics.start_steady()
         try:
-            async with asyncio.timeout(self._plan.seconds - self._plan.spread_s):
+            async with asyncio.timeout(self._options.seconds - self._options.spread_s):
                 await self._ending.wait()
         except TimeoutError:
             return
 
-    async def _beat(self) -> None:
+    async def _publish_telemetry(self) -> None:
         """Publish the telemetry of all robots, evenly distributed over each period.
 
-        Who comes more than a period late has missed it; what was missed is not made up for.
+        Messages that are more than a period late are counted as missed and not sent.
         """
-        count = len(self._members)
-        step_s = 1 / (self._plan.rate_hz * count)
-        began_s, number, at_once = time.monotonic(), 0, 0
+        count = len(self._agents)
+        step_s = 1 / (self._options.rate_hz * count)
+        start_s, number, batch = time.monotonic(), 0, 0
         while True:
-            wait_s = began_s + number * step_s - time.monotonic()
+            wait_s = start_s + number * step_s - time.monotonic()
             if wait_s > 0:
                 await asyncio.sleep(wait_s)
-                at_once = 0
+                batch = 0
                 continue
             behind = int(-wait_s / step_s)
             if behind > count:
-                self._figures.counts.missed += sum(
-                    self._members[(number + i) % count].up for i in range(behind % count)
-                )
-                self._figures.counts.missed += behind // count * sum(member.up for member in self._members)
+                self._metrics.counts.missed += sum(self._agents[(number + i) % count].up for i in range(behind % count))
+                self._metrics.counts.missed += behind // count * sum(agent.up for agent in self._agents)
                 number += behind
-            self._members[number % count].tick(time.monotonic())
-            number, at_once = number + 1, at_once + 1
-            if at_once >= _AT_ONCE:
-                at_once = 0
+            self._agents[number % count].tick(time.monotonic())
+            number, batch = number + 1, batch + 1
+            if batch >= _BATCH:
+                batch = 0
                 await asyncio.sleep(0)
 
-    async def _look(self) -> None:
-        """Keep all connections alive."""
+    async def _poll(self) -> None:
+        """Poll all connections."""
         while True:
-            for first in range(0, len(self._members), _AT_ONCE):
-                for member in self._members[first : first + _AT_ONCE]:
-                    member.look()
-                await asyncio.sleep(_LOOK_EVERY_S * _AT_ONCE / max(len(self._members), _AT_ONCE))
+            for first in range(0, len(self._agents), _BATCH):
+                for agent in self._agents[first : first + _BATCH]:
+                    agent.poll()
+                await asyncio.sleep(_POLL_PERIOD_S * _BATCH / max(len(self._agents), _BATCH))
 
-    async def _lag(self) -> None:
+    async def _measure_lag(self) -> None:
         """Measure the delay of the event loop."""
         while True:
-            began_s = time.monotonic()
-            await asyncio.sleep(_LAG_EVERY_S)
-            self._figures.lag_ms.append((time.monotonic() - began_s - _LAG_EVERY_S) * 1000)
+            start_s = time.monotonic()
+            await asyncio.sleep(_LAG_PERIOD_S)
+            self._metrics.lag_ms.append((time.monotonic() - start_s - _LAG_PERIOD_S) * 1000)
 
     async def _report(self) -> None:
         while True:
-            await asyncio.sleep(self._plan.every_s)
-            _tell(self._figures.line(_memory_bytes() - self._before_bytes))
+            await asyncio.sleep(self._options.every_s)
+            _print(self._metrics.line(_memory_bytes() - self._baseline_bytes))
 
 
-def _tell(text: str) -> None:
+def _print(text: str) -> None:
     print(text, flush=True)  # noqa: T201 (a terminal program prints)
 
 
-def _write(plan: LoadOptions, found: dict[str, Any]) -> None:
-    text = msgspec.json.encode(found).decode()
-    _tell(text)
-    if plan.json is not None:
-        plan.json.write_text(text + "\n", encoding="utf-8")
+def _write(options: LoadOptions, results: dict[str, Any]) -> None:
+    text = msgspec.json.encode(results).decode()
+    _print(text)
+    if options.json is not None:
+        options.json.write_text(text + "\n", encoding="utf-8")
 
 
-def _allow_files(wanted: int) -> None:
+def _allow_files(required: int) -> None:
     """Raise the limit of open files for the required sockets.
 
     Raises:
         LoadTestError: The system limit is too low.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft >= wanted:
+    if soft >= required:
         return
-    if hard != resource.RLIM_INFINITY and hard < wanted:
-        raise LoadTestError(f"this system lets a process open {hard} files, {wanted} are needed: see `ulimit -Hn`")
-    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    if hard != resource.RLIM_INFINITY and hard < required:
+        raise LoadTestError(f"this system allows {hard} open files per process, not {required}: see `ulimit -Hn`")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (required, hard))
 
 
 def _memory_bytes() -> int:

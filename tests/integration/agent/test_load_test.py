@@ -70,8 +70,8 @@ def test_twenty_agents_are_claimed_operated_and_reused(kind: BrokerKind, tmp_pat
         summary = json.loads(figures.read_text())
         assert json.loads(output.splitlines()[-1]) == summary
         assert [summary[name] for name in ("agents", "most_connected", "unconfirmed")] == [COUNT, COUNT, 0]
-        assert summary["troubles"] == {}
-        assert summary["counts"]["heard"] >= 3
+        assert summary["errors"] == {}
+        assert summary["counts"]["received"] >= 3
         assert summary["counts"]["lost_links"] == 0
         wait_until(lambda: not any(each["online"] for each in devices(processes)), "all to be offline")
 

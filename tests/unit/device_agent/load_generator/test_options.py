@@ -70,21 +70,21 @@ def test_percentiles_are_observed_values() -> None:
 
 def test_summary_counts_since_the_steady_phase_and_lines_since_the_previous_one() -> None:
     metrics = Metrics(2)
-    metrics.up()
+    metrics.record_connected()
     metrics.counts.out = 1000
     metrics.lag_ms.append(500.0)
-    metrics.steady()
+    metrics.start_steady()
     metrics.counts.out, metrics.counts.out_bytes, metrics.counts.missed = 1090, 9000, 10
-    metrics.counts.asked, metrics.counts.confirmed = 3, 2
+    metrics.counts.out_qos1, metrics.counts.confirmed = 3, 2
     metrics.lag_ms += [1.0, 2.0]
     line = metrics.line(4000)
-    assert all(text in line for text in ("1 of 2 connected", "lag p99 2.0 ms", "missed 10", "2 kB an agent"))
-    metrics.trouble("no way there")
-    assert "trouble: no way there (1 times)" in metrics.line(4000)
+    assert all(text in line for text in ("1 of 2 connected", "lag p99 2.0 ms", "missed 10", "2 kB per agent"))
+    metrics.record_error("unreachable")
+    assert "most frequent error: unreachable (1 times)" in metrics.line(4000)
     summary = metrics.summary(4000)
     assert summary["out_bytes_per_message"] == 100.0
     assert summary["missed_share"] == pytest.approx(0.1)
     assert summary["unconfirmed"] == 1
     assert summary["lag_ms"] == {"p50": 1.0, "p99": 2.0, "p100": 2.0, "count": 2}
     assert summary["confirm_ms"]["p99"] is None
-    assert summary["troubles"] == {"no way there": 1}
+    assert summary["errors"] == {"unreachable": 1}

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from device_agent.load_generator.kinematic_arm import DEVICE, SPEED_RAD_S, Arm, Shape, robot_type
-from device_agent.load_generator.robot import MAX_LOOP_AGE_S, WATCHDOG_S, SwarmRobot
+from device_agent.load_generator.kinematic_arm import DEVICE, SPEED_RAD_S, Arm, ArmType, robot_type
+from device_agent.load_generator.robot import MAX_LOOP_AGE_S, WATCHDOG_S, SimulatedRobot
 from device_agent.ports.clock import wall_ms
 from device_agent.protocol import (
     Ack,
@@ -44,7 +44,7 @@ MOVE = MoveJoints(position_rad=FAR, speed=1.0)
 GRANT = GrantLease(holder="ann", lease_ms=1000)
 
 
-class Bench:
+class RobotFixture:
     """A robot, the cloud's key, a virtual clock, and all messages that the robot has sent."""
 
     def __init__(self) -> None:
@@ -53,21 +53,21 @@ class Bench:
         self.now_s = 100.0
         self.cloud_ms: float | None = float(wall_ms())
         self._ids = itertools.count()
-        self.robot = SwarmRobot(
+        self.robot = SimulatedRobot(
             (SPACE, AGENT),
-            Shape(robot_type("load-test-arm", 2, 5.0)),
-            pins=pinned_keys_of(self.key),
+            ArmType(robot_type("load-test-arm", 2, 5.0)),
+            keys=pinned_keys_of(self.key),
             cloud_ms=lambda: self.cloud_ms,
-            say=self.send,
+            publish=self.publish,
             now_s=self.now_s,
         )
 
-    def send(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> None:
+    def publish(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> None:
         self.sent.append((topic, payload, qos, retain))
 
     def messages(self, kind: str, message: type[Any], name: str = "") -> list[Any]:
-        wanted = topics.device(SPACE, AGENT, DEVICE, kind, name)
-        return [codec.decode(payload, message) for topic, payload, _, _ in self.sent if topic == wanted]
+        expected = topics.device(SPACE, AGENT, DEVICE, kind, name)
+        return [codec.decode(payload, message) for topic, payload, _, _ in self.sent if topic == expected]
 
     def receive(self, kind: str, payload: bytes, name: str = "") -> None:
         self.robot.receive(topics.device(SPACE, AGENT, DEVICE, kind, name), payload, self.now_s)
@@ -81,18 +81,25 @@ class Bench:
         self.receive(topics.CMD, signing.sign(codec.encode(command), key or self.key))
         return command.id
 
-    def take(self, epoch: int = 1) -> None:
-        assert self.end(self.command(GrantLease(holder="ann", lease_ms=60_000), epoch=epoch)).status is AckStatus.DONE
+    def acquire(self, epoch: int = 1) -> None:
+        assert (
+            self.terminal_ack(self.command(GrantLease(holder="ann", lease_ms=60_000), epoch=epoch)).status
+            is AckStatus.DONE
+        )
 
-    def steer(self, position_rad: float, *, epoch: int = 1, sequence: int = 1, age_ms: int = 0) -> None:
-        self.follow(JointTarget(position_rad={"joint_1": position_rad}), epoch=epoch, sequence=sequence, age_ms=age_ms)
+    def send_joints(self, position_rad: float, *, epoch: int = 1, sequence: int = 1, age_ms: int = 0) -> None:
+        self.send_setpoint(
+            JointTarget(position_rad={"joint_1": position_rad}), epoch=epoch, sequence=sequence, age_ms=age_ms
+        )
 
-    def follow(self, target: Any, *, epoch: int = 1, sequence: int = 1, age_ms: int = 0, topic: str = "") -> None:
+    def send_setpoint(
+        self, target: Any, *, epoch: int = 1, sequence: int = 1, age_ms: int = 0, topic: str = ""
+    ) -> None:
         tick_ms = round(self.now_s * 1000) - age_ms
         setpoint = Setpoint(epoch=epoch, sequence=sequence, echo_tick_ms=tick_ms, sent_ms=7.0, target=target)
         self.receive(topics.CTL, codec.encode(setpoint), topic or str(epoch))
 
-    def after(self, seconds: float) -> JointTelemetry:
+    def advance(self, seconds: float) -> JointTelemetry:
         self.now_s += seconds
         self.robot.tick(self.now_s)
         newest: JointTelemetry = self.messages(topics.TELE, JointTelemetry, topics.JOINTS)[-1]
@@ -103,69 +110,69 @@ class Bench:
         return newest
 
     def acks(self, command: str) -> list[Ack]:
-        found = [ack for ack in self.messages(topics.ACK, Ack) if ack.id == command]
-        assert [ack.sequence for ack in found] == sorted({ack.sequence for ack in found})
-        return found
+        acks = [ack for ack in self.messages(topics.ACK, Ack) if ack.id == command]
+        assert [ack.sequence for ack in acks] == sorted({ack.sequence for ack in acks})
+        return acks
 
-    def end(self, command: str) -> Ack:
+    def terminal_ack(self, command: str) -> Ack:
         last = self.acks(command)[-1]
         assert last.status.terminal
         return last
 
-    def code(self, command: str) -> str:
-        reason = self.end(command).reason
+    def reason_code(self, command: str) -> str:
+        reason = self.terminal_ack(command).reason
         assert reason is not None
         return reason.code
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench()
+def fixture() -> RobotFixture:
+    return RobotFixture()
 
 
-def test_description_and_state_are_retained(bench: Bench) -> None:
-    bench.robot.introduce(bench.now_s)
-    (description,) = bench.messages(topics.DESC, Description)
+def test_description_and_state_are_retained(fixture: RobotFixture) -> None:
+    fixture.robot.on_connected(fixture.now_s)
+    (description,) = fixture.messages(topics.DESC, Description)
     assert [joint.name for joint in description.joints] == ["joint_1", "joint_2"]
     assert (description.simulated, description.actions, description.streams[0].rate_hz) == (True, ("move_joints",), 5.0)
-    assert (bench.state().mode, bench.state().epoch) == (Mode.IDLE, 0)
-    assert {(qos, retain) for _, _, qos, retain in bench.sent} == {(1, True)}
+    assert (fixture.state().mode, fixture.state().epoch) == (Mode.IDLE, 0)
+    assert {(qos, retain) for _, _, qos, retain in fixture.sent} == {(1, True)}
 
 
-def test_state_is_sent_on_change_at_most_once_a_second_and_every_thirty_seconds(bench: Bench) -> None:
+def test_state_is_sent_on_change_at_most_once_a_second_and_every_thirty_seconds(fixture: RobotFixture) -> None:
     def count_after(seconds: float) -> int:
-        bench.after(seconds)
-        return len(bench.messages(topics.STATE, State))
+        fixture.advance(seconds)
+        return len(fixture.messages(topics.STATE, State))
 
-    bench.robot.introduce(bench.now_s)
+    fixture.robot.on_connected(fixture.now_s)
     assert count_after(0.5) == 1
-    bench.take()
+    fixture.acquire()
     assert [count_after(seconds) for seconds in (0.1, 0.5, 20, 11)] == [1, 2, 2, 3]
-    assert bench.state().lease.holder == "ann"  # type: ignore[union-attr]
+    assert fixture.state().lease.holder == "ann"  # type: ignore[union-attr]
 
 
-def test_a_move_is_accepted_started_and_done_at_its_target(bench: Bench) -> None:
-    bench.take()
-    move = bench.command(MoveJoints(position_rad={"joint_1": 1.5}, speed=1.0), epoch=1)
-    assert [ack.status for ack in bench.acks(move)] == [AckStatus.RECEIVED, AckStatus.ACCEPTED, AckStatus.STARTED]
-    telemetry = bench.after(0.5)
+def test_a_move_is_accepted_started_and_done_at_its_target(fixture: RobotFixture) -> None:
+    fixture.acquire()
+    move = fixture.command(MoveJoints(position_rad={"joint_1": 1.5}, speed=1.0), epoch=1)
+    assert [ack.status for ack in fixture.acks(move)] == [AckStatus.RECEIVED, AckStatus.ACCEPTED, AckStatus.STARTED]
+    telemetry = fixture.advance(0.5)
     assert telemetry.mode is Mode.ACTION
     assert telemetry.position_rad == pytest.approx((0.5 * SPEED_RAD_S, 0.0))
-    bench.after(1.0)
-    bench.after(0.1)
-    end = bench.end(move)
-    assert (end.status, end.result) == (AckStatus.DONE, {"position_rad": {"joint_1": 1.5, "joint_2": 0.0}})
-    assert bench.after(1.0).mode is Mode.IDLE
+    fixture.advance(1.0)
+    fixture.advance(0.1)
+    ack = fixture.terminal_ack(move)
+    assert (ack.status, ack.result) == (AckStatus.DONE, {"position_rad": {"joint_1": 1.5, "joint_2": 0.0}})
+    assert fixture.advance(1.0).mode is Mode.IDLE
 
 
-def test_a_repeated_command_is_acknowledged_again_but_not_executed(bench: Bench) -> None:
-    bench.take()
-    move = bench.command(MOVE, epoch=1, id="once")
-    bench.after(5)
-    end, acks = bench.end(move), bench.messages(topics.ACK, Ack)
-    bench.command(MOVE, epoch=1, id="once")
-    assert bench.messages(topics.ACK, Ack) == [*acks, end]
-    assert bench.after(1.0).mode is Mode.IDLE
+def test_a_repeated_command_is_acknowledged_again_but_not_executed(fixture: RobotFixture) -> None:
+    fixture.acquire()
+    move = fixture.command(MOVE, epoch=1, id="repeated")
+    fixture.advance(5)
+    last, acks = fixture.terminal_ack(move), fixture.messages(topics.ACK, Ack)
+    fixture.command(MOVE, epoch=1, id="repeated")
+    assert fixture.messages(topics.ACK, Ack) == [*acks, last]
+    assert fixture.advance(1.0).mode is Mode.IDLE
 
 
 @pytest.mark.parametrize(
@@ -179,121 +186,121 @@ def test_a_repeated_command_is_acknowledged_again_but_not_executed(bench: Bench)
         (RequestControl(request="r", requester="bob", answer_within_ms=1000), 5, "no_lease"),
     ],
 )
-def test_invalid_commands_are_refused(bench: Bench, request_: Any, epoch: int, code: str) -> None:
-    bench.take()
-    assert bench.code(bench.command(request_, epoch=epoch)) == code
-    assert bench.after(1.0).position_rad == (0.0, 0.0)
+def test_invalid_commands_are_refused(fixture: RobotFixture, request_: Any, epoch: int, code: str) -> None:
+    fixture.acquire()
+    assert fixture.reason_code(fixture.command(request_, epoch=epoch)) == code
+    assert fixture.advance(1.0).position_rad == (0.0, 0.0)
 
 
-def test_unauthenticated_and_misdirected_messages_are_ignored(bench: Bench) -> None:
-    bench.command(StopDevice(), key=signing.generate())
-    bench.command(StopDevice(), device="leg")
-    bench.receive(topics.CMD, b"{}")
-    bench.robot.receive("ts/v1/space/other/arm/stop", codec.encode(Stop(id="s", caller="x")), bench.now_s)
-    bench.robot.receive("nonsense", b"", bench.now_s)
-    assert bench.messages(topics.ACK, Ack) == []
-    assert bench.after(0.1).mode is Mode.IDLE
-    assert bench.robot.refused == 5
+def test_unauthenticated_and_misdirected_messages_are_ignored(fixture: RobotFixture) -> None:
+    fixture.command(StopDevice(), key=signing.generate())
+    fixture.command(StopDevice(), device="leg")
+    fixture.receive(topics.CMD, b"{}")
+    fixture.robot.receive("ts/v1/space/other/arm/stop", codec.encode(Stop(id="s", caller="x")), fixture.now_s)
+    fixture.robot.receive("nonsense", b"", fixture.now_s)
+    assert fixture.messages(topics.ACK, Ack) == []
+    assert fixture.advance(0.1).mode is Mode.IDLE
+    assert fixture.robot.refused == 5
 
 
-def test_expired_and_early_commands_and_those_without_a_clock_are_refused_except_stop(bench: Bench) -> None:
-    late = bench.command(GRANT, epoch=1, issued_at_ms=wall_ms() - 10_000)
-    assert bench.end(late).status is AckStatus.EXPIRED
-    assert bench.code(bench.command(GRANT, epoch=1, issued_at_ms=wall_ms() + 60_000)) == "from_the_future"
-    bench.cloud_ms = None
-    assert bench.code(bench.command(ReleaseLease(), epoch=1)) == "no_clock"
-    assert bench.end(bench.command(StopDevice(), issued_at_ms=1)).status is AckStatus.DONE
-    assert bench.after(0.1).mode is Mode.STOPPED
+def test_expired_and_early_commands_and_those_without_a_clock_are_refused_except_stop(fixture: RobotFixture) -> None:
+    late = fixture.command(GRANT, epoch=1, issued_at_ms=wall_ms() - 10_000)
+    assert fixture.terminal_ack(late).status is AckStatus.EXPIRED
+    assert fixture.reason_code(fixture.command(GRANT, epoch=1, issued_at_ms=wall_ms() + 60_000)) == "from_the_future"
+    fixture.cloud_ms = None
+    assert fixture.reason_code(fixture.command(ReleaseLease(), epoch=1)) == "no_clock"
+    assert fixture.terminal_ack(fixture.command(StopDevice(), issued_at_ms=1)).status is AckStatus.DONE
+    assert fixture.advance(0.1).mode is Mode.STOPPED
 
 
-def test_stop_ends_the_action_holds_and_latches_until_it_is_reset(bench: Bench) -> None:
-    bench.take()
-    move = bench.command(MOVE, epoch=1)
-    bench.after(0.5)
-    bench.receive(topics.STOP, codec.encode(Stop(id="s", caller="bob")))
-    assert bench.code(move) == "stopped"
-    assert bench.after(0.1).position_rad == bench.after(5.0).position_rad
-    assert bench.code(bench.command(MOVE, epoch=2)) == "stopped"
-    assert bench.end(bench.command(ResetStop(), epoch=3)).status is AckStatus.DONE
-    bench.take(4)
-    assert bench.acks(bench.command(MOVE, epoch=4))[-1].status is AckStatus.STARTED
-    assert EventKind.STOP_LATCHED in {event.kind for event in bench.messages(topics.EVENT, Event)}
+def test_stop_ends_the_action_holds_and_latches_until_it_is_reset(fixture: RobotFixture) -> None:
+    fixture.acquire()
+    move = fixture.command(MOVE, epoch=1)
+    fixture.advance(0.5)
+    fixture.receive(topics.STOP, codec.encode(Stop(id="s", caller="bob")))
+    assert fixture.reason_code(move) == "stopped"
+    assert fixture.advance(0.1).position_rad == fixture.advance(5.0).position_rad
+    assert fixture.reason_code(fixture.command(MOVE, epoch=2)) == "stopped"
+    assert fixture.terminal_ack(fixture.command(ResetStop(), epoch=3)).status is AckStatus.DONE
+    fixture.acquire(4)
+    assert fixture.acks(fixture.command(MOVE, epoch=4))[-1].status is AckStatus.STARTED
+    assert EventKind.STOP_LATCHED in {event.kind for event in fixture.messages(topics.EVENT, Event)}
 
 
-def test_one_action_runs_at_a_time_until_it_is_cancelled_or_a_newer_lease_ends_it(bench: Bench) -> None:
-    bench.take()
-    first = bench.command(MOVE, epoch=1)
-    assert bench.code(bench.command(MOVE, epoch=1)) == "busy"
-    bench.after(0.5)
-    bench.command(CancelAction(action=first), epoch=1)
-    assert bench.end(first).status is AckStatus.CANCELLED
-    assert bench.after(0.1).position_rad == bench.after(5).position_rad
-    second = bench.command(MOVE, epoch=1)
-    bench.take(2)
-    assert bench.code(second) == "lease_lost"
-    position_rad = bench.after(0.1).position_rad
-    bench.steer(-1.0, epoch=1)
-    assert bench.after(0.2).position_rad == position_rad, "the older lease is fenced"
+def test_one_action_runs_at_a_time_until_it_is_cancelled_or_a_newer_lease_ends_it(fixture: RobotFixture) -> None:
+    fixture.acquire()
+    first = fixture.command(MOVE, epoch=1)
+    assert fixture.reason_code(fixture.command(MOVE, epoch=1)) == "busy"
+    fixture.advance(0.5)
+    fixture.command(CancelAction(action=first), epoch=1)
+    assert fixture.terminal_ack(first).status is AckStatus.CANCELLED
+    assert fixture.advance(0.1).position_rad == fixture.advance(5).position_rad
+    second = fixture.command(MOVE, epoch=1)
+    fixture.acquire(2)
+    assert fixture.reason_code(second) == "lease_lost"
+    position_rad = fixture.advance(0.1).position_rad
+    fixture.send_joints(-1.0, epoch=1)
+    assert fixture.advance(0.2).position_rad == position_rad, "the older lease is fenced"
 
 
-def test_the_watchdog_ends_motion_after_the_last_setpoint(bench: Bench) -> None:
-    bench.take()
-    bench.steer(3.0)
-    telemetry = bench.after(0.2)
+def test_the_watchdog_ends_motion_after_the_last_setpoint(fixture: RobotFixture) -> None:
+    fixture.acquire()
+    fixture.send_joints(3.0)
+    telemetry = fixture.advance(0.2)
     assert (telemetry.mode, telemetry.setpoint_sequence, telemetry.setpoint_sent_ms) == (Mode.STREAMING, 1, 7.0)
     assert telemetry.position_rad[0] == pytest.approx(0.2 * SPEED_RAD_S)
-    assert bench.after(5.0).position_rad[0] == pytest.approx(0.3 * SPEED_RAD_S)
-    assert bench.after(0.1).mode is Mode.IDLE
+    assert fixture.advance(5.0).position_rad[0] == pytest.approx(0.3 * SPEED_RAD_S)
+    assert fixture.advance(0.1).mode is Mode.IDLE
 
 
-def test_old_repeated_unleased_and_unsupported_setpoints_are_refused(bench: Bench) -> None:
-    bench.steer(1.0)
-    bench.take()
-    bench.steer(1.0, age_ms=201)
-    bench.steer(1.0, age_ms=-1)
-    bench.follow(JogTarget())
-    assert bench.robot.refused == 4
-    bench.steer(1.0)
-    bench.follow(JogTarget(), topic="9")
-    bench.steer(-1.0)
-    assert bench.robot.refused == 6
-    assert bench.after(0.1).position_rad[0] > 0
-    bench.command(MOVE, epoch=1)
-    bench.steer(-1.0, sequence=2)
-    assert bench.robot.refused == 7
+def test_old_repeated_unleased_and_unsupported_setpoints_are_refused(fixture: RobotFixture) -> None:
+    fixture.send_joints(1.0)
+    fixture.acquire()
+    fixture.send_joints(1.0, age_ms=201)
+    fixture.send_joints(1.0, age_ms=-1)
+    fixture.send_setpoint(JogTarget())
+    assert fixture.robot.refused == 4
+    fixture.send_joints(1.0)
+    fixture.send_setpoint(JogTarget(), topic="9")
+    fixture.send_joints(-1.0)
+    assert fixture.robot.refused == 6
+    assert fixture.advance(0.1).position_rad[0] > 0
+    fixture.command(MOVE, epoch=1)
+    fixture.send_joints(-1.0, sequence=2)
+    assert fixture.robot.refused == 7
 
 
-def test_setpoints_are_limited_to_the_range_of_the_joint(bench: Bench) -> None:
-    bench.take()
+def test_setpoints_are_limited_to_the_range_of_the_joint(fixture: RobotFixture) -> None:
+    fixture.acquire()
     for sequence in range(1, 40):
-        bench.steer(99.0, sequence=sequence)
-        telemetry = bench.after(0.2)
+        fixture.send_joints(99.0, sequence=sequence)
+        telemetry = fixture.advance(0.2)
     assert telemetry.position_rad[0] == pytest.approx(3.14159, abs=1e-5)
 
 
-def test_loss_of_lease_or_link_ends_motion_but_a_resting_arm_keeps_its_lease(bench: Bench) -> None:
+def test_loss_of_lease_or_link_ends_motion_but_a_resting_arm_keeps_its_lease(fixture: RobotFixture) -> None:
     slow = MoveJoints(position_rad=FAR, speed=0.01)
-    bench.command(GRANT, epoch=1)
-    move = bench.command(slow, epoch=1)
-    bench.after(1.5)
-    assert bench.code(move) == "lease_lost"
-    bench.take(2)
-    move = bench.command(slow, epoch=2)
-    bench.after(0.1)
-    bench.robot.lost()
-    assert bench.code(move) == "link_lost"
-    bench.take(3)
-    bench.robot.lost()
-    assert bench.after(0.1).epoch == 3
+    fixture.command(GRANT, epoch=1)
+    move = fixture.command(slow, epoch=1)
+    fixture.advance(1.5)
+    assert fixture.reason_code(move) == "lease_lost"
+    fixture.acquire(2)
+    move = fixture.command(slow, epoch=2)
+    fixture.advance(0.1)
+    fixture.robot.on_disconnected()
+    assert fixture.reason_code(move) == "link_lost"
+    fixture.acquire(3)
+    fixture.robot.on_disconnected()
+    assert fixture.advance(0.1).epoch == 3
 
 
-def test_control_requests_are_shown_until_withdrawn(bench: Bench) -> None:
+def test_control_requests_are_shown_until_withdrawn(fixture: RobotFixture) -> None:
     def lease_after(request: Any, *, epoch: int = 1) -> Any:
-        bench.command(request, epoch=epoch)
-        bench.after(2)
-        return bench.state().lease
+        fixture.command(request, epoch=epoch)
+        fixture.advance(2)
+        return fixture.state().lease
 
-    bench.take()
+    fixture.acquire()
     request = RequestControl(request="r1", requester="bob", answer_within_ms=60_000)
     assert lease_after(request).request.requester == "bob"
     assert lease_after(WithdrawRequest(request="r1"), epoch=0).request is None
@@ -301,8 +308,8 @@ def test_control_requests_are_shown_until_withdrawn(bench: Bench) -> None:
 
 
 def test_joints_move_at_the_given_speed_and_stop_at_the_target() -> None:
-    arm = Arm(Shape(robot_type("load-test-arm", 3, 5.0)), 0.0)
-    arm.go([1.5, -0.3, 0.0], speed=0.5)
+    arm = Arm(ArmType(robot_type("load-test-arm", 3, 5.0)), 0.0)
+    arm.move([1.5, -0.3, 0.0], speed=0.5)
     arm.advance(1.0)
     assert arm.position_rad == pytest.approx([0.5 * SPEED_RAD_S, -0.3, 0.0])
     assert arm.velocity_rad_s == pytest.approx([0.5 * SPEED_RAD_S, -0.3, 0.0])
@@ -314,8 +321,8 @@ def test_joints_move_at_the_given_speed_and_stop_at_the_target() -> None:
 
 
 def test_motion_ends_at_the_given_time_independent_of_the_update_interval() -> None:
-    arm = Arm(Shape(robot_type("load-test-arm", 3, 5.0)), 0.0)
-    arm.go([3.0, 0.0, 0.0], speed=1.0, until_s=0.3)
+    arm = Arm(ArmType(robot_type("load-test-arm", 3, 5.0)), 0.0)
+    arm.move([3.0, 0.0, 0.0], speed=1.0, until_s=0.3)
     arm.advance(0.0)
     assert (arm.position_rad, arm.velocity_rad_s) == ([0.0] * 3, [0.0] * 3), "no time has passed"
     arm.advance(10.0)
