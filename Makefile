@@ -10,13 +10,13 @@ NPM = $(NODE) --prefix web
 
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes
 PYTEST := $(BIN)/python -m pytest
-# Leaves out suites at full size and takes a sample of expensive families, which differs from commit to commit.
+# Excludes suites at full size and samples expensive families; the sample depends on the commit.
 SEED ?= $(shell git rev-parse --short HEAD 2>/dev/null || echo 0)
 SAMPLE = $(PYTEST) -q -m "not long" --sample $(SEED)
 SECONDS_EACH ?= 60
 # Most tests wait for child processes, so three workers share two cores. The tests of one file stay in one worker.
 PARALLEL = -n 3 --dist loadfile --no-loadscope-reorder
-# Two browsers and two products use two cores fully.
+# Two workers: two browsers and two products use two cores fully.
 BROWSERS = -n 2 --dist loadscope tests/e2e
 # These tests measure a moving robot or need a response within a deadline, so they run one at a time.
 SERIAL = tests/api tests/faults tests/security/tenants/test_secrets.py

@@ -1,1 +1,1 @@
-"""Brokers, servers and packaging around the code; each is a program of its own."""
+"""Brokers, servers and packaging around the code; each is a separate program."""

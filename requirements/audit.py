@@ -1,6 +1,6 @@
-"""Asks a public database of advisories (https://osv.dev) about every pinned package: ``make audit-packages``.
+"""Queries https://osv.dev for advisories against the pinned packages: ``make audit-packages``.
 
-Exit code 0: it knows of nothing against any of them. 1: it does. 2: it could not be asked, so nothing is known.
+Exit code 0: no advisories. 1: advisories were found. 2: the database could not be queried.
 """
 
 import json
@@ -17,39 +17,39 @@ _FOUND, _UNKNOWN = 1, 2
 
 
 def pinned(root: Path = ROOT) -> list[tuple[str, str]]:
-    """Every package of every exported file, with its version, each once."""
+    """Names and versions of all packages in the exported files, without duplicates."""
     files = [root / "requirements.txt", *sorted((root / "requirements").glob("*.txt"))]
     lines = [line for file in files for line in file.read_text(encoding="utf-8").splitlines()]
     return sorted({(match[1].lower(), match[2]) for line in lines if (match := _PINNED.match(line))})
 
 
 def advisories(packages: list[tuple[str, str]], database: str) -> dict[tuple[str, str], list[str]]:
-    """What the database knows against them.
+    """Ids of the advisories by package, for packages with advisories.
 
     Raises:
-        OSError: It cannot be reached, or answers with an error.
-        ValueError: It answers something else.
+        OSError: The database cannot be reached, or responds with an error.
+        ValueError: The response is invalid.
     """
     queries = [{"package": {"ecosystem": "PyPI", "name": name}, "version": version} for name, version in packages]
-    request = urllib.request.Request(  # noqa: S310 (the address is written above, or given by a test)
+    request = urllib.request.Request(  # noqa: S310 (a constant address, or that of a test)
         database, json.dumps({"queries": queries}).encode(), {"Content-Type": "application/json"}
     )
-    with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:  # noqa: S310
-        results = json.load(answer)["results"]
+    with urllib.request.urlopen(request, timeout=TIMEOUT_S) as response:  # noqa: S310
+        results = json.load(response)["results"]
     if len(results) != len(packages):
-        raise ValueError("it answers about another number of packages than it was asked about")
-    found = zip(packages, results, strict=True)
-    return {package: [each["id"] for each in result["vulns"]] for package, result in found if result.get("vulns")}
+        raise ValueError("the response has another number of results than the query")
+    pairs = zip(packages, results, strict=True)
+    return {package: [item["id"] for item in result["vulns"]] for package, result in pairs if result.get("vulns")}
 
 
 def main(database: str = DATABASE) -> int:
-    """Ask, and tell."""
+    """Print the advisories; returns the exit code."""
     packages = pinned()
     try:
         found = advisories(packages, database)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        sys.stderr.write(f"NOT CHECKED: the database of advisories at {database} could not be asked ({error}).\n")
-        sys.stderr.write(f"Nothing is known about the {len(packages)} pinned packages; try again with a network.\n")
+        sys.stderr.write(f"NOT CHECKED: the advisory database at {database} could not be queried ({error}).\n")
+        sys.stderr.write(f"The {len(packages)} pinned packages were not checked; retry with a network connection.\n")
         return _UNKNOWN
     for (name, version), ids in found.items():
         sys.stderr.write(f"{name} {version}: {', '.join(ids)}\n")

@@ -65,7 +65,7 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--certificate", type=Path, help="use TLS only, with this certificate and its chain (PEM)")
     parser.add_argument("--certificate-key", type=Path, help="its key (PEM)")
-    parser.add_argument("--revocations", type=Path, help="file for revoked tokens (default: beside the keys)")
+    parser.add_argument("--revocations", type=Path, help="file for revoked tokens (default: next to the keys)")
     arguments = parser.parse_args()
     if bool(arguments.certificate) != bool(arguments.certificate_key):
         parser.error("--certificate and --certificate-key must be given together")

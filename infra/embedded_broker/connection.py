@@ -41,7 +41,7 @@ class Admission(NamedTuple):
 
 
 class Refused(Exception):  # noqa: N818 (a response, not an error)
-    """A CONNECT that is answered with ``code`` before the connection is closed."""
+    """A CONNECT that is rejected with ``code`` before the connection is closed."""
 
     def __init__(self, code: int, reason: str) -> None:
         super().__init__(reason)

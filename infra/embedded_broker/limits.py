@@ -10,7 +10,7 @@ class Limits:
     """Limits of the embedded broker.
 
     Attributes:
-        connections: Open sockets on both listeners; further ones are closed at once.
+        connections: Open sockets on both listeners; further ones are closed immediately.
         connect_timeout_s: Time for a complete CONNECT [s].
         connect_bytes: Largest CONNECT: token, user name and will [bytes].
         payload_bytes: Largest payload [bytes], as in AWS IoT Core.

@@ -26,7 +26,7 @@ class Transport(Protocol):
 
     @property
     def congested(self) -> bool:
-        """Whether the unsent data exceeds the limit of a client that keeps up."""
+        """Whether the unsent data exceeds the limit for QoS 0 messages."""
 
     def write(self, data: bytes) -> None:
         """Send data; never blocks; ignored after closing."""

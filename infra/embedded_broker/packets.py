@@ -34,11 +34,11 @@ _SUBSCRIBE_FLAGS = 2
 _EXACT_FLAGS = {SUBSCRIBE: _SUBSCRIBE_FLAGS, UNSUBSCRIBE: _SUBSCRIBE_FLAGS}
 
 
-class MalformedPacket(Exception):  # noqa: N818 (the specification's word)
+class MalformedPacket(Exception):  # noqa: N818 (the specification's term)
     """Invalid or unsupported bytes; the connection must be closed."""
 
 
-class UnacceptableProtocol(Exception):  # noqa: N818 (the specification's word)
+class UnacceptableProtocol(Exception):  # noqa: N818 (the specification's term)
     """A CONNECT of an MQTT version other than 3.1.1."""
 
 
@@ -239,22 +239,22 @@ def read_puback(frame: Frame) -> int:
 
 
 def connack(code: int) -> bytes:
-    """The answer to a CONNECT. There never is a session from before: all are clean."""
+    """The response to a CONNECT. No session is ever present: all sessions are clean."""
     return bytes(ConnackPacket.build(0, code).to_bytes())
 
 
 def suback(packet_id: int, codes: list[int]) -> bytes:
-    """The answer to a SUBSCRIBE: a QoS or ``REFUSED`` for each filter."""
+    """The response to a SUBSCRIBE: a QoS or ``REFUSED`` for each filter."""
     return bytes(SubackPacket.build(packet_id, codes).to_bytes())
 
 
 def unsuback(packet_id: int) -> bytes:
-    """The answer to an UNSUBSCRIBE."""
+    """The response to an UNSUBSCRIBE."""
     return bytes(UnsubackPacket.build(packet_id).to_bytes())
 
 
 def puback(packet_id: int) -> bytes:
-    """The answer to a PUBLISH at QoS 1."""
+    """The response to a PUBLISH at QoS 1."""
     return b"\x40\x02" + packet_id.to_bytes(2)
 
 

@@ -17,7 +17,7 @@ _TIDY_AT = 1_000
 
 
 class RevocationsError(Exception):
-    """The revocation file cannot be used; the message says what to do."""
+    """The revocation file cannot be used; the message names the remedy."""
 
 
 class _Entry(msgspec.Struct, frozen=True):

@@ -119,8 +119,8 @@ def _common(device: str, description: Description, part: str, name: str) -> dict
 
 
 def _readable(quantity: str, part: str) -> str:
-    words = quantity.replace("_", " ")
-    return f"{words} {part}" if part else words
+    text = quantity.replace("_", " ")
+    return f"{text} {part}" if part else text
 
 
 def _announce(component: str, device: str, part: str, content: dict[str, Any]) -> Announcement:

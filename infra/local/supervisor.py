@@ -15,7 +15,7 @@ _MAX_RESTARTS = 5
 
 
 class StartError(Exception):
-    """A program could not be started or kept running; the message is its last output line."""
+    """A program could not be started, or exits repeatedly; the message is its last output line."""
 
 
 class SupervisedProcess:

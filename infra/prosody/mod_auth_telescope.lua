@@ -91,7 +91,7 @@ local function end_sessions(user, reason)
 	end
 end
 
-local function forget(user)
+local function revoke(user)
 	end_sessions(user, "the cloud ended this session");
 	local former = {};
 	for contact in pairs(contacts[user] or {}) do former[#former + 1] = contact; end
@@ -190,7 +190,7 @@ module:hook("message/host", function (event)
 	if event.origin.telescope ~= CLOUD then return; end
 	local order = event.stanza:get_child("forget", NAMESPACE);
 	if order and order.attr.user and order.attr.user ~= CLOUD then
-		forget(order.attr.user);
+		revoke(order.attr.user);
 		return true;
 	end
 end, 1000);

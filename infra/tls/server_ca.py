@@ -34,7 +34,7 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class TlsError(Exception):
-    """A certificate or key cannot be used; the message says which and what to do."""
+    """A certificate or key cannot be used; the message names it and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -124,8 +124,8 @@ def test_measurements_and_frames_are_forwarded_unchanged(bridge: RecordingBridge
 
 def test_robots_and_invalid_messages_are_ignored(bridge: RecordingBridge) -> None:
     published = list(bridge.published)
-    bridge.receive("thing", topics.TELE, measurements({"x": 1.0}), "joints")
-    bridge.receive("thing", topics.DESC, Description(device="thing", kind="arm", robot_type="ur5", label="Arm"))
+    bridge.receive("arm", topics.TELE, measurements({"x": 1.0}), "joints")
+    bridge.receive("arm", topics.DESC, Description(device="arm", kind="arm", robot_type="ur5", label="Arm"))
     bridge.receive("camera", topics.CAM, b"no picture", "colour")
     bridge.target.on_device_message("nonsense", b"")
     assert bridge.published == published
