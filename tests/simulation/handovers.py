@@ -2,8 +2,8 @@
 
 The robot is the real controller with the real lease gate. Cloud, operators and network are simulated: grants, renewals,
 releases and setpoints are lost, duplicated, delayed and reordered. Operators continue after they have lost control. Old
-grants are replayed. The robot restarts with the content of its journal. A witness that sees every received message, but
-does not know the gate's rules, checks the result.
+grants are replayed. The robot restarts with the content of its journal. A model that receives every message, but is
+independent of the gate's rules, checks the result.
 """
 
 import heapq
@@ -37,7 +37,7 @@ class Message:
 
 
 @dataclass(slots=True)
-class Witness:
+class EpochModel:
     """Decides from the received messages which epochs are valid."""
 
     newest: int = 0
@@ -46,13 +46,13 @@ class Witness:
 
     def granted(self, epoch: int, now_s: float, lease_s: float) -> None:
         """A signed grant or renewal arrived."""
-        # Until the control loop's next period a renewal may come in time.
+        # A renewal is in time until the control loop's next period.
         if epoch in self.expires_s and now_s > self.expires_s[epoch] + PERIOD_S:
             self.ended.add(epoch)
         self.expires_s[epoch] = now_s + lease_s
         self.newest = max(self.newest, epoch)
 
-    def ordered(self, epoch: int) -> None:
+    def commanded(self, epoch: int) -> None:
         """Another signed command arrived."""
         self.newest = max(self.newest, epoch)
 
@@ -69,7 +69,7 @@ class Witness:
 
 
 Tally = Counter[str]
-"""Counts of a run: ``handovers``, messages ``delivered``, commands ``applied``, and ``stale`` ones of them."""
+"""Counts of a run: ``handovers``, messages ``delivered``, commands ``applied``, and ``stale`` commands among them."""
 
 
 class History:
@@ -85,10 +85,10 @@ class History:
         self._random = random.Random(seed)
         self._gate = gate
         self._journal_first = journal_first
-        self._saved = 0
+        self._journalled_epoch = 0
         self._latch: StopLatch | None = None
-        self._robot = self._started()
-        self._witness = Witness()
+        self._robot = self._create_controller()
+        self._model = EpochModel()
         self._queue: list[Message] = []
         self._number = 0
         self.tally: Tally = Counter()
@@ -106,39 +106,39 @@ class History:
     # ------------------------------------------------------------ cloud, operators, network
 
     def _plan(self, handovers: int) -> None:
-        chance = self._random
+        rng = self._random
         now_s = 1.0
         for number in range(1, handovers + 1):
             self.tally["handovers"] += 1
-            epoch = 2 * number  # the odd ones are those of resets of Stop
-            if chance.random() < 0.2:
+            epoch = 2 * number  # odd epochs belong to resets of Stop
+            if rng.random() < 0.2:
                 self._send("reset", now_s - 0.05, epoch - 1)
-            lease_s = chance.uniform(0.3, 2.0)
+            lease_s = rng.uniform(0.3, 2.0)
             self._send("grant", now_s, epoch, lease_s)
-            if chance.random() < 0.5:
+            if rng.random() < 0.5:
                 self._send("grant", now_s + lease_s * 0.6, epoch, lease_s)
             # A former holder may continue for a while.
             for sequence in range(1, 5):
-                self._send("setpoint", now_s + chance.uniform(0.0, 2.5), epoch, sequence=sequence)
-            what = chance.random()
-            if what < 0.3:
-                self._send("release", now_s + chance.uniform(0.1, 1.5), epoch)
-            elif what < 0.6:
-                self._send("act", now_s + chance.uniform(0.0, 1.5), epoch)
-            if what > 0.9:
-                self._put("restart", now_s + chance.uniform(0.0, 2.0), epoch)
-            elif what > 0.85:
-                self._send("stop", now_s + chance.uniform(0.0, 2.0), epoch)
-            now_s += chance.uniform(0.05, 1.5)
+                self._send("setpoint", now_s + rng.uniform(0.0, 2.5), epoch, sequence=sequence)
+            event = rng.random()
+            if event < 0.3:
+                self._send("release", now_s + rng.uniform(0.1, 1.5), epoch)
+            elif event < 0.6:
+                self._send("act", now_s + rng.uniform(0.0, 1.5), epoch)
+            if event > 0.9:
+                self._put("restart", now_s + rng.uniform(0.0, 2.0), epoch)
+            elif event > 0.85:
+                self._send("stop", now_s + rng.uniform(0.0, 2.0), epoch)
+            now_s += rng.uniform(0.05, 1.5)
 
     def _send(self, kind: str, now_s: float, epoch: int, lease_s: float = 0.0, sequence: int = 0) -> None:
-        chance = self._random
-        if chance.random() < 0.1:
+        rng = self._random
+        if rng.random() < 0.1:
             return  # lost
-        for _ in range(2 if chance.random() < 0.1 else 1):
-            way = chance.random()
-            longest_s = 0.05 if way < 0.8 else 1.0 if way < 0.97 else 20.0
-            self._put(kind, now_s + chance.random() * longest_s, epoch, lease_s, sequence)
+        for _ in range(2 if rng.random() < 0.1 else 1):
+            delay = rng.random()
+            max_delay_s = 0.05 if delay < 0.8 else 1.0 if delay < 0.97 else 20.0
+            self._put(kind, now_s + rng.random() * max_delay_s, epoch, lease_s, sequence)
 
     def _put(self, kind: str, arrives_s: float, epoch: int, lease_s: float = 0.0, sequence: int = 0) -> None:
         self._number += 1
@@ -146,43 +146,45 @@ class History:
 
     # ------------------------------------------------------------ the robot
 
-    def _started(self) -> Controller:
-        controller = Controller(_TYPE, self._gate(epoch=self._saved, burned=self._saved), latch=self._latch)
+    def _create_controller(self) -> Controller:
+        controller = Controller(
+            _TYPE, self._gate(epoch=self._journalled_epoch, burned=self._journalled_epoch), latch=self._latch
+        )
         controller.start_at([0.0])
         return controller
 
-    def _signed(self, epoch: int, apply: Callable[[], None]) -> None:
+    def _apply_signed(self, epoch: int, apply: Callable[[], None]) -> None:
         """Journal the epoch before applying it, as the command processor does; a crash may happen at any moment."""
         if self._journal_first:
-            self._saved = max(self._saved, epoch)
-        when = self._random.random()
-        if when > 0.01:
+            self._journalled_epoch = max(self._journalled_epoch, epoch)
+        crash = self._random.random()
+        if crash > 0.01:
             with suppress(Refused):
                 apply()
-        if when < 0.02:
+        if crash < 0.02:
             self._restart_now()
-        self._saved = max(self._saved, self._robot.epochs[0])
+        self._journalled_epoch = max(self._journalled_epoch, self._robot.epochs[0])
 
     def _grant(self, message: Message) -> None:
         now_s, epoch, lease_s = message.arrives_s, message.epoch, message.lease_s
-        self._witness.granted(epoch, now_s, lease_s)
-        self._signed(epoch, lambda: self._robot.grant(epoch=epoch, holder="h", lease_s=lease_s, now_s=now_s))
+        self._model.granted(epoch, now_s, lease_s)
+        self._apply_signed(epoch, lambda: self._robot.grant(epoch=epoch, holder="h", lease_s=lease_s, now_s=now_s))
 
     def _release(self, message: Message) -> None:
-        self._witness.ordered(message.epoch)
-        self._signed(message.epoch, lambda: self._robot.release(epoch=message.epoch))
-        self._witness.ended.add(message.epoch)
+        self._model.commanded(message.epoch)
+        self._apply_signed(message.epoch, lambda: self._robot.release(epoch=message.epoch))
+        self._model.ended.add(message.epoch)
 
     def _act(self, message: Message) -> None:
-        stale = self._witness.stale(message.epoch, message.arrives_s, needs_lease=False)
-        self._witness.ordered(message.epoch)
+        stale = self._model.stale(message.epoch, message.arrives_s, needs_lease=False)
+        self._model.commanded(message.epoch)
 
         def act() -> None:
             reservation = self._robot.reserve(epoch=message.epoch, on_revoked=lambda _: None)
             self._robot.end_reservation(reservation)
             self._count(stale=stale)
 
-        self._signed(message.epoch, act)
+        self._apply_signed(message.epoch, act)
 
     def _setpoint(self, message: Message) -> None:
         now_s = message.arrives_s
@@ -199,25 +201,25 @@ class History:
         except Refused:
             return
         if self._robot.update(now_s).mode is Mode.STREAMING:
-            self._count(stale=self._witness.stale(message.epoch, now_s, needs_lease=True))
+            self._count(stale=self._model.stale(message.epoch, now_s, needs_lease=True))
 
     def _stop(self, _message: Message) -> None:
-        self._witness.all_ended()
+        self._model.all_ended()
         self._latch = StopLatch(caller="bob", reason="", at_ms=1)
         self._robot.stop(self._latch)
 
     def _reset(self, message: Message) -> None:
-        self._witness.ordered(message.epoch)
-        self._signed(message.epoch, lambda: self._robot.reset_stop(epoch=message.epoch))
+        self._model.commanded(message.epoch)
+        self._apply_signed(message.epoch, lambda: self._robot.reset_stop(epoch=message.epoch))
         self._latch = self._robot.latch
-        self._witness.ended.add(message.epoch)
+        self._model.ended.add(message.epoch)
 
     def _restart(self, _message: Message) -> None:
         self._restart_now()
 
     def _restart_now(self) -> None:
-        self._witness.all_ended()
-        self._robot = self._started()
+        self._model.all_ended()
+        self._robot = self._create_controller()
 
     def _count(self, *, stale: bool) -> None:
         self.tally["applied"] += 1

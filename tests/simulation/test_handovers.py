@@ -9,34 +9,34 @@ import pytest
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from tests.simulation.handovers import HANDOVERS, ExpiryOnly, NoCheck, Tally, simulate
 
-WHOLE = 1_000_000
-PART = 50_000
+FULL_SIZE = 1_000_000
+SAMPLE_SIZE = 50_000
 
 
 def test_no_stale_command_is_applied() -> None:
-    tally = simulate(PART)
+    tally = simulate(SAMPLE_SIZE)
     assert tally["stale"] == 0
-    assert tally["applied"] > PART / 4, "most handovers must lead to something"
+    assert tally["applied"] > SAMPLE_SIZE / 4, "most handovers must lead to applied commands"
 
 
 @pytest.mark.parametrize("mutant", [NoCheck, ExpiryOnly])
 def test_a_gate_without_fencing_is_detected(mutant: type[LeaseGate]) -> None:
-    assert simulate(PART // 20, gate=mutant)["stale"] > 10
+    assert simulate(SAMPLE_SIZE // 20, gate=mutant)["stale"] > 10
 
 
 def test_a_journal_written_after_applying_is_detected() -> None:
-    assert simulate(PART // 5, journal_first=False)["stale"] > 0
+    assert simulate(SAMPLE_SIZE // 5, journal_first=False)["stale"] > 0
 
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 def test_a_million_handovers() -> None:
     workers = os.cpu_count() or 1
-    each = WHOLE // workers
+    handovers = FULL_SIZE // workers
     with ProcessPoolExecutor(workers) as pool:
-        total: Tally = sum(pool.map(_share, range(workers), [each] * workers), Counter())
+        total: Tally = sum(pool.map(_share, range(workers), [handovers] * workers), Counter())
     print(total)
-    assert total["handovers"] >= WHOLE - workers * HANDOVERS
+    assert total["handovers"] >= FULL_SIZE - workers * HANDOVERS
     assert total["stale"] == 0
 
 

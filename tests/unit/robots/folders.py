@@ -19,8 +19,8 @@ SHIPPED = [folder for folder in FOLDERS if folder.parent == ROBOTS]
 MOVEMENTS = sorted(path for folder in FOLDERS for path in (folder / robot_type.MOVEMENTS).glob("*.py"))
 
 
-class Bench:
-    """One robot type's scene, stepped by hand without a driver."""
+class SteppedRobot:
+    """One robot type's scene, stepped manually without a driver."""
 
     def __init__(self, folder: Path) -> None:
         self.type = robot_type.load(folder)

@@ -1,4 +1,4 @@
-"""What every robot folder must be."""
+"""Requirements of every robot folder."""
 
 import ast
 import runpy
@@ -12,7 +12,7 @@ import pytest
 from device_agent.protocol import topics
 from device_agent.protocol.manifests import robot_type
 from tests.harness.paths import ROBOTS
-from tests.unit.robots.folders import FOLDERS, MOVEMENTS, SHIPPED, Bench, contacts
+from tests.unit.robots.folders import FOLDERS, MOVEMENTS, SHIPPED, SteppedRobot, contacts
 
 pytestmark = pytest.mark.filterwarnings("error")
 folders = pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
@@ -24,8 +24,8 @@ def test_folder_has_its_files(folder: Path):
     assert (folder / manifest.model).is_file()
     assert (folder / manifest.scene).is_file()
     readme = (folder / "README.md").read_text(encoding="utf-8")
-    assert "approximate" in readme.lower(), "the README says what is approximate"
-    assert "source" in readme.lower(), "the README says where figures come from"
+    assert "approximate" in readme.lower(), "the README lists what is approximate"
+    assert "source" in readme.lower(), "the README names the sources of figures"
     has_movements = any(path.parent.parent == folder for path in MOVEMENTS)
     assert has_movements == ("movements" in manifest.capabilities)
 
@@ -50,7 +50,7 @@ def test_manifest_and_model_agree(folder: Path):
 
 @folders
 def test_home_is_inside_the_limits_and_held_still_without_contacts(folder: Path):
-    bench = Bench(folder)
+    bench = SteppedRobot(folder)
     assert np.all(bench.lower <= bench.home)
     assert np.all(bench.home <= bench.upper)
     start = contacts(bench.model, bench.data)
@@ -65,7 +65,7 @@ def test_home_is_inside_the_limits_and_held_still_without_contacts(folder: Path)
 @folders
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_on_every_actuator_gives_no_warning(folder: Path, seed: int):
-    bench = Bench(folder)
+    bench = SteppedRobot(folder)
     noise = np.random.default_rng(seed)
     for _ in range(200):  # a new random target every 20 ms: jumps that no agent would send
         bench.data.ctrl[bench.ctrl] = noise.uniform(bench.lower, bench.upper)

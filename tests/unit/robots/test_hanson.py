@@ -14,7 +14,7 @@ from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajecto
 from device_agent.runtime.planning.visemes import estimate_duration_s
 from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 from tests.harness.paths import ROBOTS
-from tests.unit.robots.folders import Bench
+from tests.unit.robots.folders import SteppedRobot
 
 pytestmark = pytest.mark.slow
 FOLDER = ROBOTS / "hanson"
@@ -32,24 +32,24 @@ BASIC_EMOTIONS = {"happy", "sad", "angry", "surprised", "afraid", "disgusted"}
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench(FOLDER)
+def bench() -> SteppedRobot:
+    return SteppedRobot(FOLDER)
 
 
 @pytest.fixture(scope="module")
 def shape() -> RobotGeometry:
-    shape = geometry.load(Bench(FOLDER).type, FOLDER)
+    shape = geometry.load(SteppedRobot(FOLDER).type, FOLDER)
     assert shape is not None
     return shape
 
 
-def test_joint_ranges_are_the_published_ones(bench: Bench):
+def test_joint_ranges_are_the_published_ones(bench: SteppedRobot):
     joints = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in bench.type.joints}
     for name, range_rad in PUBLISHED_RAD.items():
         assert joints[name] == pytest.approx(range_rad, abs=6e-4), name
 
 
-def test_dependent_joints_follow_the_equality_constraints(bench: Bench, shape: RobotGeometry):
+def test_dependent_joints_follow_the_equality_constraints(bench: SteppedRobot, shape: RobotGeometry):
     equality_joints = EqualityJoints(bench.model)
     assert len(equality_joints.all) == 21
     target = np.random.default_rng(2).uniform(bench.lower, bench.upper)
@@ -63,22 +63,22 @@ def test_dependent_joints_follow_the_equality_constraints(bench: Bench, shape: R
         assert pose[:3] == pytest.approx(bench.data.site(frame).xpos, abs=1e-4)
 
 
-def test_clearance_and_speed_include_dependent_joints(bench: Bench, shape: RobotGeometry):
+def test_clearance_and_speed_include_dependent_joints(bench: SteppedRobot, shape: RobotGeometry):
     upright = bench.home.tolist()
     leaning = dict(zip(bench.names, upright, strict=True)) | {"Lower-Gimbal-L": -1.2, "Lower-Gimbal-R": 1.4}
-    assert shape.clearance(list(leaning.values())).room_m < shape.clearance(upright).room_m - 0.005
+    assert shape.clearance(list(leaning.values())).excess_m < shape.clearance(upright).excess_m - 0.005
     one = [1.0 if name == "Lower-Gimbal-R" else 0.0 for name in bench.names]
     assert shape.speed_m_s(one) > 0.03, "a motor moves what its rod carries"
 
 
-def test_it_moves_its_head_less_than_its_motors(bench: Bench):
+def test_it_moves_its_head_less_than_its_motors(bench: SteppedRobot):
     bench.data.ctrl[[bench.model.actuator(name).id for name in ("Upper-Gimbal-L", "Upper-Gimbal-R")]] = 1.9, -2.0
     bench.step(1500)
     assert bench.data.joint("head_pitch").qpos[0] == pytest.approx(0.15 * 3.9, abs=0.01)
 
 
 @pytest.mark.parametrize("point_m", [(1.0, 0.0, 0.4), (0.45, 0.1, 0.3), (0.3, -0.25, 0.5), (1.0, 1.0, 0.3)])
-def test_eyes_and_neck_look_at_a_point(bench: Bench, shape: RobotGeometry, point_m: tuple[float, float, float]):
+def test_eyes_and_neck_look_at_a_point(bench: SteppedRobot, shape: RobotGeometry, point_m: tuple[float, float, float]):
     position = dict(zip(bench.names, bench.home.tolist(), strict=True))
     position |= gaze.solve_gaze(bench.type, shape, bench.home.tolist(), point_m)
     poses = shape.poses([position[name] for name in bench.names])
@@ -91,7 +91,7 @@ def test_eyes_and_neck_look_at_a_point(bench: Bench, shape: RobotGeometry, point
     assert abs(position["EyeTurn-L"]) < 0.5, "the neck takes its share"
 
 
-def test_expressions_are_distinct(bench: Bench):
+def test_expressions_are_distinct(bench: SteppedRobot):
     assert set(bench.type.expressions) >= BASIC_EMOTIONS | {"neutral", "thinking", "sleepy"}
     faces = {
         name: np.array([pose.get(joint, 0.0) for joint in bench.names]) / (bench.upper - bench.lower)
@@ -101,7 +101,7 @@ def test_expressions_are_distinct(bench: Bench):
         assert np.abs(first - second).max() > 0.2, f"{one} and {other}"
 
 
-def test_visemes_reach_their_mouth_shapes(bench: Bench):
+def test_visemes_reach_their_mouth_shapes(bench: SteppedRobot):
     visemes = bench.type.visemes
     assert len(visemes) >= 12
     assert all(

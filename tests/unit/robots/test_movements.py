@@ -126,7 +126,7 @@ class ScriptedRobot(SimulatedRobot):
         velocity = np.abs(self.world.snapshot().qvel[self.driver._dof]) / self._velocity_limits
         self.fastest = max(self.fastest, float(velocity.max()))
         if self.shape is not None and round(self.now_s * 1000) % 40 == 0:
-            self.tightest_m = min(self.tightest_m, self.shape.clearance(self.controller.commanded_rad).room_m)
+            self.tightest_m = min(self.tightest_m, self.shape.clearance(self.controller.commanded_rad).excess_m)
 
 
 EXTREMES: list[tuple[str, dict[str, Any]]] = [
@@ -174,20 +174,22 @@ def test_a_movement_into_the_table_is_detected() -> None:
 def test_collisions_are_prevented() -> None:
     robot = ControlledRobot(UR5)
     assert robot.shape is not None
-    with pytest.raises(Refused, match="no room there: workspace: wrist_3 \u2013 lower z, 281 mm too near"):
+    with pytest.raises(
+        Refused, match="no clearance at the target: workspace: wrist_3 \u2013 lower z, 281 mm too close"
+    ):
         robot.move({"shoulder_lift": -0.2, "elbow": 1.2}, speed=1.0)
-    with pytest.raises(Refused, match="no room there: clearance: table_top \u2013 wrist_3_link"):
+    with pytest.raises(Refused, match="no clearance at the target: clearance: table_top \u2013 wrist_3_link"):
         robot.move({"shoulder_lift": -0.86}, speed=1.0)
     random = np.random.default_rng(11)
     lower, upper = ([getattr(joint, name) for joint in robot.type.joints] for name in ("lower_rad", "upper_rad"))
     blocked = 0
     while blocked < 5:  # targets with clearance, to which the straight path leads through the arm itself
         target = np.clip(robot.home_rad + random.uniform(-3, 3, len(robot.names)), lower, upper).tolist()
-        if robot.shape.clearance(target).room_m <= 0 or robot.shape.sweep([robot.home_rad, target]).clearance is None:
+        if robot.shape.clearance(target).excess_m <= 0 or robot.shape.sweep([robot.home_rad, target]).clearance is None:
             continue
         blocked += 1
-        with pytest.raises(Refused, match="something is in the way: clearance: ") as refused:
+        with pytest.raises(Refused, match="an obstacle is in the way: clearance: ") as refused:
             robot.move(dict(zip(robot.names, target, strict=True)), speed=1.0)
         assert refused.value.code == "no_room"
-        assert robot.shape.clearance(robot.controller.commanded_rad).room_m >= 0
+        assert robot.shape.clearance(robot.controller.commanded_rad).excess_m >= 0
         robot.move(robot.type.home_rad, speed=1.0)

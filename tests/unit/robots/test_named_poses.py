@@ -48,7 +48,7 @@ def test_every_viseme_is_reached_without_collision(folder: Path) -> None:
     assert robot.shape is not None
     for pose in robot.type.visemes.values():
         position_rad = robot.type.home_rad | pose
-        assert robot.shape.clearance([position_rad[name] for name in robot.names]).room_m >= 0
+        assert robot.shape.clearance([position_rad[name] for name in robot.names]).excess_m >= 0
     trajectory = BehaviourTrajectory(robot.type, robot.controller.commanded_rad)
     trajectory.add_speech(SpokenLine(0.0, TEXT, estimate_duration_s(TEXT)))
     path = trajectory.trajectory()

@@ -24,7 +24,7 @@ FOLDER = ROBOTS / "nao"
 TYPE = robot_type.load(FOLDER)
 FACTS: dict[str, Any] = json.loads((Path(__file__).parent / "nao_v5.json").read_text(encoding="utf-8"))
 FINGERS = {"l_wrist": "LFingers", "r_wrist": "RFingers"}
-"""Bodies of their own here; the description has their mass in the wrist's."""
+"""Separate bodies in this model; the description includes their mass in the wrist."""
 LEGS = [joint.name for joint in TYPE.joints if joint.name[1:].startswith(("Hip", "Knee", "Ankle"))]
 FORWARD = Twist(forward_m_s=0.1)
 UPRIGHT = 0.95
@@ -61,7 +61,7 @@ def test_joints_and_masses_are_those_of_the_description() -> None:
         assert in_model.range == pytest.approx((fact["lo"], fact["hi"]))
         assert body.pos == pytest.approx(fact["offset_m"], abs=1e-6)
         assert not in_model.pos.any(), "a body stands where its joint turns"
-        if not joint.name.endswith("Hand"):  # README.md: fingers are simpler here
+        if not joint.name.endswith("Hand"):  # README.md: fingers are simplified
             assert in_model.axis == pytest.approx(np.array(fact["axis"]) / np.linalg.norm(fact["axis"]), abs=1e-6)
     for name, mass_kg in FACTS["masses_kg"].items():
         parts = [name, FINGERS[name]] if name in FINGERS else [name]

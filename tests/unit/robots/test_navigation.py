@@ -22,8 +22,8 @@ from device_agent.runtime.readings import Reading, ReadingCache
 from device_agent.sandbox import api
 from device_agent.sensors.perception.driver import _flat
 from tests.harness.paths import ROBOTS
-from tests.unit.device_agent.perception.lab import PERIOD_S as LOOK_S
-from tests.unit.device_agent.perception.lab import Watched, by_hand
+from tests.unit.device_agent.perception.lab import PERIOD_S as SAMPLE_S
+from tests.unit.device_agent.perception.lab import LabFixture, manual_time
 from tests.unit.robots.simulated_robot import SimulatedRobot
 
 QBO = robot_type.load(ROBOTS / "qbo")
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module", autouse=True)
 def _manual_time() -> Iterator[None]:
-    with by_hand():
+    with manual_time():
         yield
 
 
@@ -61,13 +61,13 @@ class SteppingController(Controller):
         super().__init__(QBO, LeaseGate())
         self._lab = lab
 
-    def start_drive(self, *order: Any, **more: Any) -> Any:
-        goal = super().start_drive(*order, **more)
+    def start_drive(self, *args: Any, **kwargs: Any) -> Any:
+        goal = super().start_drive(*args, **kwargs)
         goal.finished = SteppingEvent(self._lab)
         return goal
 
-    def start_joint_goal(self, *order: Any, **more: Any) -> Any:
-        goal = super().start_joint_goal(*order, **more)
+    def start_joint_goal(self, *args: Any, **kwargs: Any) -> Any:
+        goal = super().start_joint_goal(*args, **kwargs)
         goal.finished = SteppingEvent(self._lab)
         return goal
 
@@ -76,8 +76,8 @@ class Laboratory(SimulatedRobot):
     """Qbo in its room, with driver, controller and obstacle map; the person walks, perception runs at 5 Hz."""
 
     def __init__(self, *, settle_s: float = 3.0) -> None:
-        self.watched = Watched()
-        super().__init__(ROBOTS / "qbo", room=self.watched.world.world)
+        self.room = LabFixture()
+        super().__init__(ROBOTS / "qbo", room=self.room.world.world)
         self.controller = SteppingController(self)
         self.controller.start_at(self.driver.observe().position_rad)
         self.readings = ReadingCache(
@@ -85,9 +85,9 @@ class Laboratory(SimulatedRobot):
             agent="a",
             own=["perception"],
             named=[("perception", "positions")],
-            clock_s=lambda: self.watched.now_s,
+            clock_s=lambda: self.room.now_s,
         )
-        self.looked_s = -math.inf
+        self.sampled_s = -math.inf
         self.touched: set[str] = set()
         context = DeviceContext(
             robot_type=QBO,
@@ -100,7 +100,7 @@ class Laboratory(SimulatedRobot):
                 stream: Reading(self.driver.report(stream), 0.02) for stream in ("odometry", "sonar")
             },
             name="qbo",
-            obstacle_map=lambda: self.watched.sight.grid,
+            obstacle_map=lambda: self.room.fusion.grid,
         )
         self.robot = RobotApi(context)
         self.wait(settle_s)
@@ -108,8 +108,8 @@ class Laboratory(SimulatedRobot):
 
     def period(self) -> None:
         super().period()
-        if self.watched.now_s - self.looked_s >= LOOK_S - PERIOD_S / 2:
-            self.look()
+        if self.room.now_s - self.sampled_s >= SAMPLE_S - PERIOD_S / 2:
+            self.sample()
 
     def touching(self) -> set[str]:
         """Names of the geoms that it touches, except the floor."""
@@ -123,20 +123,20 @@ class Laboratory(SimulatedRobot):
 
     def free(self, x_m: float, y_m: float) -> bool:
         """Whether the robot fits there with a margin of one cell for moving legs."""
-        grid = self.watched.sight.grid
+        grid = self.room.fusion.grid
         return not grid.blocked(QBO.base.radius_m + 0.15).at(x_m, y_m)  # type: ignore[union-attr]
 
-    def look(self) -> None:
-        now_s = self.looked_s = self.watched.now_s
-        self.watched.see()
-        tick_ms, values = round(now_s * 1000), _flat(self.watched.sight.positions(now_s))
+    def sample(self) -> None:
+        now_s = self.sampled_s = self.room.now_s
+        self.room.sample()
+        tick_ms, values = round(now_s * 1000), _flat(self.room.fusion.positions(now_s))
         measured = Measurements(tick_ms=tick_ms, at_ms=0, sequence=tick_ms, values=values)
         self.readings.record("perception", "positions", measured)
         self.touched |= self.touching()
 
     def close(self) -> None:
         self.robot.release()
-        self.watched.close()
+        self.room.close()
 
 
 @pytest.fixture
@@ -150,7 +150,7 @@ def play(lab: Laboratory, movement: str, parameters: dict[str, Any]) -> list[str
     """Runs a movement of Qbo as the sandbox would; returns the printed and spoken lines."""
     lines: list[str] = []
 
-    def ask(kind: str, **arguments: Any) -> Any:
+    def request(kind: str, **arguments: Any) -> Any:
         if kind == "say":
             return lines.append(arguments["text"])
         if kind == "look":
@@ -161,16 +161,16 @@ def play(lab: Laboratory, movement: str, parameters: dict[str, Any]) -> list[str
             raise api.RobotError(refused.message) from refused
 
     path = ROBOTS / "qbo" / "movements" / f"{movement}.py"
-    given = {
-        "robot": api.Robot(ask, joints=lab.robot.joints, frames=(), can=lab.robot.calls),
-        "room": api.Room(ask),
+    namespace = {
+        "robot": api.Robot(request, joints=lab.robot.joints, frames=(), can=lab.robot.calls),
+        "room": api.Room(request),
         "parameters": parameters,
         "wait": lab.wait,
         "progress": lambda _: None,
         "print": lambda *words: lines.append(" ".join(map(str, words))),
         "RobotError": api.RobotError,
     }
-    exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), given)  # noqa: S102 - our own script
+    exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), namespace)  # noqa: S102 - our own script
     return lines
 
 
@@ -184,18 +184,18 @@ def check(lab: Laboratory, x_m: float, y_m: float, yaw_rad: float) -> None:
 
 def test_qbo_drives_around_another_robot(lab: Laboratory) -> None:
     with pytest.raises(Refused, match="nearest reachable place is x_m") as refused:
-        lab.robot.execute(GoTo(x_m=1.5, y_m=2.0))  # the arm's table stands there
+        lab.robot.execute(GoTo(x_m=1.5, y_m=2.0))  # occupied by the arm's table
     assert refused.value.code == "taken"
-    check(lab, 0.6, -0.35, 1.0)  # straight there stands the NAO
+    check(lab, 0.6, -0.35, 1.0)  # the NAO blocks the straight path
 
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 def test_qbo_visits_several_places_while_a_person_walks(lab: Laboratory) -> None:
-    chance = random.Random(5)  # noqa: S311
+    rng = random.Random(5)  # noqa: S311
     visited = 0
     while visited < 12:
-        x_m, y_m, yaw_rad = chance.uniform(-2.2, 2.2), chance.uniform(-1.8, 1.8), chance.uniform(-math.pi, math.pi)
+        x_m, y_m, yaw_rad = rng.uniform(-2.2, 2.2), rng.uniform(-1.8, 1.8), rng.uniform(-math.pi, math.pi)
         if not lab.free(x_m, y_m):
             continue
         with suppress(Refused):
@@ -203,7 +203,7 @@ def test_qbo_visits_several_places_while_a_person_walks(lab: Laboratory) -> None
             visited += 1
             continue
         # The person stands at the goal and waits for the robot to leave.
-        person_m = lab.watched.world.place("person")[:2]
+        person_m = lab.room.world.place("person")[:2]
         assert math.dist(person_m, (x_m, y_m)) < QBO.base.radius_m + 0.35  # type: ignore[union-attr]
 
 

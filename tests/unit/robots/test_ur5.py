@@ -8,7 +8,7 @@ import numpy.typing as npt
 import pytest
 
 from tests.harness.paths import ROBOTS
-from tests.unit.robots.folders import Bench
+from tests.unit.robots.folders import SteppedRobot
 
 FOLDER = ROBOTS / "ur5"
 # UR's article on DH parameters: a [m], d [m], alpha [rad] of joints 1 to 6.
@@ -33,11 +33,11 @@ def dh_frames(position: npt.NDArray[np.float64]) -> list[npt.NDArray[np.float64]
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench(FOLDER)
+def bench() -> SteppedRobot:
+    return SteppedRobot(FOLDER)
 
 
-def test_every_frame_is_its_dh_frame_over_1000_random_poses(bench: Bench):
+def test_every_frame_is_its_dh_frame_over_1000_random_poses(bench: SteppedRobot):
     random = np.random.default_rng(2026)
     worst_m = worst_rad = 0.0
     for _ in range(1000):
@@ -53,7 +53,7 @@ def test_every_frame_is_its_dh_frame_over_1000_random_poses(bench: Bench):
     assert worst_rad < 1e-6
 
 
-def test_the_model_is_the_published_arm(bench: Bench):
+def test_the_model_is_the_published_arm(bench: SteppedRobot):
     model = bench.model
     assert bench.names == ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
     assert [joint.label for joint in bench.type.joints] == [
@@ -75,15 +75,15 @@ def test_the_model_is_the_published_arm(bench: Bench):
     assert bench.data.site("wrist_3").xpos == pytest.approx(bench.data.site("flange").xpos, abs=1e-12)
 
 
-def test_motors_do_the_work_of_holding_the_arm(bench: Bench):
+def test_motors_do_the_work_of_holding_the_arm(bench: SteppedRobot):
     bench.step(10)
     effort = bench.data.qfrc_actuator[bench.dof]
     assert effort == pytest.approx(bench.data.qfrc_bias[bench.dof], abs=0.05)
     assert abs(effort[1]) > 10
 
 
-def _demand(bench: Bench, acceleration: float, velocity: float, seed: int) -> npt.NDArray[np.float64]:
-    """Torque that each joint needs if all six accelerate at once, each sign at its worst, shape (samples, 6) [N m]."""
+def _demand(bench: SteppedRobot, acceleration: float, velocity: float, seed: int) -> npt.NDArray[np.float64]:
+    """Torque of each joint if all six accelerate in the worst directions, shape (samples, 6) [N m]."""
     random = np.random.default_rng(seed)
     stretched = np.array([0.0, 0.0, 0.0, -np.pi / 2, np.pi / 2, 0.0])
     samples = []
@@ -98,7 +98,7 @@ def _demand(bench: Bench, acceleration: float, velocity: float, seed: int) -> np
 
 
 @pytest.mark.slow
-def test_motors_can_accelerate_in_any_pose_and_brake_in_most(bench: Bench):
+def test_motors_can_accelerate_in_any_pose_and_brake_in_most(bench: SteppedRobot):
     effort = np.array([joint.max_effort_nm for joint in bench.type.joints])
     for velocity in (0.0, np.pi):
         assert (_demand(bench, 8.0, velocity, 1) <= effort).all()
@@ -107,8 +107,8 @@ def test_motors_can_accelerate_in_any_pose_and_brake_in_most(bench: Bench):
 
 
 @pytest.mark.slow
-def test_braking_from_full_speed_stops_the_arm_in_the_air(bench: Bench):
-    """All six joints at 180°/s, braked at once as the watchdog does, from random poses and the stretched one.
+def test_braking_from_full_speed_stops_the_arm_in_the_air(bench: SteppedRobot):
+    """All six joints at 180°/s, braked as the watchdog does, from random poses and the stretched one.
 
     60 ms after the command is at zero the arm is at rest (0.1 rad/s) in nine of ten; after 200 ms in all, also where
     the motors saturate.
@@ -129,11 +129,11 @@ def test_braking_from_full_speed_stops_the_arm_in_the_air(bench: Bench):
         residual = []
         for _ in range(periods + 25):
             next_speed = np.sign(speed) * np.maximum(np.abs(speed) - braking * period_s, 0.0)
-            way = (speed + next_speed) / 2 * period_s
+            step_rad = (speed + next_speed) / 2 * period_s
             for part in range(1, 5):  # the driver's straight line between two targets
-                bench.data.ctrl[bench.ctrl] = target + way * part / 4
+                bench.data.ctrl[bench.ctrl] = target + step_rad * part / 4
                 bench.step()
-            target, speed = target + way, next_speed
+            target, speed = target + step_rad, next_speed
             residual.append(float(np.abs(bench.data.qvel[bench.dof]).max()))
         after_60_ms.append(residual[periods + 7])
         after_200_ms.append(residual[-1])
@@ -141,7 +141,7 @@ def test_braking_from_full_speed_stops_the_arm_in_the_air(bench: Bench):
     assert max(after_200_ms) < 0.1
 
 
-def test_servo_follows_a_steady_motion_20_ms_behind(bench: Bench):
+def test_servo_follows_a_steady_motion_20_ms_behind(bench: SteppedRobot):
     speed = np.full(6, 0.5)
     bench.place(np.array([0.0, -1.5, 1.5, -1.5, -1.5, 0.0]), speed)
     start = bench.data.qpos[bench.qpos].copy()

@@ -1,4 +1,4 @@
-"""A room of primitives with a person, two mobile robots and an arm, seen by a noisy lidar and depth camera."""
+"""A room of primitives with a person, two mobile robots and an arm, observed by a noisy lidar and depth camera."""
 
 import math
 import random
@@ -66,9 +66,9 @@ def xml() -> str:
 class Walker:
     """Moves straight from one random place to the next and rests there."""
 
-    chance: random.Random
+    rng: random.Random
     speed_m_s: float
-    room_m: tuple[float, float, float, float]
+    area_m: tuple[float, float, float, float]
     rest_s: float
     x_m: float = 0.0
     y_m: float = 0.0
@@ -82,21 +82,21 @@ class Walker:
             self._rest_s -= elapsed_s
             return
         if self._goal is None:
-            low_x, low_y, high_x, high_y = self.room_m
-            self._goal = self.chance.uniform(low_x, high_x), self.chance.uniform(low_y, high_y)
+            low_x, low_y, high_x, high_y = self.area_m
+            self._goal = self.rng.uniform(low_x, high_x), self.rng.uniform(low_y, high_y)
         x, y = self._goal[0] - self.x_m, self._goal[1] - self.y_m
         left = math.hypot(x, y)
-        way = min(left, self.speed_m_s * elapsed_s)
+        step_m = min(left, self.speed_m_s * elapsed_s)
         self.yaw_rad = math.atan2(y, x)
-        self.x_m += x / max(left, 1e-9) * way
-        self.y_m += y / max(left, 1e-9) * way
-        self.walked_m += way
+        self.x_m += x / max(left, 1e-9) * step_m
+        self.y_m += y / max(left, 1e-9) * step_m
+        self.walked_m += step_m
         if left < 0.02:
-            self._goal, self._rest_s = None, self.chance.uniform(0, self.rest_s)
+            self._goal, self._rest_s = None, self.rng.uniform(0, self.rest_s)
 
 
 @dataclass
-class Playground:
+class SyntheticRoom:
     """The room, its walkers and its sensors, in simulated time."""
 
     seed: int = 1
@@ -104,14 +104,14 @@ class Playground:
     walkers: dict[str, Walker] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        chance = random.Random(self.seed)
+        rng = random.Random(self.seed)
         self.noise = np.random.default_rng(self.seed)
         self.model = mujoco.MjModel.from_xml_string(xml())
         self.data = mujoco.MjData(self.model)
         self.walkers = {
-            "person": Walker(chance, 0.9, (-2.2, -1.9, 2.4, 0.7), 3.0, x_m=-1.0),
-            "nao": Walker(chance, 0.1, (-2.0, -0.2, -0.6, 1.4), 6.0, x_m=-1.5, y_m=0.6),
-            "qbo": Walker(chance, 0.35, (0.3, -1.6, 2.2, 0.4), 4.0, x_m=1.4, y_m=-0.5),
+            "person": Walker(rng, 0.9, (-2.2, -1.9, 2.4, 0.7), 3.0, x_m=-1.0),
+            "nao": Walker(rng, 0.1, (-2.0, -0.2, -0.6, 1.4), 6.0, x_m=-1.5, y_m=0.6),
+            "qbo": Walker(rng, 0.35, (0.3, -1.6, 2.2, 0.4), 4.0, x_m=1.4, y_m=-0.5),
         }
         across, up = np.meshgrid(
             (np.arange(0, WIDTH, 2) + 0.5 - WIDTH / 2), (HEIGHT / 2 - np.arange(0, HEIGHT, 2) - 0.5)
@@ -119,7 +119,7 @@ class Playground:
         per_pixel = 2 * math.tan(FOVY_RAD / 2) / HEIGHT
         self.sight_lines = np.column_stack((across.ravel() * per_pixel, up.ravel() * per_pixel, -np.ones(across.size)))
         self.camera_m = np.array([-2.9, -2.3, 2.4])
-        back = self.camera_m - (0.3, 0.2, 0.4)  # the point it looks at
+        back = self.camera_m - (0.3, 0.2, 0.4)  # minus the point at which the camera points
         back /= np.linalg.norm(back)
         right = np.cross([0, 0, 1], back)
         right /= np.linalg.norm(right)
@@ -150,11 +150,11 @@ class Playground:
         self.model.body("arm").pos[2] = 50.0
         mujoco.mj_kinematics(self.model, self.data)
 
-    def _cast(self, origin: np.ndarray, ways: np.ndarray, without: int) -> np.ndarray:
-        distance, geoms = np.empty(len(ways)), np.empty(len(ways), dtype=np.int32)
+    def _cast(self, origin: np.ndarray, directions: np.ndarray, excluded_body: int) -> np.ndarray:
+        distance, geoms = np.empty(len(directions)), np.empty(len(directions), dtype=np.int32)
         mujoco.mj_multiRay(
-            self.model, self.data, origin, np.ascontiguousarray(ways).ravel(), None, True, without, geoms, distance,
-            None, len(ways), 30.0,
+            self.model, self.data, origin, np.ascontiguousarray(directions).ravel(), None, True, excluded_body, geoms,
+            distance, None, len(directions), 30.0,
         )  # fmt: skip
         return np.where(geoms >= 0, distance, np.inf)
 
@@ -170,9 +170,9 @@ class Playground:
                     nearest_m=0.15, furthest_m=12.0)  # fmt: skip
 
     def depth(self) -> Image:
-        ways = self.sight_lines @ self.camera.T
-        length = np.linalg.norm(ways, axis=1)
-        z = self._cast(self.camera_m, ways / length[:, None], -1) / length
+        directions = self.sight_lines @ self.camera.T
+        length = np.linalg.norm(directions, axis=1)
+        z = self._cast(self.camera_m, directions / length[:, None], -1) / length
         z += self.noise.normal(0, 1, len(z)) * (0.0012 + 0.0019 * (np.where(np.isfinite(z), z, 0) - 0.4) ** 2)
         depth = np.full((HEIGHT, WIDTH), np.inf, dtype=np.float32)
         depth[::2, ::2] = np.where(z < 8.0, z, np.inf).reshape(HEIGHT // 2, WIDTH // 2)
@@ -183,27 +183,27 @@ class Playground:
     def in_view(self, name: str) -> bool:
         """Whether an object's centre is visible to the depth camera."""
         walker = self.walkers[name]
-        seen = (np.array([walker.x_m, walker.y_m, 0.3]) - self.camera_m) @ self.camera
+        offset = (np.array([walker.x_m, walker.y_m, 0.3]) - self.camera_m) @ self.camera
         per_pixel = 2 * math.tan(FOVY_RAD / 2) / HEIGHT
-        across, up = (abs(seen[:2]) / -seen[2] / per_pixel).tolist()
+        across, up = (abs(offset[:2]) / -offset[2] / per_pixel).tolist()
         return bool(across < WIDTH / 2 and up < HEIGHT / 2)
 
 
 def survey(seed: int = 7) -> BackgroundModel:
     """The background model of the empty room."""
-    empty, found = Playground(seed), BackgroundModel()
-    empty.clear()
+    scene, background = SyntheticRoom(seed), BackgroundModel()
+    scene.clear()
     for _ in range(10):
-        found.add("lidar", empty.scan())
-        found.add("depth", empty.depth())
-    found.fit()
-    return found
+        background.add("lidar", scene.scan())
+        background.add("depth", scene.depth())
+    background.fit()
+    return background
 
 
-def sight(found: BackgroundModel) -> SensorFusion:
+def make_fusion(background: BackgroundModel) -> SensorFusion:
     return SensorFusion(
         grid=OccupancyGrid((-3.2, -2.7), (3.2, 2.7)),
-        background=found,
+        background=background,
         kinds=KINDS,
         mounts=MOUNTS,
         inside=(*LOWER_M, *UPPER_M),
@@ -211,13 +211,13 @@ def sight(found: BackgroundModel) -> SensorFusion:
     )
 
 
-def watch(ground: Playground, eyes: SensorFusion, seconds: float, *, period_s: float = 0.2, each=None) -> None:
-    """Look every ``period_s``; ``each(ground, eyes)`` is called half a period later."""
+def run(scene: SyntheticRoom, fusion: SensorFusion, seconds: float, *, period_s: float = 0.2, on_sample=None) -> None:
+    """Sample every ``period_s``; ``on_sample(scene, fusion)`` is called half a period later."""
     for _ in range(round(seconds / period_s)):
-        ground.step(period_s / 2)
-        eyes.update("lidar", ground.scan())
-        eyes.update("depth", ground.depth())
-        eyes.advance(ground.time_s)
-        ground.step(period_s / 2)
-        if each is not None:
-            each(ground, eyes)
+        scene.step(period_s / 2)
+        fusion.update("lidar", scene.scan())
+        fusion.update("depth", scene.depth())
+        fusion.advance(scene.time_s)
+        scene.step(period_s / 2)
+        if on_sample is not None:
+            on_sample(scene, fusion)

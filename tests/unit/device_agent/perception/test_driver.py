@@ -11,13 +11,13 @@ from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.protocol import Stream
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.perception import PerceptionDriver, create
-from tests.unit.device_agent.perception.playground import KINDS, Playground, survey
+from tests.unit.device_agent.perception.playground import KINDS, SyntheticRoom, survey
 
 pytestmark = pytest.mark.slow
 ROOM = """
-room = "toy"
+room = "synthetic"
 version = 1
-label = "Toy"
+label = "Synthetic room"
 [plan]
 lower_m = [-3.0, -2.5]
 upper_m = [3.0, 2.5]
@@ -35,20 +35,20 @@ upper_m = [0.0, 2.5, 2.7]
 
 
 class FakeSensor:
-    """A sensor of the playground with the real clock."""
+    """A sensor of the synthetic room with the real clock."""
 
     simulated = True
 
-    def __init__(self, ground, sense):
-        self.ground = ground
-        self.sense = sense
+    def __init__(self, scene, method):
+        self.scene = scene
+        self.method = method
         self.broken = False
 
     def raw(self):
         if self.broken:
             raise SensorError("the lens is dirty")
-        self.ground.time_s = time.monotonic()
-        return getattr(self.ground, self.sense)()
+        self.scene.time_s = time.monotonic()
+        return getattr(self.scene, self.method)()
 
     def read(self, _stream):
         return {"light_lux": 321.0}
@@ -58,25 +58,25 @@ MOUNT = {"name": "arm", "lowest_m": 0.78, "highest_m": 0.95, "radius_m": 0.05, "
 FIELDS = ("name", "lowest_m", "highest_m", "radius_m", "several")
 
 
-def options(**more):
+def options(**changes):
     kinds = [{name: getattr(kind, name) for name in FIELDS} for kind in KINDS]
-    return {"lidars": ["lidar"], "cameras": ["depth"], "kinds": kinds, "mounts": [MOUNT], "look_hz": 20, **more}
+    return {"lidars": ["lidar"], "cameras": ["depth"], "kinds": kinds, "mounts": [MOUNT], "look_hz": 20, **changes}
 
 
-def device(**more):
+def device(**changes):
     return RoomDeviceManifest(
         name="perception",
         kind="perception",
         label="Room perception",
         driver="perception",
         streams=(Stream(name="positions", rate_hz=5.0),),
-        options=options(**more),
+        options=options(**changes),
     )
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("toy", numbered=False)
+    folder = tmp_path_factory.mktemp("synthetic", numbered=False)
     (folder / "room.toml").write_text(ROOM)
     (folder / "survey.npz").write_bytes(survey().to_bytes())
     return folder
@@ -84,8 +84,8 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def neighbours():
-    ground = Playground(1)
-    return {name: FakeSensor(ground, sense) for name, sense in (("lidar", "scan"), ("depth", "depth"), ("light", ""))}
+    scene = SyntheticRoom(1)
+    return {name: FakeSensor(scene, method) for name, method in (("lidar", "scan"), ("depth", "depth"), ("light", ""))}
 
 
 @pytest.fixture
@@ -96,9 +96,9 @@ def driver(folder, neighbours):
     made.close()
 
 
-def until(read, accepted, patience_s=60):
+def until(read, accepted, timeout_s=60):
     """Read until the result is accepted, and return it."""
-    deadline = time.monotonic() + patience_s
+    deadline = time.monotonic() + timeout_s
     while not accepted(result := read()):
         assert time.monotonic() < deadline, result
         time.sleep(0.02)
@@ -123,9 +123,9 @@ def test_streams_report_positions(driver, neighbours):
     assert sensors.load("perception") is create
     assert driver.simulated
     assert driver.raw() is None
-    ground = neighbours["lidar"].ground
+    scene = neighbours["lidar"].scene
     values = located(driver, "person", "nao", "qbo")
-    for name, walker in ground.walkers.items():
+    for name, walker in scene.walkers.items():
         assert math.dist((values[f"x_m.{name}"], values[f"y_m.{name}"]), (walker.x_m, walker.y_m)) < 0.2
         assert values[f"age_s.{name}"] < 5
     assert all(isinstance(value, float) and math.isfinite(value) for value in values.values())
@@ -160,26 +160,26 @@ def test_it_fails_only_if_all_sensors_fail(driver, neighbours, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("changes", "message"),
     [
         ({"lenses": []}, "lenses.*lidars, cameras"),
         ({"look_hz": 0}, "look_hz"),
         ({"kinds": [{"name": "x", "lowest_m": 2, "highest_m": 1, "radius_m": 0}]}, "heights must increase"),
     ],
 )
-def test_invalid_options_are_rejected(folder, neighbours, more, message):
+def test_invalid_options_are_rejected(folder, neighbours, changes, message):
     with pytest.raises(SensorError, match=message):
-        PerceptionDriver(device(**more), folder, neighbours)
+        PerceptionDriver(device(**changes), folder, neighbours)
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("changes", "message"),
     [
         ({"lidars": ["radar"]}, "'radar'; this agent's devices: depth, lidar, light"),
         ({"survey": "none.npz"}, "capture 'survey'"),
         ({"mounts": [MOUNT | {"name": "x"}]}, "the room has: arm"),
     ],
 )
-def test_connect_reports_mismatches_with_the_room(folder, neighbours, more, message):
+def test_connect_reports_mismatches_with_the_room(folder, neighbours, changes, message):
     with pytest.raises(SensorError, match=message):
-        PerceptionDriver(device(**more), folder, neighbours).connect()
+        PerceptionDriver(device(**changes), folder, neighbours).connect()

@@ -10,40 +10,40 @@ import numpy as np
 import pytest
 
 from tests.harness.agent.rooms import ManualWorld
-from tests.unit.device_agent.perception.lab import EYES, Watched, by_hand
+from tests.unit.device_agent.perception.lab import SENSORS, LabFixture, manual_time
 
 pytestmark = pytest.mark.slow
 MEDIAN_M = 0.15
-"""Promised median position error."""
+"""Maximum median position error."""
 ALL = {"person", "ur5", "nao", "qbo", "hanson"}
-UNKNOWN = 0.05
+MAX_UNKNOWN = 0.05
 """Tolerated share of missing detections."""
-KNOWN_S = 4.4
+LOCATE_S = 4.4
 """Time until a fixed robot must be located [s]."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _manual_time() -> Iterator[None]:
-    with by_hand():
+    with manual_time():
         yield
 
 
 @pytest.fixture
-def watched() -> Iterator[Watched]:
+def lab() -> Iterator[LabFixture]:
     """The laboratory with a NAO that can walk."""
-    watched = Watched(walks=True)
-    yield watched
-    watched.close()
+    lab = LabFixture(walks=True)
+    yield lab
+    lab.close()
 
 
-def errors_while_moving(watched: Watched, turns: int, turn_s: float) -> dict[str, list[float]]:
+def errors_while_moving(lab: LabFixture, turns: int, turn_s: float) -> dict[str, list[float]]:
     """Position errors by name [m] while all robots move."""
-    watched.look(KNOWN_S)
+    lab.run(LOCATE_S)
     errors_m: dict[str, list[float]] = {name: [] for name in ALL}
     for turn in range(turns):
-        watched.go_about(turn)
-        for name, off in watched.look(turn_s).items():
-            errors_m[name] += off
+        lab.start_motions(turn)
+        for name, errors in lab.run(turn_s).items():
+            errors_m[name] += errors
     return errors_m
 
 
@@ -57,59 +57,59 @@ class EmptyRoom:
 def test_the_shipped_background_matches_the_room() -> None:
     """When this fails the furniture has moved: `python robots/rooms/survey.py lab`."""
     manifest = ManualWorld().manifest
-    watched = Watched(msgspec.structs.replace(manifest, robots=(), people=()))
-    watched.world.add(EmptyRoom())
-    watched.world.advance(4.0)
+    lab = LabFixture(msgspec.structs.replace(manifest, robots=(), people=()))
+    lab.world.add(EmptyRoom())
+    lab.world.advance(4.0)
     try:
-        for name in EYES:
-            assert watched.sight.background.change_share(name, watched.raw(name)) < 0.01, name
+        for name in SENSORS:
+            assert lab.fusion.background.change_share(name, lab.raw(name)) < 0.01, name
     finally:
-        watched.close()
+        lab.close()
 
 
 def check(errors_m: dict[str, list[float]]) -> None:
-    """Each object is located within the promised error."""
+    """Each object is located within the maximum error."""
     assert set(errors_m) == ALL
-    for name, off in errors_m.items():
-        known = [error for error in off if math.isfinite(error)]
-        unknown = len(off) - len(known)
-        print(f"{name}: median {statistics.median(off):.3f} m, 95 % {np.percentile(known, 95):.3f} m, "
-              f"most {max(known):.3f} m, unknown {unknown} of {len(off)}")  # fmt: skip
-        assert statistics.median(off) <= MEDIAN_M, name
-        assert unknown < UNKNOWN * len(off), name
+    for name, errors in errors_m.items():
+        known = [error for error in errors if math.isfinite(error)]
+        unknown = len(errors) - len(known)
+        print(f"{name}: median {statistics.median(errors):.3f} m, 95 % {np.percentile(known, 95):.3f} m, "
+              f"most {max(known):.3f} m, unknown {unknown} of {len(errors)}")  # fmt: skip
+        assert statistics.median(errors) <= MEDIAN_M, name
+        assert unknown < MAX_UNKNOWN * len(errors), name
 
 
-def test_moving_objects_are_located_accurately_and_the_grid_shows_obstacles_and_free_floor(watched: Watched) -> None:
-    check(errors_while_moving(watched, turns=3, turn_s=3.2))
-    assert watched.walked_m > 0.3
-    floor = watched.sight.grid.blocked(0.2, apart=[(*at, 0.4) for at in watched.truth().values()])
+def test_moving_objects_are_located_accurately_and_the_grid_shows_obstacles_and_free_floor(lab: LabFixture) -> None:
+    check(errors_while_moving(lab, turns=3, turn_s=3.2))
+    assert lab.walked_m > 0.3
+    floor = lab.fusion.grid.blocked(0.2, apart=[(*at, 0.4) for at in lab.truth().values()])
     for x_m, y_m in ((-1.5, -0.3), (-0.4, -0.5), (1.0, -0.8), (0.9, 0.0)):
         assert not floor.at(x_m, y_m), (x_m, y_m)
-    table = watched.world.place("ur5/base")
+    table = lab.world.place("ur5/base")
     assert floor.at(table[0] - 0.5, table[1])
-    plan = watched.world.manifest.plan
+    plan = lab.world.manifest.plan
     for x_m in np.arange(plan.lower_m[0] + 0.5, plan.upper_m[0] - 0.5, 0.25):
         assert floor.at(float(x_m), plan.upper_m[1] - 0.1)
 
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_moving_objects_are_located_accurately_for_minutes(watched: Watched) -> None:
-    check(errors_while_moving(watched, turns=60, turn_s=4.0))
-    assert watched.walked_m > 5
+def test_moving_objects_are_located_accurately_for_minutes(lab: LabFixture) -> None:
+    check(errors_while_moving(lab, turns=60, turn_s=4.0))
+    assert lab.walked_m > 5
 
 
 @pytest.mark.parametrize("posture", ["Sit", pytest.param("Crouch", marks=pytest.mark.long)])
-def test_a_sitting_nao_is_not_classified_as_qbo(watched: Watched, posture: str) -> None:
-    """Whether it was watched while sitting down, or already sat when the room began to look."""
-    nao = watched.nao
+def test_a_sitting_nao_is_not_classified_as_qbo(lab: LabFixture, posture: str) -> None:
+    """Both while NAO sits down, and when perception starts with a sitting NAO."""
+    nao = lab.nao
     assert nao is not None
-    watched.look(2.4)
+    lab.run(2.4)
     sitting = nao.controller.start_joint_goal(nao.reservation, nao.type.postures[posture], speed=1.0)
     while not sitting.finished.is_set():
-        watched.look(0.2)
-    watched.look(2.0)
-    check(watched.look(1.0))
-    watched.begin()
-    watched.look(KNOWN_S)
-    check(watched.look(0.6))
+        lab.run(0.2)
+    lab.run(2.0)
+    check(lab.run(1.0))
+    lab.restart()
+    lab.run(LOCATE_S)
+    check(lab.run(0.6))

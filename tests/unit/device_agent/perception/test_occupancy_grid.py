@@ -1,4 +1,4 @@
-"""The occupancy grid: what it learns from measurements, and what it forgets."""
+"""The occupancy grid: updates, decay and navigation maps."""
 
 import math
 
@@ -26,7 +26,7 @@ def room(*boxes):
     return np.array(ends)
 
 
-def look(grid, ends, times=1, elapsed_s=0.1):
+def add_scans(grid, ends, times=1, elapsed_s=0.1):
     for _ in range(times):
         grid.add_rays("lidar", (2.0, 1.5), ends, np.ones(len(ends), dtype=bool))
         grid.advance(elapsed_s)
@@ -42,13 +42,13 @@ def grid():
 
 
 @pytest.fixture
-def bare():
+def exact_grid():
     """A grid as large as the room."""
     return OccupancyGrid((0, 0), (4, 3))
 
 
 def test_walls_are_found_within_a_cell(grid):
-    look(grid, room(), times=50)
+    add_scans(grid, room(), times=50)
     rows, columns = np.nonzero(grid.static())
     x = -0.5 + (columns + 0.5) * 0.05
     y = -0.5 + (rows + 0.5) * 0.05
@@ -58,45 +58,45 @@ def test_walls_are_found_within_a_cell(grid):
 
 
 def test_a_person_who_leaves_disappears(grid):
-    look(grid, room(), times=100)
-    look(grid, room(PERSON), times=10)
+    add_scans(grid, room(), times=100)
+    add_scans(grid, room(PERSON), times=10)
     at = cell(grid, 3.02, 1.45)
     assert grid.moving()[at]
     assert not grid.static()[at]
-    look(grid, room(), times=15)
+    add_scans(grid, room(), times=15)
     assert not grid.taken()[at]
 
 
 def test_objects_that_stay_become_static_and_the_wall_behind_them_stays(grid):
-    look(grid, room(), times=100)
-    look(grid, room(PERSON), times=90, elapsed_s=1.0)
+    add_scans(grid, room(), times=100)
+    add_scans(grid, room(PERSON), times=90, elapsed_s=1.0)
     assert grid.static()[cell(grid, 3.02, 1.45)]
     assert grid.static()[cell(grid, 4.02, 1.5)]
 
 
-def test_unseen_cells_are_forgotten(bare):
-    bare.add_cells("depth", taken_m=EMPTY, clear_m=np.array([[1.0, 1.0]]))
+def test_unseen_cells_decay_to_unknown(exact_grid):
+    exact_grid.add_cells("depth", taken_m=EMPTY, clear_m=np.array([[1.0, 1.0]]))
     for _ in range(50):
-        bare.advance(0.1)
+        exact_grid.advance(0.1)
     for _ in range(5):
-        bare.add_cells("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
-        bare.advance(0.1)
-    assert bare.taken()[cell(bare, 1.0, 1.0)]
+        exact_grid.add_cells("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
+        exact_grid.advance(0.1)
+    assert exact_grid.taken()[cell(exact_grid, 1.0, 1.0)]
     for _ in range(300):
-        bare.advance(0.1)
-    assert not bare.taken()[cell(bare, 1.0, 1.0)]
+        exact_grid.advance(0.1)
+    assert not exact_grid.taken()[cell(exact_grid, 1.0, 1.0)]
 
 
-def test_a_table_above_the_lidar_plane_is_occupied(bare):
+def test_a_table_above_the_lidar_plane_is_occupied(exact_grid):
     table = np.array([[3.0, 1.5]])
     for _ in range(10):
-        look(bare, room(), times=1)
-        bare.add_cells("depth", taken_m=table, clear_m=EMPTY)
-    assert bare.taken()[cell(bare, 3.0, 1.5)]
+        add_scans(exact_grid, room(), times=1)
+        exact_grid.add_cells("depth", taken_m=table, clear_m=EMPTY)
+    assert exact_grid.taken()[cell(exact_grid, 3.0, 1.5)]
 
 
 def test_blocked_keeps_the_radius_from_walls(grid):
-    look(grid, room(), times=10)
+    add_scans(grid, room(), times=10)
     floor = grid.blocked(0.25)
     assert floor.at(3.8, 1.5)
     assert not floor.at(3.65, 1.5)
@@ -104,27 +104,27 @@ def test_blocked_keeps_the_radius_from_walls(grid):
     assert floor.at(9.0, 1.0), "outside of the grid"
     assert floor.at(-0.4, 1.0), "unknown behind the wall"
     assert not grid.blocked(0.1, unknown=False).at(-0.4, 1.0)
-    look(grid, room((2.8, 1.4, 3.0, 1.6)), times=10)
+    add_scans(grid, room((2.8, 1.4, 3.0, 1.6)), times=10)
     assert grid.blocked(0.2).at(2.7, 1.5)
     assert not grid.blocked(0.2, apart=[(2.9, 1.5, 0.3)]).at(2.7, 1.5), "a robot does not block itself"
 
 
-def test_invalid_points_and_sizes_are_rejected(bare):
-    bare.add_cells("depth", taken_m=np.array([[math.nan, 1.0], [math.inf, 1.0], [1.0, 1.0]]), clear_m=EMPTY)
-    assert bare.taken().sum() == 1
+def test_invalid_points_and_sizes_are_rejected(exact_grid):
+    exact_grid.add_cells("depth", taken_m=np.array([[math.nan, 1.0], [math.inf, 1.0], [1.0, 1.0]]), clear_m=EMPTY)
+    assert exact_grid.taken().sum() == 1
     with pytest.raises(ValueError, match="upper corner"):
         OccupancyGrid((0, 0), (0, 3))
 
 
-def test_people_in_front_of_hidden_floor_do_not_become_static(bare):
+def test_people_in_front_of_hidden_floor_do_not_become_static(exact_grid):
     for _ in range(10):
-        for _ in range(10):  # two seconds there, eighteen not
-            bare.add_cells("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
-            bare.advance(0.2)
+        for _ in range(10):  # occupied for two of twenty seconds
+            exact_grid.add_cells("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
+            exact_grid.advance(0.2)
         for _ in range(90):
-            bare.advance(0.2)
-        assert not bare.taken()[cell(bare, 1.0, 1.0)]
-        assert not bare.static()[cell(bare, 1.0, 1.0)]
+            exact_grid.advance(0.2)
+        assert not exact_grid.taken()[cell(exact_grid, 1.0, 1.0)]
+        assert not exact_grid.static()[cell(exact_grid, 1.0, 1.0)]
 
 
 def test_cells_outside_the_plan_are_blocked():
@@ -138,7 +138,7 @@ def test_cells_outside_the_plan_are_blocked():
 
 
 def floor_of(values: dict[str, float]) -> api.Room:
-    """A script's room in which the floor was measured just now."""
+    """A script's room with a recent measurement of the floor."""
     return api.Room(lambda kind, device, stream: {"values": values, "age_s": 0.5})  # noqa: ARG005
 
 
@@ -148,10 +148,10 @@ def test_scripts_can_decode_the_rows():
     clear = np.column_stack((across.ravel(), up.ravel()))
     for _ in range(5):
         grid.add_cells("depth", taken_m=np.array([[1.01, -1.0], [-2.5, 0.6]]), clear_m=clear)
-    found = occupancy_rows(grid)
-    assert (found["columns"], found["rows"], found["side_m"]) == (32.0, 27.0, 0.2)
-    assert len(found) <= MAX_VALUES
-    room = floor_of(found)
+    rows = occupancy_rows(grid)
+    assert (rows["columns"], rows["rows"], rows["side_m"]) == (32.0, 27.0, 0.2)
+    assert len(rows) <= MAX_VALUES
+    room = floor_of(rows)
     for x_m, y_m, taken in (
         (1.01, -1.0, True),
         (-2.5, 0.6, True),
@@ -165,7 +165,7 @@ def test_scripts_can_decode_the_rows():
     with pytest.raises(api.RobotError, match="finite"):
         room.taken(math.nan, 0.0)
     assert api.Room(lambda *_, **__: None).taken(0.0, 0.0) is None
-    assert api.Room(lambda *_, **__: {"values": found, "age_s": 60.0}).taken(0.0, 0.0) is None
+    assert api.Room(lambda *_, **__: {"values": rows, "age_s": 60.0}).taken(0.0, 0.0) is None
 
 
 @pytest.mark.parametrize("size_m", [6.0, 40.0, 80.0])
@@ -173,6 +173,6 @@ def test_rows_of_any_floor_fit_into_a_message(size_m):
     grid = OccupancyGrid((0.0, 0.0), (size_m, size_m * 0.9))
     last = np.array([[size_m - 0.03, size_m * 0.9 - 0.03]])
     grid.add_cells("depth", taken_m=last, clear_m=np.zeros((0, 2)))
-    found = occupancy_rows(grid)
-    codec.encode(Measurements(tick_ms=1, at_ms=1, sequence=1, values=found))
-    assert floor_of(found).taken(*last[0]) is True
+    rows = occupancy_rows(grid)
+    codec.encode(Measurements(tick_ms=1, at_ms=1, sequence=1, values=rows))
+    assert floor_of(rows).taken(*last[0]) is True
