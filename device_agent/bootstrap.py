@@ -66,7 +66,7 @@ class RunningAgent:
         self._agent.start()
 
     def stop(self) -> None:
-        """Hold, disconnect and close. Callable repeatedly."""
+        """Hold, disconnect and close. May be called repeatedly."""
         self._agent.stop()
         self._sandbox.close()
         self._journal.close()
@@ -118,7 +118,7 @@ def create_driver(
     Args:
         entry: The device.
         kind: Its robot type.
-        trace: Folder for the ground truth of simulated devices.
+        trace: Folder for the obstacle_map truth of simulated devices.
         faults: Folder of injected faults of simulated robots, ``{device}.toml`` each.
 
     Raises:
@@ -199,7 +199,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
 
     Args:
         store: An enrolled and claimed agent.
-        trace: Folder for the ground truth of simulated devices, ``{device}.ndjson`` each.
+        trace: Folder for the obstacle_map truth of simulated devices, ``{device}.ndjson`` each.
 
     Raises:
         ConfigError: The agent is not enrolled or claimed, or a file is wrong.
@@ -218,7 +218,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
     journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
     pins = PinnedKeys(pairing, save=store.save_pairing, now_ms=clock.now_ms)
     monitor = PairingMonitor(pairing, configuration, enrolled_devices(configuration), pins)
-    room = ReadingCache(
+    readings = ReadingCache(
         space=pairing.space,
         agent=pairing.agent,
         own=[entry.name for entry in configuration.devices],
@@ -233,9 +233,9 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
         quiet=lambda: agent.quiet,
         certificate=ClientCertificate(store.folder),
         now_ms=clock.now_ms,
-        listen=room.topics(),
+        listen=readings.topics(),
     )
-    latencies = LatencyReports(pairing.agent, _carrier(configuration), wiring.open_api)
+    latencies = LatencyReports(pairing.agent, _transport_name(configuration), wiring.open_api)
     transport = LatencyProbe(
         factory.make(wiring), upload=latencies.send, at_ms=lambda: round(clock.now_ms() or wall_ms())
     )
@@ -245,30 +245,30 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}
     for entry in configuration.devices:
-        instrument = create_room_device(entry, neighbours, uploads, faults=store.faults)
-        if instrument is not None:
-            neighbours[entry.name] = instrument.driver
+        room_device = create_room_device(entry, neighbours, uploads, faults=store.faults)
+        if room_device is not None:
+            neighbours[entry.name] = room_device.driver
         devices[entry.name] = _device(
             entry,
             pairing,
             pins=pins,
-            instrument=instrument,
-            ground=(lambda: _ground(neighbours)) if entry.room else None,
+            room_device=room_device,
+            obstacle_map=(lambda: _obstacle_map(neighbours)) if entry.room else None,
             journal=journal,
             clock=clock,
             transport=transport,
             outbox=outbox,
-            room=room,
+            readings=readings,
             sandbox=sandbox,
             trace=trace,
             faults=store.faults,
             uploads=uploads,
         )
-    agent = Agent(devices, transport, outbox=outbox, readings=room, address=(pairing.space, pairing.agent))
+    agent = Agent(devices, transport, outbox=outbox, readings=readings, address=(pairing.space, pairing.agent))
     return RunningAgent(agent, journal, monitor, sandbox)
 
 
-def _carrier(configuration: AgentConfig) -> str:
+def _transport_name(configuration: AgentConfig) -> str:
     """Name of the transport in latency reports."""
     plain = configuration.transport == "http" and configuration.http.poll == "plain"
     return "http-poll" if plain else configuration.transport
@@ -282,9 +282,9 @@ def _own_streams(configuration: AgentConfig) -> Iterator[tuple[str, str]]:
             yield entry.name, stream.name
 
 
-def _ground(neighbours: Mapping[str, RoomDriver]) -> ObstacleMap | None:
-    """What stands in the room, where a device of this agent sees it now."""
-    from device_agent.sensors.perception.driver import PerceptionDriver  # noqa: PLC0415 (for who goes somewhere only)
+def _obstacle_map(neighbours: Mapping[str, RoomDriver]) -> ObstacleMap | None:
+    """The obstacle map of the room, if a perception device of this agent is connected."""
+    from device_agent.sensors.perception.driver import PerceptionDriver  # noqa: PLC0415 (needed for navigation only)
 
     for driver in neighbours.values():
         if isinstance(driver, PerceptionDriver):
@@ -298,14 +298,19 @@ def _outbox(
 ) -> Outbox:
     own = f"{topics.ROOT}/{pairing.space}/{pairing.agent}/"
     buffer = configuration.buffer
-    shelf = OutboxStore(
+    outbox_store = OutboxStore(
         store.outbox, own=own, max_bytes=round(buffer.max_mb * 1e6), max_age_ms=round(buffer.max_age_h * 3_600_000)
     )
-    teller = own + configuration.devices[0].name
+    device_topic = own + configuration.devices[0].name
     # The other transports acknowledge a message once it is stored.
     settle_s = buffer.settle_s if configuration.transport == "mqtt" else 0.0
     return Outbox(
-        shelf, publish=publish, device_topic=teller, is_quiet=quiet, keep_hz=buffer.measurements_hz, settle_s=settle_s
+        outbox_store,
+        publish=publish,
+        device_topic=device_topic,
+        is_quiet=quiet,
+        keep_hz=buffer.measurements_hz,
+        settle_s=settle_s,
     )
 
 
@@ -314,13 +319,13 @@ def _device(
     pairing: Pairing,
     *,
     pins: PinnedKeys,
-    instrument: RoomDevice | None,
-    ground: Callable[[], ObstacleMap | None] | None,
+    room_device: RoomDevice | None,
+    obstacle_map: Callable[[], ObstacleMap | None] | None,
     journal: Journal,
     clock: CloudClock,
     transport: Transport,
     outbox: Outbox,
-    room: ReadingCache,
+    readings: ReadingCache,
     sandbox: Sandbox,
     trace: Path | None,
     faults: Path,
@@ -333,14 +338,14 @@ def _device(
         space=pairing.space,
         agent=pairing.agent,
         robot_type=kind,
-        obstacle_map=ground,
-        driver=create_driver(entry, kind, trace=trace, faults=faults) if instrument is None else instrument,
+        obstacle_map=obstacle_map,
+        driver=create_driver(entry, kind, trace=trace, faults=faults) if room_device is None else room_device,
         journal=journal,
         cloud_clock=clock,
         keys=pins,
         publish=transport.publish,
         outbox=outbox,
-        readings=room,
+        readings=readings,
         interlocks=entry.interlocks,
         geometry=_geometry(entry, kind),
         sandbox=sandbox,

@@ -53,7 +53,7 @@ def add_commands(commands: Commands, home: Path) -> None:
     parser.add_argument(
         "--poll",
         choices=("long", "plain"),
-        help="with http: the cloud responds when a command arrives (long, the default) or at once (plain)",
+        help="with http: the cloud responds when a command arrives (long, the default) or immediately (plain)",
     )
     parser.add_argument("--poll-ms", type=int, metavar="MS", help="interval of plain polls [ms]")
     parser.add_argument(
@@ -78,7 +78,7 @@ def await_claim(store: IdentityStore, api: CloudClient, config: AgentConfig, cla
     """Wait until an account claims the agent, and save the pairing. Replaces expired claim codes."""
     expires_s = time.monotonic() + (claim.expires_in_s or 0)
     while True:
-        systemd.alive()
+        systemd.notify_watchdog()
         enrollment = api.enrollment(wait_s=_LONG_POLL_S if claim.code is not None else 0.0)
         if enrollment.get("state") == "claimed":
             pairing = pairing_of(responses.read(enrollment, responses.Claimed))

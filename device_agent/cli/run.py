@@ -67,7 +67,7 @@ def _pair(store: IdentityStore, *, qr: bool) -> None:
 
 
 def _exit(*_: object) -> None:
-    """Exit at once: no device is running yet."""
+    """Exit immediately: no device is running yet."""
     raise SystemExit(0)
 
 
@@ -82,7 +82,7 @@ def _run_until_unpaired(store: IdentityStore, trace: Path | None) -> bool:
         print("running", flush=True)
         systemd.ready("running")
         while not stop.wait(_PAIRING_CHECK_S):
-            systemd.alive()
+            systemd.notify_watchdog()
             if agent.outdated:
                 return True
     finally:

@@ -10,7 +10,7 @@ def ready(status: str) -> None:
     _notify(f"READY=1\nSTATUS={status}")
 
 
-def alive() -> None:
+def notify_watchdog() -> None:
     """Trigger the watchdog; call more often than ``WatchdogSec``."""
     _notify("WATCHDOG=1")
 

@@ -56,7 +56,7 @@ class HttpPolling(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """``[http]`` of ``agent.toml``: how the ``http`` transport polls for commands.
 
     Attributes:
-        poll: ``long``: the cloud responds when a command arrives. ``plain``: it responds at once.
+        poll: ``long``: the cloud responds when a command arrives. ``plain``: it responds immediately.
         poll_ms: Interval of plain polls [ms].
     """
 
@@ -174,7 +174,7 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 def _check(config: AgentConfig, path: Path) -> None:
     names = [device.name for device in config.devices]
     if not names or _has_duplicates(names):
-        raise ConfigError(f"{path}: needs at least one device, each with a name of its own")
+        raise ConfigError(f"{path}: needs at least one device, each with a unique name")
     for source, _ in config.room_sources:
         if source not in names and "-" not in source:
             raise ConfigError(

@@ -6,7 +6,7 @@ from pathlib import Path
 from device_agent.config import private_file
 
 _SKEW_MS = 300_000
-"""The cloud antedates certificates by this time, for brokers whose clock is late [ms]."""
+"""The cloud backdates certificates by this time, for brokers whose clock is slow [ms]."""
 _RESOLUTION_MS = 1000
 """Certificates have a resolution of one second [ms]."""
 _RENEW_AT_SHARE = 2 / 3

@@ -39,7 +39,7 @@ _log = logging.getLogger(__name__)
 
 
 class Pairing(Struct, frozen=True, kw_only=True):
-    """``pairing.json``: what the agent learned when it was claimed.
+    """``pairing.json``: the result of the claim.
 
     Attributes:
         agent: Id of the agent.
@@ -47,7 +47,7 @@ class Pairing(Struct, frozen=True, kw_only=True):
         account: Display name of the owner.
         keys: Pinned keys of the cloud: key id → public key.
         owner: Account id of the owner. Scripts of other accounts are untrusted.
-        serial: Serial number of the newest key; it only rises.
+        serial: Serial number of the newest key; it never decreases.
         until_ms: Expiry of superseded keys: key id → the cloud's clock [ms].
     """
 
@@ -75,7 +75,7 @@ class IdentityStore:
         self._pairing = folder / "pairing.json"
 
     def private_key(self, *, create: bool = False) -> Ed25519PrivateKey:
-        """The agent's private key; with ``create`` generated if there is none.
+        """The agent's private key; with ``create`` generated if it is missing.
 
         Raises:
             ConfigError: The key is missing, unreadable or of another kind.
@@ -157,7 +157,7 @@ class IdentityStore:
     def lock(self) -> Iterator[None]:
         """Hold the exclusive right to run this agent until the end of the ``with`` block or of the process.
 
-        An SQLite lock behaves alike on every operating system and is released when its process dies.
+        An SQLite lock behaves the same on every operating system and is released when its process ends.
 
         Raises:
             ConfigError: Another process runs the agent, or the folder holds no agent.

@@ -17,8 +17,8 @@ Ints = npt.NDArray[np.intp]
 
 STEP_M = 0.01
 """An approach by less than this, followed by a retreat, may be missed: half of the usual margin."""
-_GLANCES = 6
-_CLOSER = 3
+_GLANCE_SAMPLES = 6
+_BISECTIONS = 3
 """Number of bisections for the end of the clear part."""
 _SAME_M = 1e-7
 """Smaller changes of a distance are ignored: far above rounding errors."""
@@ -54,7 +54,7 @@ class CollisionChecker:
         self._equality_joints = equality_joints
         self.data: Any = mujoco.MjData(model)
         self.place(at_rad)
-        self._measured = np.asarray(at_rad, dtype=np.float64), pairs.rooms_at_least(self.data)
+        self._measured = np.asarray(at_rad, dtype=np.float64), pairs.excess_bounds(self.data)
 
     def place(self, position_rad: Sequence[float] | Floats) -> None:
         """Set the joint position, shape (n,) [rad]."""
@@ -72,44 +72,44 @@ class CollisionChecker:
         if self._within(position_rad[np.newaxis]):
             return True
         self.place(position_rad)
-        return not self._pairs.too_near(self.data)
+        return not self._pairs.violations(self.data)
 
     def sweep(self, path_rad: Sequence[Sequence[float]] | Floats) -> Sweep:
         """Follow straight segments until a pair violates its margin or worsens a violation."""
         path = np.asarray(path_rad, dtype=np.float64)
         segments = np.diff(path, axis=0)
-        if self._surely_clear(path):
+        if self._clear_by_bounds(path):
             return Sweep(1.0)
         self.place(path[0])
-        near = self._pairs.near(self.data, np.abs(segments))
+        approaching = self._pairs.approaching(self.data, np.abs(segments))
         for index, segment in enumerate(segments):
             share = 0.0
-            while share < 1.0 and near.any:
+            while share < 1.0 and approaching.any:
                 checked = share
-                share = min(1.0, share + near.safe_share(index, STEP_M))
+                share = min(1.0, share + approaching.safe_share(index, STEP_M))
                 self.place(path[index] + share * segment)
-                near.update(self.data, index, share)
-                if near.broken(_SAME_M):
-                    return Sweep((index + checked) / len(segments), near.tightest())
+                approaching.update(self.data, index, share)
+                if approaching.is_violated(_SAME_M):
+                    return Sweep((index + checked) / len(segments), approaching.tightest())
         return Sweep(1.0)
 
     def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
         """Clear share of a straight segment, estimated from six samples and three bisections."""
-        start, way = np.asarray(start_rad, dtype=np.float64), np.subtract(end_rad, start_rad)
+        start, motion = np.asarray(start_rad, dtype=np.float64), np.subtract(end_rad, start_rad)
         self.place(start)
-        before = self._pairs.too_near(self.data)
+        before = self._pairs.violations(self.data)
 
         def clear(share: float) -> bool:
-            position = start + share * way
+            position = start + share * motion
             if self._within(position[np.newaxis]):
                 return True
             self.place(position)
-            return self._pairs.too_near(self.data) <= before
+            return self._pairs.violations(self.data) <= before
 
-        for index in range(_GLANCES):
-            if not clear((index + 1) / _GLANCES):
-                low, half = index / _GLANCES, 0.5 / _GLANCES
-                for _ in range(_CLOSER):
+        for index in range(_GLANCE_SAMPLES):
+            if not clear((index + 1) / _GLANCE_SAMPLES):
+                low, half = index / _GLANCE_SAMPLES, 0.5 / _GLANCE_SAMPLES
+                for _ in range(_BISECTIONS):
                     low, half = (low + half if clear(low + half) else low), half / 2
                 return low
         return 1.0
@@ -142,7 +142,7 @@ class CollisionChecker:
         velocity = right.T @ (sizes / (sizes**2 + (near * _DAMPING) ** 2 + _NOTHING) * (left.T @ target_twist))
         return tuple((dependent.spread @ velocity).tolist())
 
-    def _surely_clear(self, path: Floats) -> bool:
+    def _clear_by_bounds(self, path: Floats) -> bool:
         """Whether a path is clear by the clearances measured last; covers most paths at low cost.
 
         The bound on each clearance shrinks with each joint's distance from the measured position: corners suffice.
@@ -151,9 +151,9 @@ class CollisionChecker:
         if self._within(path):
             return True
         self.place(path[0])
-        self._measured = path[0], self._pairs.rooms_at_least(self.data)
+        self._measured = path[0], self._pairs.excess_bounds(self.data)
         return self._within(path)
 
     def _within(self, path: Floats) -> bool:
-        origin, room_m = self._measured
-        return bool(np.all(self._pairs.closing(np.abs(path - origin)) <= room_m))
+        origin, excess_m = self._measured
+        return bool(np.all(self._pairs.closing(np.abs(path - origin)) <= excess_m))

@@ -80,13 +80,13 @@ class CollisionPairs:
         planes = model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)
         self._centre[planes], self._half[planes] = (0.0, 0.0, -_FAR_M), (10 * _FAR_M, 10 * _FAR_M, _FAR_M)
         self._radius = np.linalg.norm(self._half, axis=1)
-        self._everywhere = lever_arms.of_geoms([*self._a, *self._b])
-        self._line = np.zeros(6)
+        self._point_levers = lever_arms.of_geoms([*self._a, *self._b])
+        self._from_to = np.zeros(6)
         box = robot_type.workspace
-        framed = () if box is None else box.frames
-        self._framed = [(name, *frames[name]) for name in framed]
-        self._frame_lever = np.array([lever_arms.of_frame(*frames[name]) for name in framed]).reshape(
-            len(framed), len(joints)
+        frame_names = () if box is None else box.frames
+        self._workspace_frames = [(name, *frames[name]) for name in frame_names]
+        self._frame_lever = np.array([lever_arms.of_frame(*frames[name]) for name in frame_names]).reshape(
+            len(frame_names), len(joints)
         )
         self._lower = np.zeros(3) if box is None else np.array(box.lower_m)
         self._upper = np.zeros(3) if box is None else np.array(box.upper_m)
@@ -109,20 +109,20 @@ class CollisionPairs:
             place(home if index == 0 else random.uniform(lower, upper))
             distance = np.array([self._measure(data, pair, _FAR_M) for pair in range(count)])
             least, most = np.minimum(least, distance), np.maximum(most, distance)
-        apart = [_steps(self._model, a, b) for a, b in zip(self._a, self._b, strict=True)]
-        neighbours = np.array([steps <= _NEIGHBOURS for steps in apart], dtype=bool)
+        link_distances = [_steps(self._model, a, b) for a, b in zip(self._a, self._b, strict=True)]
+        neighbours = np.array([steps <= _NEIGHBOURS for steps in link_distances], dtype=bool)
         narrow = neighbours & (least > 0)
         self._margin[narrow] = np.minimum(self._margin[narrow], least[narrow] / 2)
         keep = (most - least >= _STILL_M) | (least <= 0)
         self._a, self._b, self._lever, self._margin = (
             array[keep] for array in (self._a, self._b, self._lever, self._margin)
         )
-        self._names = [name for name, kept in zip(self._names, keep, strict=True) if kept]
+        self._names = [name for name, keeps in zip(self._names, keep, strict=True) if keeps]
         place(home)
         clearance = self.tightest(data)
-        if clearance.room_m < 0:
+        if clearance.excess_m < 0:
             raise GeometryError(
-                f"the home position is too close ({clearance.text}, {clearance.room_m * 1000:.1f} mm); "
+                f"the home position is too close ({clearance.text}, {clearance.excess_m * 1000:.1f} mm); "
                 "change home_rad, margin_m or workspace, or <exclude> the pair in the model"
             )
 
@@ -130,28 +130,32 @@ class CollisionPairs:
         """A copy with margins larger by this share, and the workspace smaller by as much."""
         wider = copy.copy(self)
         wider._margin = self._margin * (1 + share)  # noqa: SLF001 (same class)
-        wider._line = np.zeros(6)  # noqa: SLF001
+        wider._from_to = np.zeros(6)  # noqa: SLF001
         inset_m = share * float(np.max(self._margin, initial=0.0))
         wider._lower, wider._upper = self._lower + inset_m, self._upper - inset_m  # noqa: SLF001
         return wider
 
     def tightest(self, data: Any) -> Clearance:
         """The smallest clearance."""
-        room, between, kind = math.inf, ("", ""), "clearance"
-        bound = self._at_least(data) - self._margin
+        excess, between, kind = math.inf, ("", ""), "clearance"
+        bound = self._distance_bounds(data) - self._margin
         for pair in np.argsort(bound).tolist():
-            if bound[pair] >= room:
+            if bound[pair] >= excess:
                 break
             found = self._measure(data, pair, _FAR_M) - self._margin[pair]
-            if found < room:
-                room, between = float(found), self._names[pair]
-        for index, rooms in enumerate(self._rooms(data)):
-            face = int(np.argmin(rooms))
-            if rooms[face] < room:
-                room, between, kind = float(rooms[face]), (self._framed[index][0], _FACES[face]), "workspace"
-        return Clearance(room, between, kind)
+            if found < excess:
+                excess, between = float(found), self._names[pair]
+        for index, excesses in enumerate(self._face_excess(data)):
+            face = int(np.argmin(excesses))
+            if excesses[face] < excess:
+                excess, between, kind = (
+                    float(excesses[face]),
+                    (self._workspace_frames[index][0], _FACES[face]),
+                    "workspace",
+                )
+        return Clearance(excess, between, kind)
 
-    def near(self, data: Any, segments: Floats) -> "ApproachingPairs":
+    def approaching(self, data: Any, segments: Floats) -> "ApproachingPairs":
         """The pairs that could collide on a path, measured at its start.
 
         Args:
@@ -159,28 +163,28 @@ class CollisionPairs:
             segments: Joint distance of each segment, shape (segments, n) [rad], not negative.
         """
         closing = segments @ self._lever.T
-        could = np.flatnonzero(self._at_least(data) - self._margin < closing.sum(axis=0))
+        candidates = np.flatnonzero(self._distance_bounds(data) - self._margin < closing.sum(axis=0))
         frame_closing = np.repeat(segments @ self._frame_lever.T, len(_FACES), axis=1)
-        near = ApproachingPairs(self, could, closing[:, could], frame_closing)
-        near.update(data, 0, 0.0)
-        near.begin()
-        return near
+        approaching = ApproachingPairs(self, candidates, closing[:, candidates], frame_closing)
+        approaching.update(data, 0, 0.0)
+        approaching.begin()
+        return approaching
 
-    def too_near(self, data: Any) -> frozenset[int]:
+    def violations(self, data: Any) -> frozenset[int]:
         """Pairs, and frames at workspace faces, that violate their margin."""
-        pairs = np.flatnonzero(self._at_least(data) < self._margin).tolist()
-        near = {pair for pair in pairs if self.room(data, pair, 0.0) < 0}
-        return frozenset(near.union((np.flatnonzero(self.rooms(data) < 0) + len(self._a)).tolist()))
+        pairs = np.flatnonzero(self._distance_bounds(data) < self._margin).tolist()
+        violated = {pair for pair in pairs if self.excess(data, pair, 0.0) < 0}
+        return frozenset(violated.union((np.flatnonzero(self.frame_excess(data) < 0) + len(self._a)).tolist()))
 
-    def rooms_at_least(self, data: Any) -> Floats:
+    def excess_bounds(self, data: Any) -> Floats:
         """Lower bounds of clearances: pairs, then frames at faces, shape (pairs + frames x 6,) [m]."""
-        bound = self._at_least(data) - self._margin
+        bound = self._distance_bounds(data) - self._margin
         for pair in np.flatnonzero(bound < _CLOSE_M).tolist():
-            bound[pair] = self.room(data, pair, 2 * _CLOSE_M)
-        return np.concatenate((bound, self.rooms(data)))
+            bound[pair] = self.excess(data, pair, 2 * _CLOSE_M)
+        return np.concatenate((bound, self.frame_excess(data)))
 
     def closing(self, distance_rad: Floats) -> Floats:
-        """Upper bounds of how much each of ``rooms_at_least`` shrinks, shape (paths, pairs + frames x 6) [m].
+        """Upper bounds of how much each of ``excess_bounds`` shrinks, shape (paths, pairs + frames x 6) [m].
 
         Args:
             distance_rad: Distance of each joint, shape (paths, n) [rad], not negative.
@@ -190,35 +194,37 @@ class CollisionPairs:
 
     def speed_m_s(self, velocity_rad_s: Floats) -> float:
         """Upper bound of the fastest point's speed [m/s]; velocities not negative."""
-        return float(np.max(self._everywhere @ velocity_rad_s, initial=0.0))
+        return float(np.max(self._point_levers @ velocity_rad_s, initial=0.0))
 
     # ------------------------------------------------------------ for ApproachingPairs
 
-    def room(self, data: Any, pair: int, far_m: float) -> float:
-        """Clearance of one pair [m]; larger values may be reported as ``far_m``."""
+    def excess(self, data: Any, pair: int, far_m: float) -> float:
+        """Clearance of one pair beyond its margin [m]; larger values may be reported as ``far_m``."""
         margin = float(self._margin[pair])
         return self._measure(data, pair, far_m + margin) - margin
 
-    def rooms(self, data: Any) -> Floats:
+    def frame_excess(self, data: Any) -> Floats:
         """Clearance of each workspace frame to each face, shape (frames x 6,) [m]."""
-        return self._rooms(data).ravel()
+        return self._face_excess(data).ravel()
 
-    def named(self, pair: int, room_m: float) -> Clearance:
+    def named(self, pair: int, excess_m: float) -> Clearance:
         """The clearance with the pair's names."""
-        return Clearance(room_m, self._names[pair])
+        return Clearance(excess_m, self._names[pair])
 
-    def face(self, index: int, room_m: float) -> Clearance:
+    def face(self, index: int, excess_m: float) -> Clearance:
         """The clearance with the names of frame and workspace face."""
-        return Clearance(room_m, (self._framed[index // len(_FACES)][0], _FACES[index % len(_FACES)]), "workspace")
+        return Clearance(
+            excess_m, (self._workspace_frames[index // len(_FACES)][0], _FACES[index % len(_FACES)]), "workspace"
+        )
 
     # ------------------------------------------------------------ distances
 
     def _measure(self, data: Any, pair: int, far_m: float) -> float:
         return float(
-            mujoco.mj_geomDistance(self._model, data, int(self._a[pair]), int(self._b[pair]), far_m, self._line)
+            mujoco.mj_geomDistance(self._model, data, int(self._a[pair]), int(self._b[pair]), far_m, self._from_to)
         )
 
-    def _at_least(self, data: Any) -> Floats:
+    def _distance_bounds(self, data: Any) -> Floats:
         """Lower bound of each pair's distance: sphere around one shape, box around the other."""
         rotation = data.geom_xmat.reshape(-1, 3, 3)
         centre = data.geom_xpos + np.einsum("gij,gj->gi", rotation, self._centre)
@@ -233,10 +239,12 @@ class CollisionPairs:
         bound: Floats = np.maximum(from_a - self._radius[b], from_b - self._radius[a])
         return bound
 
-    def _rooms(self, data: Any) -> Floats:
-        if not self._framed:
+    def _face_excess(self, data: Any) -> Floats:
+        if not self._workspace_frames:
             return np.zeros((0, len(_FACES)))
-        world = np.array([data.site_xpos[index] if is_site else data.xpos[index] for _, is_site, index in self._framed])
+        world = np.array(
+            [data.site_xpos[index] if is_site else data.xpos[index] for _, is_site, index in self._workspace_frames]
+        )
         position = (world - data.xpos[self._base]) @ data.xmat[self._base].reshape(3, 3)
         return np.concatenate((position - self._lower, self._upper - position), axis=1)
 
@@ -248,72 +256,72 @@ class ApproachingPairs:
 
     Args:
         pairs: All pairs.
-        could: Indices of pairs that could collide, shape (p,).
+        candidates: Indices of pairs that could collide, shape (p,).
         closing: Upper bounds of their approach on each segment, shape (segments, p) [m].
         frame_closing: The same for each workspace frame and face, shape (segments, frames x 6) [m].
     """
 
-    def __init__(self, pairs: CollisionPairs, could: Ints, closing: Floats, frame_closing: Floats) -> None:
+    def __init__(self, pairs: CollisionPairs, candidates: Ints, closing: Floats, frame_closing: Floats) -> None:
         self._pairs = pairs
-        self._closing = dict(zip(could.tolist(), closing.T.tolist(), strict=True))
-        self._left = dict(zip(could.tolist(), _left(closing).T.tolist(), strict=True))
+        self._closing = dict(zip(candidates.tolist(), closing.T.tolist(), strict=True))
+        self._left = dict(zip(candidates.tolist(), _left(closing).T.tolist(), strict=True))
         self._frame_closing = frame_closing
         self._frame_left = _left(frame_closing)
-        self._room: dict[int, float] = dict.fromkeys(self._closing, 0.0)
-        self._frame_room = np.zeros(frame_closing.shape[1])
+        self._excess: dict[int, float] = dict.fromkeys(self._closing, 0.0)
+        self._frame_excess = np.zeros(frame_closing.shape[1])
         self._least: dict[int, float] = {}
-        self._frame_least = self._frame_room
+        self._frame_least = self._frame_excess
         self._frame_near = np.zeros(0, dtype=np.intp)
 
     def update(self, data: Any, segment: int, share: float) -> None:
         """Measure again at a share of a segment; drop pairs that cannot collide on the rest of the path."""
-        for pair in list(self._room):
+        for pair in list(self._excess):
             left = self._left[pair][segment] - share * self._closing[pair][segment]
-            room = self._pairs.room(data, pair, left)
-            if room < max(left, 0.0) or room <= 0:
-                self._room[pair] = room
+            excess = self._pairs.excess(data, pair, left)
+            if excess < max(left, 0.0) or excess <= 0:
+                self._excess[pair] = excess
             else:
-                del self._room[pair]
-        self._frame_room = self._pairs.rooms(data)
+                del self._excess[pair]
+        self._frame_excess = self._pairs.frame_excess(data)
         left_m = self._frame_left[segment] - share * self._frame_closing[segment]
-        self._frame_near = np.flatnonzero(self._frame_room < left_m)
+        self._frame_near = np.flatnonzero(self._frame_excess < left_m)
 
     def begin(self) -> None:
         """Store the clearances at the start."""
-        self._least = {pair: min(0.0, room) for pair, room in self._room.items()}
-        self._frame_least = np.minimum(0.0, self._frame_room)
+        self._least = {pair: min(0.0, excess) for pair, excess in self._excess.items()}
+        self._frame_least = np.minimum(0.0, self._frame_excess)
 
     @property
     def any(self) -> bool:
         """Whether any pair could still collide."""
-        return bool(self._room) or bool(len(self._frame_near))
+        return bool(self._excess) or bool(len(self._frame_near))
 
     def safe_share(self, segment: int, step_m: float) -> float:
         """Share of a segment that can be skipped: no margin is violated by ``step_m`` or more."""
         share = 1.0
-        for pair, room in self._room.items():
-            share = min(share, max(room, step_m) / max(self._closing[pair][segment], _NOTHING_M))
+        for pair, excess in self._excess.items():
+            share = min(share, max(excess, step_m) / max(self._closing[pair][segment], _NOTHING_M))
         for index in self._frame_near.tolist():
-            room = float(self._frame_room[index])
-            share = min(share, max(room, step_m) / max(float(self._frame_closing[segment, index]), _NOTHING_M))
+            excess = float(self._frame_excess[index])
+            share = min(share, max(excess, step_m) / max(float(self._frame_closing[segment, index]), _NOTHING_M))
         return share
 
-    def broken(self, same_m: float) -> bool:
+    def is_violated(self, same_m: float) -> bool:
         """Whether a pair violates its margin by more than at the start."""
-        if any(room < self._least[pair] - same_m for pair, room in self._room.items()):
+        if any(excess < self._least[pair] - same_m for pair, excess in self._excess.items()):
             return True
-        return bool(np.any(self._frame_room < self._frame_least - same_m))
+        return bool(np.any(self._frame_excess < self._frame_least - same_m))
 
     def tightest(self) -> Clearance:
         """The worst clearance relative to the start."""
         worst, found = math.inf, Clearance(math.inf, ("", ""))
-        for pair, room in self._room.items():
-            if room - self._least[pair] < worst:
-                worst, found = room - self._least[pair], self._pairs.named(pair, room)
-        change = self._frame_room - self._frame_least
+        for pair, excess in self._excess.items():
+            if excess - self._least[pair] < worst:
+                worst, found = excess - self._least[pair], self._pairs.named(pair, excess)
+        change = self._frame_excess - self._frame_least
         if len(change) and float(np.min(change)) < worst:
             index = int(np.argmin(change))
-            found = self._pairs.face(index, float(self._frame_room[index]))
+            found = self._pairs.face(index, float(self._frame_excess[index]))
         return found
 
 

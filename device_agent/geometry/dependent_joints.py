@@ -49,12 +49,12 @@ class DependentJoints:
                     own[model.jnt_dofadr[dependent.joint], list(joints).index(other)] = factor
         self.whole: Floats = own @ self.spread
 
-    def together(self, position_rad: Floats) -> Floats:
+    def with_mirrors(self, position_rad: Floats) -> Floats:
         """The joint position with mirrored joints set from the leading ones, shape (n,) [rad]."""
         position: Floats = self.spread @ position_rad[self.leading]
         return position
 
-    def held(self) -> Floats:
+    def constraint_rows(self) -> Floats:
         """Rows whose product with every permitted model motion is 0, shape (k, nv).
 
         Empty if the model has only the robot's joints and all are independent.

@@ -54,7 +54,11 @@ class InverseKinematics:
         self._model = model
         self._qpos = qpos
         self._frames = frames
-        self._dependent, self._equality_joints, self._fixed_rows = dependent, equality_joints, dependent.held()
+        self._dependent, self._equality_joints, self._fixed_rows = (
+            dependent,
+            equality_joints,
+            dependent.constraint_rows(),
+        )
         self._lower, self._upper = lower, upper
         self._lock = threading.Lock()
         self.error = (0.0, 0.0)
@@ -65,10 +69,10 @@ class InverseKinematics:
         tries = [*starts, *(random.uniform(self._lower, self._upper) for _ in range(_RESTARTS))]
         least = (np.inf, np.inf)
         for start in tries:
-            position, miss = self._descend(frame, pose, start)
-            if miss[0] <= _NEAR_M and miss[1] <= _NEAR_RAD:
+            position, error = self._descend(frame, pose, start)
+            if error[0] <= _NEAR_M and error[1] <= _NEAR_RAD:
                 yield position
-            least = min(least, miss)
+            least = min(least, error)
         self.error = least
 
     def _descend(self, frame: str, pose: tuple[Floats, Floats], start: Floats) -> tuple[Floats, tuple[float, float]]:
@@ -84,10 +88,10 @@ class InverseKinematics:
             task.set_target(mink.SE3.from_rotation_and_translation(mink.SO3(pose[1]), pose[0]))
             limits = [mink.ConfigurationLimit(self._model)]
             constraints = [FixedDirections(self._fixed_rows)] if len(self._fixed_rows) else None
-            miss = (np.inf, np.inf)
+            error = (np.inf, np.inf)
             for _ in range(_STEPS):
-                miss = _miss(task.compute_error(configuration))
-                if miss[0] <= _NEAR_M / 10 and miss[1] <= _NEAR_RAD / 10:
+                error = _error_size(task.compute_error(configuration))
+                if error[0] <= _NEAR_M / 10 and error[1] <= _NEAR_RAD / 10:
                     break
                 try:
                     velocity = mink.solve_ik(
@@ -104,18 +108,18 @@ class InverseKinematics:
                 configuration.integrate_inplace(velocity, _STEP_S)
             position: Floats = np.clip(configuration.q[self._qpos], self._lower, self._upper)
             if constraints is not None:  # measure the error that the motors can achieve
-                position = self._dependent.together(position)
+                position = self._dependent.with_mirrors(position)
                 configuration.update(self._full_qpos(position))
-                miss = _miss(task.compute_error(configuration))
-            return position, miss
+                error = _error_size(task.compute_error(configuration))
+            return position, error
 
     def _full_qpos(self, position_rad: Floats) -> Floats:
         """``qpos`` of the whole model for this joint position."""
         qpos: Floats = self._model.qpos0.copy()
-        qpos[self._qpos] = self._dependent.together(position_rad)
+        qpos[self._qpos] = self._dependent.with_mirrors(position_rad)
         self._equality_joints.apply(qpos)
         return qpos
 
 
-def _miss(error: Floats) -> tuple[float, float]:
+def _error_size(error: Floats) -> tuple[float, float]:
     return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))

@@ -23,12 +23,12 @@ class _Narrowed:
     by: int
     table: Floats
 
-    def room_rad(self, position_rad: Floats) -> Floats:
+    def distance_rad(self, position_rad: Floats) -> Floats:
         """Distance to the nearer bound, shape (positions,) [rad]; negative outside."""
         by, lower, upper = self.table
         other, own = position_rad[:, self.by], position_rad[:, self.joint]
-        room: Floats = np.minimum(own - np.interp(other, by, lower), np.interp(other, by, upper) - own)
-        return room
+        distance: Floats = np.minimum(own - np.interp(other, by, lower), np.interp(other, by, upper) - own)
+        return distance
 
     def critical_positions(self, start: Floats, end: Floats) -> Floats:
         """Ends of a straight segment and its crossings of table rows; the bounds are nearest at one of them.
@@ -73,11 +73,11 @@ class JointBounds:
     def clearance(self, start: Floats, goal: Floats) -> Floats:
         """Distance to keep from each dependent bound, shape (ranges,) [rad]; not more than at the ends."""
         ends = np.stack((start, goal))
-        return np.array([min(_INSIDE_RAD, max(0.0, float(one.room_rad(ends).min()))) for one in self._narrowed])
+        return np.array([min(_INSIDE_RAD, max(0.0, float(one.distance_rad(ends).min()))) for one in self._narrowed])
 
     def admits(self, start: Floats, end: Floats, clearance: Floats) -> bool:
         """Whether a straight segment keeps these distances from all dependent bounds."""
         return all(
-            bool(np.all(one.room_rad(one.critical_positions(start, end)) >= least - _SAME_RAD))
+            bool(np.all(one.distance_rad(one.critical_positions(start, end)) >= least - _SAME_RAD))
             for one, least in zip(self._narrowed, clearance.tolist(), strict=True)
         )

@@ -133,7 +133,7 @@ class MujocoGeometry:
         blocked: Clearance | None = None
         for solution in self._ik.solutions(frame, world, starts=(np.asarray(start_rad, dtype=np.float64), self._home)):
             clearance = self.clearance(solution.tolist())
-            if clearance.room_m >= 0:
+            if clearance.excess_m >= 0:
                 return tuple(solution.tolist())
             blocked = clearance
         if blocked is not None:

@@ -1,7 +1,7 @@
 """Client of the planner process: planning holds the interpreter lock, which would delay the control loops.
 
 The process starts with the first request and keeps running, because starting it takes as long as several plans. The
-client kills it when a request is cancelled. It exits by itself when the connection to the agent closes. Messages are
+client kills it when a request is cancelled. It exits when the connection to the agent closes. Messages are
 MessagePack, which unlike JSON can encode infinities.
 """
 
@@ -74,7 +74,7 @@ class PlanRequest(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlanResponse(msgspec.Struct, frozen=True, kw_only=True):
-    """The corners of a path, or the reason why there is none."""
+    """The corners of a path, or the reason for the failure."""
 
     corners_rad: tuple[tuple[float, ...], ...] = ()
     error: str = ""

@@ -62,9 +62,9 @@ class RrtPlanner:
         start, goal = np.array(start_rad, dtype=np.float64), np.array(goal_rad, dtype=np.float64)
         checker = CollisionChecker(self._model, self._qpos, self._pairs, self._equality_joints, start)
         at_goal = checker.clearance(goal)
-        if at_goal.room_m < min(0.0, checker.clearance(start).room_m):
+        if at_goal.excess_m < min(0.0, checker.clearance(start).excess_m):
             raise GeometryError(
-                f"the goal is not clear: {at_goal.text}, {-at_goal.room_m * 1000:.0f} mm too near; choose another"
+                f"the goal is not clear: {at_goal.text}, {-at_goal.excess_m * 1000:.0f} mm too close; choose another"
             )
         widened = CollisionChecker(self._model, self._qpos, self._pairs.widened(_WIDER), self._equality_joints, start)
         search = _Search(widened, self._bounds, start, goal)
@@ -83,7 +83,7 @@ class RrtPlanner:
             if path is not None:
                 return _tuples(path)
         raise GeometryError(
-            f"found no path in {within_s:.0f} s: an obstacle is in between; move to a position beside it first"
+            f"found no path in {within_s:.0f} s: an obstacle is in the way; move to a position next to it first"
         )
 
     def _limbs(self, moved: Ints) -> Ints:

@@ -1,7 +1,7 @@
 """The view of the empty room: how far each beam and each pixel of each sensor reaches.
 
 It is recorded without robots; people may walk through, because short occlusions are filtered out. Anything nearer than
-the background was not there before.
+the background is an object that has entered the room.
 """
 
 import io
@@ -31,7 +31,7 @@ _FAR = np.float16(1000.0)
 
 
 class BackgroundModelError(Exception):
-    """The background model cannot be used. The message says what to do."""
+    """The background model cannot be used. The message names the remedy."""
 
 
 @dataclass(frozen=True, slots=True)

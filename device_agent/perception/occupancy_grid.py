@@ -1,7 +1,7 @@
 """An occupancy grid of the room's floor, from lidar scans and depth images.
 
 Each sensor has its own layer, because sensors see different heights: a lidar looks below a table that a camera sees
-from above. A cell is occupied if one layer says so.
+from above. A cell is occupied if it is occupied in one layer.
 
 Each layer has two arrays of log odds. The *recent* one follows each sample within a second. The *lasting* one follows
 the recent one within a minute; an unseen cell decays to it. An object that has left thus disappears, and a wall behind
@@ -35,7 +35,7 @@ LASTING_S = 60.0
 YOUNG_S = 10.0
 """over at least this time [s], so that people present at the start do not become static."""
 HIDDEN_S = 120.0
-"""Time constant with which the lasting layer forgets unseen cells [s]. Otherwise a cell that is only visible while
+"""Time constant with which unseen cells decay in the lasting layer [s]. Otherwise a cell that is only visible while
 occupied would stay occupied."""
 SURE = 0.4
 """Log odds above which a cell counts as occupied, or below the negative of which as free."""
@@ -225,7 +225,7 @@ class OccupancyGrid:
         Args:
             radius_m: Radius of the object, including its safety distance [m].
             apart: Circles in which obstacles are ignored: the robot itself.
-            unknown: Whether unknown cells are blocked, too. Gaps of one cell beside free cells are not.
+            unknown: Whether unknown cells are blocked, too. Gaps of one cell next to free cells are not.
         """
         recent, _ = self._log_odds()
         taken, free = recent > SURE, recent < -SURE

@@ -81,7 +81,7 @@ class Driver(Protocol):
         """
 
     def close(self) -> None:
-        """Release the device. Callable repeatedly, and without ``connect``."""
+        """Release the device. May be called repeatedly, and without ``connect``."""
 
 
 @runtime_checkable
@@ -89,7 +89,7 @@ class RunsInline(Driver, Protocol):
     """A driver whose ``observe``, ``send`` and ``drive`` only access memory, such as a simulation in the same process.
 
     They return within microseconds, and different threads may call them one at a time. The thread that receives a Stop
-    then applies it at once, and applies setpoints while the device rests. Other drivers wait for the control loop.
+    then applies it immediately, and applies setpoints while the device rests. Other drivers wait for the control loop.
     """
 
     @property
@@ -114,12 +114,12 @@ class MobileDriver(Driver, Protocol):
 
 @runtime_checkable
 class ReportsStreams(Protocol):
-    """A driver that measures the robot type's ``streams`` besides ``joints``."""
+    """A driver that measures the robot type's ``streams`` other than ``joints``."""
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
         """The newest values of one stream, by quantity with unit, and a dot and the part if there are several.
 
-        Called at the stream's rate from one thread that may run beside the control loop, also before ``connect``
+        Called at the stream's rate from one thread, concurrently with the control loop, also before ``connect``
         succeeds and while the device does not respond. Values that are not finite are omitted.
 
         Returns:
@@ -138,7 +138,7 @@ class HasCameras(Protocol):
         """A frame taken now, or ``None`` if there is none.
 
         Called at the camera's rate while an operator has control, else at most once per second. The calling thread is
-        neither the control loop nor that of ``report``, and may run beside both, also before ``connect`` succeeds. A
+        neither the control loop nor that of ``report``. It runs concurrently, also before ``connect`` succeeds. A
         frame is a JPEG of at most 128 KB.
 
         Raises:
@@ -148,7 +148,7 @@ class HasCameras(Protocol):
 
 @runtime_checkable
 class HasSpeaker(Driver, Protocol):
-    """A driver whose robot is audible: simulated microphones in its room hear it."""
+    """A driver whose robot is audible to the simulated microphones of its room."""
 
-    def speaks(self, for_s: float) -> None:
+    def start_speech(self, for_s: float) -> None:
         """Emit speech sound from now on for ``for_s`` [s]. Never blocks; the text is published separately."""

@@ -29,12 +29,12 @@ class Clearance:
     """The smallest clearance of a robot.
 
     Attributes:
-        room_m: Distance minus the required clearance of the closest pair [m]; negative if violated.
+        excess_m: Distance minus the required clearance of the closest pair [m]; negative if violated.
         between: The pair: bodies of the robot, fixed objects of its scene, or a frame and a face of the workspace.
         kind: ``clearance`` or ``workspace``.
     """
 
-    room_m: float
+    excess_m: float
     between: tuple[str, str]
     kind: str = "clearance"
 
@@ -62,7 +62,7 @@ class RobotGeometry(Protocol):
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """Names of all frames that ``poses`` and ``solve`` know."""
+        """Names of all frames that ``poses`` and ``solve`` accept."""
 
     def poses(self, position_rad: Sequence[float]) -> Mapping[str, Pose]:
         """Pose of each frame in the robot's base frame."""

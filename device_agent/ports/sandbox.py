@@ -48,16 +48,16 @@ class SandboxProcess(Protocol):
     link: socket.socket
 
     def kill(self) -> None:
-        """Kill the process at once. Callable from any thread and repeatedly; never blocks."""
+        """Kill the process, from any thread; never blocks. May be called repeatedly."""
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until the process is dead, at most ``timeout_s`` [s]. Returns whether it is."""
+        """Wait until the process has ended, at most ``timeout_s`` [s]. Returns whether it has."""
 
     def ending(self) -> str:
-        """Why a dead process ended; empty if it exited by itself or was killed by ``kill``."""
+        """Why the process ended; empty after a normal exit or ``kill``."""
 
     def close(self) -> None:
-        """Kill the process, wait for its end and release its resources. Callable repeatedly."""
+        """Kill the process, wait for its end and release its resources. May be called repeatedly."""
 
 
 class Sandbox(Protocol):
@@ -83,4 +83,4 @@ class Sandbox(Protocol):
         """
 
     def close(self) -> None:
-        """Kill all processes. Callable repeatedly."""
+        """Kill all processes. May be called repeatedly."""

@@ -49,7 +49,7 @@ class Ended(_Message, frozen=True, kw_only=True, tag="ended"):
     error: _Text = ""
 
 
-class Moment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PlayKeyframe(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One keyframe of ``robot.play``: time, and joint positions at that time."""
 
     time_s: float
@@ -57,12 +57,12 @@ class Moment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Play(_Message, frozen=True, kw_only=True, tag="play"):
-    """``robot.play``, as far as nothing but joints moves: times count from where the joints rest now.
+    """Keyframes of ``robot.play`` that move joints only. Times count from the current rest position.
 
-    ``first``: what number the first of the keyframes has in the whole of it, to say which is meant.
+    ``first``: number of the first of these keyframes in the whole call, for error messages.
     """
 
-    keyframes: Annotated[tuple[Moment, ...], Meta(min_length=1, max_length=1000)]
+    keyframes: Annotated[tuple[PlayKeyframe, ...], Meta(min_length=1, max_length=1000)]
     first: Annotated[int, Meta(ge=1)] = 1
     speed: float
 
@@ -73,19 +73,19 @@ class Home(_Message, frozen=True, kw_only=True, tag="home"):
     speed: Speed
 
 
-class AskState(_Message, frozen=True, kw_only=True, tag="state"):
+class GetState(_Message, frozen=True, kw_only=True, tag="state"):
     """``robot.state``."""
 
 
-class AskLatest(_Message, frozen=True, kw_only=True, tag="latest"):
+class GetLatest(_Message, frozen=True, kw_only=True, tag="latest"):
     """``room.latest``."""
 
     device: _Name
     stream: _Name
 
 
-Call = RobotTask | Play | Home | AskState | AskLatest
-"""Messages that the agent answers. ``RobotTask`` is shared with the commands of the wire contract."""
+Call = RobotTask | Play | Home | GetState | GetLatest
+"""Messages to which the agent responds. ``RobotTask`` is shared with the commands of the wire contract."""
 Message = Ready | Unfit | Output | Progress | Ended | Call
 
 

@@ -152,12 +152,12 @@ class RoomDriver(Protocol):
         """
 
     def close(self) -> None:
-        """Release the device. Callable repeatedly, and without ``connect``."""
+        """Release the device. May be called repeatedly, and without ``connect``."""
 
 
 @runtime_checkable
 class Camera(RoomDriver, Protocol):
-    """A room driver with camera streams for viewers, besides ``raw``."""
+    """A room driver with camera streams for viewers, in addition to ``raw``."""
 
     def frame(self, camera: str) -> Frame | None:
         """A frame taken now, or ``None`` if there is none.

@@ -1,4 +1,4 @@
-"""Port: skills of a driver besides moving joints and base. The implementer's manual.
+"""Port: skills of a driver other than moving joints and base. The implementer's manual.
 
 Most skills need no driver: the manifest contains expressions, postures, behaviours and mouth shapes, and the runtime
 moves the joints. A driver with ``perform`` takes precedence for capabilities that both its ``performs`` and its robot
@@ -24,7 +24,7 @@ Skill = Say | SetStiffness | LookAt | Express | RunBehaviour | TakePosture
 """The messages of the wire contract that a driver can execute itself."""
 
 
-class Stage(Protocol):
+class SkillContext(Protocol):
     """Context of a running skill."""
 
     @property
@@ -50,8 +50,8 @@ class Skills(Protocol):
     def performs(self) -> Collection[str]:
         """Capabilities that ``perform`` executes."""
 
-    def perform(self, skill: Skill, stage: Stage) -> None:
-        """Execute a skill to its end, or until ``stage`` has ended.
+    def perform(self, skill: Skill, context: SkillContext) -> None:
+        """Execute a skill to its end, or until the action has ended.
 
         Raises:
             SkillError: The skill failed.

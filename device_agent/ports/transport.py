@@ -21,7 +21,7 @@ class Transport(Protocol):
     """The link of one agent. The constructor opens no connection."""
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
-        """Connect, and reconnect indefinitely with jittered backoff. Returns at once.
+        """Connect, and reconnect indefinitely with jittered backoff. Returns immediately.
 
         Raises:
             TransportError: The configuration is unusable.
@@ -45,4 +45,4 @@ class Transport(Protocol):
         """
 
     def stop(self) -> None:
-        """Publish the offline presence and disconnect within a second. Callable repeatedly."""
+        """Publish the offline presence and disconnect within a second. May be called repeatedly."""

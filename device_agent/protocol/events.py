@@ -69,7 +69,7 @@ class EventKind(StrEnum):
     JOURNAL_FAILED = "journal-failed"
     """The journal could not be written; the agent did not perform what depends on it."""
     EVENTS_DROPPED = "events-dropped"
-    """More events occurred at once than could be sent. ``count``."""
+    """More events occurred than could be sent. ``count``."""
     BUFFER_DROPPED = "buffer-dropped"
     """Messages stored during a disconnection exceeded the limit; the oldest were dropped. ``measurements``,
     ``events``."""

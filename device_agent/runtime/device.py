@@ -110,7 +110,7 @@ class Device:
                 speech=speech,
                 uploads=uploads,
                 record=self._events.record,
-                on_start=driver.speaks if isinstance(driver, HasSpeaker) else None,
+                on_start=driver.start_speech if isinstance(driver, HasSpeaker) else None,
             ),
         )
         self.publisher = DevicePublisher(

@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-Ask = Callable[..., Any]
-"""``ask(kind, **arguments)``: sends a call to the agent and returns its response."""
-Tell = Callable[..., None]
-"""``tell(kind, **arguments)``: sends a message without response."""
+Request = Callable[..., Any]
+"""``request(kind, **arguments)``: sends a call to the agent and returns its response."""
+Send = Callable[..., None]
+"""``send(kind, **arguments)``: sends a message without response."""
 
 OLD_S = 5.0
 """Older occupancy measurements are ignored [s]."""
@@ -36,8 +36,8 @@ class Robot:
         can: Names of the calls that this robot supports; others raise ``RobotError``.
     """
 
-    def __init__(self, ask: Ask, *, joints: Sequence[str], frames: Sequence[str], can: Sequence[str]) -> None:
-        self._ask = ask
+    def __init__(self, request: Request, *, joints: Sequence[str], frames: Sequence[str], can: Sequence[str]) -> None:
+        self._request = request
         self.joints = tuple(joints)
         self.frames = tuple(frames)
         self.can = tuple(can)
@@ -52,7 +52,7 @@ class Robot:
             speed: Share of each joint's velocity limit, above 0, up to 1.
             plan: Plan a path around obstacles.
         """
-        self._ask("move_joints", position_rad=self._by_name(position_rad), speed=float(speed), plan=bool(plan))
+        self._request("move_joints", position_rad=self._by_name(position_rad), speed=float(speed), plan=bool(plan))
 
     def play(self, keyframes: Sequence[Mapping[str, Any]], speed: float = 1.0) -> None:
         """Play keyframes at their times; joints pass through keyframes smoothly and rest where they reverse.
@@ -67,26 +67,26 @@ class Robot:
                 arguments by name. Time pauses during skills.
             speed: 1: times as given; 0.5: twice as long. Above 0, up to 2.
         """
-        started_s, moments = 0.0, []
+        start_s, group = 0.0, []
         for number, keyframe in enumerate(keyframes):
-            places = self._by_name(keyframe.get("position_rad", {}))
+            positions = self._by_name(keyframe.get("position_rad", {}))
             at_s = float(keyframe["time_s"])
             if not math.isfinite(at_s):
                 raise RobotError(f"the time of keyframe {number + 1} is not a finite number of seconds")
             if number == 0:
-                started_s = at_s
-                if places:
-                    self.move_joints(places, speed=min(0.5, 0.5 * float(speed)))
+                start_s = at_s
+                if positions:
+                    self.move_joints(positions, speed=min(0.5, 0.5 * float(speed)))
             else:
-                moments.append({"time_s": at_s - started_s, "position_rad": places})
-            deeds = [name for name in _SKILLS if name in keyframe]
-            if moments and (deeds or number == len(keyframes) - 1):
-                first = number + 2 - len(moments)
-                self._ask("play", keyframes=moments, first=first, speed=float(speed))
-                started_s, moments = at_s, []
-            for name in deeds:
-                how = keyframe[name]
-                getattr(self, name)(**how) if isinstance(how, Mapping) else getattr(self, name)(how)
+                group.append({"time_s": at_s - start_s, "position_rad": positions})
+            skills = [name for name in _SKILLS if name in keyframe]
+            if group and (skills or number == len(keyframes) - 1):
+                first = number + 2 - len(group)
+                self._request("play", keyframes=group, first=first, speed=float(speed))
+                start_s, group = at_s, []
+            for name in skills:
+                value = keyframe[name]
+                getattr(self, name)(**value) if isinstance(value, Mapping) else getattr(self, name)(value)
 
     def move_to(
         self,
@@ -112,7 +112,7 @@ class Robot:
         """
         if quaternion is not None and rpy_rad is not None:
             raise RobotError("give a quaternion or rpy_rad, not both")
-        self._ask(
+        self._request(
             "move_pose",
             frame=frame or (self.frames[-1] if self.frames else ""),
             position_m=_numbers(position_m, 3, "position_m"),
@@ -125,13 +125,13 @@ class Robot:
 
     def home(self, speed: float = 0.5) -> None:
         """Move to the home position of the robot type and wait until it arrives."""
-        self._ask("home", speed=float(speed))
+        self._request("home", speed=float(speed))
 
     def drive(
         self, forward_m_s: float = 0.0, left_m_s: float = 0.0, turn_rad_s: float = 0.0, *, duration_s: float = 1.0
     ) -> None:
         """Drive the base at a velocity for a time, then stop. ``turn_rad_s`` is counter-clockwise."""
-        self._ask(
+        self._request(
             "drive",
             forward_m_s=float(forward_m_s),
             left_m_s=float(left_m_s),
@@ -147,31 +147,31 @@ class Robot:
             y_m: y in the room's frame [m].
             yaw_rad: Final heading, counter-clockwise from the room's x axis; any heading by default.
         """
-        self._ask("go_to", x_m=float(x_m), y_m=float(y_m), yaw_rad=None if yaw_rad is None else float(yaw_rad))
+        self._request("go_to", x_m=float(x_m), y_m=float(y_m), yaw_rad=None if yaw_rad is None else float(yaw_rad))
 
     def look(self, position_m: Sequence[float], speed: float = 0.5) -> None:
         """Turn the gaze to a point x, y, z in the robot's base frame [m]."""
-        self._ask("look_at", position_m=_numbers(position_m, 3, "position_m"), speed=float(speed))
+        self._request("look_at", position_m=_numbers(position_m, 3, "position_m"), speed=float(speed))
 
     def say(self, text: str, language: str = "") -> None:
         """Speak and wait for the end; ``language``: ``en``, ``sk`` …, or the robot's default."""
-        self._ask("say", text=str(text), language=str(language))
+        self._request("say", text=str(text), language=str(language))
 
     def stiffness(self, value: float, joints: Sequence[str] = ()) -> None:
         """Set the holding strength of joints, 0 (limp) to 1; all joints if none is named."""
-        self._ask("set_stiffness", value=float(value), joints=[str(name) for name in joints])
+        self._request("set_stiffness", value=float(value), joints=[str(name) for name in joints])
 
     def express(self, name: str, strength: float = 1.0) -> None:
         """Show an expression, ``strength`` 0 to 1."""
-        self._ask("express", name=str(name), strength=float(strength))
+        self._request("express", name=str(name), strength=float(strength))
 
     def posture(self, name: str, speed: float = 0.5) -> None:
         """Move to a posture of the robot type and wait until it arrives; ``speed`` as for ``move_joints``."""
-        self._ask("take_posture", name=str(name), speed=float(speed))
+        self._request("take_posture", name=str(name), speed=float(speed))
 
     def behaviour(self, name: str) -> None:
         """Run a behaviour of the robot, and wait for its end."""
-        self._ask("run_behaviour", name=str(name))
+        self._request("run_behaviour", name=str(name))
 
     def state(self) -> dict[str, Any]:
         """Measured ``position_rad``, ``velocity_rad_s``, ``effort_nm`` by joint name, ``frames`` by name, ``mode``.
@@ -179,7 +179,7 @@ class Robot:
         A frame is x, y, z [m] and quaternion w, x, y, z in the robot's base frame. ``streams`` contains the other
         measurements by stream: ``values`` by name and their age, ``age_s`` [s].
         """
-        state: dict[str, Any] = self._ask("state")
+        state: dict[str, Any] = self._request("state")
         return state
 
     def _by_name(self, position_rad: Mapping[str, float] | Sequence[float]) -> dict[str, float]:
@@ -197,15 +197,15 @@ class Robot:
 class Room:
     """``room``: newest measurements of other devices of the space."""
 
-    def __init__(self, ask: Ask) -> None:
-        self._ask = ask
+    def __init__(self, request: Request) -> None:
+        self._request = request
 
     def latest(self, device: str, stream: str) -> dict[str, Any] | None:
         """The newest measurement of a stream: ``values`` by name and ``age_s``, time since it arrived [s].
 
         ``None`` if none has arrived. Check ``age_s`` before using the values.
         """
-        measurement: dict[str, Any] | None = self._ask("latest", device=str(device), stream=str(stream))
+        measurement: dict[str, Any] | None = self._request("latest", device=str(device), stream=str(stream))
         return measurement
 
     def taken(self, x_m: float, y_m: float, device: str = "perception") -> bool | None:
@@ -232,7 +232,7 @@ class Room:
         return None if int(floor[f"unknown_bits.{row}"]) >> column & 1 else False
 
 
-def names(tell: Tell, ask: Ask, flush: Callable[[], None], task: Mapping[str, Any]) -> dict[str, Any]:
+def namespace(send: Send, request: Request, flush: Callable[[], None], task: Mapping[str, Any]) -> dict[str, Any]:
     """The names that a script can use."""
 
     def wait(duration_s: float) -> None:
@@ -242,11 +242,11 @@ def names(tell: Tell, ask: Ask, flush: Callable[[], None], task: Mapping[str, An
 
     def progress(share: float) -> None:
         """Report the share of completed work, 0 to 1."""
-        tell("progress", share=min(1.0, max(0.0, float(share))))
+        send("progress", share=min(1.0, max(0.0, float(share))))
 
     return {
-        "robot": Robot(ask, joints=task["joints"], frames=task["frames"], can=task["can"]),
-        "room": Room(ask),
+        "robot": Robot(request, joints=task["joints"], frames=task["frames"], can=task["can"]),
+        "room": Room(request),
         "parameters": task["parameters"],
         "wait": wait,
         "progress": progress,

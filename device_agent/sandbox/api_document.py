@@ -50,46 +50,50 @@ def document() -> ScriptApi:
     Raises:
         LookupError: ``_STRINGS`` names an unknown parameter.
     """
-    objects = api.names(_nothing, _nothing, _nothing, _TASK)
+    objects = api.namespace(_no_agent, _no_agent, _no_agent, _TASK)
     values, functions = [], [_PRINT]
-    for name, given in objects.items():
-        if inspect.isfunction(given):
-            functions.append(_call(name, given))
-        elif inspect.isclass(given):
-            values.append(Value(name=name, type="exception", doc=_first(given)))
-        elif isinstance(given, dict):
+    for name, value in objects.items():
+        if inspect.isfunction(value):
+            functions.append(_call(name, value))
+        elif inspect.isclass(value):
+            values.append(Value(name=name, type="exception", doc=_first(value)))
+        elif isinstance(value, dict):
             values.append(Value(name=name, type="dict[str, Any]", doc=_PARAMETERS))
         else:
-            values.append(_object(name, given))
-    known = {(each.name, one.name) for value in values for each in value.methods for one in each.parameters}
+            values.append(_object(name, value))
+    known = {
+        (method.name, parameter.name) for value in values for method in value.methods for parameter in method.parameters
+    }
     if _STRINGS.keys() - known:
         raise LookupError(f"unknown parameters: {_STRINGS.keys() - known}")
     return ScriptApi(values=tuple(values), functions=tuple(functions), modules=tuple(LISTED))
 
 
-def _nothing(*_: Any, **__: Any) -> None:
+def _no_agent(*_: Any, **__: Any) -> None:
     """Placeholder for communication with the agent."""
 
 
-def _object(name: str, given: object) -> Value:
-    kind = type(given)
+def _object(name: str, value: object) -> Value:
+    kind = type(value)
     text = inspect.getdoc(kind) or ""
     attributes = [
         Value(name=key, type="tuple[str, ...]", doc=_plain(doc))
         for key, doc in re.findall(r"^    (\w+): (.+)$", text, re.MULTILINE)
-        if key in vars(given)
+        if key in vars(value)
     ]
     methods = [
-        _call(key, each) for key, each in vars(kind).items() if inspect.isfunction(each) and not key.startswith("_")
+        _call(key, method)
+        for key, method in vars(kind).items()
+        if inspect.isfunction(method) and not key.startswith("_")
     ]
     return Value(name=name, type=kind.__name__, doc=_first(kind), attributes=tuple(attributes), methods=tuple(methods))
 
 
 def _call(name: str, function: Callable[..., Any]) -> Call:
     signature = inspect.signature(function)
-    parameters = [each for key, each in signature.parameters.items() if key != "self"]
+    parameters = [parameter for key, parameter in signature.parameters.items() if key != "self"]
     bare = signature.replace(
-        parameters=[each.replace(annotation=inspect.Parameter.empty) for each in parameters],
+        parameters=[parameter.replace(annotation=inspect.Parameter.empty) for parameter in parameters],
         return_annotation=inspect.Signature.empty,
     )
     return Call(
@@ -97,26 +101,26 @@ def _call(name: str, function: Callable[..., Any]) -> Call:
         signature=f"{name}{bare}",
         doc=_first(function),
         details=_plain(inspect.getdoc(function) or ""),
-        parameters=tuple(_parameter(name, each) for each in parameters),
+        parameters=tuple(_parameter(name, parameter) for parameter in parameters),
     )
 
 
-def _parameter(call: str, given: inspect.Parameter) -> Parameter:
-    kind = inspect.formatannotation(given.annotation)
+def _parameter(call: str, parameter: inspect.Parameter) -> Parameter:
+    kind = inspect.formatannotation(parameter.annotation)
     fields = {
-        "name": given.name,
-        "kind": _KINDS[given.kind],
+        "name": parameter.name,
+        "kind": _KINDS[parameter.kind],
         "type": re.sub(r"\b(?:typing|collections\.abc)\.", "", kind),
     }
-    if given.default is not inspect.Parameter.empty:
-        fields["default"] = repr(given.default)
-    if names := _STRINGS.get((call, given.name)):
+    if parameter.default is not inspect.Parameter.empty:
+        fields["default"] = repr(parameter.default)
+    if names := _STRINGS.get((call, parameter.name)):
         fields["names"] = names
     return msgspec.convert(fields, Parameter)
 
 
-def _first(given: object) -> str:
-    return _plain((inspect.getdoc(given) or "").partition("\n")[0])
+def _first(value: object) -> str:
+    return _plain((inspect.getdoc(value) or "").partition("\n")[0])
 
 
 def _plain(text: str) -> str:

@@ -8,7 +8,7 @@ import ctypes
 import os
 
 _CREATE_RULESET, _RESTRICT_SELF = 444, 446
-_ASK_VERSION = 1
+_GET_VERSION = 1
 _FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}
 """ABI version → number of file rights; each is one bit, without gaps."""
 _TCP_RIGHTS, _TCP_SINCE = 0b11, 4
@@ -21,7 +21,7 @@ _kernel.syscall.restype = ctypes.c_long
 
 def abi() -> int:
     """The kernel's Landlock version; 0 for none."""
-    return max(0, int(_kernel.syscall(_CREATE_RULESET, None, 0, _ASK_VERSION)))
+    return max(0, int(_kernel.syscall(_CREATE_RULESET, None, 0, _GET_VERSION)))
 
 
 def restrict() -> None:

@@ -103,7 +103,7 @@ def main() -> None:
             raise api.RobotError(response["error"])
         return response.get("value")
 
-    namespace = {"__name__": "__movement__", **api.names(link.send, call, output.flush, task)}
+    namespace = {"__name__": "__movement__", **api.namespace(link.send, call, output.flush, task)}
     error = ""
     try:
         exec(compile(task["source"], filename, "exec"), namespace)  # noqa: S102 (the purpose of this process)  # nosec B102

@@ -76,7 +76,7 @@ def make(manifest: Room, folder: Path, types: dict[str, robot_type.RobotType]) -
         home=home,
         settings=manifest.start,
     )
-    # Weak reference: processes must not keep the world alive.
+    # Weak reference: processes must not prevent its deletion.
     reference = proxy(world)
     people = [Pedestrian(person) for person in manifest.people]
     for person in people:

@@ -62,7 +62,7 @@ def make(wiring: Wiring) -> Transport:
     """
     name = wiring.configuration.transport
     if name not in _MAKERS:
-        raise ConfigError(f"agent.toml: there is no transport '{name}'; known: {', '.join(names())}")
+        raise ConfigError(f"agent.toml: unknown transport '{name}'; known: {', '.join(names())}")
     return _MAKERS[name](wiring)
 
 

@@ -84,7 +84,7 @@ class PairingMonitor:
         except CloudError as error:
             if error.code == "agent-unclaimed":
                 raise self._mark_outdated("this agent was unpaired") from error
-            # The cloud does not know the agent (any more): announce it again with the next request.
+            # The cloud no longer knows the agent: announce it again with the next request.
             self._announced = self._announced and error.code != "unauthorized"
             raise
         return response

@@ -36,5 +36,5 @@ def broker(*, tls: bool, server: str, ca: Path | None, own: tuple[Path, Path] | 
             tls_context.load_cert_chain(*own)
         return tls_context
     if server.startswith("https:"):
-        raise ValueError("the server speaks TLS and names a broker that does not; start the broker with TLS too")
+        raise ValueError("the server uses TLS, but its broker does not; start the broker with TLS")
     return None

@@ -76,12 +76,13 @@ def _certificate(api: CloudClient) -> Finding:
         return problem(
             "certificate",
             f"{host}: {error.verify_message}; trusted: {authorities}",
-            "If the server has an authority of its own, provide it: `enroll --ca ca.crt`. If the certificate expired "
+            "If the server has a private certificate authority, provide it: `enroll --ca ca.crt`. If the certificate "
+            "expired "
             "or names another host, renew it at the server: `python -m infra.tls --renew`.",
         )
     except OSError as error:
         return problem(
-            "certificate", f"{host}:{port} presents no certificate: {error}", "Check whether the server speaks TLS."
+            "certificate", f"{host}:{port} presents no certificate: {error}", "Check whether the server uses TLS."
         )
     days = (ssl.cert_time_to_seconds(str(certificate["notAfter"])) - time.time()) / 86_400
     if days < _EXPIRY_WARNING_DAYS:
@@ -195,7 +196,7 @@ def _connect(
         transport.stop()
     journal.close()
     if connected:
-        yield ok("link", f"{configuration.transport}: connected in {took_ms} ms with the agent's own credentials")
+        yield ok("link", f"{configuration.transport}: connected in {took_ms} ms with the agent's credentials")
     else:
         yield problem(
             "link",

@@ -81,7 +81,7 @@ def room(configuration: AgentConfig) -> Iterator[Finding]:
 
 
 def renderer(configuration: AgentConfig) -> Iterator[Finding]:
-    """Check that MuJoCo can render, in a process of its own: without a renderer its libraries abort the process."""
+    """Check that MuJoCo can render, in a separate process: without a renderer its libraries abort the process."""
     used = {entry.driver or _driver_of(entry) for entry in configuration.devices}
     if "mujoco" not in used or importlib.util.find_spec("mujoco") is None:
         return

@@ -40,7 +40,7 @@ def user() -> Iterator[Finding]:
         yield warning(
             "user",
             "runs as root: process limits do not apply to root, and a fault could affect the whole machine",
-            "Run the agent as a user of its own: docs/guides/install-an-agent.md.",
+            "Run the agent as a dedicated user: docs/guides/install-an-agent.md.",
         )
     else:
         yield ok("user", f"runs as an unprivileged user (uid {os.geteuid()})")

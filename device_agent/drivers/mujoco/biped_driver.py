@@ -2,8 +2,8 @@
 
 The walk is simplified in two ways. While it lasts, the gait moves the legs and the agent's leg commands wait. A spring
 keeps the torso upright and on course, limited by the manifest (``[simulation.walk]``); the legs carry the weight. At
-all other times there is no support: a robot that loses its balance falls. It lies for a while and is then reset to its
-start, as a person in a real room would do.
+all other times there is no support: a robot that loses its balance falls. After a
+delay it is reset to its start, as an operator would do in a real room.
 """
 
 import math
@@ -179,11 +179,11 @@ class AssistedWalk:
                 0.0,
             )
         )
-        wanted = np.array((math.cos(place.yaw_rad / 2), 0.0, 0.0, math.sin(place.yaw_rad / 2)))
+        upright = np.array((math.cos(place.yaw_rad / 2), 0.0, 0.0, math.sin(place.yaw_rad / 2)))
         turn, spin = np.empty(3), np.empty(3)
-        mujoco.mju_subQuat(turn, wanted, data.xquat[self._base])  # in the torso's frame, like its angular velocity
-        torque_here = _STIFFNESS_NM * turn - _DAMPING_NMS * data.qvel[self._free + 3 : self._free + 6]
-        mujoco.mju_rotVecQuat(spin, torque_here, data.xquat[self._base])
+        mujoco.mju_subQuat(turn, upright, data.xquat[self._base])  # in the torso's frame, like its angular velocity
+        torque = _STIFFNESS_NM * turn - _DAMPING_NMS * data.qvel[self._free + 3 : self._free + 6]
+        mujoco.mju_rotVecQuat(spin, torque, data.xquat[self._base])
         spin[2] += _DAMPING_NMS * velocity.turn_rad_s
         pull = data.xfrc_applied[self._base]
         pull[:3] = share * _limited(force, self._walk.support_n)
@@ -201,8 +201,8 @@ class BipedDriver(MujocoDriver):
     """A ``MobileDriver`` for robot types with ``[simulation.walk]``. The robot walks only from its home posture.
 
     During a walk the gait commands the legs, and ``send`` returns the gait's leg positions, so telemetry shows the leg
-    commands as limited by the driver. At the end of a walk the torso stops at once and the feet come together. The legs
-    then move slowly to the agent's newest command.
+    commands as limited by the driver. At the end of a walk the torso stops immediately and the feet move together. Then
+    the legs move slowly to the agent's newest command.
     """
 
     def __init__(self, *, robot_type: RobotType, world: World, device: str, prefix: str = "", **more: Any) -> None:

@@ -17,7 +17,7 @@ from device_agent.drivers.mujoco.servo_gains import ServoGains
 from device_agent.ports import skills
 from device_agent.ports.driver import DriverError, Observation, Twist
 from device_agent.ports.sensor import Frame
-from device_agent.ports.skills import Skill, SkillError, Stage
+from device_agent.ports.skills import Skill, SkillContext, SkillError
 from device_agent.protocol import Pose, SetStiffness, Twin
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation.mjcf import twin
@@ -175,18 +175,18 @@ class MujocoDriver:
 
     performs = (skills.STIFFNESS,)
 
-    def perform(self, skill: Skill, stage: Stage) -> None:
+    def perform(self, skill: Skill, context: SkillContext) -> None:
         """Set the stiffness of joints, from the next group of steps on.
 
         Raises:
             SkillError: Unsupported skill, or not connected.
         """
-        del stage
+        del context
         if not isinstance(skill, SetStiffness) or self._stiffness is None:
             raise SkillError(f"the simulation of '{self._device}' does not support this skill or is not connected")
         self._stiffness.set(skill.value, skill.joints or [joint.name for joint in self._type.joints])
 
-    def speaks(self, for_s: float) -> None:
+    def start_speech(self, for_s: float) -> None:
         """Emit speech sound in the simulated room."""
         if self._connected:
             self._world.sound(self._device, SPEECH_DB, for_s=for_s)

@@ -1,4 +1,4 @@
-"""Faults injected into a simulated robot from a file beside the agent, for tests and demonstrations.
+"""Faults injected into a simulated robot from a file on the agent's machine, for tests and demonstrations.
 
 Only users of the agent's machine can inject faults; no message can. The file may be missing and is read again when it
 changes.
@@ -88,22 +88,22 @@ class MotorFault:
         self._damping = np.array(model.dof_damping)
         self._force = np.array(model.actuator_forcerange)
         self._torque = np.array(model.jnt_actfrcrange)
-        self._wanted = self._applied = NO_FAULTS
+        self._requested = self._applied = NO_FAULTS
 
     def set(self, faults: InjectedFaults) -> None:
         """Apply these faults from the next group of steps on. Thread-safe."""
-        self._wanted = faults
+        self._requested = faults
 
     def step(self, model: Any, data: Any, time_s: float) -> None:
         """See ``Process``."""
         del data, time_s
-        wanted = self._wanted
-        if wanted is self._applied:
+        requested = self._requested
+        if requested is self._applied:
             return
         for name, actuator in self._actuators.items():
-            joint, share = model.actuator_trnid[actuator, 0], wanted.weak.get(name, 1.0)
+            joint, share = model.actuator_trnid[actuator, 0], requested.weak.get(name, 1.0)
             dof, max_nm = model.jnt_dofadr[joint], float(np.abs(self._force[actuator]).max())
-            model.dof_damping[dof] = max_nm / _CREEP_RAD_S if name in wanted.stuck else self._damping[dof]
+            model.dof_damping[dof] = max_nm / _CREEP_RAD_S if name in requested.stuck else self._damping[dof]
             model.actuator_forcerange[actuator] = self._force[actuator] * share
             model.jnt_actfrcrange[joint] = self._torque[joint] * share
-        self._applied = wanted
+        self._applied = requested

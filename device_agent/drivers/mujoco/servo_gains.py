@@ -26,28 +26,28 @@ class ServoGains:
         self._carried = {
             name: _carried(model, int(model.actuator_trnid[servo, 0])) for name, servo in actuators.items()
         }
-        self._wanted: dict[str, float] = {}
-        self._applied: dict[str, float] = self._wanted
+        self._requested: dict[str, float] = {}
+        self._applied: dict[str, float] = self._requested
 
     def set(self, value: float, joints: Sequence[str]) -> None:
         """Set the stiffness of these joints, 0…1, from the next group of steps on. Thread-safe."""
-        self._wanted = {**self._wanted, **dict.fromkeys(joints, value)}
+        self._requested = {**self._requested, **dict.fromkeys(joints, value)}
 
     def step(self, model: Any, data: Any, time_s: float) -> None:
         """See ``Process``."""
         del data, time_s
-        wanted = self._wanted
-        if wanted is self._applied:
+        requested = self._requested
+        if requested is self._applied:
             return
         compensation = self._compensation.copy()
-        for name, value in wanted.items():
+        for name, value in requested.items():
             servo, bodies = self._actuators[name], self._carried[name]
             model.actuator_gainprm[servo, 0] = self._gains[servo] * value
             model.actuator_biasprm[servo, 1:3] = self._biases[servo] * value
             compensation[bodies] = np.minimum(compensation[bodies], self._compensation[bodies] * value)
         own = sorted({body for bodies in self._carried.values() for body in bodies})
         model.body_gravcomp[own] = compensation[own]
-        self._applied = wanted
+        self._applied = requested
 
 
 def _carried(model: Any, joint: int) -> list[int]:

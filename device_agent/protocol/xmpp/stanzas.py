@@ -49,7 +49,7 @@ class Delivery(NamedTuple):
 
 
 class Rejection(NamedTuple):
-    """A returned message. ``final``: the recipient rejects it for good; otherwise there was no recipient."""
+    """A returned message. ``final``: the recipient rejects it permanently; otherwise no recipient was available."""
 
     id: str
     reason: str
@@ -111,7 +111,7 @@ def presence(*, to: str = "", available: bool = True) -> str:
 
 
 def revoke_user(domain: str, user: str) -> str:
-    """Tells the server that a user has lost all rights (``infra/prosody``)."""
+    """Revokes all rights of a user at the server (``infra/prosody``)."""
     stanza = Element("message", {"to": domain})
     SubElement(stanza, "forget", {"xmlns": NAMESPACE, "user": user})
     return tostring(stanza, encoding="unicode")

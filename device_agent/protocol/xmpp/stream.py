@@ -1,7 +1,7 @@
 """One XMPP connection for either end of the wire contract, on slixmpp and the running event loop.
 
 slixmpp provides the stream, TLS and the login. Its chat features are not used: each stanza goes to one callback, and
-sent stanzas are written at once (asyncio sets TCP_NODELAY).
+sent stanzas are written immediately (asyncio sets TCP_NODELAY).
 """
 
 import asyncio
@@ -182,7 +182,7 @@ class Stream:
 
 
 class _Client(ClientXMPP):  # type: ignore[misc]  # slixmpp has no type information
-    """slixmpp's client without what it does for chat."""
+    """slixmpp's client without its chat features."""
 
     def __init__(self, login: Login) -> None:
         self.last_traffic_s = 0.0

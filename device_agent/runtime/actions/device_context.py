@@ -10,7 +10,7 @@ from device_agent.ports import skills
 from device_agent.ports.driver import Observation
 from device_agent.ports.floor_map import ObstacleMap
 from device_agent.ports.geometry import RobotGeometry
-from device_agent.ports.script_calls import AskLatest, AskState, Home, Play
+from device_agent.ports.script_calls import GetLatest, GetState, Home, Play
 from device_agent.ports.skills import Skills
 from device_agent.protocol import (
     Drive,
@@ -105,8 +105,8 @@ class DeviceContext:
             Express: skills.EXPRESSIONS in by_driver or bool(kind.expressions),
             TakePosture: skills.POSTURES in by_driver or bool(kind.postures),
             RunBehaviour: skills.BEHAVIOURS in by_driver or bool(kind.behaviours),
-            AskState: True,
-            AskLatest: True,
+            GetState: True,
+            GetLatest: True,
         }
         return tuple(call for call, available in has.items() if available)
 

@@ -48,8 +48,8 @@ class ActionExecutor:
         """Start the action of an accepted command. Its acks follow.
 
         Raises:
-            Refused: The device is busy, stopped or faulty; the lease is stale; the script is not the signed one or
-                older than one that ran; or this machine has no sandbox.
+            Refused: The device is busy, stopped or faulty; the lease is stale; the script is modified or older
+                than one that ran; or this machine has no sandbox.
         """
         with self._lock:
             if self._run is not None:
@@ -111,7 +111,7 @@ class ActionExecutor:
 
 
 class _Activity(Protocol):
-    """What an action does."""
+    """Work of an action."""
 
     def run(self) -> dict[str, Any]:
         """Run to the end; returns additional entries of the result."""
@@ -171,7 +171,7 @@ class _Run:
         self.robot.reserve(self.command.epoch, self._on_revoked)
 
     def report_started(self) -> None:
-        """Acknowledge the start at once, while the action's thread starts and syncs the journal."""
+        """Acknowledge the start immediately, while the action's thread starts and syncs the journal."""
         self._attempt(lambda: self._report(self.command.id, AckStatus.STARTED))
         self._started.set()
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import GeometryError, RobotGeometry
-from device_agent.ports.script_calls import AskLatest, AskState, Call, Home, Play
+from device_agent.ports.script_calls import Call, GetLatest, GetState, Home, Play
 from device_agent.protocol import Drive, GoTo, LookAt, MoveJoints, MovePose, RobotTask
 from device_agent.runtime.actions.device_context import SCRIPT_NAMES, DeviceContext, by_name, tag
 from device_agent.runtime.actions.skill_runner import SkillRunner
@@ -78,9 +78,9 @@ class RobotApi:
                 self._go_to(call)
             case LookAt():
                 self._look_at(call)
-            case AskState():
+            case GetState():
                 return self._state()
-            case AskLatest(device=device, stream=stream):
+            case GetLatest(device=device, stream=stream):
                 return self._latest(device, stream)
             case _:
                 self.skill_runner.run(call)
@@ -155,7 +155,7 @@ class RobotApi:
         self.wait_for(self._context.controller.start_drive(self.reservation, twist, duration_s=call.duration_s))
 
     def _go_to(self, call: GoTo) -> None:
-        """Navigate by short drives, each of which ends by itself: if this loop stops, the robot stops."""
+        """Navigate by drives of limited duration: if this loop stops, the robot stops."""
         context, controller = self._context, self._context.controller
         navigator = Navigator.for_robot(call.x_m, call.y_m, call.yaw_rad, context.robot_type)
         estimator = PoseEstimator(context.name)
@@ -163,7 +163,7 @@ class RobotApi:
         while not self.ended.is_set():
             obstacle_map = None if context.obstacle_map is None else context.obstacle_map()
             if obstacle_map is None:
-                raise Refused("no_ground", "no sensor reports what stands in the room now; drive by hand")
+                raise Refused("no_ground", "no sensor reports the obstacles in the room; drive manually")
             pose = estimator.estimate(
                 context.own_readings().get(ODOMETRY), context.readings.newest(POSITIONS, f"x_m.{context.name}")
             )
@@ -189,7 +189,7 @@ class RobotApi:
         """
         self._context.wake()
         goal.finished.wait()
-        self.limited += tuple(one for one in goal.limited if one not in self.limited)
+        self.limited += tuple(limit for limit in goal.limited if limit not in self.limited)
         if goal.result is not GoalResult.REACHED:
             raise goal.why or Refused("interrupted", "the motion was interrupted")
 

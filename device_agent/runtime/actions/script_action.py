@@ -1,4 +1,4 @@
-"""Runs a movement script in a sandboxed process, and answers its calls."""
+"""Runs a movement script in a sandboxed process, and responds to its calls."""
 
 import contextlib
 import select
@@ -18,14 +18,14 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.errors import Refused
 
 MAX_OUTPUT = 2000
-"""Characters of printed output in an ack; the newest ones are kept."""
+"""Characters of printed output in an ack; older ones are dropped."""
 _MESSAGES_PER_S = 500.0
 _BYTES_PER_MESSAGE = 1024
 """Rate limit of a script's messages. A script that exceeds it waits, so that it cannot exhaust the agent's CPU."""
 _BURST = 500.0
 _READY_TIMEOUT_S = 30.0
 _WRITE_TIMEOUT_S = 5.0
-"""A process that does not read its answers is ended after this time [s]."""
+"""A process that does not read its responses is ended after this time [s]."""
 _EXIT_CHECK_S = 60.0
 _CHUNK = 65_536
 
@@ -99,7 +99,7 @@ class ScriptAction:
         """Run the script to its end.
 
         Raises:
-            ScriptFailed: The script raised, or its process died.
+            ScriptFailed: The script raised, or its process ended.
         """
         try:
             process = self._sandbox.sandbox.open(self._sandbox.limits, untrusted=self._sandbox.untrusted)
@@ -119,7 +119,7 @@ class ScriptAction:
                 watcher.join(_WRITE_TIMEOUT_S)
 
     def kill(self) -> None:
-        """End the process at once, from any thread; ``run`` then raises. May be called twice."""
+        """End the process, from any thread; ``run`` then raises. May be called twice."""
         # No lock: the control loop may call this, and must not wait for the start of a process.
         self._killed.set()
         if self._process is not None:

@@ -1,4 +1,4 @@
-"""Script policy: a device runs only scripts that the cloud signed, unmodified, and never an older version again."""
+"""Script policy: a device runs only unmodified, signed scripts that are not older than a version that ran."""
 
 import hashlib
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ class ScriptPolicy:
         if request.robot_type != self._robot_type:
             raise Refused("wrong_type", f"a movement of '{request.robot_type}', not of '{self._robot_type}'")
         if hashlib.sha256(request.source.encode()).hexdigest() != request.sha256:
-            raise Refused("wrong_hash", "the script is not the signed one; save the movement again")
+            raise Refused("wrong_hash", "the script does not match its hash; save the movement again")
         self._verify_signature(request)
         highest = self._journal.movement(self._device, request.author, request.robot_type, request.name)
         if request.version < highest:
@@ -59,4 +59,4 @@ class ScriptPolicy:
         try:
             signing.verify_text(text, request.signature, key, context=signing.MOVEMENT_CONTEXT)
         except SignatureError as error:
-            raise Refused("bad_signature", "the movement is not the signed one; save it again") from error
+            raise Refused("bad_signature", "the movement does not match its signature; save it again") from error

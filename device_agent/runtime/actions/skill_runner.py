@@ -98,7 +98,9 @@ class SkillRunner:
     def _run_behaviour(self, name: str) -> None:
         robot_type, controller = self._context.robot_type, self._context.controller
         keyframes = named_poses.find("behaviour", name, robot_type.behaviours)
-        utterances = {one.say: self._context.speech.prepare(one.say, "") for one in keyframes if one.say}
+        utterances = {
+            keyframe.say: self._context.speech.prepare(keyframe.say, "") for keyframe in keyframes if keyframe.say
+        }
         self.wait_for_rest()
         behaviour = BehaviourTrajectory(robot_type, controller.commanded_rad)
         durations_s = {text: utterance.duration_s for text, utterance in utterances.items()}
@@ -124,17 +126,17 @@ class SkillRunner:
 
     # ------------------------------------------------------------ stiffness
 
-    def _set_stiffness(self, order: SetStiffness) -> None:
+    def _set_stiffness(self, request: SetStiffness) -> None:
         """Change the stiffness. Meanwhile the joints are commanded to their measured positions, so that none jumps."""
         controller = self._context.controller
-        resulting = before = controller.stiffness_of(order.joints)
+        resulting = before = controller.stiffness_of(request.joints)
         self.wait_for_rest()
         controller.set_stiffness(dict.fromkeys(before, 0.0), reservation=self._mover.reservation)
         settle_s = _SETTLE_PERIODS * self._context.robot_type.period_ms / 1000
         try:
             self._mover.ended.wait(settle_s)
-            self.perform(order)
-            resulting = dict.fromkeys(before, order.value)
+            self.perform(request)
+            resulting = dict.fromkeys(before, request.value)
             self._mover.ended.wait(settle_s)
         finally:
             controller.set_stiffness(resulting)

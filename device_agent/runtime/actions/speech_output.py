@@ -59,7 +59,7 @@ class SpeechOutput:
             Refused: The text is empty, or the language is invalid.
         """
         if not text.strip():
-            raise Refused("nothing_to_say", "there is nothing to say; give a text")
+            raise Refused("nothing_to_say", "the text is empty; provide a text")
         if re.fullmatch(LANGUAGE_PATTERN, language) is None:
             raise Refused("bad_language", f"'{language[:40]}' is not a language; use a code such as en or sk, or none")
         spoken = self._synthesize(text, language)

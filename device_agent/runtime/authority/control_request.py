@@ -24,7 +24,7 @@ class PendingControlRequest:
         self._request: ControlRequest | None = None
         self._withdrawn = ""
 
-    def open(self, order: RequestControl, *, epoch: int, lease: Lease | None, now_s: float) -> None:
+    def open(self, request: RequestControl, *, epoch: int, lease: Lease | None, now_s: float) -> None:
         """Show a request until it is withdrawn, it expires, or the requested lease ends.
 
         Raises:
@@ -33,8 +33,10 @@ class PendingControlRequest:
         if lease is None or lease.epoch != epoch:
             raise Refused("no_lease", f"lease {epoch} is not in force here, so it cannot be requested")
         # Two cloud processes may have sent the request and its withdrawal in the opposite order.
-        if order.request != self._withdrawn:
-            self._request = ControlRequest(order.request, order.requester, epoch, now_s + order.answer_within_ms / 1000)
+        if request.request != self._withdrawn:
+            self._request = ControlRequest(
+                request.request, request.requester, epoch, now_s + request.answer_within_ms / 1000
+            )
 
     def withdraw(self, request: str) -> None:
         """Remove a request. Withdrawing an earlier request does not remove a later one."""

@@ -84,7 +84,7 @@ class Interlocks:
             self._lift(rule.name)
             if before:
                 event = EventRecord(
-                    EventKind.INTERLOCK_CLEARED, "the room is free again", data={"interlock": rule.name}
+                    EventKind.INTERLOCK_CLEARED, "the room is clear again", data={"interlock": rule.name}
                 )
                 self._record(event, rule.name, now_s)
         state.why = why

@@ -43,7 +43,7 @@ class Restrictions:
     @property
     def all(self) -> tuple[Restriction, ...]:
         """Restrictions in force, the strictest first."""
-        return tuple(sorted(self._by_source.values(), key=lambda one: (one.speed, one.source)))
+        return tuple(sorted(self._by_source.values(), key=lambda restriction: (restriction.speed, restriction.source)))
 
     @property
     def strictest(self) -> Restriction | None:
@@ -53,4 +53,4 @@ class Restrictions:
     @property
     def speed(self) -> float:
         """Share of the speed that remains."""
-        return min((one.speed for one in self._by_source.values()), default=1.0)
+        return min((restriction.speed for restriction in self._by_source.values()), default=1.0)

@@ -195,7 +195,7 @@ class CommandProcessor:
             return  # a late Stop still stops
         now_ms = self._cloud_clock.now_ms()
         if now_ms is None:
-            raise Refused("no_clock", "the device does not know the cloud's time yet; send it again")
+            raise Refused("no_clock", "the device does not know the cloud's time yet; retry")
         if now_ms > command.issued_at_ms + command.ttl_ms:
             late = round(now_ms - command.issued_at_ms - command.ttl_ms)
             raise Refused("expired", f"arrived {late} ms after it had expired")
@@ -232,7 +232,7 @@ class CommandProcessor:
             case CancelAction(action=action):
                 self._executor.cancel(action, command.caller)
             case action:
-                # Only the next ack, which follows at once, is journalled. After a crash the action is not run again.
+                # Only the next ack, which follows soon, is journalled. After a crash the action is not run again.
                 self._publisher.send_ack(self._publisher.create_ack(command.id, AckStatus.ACCEPTED))
                 self._executor.start(command, action)
                 self._write_journal()
@@ -284,7 +284,8 @@ class CommandProcessor:
             faults=self._faults(),
             action=self._executor.current(),
             restrictions=tuple(
-                Restriction(source=one.source, speed=one.speed, reason=one.why) for one in self._controller.restrictions
+                Restriction(source=item.source, speed=item.speed, reason=item.why)
+                for item in self._controller.restrictions
             ),
             stiffness=self._controller.reduced_stiffness,
         )

@@ -99,7 +99,7 @@ class PinnedKeys(Mapping[str, Ed25519PublicKey]):
         if before.until_ms.get(signer):
             raise Refused("rolled_back", f"key {new.serial} is signed by a key that has a successor already; {ADVICE}")
         if now_ms is None:
-            raise Refused("no_clock", "the device does not know the cloud's time yet; send it again")
+            raise Refused("no_clock", "the device does not know the cloud's time yet; retry")
         if now_ms >= new.former_until_ms:
             raise Refused("expired", f"the key that signed the statement has expired; {ADVICE}")
         valid = {old: text for old, text in before.keys.items() if not self._expired(before, old)}

@@ -58,13 +58,13 @@ class BaseMotion:
         """Brake to rest at the robot type's deceleration."""
         self._set_target(REST, self._braking, _BRAKING_RAMP_S)
 
-    def update(self, passed_s: float | None = None) -> Twist:
-        """Advance one period, or ``passed_s`` of it [s].
+    def update(self, elapsed_s: float | None = None) -> Twist:
+        """Advance one period, or ``elapsed_s`` of it [s].
 
         Raises:
             MotionError: The generator found no trajectory; the twist is unchanged.
         """
-        self._generator.delta_time = passed_s or self._period_s
+        self._generator.delta_time = elapsed_s or self._period_s
         generate(self._generator.update, self._input, self._output)
         self._output.pass_to_input(self._input)
         self.twist = Twist(*self._output.new_velocity)

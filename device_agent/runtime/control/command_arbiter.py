@@ -49,7 +49,7 @@ class CommandArbiter:
         self._driver_limits: tuple[str, ...] = ()
         self._base_limits: tuple[str, ...] = ()
 
-    def update(self, now_s: float, measured_rad: Sequence[float] | None, passed_s: float | None) -> ControlOutput:
+    def update(self, now_s: float, measured_rad: Sequence[float] | None, elapsed_s: float | None) -> ControlOutput:
         """Compute the command of this period; see ``Controller.update``."""
         state = self._state
         if measured_rad is not None:
@@ -62,7 +62,7 @@ class CommandArbiter:
             obstacle = state.goals.check_clearance(late_s)
             if obstacle is not None:
                 self._block(obstacle)
-            state.goals.update(passed_s)
+            state.goals.update(elapsed_s)
         except MotionError as error:
             state.authority.end(Refused("fault", str(error)))
             state.mode = Mode.HOLDING
@@ -103,7 +103,9 @@ class CommandArbiter:
             self._state.motion.brake()
         else:
             goals.goal.add_limits((obstacle.text,))
-            goals.interrupt(Refused("no_room", f"something is in the way: {obstacle.text}; the device holds before it"))
+            goals.interrupt(
+                Refused("no_room", f"an obstacle is in the way: {obstacle.text}; the device holds before it")
+            )
 
     def _select_mode(self, now_s: float) -> Mode:
         authority, goals, stream = self._state.authority, self._state.goals, self._state.stream

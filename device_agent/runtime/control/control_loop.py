@@ -1,6 +1,6 @@
 """Control loop of one device: observe, compute, command, every ``period_ms``. The only writer of motor commands.
 
-A device at rest starts a setpoint or goal in a period of its own, without waiting for the next regular period. While
+A device at rest starts a setpoint or goal in an additional period, without waiting for the next regular one. While
 the device moves, periods keep their length, because each carries one period of motion. Only a Stop shortens a period.
 """
 
@@ -30,7 +30,7 @@ Each setpoint triggers a message. Consoles send setpoints 25 ms apart; a message
 _RECONNECT_PERIOD_S = 1.0
 _REST_TIMEOUT_S = 1.0
 _STOP_TIMEOUT_S = 2.0
-_MIN_PASSED_S = 1e-4
+_MIN_ELAPSED_S = 1e-4
 """Lower bound of the time since the last period: ``ruckig`` cannot plan for a duration of 0 [s]."""
 _log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class ControlLoop:
         self._published_setpoint = 0
         self._rounded: tuple[Observation, Observation] | None = None
         self._next_s = 0.0
-        self._out_of_turn = False
+        self._ran_early = False
         self._error = ""
         self._runs_inline = isinstance(driver, RunsInline) and driver.prompt
         self._requested = threading.Event()
@@ -120,7 +120,7 @@ class ControlLoop:
 
     def _may_run_early(self) -> bool:
         """Whether a period may run early: always for a Stop, otherwise at rest and not twice in a row."""
-        at_rest = not (self._out_of_turn or self._controller.moving)
+        at_rest = not (self._ran_early or self._controller.moving)
         return not self._error and (self._controller.stop_pending or at_rest)
 
     def _run(self) -> None:
@@ -140,7 +140,7 @@ class ControlLoop:
     def _wait(self) -> bool:
         """Sleep until the next period. Returns True if a device at rest was woken earlier."""
         pause_s = max(0.0, self._next_s - time.monotonic())
-        if self._out_of_turn or self._controller.moving:
+        if self._ran_early or self._controller.moving:
             self._stopping.wait(pause_s)
             return False
         return self._requested.wait(pause_s)
@@ -154,8 +154,8 @@ class ControlLoop:
             observation = (early and self.observation) or self._driver.observe()
             self.observation = observation
             self._check_interlocks(now_s)
-            passed_s = self._passed_s(now_s) if early and self._controller.moving else None
-            output = self._controller.update(now_s, observation.position_rad, passed_s=passed_s)
+            elapsed_s = self._elapsed_s(now_s) if early and self._controller.moving else None
+            output = self._controller.update(now_s, observation.position_rad, elapsed_s=elapsed_s)
             applied = self._driver.send(output.position_rad)
             self._controller.record_applied(applied)
             if self._base is not None:
@@ -167,15 +167,15 @@ class ControlLoop:
             _log.exception("%s: control loop", self._name)
             self._error = f"internal error: {error}"
         if self._error:
-            self._requested.set()  # wakes the loop's own thread, which handles the fault
-        self._out_of_turn = early
+            self._requested.set()  # wakes the loop's thread, which handles the fault
+        self._ran_early = early
         # Late periods are dropped and not repeated: a burst of commands would be a jump.
         start_s = now_s if early else max(self._next_s, time.monotonic() - 2 * self._period_s)
         self._next_s = start_s + self._period_s
 
-    def _passed_s(self, now_s: float) -> float:
+    def _elapsed_s(self, now_s: float) -> float:
         """Time since the start of the present period [s]."""
-        return min(max(now_s - (self._next_s - self._period_s), _MIN_PASSED_S), self._period_s)
+        return min(max(now_s - (self._next_s - self._period_s), _MIN_ELAPSED_S), self._period_s)
 
     def _handle_fault(self) -> None:
         _log.error("%s: %s", self._name, self._error)

@@ -1,6 +1,6 @@
 """Controller: the thread-safe interface to one device's authority and motion.
 
-It has no thread, clock or I/O of its own. The control loop calls ``update``. Other threads submit setpoints, goals and
+It has no thread, clock or I/O. The control loop calls ``update``. Other threads submit setpoints, goals and
 stops. One lock protects one ``ControlState``.
 """
 
@@ -317,17 +317,17 @@ class Controller:
             self._state.stream.reset(position_rad)
 
     def update(
-        self, now_s: float, measured_rad: Sequence[float] | None = None, *, passed_s: float | None = None
+        self, now_s: float, measured_rad: Sequence[float] | None = None, *, elapsed_s: float | None = None
     ) -> ControlOutput:
         """Compute the command of this period.
 
         Args:
             now_s: Monotonic clock [s].
             measured_rad: Measured positions, shape (n,). Compliant joints are commanded there; goals wait for them.
-            passed_s: Time since the last period began if a Stop makes this one early [s].
+            elapsed_s: Time since the last period began if a Stop makes this one early [s].
         """
         with self._lock:
-            return self._arbiter.update(now_s, measured_rad, passed_s)
+            return self._arbiter.update(now_s, measured_rad, elapsed_s)
 
     def record_applied(self, position_rad: Sequence[float]) -> None:
         """Record the positions that the driver applied, shape (n,) [rad]; ``limited`` shows differences."""

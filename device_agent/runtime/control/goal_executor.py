@@ -107,11 +107,11 @@ class GoalExecutor:
             return None
         return self._limits.find_obstacle(self.motion.propose())
 
-    def update(self, passed_s: float | None = None) -> None:
-        """Advance one period, or ``passed_s`` of it [s]."""
-        self.motion.update(passed_s)
+    def update(self, elapsed_s: float | None = None) -> None:
+        """Advance one period, or ``elapsed_s`` of it [s]."""
+        self.motion.update(elapsed_s)
         if self.base is not None:
-            self.base.update(passed_s)
+            self.base.update(elapsed_s)
 
     def finish(self, limited: tuple[str, ...], *, measured_rad: Sequence[float] | None, soft: Collection[int]) -> None:
         """End the goal if it has been reached.
@@ -131,8 +131,8 @@ class GoalExecutor:
                 if isinstance(goal, DriveGoal)
                 else self._is_reached(measured_rad, soft)
             )
-        except Refused as not_arrived:
-            self.interrupt(not_arrived)
+        except Refused as refused:
+            self.interrupt(refused)
             return
         if done:
             self.goal = None
@@ -163,7 +163,7 @@ class GoalExecutor:
             self.base.brake()
 
     def abort(self) -> None:
-        """Brake; if no braking trajectory is found, stop at once."""
+        """Brake; if no braking trajectory is found, stop immediately."""
         self.brake()
         try:
             self.motion.update()

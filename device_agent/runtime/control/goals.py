@@ -31,7 +31,7 @@ class MotionGoal:
 
     def add_limits(self, limited: tuple[str, ...]) -> None:
         """Add limits that apply now."""
-        self.limited += tuple(one for one in limited if one not in self.limited)
+        self.limited += tuple(limit for limit in limited if limit not in self.limited)
 
     def end(self, result: GoalResult, why: Refused | None = None) -> None:
         """Set the result and wake waiting threads."""

@@ -122,7 +122,7 @@ class JointMotion:
         if self._follower is not None:
             self.brake()
             return
-        if self.braking and self._would_turn():
+        if self.braking and self._would_reverse():
             return
         self.braking = False
         self._input.control_interface = ControlInterface.Position
@@ -137,7 +137,7 @@ class JointMotion:
         self._input.target_velocity = self._zeros
         self._input.target_acceleration = self._zeros
 
-    def _would_turn(self) -> bool:
+    def _would_reverse(self) -> bool:
         """Whether a joint with ordinary jerk would reverse before its deceleration has ended."""
         return any(
             abs(now) > limit + _SAME_RAD_S2
@@ -243,8 +243,8 @@ class JointMotion:
         ahead = [self._plan.at_time(self._plan.duration * (index + 1) / knots)[0] for index in range(knots)]
         return [list(self.position_rad), list(self._output.new_position), *(list(knot) for knot in ahead)]
 
-    def update(self, passed_s: float | None = None) -> list[float]:
-        """Advance one period, as proposed if it was, or ``passed_s`` of a period without a proposal.
+    def update(self, elapsed_s: float | None = None) -> list[float]:
+        """Advance one period, as proposed if it was, or ``elapsed_s`` of a period without a proposal.
 
         Returns:
             The position to command now, shape (n,) [rad].
@@ -253,11 +253,11 @@ class JointMotion:
             MotionError: The generator found no trajectory; position and velocity are unchanged.
         """
         if self._follower is not None:
-            return self._update_follower(self._follower, passed_s)
+            return self._update_follower(self._follower, elapsed_s)
         if not self._zeros:
             return self.position_rad
         if not self._proposed:
-            self._generator.delta_time = passed_s or self._period_s
+            self._generator.delta_time = elapsed_s or self._period_s
             try:
                 generate(self._generator.update, self._input, self._output)
             finally:
@@ -272,8 +272,8 @@ class JointMotion:
         self._apply_couplings(before)
         return self.position_rad
 
-    def _update_follower(self, follower: TrajectoryFollower, passed_s: float | None) -> list[float]:
-        follower.update(passed_s)
+    def _update_follower(self, follower: TrajectoryFollower, elapsed_s: float | None) -> list[float]:
+        follower.update(elapsed_s)
         before = self.position_rad
         self.position_rad, self.velocity_rad_s = follower.position_rad.tolist(), follower.velocity_rad_s.tolist()
         self._apply_couplings(before)

@@ -92,10 +92,12 @@ class MotionLimits:
             target[index] = min(max(target[index], lower), upper)
         if self._geometry is not None:
             clearance = self._geometry.clearance(target)
-            # A robot that is already too near to something may move to where there is more clearance.
-            if clearance.room_m < min(0.0, self._geometry.clearance(current_rad).room_m):
-                short_mm = math.ceil(-clearance.room_m * 1000)
-                raise Refused("no_room", f"no room there: {clearance.text}, {short_mm} mm too near; choose another")
+            # A robot that is already too close to an obstacle may move to a position with more clearance.
+            if clearance.excess_m < min(0.0, self._geometry.clearance(current_rad).excess_m):
+                short_mm = math.ceil(-clearance.excess_m * 1000)
+                raise Refused(
+                    "no_room", f"no clearance at the target: {clearance.text}, {short_mm} mm too close; choose another"
+                )
         return target
 
     def check_trajectory(self, position_rad: Floats) -> None:

@@ -80,9 +80,9 @@ class TrajectoryFollower:
         times = [time_s, *(time_s + ahead_s * (index + 1) / knots for index in range(knots))]
         return [self.position_rad.tolist(), *(self.trajectory.at(time)[0].tolist() for time in times)]
 
-    def update(self, passed_s: float | None = None) -> None:
-        """Advance one period, as proposed if it was, or ``passed_s`` of it [s]."""
-        self._time_s, self._share, self._change = self._next or self._advance(passed_s or self._period_s)
+    def update(self, elapsed_s: float | None = None) -> None:
+        """Advance one period, as proposed if it was, or ``elapsed_s`` of it [s]."""
+        self._time_s, self._share, self._change = self._next or self._advance(elapsed_s or self._period_s)
         self._next = None
         position, velocity, _ = self.trajectory.at(self._time_s)
         self.position_rad, self.velocity_rad_s = position, velocity * max(self._share, 0.0)
@@ -93,19 +93,19 @@ class TrajectoryFollower:
         self._share, self._next = max(0.0, self._share + lower * lost_s), None
         self.velocity_rad_s = self.trajectory.at(self._time_s)[1] * self._share
 
-    def _advance(self, passed_s: float) -> tuple[float, float, float]:
-        """Trajectory time, share and change of the share after ``passed_s``."""
+    def _advance(self, elapsed_s: float) -> tuple[float, float, float]:
+        """Trajectory time, share and change of the share after ``elapsed_s``."""
         current = max(self._share, 0.0)
         if self._braking:
-            change = max(self._change_limits(self._braking_limits)[0], -current / passed_s)
+            change = max(self._change_limits(self._braking_limits)[0], -current / elapsed_s)
         else:
             lower, upper = self._change_limits(self._acceleration_limits)
             speed = np.maximum(np.abs(self.trajectory.at(self._time_s)[1]), _EPSILON)
-            ramp = passed_s * float(np.min(self._jerk_limits / speed))
+            ramp = elapsed_s * float(np.min(self._jerk_limits / speed))
             eased = (self._target_share - current) / _EASE_S
             change = min(max(min(max(eased, self._change - ramp), self._change + ramp), lower), upper)
-        share = min(max(current + change * passed_s, 0.0), max(current, self._target_share))
-        return self._time_s + (current + share) / 2 * passed_s, share, change
+        share = min(max(current + change * elapsed_s, 0.0), max(current, self._target_share))
+        return self._time_s + (current + share) / 2 * elapsed_s, share, change
 
     def _change_limits(self, limit: Floats) -> tuple[float, float]:
         """Lowest and highest change of the share that keeps each joint within an acceleration limit [1/s]."""

@@ -36,7 +36,7 @@ class BehaviourTrajectory:
         self._type = robot_type
         self._index = {joint.name: index for index, joint in enumerate(robot_type.joints)}
         self._couplings = Couplings(robot_type)
-        self._points: list[list[tuple[float, float]]] = [[(0.0, place)] for place in start_rad]
+        self._points: list[list[tuple[float, float]]] = [[(0.0, position)] for position in start_rad]
         self._now_s = 0.0
         self._end_s = 0.0
 
@@ -139,7 +139,7 @@ def _merge_close(shapes: list[tuple[float, str]]) -> list[tuple[float, str]]:
 
 
 def _min_duration_s(joint: Joint, distance_rad: float) -> float:
-    """The least time for a way from rest to rest with the profile of ``_interpolate`` [s]."""
+    """Minimum duration of a motion from rest to rest with the profile of ``_interpolate`` [s]."""
     return max(
         2 * distance_rad / joint.max_velocity_rad_s,
         math.sqrt(8 * distance_rad / joint.max_acceleration_rad_s2),
@@ -158,15 +158,15 @@ def _max_distance_rad(joint: Joint, time_s: float) -> float:
 
 def _interpolate(points: Sequence[tuple[float, float]], times: Floats) -> tuple[Floats, Floats, Floats]:
     """Position, velocity and acceleration of one joint, from rest to rest between points, in four phases of jerk."""
-    moments, places = np.array(points).T
-    before = np.clip(np.searchsorted(moments, times, side="right") - 1, 0, len(moments) - 1)
-    after = np.minimum(before + 1, len(moments) - 1)
-    durations = np.maximum(moments[after] - moments[before], _SAME_RAD)
-    distance, u = places[after] - places[before], (times - moments[before]) / durations
+    times_s, positions = np.array(points).T
+    before = np.clip(np.searchsorted(times_s, times, side="right") - 1, 0, len(times_s) - 1)
+    after = np.minimum(before + 1, len(times_s) - 1)
+    durations = np.maximum(times_s[after] - times_s[before], _SAME_RAD)
+    distance, u = positions[after] - positions[before], (times - times_s[before]) / durations
     u = np.where(after == before, 0.0, np.clip(u, 0.0, 1.0))
     x, rest = u - 0.25, 1 - u
     early, late = u < 0.25, u > 0.75  # noqa: PLR2004 (quarters)
     share = np.select([early, late], [16 / 3 * u**3, 1 - 16 / 3 * rest**3], 1 / 12 + x + 4 * x**2 - 16 / 3 * x**3)
     speed = np.select([early, late], [16 * u**2, 16 * rest**2], 1 + 8 * x - 16 * x**2)
     change = np.select([early, late], [32 * u, -32 * rest], 8 - 32 * x)
-    return places[before] + distance * share, distance / durations * speed, distance / durations**2 * change
+    return positions[before] + distance * share, distance / durations * speed, distance / durations**2 * change

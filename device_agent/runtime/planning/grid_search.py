@@ -13,7 +13,7 @@ from device_agent.runtime.errors import Refused
 _ITERATIONS = 16
 """Cells by which the reachable area grows between two checks."""
 _MAX_ESCAPE_M = 0.4
-"""A robot that stands too near to something leaves straight to a free cell within this distance [m]."""
+"""A robot that is too close to an obstacle leaves straight to a free cell within this distance [m]."""
 _NEIGHBOURS = [(row, column, math.hypot(row, column)) for row in (-1, 0, 1) for column in (-1, 0, 1) if row or column]
 
 _Cell = tuple[int, int]
@@ -50,7 +50,7 @@ def find_path(floor: FloorMap, start: _Point, goal: _Point) -> list[_Point]:
 
 
 def _unreachable(floor: FloorMap, reachable: NDArray[np.bool_], goal: _Point, *, occupied: bool) -> Refused:
-    why = "something stands there or too near, or it is unseen" if occupied else "there is no free path to it"
+    why = "the place is occupied, too close to an obstacle or unobserved" if occupied else "there is no free path to it"
     nearest = ""
     if reachable.any():
         x_m, y_m = floor.centre(*_nearest(floor, reachable, goal))
@@ -59,7 +59,7 @@ def _unreachable(floor: FloorMap, reachable: NDArray[np.bool_], goal: _Point, *,
 
 
 def _escape(floor: FloorMap, free: NDArray[np.bool_], cell: _Cell, point: _Point) -> _Cell:
-    """The start of a path: the robot's cell, or the nearest free one if the robot stands too near to something."""
+    """The start of a path: the robot's cell, or the nearest free one if the robot is too close to an obstacle."""
     if free[cell] or not free.any():
         return cell
     nearest = _nearest(floor, free, point)

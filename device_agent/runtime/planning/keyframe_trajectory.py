@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from device_agent.ports.script_calls import Moment, Play
+from device_agent.ports.script_calls import Play, PlayKeyframe
 from device_agent.protocol import Joint
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
@@ -65,29 +65,29 @@ class KeyframeTrajectory:
         self._couplings = Couplings(robot_type)
         self._names = [joint.name for joint in robot_type.joints]
         self._gaps_s = _gaps(play) / play.speed
-        self._keys: list[list[tuple[int, float]]] = [[(0, place)] for place in start_rad]
+        self._keys: list[list[tuple[int, float]]] = [[(0, position)] for position in start_rad]
         """Of each joint: numbers of the keyframes that name it, 0 for the start, and its positions [rad]."""
         for number, keyframe in enumerate(play.keyframes):
-            for name, place in self._leaders(number + play.first, keyframe).items():
-                self._keys[self._names.index(name)].append((number + 1, place))
+            for name, position in self._leaders(number + play.first, keyframe).items():
+                self._keys[self._names.index(name)].append((number + 1, position))
         requested_s = float(self._gaps_s.sum())
         self._fit()
         self.limited = ("keyframes: later",) if self._gaps_s.sum() > requested_s * _TOLERANCE + _MIN_GAP_S else ()
 
     def poses(self) -> list[dict[str, float]]:
         """Positions of the joints at each keyframe [rad], without mimic joints."""
-        moments = self._moments()[1:]
-        places = [_interpolate(self._curve(index), moments)[0] for index in range(len(self._names))]
+        key_times = self._key_times()[1:]
+        positions = [_interpolate(self._curve(index), key_times)[0] for index in range(len(self._names))]
         followers = {mirror.joint for mirror in self._type.mimic_joints}
         narrowed = {narrowing.joint for narrowing in self._type.position_dependent_limits}
         named = [{number for number, _ in keys} for keys in self._keys]
         return [
             {
-                name: float(places[index][number])
+                name: float(positions[index][number])
                 for index, name in enumerate(self._names)
                 if name not in followers and (name not in narrowed or number + 1 in named[index])
             }
-            for number in range(len(moments))
+            for number in range(len(key_times))
         ]
 
     def trajectory(self) -> Trajectory:
@@ -100,7 +100,7 @@ class KeyframeTrajectory:
         velocity[[0, -1]] = acceleration[[0, -1]] = 0.0
         return constrain(self._couplings, Trajectory(step_s, position.copy(), velocity, acceleration))
 
-    def _leaders(self, number: int, keyframe: Moment) -> dict[str, float]:
+    def _leaders(self, number: int, keyframe: PlayKeyframe) -> dict[str, float]:
         unknown = sorted(set(keyframe.position_rad) - set(self._names))
         if unknown:
             message = f"no joint '{unknown[0][:80]}'; there are {', '.join(self._names)}"
@@ -110,24 +110,26 @@ class KeyframeTrajectory:
             raise Refused("mirrored", f"keyframe {number}: one motor moves {differing[0]} and another joint")
         return dict(leaders)
 
-    def _moments(self) -> Floats:
+    def _key_times(self) -> Floats:
         return np.concatenate(([0.0], np.cumsum(self._gaps_s)))
 
     def _curve(self, index: int) -> Floats:
         """Time, position and speed of a joint at the keyframes that name it, shape (3, keys)."""
-        numbers, places = zip(*self._keys[index], strict=True)
-        return _curve(self._moments()[list(numbers)], np.array(places))
+        numbers, positions = zip(*self._keys[index], strict=True)
+        return _curve(self._key_times()[list(numbers)], np.array(positions))
 
     def _fit(self) -> None:
         """Lengthen gaps until the limits are met; each change affects the speed in other gaps, so it iterates."""
         moving = [(joint, keys) for joint, keys in zip(self._type.joints, self._keys, strict=True) if len(keys) > 1]
         for _ in range(_ITERATIONS):
             longer = np.ones_like(self._gaps_s)
-            moments = self._moments()
+            key_times = self._key_times()
             for joint, keys in moving:
-                numbers, places = zip(*keys, strict=True)
+                numbers, positions = zip(*keys, strict=True)
                 for (start, end), factor in zip(
-                    pairwise(numbers), _stretch(_curve(moments[list(numbers)], np.array(places)), joint), strict=True
+                    pairwise(numbers),
+                    _stretch(_curve(key_times[list(numbers)], np.array(positions)), joint),
+                    strict=True,
                 ):
                     longer[start:end] = np.maximum(longer[start:end], factor)
             if longer.max() <= _TOLERANCE:
@@ -149,21 +151,21 @@ def _gaps(play: Play) -> Floats:
     return np.array(gaps)
 
 
-def _curve(times: Floats, places: Floats) -> Floats:
+def _curve(times: Floats, positions: Floats) -> Floats:
     """Times, positions and the speeds at them, shape (3, keys)."""
-    slopes = np.diff(places) / np.diff(times)
-    speeds = np.zeros_like(places)
+    slopes = np.diff(positions) / np.diff(times)
+    speeds = np.zeros_like(positions)
     before, after = slopes[:-1], slopes[1:]
     on = before * after > 0
     speeds[1:-1][on] = (2 * before[on] * after[on]) / (before[on] + after[on])
-    return np.array([times, places, speeds])
+    return np.array([times, positions, speeds])
 
 
 def _stretch(curve: Floats, joint: Joint) -> Floats:
     """Factor by which each gap of a curve must be lengthened for the limits, shape (keys - 1,)."""
-    times, places, speeds = curve
+    times, positions, speeds = curve
     durations = np.diff(times)
-    parts = np.array([np.diff(places), speeds[:-1] * durations, speeds[1:] * durations])
+    parts = np.array([np.diff(positions), speeds[:-1] * durations, speeds[1:] * durations])
     _, velocity, acceleration, jerk = (np.abs(parts.T @ shape).max(axis=1) for shape in _SHAPE)
     return np.asarray(
         np.maximum(
@@ -178,14 +180,16 @@ def _stretch(curve: Floats, joint: Joint) -> Floats:
 
 def _interpolate(curve: Floats, times: Floats) -> Floats:
     """Position, velocity and acceleration of one joint, shape (3, times). It rests before and after the curve."""
-    moments, places, speeds = curve
-    if len(moments) == 1:
-        return np.array([np.full_like(times, places[0]), np.zeros_like(times), np.zeros_like(times)])
-    start = np.clip(np.searchsorted(moments, times, side="right") - 1, 0, len(moments) - 2)
+    key_times, positions, speeds = curve
+    if len(key_times) == 1:
+        return np.array([np.full_like(times, positions[0]), np.zeros_like(times), np.zeros_like(times)])
+    start = np.clip(np.searchsorted(key_times, times, side="right") - 1, 0, len(key_times) - 2)
     end = start + 1
-    durations = moments[end] - moments[start]
-    u = np.clip((times - moments[start]) / durations, 0.0, 1.0)
-    parts = np.array([places[end] - places[start], speeds[start] * durations, speeds[end] * durations])
-    place, velocity, acceleration, _ = (parts * _shape(u)).sum(axis=1)
-    low, high = np.minimum(places[start], places[end]), np.maximum(places[start], places[end])
-    return np.array([np.clip(places[start] + place, low, high), velocity / durations, acceleration / durations**2])
+    durations = key_times[end] - key_times[start]
+    u = np.clip((times - key_times[start]) / durations, 0.0, 1.0)
+    parts = np.array([positions[end] - positions[start], speeds[start] * durations, speeds[end] * durations])
+    displacement, velocity, acceleration, _ = (parts * _shape(u)).sum(axis=1)
+    low, high = np.minimum(positions[start], positions[end]), np.maximum(positions[start], positions[end])
+    return np.array(
+        [np.clip(positions[start] + displacement, low, high), velocity / durations, acceleration / durations**2]
+    )

@@ -41,7 +41,7 @@ class PoseEstimator:
         seen = _position(room, f".{self._name}")
         if wheels is None:
             if seen is None or "yaw_rad" not in seen:
-                raise Refused("no_position", "the position of the robot is unknown; it stands")
+                raise Refused("no_position", "the position of the robot is unknown; the robot does not move")
             return Pose2D(seen["x_m"], seen["y_m"], seen["yaw_rad"])
         if seen is not None:
             x, y = seen["x_m"] - wheels["x_m"], seen["y_m"] - wheels["y_m"]

@@ -59,7 +59,7 @@ class MotionPlanner:
         """A trajectory on which a frame moves straight to a pose in the base frame, and turns at a constant rate.
 
         Raises:
-            Refused: Out of reach, not straight, or something is in the way.
+            Refused: Out of reach, not straight, or an obstacle is in the way.
         """
         start = self._geometry.poses(start_rad)[frame]
         turn = _rotation_between(start[3:], pose[3:])
@@ -86,7 +86,7 @@ class MotionPlanner:
                 )
         swept = self._geometry.sweep([point.tolist() for point in points])
         if swept.clearance is not None:
-            raise Refused("no_room", f"something is in the way: {swept.clearance.text}; use plan=True")
+            raise Refused("no_room", f"an obstacle is in the way: {swept.clearance.text}; use plan=True")
         return self._parameterize(trajectory.resample(np.array(points), _SPACING_RAD), speed)
 
     def _parameterize(self, points: Floats, speed: float) -> Trajectory:

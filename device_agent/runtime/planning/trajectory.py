@@ -75,8 +75,8 @@ def blend_corners(corners: Sequence[Sequence[float]], is_clear: Callable[[Floats
     path = np.array(corners, dtype=np.float64)
     for spacing_rad in _SPACINGS_RAD:
         points = resample(path, spacing_rad)
-        places = _along(points, _CHECKS)[0]
-        if all(is_clear(places[index : index + _BATCH + 1]) for index in range(0, len(places) - 1, _BATCH)):
+        positions = _along(points, _CHECKS)[0]
+        if all(is_clear(positions[index : index + _BATCH + 1]) for index in range(0, len(positions) - 1, _BATCH)):
             return points
     return None
 
@@ -88,8 +88,8 @@ def resample(path: Floats, spacing_rad: float) -> Floats:
     """
     lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))))
     count = max(1, int(np.ceil(lengths[-1] / spacing_rad)))
-    places = np.linspace(0.0, lengths[-1], count + 1)
-    points: Floats = np.stack([np.interp(places, lengths, joint) for joint in path.T], axis=1)
+    distances = np.linspace(0.0, lengths[-1], count + 1)
+    points: Floats = np.stack([np.interp(distances, lengths, joint) for joint in path.T], axis=1)
     points[0], points[-1] = path[0], path[-1]
     return points
 
@@ -112,8 +112,8 @@ def time_parameterize(points: Floats, joints: Sequence[Joint], *, speed: float, 
     ramp_s = float(np.max(limits[1] / limits[2]))
     allowed = limits.copy()
     for _ in range(_ITERATIONS):
-        places = _sample(points, _time_law(points, allowed), ramp_s)
-        velocity_excess, acceleration_excess, jerk_excess = _excess(places, limits)
+        positions = _sample(points, _time_law(points, allowed), ramp_s)
+        velocity_excess, acceleration_excess, jerk_excess = _excess(positions, limits)
         excess = max(velocity_excess, acceleration_excess**0.5)
         if max(excess, jerk_excess) <= _TOLERANCE:
             break
@@ -121,24 +121,24 @@ def time_parameterize(points: Floats, joints: Sequence[Joint], *, speed: float, 
             allowed /= np.array([[excess], [excess**2], [excess**3]])
         ramp_s *= max(1.0, jerk_excess)
     every = max(1, round(step_s / _STEP_S))
-    places = np.concatenate((places, np.repeat(places[-1:], -(len(places) - 1) % every, axis=0)))
-    velocity = np.gradient(places, _STEP_S, axis=0)
+    positions = np.concatenate((positions, np.repeat(positions[-1:], -(len(positions) - 1) % every, axis=0)))
+    velocity = np.gradient(positions, _STEP_S, axis=0)
     acceleration = np.gradient(velocity, _STEP_S, axis=0)
     velocity[[0, -1]] = acceleration[[0, -1]] = 0.0
-    return Trajectory(every * _STEP_S, places[::every], velocity[::every], acceleration[::every])
+    return Trajectory(every * _STEP_S, positions[::every], velocity[::every], acceleration[::every])
 
 
 def _along(points: Floats, parts: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """The spline and its first three derivatives at ``parts`` points per span, shape (places, n) each."""
+    """The spline and its first three derivatives at ``parts`` points per span, shape (points, n) each."""
     spans = len(points) - 1
     return _spline(points, np.linspace(0.0, spans, spans * parts + 1))
 
 
-def _spline(points: Floats, places: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def _spline(points: Floats, parameters: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     # Mirrored ends: the spline starts and ends at its first and last point.
     whole = np.concatenate(([2 * points[0] - points[1]], points, [2 * points[-1] - points[-2]]))
-    index = np.minimum(places.astype(np.intp), len(points) - 2)
-    u = (places - index)[:, np.newaxis]
+    index = np.minimum(parameters.astype(np.intp), len(points) - 2)
+    u = (parameters - index)[:, np.newaxis]
     near = whole[index[:, np.newaxis] + np.arange(4)]
     one, two, three, four = (np.einsum("c,pcn->pn", row, near) for row in _SPLINE)
     return (
@@ -168,31 +168,31 @@ def _time_law(points: Floats, limits: Floats) -> tuple[Floats, Floats]:
 
 def _sample(points: Floats, time_law: tuple[Floats, Floats], ramp_s: float) -> Floats:
     """Positions every ``_STEP_S``, with accelerations that build up over ``ramp_s``, shape (samples, n)."""
-    places, times = time_law
+    parameters, times = time_law
     width = max(1, round(ramp_s / _STEP_S))
-    moments: Floats = np.arange(-width, int(times[-1] / _STEP_S) + 2 * width, dtype=np.float64) * _STEP_S
+    sample_times: Floats = np.arange(-width, int(times[-1] / _STEP_S) + 2 * width, dtype=np.float64) * _STEP_S
     # Between two parameters the acceleration is constant, so the parameter is a parabola of time.
     smoothed = np.convolve(
-        _parabolas(places, times, moments), np.full(width, 1 / width, dtype=np.float64), mode="valid"
+        _parabolas(parameters, times, sample_times), np.full(width, 1 / width, dtype=np.float64), mode="valid"
     )
-    return _spline(points, np.clip(smoothed, 0.0, places[-1]))[0]
+    return _spline(points, np.clip(smoothed, 0.0, parameters[-1]))[0]
 
 
-def _parabolas(places: Floats, times: Floats, moments: Floats) -> Floats:
-    inside = np.clip(moments, 0.0, times[-1])
+def _parabolas(parameters: Floats, times: Floats, sample_times: Floats) -> Floats:
+    inside = np.clip(sample_times, 0.0, times[-1])
     index = np.clip(np.searchsorted(times, inside, side="right") - 1, 0, len(times) - 2)
     durations = np.diff(times)
     speed = np.zeros(len(times))
-    for segment, (delta, duration) in enumerate(zip(np.diff(places), durations, strict=True)):
+    for segment, (delta, duration) in enumerate(zip(np.diff(parameters), durations, strict=True)):
         speed[segment + 1] = max(0.0, 2 * delta / duration - speed[segment])
     u = (inside - times[index]) / durations[index]
     start, end = speed[index], speed[index + 1]
-    return np.asarray(places[index] + durations[index] * u * (start + u * (end - start) / 2))
+    return np.asarray(parameters[index] + durations[index] * u * (start + u * (end - start) / 2))
 
 
-def _excess(places: Floats, limits: Floats) -> list[float]:
+def _excess(positions: Floats, limits: Floats) -> list[float]:
     """Ratios of velocity, acceleration and jerk to their limits."""
-    excess, slopes = [], places
+    excess, slopes = [], positions
     for limit in limits:
         slopes = np.diff(slopes, axis=0) / _STEP_S
         excess.append(float(np.max(np.abs(slopes) / limit, initial=0.0)))

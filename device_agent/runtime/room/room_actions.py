@@ -32,10 +32,10 @@ class CollectAction:
         streams = self._room_device.collect(self._request.streams, self._request.rate_hz)
         try:
             while not self._killed.is_set():
-                passed_s = time.monotonic() - start_s
-                if passed_s >= duration_s:
+                elapsed_s = time.monotonic() - start_s
+                if elapsed_s >= duration_s:
                     break
-                step_s = min(duration_s - passed_s, max(_PROGRESS_PERIOD_S, duration_s / _STEPS))
+                step_s = min(duration_s - elapsed_s, max(_PROGRESS_PERIOD_S, duration_s / _STEPS))
                 if not self._killed.wait(step_s):
                     self._on_output("", min(1.0, (time.monotonic() - start_s) / duration_s))
         finally:
@@ -58,7 +58,7 @@ class OneShotAction:
         return self._call()
 
     def kill(self) -> None:
-        """Do nothing: the end of the reservation ends motion, measurements end by themselves, the loop applies Stop."""
+        """Do nothing: the end of the reservation ends motion, measurements are short, and the loop applies Stop."""
 
 
 def create(request: RoomTask, room_device: RoomDevice | None, on_output: OnOutput) -> CollectAction | OneShotAction:

@@ -22,8 +22,8 @@ class RoomDevice:
     """One room device. As thread-safe as its driver.
 
     Attributes:
-        driver: As given; the sensor loop connects it.
-        manifest: As given.
+        driver: Driver; the sensor loop connects it.
+        manifest: Manifest of the device.
         streams: Names of the streams.
         cameras: Names of the cameras.
         watchdog: Detects silent or stuck streams and cameras.
@@ -59,7 +59,7 @@ class RoomDevice:
             (CaptureRaw, self.manifest.captures),
             (SetControl, self.manifest.controls),
         )
-        return tuple(str(order.__struct_config__.tag) for order, items in supported if items)
+        return tuple(str(task.__struct_config__.tag) for task, items in supported if items)
 
     # ------------------------------------------------------------ rates
 

@@ -115,7 +115,7 @@ class SensorLoop:
         due_s = min((source.due_s for source in self._sources), default=now_s + _CHECK_PERIOD_S)
         if self._room_device.rates_changed.wait(min(_CHECK_PERIOD_S, max(0.0, due_s - now_s))):
             self._room_device.rates_changed.clear()
-            for source in self._sources:  # a faster rate applies at once
+            for source in self._sources:  # a faster rate applies immediately
                 source.due_s = min(source.due_s, now_s + 1 / self._room_device.rate_hz(source.name))
 
     def _apply_mode(self, mode: Mode) -> None:

@@ -65,7 +65,7 @@ class StreamWatchdog:
         """Present faults; a continuing fault keeps its message and the time of its detection."""
         now_s = self._clock_s()
         with self._lock:
-            messages = {f"{what}.{source}": message for what, source, message in self._check(now_s)}
+            messages = {f"{kind}.{source}": message for kind, source, message in self._check(now_s)}
             self._open = {
                 code: self._open.get(code) or Fault(code=code, message=message, since_ms=wall_ms())
                 for code, message in messages.items()

@@ -31,7 +31,7 @@ CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NU
 _CACHE_KB = 256
 """Rows are accessed individually by key, so a larger cache would only use memory [kB]."""
 _KEEP_MS = 7 * 24 * 3600 * 1000
-"""Commands are kept for a week, longer than any ``ttl_ms`` (at most a day), so that none runs twice [ms]."""
+"""Commands are stored for a week, longer than any ``ttl_ms`` (at most a day), so that none runs twice [ms]."""
 
 
 class JournalError(Exception):

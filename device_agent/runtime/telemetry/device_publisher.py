@@ -199,7 +199,7 @@ class DevicePublisher:
         self._outbox.add_measurement(late, payload, at_ms=telemetry.at_ms, sent=sent, now_s=time.monotonic())
 
     def publish_frame(self, camera: str, frame: CameraFrame) -> None:
-        """Publish a camera frame; it is dropped if it cannot be sent at once."""
+        """Publish a camera frame; it is dropped if it cannot be sent immediately."""
         self._publish(self._topic(topics.CAM, camera), camera_frames.encode(frame), qos=0)
 
     def publish_event(self, event: EventRecord) -> None:

@@ -1,4 +1,4 @@
-"""Latency probe: measures round-trip times from messages that are acknowledged anyway.
+"""Latency probe: measures round-trip times from messages that need an acknowledgement.
 
 A sample is the time from sending a state or ack to its acknowledgement: to the broker over MQTT, to the cloud over HTTP
 and XMPP. One clock measures both ends, and there are no additional messages. Samples that cannot be uploaded are
@@ -28,7 +28,7 @@ DEVICE_PERIOD_S = 60.0
 SPACING_S = 1.0
 """Minimum time between two samples of a device: a message in a queue would measure the queue [s]."""
 MAX_SAMPLES = 100
-"""Samples of one device that wait for upload; the newest ones are kept."""
+"""Samples of one device that wait for upload; older ones are dropped."""
 _TIMED = frozenset({topics.STATE, topics.ACK})
 """Classes that are sent live and acknowledged. Stored messages are sent in bulk and are not measured."""
 _log = logging.getLogger(__name__)

@@ -162,7 +162,7 @@ class Outbox:
     def _lose(self, item: OutboxItem) -> None:
         self._lost[device_of(item.topic), item.late] += 1
 
-    # ------------------------------------------------------------ its own thread
+    # ------------------------------------------------------------ the outbox's thread
 
     def _run(self) -> None:
         while not self._stopping.is_set():

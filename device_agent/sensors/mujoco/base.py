@@ -85,7 +85,7 @@ class SimulatedSensor:
         self.require()
         if stream != SETTINGS or not self._servos:
             self._reject_unknown("stream", stream, [each.name for each in self._device.streams])
-        with self.view.look() as (data, _):
+        with self.view.current() as (data, _):
             now = {name: float(data.qpos[servo.qpos]) for name, servo in self._servos.items() if servo.qpos is not None}
         settings = self._world.settings
         values = {}
@@ -113,7 +113,7 @@ class SimulatedSensor:
     def hold(self) -> None:
         """See ``ports.sensor.Movable``."""
         self.require()
-        with self.view.look() as (data, _):
+        with self.view.current() as (data, _):
             now = {
                 servo.name: float(data.qpos[servo.qpos]) for servo in self._servos.values() if servo.qpos is not None
             }

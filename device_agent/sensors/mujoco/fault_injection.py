@@ -1,4 +1,4 @@
-"""Faults injected into a simulated room device from a file beside the agent, for tests and demonstrations.
+"""Faults injected into a simulated room device from a file on the agent's machine, for tests and demonstrations.
 
 Only users of the agent's machine can inject faults. The file may be missing and is read again when it changes.
 

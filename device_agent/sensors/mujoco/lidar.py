@@ -63,7 +63,7 @@ class Lidar(SimulatedSensor):
         self.require()
         count = len(self._angle_rad)
         distance_m, geoms = np.empty(count), np.empty(count, dtype=np.int32)
-        with self.view.look() as (data, taken_s):
+        with self.view.current() as (data, taken_s):
             position_m = data.site_xpos[self._site].copy()
             rotation = data.site_xmat[self._site].reshape(3, 3).copy()
             beams = np.ascontiguousarray(self._beams @ rotation.T).ravel()

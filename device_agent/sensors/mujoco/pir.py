@@ -69,7 +69,7 @@ class Pir(SimulatedSensor):
         if stream != STREAM:
             return super().read(stream)
         self.require()
-        with self.view.look() as (data, _):
+        with self.view.current() as (data, _):
             now_s = float(data.time)
             for body in self._bodies:
                 offset = self._visible(data, body)
@@ -95,8 +95,8 @@ class Pir(SimulatedSensor):
 
     def _moves(self, body: int, offset: Floats, now_s: float) -> bool:
         before_s, before = self._before.setdefault(body, (now_s, offset))
-        passed_s = now_s - before_s
-        if passed_s < _INTERVAL_S:
+        elapsed_s = now_s - before_s
+        if elapsed_s < _INTERVAL_S:
             return False
         self._before[body] = (now_s, offset)
-        return float(np.linalg.norm(offset - before)) > _ACROSS_RAD_S * passed_s * float(np.linalg.norm(offset))
+        return float(np.linalg.norm(offset - before)) > _ACROSS_RAD_S * elapsed_s * float(np.linalg.norm(offset))

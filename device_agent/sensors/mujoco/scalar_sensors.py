@@ -63,5 +63,5 @@ class Contact(SimulatedSensor):
         if stream not in {each.name for each in self._device.streams}:
             return super().read(stream)
         self.require()
-        with self.view.look() as (data, _):
+        with self.view.current() as (data, _):
             return {"open": abs(float(data.qpos[self._qpos])) > self._shut_rad}

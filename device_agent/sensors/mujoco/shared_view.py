@@ -18,7 +18,7 @@ OLDEST_S = 0.02
 
 
 class View:
-    """The copy. The world must be open during ``look``."""
+    """The copy. The world must be open during ``current``."""
 
     def __init__(self, world: SimulatedWorld) -> None:
         self._world = world
@@ -27,7 +27,7 @@ class View:
         self._taken_s = float("-inf")
 
     @contextlib.contextmanager
-    def look(self) -> Iterator[tuple[Any, float]]:
+    def current(self) -> Iterator[tuple[Any, float]]:
         """The state as ``MjData``, and its time [s]. Blocks other sensors.
 
         Raises:

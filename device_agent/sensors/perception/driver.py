@@ -30,7 +30,7 @@ POSITIONS, PRESENCE, LIGHT, OCCUPANCY = "positions", "presence", "light", "occup
 STREAMS = (POSITIONS, PRESENCE, LIGHT, OCCUPANCY)
 MAP, SURVEY = "map", "survey"
 CAPTURES = (OCCUPANCY, MAP, SURVEY)
-SURVEY_LOOKS, SURVEY_EVERY_S = 20, 0.5
+SURVEY_SAMPLES, SURVEY_EVERY_S = 20, 0.5
 """Number of samples of a survey and their interval; people who walk through are filtered out."""
 COLOURS_EVERY_S = 1.0
 """Interval of colour images, which only provide brightness [s]."""
@@ -287,7 +287,7 @@ class PerceptionDriver:
 
     def _take_survey(self) -> BackgroundModel:
         result = BackgroundModel()
-        for _ in range(SURVEY_LOOKS):
+        for _ in range(SURVEY_SAMPLES):
             for name in self._sensors:
                 raw = self._neighbours[name].raw()
                 if isinstance(raw, Scan) or (isinstance(raw, Image) and raw.depth_m is not None):

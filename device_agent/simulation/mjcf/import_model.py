@@ -31,7 +31,7 @@ _POSITION_KEY = "home"
 
 
 class ImportModelError(Exception):
-    """The model cannot become a robot type. The message says why and what to do."""
+    """The model cannot become a robot type. The message states the cause and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ def import_model(source: Path, name: str, into: Path, *, without: Sequence[str] 
     return folder
 
 
-# ------------------------------------------------------------ what it is
+# ------------------------------------------------------------ read the model
 
 
 def _read(source: Path) -> Any:
@@ -163,8 +163,8 @@ def _root(model: Any) -> int:
 def _keep_robot_only(spec: Any, root: str) -> None:
     """Remove the scene around the robot."""
     world = spec.worldbody
-    for thing in [*world.geoms, *world.lights, *world.cameras, *world.sites]:
-        spec.delete(thing)
+    for element in [*world.geoms, *world.lights, *world.cameras, *world.sites]:
+        spec.delete(element)
     for body in [body for body in world.bodies if body.name != root]:
         spec.delete(body)
     for body in world.bodies:
@@ -248,7 +248,7 @@ def _gravity_load(model: Any, joint: int) -> float:
     return largest
 
 
-# ------------------------------------------------------------ what is written
+# ------------------------------------------------------------ write the folder
 
 
 def _write_model(spec: Any, source: Path, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Makes the options of model parts equal."""
+"""Copies options between model parts."""
 
 from typing import Any
 

@@ -127,7 +127,7 @@ class CloudClient:
         """Send messages: topics and JSON.
 
         Returns:
-            For each message ``None`` if the cloud has stored it, otherwise why it is rejected for good.
+            For each message ``None`` if the cloud has stored it, otherwise why it is rejected permanently.
 
         Raises:
             OSError: No response: the messages may have been stored, and may be sent again.

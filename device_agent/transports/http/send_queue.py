@@ -20,11 +20,11 @@ _BATCH_BYTES = 500_000
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One message to send. ``kept``: never dropped while the link is up."""
+    """One message to send. ``reliable``: never dropped while the link is up."""
 
     topic: str
     payload: bytes
-    kept: bool
+    reliable: bool
     delivered: Callable[[], None] | None = None
 
     @property
@@ -34,41 +34,41 @@ class Message:
 
 
 class SendQueue:
-    """Two ordered queues. Acks, state and events are sent first and at once; of measurements the newest are kept."""
+    """Two ordered queues. Acks, state and events are sent first; of measurements only the newest remain queued."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._kept: deque[Message] = deque()
+        self._reliable: deque[Message] = deque()
         self._measured: deque[Message] = deque(maxlen=_MAX_MEASUREMENTS)
         self._sent_s = 0.0
         self._closed = False
 
     def put(self, message: Message) -> bool:
-        """Add a message; never blocks. Returns whether there was room; measurements always have room."""
+        """Add a message; never blocks. Returns False if the queue is full; measurements are always accepted."""
         with self._changed:
-            if not message.kept:
+            if not message.reliable:
                 self._measured.append(message)
-            elif len(self._kept) < _MAX_URGENT:
-                self._kept.append(message)
+            elif len(self._reliable) < _MAX_URGENT:
+                self._reliable.append(message)
             else:
                 return False
-            # The sender wakes by itself when a batch of measurements is due.
-            if message.kept or len(self._measured) == 1:
+            # The sender's own timeout covers the next batch of measurements.
+            if message.reliable or len(self._measured) == 1:
                 self._changed.notify()
         return True
 
     def put_back(self, batch: Sequence[Message]) -> None:
         """Return messages that could not be sent, ahead of newer ones."""
         with self._changed:
-            self._kept.extendleft(message for message in reversed(batch) if message.kept)
+            self._reliable.extendleft(message for message in reversed(batch) if message.reliable)
             for message in reversed(batch):
-                if not message.kept and len(self._measured) < _MAX_MEASUREMENTS:
+                if not message.reliable and len(self._measured) < _MAX_MEASUREMENTS:
                     self._measured.appendleft(message)
 
     def clear(self) -> None:
         """Drop all messages, because the link is lost; senders repeat messages that must be delivered."""
         with self._changed:
-            self._kept.clear()
+            self._reliable.clear()
             self._measured.clear()
 
     def close(self) -> None:
@@ -92,7 +92,7 @@ class SendQueue:
             return self._batch(time.monotonic())
 
     def _due_s(self) -> float:
-        if self._kept:
+        if self._reliable:
             return 0.0
         if len(self._measured) >= _BATCH:
             return 0.0
@@ -100,7 +100,7 @@ class SendQueue:
 
     def _batch(self, now_s: float) -> list[Message]:
         """Urgent messages alone, since their senders wait; with measurements if those are overdue."""
-        batch = _cut(self._kept, _BATCH, _BATCH_BYTES)
+        batch = _cut(self._reliable, _BATCH, _BATCH_BYTES)
         if not batch or now_s - self._sent_s > _OVERDUE_S:
             size = sum(len(message.payload) for message in batch)
             batch += _cut(self._measured, _BATCH - len(batch), _BATCH_BYTES - size)

@@ -105,13 +105,13 @@ class HttpTransport:
         payload: bytes,
         *,
         qos: int,
-        retain: bool = False,  # noqa: ARG002 (the cloud knows which classes are retained)
+        retain: bool = False,  # noqa: ARG002 (the cloud retains by class)
         delivered: Callable[[], None] | None = None,
     ) -> bool:
         """Implements ``Transport.publish``. Payloads that are not JSON, such as camera frames, are dropped."""
         if not self._up or not payload.startswith(b"{"):
             return False
-        return self._queue.put(Message(topic, payload, kept=qos > 0, delivered=delivered))
+        return self._queue.put(Message(topic, payload, reliable=qos > 0, delivered=delivered))
 
     def stop(self) -> None:
         """Implements ``Transport.stop``."""
@@ -291,7 +291,7 @@ class HttpTransport:
         """Send a batch, or a heartbeat if it is empty.
 
         Raises:
-            CloudError: The cloud accepts nothing now, or nothing from this agent.
+            CloudError: The cloud rejects all messages at present, or all of this agent.
             OSError: The cloud cannot be reached.
         """
         if not batch:
@@ -320,12 +320,12 @@ class HttpTransport:
                 _log.warning("the cloud rejects a message on %s: %s", message.topic, rejection[:300])
                 continue
             if message.is_ack:
-                self._forget(message.payload)
+                self._remove_received(message.payload)
             if message.delivered is not None:
                 message.delivered()
 
-    def _forget(self, payload: bytes) -> None:
-        """Stop listing a command as received: the cloud knows from its acknowledgement."""
+    def _remove_received(self, payload: bytes) -> None:
+        """Remove a command from ``have``: the cloud has received its acknowledgement."""
         with contextlib.suppress(ProtocolError), self._have_lock:
             self._have.pop(codec.decode(payload, Ack).id, None)
 
@@ -334,7 +334,7 @@ class HttpTransport:
         if not self._announced_online:
             return
         batch = self._queue.take(0.0)
-        last = Message(self._presence_topic, self._presence(online=False), kept=True)
+        last = Message(self._presence_topic, self._presence(online=False), reliable=True)
         payloads = [(message.topic, message.payload) for message in (*batch, last)]
         with contextlib.suppress(OSError, ValueError):
             self._process_results((*batch, last), self._send_api.send(self._agent, payloads, within_s=_DISCONNECT_S))

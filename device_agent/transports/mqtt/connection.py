@@ -1,4 +1,4 @@
-"""One paho connection without a thread of its own: the transport's thread reads, and every caller writes directly.
+"""One paho connection without its own thread: the transport's thread reads, and every caller writes directly.
 
 A separate writer thread would have to be woken for each message, and to wait for its turn.
 """
@@ -120,7 +120,7 @@ class Connection:
         if events != self._events:
             self._selector.modify(sock, events)
             self._events = events
-        # TLS may have decrypted several messages at once; the socket does not signal those.
+        # TLS may have decrypted several messages; the socket does not signal those.
         decrypted = isinstance(sock, ssl.SSLSocket) and sock.pending() > 0
         started_s = time.monotonic()
         ready = {key.fileobj: for_ for key, for_ in self._selector.select(0 if decrypted else within_s)}

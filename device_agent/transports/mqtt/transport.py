@@ -348,8 +348,8 @@ class _Renewal:
 
     def begin(self) -> None:
         """Request credentials, unless a request is running or failed recently."""
-        asking = self._thread is not None and self._thread.is_alive()
-        if self.access is None and not asking and time.monotonic() >= self._next_s:
+        running = self._thread is not None and self._thread.is_alive()
+        if self.access is None and not running and time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + _RENEWAL_RETRY_S
             self._thread = threading.Thread(target=self._request, name="mqtt-renewal", daemon=True)
             self._thread.start()

@@ -98,7 +98,7 @@ class XmppTransport:
         payload: bytes,
         *,
         qos: int,
-        retain: bool = False,  # noqa: ARG002 (the gateway knows which classes are retained)
+        retain: bool = False,  # noqa: ARG002 (the gateway retains by class)
         delivered: Callable[[], None] | None = None,
     ) -> bool:
         """Implements ``Transport.publish``. Payloads that are not JSON, such as camera frames, are dropped."""
@@ -193,7 +193,7 @@ class _Link:
         present: JIDs of the gateways that are online.
         peer: The chosen gateway.
         up: Whether it has acknowledged the agent's presence.
-        left: Whether the gateway went offline since.
+        left: Whether the gateway has gone offline.
         session: Session number.
     """
 
@@ -320,7 +320,7 @@ class _Link:
             self._receive(delivery.topic, delivery.payload)
 
     def _settle(self, number: str, reason: str = "") -> None:
-        """Complete a message that was acknowledged or rejected for good; sending it again would change nothing."""
+        """Complete a message that was acknowledged or rejected permanently, so that it is not sent again."""
         response = self._responses.get(number)
         if response is not None and not response.done():
             response.set_result(reason)

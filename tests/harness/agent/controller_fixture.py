@@ -151,7 +151,7 @@ class Wall:
         return Clearance(self.at_rad - position_rad[1], ("hand", "wall"))
 
     def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
-        rooms = [self.clearance(position).room_m for position in path_rad]
+        rooms = [self.clearance(position).excess_m for position in path_rad]
         least = min(0.0, rooms[0]) - 1e-7
         for leg, (begin, end) in enumerate(pairwise(rooms)):
             if end < least:

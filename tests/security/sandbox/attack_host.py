@@ -75,7 +75,7 @@ class RecordingRobot:
 
     def execute(self, call: script_calls.Call) -> Any:
         self.messages += 1
-        if isinstance(call, script_calls.AskState):
+        if isinstance(call, script_calls.GetState):
             return {"position_rad": dict.fromkeys(self.joints, 0.0)}
         self.moves.append(msgspec.to_builtins(call))
         raise Refused("busy", "it does not move")

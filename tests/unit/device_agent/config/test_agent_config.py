@@ -74,7 +74,7 @@ def test_defaults(tmp_path: Path) -> None:
         (INTERLOCK.replace("equals = true", ""), "exactly one of above, below, equals"),
         (INTERLOCK.replace("true", "nan"), "finite"),
         (INTERLOCK + INTERLOCK, "two interlocks of 'arm'"),
-        ('[[devices]]\nname = "arm"\ntype = "ur5"\n', "at least one device, each with a name of its own"),
+        ('[[devices]]\nname = "arm"\ntype = "ur5"\n', "at least one device, each with a unique name"),
         (None, "at least one device"),
     ],
 )

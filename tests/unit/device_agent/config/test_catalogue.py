@@ -51,4 +51,4 @@ def test_furniture_of_the_room_limits_the_arm() -> None:
     path = geometry.sweep([home, down])
     assert path.clearance is not None
     assert "table_top" in path.clearance.text
-    assert geometry.clearance(home).room_m > 0
+    assert geometry.clearance(home).excess_m > 0

@@ -73,8 +73,8 @@ def test_frames_are_relative_to_the_base(arm: MujocoDriver, room: Path):
     away = MujocoDriver(robot_type=TYPE, world=world, device="away", prefix="x/")
     away.connect()
     try:
-        for here, there in zip(arm.observe().frames, away.observe().frames, strict=True):
-            assert there == pytest.approx(here, abs=2e-3)  # gravity differs, but its compensation is exact
+        for expected, measured in zip(arm.observe().frames, away.observe().frames, strict=True):
+            assert measured == pytest.approx(expected, abs=2e-3)  # gravity differs, but its compensation is exact
     finally:
         away.close()
 

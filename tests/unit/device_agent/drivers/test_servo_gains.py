@@ -12,7 +12,7 @@ from device_agent.protocol.manifests import robot_type
 from tests.harness.paths import UR5
 
 KIND = robot_type.load(UR5)
-STAGE: Any = None
+CONTEXT: Any = None
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def driver(world: World) -> MujocoDriver:
 
 def test_a_compliant_joint_falls_and_the_others_hold(world: World, driver: MujocoDriver) -> None:
     before = world.step(100).position_rad
-    driver.perform(SetStiffness(value=0.0, joints=("wrist_1",)), STAGE)
+    driver.perform(SetStiffness(value=0.0, joints=("wrist_1",)), CONTEXT)
     after = world.step(500).position_rad
     assert abs(after["wrist_1"] - before["wrist_1"]) > 0.3
     assert abs(after["shoulder_pan"] - before["shoulder_pan"]) < 0.02
@@ -42,15 +42,15 @@ def test_full_stiffness_restores_the_model(world: World, driver: MujocoDriver) -
     model = world.model
     fields = ("actuator_gainprm", "actuator_biasprm", "body_gravcomp")
     original = {name: getattr(model, name).copy() for name in fields}
-    driver.perform(SetStiffness(value=0.3, joints=()), STAGE)
+    driver.perform(SetStiffness(value=0.3, joints=()), CONTEXT)
     world.step(4)
     elbow = model.actuator("elbow").id
     assert model.actuator_gainprm[elbow, 0] == pytest.approx(original["actuator_gainprm"][elbow, 0] * 0.3)
-    driver.perform(SetStiffness(value=1.0, joints=()), STAGE)
+    driver.perform(SetStiffness(value=1.0, joints=()), CONTEXT)
     world.step(4)
     assert all(np.array_equal(getattr(model, name), original[name]) for name in fields)
 
 
 def test_other_skills_are_rejected(driver: MujocoDriver) -> None:
     with pytest.raises(SkillError, match="does not support this skill"):
-        driver.perform(Say(text="hello"), STAGE)
+        driver.perform(Say(text="hello"), CONTEXT)

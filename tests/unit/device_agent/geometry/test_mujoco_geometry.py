@@ -35,7 +35,7 @@ def positions(count: int, seed: int) -> Any:
 
 
 def free(shape: MujocoGeometry, count: int, seed: int) -> list[Any]:
-    found = [position for position in positions(20 * count, seed) if shape.clearance(position.tolist()).room_m > 0]
+    found = [position for position in positions(20 * count, seed) if shape.clearance(position.tolist()).excess_m > 0]
     assert len(found) >= count
     return found[:count]
 
@@ -56,9 +56,9 @@ def test_contacts_have_no_clearance(shape: MujocoGeometry, simulated: tuple[Any,
         mujoco.mj_collision(model, data)
         if (data.contact.dist < 0).any():
             touching += 1
-            assert shape.clearance(position.tolist()).room_m < 0
+            assert shape.clearance(position.tolist()).excess_m < 0
     assert touching > 50
-    assert shape.clearance(HOME).room_m > 0.02
+    assert shape.clearance(HOME).excess_m > 0.02
 
 
 def test_sweeps_agree_with_sampling(shape: MujocoGeometry) -> None:
@@ -69,12 +69,12 @@ def test_sweeps_agree_with_sampling(shape: MujocoGeometry) -> None:
         swept = shape.sweep([start, (start + end) / 2, end])
         share = swept.share
         for part in np.linspace(0, share, 40):
-            assert shape.clearance((start + part * (end - start)).tolist()).room_m > -0.01
+            assert shape.clearance((start + part * (end - start)).tolist()).excess_m > -0.01
         if swept.clearance is not None:
             blocked += 1
-            assert swept.clearance.room_m < 0
+            assert swept.clearance.excess_m < 0
             beyond = [start + part * (end - start) for part in np.linspace(share, 1, 60)]
-            assert min(shape.clearance(position.tolist()).room_m for position in beyond) < 0
+            assert min(shape.clearance(position.tolist()).excess_m for position in beyond) < 0
         else:
             assert share == 1.0
     assert 20 < blocked < 100
@@ -98,7 +98,7 @@ def test_cached_bounds_agree_with_measurements(shape: MujocoGeometry, monkeypatc
 
 def test_a_violated_margin_may_only_grow(shape: MujocoGeometry) -> None:
     low, away, on = ([0.0, lift, *HOME[2:]] for lift in (-0.86, -1.0, -0.80))
-    assert shape.clearance(low).room_m < 0
+    assert shape.clearance(low).excess_m < 0
     assert shape.sweep([low, away]).share == 1.0
     stopped = shape.sweep([low, on])
     assert stopped.share == 0.0
@@ -142,9 +142,9 @@ def test_no_point_is_faster_than_the_bound(shape: MujocoGeometry, simulated: tup
 
 
 def test_the_workspace_keeps_frames_inside(shape: MujocoGeometry) -> None:
-    beside = [1.2, -0.05, 0.3, HOME[3], HOME[4], 0.0]  # beside the table, below its top
-    found = shape.clearance(beside)
-    assert found.room_m < 0
+    position = [1.2, -0.05, 0.3, HOME[3], HOME[4], 0.0]  # next to the table, below its top
+    clearance = shape.clearance(position)
+    assert clearance.excess_m < 0
     narrow = msgspec.structs.replace(
         KIND, workspace=robot_type.Workspace(lower_m=(-0.6, -0.6, 0.0), upper_m=(0.6, 0.6, 0.5), frames=("flange",))
     )
@@ -184,7 +184,7 @@ def test_inverse_kinematics_finds_reachable_poses_near_the_start(shape: MujocoGe
         assert pose[:3] == pytest.approx(target[:3], abs=2e-4)
         assert abs(np.dot(pose[3:], target[3:])) == pytest.approx(1.0, abs=1e-6)
         assert np.array_equal(solution, np.clip(solution, LOWER, UPPER))
-        assert shape.clearance(solution).room_m >= 0
+        assert shape.clearance(solution).excess_m >= 0
     x, y, z, *turn = shape.poses(HOME)["flange"]
     nearby = shape.solve("flange", (x, y + 0.05, z - 0.05, *turn), HOME)  # type: ignore[arg-type]
     assert np.abs(np.subtract(nearby, HOME)).max() < 0.3
@@ -274,7 +274,7 @@ def test_a_mobile_robot_is_only_checked_against_itself(tmp_path: Path) -> None:
     )
     cart = MujocoGeometry(kind, tmp_path / "cart.xml")
     assert cart.clearance([0.0, 1.4]).between == ("cart", "arm")
-    assert cart.clearance([0.3, 0.0]).room_m > 0.2
+    assert cart.clearance([0.3, 0.0]).excess_m > 0.2
     assert "arm" in cart.poses([0.1, 0.0])
     assert cart.speed_m_s([1.0, 0.0]) == pytest.approx(1.0)
     with pytest.raises(GeometryError, match="floor"):
@@ -293,18 +293,18 @@ def test_another_scene_can_be_selected(tmp_path: Path) -> None:
     assert "post" in swept.clearance.text
 
 
-def room_with(tmp_path: Path, *things: str) -> Path:
+def room_with(tmp_path: Path, *objects: str) -> Path:
     room = tmp_path / "room.xml"
     room.write_text(
         '<mujoco><compiler angle="radian"/><option timestep="0.01" integrator="RK4"/><visual><map zfar="9"/></visual>'
-        f'<worldbody><geom name="floor" type="plane" size="5 5 1"/>{"".join(things)}</worldbody></mujoco>'
+        f'<worldbody><geom name="floor" type="plane" size="5 5 1"/>{"".join(objects)}</worldbody></mujoco>'
     )
     return room
 
 
-def base_pose(room: Path, yaw_rad: float = 0.7) -> MujocoGeometry:
-    there = geometry.BasePose(room=room, position_m=(2.0, -1.0, 0.75), yaw_rad=yaw_rad)
-    return MujocoGeometry(KIND, UR5 / KIND.model, base_pose=there)
+def in_room(room: Path, yaw_rad: float = 0.7) -> MujocoGeometry:
+    base_pose = geometry.BasePose(room=room, position_m=(2.0, -1.0, 0.75), yaw_rad=yaw_rad)
+    return MujocoGeometry(KIND, UR5 / KIND.model, base_pose=base_pose)
 
 
 def test_poses_in_a_room_are_relative_to_the_base_and_moving_or_far_objects_are_left_out(
@@ -313,13 +313,13 @@ def test_poses_in_a_room_are_relative_to_the_base_and_moving_or_far_objects_are_
     gate = '<geom name="gate" type="box" size="0.05 0.4 0.4"/>'
     swinging = f'<body pos="1.5 -1 1"><joint name="swing" type="hinge"/>{gate}</body>'
     far = '<geom name="far" type="box" size="0.1 0.1 0.1" pos="-3 3 1"/>'
-    there = base_pose(room_with(tmp_path, swinging, far))
-    names = {name for pair in there._pairs._names for name in pair}
+    placed = in_room(room_with(tmp_path, swinging, far))
+    names = {name for pair in placed._pairs._names for name in pair}
     assert "floor" in names
     assert not {"gate", "far"} & names
     for name, pose in shape.poses(HOME).items():
-        assert there.poses(HOME)[name] == pytest.approx(pose, abs=1e-9)
-    assert there.solve("flange", shape.poses(HOME)["flange"], HOME) == pytest.approx(HOME, abs=1e-2)
+        assert placed.poses(HOME)[name] == pytest.approx(pose, abs=1e-9)
+    assert placed.solve("flange", shape.poses(HOME)["flange"], HOME) == pytest.approx(HOME, abs=1e-2)
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.7, -2.2])
@@ -331,9 +331,9 @@ def test_room_objects_are_transformed_by_the_base_pose(tmp_path: Path, yaw_rad: 
         -1.0 + x * math.sin(yaw_rad) + y * math.cos(yaw_rad),
     )
     post = f'<geom name="post" type="cylinder" size="0.05 0.6" pos="{position[0]} {position[1]} 1.3"/>'
-    there = base_pose(room_with(tmp_path, post), yaw_rad=yaw_rad)
-    swept = there.sweep([HOME, [HOME[0] + 1.0, *HOME[1:]]])
+    placed = in_room(room_with(tmp_path, post), yaw_rad=yaw_rad)
+    swept = placed.sweep([HOME, [HOME[0] + 1.0, *HOME[1:]]])
     assert swept.clearance is not None
     assert swept.clearance.between[0] == "post"
     assert swept.share == pytest.approx(0.4, abs=0.1)
-    assert there.sweep([HOME, [HOME[0] - 1.0, *HOME[1:]]]).share == 1.0
+    assert placed.sweep([HOME, [HOME[0] - 1.0, *HOME[1:]]]).share == 1.0

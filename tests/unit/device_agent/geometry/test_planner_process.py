@@ -36,7 +36,7 @@ NAO = ROBOTS / "nao"
 KIND = robot_type.load(UR5)
 HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
 BEYOND = [1.6, *HOME[1:]]
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 WALL = '<geom type="box" size="0.9 0.02 1.5" pos="{} {} 1.5" euler="0 0 {}"/>'
 
 
@@ -60,9 +60,9 @@ def shape(divided: Path) -> Iterator[MujocoGeometry]:
 
 
 def until(happened: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while not happened():
-        assert time.monotonic() < deadline_s, "it did not happen"
+        assert time.monotonic() < deadline_s, "timeout"
         time.sleep(0.01)
 
 
@@ -87,11 +87,11 @@ def test_the_process_plans_the_same_path() -> None:
     shape = MujocoGeometry(KIND, UR5 / KIND.scene)
     low = shape.solve("flange", (*shape.poses(HOME)["flange"][:2], 0.1, *shape.poses(HOME)["flange"][3:]), HOME)
     goal = [low[0] + 2.5, *low[1:]]
-    there = shape.plan(low, goal, seed=4)
-    assert there == shape.plan_here(low, goal, seed=4, within_s=5.0)
+    planned = shape.plan(low, goal, seed=4)
+    assert planned == shape.plan_here(low, goal, seed=4, within_s=5.0)
     first = pid_of(shape)
     shape.plan(goal, low, seed=4)
-    assert pid_of(shape) == first, "it is kept"
+    assert pid_of(shape) == first, "the process still runs"
     del shape
     until(lambda: not alive(first))
 
@@ -106,7 +106,7 @@ def test_cancelling_kills_the_process(shape: MujocoGeometry) -> None:
     pid, enough = pid_of(shape), threading.Event()
     threading.Timer(0.3, enough.set).start()
     with pytest.raises(GeometryError, match="cancelled"):
-        shape.plan(HOME, BEYOND, within_s=PATIENCE_S, ended=enough.is_set)
+        shape.plan(HOME, BEYOND, within_s=TIMEOUT_S, ended=enough.is_set)
     assert not alive(pid)
 
 
@@ -208,7 +208,7 @@ def test_the_process_exits_when_the_agent_is_killed(divided: Path) -> None:
     until(lambda: not alive(pid))
 
 
-# ------------------------------------------------------------ joints that hang together
+# ------------------------------------------------------------ coupled joints
 
 
 def test_planned_paths_respect_joint_couplings() -> None:

@@ -213,7 +213,7 @@ def test_state_shows_a_control_request_until_it_is_withdrawn(harness: DeviceHarn
     harness.done(WithdrawRequest(request="r1"), epoch=1)
     lease = wait_for_state(harness, lambda state: state.lease and not state.lease.request).lease
     assert lease is not None
-    assert lease.reason == "needed in the lab", "a renewal keeps it"
+    assert lease.reason == "needed in the lab", "a renewal keeps the reason"
 
 
 def test_a_new_epoch_is_journalled_before_it_is_applied_and_its_end_is_shown(

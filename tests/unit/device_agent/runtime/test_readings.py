@@ -108,7 +108,7 @@ def test_overtaken_messages_are_dropped_but_a_restarted_sender_is_accepted(
     receive(room, measured(7, tick_ms=700, present=0.0))
     assert value(room) == 1.0
     receive(room, measured(1, tick_ms=900, present=2.0))
-    assert value(room) == 2.0, "the agent there restarted"
+    assert value(room) == 2.0, "the sending agent restarted"
     clock.now_s += RESTART_GAP_S
     receive(room, measured(1, tick_ms=5, present=3.0))
-    assert value(room) == 3.0, "the machine there restarted"
+    assert value(room) == 3.0, "the sending machine restarted"

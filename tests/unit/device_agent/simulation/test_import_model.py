@@ -135,7 +135,7 @@ def test_an_actuator_can_be_left_out(scene: Path, tmp_path: Path) -> None:
     ("source", "name", "why"),
     [
         ("nowhere.xml", "arm", "MuJoCo cannot read this model"),
-        ("scene.xml", "no good", "not a valid robot type"),
+        ("scene.xml", "invalid name", "not a valid robot type"),
         ("scene.xml", "types", "exists already"),
     ],
 )

@@ -42,17 +42,17 @@ def warned(world: World) -> bool:
 
 def test_random_commands_are_finite_and_reproducible():
     def play() -> list[np.ndarray]:
-        world, random, seen = lab(), np.random.default_rng(5), []
+        world, random, states = lab(), np.random.default_rng(5), []
         lower, upper = world.model.actuator_ctrlrange.T
         own = np.flatnonzero(["/" in world.model.actuator(index).name for index in range(world.model.nu)])
         home = world.snapshot().ctrl[own]
         for _ in range(100):
             target = np.clip(home + random.uniform(-0.1, 0.1, len(own)), lower[own], upper[own])
             world.command("all", own, target, ramp_s=0.04)
-            seen.append(world.step(20).qpos)
+            states.append(world.step(20).qpos)
         assert not warned(world)
-        assert np.isfinite(seen).all()
-        return seen
+        assert np.isfinite(states).all()
+        return states
 
     for first, second in zip(play(), play(), strict=True):
         assert np.array_equal(first, second)
@@ -179,13 +179,13 @@ def test_the_persons_path_is_free_of_obstacles():
     people = shapes_of_the_person(world)
     hit = np.full(1, -1, dtype=np.int32)
     corners = np.array(MANIFEST.people[0].path_m)
-    for here, there in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        length_m = np.linalg.norm(there - here)
-        direction = (there - here) / length_m
+    for start_m, end_m in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        length_m = np.linalg.norm(end_m - start_m)
+        direction = (end_m - start_m) / length_m
         for side_m in (-0.25, 0.0, 0.25):  # at hip width including elbows
-            start = np.array((*(here + side_m * np.array((-direction[1], direction[0]))), 0.3))
+            start = np.array((*(start_m + side_m * np.array((-direction[1], direction[0]))), 0.3))
             away_m = mujoco.mj_ray(world.model, data, start, np.array((*direction, 0.0)), None, True, -1, hit, None)
-            assert away_m < 0 or away_m > length_m or hit[0] in people, (here, there, int(hit[0]))
+            assert away_m < 0 or away_m > length_m or hit[0] in people, (start_m, end_m, int(hit[0]))
 
 
 def test_the_person_stops_for_a_robot_and_turns_around():
@@ -308,7 +308,7 @@ def test_footsteps_and_speech_raise_the_sound_level():
     world = lab(msgspec.structs.replace(MANIFEST, climate=quiet))
     world.step(300)
     before = world.quantities["sound_db"]
-    place_driver(world, "ur5").speaks(0.5)
+    place_driver(world, "ur5").start_speech(0.5)
     world.step(100)
     assert world.quantities["sound_db"] > before + 5
     world.step(300)

@@ -18,10 +18,10 @@ def test_batched_steps_equal_single_steps() -> None:
     one = mujoco.MjData(model)
     lab.copy(one)
     many = copy.copy(one)
-    stepper, chance = Stepper(model), np.random.default_rng(5)
+    stepper, rng = Stepper(model), np.random.default_rng(5)
     for count in (1, 2, 4, 2, 4, 1, 4):
-        rows = one.ctrl + chance.normal(0.0, 0.02, (count, model.nu))
-        push = chance.normal(0.0, 0.5, (model.nbody, 6))  # external forces are kept
+        rows = one.ctrl + rng.normal(0.0, 0.02, (count, model.nu))
+        push = rng.normal(0.0, 0.5, (model.nbody, 6))  # external forces stay in effect
         one.xfrc_applied[:], many.xfrc_applied[:] = push, push
         one.mocap_pos[:] += 0.01
         many.mocap_pos[:] += 0.01

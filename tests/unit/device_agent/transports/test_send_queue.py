@@ -1,4 +1,4 @@
-"""Acknowledged messages are sent first and alone; of measurements the newest are kept."""
+"""Acknowledged messages are sent first and alone; of measurements the newest remain."""
 
 from types import SimpleNamespace
 
@@ -10,7 +10,7 @@ from device_agent.transports.http.send_queue import Message, SendQueue
 
 TELE = topics.device("lab", "arm1", "arm", topics.TELE, "load")
 EVENT = topics.device("lab", "arm1", "arm", topics.EVENT)
-MEASUREMENT = Message(TELE, b"{}", kept=False)
+MEASUREMENT = Message(TELE, b"{}", reliable=False)
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def queue() -> SendQueue:
 
 
 def event(payload: bytes) -> Message:
-    return Message(EVENT, payload, kept=True)
+    return Message(EVENT, payload, reliable=True)
 
 
 def test_events_are_sent_before_measurements_and_alone(queue: SendQueue) -> None:
@@ -34,7 +34,7 @@ def test_events_are_sent_before_measurements_and_alone(queue: SendQueue) -> None
 
 def test_the_newest_measurements_are_kept(queue: SendQueue) -> None:
     for number in range(2000):
-        assert queue.put(Message(TELE, b"%d" % number, kept=False))
+        assert queue.put(Message(TELE, b"%d" % number, reliable=False))
     assert [int(message.payload) for _ in range(3) for message in queue.take(1)] == list(range(1500, 2000))
 
 

@@ -9,7 +9,7 @@ interface Case {
   name: string;
   start_rad: number[];
   keyframes: Movement["keyframes"];
-  reckoned: { reached_s: number[]; position_rad: number[][] };
+  expected: { reached_s: number[]; position_rad: number[][] };
 }
 
 const cases = JSON.parse(readFileSync(new URL("../../../../tests/unit/device_agent/runtime/planning/timelines.json", import.meta.url), "utf8")) as Case[];
@@ -28,8 +28,8 @@ function movement({ start_rad, keyframes }: Case, robot: Robot): Movement {
 test.each(cases)("$name: the plan equals the trajectory of the robot", (one) => {
   const robot = head();
   const found = plan(movement(one, robot), robot);
-  one.reckoned.reached_s.forEach((time, index) => expect(found.reached_s[index + 1]).toBeCloseTo(time, 5));
-  one.reckoned.position_rad.forEach((places, index) => {
+  one.expected.reached_s.forEach((time, index) => expect(found.reached_s[index + 1]).toBeCloseTo(time, 5));
+  one.expected.position_rad.forEach((places, index) => {
     const now = found.at((found.duration_s * index) / 9);
     // The robot's control periods are coarser where a narrow range begins.
     robot.joints.forEach(({ name }, joint) => expect(now[name], `${name} at sample ${index}`).toBeCloseTo(places[joint] ?? NaN, 2.5));

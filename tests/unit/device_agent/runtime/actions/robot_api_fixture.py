@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from device_agent.ports.driver import Observation, Twist
 from device_agent.ports.geometry import GeometryError
-from device_agent.ports.skills import Skill, SkillError, Stage
+from device_agent.ports.skills import Skill, SkillContext, SkillError
 from device_agent.protocol import Express, Pose, RunBehaviour
 from device_agent.protocol.manifests.robot_type import Gaze, RobotType
 from device_agent.runtime.actions.device_context import DeviceContext
@@ -19,7 +19,7 @@ from tests.harness.agent.device_harness import DeviceHarness
 
 
 class AbleDriver(FakeDriver):
-    """A driver that executes and records every skill at once."""
+    """A driver that executes every skill immediately and records it."""
 
     performs = ("speech", "stiffness", "gaze", "expressions", "behaviours", "postures")
 
@@ -33,19 +33,19 @@ class AbleDriver(FakeDriver):
         self.twists.append(twist)
         return twist
 
-    def perform(self, skill: Skill, stage: Stage) -> None:
+    def perform(self, skill: Skill, context: SkillContext) -> None:
         self.performed.append(skill)
         match skill:
             case RunBehaviour(name="nod"):
-                stage.move_joints({"elbow": 0.1}, 1.0)
+                context.move_joints({"elbow": 0.1}, 1.0)
             case RunBehaviour(name="too_far"):
-                stage.move_joints({"elbow": 99.0}, 1.0)
+                context.move_joints({"elbow": 99.0}, 1.0)
             case RunBehaviour(name="dance"):
-                while not stage.ended:
-                    stage.wait(0.01)
+                while not context.ended:
+                    context.wait(0.01)
                 self.interrupted.set()
             case RunBehaviour(name="sulk"):
-                stage.wait(60)
+                context.wait(60)
                 raise SkillError("it broke off")
             case Express(name="frown"):
                 raise SkillError("no expression 'frown'; there are smile")
@@ -84,7 +84,7 @@ def able_type() -> RobotType:
         BASE,
         capabilities=("cartesian", "speech", "stiffness", "expressions", "behaviours", "postures"),
         frames=("face",),
-        model="toy.xml",
+        model="robot.xml",
         gaze=Gaze(frame="face", joints=("shoulder", "elbow")),
     )
 

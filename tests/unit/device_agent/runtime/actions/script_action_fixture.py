@@ -28,7 +28,7 @@ class RecordingApi:
                 if "knee" in position_rad:
                     raise Refused("unknown_joint", "no joint 'knee'")
                 self.received.append((position_rad, speed))
-            case script_calls.AskState():
+            case script_calls.GetState():
                 return {"position_rad": {"shoulder": 0.1, "elbow": 0.2}, "mode": "action"}
             case _:
                 self.received.append(call)
@@ -100,7 +100,7 @@ class Run:
         self.api, self.output = RecordingApi(), RecordedOutput()
         digest = hashlib.sha256(source.encode()).hexdigest()
         request = RunMovement(
-            robot_type="toy", name="wave", version=1, sha256=digest, source=source, parameters=parameters or {}
+            robot_type="arm", name="wave", version=1, sha256=digest, source=source, parameters=parameters or {}
         )
         self.script = ScriptAction(
             request,

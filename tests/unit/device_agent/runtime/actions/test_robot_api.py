@@ -121,7 +121,7 @@ def test_unsupported_calls_are_rejected_with_the_supported_ones(make_device: Mak
 
 
 @pytest.mark.parametrize(
-    ("call", "says"),
+    ("call", "expected"),
     [
         ("robot.express('frown')", "no expression 'frown'; there are smile"),
         ("robot.express('smile', 2)", "Expected `float` <= 1.0 - at `$.strength`"),
@@ -144,16 +144,16 @@ def test_unsupported_calls_are_rejected_with_the_supported_ones(make_device: Mak
         ("robot.play([{'time_s': 0}, {'time_s': 1}], speed=3)", "speed must be above 0 and at most 2, not 3.0"),
     ],
 )
-def test_failed_calls_report_reason_and_line(harness: DeviceHarness, call: str, says: str) -> None:
+def test_failed_calls_report_reason_and_line(harness: DeviceHarness, call: str, expected: str) -> None:
     message = harness.failed(harness.script(f"\n{call}"), epoch=1).message
     assert message.startswith("line 2: RobotError: ")
-    assert says in message
+    assert expected in message
 
 
 def test_a_script_reads_room_measurements() -> None:
     readings = ReadingCache(space="s", agent="a", own=["arm"], named=[("b-pir", "presence")])
     robot = RobotApi(replace(device_context(robot_type()), readings=readings))
-    call = script_calls.AskLatest(device="b-pir", stream="presence")
+    call = script_calls.GetLatest(device="b-pir", stream="presence")
     assert robot.execute(call) is None
     measured = Measurements(tick_ms=1, at_ms=1, sequence=1, values={"present": True, "distance_m": 1.5})
     readings.receive(topics.parse("ts/v1/s/b/pir/tele/presence"), codec.encode(measured))
@@ -229,9 +229,9 @@ def test_expressions_and_postures_of_the_manifest_need_no_driver(make_device: Ma
 
 def test_unknown_expressions_and_postures_are_rejected_with_the_known_ones(make_device: MakeDevice) -> None:
     harness = make_device(kind=posing_type())
-    for task, says in (
+    for task, expected in (
         (Express(name="sad"), "no expression 'sad'; there are glad, shy"),
         (TakePosture(name="Sit"), "no posture 'Sit'; there are Bow"),
         (RunBehaviour(name="dance"), "this robot has no behaviour; it has move_joints, play, home, express, posture, "),
     ):
-        assert says in harness.failed(task, epoch=1).message
+        assert expected in harness.failed(task, epoch=1).message

@@ -50,7 +50,7 @@ def test_every_call_of_the_api_is_received_unchanged() -> None:
         protocol.SetStiffness(value=0.5, joints=("elbow",)),
         protocol.Express(name="smile", strength=0.7),
         protocol.RunBehaviour(name="wave"),
-        script_calls.AskLatest(device="agent-pir", stream="presence"),
+        script_calls.GetLatest(device="agent-pir", stream="presence"),
     ]
 
 
@@ -66,16 +66,19 @@ def test_play_is_split_at_keyframes_with_other_calls() -> None:
         "robot.play([{'time_s': 0, 'say': 'end'}])\n"
         "robot.play([])\n"
     )
-    there = script_calls.Moment(time_s=1, position_rad={"elbow": 0.2})
+    there = script_calls.PlayKeyframe(time_s=1, position_rad={"elbow": 0.2})
     assert api.received == [
         ({"elbow": 0.1}, 0.25),
         protocol.Say(text="off", language=""),
-        script_calls.Play(keyframes=(there, script_calls.Moment(time_s=2)), first=2, speed=0.5),
+        script_calls.Play(keyframes=(there, script_calls.PlayKeyframe(time_s=2)), first=2, speed=0.5),
         protocol.TakePosture(name="Sit", speed=0.5),
         protocol.Express(name="smile", strength=1),
         protocol.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0, duration_s=2),
         script_calls.Play(
-            keyframes=(script_calls.Moment(time_s=2), script_calls.Moment(time_s=2.5, position_rad={"shoulder": 0.3})),
+            keyframes=(
+                script_calls.PlayKeyframe(time_s=2),
+                script_calls.PlayKeyframe(time_s=2.5, position_rad={"shoulder": 0.3}),
+            ),
             first=4,
             speed=0.5,
         ),

@@ -56,7 +56,7 @@ def test_a_script_of_another_account_runs_behind_bubblewrap(harness: DeviceHarne
     own = int(harness.done(harness.script(source), epoch=1).output)
     foreign = int(harness.done(harness.script(source, author="accountbbbbbbbbb"), epoch=1).output)
     children = [int(child) for task in Path("/proc/self/task").glob("*/children") for child in task.read_text().split()]
-    # Process ids wrap around, so an absolute limit says nothing.
+    # Process ids wrap around, so an absolute limit proves nothing.
     assert foreign < min(own, *children), "it sees only process ids of its own namespace"
 
 

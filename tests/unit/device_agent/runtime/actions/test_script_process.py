@@ -72,16 +72,16 @@ def test_a_failed_process_start_is_reported() -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "says"),
+    ("first", "expected"),
     [
         (b'{"kind": "unfit", "reason": "landlock: no"}', "the sandbox is incomplete: landlock: no"),
         *((line, "ended before the script did: it crashed") for line in (b'{"kind": "nonsense"}', b"", b"\xff\xfe")),
     ],
 )
-def test_a_process_without_a_valid_first_message_gets_no_script(first: bytes, says: str) -> None:
+def test_a_process_without_a_valid_first_message_gets_no_script(first: bytes, expected: str) -> None:
     process = FakeProcess()
     process.send(first)
-    with pytest.raises(ScriptFailed, match=says):
+    with pytest.raises(ScriptFailed, match=expected):
         run_fake(process)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from device_agent.ports.skills import Skill, SkillError, Stage
+from device_agent.ports.skills import Skill, SkillContext, SkillError
 from device_agent.ports.speech import SpeechError, Spoken
 from device_agent.ports.uploads import UploadError
 from device_agent.protocol import Event, GrantLease, MoveJoints, RunBehaviour, Say, SetStiffness, State, Task, topics
@@ -45,9 +45,9 @@ class Servos(FakeDriver):
             self.position = tuple(position_rad)
         return tuple(position_rad)
 
-    def perform(self, skill: Skill, stage: Stage) -> None:
+    def perform(self, skill: Skill, context: SkillContext) -> None:
         assert isinstance(skill, SetStiffness)
-        assert not stage.ended
+        assert not context.ended
         if self.fails:
             raise SkillError("the servos do not answer")
         self.stiffness = skill.value
@@ -180,10 +180,10 @@ def test_stop_ends_speech_before_the_next_line(
 
 
 @pytest.mark.parametrize(
-    ("text", "language", "says"), [("  ", "", "nothing to say"), ("a", "-v x", "is not a language")]
+    ("text", "language", "message"), [("  ", "", "the text is empty"), ("a", "-v x", "is not a language")]
 )
-def test_invalid_speech_is_rejected(text: str, language: str, says: str) -> None:
-    with pytest.raises(Refused, match=says):
+def test_invalid_speech_is_rejected(text: str, language: str, message: str) -> None:
+    with pytest.raises(Refused, match=message):
         SpeechOutput().prepare(text, language)
 
 
@@ -209,8 +209,8 @@ class Speaking(Servos):
         super().__init__()
         self.lines: list[str] = []
 
-    def perform(self, skill: Skill, stage: Stage) -> None:
-        del stage
+    def perform(self, skill: Skill, context: SkillContext) -> None:
+        del context
         assert isinstance(skill, Say)
         self.lines.append(skill.text)
 

@@ -12,7 +12,7 @@ def refusal(message: str = "too late") -> EventRecord:
 def test_events_are_drained_once_in_order_with_their_time() -> None:
     recorder = EventRecorder()
     recorder.record(EventRecord(EventKind.LEASE_GRANTED, "ann took control", at_ms=5))
-    recorder.record(EventRecord(EventKind.LEASE_ENDED, "ann let go"))
+    recorder.record(EventRecord(EventKind.LEASE_ENDED, "ann released control"))
     first, second = recorder.drain(0.0)
     assert (first.kind, first.at_ms) == (EventKind.LEASE_GRANTED, 5)
     assert second.kind is EventKind.LEASE_ENDED
@@ -31,7 +31,7 @@ def test_repeated_rejections_are_counted() -> None:
     assert rest.data == {"code": "too_old", "count": 999}
     assert recorder.drain(10.0 + 2 * GAP_S) == [], "it is over"
     recorder.record_rejection(refusal(), code="too_old", now_s=30.0)
-    assert len(recorder.drain(30.0)) == 1, "and a later one is recorded at once again"
+    assert len(recorder.drain(30.0)) == 1, "and a later one is recorded immediately again"
 
 
 def test_the_last_drain_returns_all_counts() -> None:

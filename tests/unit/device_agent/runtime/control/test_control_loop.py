@@ -109,7 +109,7 @@ def test_an_inline_driver_is_commanded_by_the_callers_thread_until_the_stop(make
     assert driver.position[1] == pytest.approx(0.5)
     assert driver.threads[1:] == [threading.current_thread().name]
     setup.loop.stop()
-    setup.loop._out_of_turn = False
+    setup.loop._ran_early = False
     setup.send_setpoint(0.9)
     assert len(driver.threads) == 2
 
@@ -117,7 +117,7 @@ def test_an_inline_driver_is_commanded_by_the_callers_thread_until_the_stop(make
 def test_a_full_period_follows_an_early_one(make_loop: MakeLoop) -> None:
     driver = InlineDriver()
     setup = make_loop(driver, period_ms=300)
-    setup.loop._out_of_turn = False
+    setup.loop._ran_early = False
     start_s = time.monotonic()
     setup.send_setpoint(0.5)
     commanded = len(driver.threads)
@@ -143,7 +143,7 @@ def test_concurrent_wakes_run_one_period(make_loop: MakeLoop) -> None:
 
         def acquire(self, **options: Any) -> bool:
             acquired = real.acquire(**options)
-            setup.loop._out_of_turn = True
+            setup.loop._ran_early = True
             return acquired
 
         def release(self) -> None:
@@ -214,7 +214,7 @@ def moving(monkeypatch: pytest.MonkeyPatch) -> LoopFixture:
     monkeypatch.setattr(module, "time", clock)
     setup.loop._next_s = clock.now_s
     setup.loop._thread = threading.current_thread()
-    setup.loop._out_of_turn = True
+    setup.loop._ran_early = True
     setup.send_setpoint(2.5)
     for _ in range(20):
         clock.now_s = setup.loop._next_s
@@ -243,7 +243,7 @@ def test_a_stop_in_motion_brakes_at_once_for_the_elapsed_time(moving: LoopFixtur
 @pytest.mark.parametrize("running", [False, True])
 def test_a_stop_does_not_wait_after_an_early_period_but_for_a_running_one(moving: LoopFixture, running: bool) -> None:
     setup = moving
-    setup.loop._out_of_turn = not running
+    setup.loop._ran_early = not running
     setup.controller.stop(LATCH)
     if not running:
         setup.loop.wake()
@@ -259,7 +259,7 @@ def test_a_stop_does_not_wait_after_an_early_period_but_for_a_running_one(moving
 def test_the_elapsed_time_is_bounded() -> None:
     loop = LoopFixture(period_ms=4).loop
     loop._next_s = 10.0
-    elapsed_s = [loop._passed_s(now_s) for now_s in (9.0, 9.996, 9.998, 10.0, 11.0)]
+    elapsed_s = [loop._elapsed_s(now_s) for now_s in (9.0, 9.996, 9.998, 10.0, 11.0)]
     assert elapsed_s == pytest.approx([0.0001, 0.0001, 0.002, 0.004, 0.004])
 
 

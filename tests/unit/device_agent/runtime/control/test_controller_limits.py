@@ -56,7 +56,7 @@ def test_a_goal_at_full_speed_stops_before_the_wall() -> None:
 
 def test_a_goal_without_clearance_is_rejected_with_the_obstacle() -> None:
     fixture = ControllerFixture(geometry=Wall())
-    with pytest.raises(Refused, match=r"no room there: .*hand \u2013 wall, 250 mm") as refused:
+    with pytest.raises(Refused, match=r"no clearance at the target: .*hand \u2013 wall, 250 mm") as refused:
         fixture.move(elbow=1.25)
     assert refused.value.code == "no_room"
     fixture.run(0.5)

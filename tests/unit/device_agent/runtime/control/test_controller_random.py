@@ -34,7 +34,7 @@ JERK_PERIODS = 20
 
 
 class Board(Wall):
-    """A wall, with a hand whose x the elbow moves and whose y the shoulder."""
+    """A wall, and a hand: the elbow moves its x, the shoulder its y."""
 
     frames = ("hand",)
 
@@ -74,7 +74,7 @@ class RandomRun:
         self.reservation: Reservation | None = None
         self.may_move_until_s = -1.0
         self.position, self.velocity, self.twist = [0.0, 0.0], [0.0, 0.0], REST
-        self.passed_s, self.share = PERIOD_S, 1.0
+        self.elapsed_s, self.share = PERIOD_S, 1.0
         self.authorized_s = self.rest_from_s = self.unauthorized_s = 0.0
         self.restrictions: dict[str, float] = {}
 
@@ -88,7 +88,7 @@ class RandomRun:
             self.end: 1,
             self.stop: 0.4,
             self.reset: 2,
-            self.lose: 0.4,
+            self.lose_link: 0.4,
             self.fail: 0.3,
             self.restrict: 0.7,
             self.lift: 1.5,
@@ -136,15 +136,15 @@ class RandomRun:
                 target=target() if callable(target) else target,
             )
             self.controller.accept_setpoint(setpoint, now_s=self.now_s, tick_ms=tick_ms)
-            assert self.epoch > self.burned, "a lease that has ended"
-            assert self.speed() > 0, "the room holds it"
+            assert self.epoch > self.burned, "accepted although the lease has ended"
+            assert self.speed() > 0, "motion although the room holds the device"
             self.may_move_until_s = self.now_s + REST_WITHIN_S
             self.rest_from_s = self.now_s + REST_WITHIN_S
             for _ in range(3):
                 self.tick()
 
     def target(self) -> Target | Callable[[], Target]:
-        """A target, also beyond the limits; sometimes a function that returns another one each time."""
+        """A target, also beyond the limits; sometimes a function that returns a random one at each call."""
         push = partial(self.random.uniform, -6, 6)
         elbow = push()
         kinds: list[Callable[[], Target]] = [
@@ -162,11 +162,11 @@ class RandomRun:
     def act(self) -> None:
         if self.reservation is None and not self.clear_obstacles():
             self.epoch += self.random.choice((0, 1))
-        self.reservation = self.controller.reserve(epoch=self.epoch, on_revoked=self.lost)
-        assert self.epoch > self.burned, "a lease that has ended"
-        assert self.speed() > 0, "the room holds it"
+        self.reservation = self.controller.reserve(epoch=self.epoch, on_revoked=self.on_revoked)
+        assert self.epoch > self.burned, "accepted although the lease has ended"
+        assert self.speed() > 0, "motion although the room holds the device"
 
-    def lost(self, _why: Refused) -> None:
+    def on_revoked(self, _why: Refused) -> None:
         self.reservation = None
 
     def move(self) -> None:
@@ -197,8 +197,8 @@ class RandomRun:
         self.controller.reset_stop(epoch=self.epoch)
         self.check_revoked()
 
-    def lose(self) -> None:
-        self.controller.interrupt(Refused("link_lost", "the link is gone"))
+    def lose_link(self) -> None:
+        self.controller.interrupt(Refused("link_lost", "the link was lost"))
 
     def fail(self) -> None:
         self.controller.set_fault("no answer")
@@ -237,15 +237,15 @@ class RandomRun:
 
     # ------------------------------------------------------------ checks
 
-    def tick(self, passed_s: float = PERIOD_S) -> None:
-        self.now_s += passed_s
-        output = self.controller.update(self.now_s, passed_s=None if passed_s == PERIOD_S else passed_s)
-        between_s, self.passed_s = (self.passed_s + passed_s) / 2, passed_s
+    def tick(self, elapsed_s: float = PERIOD_S) -> None:
+        self.now_s += elapsed_s
+        output = self.controller.update(self.now_s, elapsed_s=None if elapsed_s == PERIOD_S else elapsed_s)
+        between_s, self.elapsed_s = (self.elapsed_s + elapsed_s) / 2, elapsed_s
         faster = False
         self.slowed_for = self.slowed_for + 1 if self.speed() == self.share else 0
         self.share = self.speed()
         for index, (was, now) in enumerate(zip(self.position, output.position_rad, strict=True)):
-            velocity = (now - was) / passed_s
+            velocity = (now - was) / elapsed_s
             gain = abs(velocity) - abs(self.velocity[index])
             turned = velocity * self.velocity[index] < 0
             assert -RANGE - 1e-9 <= now <= RANGE + 1e-9
@@ -258,13 +258,13 @@ class RandomRun:
             self.velocity[index] = velocity
         self.position = output.position_rad
         if self.shape is not None:
-            assert self.shape.clearance(self.position).room_m >= -CLIPPED
-        faster |= self.base(output.twist, passed_s)
+            assert self.shape.clearance(self.position).excess_m >= -CLIPPED
+        faster |= self.check_base(output.twist, elapsed_s)
         allowed = self.reservation is not None or self.now_s <= self.may_move_until_s + 1e-9
         authorized = allowed and output.mode in {Mode.STREAMING, Mode.ACTION}
         # Acceleration continues for four milliseconds after the start of a hold: the brakes have a ramp.
-        self.unauthorized_s = 0.0 if authorized else self.unauthorized_s + passed_s
-        assert self.unauthorized_s <= 2 * PERIOD_S + 1e-9 or not faster, "it moves by itself"
+        self.unauthorized_s = 0.0 if authorized else self.unauthorized_s + elapsed_s
+        assert self.unauthorized_s <= 2 * PERIOD_S + 1e-9 or not faster, "motion without authority"
         moving = max(map(abs, self.velocity)) > 1e-6 or any(abs(part) > 1e-6 for part in output.twist)
         if authorized:
             self.authorized_s = self.now_s
@@ -276,13 +276,15 @@ class RandomRun:
         if self.reservation is None and self.now_s > self.may_move_until_s + PERIOD_S and output.mode is Mode.STREAMING:
             pytest.fail("setpoints apply no longer than 300 ms")
 
-    def base(self, twist: Twist, passed_s: float) -> bool:
+    def check_base(self, twist: Twist, elapsed_s: float) -> bool:
         """Check the base; returns whether any part of its twist grows."""
         faster = False
-        for was, now, limit, easy, hard in zip(self.twist, twist, LIMITS, ACCELERATIONS, DECELERATIONS, strict=True):
+        for was, now, limit, acceleration, deceleration in zip(
+            self.twist, twist, LIMITS, ACCELERATIONS, DECELERATIONS, strict=True
+        ):
             gain = abs(now) - abs(was)
             assert abs(now) <= limit + 1e-6
-            assert abs(now - was) / passed_s <= (easy if gain > 0 and now * was >= 0 else hard) + 1e-3
+            assert abs(now - was) / elapsed_s <= (acceleration if gain > 0 and now * was >= 0 else deceleration) + 1e-3
             faster |= gain > 1e-6
             if gain > 1e-6 and self.slowed_for > JERK_PERIODS:
                 assert abs(now) <= self.speed() * limit + 1e-6, "faster than the room allows"

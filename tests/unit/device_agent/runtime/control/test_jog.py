@@ -30,7 +30,7 @@ LIMIT_RAD_S = 0.35 * 3.1416
 
 
 class Jogger(ControllerFixture):
-    """An operator with a joystick at a UR5, or at the toy with a base."""
+    """An operator with a joystick at a UR5, or a fake robot with a base."""
 
     def __init__(self, *, base: bool = False) -> None:
         super().__init__(base=BASE if base else None)
@@ -96,7 +96,7 @@ def test_a_jog_is_held_before_the_table_and_can_leave_it() -> None:
     fixture.hold(JogTarget(linear_m_s=(0.0, 0.0, -0.4)), 4.0)
     assert any(one.startswith(("clearance", "workspace")) for one in fixture.limited)
     low = fixture.flange()[2]
-    assert SHAPE.clearance(fixture.controller.commanded_rad).room_m >= 0
+    assert SHAPE.clearance(fixture.controller.commanded_rad).excess_m >= 0
     fixture.hold(JogTarget(linear_m_s=(0.0, 0.0, 0.2)), 0.8)
     assert fixture.flange()[2] > low + 0.03
 
@@ -123,7 +123,7 @@ def test_random_jogs_stay_within_every_limit(twists: list[tuple[float, ...]]) ->
     assert np.abs(velocity).max() <= LIMIT_RAD_S * 1.01
     assert np.abs(np.diff(velocity, axis=0) / PERIOD_S).max() <= 21.0 + 0.1
     assert not fixture.controller.moving
-    assert all(SHAPE.clearance(position).room_m > -0.004 for position in positions[::10].tolist())
+    assert all(SHAPE.clearance(position).excess_m > -0.004 for position in positions[::10].tolist())
 
 
 def test_a_base_drives_while_setpoints_are_fresh_and_no_longer() -> None:
@@ -194,7 +194,7 @@ def test_invalid_targets_are_rejected(base: bool, target: Target, code: str) -> 
         Jogger(base=base).hold(target, 0.03)
 
 
-_ODD: st.SearchStrategy[object] = st.one_of(
+_INVALID_NUMBERS: st.SearchStrategy[object] = st.one_of(
     st.floats(),
     st.floats(-3, 3),
     st.integers(),
@@ -204,7 +204,10 @@ _ODD: st.SearchStrategy[object] = st.one_of(
 
 @pytest.mark.slow
 @settings(max_examples=100, deadline=None)
-@given(st.dictionaries(st.sampled_from([*DriveTarget.__struct_fields__, "up_m_s", ""]), _ODD), st.integers(0, 220))
+@given(
+    st.dictionaries(st.sampled_from([*DriveTarget.__struct_fields__, "up_m_s", ""]), _INVALID_NUMBERS),
+    st.integers(0, 220),
+)
 def test_random_drive_messages_are_rejected_or_stay_within_limits(sent: dict[str, object], age_ms: int) -> None:
     target: object = {"kind": "drive"} | sent
     text = json.dumps({"epoch": 1, "sequence": 1, "echo_tick_ms": 1, "sent_ms": 1.0, "target": target})
@@ -237,8 +240,8 @@ def _number(value: object) -> bool:
 
 @pytest.mark.parametrize("wrong", [b'{"kind":"jog","linear_m_s":[1,2]}', b'{"kind":"drive","forward_m_s":1e999}'])
 def test_a_malformed_setpoint_does_not_pass_the_parser(wrong: bytes) -> None:
-    good = Setpoint(epoch=1, sequence=1, echo_tick_ms=1, sent_ms=1.0, target=JogTarget())
-    text = msgspec.json.encode(good)
-    assert codec.decode(text, Setpoint) == good
+    setpoint = Setpoint(epoch=1, sequence=1, echo_tick_ms=1, sent_ms=1.0, target=JogTarget())
+    text = msgspec.json.encode(setpoint)
+    assert codec.decode(text, Setpoint) == setpoint
     with pytest.raises(ProtocolError):
-        codec.decode(text.replace(msgspec.json.encode(good.target), wrong), Setpoint)
+        codec.decode(text.replace(msgspec.json.encode(setpoint.target), wrong), Setpoint)

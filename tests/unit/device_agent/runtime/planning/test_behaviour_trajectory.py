@@ -125,7 +125,7 @@ def test_mouth_shapes_start_from_and_return_to_the_keyframes() -> None:
     behaviour.add_keyframes([frame(0.5, pitch=-0.2), frame(1.0, say="baba"), frame(4.0, pitch=0.1)], {"baba": 1.0})
     trajectory = behaviour.trajectory()
     assert at(trajectory, 0.5)[1] == pytest.approx(-0.2)
-    assert at(trajectory, 2.5)[1] == pytest.approx(-0.2, abs=0.15), "closed as it was, or on its way to the next"
+    assert at(trajectory, 2.5)[1] == pytest.approx(-0.2, abs=0.15), "closed, or moving to the next keyframe"
     assert at(trajectory, trajectory.duration_s)[1] == pytest.approx(0.1)
 
 

@@ -194,15 +194,15 @@ def test_a_joint_that_cannot_return_stays() -> None:
 
 
 @pytest.mark.parametrize(
-    ("positions", "says"),
+    ("positions", "message"),
     [
         ([[0.0, 0.0, -0.4, 0.2], [2.0, 0.1, 0.0, 0.0]], ""),
         ([[0.0, 0.0, -0.4, 0.2], [2.0, 0.2, 0.0, 0.0]], "leads pitch where yaw does not allow it"),
         ([[0.0, 0.0, -0.4, 0.2], [2.0, 0.1, 0.0, 0.1]], "separates right from left, which the same motor moves"),
     ],
 )
-def test_a_trajectory_that_violates_couplings_is_rejected(positions: list[list[float]], says: str) -> None:
-    with pytest.raises(Refused, match=says) if says else nullcontext():
+def test_a_trajectory_that_violates_couplings_is_rejected(positions: list[list[float]], message: str) -> None:
+    with pytest.raises(Refused, match=message) if message else nullcontext():
         MotionLimits(head(), None).check_trajectory(np.array(positions))
 
 

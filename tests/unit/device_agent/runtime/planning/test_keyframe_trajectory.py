@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from device_agent.ports.script_calls import Moment, Play
+from device_agent.ports.script_calls import Play, PlayKeyframe
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
@@ -24,11 +24,11 @@ SHARED = Path(__file__).with_name("timelines.json")
 """Movements and their expected trajectories, shared with ``web/tests/features/keyframes/timeline-layout.test.ts``."""
 
 
-def frame(time_s: float, **position_rad: float) -> Moment:
-    return Moment(time_s=time_s, position_rad=position_rad)
+def frame(time_s: float, **position_rad: float) -> PlayKeyframe:
+    return PlayKeyframe(time_s=time_s, position_rad=position_rad)
 
 
-def timeline(*keyframes: Moment, speed: float = 1.0) -> KeyframeTrajectory:
+def timeline(*keyframes: PlayKeyframe, speed: float = 1.0) -> KeyframeTrajectory:
     return KeyframeTrajectory(head(), START, Play(keyframes=keyframes, speed=speed))
 
 
@@ -54,9 +54,9 @@ def test_joints_reach_keyframes_in_time_and_pass_through() -> None:
     assert at(trajectory, 1.0) == pytest.approx([0.5, 0.0, at(trajectory, 1.0)[2], at(trajectory, 1.0)[3]], abs=1e-6)
     assert at(trajectory, 2.0) == pytest.approx([1.0, 0.0, 0.3, -0.15], abs=1e-6)
     assert at(trajectory, 4.0) == pytest.approx([0.0, 0.0, 0.3, -0.15], abs=1e-6)
-    assert trajectory.at(1.0)[1][0] == pytest.approx(0.5, abs=1e-3), "it goes on there, and does not stop"
-    assert trajectory.at(2.0)[1][0] == pytest.approx(0.0, abs=1e-3), "it turns there"
-    assert 0 < at(trajectory, 1.0)[2] < 0.3, "a joint that a keyframe does not name is on its way to the next that does"
+    assert trajectory.at(1.0)[1][0] == pytest.approx(0.5, abs=1e-3), "the joint passes the keyframe without stopping"
+    assert trajectory.at(2.0)[1][0] == pytest.approx(0.0, abs=1e-3), "the joint reverses"
+    assert 0 < at(trajectory, 1.0)[2] < 0.3, "a joint moves through a keyframe that does not name it"
     check_limits(trajectory, head(), (0, 2))
 
 
@@ -87,7 +87,7 @@ def test_poses_contain_leading_joints_at_each_keyframe() -> None:
 
 
 @pytest.mark.parametrize(
-    ("keyframes", "says"),
+    ("keyframes", "message"),
     [
         ([frame(0.0, yaw=0.1)], "keyframe 1: time_s is 0.0; times must increase"),
         ([frame(1.0), frame(1.0)], "keyframe 2: time_s is 1.0; times must increase"),
@@ -96,10 +96,10 @@ def test_poses_contain_leading_joints_at_each_keyframe() -> None:
         ([frame(1.0, left=0.1, right=0.1)], "keyframe 1: one motor moves right and another joint"),
     ],
 )
-def test_invalid_keyframes_are_rejected_with_their_number(keyframes: list[Moment], says: str) -> None:
+def test_invalid_keyframes_are_rejected_with_their_number(keyframes: list[PlayKeyframe], message: str) -> None:
     with pytest.raises(Refused) as refused:
         timeline(*keyframes)
-    assert says in refused.value.message
+    assert message in refused.value.message
 
 
 def test_after_the_last_iteration_the_whole_trajectory_is_slowed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,20 +109,20 @@ def test_after_the_last_iteration_the_whole_trajectory_is_slowed(monkeypatch: py
 
 
 @st.composite
-def movements(draw: st.DrawFn) -> list[Moment]:
+def movements(draw: st.DrawFn) -> list[PlayKeyframe]:
     reached_s, timed = 0.0, []
     for _ in range(draw(st.integers(1, 6))):
         reached_s += draw(st.floats(0.01, 1.5))
         named = draw(st.sets(st.sampled_from((0, 1, 2))))
         places = {("yaw", "pitch", "left")[one]: draw(st.floats(*RANGES[one])) for one in named}
-        timed.append(Moment(time_s=reached_s, position_rad=places))
+        timed.append(PlayKeyframe(time_s=reached_s, position_rad=places))
     return timed
 
 
 @pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(movements())
-def test_random_movements_stay_within_limits_and_do_not_overshoot(keyframes: list[Moment]) -> None:
+def test_random_movements_stay_within_limits_and_do_not_overshoot(keyframes: list[PlayKeyframe]) -> None:
     kind = head()
     trajectory = KeyframeTrajectory(kind, START, Play(keyframes=tuple(keyframes), speed=1.0)).trajectory()
     MotionLimits(kind, None).check_trajectory(trajectory.position_rad)
@@ -138,20 +138,20 @@ def test_random_movements_stay_within_limits_and_do_not_overshoot(keyframes: lis
 
 
 def computed(case: dict[str, Any]) -> dict[str, Any]:
-    """A shared movement with when its keyframes are reached and where its joints are at ten moments."""
-    keyframes = msgspec.convert(case["keyframes"], tuple[Moment, ...])
+    """Times of a shared movement's keyframes, and joint positions at ten times."""
+    keyframes = msgspec.convert(case["keyframes"], tuple[PlayKeyframe, ...])
     timed = KeyframeTrajectory(head(), case["start_rad"], Play(keyframes=keyframes, speed=1.0))
-    moments = timed._moments()
-    looks = np.linspace(0, moments[-1], 10)
-    positions = [at(timed.trajectory(), time_s) for time_s in looks]
-    return {"reached_s": moments[1:].tolist(), "position_rad": positions}
+    key_times = timed._key_times()
+    times = np.linspace(0, key_times[-1], 10)
+    positions = [at(timed.trajectory(), time_s) for time_s in times]
+    return {"reached_s": key_times[1:].tolist(), "position_rad": positions}
 
 
 def test_the_preview_computes_the_same_timeline() -> None:
     cases = json.loads(SHARED.read_text())
     assert cases
     for case in cases:
-        actual, expected = computed(case), case["reckoned"]
+        actual, expected = computed(case), case["expected"]
         assert actual["reached_s"] == pytest.approx(expected["reached_s"], rel=1e-6), case["name"]
         positions = np.array(expected["position_rad"])
         assert np.array(actual["position_rad"]) == pytest.approx(positions, abs=1e-6), case["name"]
@@ -159,4 +159,4 @@ def test_the_preview_computes_the_same_timeline() -> None:
 
 if __name__ == "__main__":
     cases = json.loads(SHARED.read_text())
-    SHARED.write_text(json.dumps([case | {"reckoned": computed(case)} for case in cases], indent=1) + "\n")
+    SHARED.write_text(json.dumps([case | {"expected": computed(case)} for case in cases], indent=1) + "\n")

@@ -118,7 +118,7 @@ def test_a_straight_path_is_straight_in_simulation(scene: Path, shape: MujocoGeo
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("goal_rad", "options", "says"),
+    ("goal_rad", "options", "message"),
     [
         ([0.8, *HOME[1:]], {}, "the goal is not clear: clearance: post"),
         (BEYOND, {"within_s": 0.0}, "found no path in 0 s"),
@@ -126,9 +126,9 @@ def test_a_straight_path_is_straight_in_simulation(scene: Path, shape: MujocoGeo
     ],
 )
 def test_a_search_without_a_result_is_an_error(
-    shape: MujocoGeometry, goal_rad: list[float], options: dict[str, Any], says: str
+    shape: MujocoGeometry, goal_rad: list[float], options: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(GeometryError, match=says):
+    with pytest.raises(GeometryError, match=message):
         shape.plan(HOME, goal_rad, **options)
 
 

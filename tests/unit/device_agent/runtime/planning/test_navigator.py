@@ -26,7 +26,7 @@ LIMITS = Twist(0.3, 0.0, 1.5)
 
 
 def room(*walls: tuple[float, float, float, float]) -> OccupancyGrid:
-    """Four by four metres, seen, with boxes (lowest x, y, highest x, y)."""
+    """Observed floor of four by four metres with boxes (lowest x, y, highest x, y)."""
     grid = OccupancyGrid((-2.0, -2.0), (2.0, 2.0))
     places = np.array([(x, y) for x in np.arange(-1.98, 2, 0.04) for y in np.arange(-1.98, 2, 0.04)])
     taken = np.zeros(len(places), dtype=bool)
@@ -52,7 +52,7 @@ def moved(pose: Pose2D, twist: Twist, time_s: float) -> Pose2D:
 
 
 def go(navigator: Navigator, grid: OccupancyGrid, start: Pose2D) -> list[Pose2D]:
-    """The poses on the way to the goal."""
+    """Poses on the path to the goal."""
     poses = [start]
     for _ in range(round(60 / UPDATE_PERIOD_S)):
         twist = navigator.compute_twist(poses[-1], grid)
@@ -60,7 +60,7 @@ def go(navigator: Navigator, grid: OccupancyGrid, start: Pose2D) -> list[Pose2D]
             return poses
         assert all(abs(part) <= limit + 1e-9 for part, limit in zip(twist, LIMITS, strict=True))
         poses.append(moved(poses[-1], twist, UPDATE_PERIOD_S))
-    pytest.fail(f"not there: {poses[-1]}")
+    pytest.fail(f"goal not reached: {poses[-1]}")
 
 
 @pytest.mark.slow
@@ -79,18 +79,18 @@ def test_without_a_heading_any_heading_is_final() -> None:
 
 
 @pytest.mark.parametrize(
-    ("goal", "code", "says"),
+    ("goal", "code", "message"),
     [
         ((1.0, 0.0), "no_way", r"nearest reachable place is .*x_m -0\.\d+, y_m -?0\.0"),
-        ((0.0, 0.0), "taken", "something stands there"),
+        ((0.0, 0.0), "taken", "the place is occupied"),
         ((0.0, 0.3), "taken", r"nearest reachable place is .*y_m 0\.\d+"),
         ((9.0, 0.0), "out_of_room", "The goal is outside"),
     ],
 )
 def test_unreachable_goals_are_rejected_with_the_nearest_reachable_place(
-    goal: tuple[float, float], code: str, says: str
+    goal: tuple[float, float], code: str, message: str
 ) -> None:
-    with pytest.raises(Refused, match=says) as refused:
+    with pytest.raises(Refused, match=message) as refused:
         navigator_to(goal).compute_twist(Pose2D(-1.0, 0.0, 0.0), room((-0.1, -2.0, 0.1, 2.0)))
     assert refused.value.code == code
 
@@ -102,7 +102,7 @@ def test_a_path_needs_free_cells() -> None:
     with pytest.raises(Refused, match="no free path"):
         find_path(floor, (0.5, 0.5), (4.5, 0.5))
     floor.blocked[:, :] = True
-    with pytest.raises(Refused, match=r"or it is unseen$"):
+    with pytest.raises(Refused, match=r"or unobserved$"):
         find_path(floor, (0.5, 0.5), (4.5, 0.5))
     diagonal = GridFloorMap(np.eye(6, dtype=bool)[::-1].copy(), (0.0, 0.0), 1.0)
     diagonal.blocked[0, 5] = False
@@ -131,17 +131,17 @@ def test_an_occupied_goal_has_a_short_timeout_before_the_start() -> None:
 def test_room_positions_correct_or_replace_the_odometry() -> None:
     estimator = PoseEstimator("qbo")
     odometry = Reading({"x_m": 1.0, "y_m": 0.0, "yaw_rad": 0.5}, 0.02)
-    seen = Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "age_s.qbo": 0.2}, 0.1)
+    observed = Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "age_s.qbo": 0.2}, 0.1)
     assert estimator.estimate(odometry, None) == Pose2D(1.0, 0.0, 0.5)
     corrected = pytest.approx((1.2, 0.1, 0.5))
-    assert astuple(estimator.estimate(odometry, seen)) == corrected
+    assert astuple(estimator.estimate(odometry, observed)) == corrected
     assert astuple(estimator.estimate(odometry, None)) == corrected, "the correction remains"
-    seen = Reading({"x_m.nao": 1.2, "y_m.nao": 0.1, "yaw_rad.nao": 0.3}, 0.1)
-    assert PoseEstimator("nao").estimate(None, seen) == Pose2D(1.2, 0.1, 0.3)
+    observed = Reading({"x_m.nao": 1.2, "y_m.nao": 0.1, "yaw_rad.nao": 0.3}, 0.1)
+    assert PoseEstimator("nao").estimate(None, observed) == Pose2D(1.2, 0.1, 0.3)
 
 
 @pytest.mark.parametrize(
-    "seen",
+    "observed",
     [
         None,
         Reading({"x_m.nao": 1.2, "y_m.nao": 0.1}, 0.1),
@@ -151,9 +151,9 @@ def test_room_positions_correct_or_replace_the_odometry() -> None:
         Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "yaw_rad.qbo": 0.3}, 0.1),
     ],
 )
-def test_a_robot_without_a_position_does_not_drive(seen: Reading | None) -> None:
+def test_a_robot_without_a_position_does_not_drive(observed: Reading | None) -> None:
     with pytest.raises(Refused, match="the position of the robot is unknown"):
-        PoseEstimator("nao").estimate(None, seen)
+        PoseEstimator("nao").estimate(None, observed)
 
 
 def test_at_the_goal_the_robot_only_turns() -> None:

@@ -235,5 +235,5 @@ def test_a_path_that_is_too_narrow_is_rejected() -> None:
     planner = MotionPlanner(robot_type(), NarrowGeometry())
     with pytest.raises(Refused, match="too narrow"):
         planner.plan([0.0, 0.0], [1.0, 1.0], speed=1.0, ended=never)
-    with pytest.raises(Refused, match="something is in the way: clearance: hand"):
+    with pytest.raises(Refused, match="an obstacle is in the way: clearance: hand"):
         planner.plan_straight([0.0, 0.0], "hand", (0.1, 0, 0, 1, 0, 0, 0), speed=1.0)

@@ -19,7 +19,7 @@ ENTRY = RoomDeviceManifest(
     name="arm",  # the device name of the harness
     kind="window",
     label="Window",
-    driver="toy",
+    driver="fake",
     streams=(Stream(name="air", rate_hz=20.0), Stream(name="rain", rate_hz=5.0)),
     cameras=(Stream(name="garden", rate_hz=20.0),),
     captures=("image",),

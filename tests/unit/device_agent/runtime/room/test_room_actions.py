@@ -91,7 +91,7 @@ def test_unknown_names_are_rejected_with_the_valid_ones(
 def test_actions_without_streams_or_storage_are_rejected(
     make_room_device: MakeRoomDevice, make_device: MakeDevice
 ) -> None:
-    entry = RoomDeviceManifest(name="arm", kind="window", label="Window", driver="toy", captures=("image",))
+    entry = RoomDeviceManifest(name="arm", kind="window", label="Window", driver="fake", captures=("image",))
     harness = make_room_device(uploads=False, entry=entry)
     assert harness.failed(TakePicture()).code == "no_streams"
     assert harness.failed(CaptureRaw(name="image")).code == "no_store"

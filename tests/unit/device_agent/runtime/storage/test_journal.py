@@ -42,9 +42,9 @@ def test_a_command_is_recorded_once_and_its_terminal_ack_is_final(journal: Journ
     assert journal.begin("arm", ack("c1")) is None
     for sequence, status in enumerate((AckStatus.STARTED, AckStatus.DONE, AckStatus.FAILED), 2):
         journal.record(ack("c1", status, sequence))
-        seen = journal.begin("arm", ack("c1"))
-        assert seen is not None
-        assert seen.status is (AckStatus.DONE if status is AckStatus.FAILED else status)
+        stored = journal.begin("arm", ack("c1"))
+        assert stored is not None
+        assert stored.status is (AckStatus.DONE if status is AckStatus.FAILED else status)
 
 
 def test_open_commands_of_a_previous_run_are_failed(open_journal: OpenJournal) -> None:
@@ -55,11 +55,11 @@ def test_open_commands_of_a_previous_run_are_failed(open_journal: OpenJournal) -
     before.record(ack("c2", AckStatus.DONE, 2))
     after = open_journal(now_ms=5)
     assert after.end_open(now_ms=5, tick_ms=5) == 1
-    seen = after.begin("arm", ack("c1"))
-    assert seen is not None
-    assert (seen.status, seen.sequence) == (AckStatus.FAILED, 3)
-    assert seen.reason is not None
-    assert seen.reason.code == "agent_restarted"
+    stored = after.begin("arm", ack("c1"))
+    assert stored is not None
+    assert (stored.status, stored.sequence) == (AckStatus.FAILED, 3)
+    assert stored.reason is not None
+    assert stored.reason.code == "agent_restarted"
 
 
 def test_acks_are_undelivered_until_the_newest_is_delivered(journal: Journal) -> None:
@@ -105,7 +105,7 @@ def test_old_terminal_commands_are_deleted(open_journal: OpenJournal) -> None:
 
 def test_an_invalid_journal_file_is_named_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "journal.db"
-    path.write_bytes(b"this is not a database, but long enough to look like one" * 100)
+    path.write_bytes(b"this is not a database, but as long as one" * 100)
     journal = Journal(path)
     with pytest.raises(JournalError, match=r"journal\.db"):
         journal.open(now_ms=0)

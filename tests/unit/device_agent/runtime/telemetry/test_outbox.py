@@ -171,7 +171,7 @@ def test_sending_starts_after_the_settle_time(fixture: OutboxFixture) -> None:
     assert fixture.events() == ["held"]
     fixture.event("live")
     fixture.iterate()
-    assert fixture.events() == ["held", "live"], "from then on at once"
+    assert fixture.events() == ["held", "live"], "then immediately"
 
 
 def test_messages_in_flight_are_limited_and_a_full_link_queue_is_retried(fixture: OutboxFixture) -> None:
@@ -313,13 +313,13 @@ def test_the_thread_sends_at_once_and_drains_before_it_stops(fixture: OutboxFixt
     fixture.event("held")
     eventually(lambda: fixture.events() == ["held"])
     fixture.acknowledges = False
-    fixture.event("goodbye")
+    fixture.event("last")
     later = threading.Timer(0.1, fixture.acknowledge)
     later.start()
     fixture.outbox.stop()
     fixture.outbox.stop()
     later.join()
-    assert fixture.events() == ["held", "goodbye"]
+    assert fixture.events() == ["held", "last"]
     fixture.restart()
     fixture.event("last")
     fixture.iterate()
