@@ -1,8 +1,8 @@
 """``python -m infra.aws FOLDER``: create the deployment package of the Lambda function in a folder.
 
-botocore contains descriptions of over four hundred services (23 MB); only the descriptions of used services are included. Unknown options are
-passed to pip: on a machine of another platform, ``--platform manylinux2014_x86_64 --only-binary=:all:
---python-version 3.13``.
+botocore contains descriptions of over four hundred services (23 MB); only those of used services are included.
+Unknown options are passed to pip: on a machine of another platform, ``--platform manylinux2014_x86_64
+--only-binary=:all: --python-version 3.13``.
 """
 
 import argparse
