@@ -20,7 +20,7 @@ export interface Presence {
  * mimic_joints: Joints that follow other joints.
  * position_dependent_limits: Joint ranges that depend on other joints.
  * actions: Kinds of actions that the device accepts. `postures`, `expressions` and `behaviours` list the
- * names that such actions may use. Empty: the agent is an older one.
+ * names that such actions may use. Empty for older agents.
  * cameras: Camera streams at `cam/{name}`.
  * captures: Raw data that can be captured.
  * controls: Values that can be set.
