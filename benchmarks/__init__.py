@@ -1,1 +1,1 @@
-"""Measurements that a person runs; the page of each figure says which."""
+"""Benchmarks of Telescope, of its parts and of comparable systems."""

@@ -92,8 +92,8 @@ def main() -> None:
     for label, source in (("setpoints", setpoints), ("moves", moves)):
         for checked, description in ((None, "ranges only"), (shape, "with collision checks")):
             times = measure(kind, checked, source)
-            marks = "".join(f"{percentile(times, mark):8.3f}" for mark in (0.5, 0.95, 0.99, 1))
-            print(f"{label + ', ' + description:34}{marks}")
+            percentiles = "".join(f"{percentile(times, share):8.3f}" for share in (0.5, 0.95, 0.99, 1))
+            print(f"{label + ', ' + description:34}{percentiles}")
 
 
 if __name__ == "__main__":

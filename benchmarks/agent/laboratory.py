@@ -53,7 +53,7 @@ DIVIDER = "--"
 """Separates the options of the benchmark from those of the agent."""
 SHOWN_PERCENT = 0.3
 _TICKS_S = os.sysconf("SC_CLK_TCK")
-_MARKS = (0.5, 0.95, 0.99, 1.0)
+_SHARES = (0.5, 0.95, 0.99, 1.0)
 
 
 # ------------------------------------------------------------ in the agent's process
@@ -107,7 +107,7 @@ def _watch(report: Path, for_s: float, gaps: dict[str, list[float]]) -> None:
         "agent_percent": used_s / duration_s * 100,
         "others_percent": (_busy_s() - busy - used_s) / duration_s * 100,
         "gaps_ms": {
-            name: [len(each), *([round(percentile(each, mark) * 1000, 2) for mark in _MARKS])]
+            name: [len(each), *([round(percentile(each, share) * 1000, 2) for share in _SHARES])]
             for name, each in sorted(gaps.items())
             if name.endswith("-loop") and each
         },
@@ -183,8 +183,8 @@ def show(result: dict[str, Any], for_s: float, broker: str) -> None:
     print(f"  {'agent, total':28}{result['agent_percent']:6.1f} %")
     print(f"  {'other programs':28}{result['others_percent']:6.1f} %")
     print(f"{'ms between two decisions':30}{'n':>8}{'p50':>8}{'p95':>8}{'p99':>8}{'max':>8}")
-    for name, (count, *marks) in result["gaps_ms"].items():
-        print(f"  {name:28}{count:8}" + "".join(f"{mark:8.2f}" for mark in marks))
+    for name, (count, *percentiles) in result["gaps_ms"].items():
+        print(f"  {name:28}{count:8}" + "".join(f"{value:8.2f}" for value in percentiles))
 
 
 def measure(for_s: float, broker: str, port: int) -> None:

@@ -26,7 +26,7 @@ NAMES = ("ur5", "nao", "qbo", "hanson")
 POST_SIZE_M, POST_M = (0.04, 0.35, 0.0), (-0.249, -0.414, 0.35)
 TARGET_RAD = 1.6
 """Target of the arm's first joint [rad]; the post is halfway."""
-_MARKS = (0.5, 0.95, 0.99, 1.0)
+_SHARES = (0.5, 0.95, 0.99, 1.0)
 
 
 class Loop:
@@ -100,7 +100,7 @@ def measure(for_s: float, *, planning: bool) -> None:
         loop.thread.join()
     print("with planning" if planning else "without planning")
     for name, loop in loops.items():
-        late_ms = " ".join(f"{percentile(loop.late_s, mark) * 1000:8.2f}" for mark in _MARKS)
+        late_ms = " ".join(f"{percentile(loop.late_s, share) * 1000:8.2f}" for share in _SHARES)
         print(f"  {name:8} {len(loop.late_s):6} periods, late p50, p95, p99, max ms {late_ms}")
     if durations_s:
         p50_ms, max_ms = percentile(durations_s, 0.5) * 1000, max(durations_s) * 1000

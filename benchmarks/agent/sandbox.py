@@ -60,8 +60,8 @@ def measure(
 
 def percentiles(values: list[float]) -> str:
     """Returns p50, p95, p99 and the maximum."""
-    marks = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
-    return "   ".join(f"{name} {percentile(values, share):6.1f}" for name, share in marks.items())
+    shares = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
+    return "   ".join(f"{name} {percentile(values, share):6.1f}" for name, share in shares.items())
 
 
 def main(runs: int = 300) -> None:

@@ -50,9 +50,9 @@ WATCH_FRAMES: Final = """() => {
 }"""
 TAKE_FRAMES: Final = """() => {
     const {gaps, long} = benchFrames;
-    const taken = {gaps: [...gaps], long: [...long]};
+    const frames = {gaps: [...gaps], long: [...long]};
     gaps.length = long.length = 0;
-    return taken;
+    return frames;
 }"""
 DRAWN: Final = (
     "() => [...document.querySelectorAll('[data-testid=view-3d]')].map((each) => Number(each.dataset.frames))"
@@ -116,9 +116,9 @@ def measure_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:
         before = sum(page.evaluate(DRAWN))
         page.evaluate(TAKE_FRAMES)  # the forced collection takes time that does not belong to the page
         time.sleep(60)
-        taken = page.evaluate(TAKE_FRAMES)
+        frames = page.evaluate(TAKE_FRAMES)
         drawn = sum(page.evaluate(DRAWN)) - before
-        is_smooth = _show_minute(taken, drawn / 60)
+        is_smooth = _show_minute(frames, drawn / 60)
         every_minute = [memory_samples(session)]
         print(f"after minute 1: {every_minute[0]}", flush=True)
         for minute in range(2, round(minutes) + 1):
@@ -128,18 +128,18 @@ def measure_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:
         return steady(every_minute) and is_smooth
 
 
-def _show_minute(taken: dict[str, Any], drawn_hz: float) -> bool:
-    longest = _show_frames("the minute", taken)
+def _show_minute(frames: dict[str, Any], drawn_hz: float) -> bool:
+    longest = _show_frames("the minute", frames)
     print(f"twins drawn: {drawn_hz:.0f} per second in total; load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-    for each in sorted(taken["long"], key=lambda frame: -float(frame["duration"]))[:3]:
+    for each in sorted(frames["long"], key=lambda frame: -float(frame["duration"]))[:3]:
         print("  {duration:.0f} ms, of which drawing {drawing:.0f}, layout {layout:.0f}; {scripts}".format(**each))
     is_smooth = longest <= MAX_FRAME_MS
     print(f"longest frame {longest:.0f} ms, {'within' if is_smooth else 'MORE THAN'} {MAX_FRAME_MS:.0f} ms", flush=True)
     return is_smooth
 
 
-def _show_frames(when: str, taken: dict[str, Any]) -> float:
-    gaps: list[float] = sorted(taken["gaps"]) or [float("inf")]
+def _show_frames(when: str, frames: dict[str, Any]) -> float:
+    gaps: list[float] = sorted(frames["gaps"]) or [float("inf")]
     percentiles = [gaps[round((len(gaps) - 1) * share)] for share in (0.5, 0.95, 0.99, 1.0)]
     late = sum(gap > MAX_FRAME_MS for gap in gaps)
     intervals = "p50 {:.0f}, p95 {:.0f}, p99 {:.0f}, max {:.0f}".format(*percentiles)

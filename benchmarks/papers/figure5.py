@@ -138,14 +138,14 @@ def _at(
 
 def _once(product: TracedProduct, robot: Robot, begin: Begin) -> Sample:
     """Measures one request to a robot at rest."""
-    product.marks.drain()
-    product.marks.until(f"rests:{robot.name}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
+    product.timestamps.drain()
+    product.timestamps.until(f"rests:{robot.name}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
     time.sleep(random.uniform(0.0, 0.04))  # sample every phase of the control period
     started_ns = time.monotonic_ns()
     end = begin()
-    marks = product.marks.until(f"fast:{robot.name}", since_ns=started_ns, within_s=_WITHIN_S)
+    timestamps = product.timestamps.until(f"fast:{robot.name}", since_ns=started_ns, within_s=_WITHIN_S)
     end()
-    at_ns = {mark.name: mark.at_ns for mark in reversed(marks)}  # the first of each name
+    at_ns = {mark.name: mark.at_ns for mark in reversed(timestamps)}  # the first of each name
     moves_ns, fast_ns = at_ns[f"moves:{robot.name}"], at_ns[f"fast:{robot.name}"]
     return Sample((moves_ns - started_ns) / 1e6, (fast_ns - started_ns) / 1e6)
 
@@ -214,8 +214,8 @@ def show(report: Report, found: Samples) -> None:
     rows: list[list[Cell]] = [["published: NAO, Qbo, Hanson", "a movement", "about 15", None, _PUBLISHED, *[None] * 4]]
     for (where, what, rtt_ms), each in found.items():
         times = [sample.moves_ms for sample in each]
-        marks = (statistics.fmean(times), median(times), percentile(times, 0.95), max(times))
-        rows.append([where, what, rtt_ms, len(each), *marks, median([sample.fast_ms for sample in each])])
+        summary = (statistics.fmean(times), median(times), percentile(times, 0.95), max(times))
+        rows.append([where, what, rtt_ms, len(each), *summary, median([sample.fast_ms for sample in each])])
     report.tables.append(
         Table(
             title="From the operator's request to the robot's first motion (Fig. 5)",

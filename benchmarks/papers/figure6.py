@@ -51,9 +51,9 @@ def measure(report: Report, *, quick: bool, log: Callable[[str], None]) -> None:
         with start(Path(folder), "mosquitto", **unlimited) as product, paths(product) as found:
             enroll = found.pop(ENROLLED)
             # The target is the worst of 1,000 samples, so a quick run takes 1,000 as well.
-            taken = measure_interleaved({ENROLLED: enroll}, rounds=_ROUNDS, each=50)
-            taken |= measure_interleaved(found, rounds=rounds, each=each)
-    judge(report, taken)
+            samples = measure_interleaved({ENROLLED: enroll}, rounds=_ROUNDS, each=50)
+            samples |= measure_interleaved(found, rounds=rounds, each=each)
+    add_results(report, samples)
     for claim in report.claims[-2:]:
         log(claim.line())
 
@@ -95,12 +95,12 @@ def _enroll(product: MeasuredProduct, server: str) -> Exchange:
     return enroll
 
 
-def judge(report: Report, taken: dict[str, list[float]]) -> None:
+def add_results(report: Report, samples: dict[str, list[float]]) -> None:
     """Adds the results and the published values."""
     rows: list[list[Cell]] = [["published for Telescope v2", None, *PUBLISHED.values(), None, None]]
-    for name, found in taken.items():
-        marks = (percentile(found, 0.5), percentile(found, 0.99))
-        rows.append([name, len(found), statistics.fmean(found), min(found), max(found), *marks])
+    for name, found in samples.items():
+        percentiles = (percentile(found, 0.5), percentile(found, 0.99))
+        rows.append([name, len(found), statistics.fmean(found), min(found), max(found), *percentiles])
     report.tables.append(
         Table(
             title="Request and response of a room client, 15 ms round trip to the cloud (Fig. 6)",
@@ -119,10 +119,10 @@ def judge(report: Report, taken: dict[str, list[float]]) -> None:
             x_label="ms",
             y_label="share of the samples",
             x=[],
-            series={name.partition(" (")[0]: list(found) for name, found in taken.items()},
+            series={name.partition(" (")[0]: list(found) for name, found in samples.items()},
         )
     )
-    found = taken[ENROLLED]
+    found = samples[ENROLLED]
     report.claims += [
         Claim(
             "request and response of a room client, 15 ms round trip, mean (published: 63)",

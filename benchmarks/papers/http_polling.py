@@ -3,7 +3,7 @@
 The paper does not describe its HTTP receiver. Its figures (2,711 to 3,298 ms with one message per 3 s) match a receiver
 that polls every 3 s in phase with the sender, just before each message arrives. At a random phase the delay would be 0
 to 3,000 ms, 1,500 ms on average; both cases are measured. Each request opens a new connection, as clients of that time
-did. Many pairs run at once, so 20 samples take less than a minute.
+did. Many pairs run in parallel, so 20 samples take less than a minute.
 """
 
 import contextlib

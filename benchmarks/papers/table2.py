@@ -151,41 +151,41 @@ def _poll(stack: contextlib.ExitStack, port: int) -> dict[str, Future[list[float
 
 
 def show(report: Report, found: Mapping[Condition, Mapping[str, list[float]]]) -> None:
-    """Adds the results beside the published values."""
-    shown = next(taken for each, taken in found.items() if each.rtt_ms == SHOWN_RTT_MS and not each.loss)
+    """Adds the results and the published values."""
+    shown = next(samples for each, samples in found.items() if each.rtt_ms == SHOWN_RTT_MS and not each.loss)
     report.tables.append(_first_samples(shown))
-    report.tables += [_all_samples(condition, taken) for condition, taken in found.items()]
+    report.tables += [_all_samples(condition, samples) for condition, samples in found.items()]
     report.charts.append(_chart(found))
-    report.claims += [claim(condition, taken) for condition, taken in found.items() if not condition.loss]
+    report.claims += [claim(condition, samples) for condition, samples in found.items() if not condition.loss]
 
 
-def claim(condition: Condition, taken: Mapping[str, list[float]]) -> Claim:
+def claim(condition: Condition, samples: Mapping[str, list[float]]) -> Claim:
     """Returns the target: ratio of Telescope to the fastest transport without MQTT."""
-    others = {name: median(each) for name, each in taken.items() if not name.startswith("MQTT")}
+    others = {name: median(each) for name, each in samples.items() if not name.startswith("MQTT")}
     best = min(others, key=lambda name: others[name])
     return Claim(
         f"Table 2 at {condition.rtt_ms} ms round trip: MQTT (mosquitto), to the fastest other transport ({best})",
-        median(taken[MOSQUITTO]) / others[best],
+        median(samples[MOSQUITTO]) / others[best],
         1.0,
         "×",
     )
 
 
-def _first_samples(taken: Mapping[str, list[float]]) -> Table:
+def _first_samples(samples: Mapping[str, list[float]]) -> Table:
     rows: list[list[Cell]] = [
         [
             index + 1,
             HTTP[index],
             XMPP[index],
-            *(round(each[index], 1) if index < len(each) else None for each in taken.values()),
+            *(round(each[index], 1) if index < len(each) else None for each in samples.values()),
         ]
         for index in range(SAMPLES)
     ]
-    means = [statistics.fmean(each[:SAMPLES]) for each in (HTTP, XMPP, *taken.values())]
+    means = [statistics.fmean(each[:SAMPLES]) for each in (HTTP, XMPP, *samples.values())]
     rows.append(["average", *means])
     return Table(
         title=f"Table 2: 20 messages [ms], published and over {SHOWN_RTT_MS} ms round trip",
-        columns=["sample", "published: HTTP", "published: XMPP", *taken],
+        columns=["sample", "published: HTTP", "published: XMPP", *samples],
         rows=rows,
         note="One way, from the sender through a server to the receiver; each has this round trip to the server. "
         "The paper's server was in Singapore; the paper does not state the distance. "
@@ -193,28 +193,28 @@ def _first_samples(taken: Mapping[str, list[float]]) -> Table:
     )
 
 
-def _all_samples(condition: Condition, taken: Mapping[str, list[float]]) -> Table:
-    best = min(median(each) for name, each in taken.items() if not name.startswith("MQTT"))
+def _all_samples(condition: Condition, samples: Mapping[str, list[float]]) -> Table:
+    best = best_median(samples)
     rows: list[list[Cell]] = [
         [name, len(each), *(percentile(each, share) for share in SHARES.values()), median(each) / best]
-        for name, each in taken.items()
+        for name, each in samples.items()
     ]
     return Table(
         title=f"All samples, {condition.name}{'' if condition.rtt_ms else ' (loopback)'}",
         columns=["transport", "n", *(f"{share} ms" for share in SHARES), "× the fastest that is not MQTT"],
         rows=rows,
-        note=_why(condition, taken),
+        note=_why(condition, samples),
     )
 
 
-def _why(condition: Condition, taken: Mapping[str, list[float]]) -> str:
+def _why(condition: Condition, samples: Mapping[str, list[float]]) -> str:
     """Explains the order of the transports."""
     if condition.loss:
         return (
             "A stall delays all following data of the same connection. Polling is hardly affected, because the "
             "polling period dominates."
         )
-    slower = [name for name in (MOSQUITTO, EMBEDDED) if median(taken[name]) > best_median(taken)]
+    slower = [name for name in (MOSQUITTO, EMBEDDED) if median(samples[name]) > best_median(samples)]
     note = (
         f"A setpoint of {len(exchanges.SETPOINT)} bytes, one way. A message over an open connection takes half a "
         "round trip plus processing. Telescope's long poll delivers a whole action (identity, role, rows, signature), "
@@ -228,9 +228,9 @@ def _why(condition: Condition, taken: Mapping[str, list[float]]) -> str:
     return note
 
 
-def best_median(taken: Mapping[str, list[float]]) -> float:
+def best_median(samples: Mapping[str, list[float]]) -> float:
     """Returns the median of the fastest transport without MQTT [ms]."""
-    return min(median(each) for name, each in taken.items() if not name.startswith("MQTT"))
+    return min(median(each) for name, each in samples.items() if not name.startswith("MQTT"))
 
 
 def _chart(found: Mapping[Condition, Mapping[str, list[float]]]) -> Chart:
@@ -241,7 +241,7 @@ def _chart(found: Mapping[Condition, Mapping[str, list[float]]]) -> Chart:
         x_label="round trip to the server",
         y_label="ms",
         x=[condition.name for condition in found],
-        series={name: [median(taken[name]) for taken in found.values()] for name in names},
+        series={name: [median(samples[name]) for samples in found.values()] for name in names},
         marks={"published: HTTP": statistics.fmean(HTTP), "published: XMPP": statistics.fmean(XMPP)},
         log=True,
     )

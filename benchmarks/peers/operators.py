@@ -51,13 +51,13 @@ class PeerOperator:
         """
         time.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = time.monotonic() + PERIOD_S
-        began = time.perf_counter()
+        started_s = time.perf_counter()
         with self._telemetry_received:
             self._sequence += 1
             self._send(self._sequence)
             if not self._telemetry_received.wait_for(lambda: self._applied >= self._sequence, TIMEOUT_S):
                 raise TimeoutError(f"setpoint {self._sequence} is not reported by telemetry")
-        return (time.perf_counter() - began) * 1000
+        return (time.perf_counter() - started_s) * 1000
 
     def settle(self) -> Exchange:
         """Returns the exchange after a first success; a channel may open before the other end is connected."""

@@ -15,8 +15,8 @@ from benchmarks.reporting.report import Chart, Report, Table, format_cell, load
 ROOT: Final = Path(__file__).resolve().parents[2]
 PAGE: Final = ROOT / "docs" / "results" / "benchmarks.md"
 PICTURES: Final = ROOT / "docs" / "pictures" / "benchmarks"
-_MAX_NAMES_INSIDE: Final = 5
-"""A chart with more names has its legend beside it."""
+_MAX_LEGEND_NAMES: Final = 5
+"""A chart with more names has its legend outside of the axes."""
 _DASHES: Final = ("--", ":", "-.")
 _HEAD: Final = """# Benchmarks
 
@@ -54,7 +54,7 @@ def _anchor(report: Report) -> str:
 def _section(report: Report) -> Iterator[str]:
     run = f"`python -m benchmarks {report.suite}{' --quick' if report.quick else ''}`"
     yield f"## {report.title}\n"
-    yield f"{run}, {report.made}, {report.machine}, load {report.load:g} before.\n"
+    yield f"{run}, {report.created}, {report.machine}, load {report.load:g} before.\n"
     for paragraph in report.about:
         yield f"{paragraph}\n"
     for table in report.tables:
@@ -87,8 +87,8 @@ def draw(report: Report) -> None:
     PICTURES.mkdir(parents=True, exist_ok=True)
     for number, chart in enumerate(report.charts):
         names = len(chart.series) + len(chart.marks)
-        beside = names > _MAX_NAMES_INSIDE
-        figure, axes = plt.subplots(figsize=(9.6 if beside else 7.2, 3.6), layout="constrained")
+        legend_outside = names > _MAX_LEGEND_NAMES
+        figure, axes = plt.subplots(figsize=(9.6 if legend_outside else 7.2, 3.6), layout="constrained")
         _plot(axes, chart)
         axes.set(title=chart.title, xlabel=chart.x_label, ylabel=chart.y_label)
         if chart.log:
@@ -96,7 +96,7 @@ def draw(report: Report) -> None:
         for place, (name, value) in enumerate(chart.marks.items()):
             axes.axhline(value, linestyle=_DASHES[place % len(_DASHES)], linewidth=1, color="dimgrey", label=name)
         axes.grid(alpha=0.3)
-        if beside:
+        if legend_outside:
             figure.legend(loc="outside right upper", fontsize="small")
         elif names > 1:
             axes.legend(fontsize="small")

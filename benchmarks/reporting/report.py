@@ -73,7 +73,7 @@ class Claim(msgspec.Struct, frozen=True, rename={"measured": "seen"}):
         return f"{self.text}: {self.measured:.3g} {self.unit} (target {sign} {self.bound:g})"
 
 
-class Report(msgspec.Struct, kw_only=True):
+class Report(msgspec.Struct, kw_only=True, rename={"created": "made"}):
     """Result of one run of a suite.
 
     Attributes:
@@ -90,7 +90,7 @@ class Report(msgspec.Struct, kw_only=True):
     claims: list[Claim] = msgspec.field(default_factory=list)
     tables: list[Table] = msgspec.field(default_factory=list)
     charts: list[Chart] = msgspec.field(default_factory=list)
-    made: str = msgspec.field(default_factory=lambda: time.strftime("%Y-%m-%d %H:%M", time.gmtime()))
+    created: str = msgspec.field(default_factory=lambda: time.strftime("%Y-%m-%d %H:%M", time.gmtime()))
     machine: str = msgspec.field(
         default_factory=lambda: (
             f"{os.cpu_count()} cores ({platform.machine()}), {platform.system()}, Python {platform.python_version()}"

@@ -80,7 +80,7 @@ class LoadTestResult(msgspec.Struct):
             "on": datetime.now(UTC).date().isoformat(),
             **self.figures,
             "measured": self.measured,
-            "subscriber_heard": self.received.count,
+            "subscriber_received": self.received.count,
             "lost_share": round(self.lost / max(self.measured, 1), 6),
             "load_before": self.load_before,
             "load_after": self.load_after,

@@ -58,7 +58,7 @@ def functions(site: FunctionsUnderTest, steps: tuple[int, ...]) -> list[list[Cel
     """Measures one process of the functions."""
     with contextlib.ExitStack() as stack:
         connections: list[socket.socket] = []
-        request = Request("GET", "/api/v1/nothing").encode()
+        request = Request("GET", "/api/v1/unknown").encode()
 
         def grow(count: int) -> None:
             while len(connections) < count:

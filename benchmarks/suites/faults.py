@@ -49,7 +49,7 @@ _HISTORY: Final = Table(
     columns=["change", "message → braking: p99 ms", "POST → braking: p99 ms"],
     rows=[
         ["before: a Stop waits for the next control period", 13.4, 15.5],
-        ["a Stop starts a period at once; its message is published before signing", 6.62, 10.9],
+        ["a Stop starts a period immediately; its message is published before signing", 6.62, 10.9],
         ["also directly after a period started by a setpoint", 1.99, 5.88],
     ],
     note="""Quick runs of one day (2026-11-22), 30 Stops per method. A period started by a Stop brakes for the time

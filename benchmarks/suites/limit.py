@@ -73,27 +73,27 @@ def run(*, quick: bool, log: Callable[[str], None]) -> Report:
     for kind in BROKERS:
         log(f"{kind}: starting")
         with tempfile.TemporaryDirectory() as folder, start(Path(folder), kind) as product, paths(product) as found:
-            taken = measure_interleaved(found, rounds=rounds, each=each, pause_s=PERIOD_S)
-        _judge(report, kind, taken)
+            samples = measure_interleaved(found, rounds=rounds, each=each, pause_s=PERIOD_S)
+        _add_results(report, kind, samples)
         for claim in report.claims[-2:]:
             log(claim.line())
     report.tables.append(_HISTORY)
     return report
 
 
-def _judge(report: Report, kind: str, taken: dict[str, list[float]]) -> None:
-    report.tables.append(table(f"Over {kind}", taken, reference="MQTT, QoS 0"))
-    mqtt, echo = median(taken["MQTT, QoS 0"]), median(taken["HTTP"])
+def _add_results(report: Report, kind: str, samples: dict[str, list[float]]) -> None:
+    report.tables.append(table(f"Over {kind}", samples, reference="MQTT, QoS 0"))
+    mqtt, echo = median(samples["MQTT, QoS 0"]), median(samples["HTTP"])
     report.claims += [
         Claim(
             f"setpoint until telemetry reports it as applied, to a bare round trip over {kind}",
-            median(taken["setpoint"]) / mqtt,
+            median(samples["setpoint"]) / mqtt,
             MAX_SETPOINT_RATIO,
             "×",
         ),
         Claim(
             f"`POST actions` until started, to bare HTTP and a bare round trip over {kind}",
-            median(taken["action"]) / (median(taken["MQTT, QoS 1"]) + echo),
+            median(samples["action"]) / (median(samples["MQTT, QoS 1"]) + echo),
             MAX_ACTION_RATIO,
             "×",
         ),

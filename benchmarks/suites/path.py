@@ -83,9 +83,9 @@ def measure(product: TracedProduct, count: int) -> dict[str, Parts]:
         home_rad = operator.target_rad[JOINT]
         for index in range(count + _WARM_UP):
             to_rad = home_rad + (0.0 if index % 2 else SWING_RAD)
-            marks = list(_run_action(product, caller, operator, to_rad))
+            timestamps = list(_run_action(product, caller, operator, to_rad))
             stages: dict[str, dict[str, float] | None] = {}
-            stages["action"], stages["first motion"] = parts(marks, ACTION), parts(marks, MOTION)
+            stages["action"], stages["first motion"] = parts(timestamps, ACTION), parts(timestamps, MOTION)
             operator.target_rad[JOINT] = to_rad
             operator.exchange()  # streaming resumes after the action
             time.sleep(0.1 + 0.003 * (index % 7))  # sample every phase of the control period
@@ -108,38 +108,38 @@ def _run_action(
     request = {"kind": "move_joints", "position_rad": {JOINT: to_rad}}
     body = {"request": request, "epoch": operator.epoch, "wait_for": "started", "wait_ms": 10_000}
     payload = json.dumps(body).encode()
-    product.marks.drain()
-    product.marks.until(f"rests:{ROBOT}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
+    product.timestamps.drain()
+    product.timestamps.until(f"rests:{ROBOT}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
     time.sleep(random.uniform(0.0, 0.01))  # sample every phase of the control period
     started_ns = time.monotonic_ns()
     yield Timestamp(REQUESTED, started_ns)
     started = caller.request("POST", f"/api/v1/devices/{operator.device['id']}/actions", payload)
     yield Timestamp(RESPONDED, time.monotonic_ns())
-    yield from product.marks.until(f"moves:{ROBOT}", since_ns=started_ns, within_s=_WITHIN_S)
+    yield from product.timestamps.until(f"moves:{ROBOT}", since_ns=started_ns, within_s=_WITHIN_S)
     caller.request("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
 
 
 def _send_setpoint(product: TracedProduct, operator: StreamingOperator) -> list[Timestamp]:
     """Sends one setpoint and returns its timestamps until telemetry reports it."""
-    product.marks.drain()
+    product.timestamps.drain()
     started_ns = time.monotonic_ns()
     duration_ms = operator.exchange()
     responded = Timestamp(RESPONDED, time.monotonic_ns())
     # `exchange` may have waited before it sent the setpoint.
     requested = Timestamp(REQUESTED, max(started_ns, responded.at_ns - round(duration_ms * 1e6)))
-    return [requested, *product.marks.drain(), responded]
+    return [requested, *product.timestamps.drain(), responded]
 
 
-def parts(marks: Sequence[Timestamp], steps: Steps) -> dict[str, float] | None:
+def parts(timestamps: Sequence[Timestamp], steps: Steps) -> dict[str, float] | None:
     """Returns the duration of each part [ms], or None if a timestamp is missing.
 
     The timestamp of a step is the first one of its name after the previous step.
     """
-    marks = sorted(marks, key=lambda mark: mark.at_ns)
-    at_ns = next(mark.at_ns for mark in marks if mark.name == REQUESTED)
+    timestamps = sorted(timestamps, key=lambda mark: mark.at_ns)
+    at_ns = next(mark.at_ns for mark in timestamps if mark.name == REQUESTED)
     durations: dict[str, float] = {}
     for name, description in steps:
-        following = next((mark.at_ns for mark in marks if mark.name == name and mark.at_ns >= at_ns), None)
+        following = next((mark.at_ns for mark in timestamps if mark.name == name and mark.at_ns >= at_ns), None)
         if following is None:
             return None
         durations[description] = (following - at_ns) / 1e6

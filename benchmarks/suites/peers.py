@@ -37,14 +37,14 @@ def run(*, quick: bool, log: Callable[[str], None]) -> Report:
     log("starting all programs")
     with paths() as found:
         log("measuring interleaved")
-        taken = measure_interleaved(found, rounds=rounds, each=each)
+        samples = measure_interleaved(found, rounds=rounds, each=each)
     report = Report(suite="peers", title="Comparable protocols", quick=quick, about=[_ABOUT, _HOW])
-    report.tables += [table("Setpoint until reported as applied", taken, reference=TELESCOPE), safety.table()]
-    report.charts.append(_chart(taken))
+    report.tables += [table("Setpoint until reported as applied", samples, reference=TELESCOPE), safety.table()]
+    report.charts.append(_chart(samples))
     report.claims.append(
         Claim(
             "setpoint until reported as applied over mosquitto, to the rosbridge-style peer",
-            median(taken[TELESCOPE]) / median(taken[ROSBRIDGE]),
+            median(samples[TELESCOPE]) / median(samples[ROSBRIDGE]),
             1.0,
             "×",
         )
@@ -53,15 +53,15 @@ def run(*, quick: bool, log: Callable[[str], None]) -> Report:
     return report
 
 
-def _chart(taken: dict[str, list[float]]) -> Chart:
+def _chart(samples: dict[str, list[float]]) -> Chart:
     shares = {"median": 0.5, "p95": 0.95, "p99": 0.99}
     return Chart(
         title="Setpoint until reported as applied",
         kind="bar",
         x_label="",
         y_label="ms",
-        x=[name.replace(", ", ",\n") for name in taken],
-        series={label: [percentile(each, share) for each in taken.values()] for label, share in shares.items()},
+        x=[name.replace(", ", ",\n") for name in samples],
+        series={label: [percentile(each, share) for each in samples.values()] for label, share in shares.items()},
     )
 
 

@@ -111,7 +111,7 @@ def _quick_claims(trends: list[DescriptorTrend], clients: Load) -> list[Claim]:
     found = []
     if latest is not None:
         found = [
-            Claim(f"{each.text} (full run of {latest.made})", each.measured, each.bound, each.unit)
+            Claim(f"{each.text} (full run of {latest.created})", each.measured, each.bound, each.unit)
             for each in latest.claims
         ]
     return [

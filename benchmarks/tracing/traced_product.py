@@ -18,14 +18,20 @@ class TracedProduct(MeasuredProduct):
     """A ``MeasuredProduct`` with tracing; ``start`` creates it.
 
     Attributes:
-        marks: Receives the timestamps of its programs.
+        timestamps: Receives the timestamps of its programs.
     """
 
     def __init__(
-        self, machine: Machine, kind: BrokerKind, cloud: Cloud, *, marks: TimestampReceiver, network: DelayedNetwork
+        self,
+        machine: Machine,
+        kind: BrokerKind,
+        cloud: Cloud,
+        *,
+        timestamps: TimestampReceiver,
+        network: DelayedNetwork,
     ) -> None:
         super().__init__(machine, kind, cloud)
-        self.marks = marks
+        self.timestamps = timestamps
         self._network = network
         self._delayed = False
 
@@ -59,7 +65,7 @@ def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) 
     """
     port = free_ports()
     with contextlib.ExitStack() as stack:
-        marks = stack.enter_context(TimestampReceiver())
+        timestamps = stack.enter_context(TimestampReceiver())
         network = stack.enter_context(start_delay(port, port + 1, rtt_ms=0))
         variables = {
             "TELESCOPE_BROKER": kind,
@@ -68,7 +74,7 @@ def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) 
             traced_programs.DEVICE: next(iter(joints)),
             traced_programs.JOINTS: ",".join(f"{robot}:{each}" for robot, each in joints.items()),
             traced_programs.PORTS: ",".join(f"{each}={network.ports[each]}" for each in network.ports),
-            **marks.settings,
+            **timestamps.settings,
             **more,
         }
         machine = stack.enter_context(
@@ -78,4 +84,4 @@ def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) 
             raise RuntimeError("".join(machine.lines))
         environment = {"TELESCOPE_HOME": str(home), "TELESCOPE_PORT": str(machine.port), **variables}
         cloud = stack.enter_context(Cloud(settings.read(environment)))
-        yield TracedProduct(machine, kind, cloud, marks=marks, network=network)
+        yield TracedProduct(machine, kind, cloud, timestamps=timestamps, network=network)

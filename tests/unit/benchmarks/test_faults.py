@@ -77,9 +77,9 @@ def test_motion_after_a_stop_fails_the_claim_of_rest() -> None:
 
 def test_the_recorder_receives_periods_of_the_agent(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "s")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
         for text in ("started arm1 x", "period arm0 10.5 streaming 0.001 3 7", "period arm0 18.5 stopped 0.002 3 7"):
-            line.sendto(text.encode(), str(tmp_path / "s"))
+            sender.sendto(text.encode(), str(tmp_path / "s"))
     wait_until(lambda: len(recorder.since("arm0", 0.0)) > 1, "two periods")
     assert recorder.starts == {"x": 1}
     assert recorder.since("arm0", 11.0) == [Period(18.5, "stopped", 0.002, 3, 7)]

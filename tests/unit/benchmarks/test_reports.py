@@ -38,7 +38,7 @@ def test_a_claim_that_does_not_hold_is_marked() -> None:
 
 def test_saved_reports_are_loaded(tmp_path) -> None:
     save(REPORT, tmp_path)
-    assert (load("limit", tmp_path), load("nothing", tmp_path)) == (REPORT, None)
+    assert (load("limit", tmp_path), load("unknown", tmp_path)) == (REPORT, None)
 
 
 def test_percentiles_are_samples() -> None:

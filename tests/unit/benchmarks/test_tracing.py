@@ -1,4 +1,4 @@
-"""Timestamps of traced programs are received in order, and the parts of a path add up to the whole."""
+"""Timestamps of traced programs are received in order, and the parts of a path add up to the total."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ from benchmarks.tracing import traced_programs
 from benchmarks.tracing.timestamps import VARIABLE, Timestamp, TimestampReceiver, TimestampSender
 from tests.harness.paths import ROOT
 
-STEPS = (("in", "there"), ("out", "work"), (RESPONDED, "back"))
+STEPS = (("in", "request"), ("out", "work"), (RESPONDED, "response"))
 
 
 def test_timestamps_are_received_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,7 +36,7 @@ def test_timestamps_are_received_in_order(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_parts_run_from_each_step_to_the_next_and_add_up() -> None:
-    marks = [
+    timestamps = [
         Timestamp("out", 500_000),  # of the previous exchange
         Timestamp(REQUESTED, 1_000_000),
         Timestamp("in", 3_000_000),
@@ -45,9 +45,9 @@ def test_parts_run_from_each_step_to_the_next_and_add_up() -> None:
         Timestamp("in", 7_000_000),
         Timestamp(RESPONDED, 10_000_000),
     ]
-    found = parts(marks, STEPS)
-    assert found == {"there": 2.0, "work": 3.0, "back": 4.0}
-    assert totals([found]) == [9.0]
+    durations = parts(timestamps, STEPS)
+    assert durations == {"request": 2.0, "work": 3.0, "response": 4.0}
+    assert totals([durations]) == [9.0]
 
 
 @pytest.mark.parametrize("names", [[REQUESTED, "in", RESPONDED], [REQUESTED, "out", "in", RESPONDED]])
