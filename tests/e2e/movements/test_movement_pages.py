@@ -102,10 +102,10 @@ def wrist(trace: Trace) -> float:
 def test_a_movement_is_written_corrected_and_saved(browser: Browser, machine: Machine, name: str) -> None:
     with pages(browser, machine) as (page,):
         page.get_by_role("link", name="Movements").click()
-        expect(page.get_by_test_id("shelf-ur5-wave")).to_be_visible()
+        expect(page.get_by_test_id("movement-entry-ur5-wave")).to_be_visible()
         page.get_by_test_id("movement-search").fill("square air")
-        expect(page.get_by_test_id("shelf-ur5-slow_square")).to_be_visible()
-        expect(page.get_by_test_id("shelf-ur5-wave")).to_have_count(0)
+        expect(page.get_by_test_id("movement-entry-ur5-slow_square")).to_be_visible()
+        expect(page.get_by_test_id("movement-entry-ur5-wave")).to_have_count(0)
         page.get_by_test_id("movement-search").fill("")
         assert_good_page(page, "movements")
 
@@ -241,7 +241,7 @@ def test_unsaved_text_is_kept_and_versions_can_be_restored(
         mine.goto(f"{machine.url}/#/movements")
         mine.get_by_test_id(f"remove-{name}").click()
         mine.get_by_test_id("confirm-yes").click()
-        expect(mine.get_by_test_id(f"shelf-ur5-{name}")).to_have_count(0)
+        expect(mine.get_by_test_id(f"movement-entry-ur5-{name}")).to_have_count(0)
 
 
 def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(

@@ -38,7 +38,7 @@ export function useDeviceSessions(
     };
     // While the page has no focus it receives no keyup events.
     const blur = (): void => {
-      for (const { control } of made) control.streamer.value?.letGo();
+      for (const { control } of made) control.streamer.value?.release();
     };
     const leave = (): void => {
       for (const { control, watchers: watching } of made) {

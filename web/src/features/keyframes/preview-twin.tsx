@@ -25,7 +25,7 @@ interface TwinProps {
 }
 
 export function PreviewTwin({ twin, device, editor }: TwinProps) {
-  const { canvas, box, scene, said } = useScene(twin);
+  const { canvas, box, scene, errorText } = useScene(twin);
   usePreviewClock(editor);
   const playing = editor.playing.value;
   const count = editor.movement.value.keyframes.length;
@@ -44,7 +44,7 @@ export function PreviewTwin({ twin, device, editor }: TwinProps) {
         {/* Keyed: a canvas cannot be drawn on after its context is lost. */}
         <canvas key={twin} ref={canvas} aria-label={texts.twinLabel} role="img" />
         {twin === null && <p class="over quiet">{texts.viewWaiting}</p>}
-        {said !== "" && <p class="over notice">{said}</p>}
+        {errorText !== "" && <p class="over notice">{errorText}</p>}
         <p class={`tag ${playing ? "kf-preview" : ""}`}>
           {playing ? texts.previewing : texts.numberOf(editor.selected.value + 1, count)}
         </p>

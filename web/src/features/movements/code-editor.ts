@@ -10,7 +10,7 @@ import { EditorState, Prec, StateEffect, type Extension } from "@codemirror/stat
 import { drawSelection, EditorView, highlightActiveLine, highlightActiveLineGutter, keymap, lineNumbers, tooltips } from "@codemirror/view";
 import { tags } from "@lezer/highlight";
 import type { Scripting } from "../../shared/api/movement-library";
-import type { Place } from "./model/text-offsets";
+import type { TextRange } from "./model/text-offsets";
 import { complete } from "./completion";
 
 const CHECK_AFTER_MS = 500;
@@ -90,11 +90,11 @@ const shared: Extension = [
 interface CodeEditorOptions {
   text: string;
   label: string;
-  described: string;
+  description: string;
   /** The available functions and names; `null` until loaded. */
   scripting: () => Scripting | null;
   parameters: () => readonly string[];
-  check: (text: string) => Promise<readonly Place[]>;
+  check: (text: string) => Promise<readonly TextRange[]>;
   onChange: (text: string) => void;
   onSave: () => void;
   /** Called for Escape if no other handler used it. */
@@ -139,7 +139,7 @@ export class CodeEditor {
             delay: CHECK_AFTER_MS,
             needsRefresh: ({ transactions }) => transactions.some(({ effects }) => effects.some((one) => one.is(checkAgain))),
           }),
-          EditorView.contentAttributes.of({ "aria-label": options.label, "aria-description": options.described }),
+          EditorView.contentAttributes.of({ "aria-label": options.label, "aria-description": options.description }),
           EditorView.updateListener.of((update) => {
             if (update.docChanged) options.onChange(update.state.doc.toString());
           }),
@@ -226,6 +226,6 @@ function shadow(host: HTMLElement): ShadowRoot {
   return root;
 }
 
-async function diagnostics(found: Promise<readonly Place[]>): Promise<Diagnostic[]> {
+async function diagnostics(found: Promise<readonly TextRange[]>): Promise<Diagnostic[]> {
   return (await found).map((place) => ({ ...place }));
 }

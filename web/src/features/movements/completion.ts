@@ -17,7 +17,7 @@ export function complete(
   const { state, pos } = context;
   const node = syntaxTree(state).resolveInner(pos, -1);
   if (node.name === "Comment") return null;
-  const string = within(node, "String");
+  const string = enclosing(node, "String");
   if (string !== null) return inString(scripting, state, string, pos, parameters);
   const word = context.matchBefore(WORD);
   const from = word?.from ?? pos;
@@ -27,7 +27,7 @@ export function complete(
   if (/(^|\n)[ \t]*(from|import)[ \t]+$/.test(before)) return options(from, scripting.api.modules.map(moduleOption));
   // At an empty place, completions need an explicit request.
   if (from === pos && !context.explicit) return null;
-  const call = calledAround(scripting, state, node);
+  const call = callAt(scripting, state, node);
   return options(from, [...(call === null ? [] : call.parameters.flatMap(keyword)), ...globals(scripting)]);
 }
 
@@ -88,19 +88,19 @@ function inString(
   if (/parameters(\[|\.get\()\s*$/.test(state.sliceDoc(Math.max(0, string.from - 40), string.from))) {
     return found(parameters, "property");
   }
-  const names = calledAround(scripting, state, string)?.argument?.names;
+  const names = callAt(scripting, state, string)?.argument?.names;
   return names === undefined ? null : found(scripting.names[names] ?? [], "constant");
 }
 
-interface Around {
+interface CallContext {
   parameters: readonly ScriptParameter[];
   /** The argument at the cursor; `undefined` if unknown. */
   argument: ScriptParameter | undefined;
 }
 
 /** The sandbox function whose parentheses contain a position. */
-function calledAround({ api }: Scripting, state: EditorState, node: SyntaxNode): Around | null {
-  const list = within(node, "ArgList");
+function callAt({ api }: Scripting, state: EditorState, node: SyntaxNode): CallContext | null {
+  const list = enclosing(node, "ArgList");
   const called = list?.parent?.firstChild;
   if (list === null || called === undefined || called === null) return null;
   const [owner, method] = state.sliceDoc(called.from, called.to).split(".");
@@ -132,7 +132,7 @@ function argumentAt(
   return parameters.filter(({ kind }) => kind === "positional")[count];
 }
 
-function within(node: SyntaxNode, name: string): SyntaxNode | null {
+function enclosing(node: SyntaxNode, name: string): SyntaxNode | null {
   for (let at: SyntaxNode | null = node; at !== null; at = at.parent) {
     if (at.name === name) return at;
     if (at.name === "Body" || at.name === "Script") return null;

@@ -13,7 +13,7 @@ import { sentence } from "../../shared/api/http";
 import { storedDraft } from "../../shared/lib/local-storage";
 import type { CheckResult, Scripting } from "../../shared/api/movement-library";
 import { ScriptDraft } from "./model/script-draft";
-import { failureMark, placed, type Place } from "./model/text-offsets";
+import { failureMark, rangeOf, type TextRange } from "./model/text-offsets";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { movementsAddress, typeKeyframesAddress } from "../../shared/routing/routes";
@@ -36,8 +36,8 @@ export function EditorPage({ api, fleet, account, robotType, name }: EditorPageP
     () => new ScriptDraft(api.library, robotType, name, storedDraft(storage(), account.id, robotType, name), texts.library.template),
     [api, account, robotType, name],
   );
-  const [chosen, setChosen] = useState<readonly string[]>([]);
-  const devices = robotsOf(fleet, robotType, account.id).own.filter(({ id }) => chosen.includes(id));
+  const [selected, setSelected] = useState<readonly string[]>([]);
+  const devices = robotsOf(fleet, robotType, account.id).own.filter(({ id }) => selected.includes(id));
   const sessions = useDeviceSessions(api, fleet, devices, account);
   const loading = script.loading.value;
   useEffect(() => void script.load(), [script]);
@@ -50,7 +50,7 @@ export function EditorPage({ api, fleet, account, robotType, name }: EditorPageP
           <h1>{name}</h1>
           <p class="quiet">
             {robotType.replaceAll("_", " ")}
-            {loading.kind === "there" && <AsKeyframes script={script} />}
+            {loading.kind === "loaded" && <AsKeyframes script={script} />}
           </p>
         </div>
         {loading.kind === "loading" && (
@@ -60,21 +60,21 @@ export function EditorPage({ api, fleet, account, robotType, name }: EditorPageP
         )}
         {loading.kind === "failed" && (
           <p class="notice bad" role="alert">
-            {texts.editor.failed(loading.why)}{" "}
+            {texts.editor.failed(loading.saveError)}{" "}
             <button type="button" onClick={() => void script.load()}>
               {texts.movements.retry}
             </button>
           </p>
         )}
-        {loading.kind === "there" && (
+        {loading.kind === "loaded" && (
           <Desk
             api={api}
             fleet={fleet}
             account={account}
             script={script}
             sessions={sessions}
-            chosen={chosen}
-            onChoose={setChosen}
+            selected={selected}
+            onSelect={setSelected}
           />
         )}
       </main>
@@ -102,11 +102,11 @@ interface DeskProps {
   account: Account;
   script: ScriptDraft;
   sessions: readonly DeviceSession[];
-  chosen: readonly string[];
-  onChoose: (chosen: readonly string[]) => void;
+  selected: readonly string[];
+  onSelect: (selected: readonly string[]) => void;
 }
 
-function Desk({ api, fleet, account, script, sessions, chosen, onChoose }: DeskProps) {
+function Desk({ api, fleet, account, script, sessions, selected, onSelect }: DeskProps) {
   const { robotType, name } = script;
   const [checked, setChecked] = useState<{ of: string; found: CheckResult } | null>(null);
   const base = script.base.value;
@@ -127,8 +127,8 @@ function Desk({ api, fleet, account, script, sessions, chosen, onChoose }: DeskP
           movement={name}
           schema={schema}
           sessions={sessions}
-          chosen={chosen}
-          onChoose={onChoose}
+          selected={selected}
+          onSelect={onSelect}
           unsaved={unsaved}
           beforeRun={() => script.save()}
         />
@@ -162,9 +162,9 @@ function Code({ api, fleet, script, sessions, checked, onChecked }: CodeProps) {
   const editor = useRef<CodeEditor | null>(null);
   const saveButton = useRef<HTMLButtonElement>(null);
   const parameters = useRef<readonly string[]>([]);
-  const failure = useRef<{ of: string; places: readonly Place[] }>({ of: "", places: [] });
-  const [places, setPlaces] = useState<readonly Place[]>([]);
-  const [unchecked, setUnchecked] = useState("");
+  const failure = useRef<{ of: string; marks: readonly TextRange[] }>({ of: "", marks: [] });
+  const [marks, setMarks] = useState<readonly TextRange[]>([]);
+  const [checkError, setCheckError] = useState("");
   parameters.current = Object.keys(checked?.found.parameters_schema?.properties ?? {});
 
   useEffect(() => {
@@ -172,23 +172,23 @@ function Code({ api, fleet, script, sessions, checked, onChecked }: CodeProps) {
     let scripting: Scripting | null = null;
     void api.library.scripting(script.robotType).then((found) => {
       scripting = { ...found, names: { ...found.names, devices: deviceNames(fleet) } };
-    }, () => undefined); // Without them there is no completion; the check reports an unreachable server.
+    }, () => undefined); // Completions are unavailable then; the check reports an unreachable server.
     const made = new CodeEditor(host.current, {
       text: script.text.value,
       label: texts.editor.label(script.name),
-      described: texts.editor.keys,
+      description: texts.editor.keys,
       scripting: () => scripting,
       parameters: () => parameters.current,
       check: async (text) => {
         try {
           const found = await api.library.check(script.robotType, text);
           onChecked({ of: text, found });
-          setUnchecked("");
-          const all = [...found.diagnostics.map((mark) => placed(text, mark)), ...(failure.current.of === text ? failure.current.places : [])];
-          setPlaces(all);
+          setCheckError("");
+          const all = [...found.diagnostics.map((mark) => rangeOf(text, mark)), ...(failure.current.of === text ? failure.current.marks : [])];
+          setMarks(all);
           return all;
         } catch (error) {
-          setUnchecked(sentence(error));
+          setCheckError(sentence(error));
           return [];
         }
       },
@@ -213,7 +213,7 @@ function Code({ api, fleet, script, sessions, checked, onChecked }: CodeProps) {
   useEffect(() => {
     const mark = failureMark(why);
     const text = script.text.peek();
-    failure.current = mark === null ? { of: "", places: [] } : { of: text, places: [placed(text, mark)] };
+    failure.current = mark === null ? { of: "", marks: [] } : { of: text, marks: [rangeOf(text, mark)] };
     editor.current?.checkAgain();
   }, [script, why]);
 
@@ -236,15 +236,15 @@ function Code({ api, fleet, script, sessions, checked, onChecked }: CodeProps) {
         <span class="quiet small">{texts.editor.keys}</span>
       </div>
       <div role="alert">
-        {script.why.value !== "" && (
+        {script.saveError.value !== "" && (
           <p class="notice bad" data-testid="save-refused">
-            {texts.editor.refused(script.why.value)}
+            {texts.editor.refused(script.saveError.value)}
           </p>
         )}
         <ConflictNotice script={script} />
       </div>
-      {unchecked !== "" && <p class="notice warn">{texts.editor.unchecked(unchecked)}</p>}
-      <Problems places={places} text={script.text.value} onGo={(place) => editor.current?.goTo(place.from)} />
+      {checkError !== "" && <p class="notice warn">{texts.editor.checkError(checkError)}</p>}
+      <Problems marks={marks} text={script.text.value} onGo={(mark) => editor.current?.goTo(mark.from)} />
     </Card>
   );
 }
@@ -257,7 +257,7 @@ function SaveState({ script }: { script: ScriptDraft }) {
   const base = script.base.value;
   const text =
     base === null
-      ? texts.editor.isNew
+      ? texts.editor.unsaved
       : script.changed.value
         ? texts.editor.changed(base.version)
         : texts.editor.isSaved(base.version, base.built_in);
@@ -270,20 +270,20 @@ function SaveState({ script }: { script: ScriptDraft }) {
 
 /** A notice that unsaved text was restored, with a button to discard it. */
 function Restored({ script }: { script: ScriptDraft }) {
-  const [given, setGiven] = useState<string | null>(null);
+  const [discarded, setDiscarded] = useState<string | null>(null);
   const at = script.restored.value;
-  if (given !== null && !script.changed.value) {
+  if (discarded !== null && !script.changed.value) {
     return (
       <p class="notice" role="status">
         {texts.editor.discarded}{" "}
         <button
           type="button"
           onClick={() => {
-            script.edit(given);
-            setGiven(null);
+            script.edit(discarded);
+            setDiscarded(null);
           }}
         >
-          {texts.editor.bringBack}
+          {texts.editor.undo}
         </button>
       </p>
     );
@@ -292,7 +292,7 @@ function Restored({ script }: { script: ScriptDraft }) {
   return (
     <p class="notice warn" role="status" data-testid="restored">
       <Age at={now() - Math.max(0, Date.now() - at)} as={texts.editor.restored} />{" "}
-      <button type="button" data-testid="discard-draft" onClick={() => setGiven(script.discard())}>
+      <button type="button" data-testid="discard-draft" onClick={() => setDiscarded(script.discard())}>
         {texts.editor.discard}
       </button>
     </p>
@@ -324,27 +324,27 @@ function ConflictNotice({ script }: { script: ScriptDraft }) {
 }
 
 interface ProblemsProps {
-  places: readonly Place[];
+  marks: readonly TextRange[];
   text: string;
-  onGo: (place: Place) => void;
+  onGo: (mark: TextRange) => void;
 }
 
 /** The findings as a list, for users who cannot see or reach the marks in the text. */
-function Problems({ places, text, onGo }: ProblemsProps) {
+function Problems({ marks, text, onGo }: ProblemsProps) {
   return (
     <section aria-label={texts.editor.problems}>
-      <p class="quiet small" role="status" data-testid="problem-count" data-count={places.length}>
-        {texts.editor.count(places.filter((place) => place.severity === "error").length, places.length)}
+      <p class="quiet small" role="status" data-testid="problem-count" data-count={marks.length}>
+        {texts.editor.count(marks.filter((mark) => mark.severity === "error").length, marks.length)}
       </p>
       <ul class="problems">
-        {places.map((place) => {
-          const line = text.slice(0, place.from).split("\n").length;
+        {marks.map((mark) => {
+          const line = text.slice(0, mark.from).split("\n").length;
           return (
-            <li key={`${place.from}-${place.message}`} class={place.severity} data-testid="problem" data-line={line}>
-              <button type="button" class="plain" onClick={() => onGo(place)}>
+            <li key={`${mark.from}-${mark.message}`} class={mark.severity} data-testid="problem" data-line={line}>
+              <button type="button" class="plain" onClick={() => onGo(mark)}>
                 {texts.editor.line(line)}
               </button>{" "}
-              {place.message}
+              {mark.message}
             </li>
           );
         })}

@@ -11,39 +11,39 @@ import { ConfirmButton } from "../../shared/ui/confirm-button";
 import { movementAddress, typeKeyframesAddress } from "../../shared/routing/routes";
 import "./movements.css";
 
-interface Shelf {
+interface TypeGroup {
   type: RobotTypeEntry;
   movements: readonly Movement[];
 }
 
-type Shelves = { kind: "loading" } | { kind: "there"; items: readonly Shelf[] } | { kind: "failed"; why: string };
+type Groups = { kind: "loading" } | { kind: "loaded"; items: readonly TypeGroup[] } | { kind: "failed"; why: string };
 
 export function LibraryPage({ api, fleet }: { api: Api; fleet: Fleet }) {
-  const [shelves, setShelves] = useState<Shelves>({ kind: "loading" });
-  const [tries, setTries] = useState(0);
+  const [groups, setGroups] = useState<Groups>({ kind: "loading" });
+  const [attempt, setAttempt] = useState(0);
   const [search, setSearch] = useState("");
-  const [told, setTold] = useState("");
+  const [message, setMessage] = useState("");
   useEffect(() => {
-    let wanted = true;
+    let active = true;
     read(api).then(
-      (items) => wanted && setShelves({ kind: "there", items }),
-      (error: unknown) => wanted && setShelves({ kind: "failed", why: sentence(error) }),
+      (items) => active && setGroups({ kind: "loaded", items }),
+      (error: unknown) => active && setGroups({ kind: "failed", why: sentence(error) }),
     );
     return () => {
-      wanted = false;
+      active = false;
     };
-  }, [api, tries]);
+  }, [api, attempt]);
 
   const owned = new Set([...(fleet.devices.value?.values() ?? [])].map(({ info }) => info.value.robot_type));
-  const items = shelves.kind === "there" ? sorted(shelves.items, owned) : [];
+  const items = groups.kind === "loaded" ? sorted(groups.items, owned) : [];
   const shown = items
-    .map((shelf) => ({ ...shelf, movements: shelf.movements.filter((movement) => fits(shelf, movement, search)) }))
+    .map((group) => ({ ...group, movements: group.movements.filter((movement) => matches(group, movement, search)) }))
     .filter(({ movements }) => movements.length > 0 || search === "");
   return (
     <main class="page library" id="content">
       <h1>{texts.library.title}</h1>
       <p class="quiet">{texts.library.explain}</p>
-      {shelves.kind === "there" && <NewMovement shelves={items} />}
+      {groups.kind === "loaded" && <NewMovement groups={items} />}
       <div class="row-form">
         <label for="movement-search">{texts.library.search}</label>
         <div class="row">
@@ -58,30 +58,30 @@ export function LibraryPage({ api, fleet }: { api: Api; fleet: Fleet }) {
         </div>
       </div>
       <p class="field-note" role="status">
-        {told}
+        {message}
       </p>
-      {shelves.kind === "loading" && (
+      {groups.kind === "loading" && (
         <p class="quiet" role="status">
           {common.loading}
         </p>
       )}
-      {shelves.kind === "failed" && (
+      {groups.kind === "failed" && (
         <p class="notice bad" role="alert">
-          {texts.movements.failed(shelves.why)}{" "}
-          <button type="button" onClick={() => setTries(tries + 1)}>
+          {texts.movements.failed(groups.why)}{" "}
+          <button type="button" onClick={() => setAttempt(attempt + 1)}>
             {texts.movements.retry}
           </button>
         </p>
       )}
-      {shelves.kind === "there" && shown.length === 0 && <p class="quiet">{texts.library.nothing}</p>}
-      {shown.map((shelf) => (
-        <TypeShelf
-          key={shelf.type.type}
+      {groups.kind === "loaded" && shown.length === 0 && <p class="quiet">{texts.library.noMatches}</p>}
+      {shown.map((group) => (
+        <GroupCard
+          key={group.type.type}
           api={api}
-          shelf={shelf}
+          group={group}
           onRemoved={(name) => {
-            setTold(texts.library.removed(name));
-            setTries(tries + 1);
+            setMessage(texts.library.removed(name));
+            setAttempt(attempt + 1);
           }}
         />
       ))}
@@ -89,36 +89,36 @@ export function LibraryPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   );
 }
 
-async function read(api: Api): Promise<Shelf[]> {
+async function read(api: Api): Promise<TypeGroup[]> {
   const types = (await api.library.robotTypes()).filter(({ state }) => state === "ready");
   return Promise.all(types.map(async (type) => ({ type, movements: await api.library.list(type.type) })));
 }
 
 /** Types of own robots first. */
-function sorted(shelves: readonly Shelf[], owned: ReadonlySet<string>): Shelf[] {
-  const rank = ({ type }: Shelf): number => (owned.has(type.type) ? 0 : 1);
-  return shelves.toSorted((a, b) => rank(a) - rank(b) || a.type.label.localeCompare(b.type.label));
+function sorted(groups: readonly TypeGroup[], owned: ReadonlySet<string>): TypeGroup[] {
+  const rank = ({ type }: TypeGroup): number => (owned.has(type.type) ? 0 : 1);
+  return groups.toSorted((a, b) => rank(a) - rank(b) || a.type.label.localeCompare(b.type.label));
 }
 
-function fits({ type }: Shelf, { name, description }: Movement, search: string): boolean {
+function matches({ type }: TypeGroup, { name, description }: Movement, search: string): boolean {
   const text = [name, description, type.label, type.type].join(" ").toLowerCase().replaceAll("_", " ");
   return search.toLowerCase().replaceAll("_", " ").split(/\s+/).every((word) => text.includes(word));
 }
 
-interface TypeShelfProps {
+interface GroupCardProps {
   api: Api;
-  shelf: Shelf;
+  group: TypeGroup;
   onRemoved: (name: string) => void;
 }
 
-function TypeShelf({ api, shelf, onRemoved }: TypeShelfProps) {
-  const { type, movements } = shelf;
+function GroupCard({ api, group, onRemoved }: GroupCardProps) {
+  const { type, movements } = group;
   return (
     <Card title={type.label} aside={<span class="quiet small">{texts.library.count(movements.length)}</span>}>
       {movements.length === 0 && <p class="quiet">{texts.movements.none}</p>}
       <ul class="movement-list">
         {movements.map((movement) => (
-          <li key={movement.name} data-testid={`shelf-${type.type}-${movement.name}`}>
+          <li key={movement.name} data-testid={`movement-entry-${type.type}-${movement.name}`}>
             <span class="movement-name">
               <a href={movementAddress(type.type, movement.name)}>
                 <strong>{movement.name}</strong>
@@ -153,28 +153,28 @@ function TypeShelf({ api, shelf, onRemoved }: TypeShelfProps) {
   );
 }
 
-function NewMovement({ shelves }: { shelves: readonly Shelf[] }) {
+function NewMovement({ groups }: { groups: readonly TypeGroup[] }) {
   const id = useId();
-  const [type, setType] = useState(shelves[0]?.type.type ?? "");
+  const [type, setType] = useState(groups[0]?.type.type ?? "");
   const [name, setName] = useState("");
-  const [wrong, setWrong] = useState("");
-  const begin = (event: Event): void => {
+  const [error, setError] = useState("");
+  const submit = (event: Event): void => {
     event.preventDefault();
-    const there = shelves.find((shelf) => shelf.type.type === type)?.movements.some((each) => each.name === name);
-    const why = !/^[A-Za-z0-9_-]{1,64}$/.test(name) ? texts.library.badName : there === true ? texts.library.taken : "";
-    setWrong(why);
+    const exists = groups.find((group) => group.type.type === type)?.movements.some((each) => each.name === name);
+    const why = !/^[A-Za-z0-9_-]{1,64}$/.test(name) ? texts.library.badName : exists === true ? texts.library.nameExists : "";
+    setError(why);
     if (why === "") location.hash = movementAddress(type, name);
   };
   return (
-    <form class="new-movement" onSubmit={begin}>
+    <form class="new-movement" onSubmit={submit}>
       <h2>{texts.library.create}</h2>
       <div class="row">
         <span class="field">
           <label for={`${id}-type`}>{texts.library.robotType}</label>
           <select id={`${id}-type`} data-testid="new-type" value={type} onChange={(event) => setType(event.currentTarget.value)}>
-            {shelves.map((shelf) => (
-              <option key={shelf.type.type} value={shelf.type.type}>
-                {shelf.type.label}
+            {groups.map((group) => (
+              <option key={group.type.type} value={group.type.type}>
+                {group.type.label}
               </option>
             ))}
           </select>
@@ -187,21 +187,21 @@ function NewMovement({ shelves }: { shelves: readonly Shelf[] }) {
             data-testid="new-name"
             autocomplete="off"
             placeholder={texts.library.nameExample}
-            aria-invalid={wrong !== ""}
+            aria-invalid={error !== ""}
             aria-describedby={`${id}-wrong`}
             value={name}
             onInput={(event) => setName(event.currentTarget.value.trim())}
           />
         </span>
         <button type="submit" class="primary" data-testid="new-movement">
-          {texts.library.begin}
+          {texts.library.submit}
         </button>
         <a class="elsewhere" data-testid="new-keyframes" href={typeKeyframesAddress(type)}>
           {texts.library.beginKeyframes}
         </a>
       </div>
       <p id={`${id}-wrong`} class="field-error" role="alert">
-        {wrong}
+        {error}
       </p>
     </form>
   );

@@ -22,26 +22,26 @@ interface MovementsProps {
   account: string;
 }
 
-type Library = { kind: "loading" } | { kind: "there"; items: readonly Movement[] } | { kind: "failed"; why: string };
+type Library = { kind: "loading" } | { kind: "loaded"; items: readonly Movement[] } | { kind: "failed"; why: string };
 
 export function MovementsCard({ api, device, control, actions, account }: MovementsProps) {
   const [library, setLibrary] = useState<Library>({ kind: "loading" });
-  const [tries, setTries] = useState(0);
+  const [attempt, setAttempt] = useState(0);
   const [open, setOpen] = useState("");
   const { id, role, owner, robot_type: robotType } = device.info.value;
-  const watches = role === "viewer";
+  const isViewer = role === "viewer";
   useEffect(() => {
-    if (watches) return undefined;
-    let wanted = true;
+    if (isViewer) return undefined;
+    let active = true;
     setLibrary({ kind: "loading" });
     api.movements(id).then(
-      (items) => wanted && setLibrary({ kind: "there", items }),
-      (error: unknown) => wanted && setLibrary({ kind: "failed", why: sentence(error) }),
+      (items) => active && setLibrary({ kind: "loaded", items }),
+      (error: unknown) => active && setLibrary({ kind: "failed", why: sentence(error) }),
     );
     return () => {
-      wanted = false;
+      active = false;
     };
-  }, [api, id, watches, tries]);
+  }, [api, id, isViewer, attempt]);
 
   const run = actions.run.value;
   const running = (run !== null && !ended(run)) || (device.live.value && device.state.value?.mode === "action");
@@ -50,18 +50,18 @@ export function MovementsCard({ api, device, control, actions, account }: Moveme
     void actions.start({ kind: "run_movement", name, parameters }, control.epoch);
   return (
     <Card title={texts.movements.title} class="movements">
-      {watches && <p class="quiet">{texts.movements.viewer}</p>}
-      {!watches && library.kind === "loading" && <p class="quiet">{common.loading}</p>}
+      {isViewer && <p class="quiet">{texts.movements.viewer}</p>}
+      {!isViewer && library.kind === "loading" && <p class="quiet">{common.loading}</p>}
       {library.kind === "failed" && (
         <p class="notice bad">
           {texts.movements.failed(library.why)}{" "}
-          <button type="button" onClick={() => setTries(tries + 1)}>
+          <button type="button" onClick={() => setAttempt(attempt + 1)}>
             {texts.movements.retry}
           </button>
         </p>
       )}
-      {library.kind === "there" && library.items.length === 0 && <p class="quiet">{texts.movements.none}</p>}
-      {library.kind === "there" && (
+      {library.kind === "loaded" && library.items.length === 0 && <p class="quiet">{texts.movements.none}</p>}
+      {library.kind === "loaded" && (
         <ul class="movement-list">
           {library.items.map((movement) => (
             <Row
@@ -96,9 +96,9 @@ interface RowProps {
 
 function Row({ movement, robotType, account, address, blocked, open, onOpen, onRun }: RowProps) {
   const { name, description, built_in: builtIn, parameters_schema: schema } = movement;
-  const takes = Object.keys(schema?.properties ?? {}).length > 0;
+  const hasParameters = Object.keys(schema?.properties ?? {}).length > 0;
   // Required parameters have no default.
-  const must = (schema?.required ?? []).length > 0;
+  const hasRequired = (schema?.required ?? []).length > 0;
   return (
     <li class={open ? "open" : ""}>
       <span>
@@ -107,7 +107,7 @@ function Row({ movement, robotType, account, address, blocked, open, onOpen, onR
         <span class="quiet small">{description}</span>
       </span>
       <span class="row">
-        {takes && (
+        {hasParameters && (
           <button
             type="button"
             class="plain"
@@ -125,8 +125,8 @@ function Row({ movement, robotType, account, address, blocked, open, onOpen, onR
             data-testid={`movement-${name}`}
             aria-label={texts.movements.runNamed(name)}
             disabled={blocked}
-            title={takes ? texts.parameters.withDefaults : undefined}
-            onClick={() => (must ? onOpen() : onRun({}))}
+            title={hasParameters ? texts.parameters.withDefaults : undefined}
+            onClick={() => (hasRequired ? onOpen() : onRun({}))}
           >
             {texts.movements.run}
           </button>
@@ -154,7 +154,7 @@ function Form({ name, robotType, account, movement, blocked, onRun }: FormProps)
       data-testid="parameter-form"
       onSubmit={(event) => {
         event.preventDefault();
-        const parameters = values.take();
+        const parameters = values.submit();
         if (parameters !== null) onRun(parameters);
       }}
     >

@@ -2,19 +2,19 @@
 import { useId, useMemo, useState } from "preact/hooks";
 import { storedParameters } from "../../shared/lib/local-storage";
 import type { ObjectSchema, Parameters } from "../../shared/api/movement-library";
-import { fieldsOf, fill, read, type Field, type Filled, type Wrong } from "./model/parameter-form";
+import { fieldsOf, initialTexts, read, type Field, type FieldTexts, type FieldError } from "./model/parameter-form";
 import { texts } from "./texts";
 import { storage } from "../../shared/hooks/browser-storage";
 
 interface ParameterValues {
   fields: readonly Field[];
-  filled: Filled;
-  wrong: Readonly<Record<string, Wrong>>;
+  filled: FieldTexts;
+  error: Readonly<Record<string, FieldError>>;
   set: (name: string, text: string) => void;
   /** Restores the defaults. */
   reset: () => void;
   /** Returns the values and stores them as last used; `null` if one is invalid, which is shown from then on. */
-  take: () => Parameters | null;
+  submit: () => Parameters | null;
 }
 
 /** The parameter values of one movement, initially those used last. */
@@ -26,25 +26,25 @@ export function useParameters(
 ): ParameterValues {
   const shape = JSON.stringify(schema);
   const fields = useMemo(() => fieldsOf(JSON.parse(shape) as ObjectSchema | null), [shape]);
-  const kept = useMemo(() => storedParameters(storage(), account, robotType, movement), [account, robotType, movement]);
-  const [typed, setTyped] = useState<Filled>({});
-  const [asked, setAsked] = useState(false);
-  const start = useMemo(() => fill(fields, kept.read() ?? {}), [fields, kept]);
+  const stored = useMemo(() => storedParameters(storage(), account, robotType, movement), [account, robotType, movement]);
+  const [typed, setTyped] = useState<FieldTexts>({});
+  const [submitted, setSubmitted] = useState(false);
+  const start = useMemo(() => initialTexts(fields, stored.read() ?? {}), [fields, stored]);
   const filled = { ...start, ...typed };
-  const { values, wrong } = read(fields, filled);
+  const { values, errors } = read(fields, filled);
   return {
     fields,
     filled,
-    wrong: asked ? wrong : Object.fromEntries(Object.entries(wrong).filter(([name]) => name in typed)),
+    error: submitted ? errors : Object.fromEntries(Object.entries(errors).filter(([name]) => name in typed)),
     set: (name, text) => setTyped({ ...typed, [name]: text }),
     reset: () => {
-      setTyped(fill(fields));
-      setAsked(false);
+      setTyped(initialTexts(fields));
+      setSubmitted(false);
     },
-    take: () => {
-      setAsked(true);
-      if (Object.keys(wrong).length > 0) return null;
-      if (fields.length > 0) kept.write(values);
+    submit: () => {
+      setSubmitted(true);
+      if (Object.keys(errors).length > 0) return null;
+      if (fields.length > 0) stored.write(values);
       return values;
     },
   };
@@ -59,7 +59,7 @@ export function ParameterFields({ values, disabled }: { values: ParameterValues;
           key={field.name}
           field={field}
           text={values.filled[field.name] ?? ""}
-          wrong={values.wrong[field.name] ?? null}
+          error={values.error[field.name] ?? null}
           disabled={disabled ?? false}
           onText={(text) => values.set(field.name, text)}
         />
@@ -71,22 +71,22 @@ export function ParameterFields({ values, disabled }: { values: ParameterValues;
 interface ParameterFieldProps {
   field: Field;
   text: string;
-  wrong: Wrong | null;
+  error: FieldError | null;
   disabled: boolean;
   onText: (text: string) => void;
 }
 
-function ParameterField({ field, text, wrong, disabled, onText }: ParameterFieldProps) {
+function ParameterField({ field, text, error, disabled, onText }: ParameterFieldProps) {
   const id = useId();
-  const said = {
+  const attributes = {
     id,
     disabled,
-    "aria-invalid": wrong !== null,
+    "aria-invalid": error !== null,
     "aria-describedby": `${id}-note`,
     "data-testid": `parameter-${field.name}`,
   };
   const onInput = (event: { currentTarget: { value: string } }): void => onText(event.currentTarget.value);
-  const range = texts.parameters.range(field.least, field.most, field.unit);
+  const range = texts.parameters.range(field.min, field.max, field.unit);
   return (
     <div class={`field ${field.kind === "yes-no" ? "yes-no" : ""}`}>
       <label for={id}>
@@ -99,12 +99,12 @@ function ParameterField({ field, text, wrong, disabled, onText }: ParameterField
       {field.kind === "yes-no" ? (
         <input
           type="checkbox"
-          {...said}
+          {...attributes}
           checked={text === "true"}
           onChange={(event) => onText(String(event.currentTarget.checked))}
         />
       ) : field.kind === "choice" ? (
-        <select {...said} value={text} onChange={onInput}>
+        <select {...attributes} value={text} onChange={onInput}>
           {text === "" && <option value="">{texts.parameters.choose}</option>}
           {field.choices.map((choice) => (
             <option key={choice} value={choice}>
@@ -115,17 +115,17 @@ function ParameterField({ field, text, wrong, disabled, onText }: ParameterField
       ) : (
         <input
           type="text"
-          {...said}
+          {...attributes}
           inputMode={field.kind === "number" || field.kind === "integer" ? "decimal" : undefined}
           autocomplete="off"
           value={text}
           onInput={onInput}
         />
       )}
-      <p id={`${id}-note`} class={wrong === null ? "quiet small" : "field-error"}>
-        {wrong === null
-          ? [field.description, range, texts.parameters.how[field.kind]].filter((one) => one !== "").join(" · ")
-          : texts.parameters.wrong(wrong, field.unit)}
+      <p id={`${id}-note`} class={error === null ? "quiet small" : "field-error"}>
+        {error === null
+          ? [field.description, range, texts.parameters.hints[field.kind]].filter((one) => one !== "").join(" · ")
+          : texts.parameters.error(error, field.unit)}
       </p>
     </div>
   );

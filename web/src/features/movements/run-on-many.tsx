@@ -20,8 +20,8 @@ export function robotsOf(fleet: Fleet, robotType: string, account: string): { ow
   const all = [...(fleet.devices.value?.values() ?? [])].filter(
     ({ info }) => info.value.robot_type === robotType && info.value.role !== "viewer",
   );
-  const mine = ({ info }: DeviceStore): boolean => info.value.owner.id === account;
-  return { own: all.filter(mine), others: all.filter((device) => !mine(device)) };
+  const isOwn = ({ info }: DeviceStore): boolean => info.value.owner.id === account;
+  return { own: all.filter(isOwn), others: all.filter((device) => !isOwn(device)) };
 }
 
 /** Always visible while robots are selected: one button, or one key, stops all of them. */
@@ -68,8 +68,8 @@ interface RunPanelProps {
   movement: string;
   schema: ObjectSchema | null;
   sessions: readonly DeviceSession[];
-  chosen: readonly string[];
-  onChoose: (chosen: readonly string[]) => void;
+  selected: readonly string[];
+  onSelect: (chosen: readonly string[]) => void;
   /** Whether the text must be saved before running. */
   unsaved: boolean;
   /** Saves the text; returns whether it is saved. */
@@ -77,30 +77,30 @@ interface RunPanelProps {
 }
 
 export function RunPanel(props: RunPanelProps) {
-  const { api, fleet, account, robotType, movement, schema, sessions, chosen, onChoose, unsaved, beforeRun } = props;
-  const [asking, setAsking] = useState(false);
-  const [why, setWhy] = useState("");
+  const { api, fleet, account, robotType, movement, schema, sessions, selected, onSelect, unsaved, beforeRun } = props;
+  const [starting, setStarting] = useState(false);
+  const [error, setError] = useState("");
   const values = useParameters(account.id, robotType, movement, schema);
   const { own, others } = robotsOf(fleet, robotType, account.id);
-  const running = asking || sessions.some(({ actions }) => isRunning(actions.run.value));
-  const here = own.map(({ id }) => id).join(" ");
+  const running = starting || sessions.some(({ actions }) => isRunning(actions.run.value));
+  const ownIds = own.map(({ id }) => id).join(" ");
 
   // Deselect removed robots. No robot is preselected: with a selection, Escape is Stop even in the editor.
   useEffect(() => {
-    const ids = here.split(" ");
-    const next = chosen.filter((id) => ids.includes(id));
-    if (next.length < chosen.length) onChoose(next);
-  }, [here]);
+    const ids = ownIds.split(" ");
+    const next = selected.filter((id) => ids.includes(id));
+    if (next.length < selected.length) onSelect(next);
+  }, [ownIds]);
 
   const run = async (): Promise<void> => {
-    const parameters = values.take();
-    setWhy(parameters === null ? texts.parameters.mend : "");
+    const parameters = values.submit();
+    setError(parameters === null ? texts.parameters.fixErrors : "");
     if (parameters === null) return;
-    setAsking(true);
+    setStarting(true);
     try {
       if (!unsaved || (await beforeRun())) await start(api, sessions, movement, parameters);
     } finally {
-      setAsking(false);
+      setStarting(false);
     }
   };
 
@@ -114,9 +114,9 @@ export function RunPanel(props: RunPanelProps) {
             <input
               type="checkbox"
               data-testid={`choose-${device.info.value.name}`}
-              checked={chosen.includes(device.id)}
+              checked={selected.includes(device.id)}
               onChange={(event) =>
-                onChoose(event.currentTarget.checked ? [...chosen, device.id] : chosen.filter((id) => id !== device.id))
+                onSelect(event.currentTarget.checked ? [...selected, device.id] : selected.filter((id) => id !== device.id))
               }
             />
             <span>
@@ -126,7 +126,7 @@ export function RunPanel(props: RunPanelProps) {
           </label>
         ))}
         {own.length > 1 && (
-          <button type="button" class="plain" onClick={() => onChoose(own.map(({ id }) => id))}>
+          <button type="button" class="plain" onClick={() => onSelect(own.map(({ id }) => id))}>
             {texts.many.chooseAll}
           </button>
         )}
@@ -143,7 +143,7 @@ export function RunPanel(props: RunPanelProps) {
         <ParameterFields values={values} disabled={running} />
         <div class="row">
           <button type="submit" class="primary" data-testid="run-many" disabled={running || sessions.length === 0}>
-            {asking ? texts.many.asking : unsaved ? texts.many.saveAndRun(sessions.length) : texts.many.run(sessions.length)}
+            {starting ? texts.many.starting : unsaved ? texts.many.saveAndRun(sessions.length) : texts.many.run(sessions.length)}
           </button>
           {values.fields.length > 0 && (
             <button type="button" class="plain" disabled={running} onClick={values.reset}>
@@ -152,7 +152,7 @@ export function RunPanel(props: RunPanelProps) {
           )}
         </div>
         <p class="field-error" role="alert">
-          {why}
+          {error}
         </p>
       </form>
       <ul class="run-rows" aria-label={texts.many.rows}>
@@ -171,12 +171,12 @@ async function start(api: Api, sessions: readonly DeviceSession[], movement: str
     sessions.flatMap(({ device, control }) => (control.epoch === null ? [] : [[device.id, control.epoch]])),
   );
   const ids = sessions.map(({ device }) => device.id);
-  const asked = api.library.runOnMany(ids, movement, parameters, epochs, newId());
+  const results = api.library.runOnMany(ids, movement, parameters, epochs, newId());
   await Promise.all(
     sessions.map(({ device, actions }) =>
       actions.follow(
         request,
-        asked.then((items) => {
+        results.then((items) => {
           const item = items.find((each) => each.device === device.id);
           if (item?.action === null || item === undefined) {
             throw new ApiError(item?.status ?? 500, "refused", item?.problem?.detail ?? texts.many.noAnswer);
@@ -192,7 +192,7 @@ function RunRow({ session }: { session: DeviceSession }) {
   const { device, control, stop, actions } = session;
   const run = actions.run.value;
   const { label, name } = device.info.value;
-  const no = isRunning(run) ? "" : actionUnavailableReason(device, control);
+  const unavailable = isRunning(run) ? "" : actionUnavailableReason(device, control);
   return (
     <li class="run-row" data-testid={`run-${name}`} data-status={run?.status ?? ""}>
       <div class="row">
@@ -211,7 +211,7 @@ function RunRow({ session }: { session: DeviceSession }) {
       </div>
       <div class={`run run-${run?.status ?? "none"}`} role="status">
         {run !== null && <RunSteps run={run} />}
-        {run === null && no !== "" && <p class="quiet">{no}</p>}
+        {run === null && unavailable !== "" && <p class="quiet">{unavailable}</p>}
       </div>
       {run !== null && run.output !== "" && (
         <pre class="output" tabIndex={0} aria-label={texts.many.outputOf(`${label} ${name}`)}>

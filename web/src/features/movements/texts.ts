@@ -1,4 +1,4 @@
-import type { FieldKind, Wrong } from "./model/parameter-form";
+import type { FieldKind, FieldError } from "./model/parameter-form";
 import { format } from "../../shared/i18n/format";
 
 export const texts = {
@@ -7,7 +7,7 @@ export const texts = {
     explain: "Scripts that a robot runs on its own: built-in ones and your own. Open one to view, edit or run it.",
     search: "Search",
     searchExample: "Name, description or robot type",
-    nothing: "No movements match your search.",
+    noMatches: "No movements match your search.",
     count: (count: number): string => format.count(count, "movement"),
     builtIn: "built-in",
     own: "own",
@@ -25,9 +25,9 @@ export const texts = {
     name: "Name",
     nameExample: "bow_twice",
     beginKeyframes: "Create with keyframes",
-    begin: "Create script",
+    submit: "Create script",
     badName: "Use unaccented letters, digits, _ and -, without spaces; at most 64 characters.",
-    taken: "This robot type already has a movement with this name.",
+    nameExists: "This robot type already has a movement with this name.",
     /** The script of a new movement. */
     template: `"""Describe the movement in one line."""
 
@@ -53,7 +53,7 @@ print("done")
     save: "Save",
     saving: "Saving…",
     asKeyframes: "Edit as keyframes",
-    isNew: "New: not saved",
+    unsaved: "New: not saved",
     changed: (version: number): string => `Changed since version ${version}`,
     isSaved: (version: number, builtIn: boolean): string => (builtIn ? `Version ${version}, built-in` : `Saved as version ${version}`),
     failed: (reason: string): string => `The movement failed to load: ${reason}`,
@@ -61,14 +61,14 @@ print("done")
     restored: (age: string): string => `Unsaved draft from ${age} restored.`,
     discard: "Discard draft",
     discarded: "Draft discarded. Showing the saved text.",
-    bringBack: "Undo",
+    undo: "Undo",
     deleted: "Not saved: the movement was deleted in the meantime. Your text is still here.",
     conflict: (version: number, at: string): string =>
       `Not saved: version ${version} was saved in the meantime, on ${format.dateTime(at)}. Below is your text with the differences.`,
     bothLabel: (version: number): string => `Your text, compared with version ${version}`,
     saveMine: "Save mine as the newest version",
     takeTheirs: (version: number): string => `Continue with version ${version}`,
-    unchecked: (reason: string): string => `The script check failed: ${reason}`,
+    checkError: (reason: string): string => `The script check failed: ${reason}`,
     problems: "Problems",
     count: (errors: number, all: number): string => {
       if (all === 0) return "No problems found.";
@@ -85,8 +85,8 @@ print("done")
   versions: {
     title: "Versions",
     one: (version: number): string => `Version ${version}`,
-    look: "View",
-    lookAt: (version: number): string => `View version ${version}`,
+    view: "View",
+    viewVersion: (version: number): string => `View version ${version}`,
     close: "Close",
     closeOf: (version: number): string => `Close version ${version}`,
     same: (version: number): string => `Version ${version} is identical to the text in the editor.`,
@@ -103,14 +103,14 @@ print("done")
     reset: "Reset to defaults",
     optional: "(optional)",
     choose: "Choose…",
-    mend: "Correct the errors above first.",
+    fixErrors: "Correct the errors above first.",
     range: (least: number | null, most: number | null, unit: string): string => {
       const of = (value: number): string => `${value}${unit.startsWith("°") || unit === "" ? unit : ` ${unit}`}`;
       if (least !== null && most !== null) return `${of(least)} to ${of(most)}`;
       if (least !== null) return `at least ${of(least)}`;
       return most === null ? "" : `at most ${of(most)}`;
     },
-    how: {
+    hints: {
       number: "",
       integer: "an integer",
       text: "",
@@ -119,7 +119,7 @@ print("done")
       list: "numbers, separated by spaces",
       json: "as JSON",
     } satisfies Record<FieldKind, string>,
-    wrong: (wrong: Wrong, unit: string): string => {
+    error: (wrong: FieldError, unit: string): string => {
       const limit = "limit" in wrong ? `${wrong.limit} ${unit}`.trim() : "";
       switch (wrong.kind) {
         case "missing":
@@ -162,7 +162,7 @@ print("done")
     running: (count: number, all: number): string => (all === 1 ? "Running" : `Running on ${count} of ${all} robots`),
     run: (count: number): string => (count < 2 ? "Run" : `Run on ${count} robots`),
     saveAndRun: (count: number): string => (count < 2 ? "Save and run" : `Save and run on ${count} robots`),
-    asking: "Starting…",
+    starting: "Starting…",
     rows: "Results",
     cancelAll: "Cancel all",
     stop: "Stop",

@@ -23,7 +23,7 @@ interface VersionsProps {
   api: Api;
   robotType: string;
   name: string;
-  /** The newest known version; the list is reloaded when it changes. */
+  /** The newest version; the list is reloaded when it changes. */
   newest: number;
   text: string;
   onRestore: (source: string) => Promise<void>;
@@ -31,36 +31,36 @@ interface VersionsProps {
 
 export function VersionList({ api, robotType, name, newest, text, onRestore }: VersionsProps) {
   const [versions, setVersions] = useState<readonly Movement[]>([]);
-  const [looked, setLooked] = useState<{ version: number; source: string } | null>(null);
-  const [why, setWhy] = useState("");
+  const [opened, setOpened] = useState<{ version: number; source: string } | null>(null);
+  const [error, setError] = useState("");
   const [working, setWorking] = useState(false);
   useEffect(() => {
-    let wanted = true;
-    setLooked(null);
+    let active = true;
+    setOpened(null);
     if (newest === 0) return undefined;
     api.library.versions(robotType, name).then(
-      (found) => wanted && setVersions(found),
-      (error: unknown) => wanted && setWhy(sentence(error)),
+      (found) => active && setVersions(found),
+      (error: unknown) => active && setError(sentence(error)),
     );
     return () => {
-      wanted = false;
+      active = false;
     };
   }, [api, robotType, name, newest]);
 
   const attempt = async (work: () => Promise<void>): Promise<void> => {
     setWorking(true);
-    setWhy("");
+    setError("");
     try {
       await work();
     } catch (error) {
-      setWhy(sentence(error));
+      setError(sentence(error));
     } finally {
       setWorking(false);
     }
   };
-  const look = (version: number): Promise<void> =>
+  const open = (version: number): Promise<void> =>
     attempt(async () => {
-      setLooked({ version, source: (await api.library.get(robotType, name, version)).source });
+      setOpened({ version, source: (await api.library.get(robotType, name, version)).source });
     });
 
   if (newest === 0) return null;
@@ -78,33 +78,33 @@ export function VersionList({ api, robotType, name, newest, text, onRestore }: V
             <button
               type="button"
               class="plain"
-              aria-expanded={looked?.version === version.version}
-              aria-label={looked?.version === version.version ? texts.versions.closeOf(version.version) : texts.versions.lookAt(version.version)}
+              aria-expanded={opened?.version === version.version}
+              aria-label={opened?.version === version.version ? texts.versions.closeOf(version.version) : texts.versions.viewVersion(version.version)}
               disabled={working}
-              onClick={() => (looked?.version === version.version ? setLooked(null) : void look(version.version))}
+              onClick={() => (opened?.version === version.version ? setOpened(null) : void open(version.version))}
             >
-              {looked?.version === version.version ? texts.versions.close : texts.versions.look}
+              {opened?.version === version.version ? texts.versions.close : texts.versions.view}
             </button>
           </li>
         ))}
       </ul>
       <p class="field-error" role="alert">
-        {why}
+        {error}
       </p>
-      {looked !== null && (
-        <section class="looked" aria-label={texts.versions.one(looked.version)}>
+      {opened !== null && (
+        <section class="opened-version" aria-label={texts.versions.one(opened.version)}>
           <p class="quiet small">
-            {looked.source === text ? texts.versions.same(looked.version) : texts.versions.explain(looked.version)}
+            {opened.source === text ? texts.versions.same(opened.version) : texts.versions.explain(opened.version)}
           </p>
-          <ScriptDiff before={looked.source} after={text} label={texts.versions.label(looked.version)} />
-          {looked.source !== text && (
+          <ScriptDiff before={opened.source} after={text} label={texts.versions.label(opened.version)} />
+          {opened.source !== text && (
             <button
               type="button"
               data-testid="restore-version"
               disabled={working}
-              onClick={() => void attempt(() => onRestore(looked.source))}
+              onClick={() => void attempt(() => onRestore(opened.source))}
             >
-              {working ? texts.editor.saving : texts.versions.restore(looked.version)}
+              {working ? texts.editor.saving : texts.versions.restore(opened.version)}
             </button>
           )}
         </section>

@@ -21,7 +21,7 @@ function atRest(joint: Joint): number {
 export function ModelViewer({ twin, joints }: ModelViewProps) {
   const rest = Object.fromEntries(joints.map((joint) => [joint.name, atRest(joint)]));
   const [pose, setPose] = useState<Readonly<Record<string, number>>>(rest);
-  const { canvas, box, scene, said } = useScene(twin);
+  const { canvas, box, scene, errorText } = useScene(twin);
   useEffect(() => scene?.show(pose, null), [scene, pose]);
   const words = texts.model;
   return (
@@ -41,7 +41,7 @@ export function ModelViewer({ twin, joints }: ModelViewProps) {
     >
       <div ref={box} class="canvas-box" data-testid="model-view" data-frames="0">
         <canvas key={twin} ref={canvas} aria-label={words.label} role="img" />
-        {said !== "" && <p class="over notice">{said}</p>}
+        {errorText !== "" && <p class="over notice">{errorText}</p>}
       </div>
       <p class="quiet small">{words.explained}</p>
       <ul class="model-joints" aria-label={words.joints}>

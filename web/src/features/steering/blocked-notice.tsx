@@ -15,13 +15,13 @@ export function blockedReason(device: DeviceStore, control: Control): string | n
   return null;
 }
 
-interface StreamNoteProps {
+interface BlockedNoticeProps {
   device: DeviceStore;
   streamer: SetpointStreamer | null;
   blocked: string | null;
 }
 
-export function BlockedNotice({ device, streamer, blocked }: StreamNoteProps) {
+export function BlockedNotice({ device, streamer, blocked }: BlockedNoticeProps) {
   const [state, text] = streamText(device, streamer, blocked);
   const limited = state === "streaming" && device.limited.value !== "";
   return (
@@ -37,7 +37,7 @@ function streamText(device: DeviceStore, streamer: SetpointStreamer | null, bloc
   if (state === "waiting") return [state, texts.joints.waiting];
   if (state === "streaming") {
     if (device.limited.value !== "") return [state, texts.joints.limited(device.limited.value)];
-    return [state, streamer.way.value === "joints" ? texts.joints.streaming : texts.steer.holding];
+    return [state, streamer.steeringMode.value === "joints" ? texts.joints.streaming : texts.steer.holding];
   }
   const ended = streamer.ended.value;
   return [state, ended === null ? "" : texts.joints.ended[ended]];

@@ -15,8 +15,8 @@ import type { PanelProps } from "./panel-props";
 import { NumberWithUnit } from "../../shared/ui/number-with-unit";
 
 /** Maximum jog speed [mm/s], from ISO 10218-1 for people near a robot; and rotation [°/s]. */
-const LINEAR_MM_S = { least: 5, most: 250, step: 5, first: 60 };
-const ANGULAR_DEG_S = { least: 1, most: 60, step: 1, first: 15 };
+const LINEAR_MM_S = { min: 5, max: 250, step: 5, initial: 60 };
+const ANGULAR_DEG_S = { min: 1, max: 60, step: 1, initial: 15 };
 
 const AXES = ["x", "y", "z"] as const;
 const TURNS = ["roll", "pitch", "yaw"] as const;
@@ -29,13 +29,13 @@ export function CartesianPanel({ device, streamer, active, pad }: PanelProps) {
   const frames = device.description.value?.frames ?? [];
   const [picked, setPicked] = useState<string | null>(null);
   const [axes, setAxes] = useState<Axes>("base");
-  const [linear, setLinear] = useState(LINEAR_MM_S.first);
-  const [angular, setAngular] = useState(ANGULAR_DEG_S.first);
+  const [linear, setLinear] = useState(LINEAR_MM_S.initial);
+  const [angular, setAngular] = useState(ANGULAR_DEG_S.initial);
   const frame = picked !== null && frames.includes(picked) ? picked : (frames.at(-1) ?? "");
   const speed = { linear_m_s: linear / 1000, angular_rad_s: radians(angular) };
-  const held = usePressedInputs<Direction>(streamer, (parts) => jogOf(sumOf(parts), speed, frame, axes === "tool"));
-  useHeldKeys(active && streamer !== null, held, JOG_KEYS);
-  useGamepadInputs(pad, held, ({ left, right, lift, cross }): Direction => ({
+  const inputs = usePressedInputs<Direction>(streamer, (parts) => jogOf(sumOf(parts), speed, frame, axes === "tool"));
+  useHeldKeys(active && streamer !== null, inputs, JOG_KEYS);
+  useGamepadInputs(pad, inputs, ({ left, right, lift, cross }): Direction => ({
     along: [left[1], -left[0], lift],
     about: [right[0], right[1], -cross[0]],
   }));
@@ -73,7 +73,7 @@ export function CartesianPanel({ device, streamer, active, pad }: PanelProps) {
                 {SIGNS.map((sign) => (
                   <HoldButton
                     key={sign}
-                    held={held}
+                    inputs={inputs}
                     name={`${name}${sign > 0 ? "+" : "-"}`}
                     part={direction(kind, axis as 0 | 1 | 2, sign)}
                     label={texts.steer.pad(name, sign)}
@@ -92,7 +92,7 @@ export function CartesianPanel({ device, streamer, active, pad }: PanelProps) {
         name="linear"
         range={LINEAR_MM_S}
         value={linear}
-        shown={texts.steer.millimetres(linear)}
+        text={texts.steer.millimetres(linear)}
         onChange={setLinear}
       />
       <NumberWithUnit
@@ -100,7 +100,7 @@ export function CartesianPanel({ device, streamer, active, pad }: PanelProps) {
         name="angular"
         range={ANGULAR_DEG_S}
         value={angular}
-        shown={texts.steer.degreesPerSecond(angular)}
+        text={texts.steer.degreesPerSecond(angular)}
         onChange={setAngular}
       />
       <LivePose device={device} frame={frame} />
@@ -113,7 +113,7 @@ function LivePose({ device, frame }: { device: DeviceStore; frame: string }) {
   const index = device.description.value?.frames.indexOf(frame) ?? -1;
   const pose = device.telemetry.value?.message.frames[index];
   const at = pose?.slice(0, 3);
-  const turned = pose === undefined ? undefined : rollPitchYaw(unit([pose[3], pose[4], pose[5], pose[6]])).map(degrees);
+  const rollPitchYawDeg = pose === undefined ? undefined : rollPitchYaw(unit([pose[3], pose[4], pose[5], pose[6]])).map(degrees);
   return (
     <dl
       class={`figures live-pose ${device.live.value ? "" : "old"}`}
@@ -130,7 +130,7 @@ function LivePose({ device, frame }: { device: DeviceStore; frame: string }) {
       {TURNS.map((name, axis) => (
         <div key={name}>
           <dt>{name}</dt>
-          <dd>{turned === undefined ? format.unknown : format.degrees(turned[axis] ?? NaN)}</dd>
+          <dd>{rollPitchYawDeg === undefined ? format.unknown : format.degrees(rollPitchYawDeg[axis] ?? NaN)}</dd>
         </div>
       ))}
     </dl>

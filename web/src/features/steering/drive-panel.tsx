@@ -3,7 +3,7 @@ import { useState } from "preact/hooks";
 import { degrees } from "../../shared/lib/angles";
 import { DRIVE_KEYS } from "./model/keymap";
 import type { BaseLimits } from "../../shared/mqtt/protocol.generated";
-import { AT_REST, driveOf, pushed, type Push } from "./model/steerable-parts";
+import { AT_REST, driveOf, sumOfPushes, type Push } from "./model/steerable-parts";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
@@ -15,22 +15,22 @@ import type { PanelProps } from "./panel-props";
 import { NumberWithUnit } from "../../shared/ui/number-with-unit";
 import { VirtualStick } from "./inputs/virtual-stick";
 
-const PERCENT = { least: 5, most: 100, step: 5, first: 50 };
+const PERCENT = { min: 5, max: 100, step: 5, initial: 50 };
 
 /** Drives the base while a stick, key or gamepad is held. */
 export function DrivePanel({ device, streamer, active, pad }: PanelProps) {
   const limits = device.description.value?.base ?? { forward_m_s: 0, left_m_s: 0, turn_rad_s: 0 };
-  const [percent, setPercent] = useState(PERCENT.first);
-  const held = usePressedInputs<Push>(streamer, (parts) => driveOf(pushed(parts), limits, percent / 100));
-  useHeldKeys(active && streamer !== null, held, DRIVE_KEYS);
-  useGamepadInputs(pad, held, ({ left, right }) => ({ forward: left[1], turn: -left[0], left: -right[0] }));
-  const aside = limits.left_m_s > 0;
+  const [percent, setPercent] = useState(PERCENT.initial);
+  const inputs = usePressedInputs<Push>(streamer, (parts) => driveOf(sumOfPushes(parts), limits, percent / 100));
+  useHeldKeys(active && streamer !== null, inputs, DRIVE_KEYS);
+  useGamepadInputs(pad, inputs, ({ left, right }) => ({ forward: left[1], turn: -left[0], left: -right[0] }));
+  const canMoveSideways = limits.left_m_s > 0;
   return (
     <div class="drive">
       <div class="drive-hands">
-        {aside && (
+        {canMoveSideways && (
           <HoldButton
-            held={held}
+            inputs={inputs}
             name="left"
             part={{ ...AT_REST, left: 1 }}
             label={texts.steer.sideways.left}
@@ -39,10 +39,10 @@ export function DrivePanel({ device, streamer, active, pad }: PanelProps) {
             ←
           </HoldButton>
         )}
-        <VirtualStick held={held} disabled={streamer === null} />
-        {aside && (
+        <VirtualStick inputs={inputs} disabled={streamer === null} />
+        {canMoveSideways && (
           <HoldButton
-            held={held}
+            inputs={inputs}
             name="right"
             part={{ ...AT_REST, left: -1 }}
             label={texts.steer.sideways.right}
@@ -57,7 +57,7 @@ export function DrivePanel({ device, streamer, active, pad }: PanelProps) {
         name="drive"
         range={PERCENT}
         value={percent}
-        shown={texts.steer.driveSpeed((limits.forward_m_s * percent) / 100, degrees((limits.turn_rad_s * percent) / 100))}
+        text={texts.steer.driveSpeed((limits.forward_m_s * percent) / 100, degrees((limits.turn_rad_s * percent) / 100))}
         onChange={setPercent}
       />
       <Velocities device={device} streamer={streamer} limits={limits} />
@@ -77,10 +77,10 @@ interface VelocitiesProps {
 function Velocities({ device, streamer, limits }: VelocitiesProps) {
   const stream = device.description.value?.streams.find(({ name }) => name === "odometry")?.name;
   const measured = stream === undefined ? null : device.measured(stream).value;
-  const asked = streamer?.velocity.value;
+  const target = streamer?.velocity.value;
   const shown = PARTS.filter((part) => limits[part] > 0);
   const values = measured?.message.values ?? {};
-  const measures = shown.some((part) => typeof values[part] === "number");
+  const hasMeasurements = shown.some((part) => typeof values[part] === "number");
   const text = (part: (typeof PARTS)[number], value: unknown): string =>
     typeof value === "number"
       ? part === "turn_rad_s"
@@ -92,16 +92,16 @@ function Velocities({ device, streamer, limits }: VelocitiesProps) {
       <thead>
         <tr>
           <td />
-          <th scope="col">{texts.steer.asked}</th>
-          {measures && <th scope="col">{texts.steer.measured}</th>}
+          <th scope="col">{texts.steer.target}</th>
+          {hasMeasurements && <th scope="col">{texts.steer.measured}</th>}
         </tr>
       </thead>
       <tbody>
         {shown.map((part) => (
           <tr key={part}>
             <th scope="row">{texts.steer.part[part]}</th>
-            <td>{text(part, asked?.kind === "drive" ? asked[part] : 0)}</td>
-            {measures && (
+            <td>{text(part, target?.kind === "drive" ? target[part] : 0)}</td>
+            {hasMeasurements && (
               <td class={stream !== undefined && device.late(stream) ? "old" : "measured"}>{text(part, values[part])}</td>
             )}
           </tr>

@@ -5,7 +5,7 @@ import type { Joint } from "../../shared/mqtt/protocol.generated";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 
-interface JointRowProps {
+interface JointSliderProps {
   joint: Joint;
   /** Target position [rad]; `undefined`: unknown. */
   targetRad: number | undefined;
@@ -16,10 +16,10 @@ interface JointRowProps {
   /** The measurement is out of date. */
   old?: boolean;
   /** Whether keys move this joint. */
-  chosen?: boolean;
+  selected?: boolean;
 }
 
-export function JointSlider({ joint, targetRad, measuredRad, onSet, old = false, chosen = false }: JointRowProps) {
+export function JointSlider({ joint, targetRad, measuredRad, onSet, old = false, selected = false }: JointSliderProps) {
   const measured = measuredRad === undefined ? undefined : degrees(measuredRad);
   const target = targetRad === undefined ? undefined : degrees(targetRad);
   const lower = degrees(joint.lower_rad);
@@ -27,10 +27,10 @@ export function JointSlider({ joint, targetRad, measuredRad, onSet, old = false,
   const set = (deg: number): void => onSet?.(radians(deg));
   return (
     <div
-      class={`joint ${old ? "old" : ""} ${chosen ? "chosen" : ""}`}
+      class={`joint ${old ? "old" : ""} ${selected ? "selected" : ""}`}
       role="group"
       aria-label={joint.label}
-      aria-current={chosen}
+      aria-current={selected}
       data-testid={`joint-${joint.name}`}
     >
       <span class="joint-name">{joint.label}</span>

@@ -24,28 +24,28 @@ const SHOWN_RAD = 1e-5;
 export function JointsPanel({ device, streamer, active, pad }: PanelProps) {
   const description = device.description.value;
   const joints = description?.joints ?? [];
-  const [chosen, setChosen] = useState(0);
+  const [selected, setSelected] = useState(0);
   const rows = useRef<HTMLDivElement>(null);
-  useTurning({ device, streamer, active, pad }, chosen);
+  useJointJog({ device, streamer, active, pad }, selected);
   const telemetry = useFrameSignal(device.telemetry);
 
-  const choose = (index: number): void => {
+  const select = (index: number): void => {
     const next = clamp(index, 0, joints.length - 1);
-    setChosen(next);
+    setSelected(next);
     rows.current?.children[next]?.scrollIntoView({ block: "nearest" });
   };
   useKey(active && joints.length > 0, (event) => {
     const index = jointOfKey(event.code);
-    if (index !== null && index < joints.length) choose(index);
-    else if (event.key === "[") choose(chosen - 1);
-    else if (event.key === "]") choose(chosen + 1);
+    if (index !== null && index < joints.length) select(index);
+    else if (event.key === "[") select(selected - 1);
+    else if (event.key === "]") select(selected + 1);
     else return false;
     return true;
   });
   const cross = useRef(0);
   useSignalEffect(() => {
     const step = pad.reading.value?.cross[1] ?? 0;
-    if (step !== 0 && cross.current === 0) choose(chosen - step);
+    if (step !== 0 && cross.current === 0) select(selected - step);
     cross.current = step;
   });
 
@@ -66,7 +66,7 @@ export function JointsPanel({ device, streamer, active, pad }: PanelProps) {
             device={device}
             telemetry={telemetry}
             streamer={streamer}
-            chosen={active && streamer !== null && index === chosen}
+            selected={active && streamer !== null && index === selected}
           />
         ))}
       </div>
@@ -79,11 +79,11 @@ interface LiveJointProps extends Pick<PanelProps, "device" | "streamer"> {
   joint: Joint;
   index: number;
   telemetry: DeviceStore["telemetry"];
-  chosen: boolean;
+  selected: boolean;
 }
 
-/** Subscribes to telemetry itself, so that the panel does not render at telemetry rate. */
-function LiveJoint({ joint, index, device, telemetry, streamer, chosen }: LiveJointProps) {
+/** Subscribes to telemetry here, so that the panel does not render at telemetry rate. */
+function LiveJoint({ joint, index, device, telemetry, streamer, selected }: LiveJointProps) {
   const measured = useShown(telemetry, (message) => message.position_rad[index]);
   const commanded = useShown(telemetry, (message) => message.commanded_rad[index]);
   return (
@@ -92,7 +92,7 @@ function LiveJoint({ joint, index, device, telemetry, streamer, chosen }: LiveJo
       targetRad={streamer?.targets.value[joint.name] ?? commanded.value}
       measuredRad={measured.value}
       old={!device.live.value}
-      chosen={chosen}
+      selected={selected}
       onSet={streamer === null ? null : (positionRad) => streamer.setTarget(joint.name, positionRad)}
     />
   );
@@ -110,12 +110,12 @@ function useShown(
 }
 
 /** Moves the selected joint while a key or gamepad stick is held; the target leads by a small amount. */
-function useTurning({ device, streamer, active, pad }: PanelProps, chosen: number): void {
-  const amount = useRef(0);
-  const held = useMemo(
+function useJointJog({ device, streamer, active, pad }: PanelProps, selected: number): void {
+  const rate = useRef(0);
+  const inputs = useMemo(
     () =>
       new PressedInputs<number>((parts) => {
-        amount.current = clamp(
+        rate.current = clamp(
           parts.reduce((sum, part) => sum + part, 0),
           -1,
           1,
@@ -124,43 +124,43 @@ function useTurning({ device, streamer, active, pad }: PanelProps, chosen: numbe
     [],
   );
   // Without control, arrow keys scroll the page.
-  useHeldKeys(active && streamer !== null, held, JOINT_KEYS);
-  useGamepadInputs(pad, held, ({ left }) => left[1]);
+  useHeldKeys(active && streamer !== null, inputs, JOINT_KEYS);
+  useGamepadInputs(pad, inputs, ({ left }) => left[1]);
   useEffect(
     () =>
       effect(() => {
-        // As with a velocity, the end of the stream also spends the pressed inputs.
+        // As for a velocity, pressed inputs have no effect after the end of the stream.
         const ended = streamer?.ended.value ?? null;
-        if (streamer === null || (ended !== null && ended !== "reached")) held.releaseAll();
+        if (streamer === null || (ended !== null && ended !== "reached")) inputs.releaseAll();
       }),
-    [held, streamer],
+    [inputs, streamer],
   );
   useEffect(() => {
-    const drop = (): void => held.releaseAll();
-    addEventListener("blur", drop);
-    document.addEventListener("visibilitychange", drop);
+    const releaseInputs = (): void => inputs.releaseAll();
+    addEventListener("blur", releaseInputs);
+    document.addEventListener("visibilitychange", releaseInputs);
     return () => {
-      removeEventListener("blur", drop);
-      document.removeEventListener("visibilitychange", drop);
-      drop();
+      removeEventListener("blur", releaseInputs);
+      document.removeEventListener("visibilitychange", releaseInputs);
+      releaseInputs();
     };
-  }, [held]);
-  const joint = device.description.value?.joints[chosen];
+  }, [inputs]);
+  const joint = device.description.value?.joints[selected];
   useEffect(() => {
     if (streamer === null || joint === undefined) return;
-    held.releaseAll();
+    inputs.releaseAll();
     const timer = setInterval(() => {
-      if (amount.current !== 0) turn(streamer, joint, device.telemetry.peek()?.message.position_rad[chosen]);
+      if (rate.current !== 0) step(streamer, joint, device.telemetry.peek()?.message.position_rad[selected]);
     }, STEP_MS);
-    const turn = (to: SetpointStreamer, one: Joint, measuredRad: number | undefined): void => {
+    const step = (to: SetpointStreamer, one: Joint, measuredRad: number | undefined): void => {
       if (measuredRad === undefined) return;
       to.follow();
-      const target = (to.targets.peek()[one.name] ?? measuredRad) + (amount.current * RATE_RAD_S * STEP_MS) / 1000;
+      const target = (to.targets.peek()[one.name] ?? measuredRad) + (rate.current * RATE_RAD_S * STEP_MS) / 1000;
       to.setTarget(one.name, clamp(target, measuredRad - LEAD_RAD, measuredRad + LEAD_RAD));
     };
     return () => {
       clearInterval(timer);
-      held.releaseAll();
+      inputs.releaseAll();
     };
-  }, [streamer, joint, chosen, device, held]);
+  }, [streamer, joint, selected, device, inputs]);
 }

@@ -1,13 +1,13 @@
 import type { DeviceStore } from "../devices/model";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
-import type { PadWatch } from "./inputs/use-gamepad";
+import type { GamepadState } from "./inputs/use-gamepad";
 
-/** What each way of steering gets. */
+/** Properties of every steering panel. */
 export interface PanelProps {
   device: DeviceStore;
-  /** There while this page may move the robot. */
+  /** `null` while this page cannot move the robot. */
   streamer: SetpointStreamer | null;
-  /** Whether keys and gamepad are this robot's. */
+  /** Whether keyboard and gamepad control this robot. */
   active: boolean;
-  pad: PadWatch;
+  pad: GamepadState;
 }

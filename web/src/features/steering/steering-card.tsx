@@ -1,4 +1,4 @@
-/** What moves a robot by hand, in the ways that its description names: joints, a frame, the base. */
+/** Manual steering of a robot in the modes that its description supports: joints, a frame, the base. */
 import type { DeviceSession } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { useId, useRef, useState } from "preact/hooks";
@@ -7,7 +7,7 @@ import { steeringModesOf, type SteeringMode } from "./model/steerable-parts";
 import { texts } from "./texts";
 import { BlockedNotice, blockedReason } from "./blocked-notice";
 import { DrivePanel } from "./drive-panel";
-import { useGamepad, type PadNews } from "./inputs/use-gamepad";
+import { useGamepad, type GamepadNotice } from "./inputs/use-gamepad";
 import { CartesianPanel } from "./cartesian-panel";
 import { JointsPanel } from "./joints-panel";
 import { KeyboardHelp, useKey } from "./inputs/keyboard-help";
@@ -20,59 +20,59 @@ const PANELS: Readonly<Record<SteeringMode, ComponentType<PanelProps>>> = {
   drive: DrivePanel,
 };
 
-interface SteerCardProps {
+interface SteeringCardProps {
   session: DeviceSession;
-  /** Whether keys and gamepad are this robot's: of several, one. */
+  /** Whether keyboard and gamepad control this robot. On a page with several robots only one is active. */
   active?: boolean;
-  /** What the gamepad's button for it stops. */
+  /** Called for the gamepad's Stop button. */
   onStop: () => void;
 }
 
-export function SteeringCard({ session, active = true, onStop }: SteerCardProps) {
+export function SteeringCard({ session, active = true, onStop }: SteeringCardProps) {
   const { device, control } = session;
-  const ways = steeringModesOf(device.description.value);
+  const modes = steeringModesOf(device.description.value);
   const [picked, setPicked] = useState<SteeringMode>("joints");
-  const [keysShown, setKeysShown] = useState(false);
+  const [helpShown, setHelpShown] = useState(false);
   const id = useId();
-  const way = ways.includes(picked) ? picked : (ways[0] ?? "joints");
+  const mode = modes.includes(picked) ? picked : (modes[0] ?? "joints");
   const blocked = blockedReason(device, control);
   const streamer = blocked === null ? control.streamer.value : null;
   const pad = useGamepad(active, onStop);
   useKey(active, (event) => {
     if (event.repeat) return false;
-    if (event.key === "?") setKeysShown(!keysShown);
+    if (event.key === "?") setHelpShown(!helpShown);
     else if (event.code === "KeyT") takeOrRelease(session);
     else return false;
     return true;
   });
-  const Panel = PANELS[way];
+  const Panel = PANELS[mode];
   return (
     <Card
-      title={ways.length > 1 ? texts.steer.title : texts.joints.title}
+      title={modes.length > 1 ? texts.steer.title : texts.joints.title}
       class="joints steer"
       data-testid="steer-card"
       aside={<BlockedNotice device={device} streamer={control.streamer.value} blocked={blocked} />}
     >
       <div class="steer-top">
-        {ways.length > 1 && <Tabs ways={ways} way={way} id={id} onChange={setPicked} />}
+        {modes.length > 1 && <Tabs modes={modes} mode={mode} id={id} onChange={setPicked} />}
         <button
           type="button"
           class="plain"
           data-testid="show-keys"
-          aria-expanded={keysShown}
-          onClick={() => setKeysShown(!keysShown)}
+          aria-expanded={helpShown}
+          onClick={() => setHelpShown(!helpShown)}
         >
           {texts.steer.showKeys} <kbd>?</kbd>
         </button>
       </div>
       <p class="pad-news small quiet" role="status" data-testid="gamepad">
-        {news(pad.news.value)}
+        {noticeText(pad.notice.value)}
       </p>
-      {keysShown && <KeyboardHelp way={way} />}
+      {helpShown && <KeyboardHelp mode={mode} />}
       <div
-        {...(ways.length > 1 ? { role: "tabpanel", id: `${id}-panel`, "aria-labelledby": `${id}-${way}` } : {})}
+        {...(modes.length > 1 ? { role: "tabpanel", id: `${id}-panel`, "aria-labelledby": `${id}-${mode}` } : {})}
         class="steer-panel"
-        data-testid={`steer-${way}`}
+        data-testid={`steer-${mode}`}
       >
         <Panel device={device} streamer={streamer} active={active} pad={pad} />
       </div>
@@ -80,27 +80,27 @@ export function SteeringCard({ session, active = true, onStop }: SteerCardProps)
   );
 }
 
-/** As the button does it, and where it would. */
+/** Takes or releases control, under the same conditions as the button. */
 function takeOrRelease({ device, control }: DeviceSession): void {
   if (control.streamer.value !== null) void control.release();
   else if (device.description.value !== null && device.info.value.role !== "viewer") void control.take();
 }
 
-function news(what: PadNews | null): string {
+function noticeText(what: GamepadNotice | null): string {
   return what === null ? "" : texts.steer.pads[what.kind](what.id);
 }
 
 interface TabsProps {
-  ways: readonly SteeringMode[];
-  way: SteeringMode;
+  modes: readonly SteeringMode[];
+  mode: SteeringMode;
   id: string;
-  onChange: (way: SteeringMode) => void;
+  onChange: (mode: SteeringMode) => void;
 }
 
-function Tabs({ ways, way, id, onChange }: TabsProps) {
+function Tabs({ modes, mode, id, onChange }: TabsProps) {
   const list = useRef<HTMLDivElement>(null);
-  const go = (step: number): void => {
-    const next = ways[(ways.indexOf(way) + step + ways.length) % ways.length];
+  const selectTab = (step: number): void => {
+    const next = modes[(modes.indexOf(mode) + step + modes.length) % modes.length];
     if (next === undefined) return;
     onChange(next);
     list.current?.querySelector<HTMLElement>(`#${CSS.escape(`${id}-${next}`)}`)?.focus();
@@ -110,27 +110,27 @@ function Tabs({ ways, way, id, onChange }: TabsProps) {
       ref={list}
       class="tabs"
       role="tablist"
-      aria-label={texts.steer.ways}
+      aria-label={texts.steer.modes}
       onKeyDown={(event) => {
-        if (event.key === "ArrowRight") go(1);
-        else if (event.key === "ArrowLeft") go(-1);
+        if (event.key === "ArrowRight") selectTab(1);
+        else if (event.key === "ArrowLeft") selectTab(-1);
         else return;
         event.preventDefault();
       }}
     >
-      {ways.map((each) => (
+      {modes.map((each) => (
         <button
           key={each}
           type="button"
           role="tab"
           id={`${id}-${each}`}
           data-testid={`tab-${each}`}
-          aria-selected={each === way}
+          aria-selected={each === mode}
           aria-controls={`${id}-panel`}
-          tabIndex={each === way ? 0 : -1}
+          tabIndex={each === mode ? 0 : -1}
           onClick={() => onChange(each)}
         >
-          {texts.steer.way[each]}
+          {texts.steer.mode[each]}
         </button>
       ))}
     </div>

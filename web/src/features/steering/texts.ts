@@ -20,10 +20,10 @@ export const texts = {
     ended: {
       reached: "Target reached",
       stuck: "The robot stopped before the target",
-      "let-go": "",
+      "released": "",
       stopped: "Ended: the robot is stopped",
       hidden: "Ended: the page was not visible",
-      "lost-sight": "Ended: no recent telemetry from the robot. Move the slider again to continue.",
+      "no-telemetry": "Ended: no recent telemetry from the robot. Move the slider again to continue.",
       busy: "Ended: an action is running",
       "no-connection": "Ended: no connection for setpoints. Move the slider again to continue.",
     } satisfies Record<Exclude<EndedBecause, null>, string>,
@@ -31,8 +31,8 @@ export const texts = {
 
   steer: {
     title: "Steering",
-    ways: "Steering mode",
-    way: { joints: "Joints", jog: "Cartesian", drive: "Drive" } satisfies Record<SteeringMode, string>,
+    modes: "Steering mode",
+    mode: { joints: "Joints", jog: "Cartesian", drive: "Drive" } satisfies Record<SteeringMode, string>,
     holding: "Moves while you hold",
     showKeys: "Keyboard shortcuts",
     everywhere: "These keys work everywhere on this page, except in text fields",
@@ -55,7 +55,7 @@ export const texts = {
     sideways: { left: "Left: moves while you hold it", right: "Right: moves while you hold it" },
     upTo: "Maximum speed",
     driveSpeed: (forward: number, turn: number): string => `${forward.toFixed(2)} m/s · ${Math.round(turn)} °/s`,
-    asked: "Target",
+    target: "Target",
     measured: "Measured",
     part: { forward_m_s: "Forward", left_m_s: "Left", turn_rad_s: "Turn left" },
     keys: {
@@ -91,7 +91,7 @@ export const texts = {
     } satisfies Record<SteeringMode, string>,
     pads: {
       connected: (id: string): string => `Gamepad connected: ${id}. Hold a shoulder button to move the robot.`,
-      gone: (id: string): string => `Gamepad disconnected: ${id}.`,
+      disconnected: (id: string): string => `Gamepad disconnected: ${id}.`,
       unknown: (id: string): string => `This gamepad's layout is not supported, so it is ignored: ${id}.`,
     },
     noConnection: "Connecting for setpoints…",

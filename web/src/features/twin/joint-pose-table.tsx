@@ -9,7 +9,7 @@ import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 
 type Form = "degrees" | "quaternion";
-type Which = "told" | "joints";
+type FrameSource = "published" | "joints";
 
 interface Frame {
   name: string;
@@ -19,8 +19,8 @@ interface Frame {
 /** Position and rotation of every joint's frame in the robot's base, as in the paper's application. */
 export function JointPoseTable({ device }: { device: DeviceStore }) {
   const [form, setForm] = useState<Form>("degrees");
-  const [which, setWhich] = useState<Which>("told");
-  const frames = which === "told" ? told(device) : reckoned(device);
+  const [source, setSource] = useState<FrameSource>("published");
+  const frames = source === "published" ? publishedFrames(device) : computedFrames(device);
   return (
     <Card
       title={texts.poses.title}
@@ -39,11 +39,11 @@ export function JointPoseTable({ device }: { device: DeviceStore }) {
     >
       {device.twin.value !== null && (
         <Choice
-          label={texts.poses.which}
-          value={which}
-          onChange={setWhich}
+          label={texts.poses.source}
+          value={source}
+          onChange={setSource}
           options={[
-            ["told", texts.poses.told],
+            ["published", texts.poses.publishedFrames],
             ["joints", texts.poses.joints],
           ]}
         />
@@ -68,20 +68,20 @@ export function JointPoseTable({ device }: { device: DeviceStore }) {
           </table>
         </div>
       )}
-      {which === "joints" && <p class="quiet small">{texts.poses.reckoned}</p>}
+      {source === "joints" && <p class="quiet small">{texts.poses.computedFrames}</p>}
       {!device.live.value && frames.some(({ pose }) => pose !== undefined) && <p class="quiet small">{texts.poses.old}</p>}
     </Card>
   );
 }
 
 /** Frames that the robot measures. */
-function told(device: DeviceStore): Frame[] {
+function publishedFrames(device: DeviceStore): Frame[] {
   const poses = device.telemetry.value?.message.frames ?? [];
   return (device.description.value?.frames ?? []).map((name, index) => ({ name, pose: poses[index] }));
 }
 
 /** Joint frames computed from the twin and the measured positions. */
-function reckoned(device: DeviceStore): Frame[] {
+function computedFrames(device: DeviceStore): Frame[] {
   const [twin, description] = [device.twin.value, device.description.value];
   const message = device.telemetry.value?.message;
   if (twin === null || description === null || message === undefined) return [];

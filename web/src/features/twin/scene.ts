@@ -8,7 +8,7 @@ import {
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { radians } from "../../shared/lib/angles";
 import { isVisibleChange } from "./model/visible-change";
-import { add, forward, placed, rotate, standing } from "./model/forward-kinematics";
+import { add, forward, placementOf, rotate, jointPosition } from "./model/forward-kinematics";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import type { Geometry } from "../../shared/mqtt/protocol.generated";
 import type { Vector3 as Vector } from "../../shared/lib/vectors";
@@ -19,7 +19,7 @@ export class NoWebglError extends Error {
 }
 
 export interface LiveScene {
-  /** Shows the measured pose, and the target's if it differs (`null`: no target). */
+  /** Shows the measured pose, and the target's if it differs (`null`: none). */
   show(measured: Targets, target: Targets | null): void;
   /** Applies changed theme colours. */
   recolour(): void;
@@ -38,7 +38,7 @@ type Robot = Object3D[];
 export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame: () => void): LiveScene {
   const renderer = createRenderer(canvas);
   const scene = new Scene();
-  const robots = bothRobots(scene, twin);
+  const robots = createRobots(scene, twin);
   const home = frame(twin);
   light(scene, home.radius);
   let grid = floor(scene, home);
@@ -47,24 +47,24 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
   const controls = new OrbitControls(camera, canvas);
   controls.enableDamping = false;
 
-  let wanted: Shown = { measured: {}, target: null };
-  let drawn: Shown | null = null;
-  let inSight = true;
-  const turn = new DrawSlot(() => {
-    robots.pose(wanted);
+  let requested: Poses = { measured: {}, target: null };
+  let drawn: Poses | null = null;
+  let visible = true;
+  const slot = new DrawSlot(() => {
+    robots.pose(requested);
     renderer.render(scene, camera);
-    drawn = wanted;
+    drawn = requested;
     onFrame();
   });
   // A view outside the viewport does not draw, except its first frame, so that scrolling never shows an empty view.
-  const drawSoon = (): void => {
-    if (inSight || drawn === null) turn.request();
+  const requestDraw = (): void => {
+    if (visible || drawn === null) slot.request();
   };
   const resetView = (): void => {
     controls.target.copy(home.centre);
     camera.position.copy(home.centre).add(new Vector3(1.15, -1.5, 0.75).normalize().multiplyScalar(home.radius * 3.2));
     controls.update();
-    drawSoon();
+    requestDraw();
   };
   const resize = (): void => {
     const { clientWidth: width, clientHeight: height } = canvas;
@@ -75,33 +75,33 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
     camera.updateProjectionMatrix();
     // A resize clears the canvas.
     drawn = null;
-    drawSoon();
+    requestDraw();
   };
-  const forget = watchCanvas(canvas, resize, (seen) => {
-    inSight = seen;
-    drawSoon();
+  const stopWatching = observeCanvas(canvas, resize, (seen) => {
+    visible = seen;
+    requestDraw();
   });
-  controls.addEventListener("change", drawSoon);
+  controls.addEventListener("change", requestDraw);
   resize();
   resetView();
 
   return {
     show(measured, target) {
-      wanted = { measured, target: target !== null && differs(measured, target) ? target : null };
+      requested = { measured, target: target !== null && differs(measured, target) ? target : null };
       const pxPerM = canvas.height / (2 * Math.tan(radians(camera.fov) / 2)) / nearest(camera, controls.target, home.reach);
       const seen = (next: Targets | null, last: Targets | null): boolean => isVisibleChange(last, next, home.reach, pxPerM);
-      if (drawn === null || seen(measured, drawn.measured) || seen(wanted.target, drawn.target)) drawSoon();
+      if (drawn === null || seen(measured, drawn.measured) || seen(requested.target, drawn.target)) requestDraw();
     },
     recolour() {
       scene.remove(grid);
       grid.dispose();
       grid = floor(scene, home);
-      drawSoon();
+      requestDraw();
     },
     resetView,
     dispose() {
-      turn.dispose();
-      forget();
+      slot.dispose();
+      stopWatching();
       controls.dispose();
       scene.traverse((object) => {
         if (!(object instanceof Mesh)) return;
@@ -125,13 +125,13 @@ function createRenderer(canvas: HTMLCanvasElement): WebGLRenderer {
   }
 }
 
-interface Shown {
+interface Poses {
   measured: Targets;
   target: Targets | null;
 }
 
 /** The robot's measured pose and the ghost of its target. */
-function bothRobots(scene: Scene, twin: KnownTwin): { pose: (shown: Shown) => void } {
+function createRobots(scene: Scene, twin: KnownTwin): { pose: (shown: Poses) => void } {
   const solid = build(scene, twin, solidMaterial);
   const ghostRoot = new Group();
   scene.add(ghostRoot);
@@ -162,10 +162,10 @@ function nearest(camera: PerspectiveCamera, centre: Vector3, reach: number): num
 }
 
 /** Reports size changes and visibility. Returns a function that ends it. */
-function watchCanvas(canvas: HTMLCanvasElement, resized: () => void, sight: (seen: boolean) => void): () => void {
-  const sizes = new ResizeObserver(resized);
+function observeCanvas(canvas: HTMLCanvasElement, onResize: () => void, onVisible: (seen: boolean) => void): () => void {
+  const sizes = new ResizeObserver(onResize);
   sizes.observe(canvas);
-  const places = new IntersectionObserver((entries) => sight(entries.at(-1)?.isIntersecting ?? true));
+  const places = new IntersectionObserver((entries) => onVisible(entries.at(-1)?.isIntersecting ?? true));
   places.observe(canvas);
   return () => {
     sizes.disconnect();
@@ -230,7 +230,7 @@ function shape({ shape: kind, size_m: [a, b, c] }: Geometry): BufferGeometry {
 
 function pose(robot: Robot, twin: KnownTwin, positions: Targets): void {
   twin.bodies.forEach((body, index) => {
-    const { position_m, quaternion } = placed(body, standing(body.joint, positions));
+    const { position_m, quaternion } = placementOf(body, jointPosition(body.joint, positions));
     const [w, x, y, z] = quaternion;
     robot[index]?.position.set(...position_m);
     robot[index]?.quaternion.set(x, y, z, w);
@@ -254,7 +254,7 @@ interface Frame {
   reach: number;
 }
 
-/** The camera position that shows the whole robot, also when stretched out. */
+/** Centre and radius of a view that contains the whole robot, also when stretched out. */
 function frame(twin: KnownTwin): Frame {
   const parts = moving(twin);
   const points = forward(twin, {}).flatMap(({ position_m, quaternion }, index) => {

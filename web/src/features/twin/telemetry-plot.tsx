@@ -24,20 +24,20 @@ export function TelemetryPlot({ device }: { device: DeviceStore }) {
   const box = useRef<HTMLDivElement>(null);
 
   const shown = joints.map((joint, index) => ({ joint, index })).filter(({ joint }) => !hidden.has(joint.name));
-  const wanted = shown.map(({ joint }) => joint.name).join(" ");
+  const shownNames = shown.map(({ joint }) => joint.name).join(" ");
 
   useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
 
   useEffect(() => {
-    if (box.current === null || wanted === "") return;
+    if (box.current === null || shownNames === "") return;
     const element = box.current;
-    let alive = true;
+    let active = true;
     let chart: Chart | null = null;
-    let asked = 0;
+    let frameRequest = 0;
     let drawnAt = 0;
     const indices = shown.map(({ index }) => index);
     const draw = (at: number): void => {
-      asked = requestAnimationFrame(draw);
+      frameRequest = requestAnimationFrame(draw);
       if (at - drawnAt < DRAW_EVERY_MS) return;
       drawnAt = at;
       const [times, ...values] = device.history.columns(quantity, indices, now());
@@ -46,24 +46,24 @@ export function TelemetryPlot({ device }: { device: DeviceStore }) {
     };
     import("./live-chart").then(
       ({ createChart }) => {
-        if (!alive) return;
+        if (!active) return;
         const lines = shown.map(({ joint, index }) => ({
           label: joint.label,
           colour: seriesColour(index),
           limits: limitsOf(joint, quantity),
         }));
         chart = createChart(element, lines, texts.plot.unit[quantity]);
-        asked = requestAnimationFrame(draw);
+        frameRequest = requestAnimationFrame(draw);
       },
       () => setFailed(true),
     );
     return () => {
-      alive = false;
-      cancelAnimationFrame(asked);
+      active = false;
+      cancelAnimationFrame(frameRequest);
       chart?.dispose();
     };
     // `wanted` contains the joint names: a new array with the same joints must not rebuild the chart.
-  }, [device, quantity, wanted, repaint]);
+  }, [device, quantity, shownNames, repaint]);
 
   const toggle = (name: string): void => {
     const next = new Set(hidden);

@@ -13,7 +13,7 @@ interface TwinViewProps {
 
 export function TwinView({ device, control }: TwinViewProps) {
   const twin = device.twin.value;
-  const { canvas, box, scene, trouble, said } = useScene(twin);
+  const { canvas, box, scene, error, errorText } = useScene(twin);
 
   return (
     <Card
@@ -31,13 +31,13 @@ export function TwinView({ device, control }: TwinViewProps) {
         class={`canvas-box ${device.live.value ? "" : "old"}`}
         data-testid="view-3d"
         data-frames="0"
-        data-trouble={trouble ?? ""}
+        data-trouble={error ?? ""}
       >
         {/* Keyed: a canvas cannot be drawn on after its context is lost. */}
         <canvas key={twin} ref={canvas} aria-label={texts.view.label} role="img" />
         {twin === null && <p class="over quiet">{texts.view.waiting}</p>}
-        {trouble !== null && <p class="over notice">{said}</p>}
-        {trouble === null && scene !== null && !device.live.value && <p class="tag">{texts.view.staleNote}</p>}
+        {error !== null && <p class="over notice">{errorText}</p>}
+        {error === null && scene !== null && !device.live.value && <p class="tag">{texts.view.staleNote}</p>}
       </div>
       <p class="quiet small">{texts.view.ghost}</p>
     </Card>

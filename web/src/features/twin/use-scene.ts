@@ -10,9 +10,9 @@ interface SceneView {
   /** The element with the frame counter `data-frames`. */
   box: RefObject<HTMLDivElement | null>;
   scene: LiveScene | null;
-  trouble: "no-webgl" | "failed" | null;
+  error: "no-webgl" | "failed" | null;
   /** The error, or "". */
-  said: string;
+  errorText: string;
 }
 
 /** A twin's scene on a canvas, loaded when visible. */
@@ -20,41 +20,41 @@ export function useScene(twin: KnownTwin | null): SceneView {
   const canvas = useRef<HTMLCanvasElement>(null);
   const box = useRef<HTMLDivElement>(null);
   const [scene, setScene] = useState<LiveScene | null>(null);
-  const [trouble, setTrouble] = useState<SceneView["trouble"]>(null);
+  const [error, setError] = useState<SceneView["error"]>(null);
 
   useEffect(() => {
     if (twin === null) return;
-    let wanted = true;
-    let made: LiveScene | null = null;
+    let active = true;
+    let created: LiveScene | null = null;
     let frames = 0;
     const start = async (): Promise<void> => {
       try {
         const { createScene, NoWebglError } = await import("./scene");
-        if (!wanted || canvas.current === null) return;
+        if (!active || canvas.current === null) return;
         try {
-          made = createScene(canvas.current, twin, () => {
+          created = createScene(canvas.current, twin, () => {
             frames += 1;
             box.current?.setAttribute("data-frames", String(frames));
           });
-          setScene(made);
-          setTrouble(null);
+          setScene(created);
+          setError(null);
         } catch (error) {
-          setTrouble(error instanceof NoWebglError ? "no-webgl" : "failed");
+          setError(error instanceof NoWebglError ? "no-webgl" : "failed");
         }
       } catch {
-        setTrouble("failed");
+        setError("failed");
       }
     };
     void start();
-    const forget = onColourChange(() => made?.recolour());
+    const unsubscribe = onColourChange(() => created?.recolour());
     return () => {
-      wanted = false;
-      forget();
-      made?.dispose();
+      active = false;
+      unsubscribe();
+      created?.dispose();
       setScene(null);
     };
   }, [twin]);
 
-  const said = trouble === null ? "" : trouble === "no-webgl" ? texts.view.noWebgl : texts.view.failed;
-  return { canvas, box, scene, trouble, said };
+  const errorText = error === null ? "" : error === "no-webgl" ? texts.view.noWebgl : texts.view.failed;
+  return { canvas, box, scene, error, errorText };
 }

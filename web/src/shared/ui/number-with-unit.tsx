@@ -1,14 +1,14 @@
 interface NumberWithUnitProps {
   label: string;
   name: string;
-  range: { least: number; most: number; step: number };
+  range: { min: number; max: number; step: number };
   value: number;
   /** The value with its unit. */
-  shown: string;
+  text: string;
   onChange: (value: number) => void;
 }
 
-export function NumberWithUnit({ label, name, range, value, shown, onChange }: NumberWithUnitProps) {
+export function NumberWithUnit({ label, name, range, value, text, onChange }: NumberWithUnitProps) {
   return (
     <label class="speed">
       <span>{label}</span>
@@ -16,15 +16,15 @@ export function NumberWithUnit({ label, name, range, value, shown, onChange }: N
         <input
           type="range"
           data-testid={`speed-${name}`}
-          min={range.least}
-          max={range.most}
+          min={range.min}
+          max={range.max}
           step={range.step}
           value={value}
-          aria-valuetext={shown}
+          aria-valuetext={text}
           onInput={(event) => onChange(event.currentTarget.valueAsNumber)}
         />
       </span>
-      <output>{shown}</output>
+      <output>{text}</output>
     </label>
   );
 }

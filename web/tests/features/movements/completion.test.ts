@@ -43,11 +43,11 @@ describe("completion", () => {
     ["parameters.get('|')", ["speed", "times"]],
     ["x = '|'", []],
     ["# robot.|", []],
-  ])("knows names inside strings: %s", (text, expected) => {
+  ])("offers names inside strings: %s", (text, expected) => {
     expect(offered(text)).toEqual(expected);
   });
 
-  test("offers a call's arguments by name first, and nothing at an empty place before an explicit request", () => {
+  test("offers a call's arguments by name first, and nothing at an empty position without an explicit request", () => {
     expect(offered("robot.home(s|)")[0]).toBe("speed");
     expect(offered("robot.drive(|)", true).slice(0, 4)).toEqual(["forward_m_s", "left_m_s", "turn_rad_s", "duration_s"]);
     expect(offered("|")).toEqual([]);

@@ -1,7 +1,7 @@
 import { describe, expect, test } from "vitest";
 import { storedDraft, storedParameters } from "../../../src/shared/lib/local-storage";
 import type { ObjectSchema } from "../../../src/shared/api/movement-library";
-import { fieldsOf, fill, read } from "../../../src/features/movements/model/parameter-form";
+import { fieldsOf, initialTexts, read } from "../../../src/features/movements/model/parameter-form";
 import { FakeStorage } from "../../support/fake-storage";
 
 const SCHEMA: ObjectSchema = {
@@ -19,20 +19,20 @@ const SCHEMA: ObjectSchema = {
   required: ["word"],
 };
 const fields = fieldsOf(SCHEMA);
-const good = { ...fill(fields), word: "hey" };
+const valid = { ...initialTexts(fields), word: "hey" };
 
 describe("a form for parameters", () => {
-  test("begins with the defaults, angles in degrees", () => {
-    expect(fill(fields)).toEqual({
+  test("starts with the defaults, angles in degrees", () => {
+    expect(initialTexts(fields)).toEqual({
       times: "3", angle_rad: "28.65", word: "", colour: "green", loud: "true", place_m: "", more: "", share: "0.5",
     });
     expect(fields.map(({ kind }) => kind)).toEqual(["integer", "number", "text", "choice", "yes-no", "list", "json", "number"]);
-    expect(fields[1]).toMatchObject({ title: "Angle", unit: "°", least: -90, most: 90 });
+    expect(fields[1]).toMatchObject({ title: "Angle", unit: "°", min: -90, max: 90 });
   });
 
-  test("gives values in the units of the script, and leaves out what is empty and need not be there", () => {
-    const { values, wrong } = read(fields, { ...good, angle_rad: "90", place_m: "1.5, -2" });
-    expect(wrong).toEqual({});
+  test("returns values in the units of the script, and omits empty optional fields", () => {
+    const { values, errors } = read(fields, { ...valid, angle_rad: "90", place_m: "1.5, -2" });
+    expect(errors).toEqual({});
     expect(values).toEqual({
       times: 3, angle_rad: Math.PI / 2, word: "hey", colour: "green", loud: true, place_m: [1.5, -2], share: 0.5,
     });
@@ -56,11 +56,11 @@ describe("a form for parameters", () => {
     ["share", "1", "below"],
     ["share", "Infinity", "number"],
   ])("%s = '%s' is %s", (name, text, kind) => {
-    expect(read(fields, { ...good, [name]: text }).wrong[name]?.kind).toBe(kind);
+    expect(read(fields, { ...valid, [name]: text }).errors[name]?.kind).toBe(kind);
   });
 
-  test("shows what was used last, unless it does not fit any more", () => {
-    const shown = fill(fields, { times: 7, angle_rad: 9, colour: "blue", loud: false, place_m: [1, 2], word: "x" });
+  test("starts with the values used last, unless they are no longer valid", () => {
+    const shown = initialTexts(fields, { times: 7, angle_rad: 9, colour: "blue", loud: false, place_m: [1, 2], word: "x" });
     expect(shown).toMatchObject({ times: "7", angle_rad: "28.65", colour: "green", loud: "false", place_m: "1 2", word: "" });
     expect(fieldsOf(null)).toEqual([]);
   });

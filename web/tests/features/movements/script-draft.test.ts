@@ -3,7 +3,7 @@ import { ApiError, type Http } from "../../../src/shared/api/http";
 import { StoredValue, storedDraft, type Draft } from "../../../src/shared/lib/local-storage";
 import { Library, type MovementSource } from "../../../src/shared/api/movement-library";
 import { ScriptDraft } from "../../../src/features/movements/model/script-draft";
-import { failureMark, placed } from "../../../src/features/movements/model/text-offsets";
+import { failureMark, rangeOf } from "../../../src/features/movements/model/text-offsets";
 import { FakeStorage } from "../../support/fake-storage";
 
 /** The movements of one account. */
@@ -16,7 +16,7 @@ class FakeLibrary {
       if (this.broken) return Promise.reject(new ApiError(0, "unreachable", "The server cannot be reached."));
       const version = this.versions.length;
       if (method === "GET") {
-        if (version === 0) return Promise.reject(new ApiError(404, "movement-unknown", "There is none."));
+        if (version === 0) return Promise.reject(new ApiError(404, "movement-unknown", "The movement does not exist."));
         return Promise.resolve({ version, source: this.versions.at(-1) });
       }
       const body = options?.body ?? { source: "", based_on: 0 };
@@ -47,7 +47,7 @@ beforeEach(() => {
 });
 
 describe("a script", () => {
-  test("begins with the template, and is saved as the first version", async () => {
+  test("starts with the template, and is saved as the first version", async () => {
     const script = await open();
     expect([script.text.value, script.changed.value]).toEqual(["template", true]);
     script.edit("robot.home()");
@@ -71,14 +71,14 @@ describe("a script", () => {
     const script = await open();
     script.edit("(((");
     expect(await script.save()).toBe(false);
-    expect([script.text.value, script.why.value]).toEqual(["(((", "Line 1: no."]);
+    expect([script.text.value, script.saveError.value]).toEqual(["(((", "Line 1: no."]);
     server.broken = true;
     script.edit("good");
     expect(await script.save()).toBe(false);
     expect(script.text.value).toBe("good");
     server.broken = false;
     expect(await script.save()).toBe(true);
-    expect(script.why.value).toBe("");
+    expect(script.saveError.value).toBe("");
   });
 
   test("does not overwrite a version of another tab; either can be chosen", async () => {
@@ -114,12 +114,12 @@ describe("positions in a text", () => {
 
   test("convert from characters to UTF-16 units", () => {
     const text = "a = 1\r\n'🤖'; b\nc";
-    expect(placed(text.replace("\r", ""), { ...mark, line: 2, column: 5, end_line: 2, end_column: 6 })).toMatchObject({ from: 12, to: 13 });
+    expect(rangeOf(text.replace("\r", ""), { ...mark, line: 2, column: 5, end_line: 2, end_column: 6 })).toMatchObject({ from: 12, to: 13 });
   });
 
   test("are inside of it and not empty", () => {
-    expect(placed("ab", { ...mark, line: 9, column: 9, end_line: 1, end_column: 0 })).toMatchObject({ from: 2, to: 2 });
-    expect(placed("ab\ncd", { ...mark, line: 1, column: 0, end_line: 1, end_column: 0 })).toMatchObject({ from: 0, to: 1 });
+    expect(rangeOf("ab", { ...mark, line: 9, column: 9, end_line: 1, end_column: 0 })).toMatchObject({ from: 2, to: 2 });
+    expect(rangeOf("ab\ncd", { ...mark, line: 1, column: 0, end_line: 1, end_column: 0 })).toMatchObject({ from: 0, to: 1 });
   });
 
   test("are read from the error of a run", () => {

@@ -58,8 +58,8 @@ class SimulatedRobot {
       if (this.silent) continue;
       const still = this.blocked || this.streamer.state.value === "idle";
       const moved = this.position.map((position, index) => {
-        const wanted = this.newest()?.[index === 0 ? "a" : "b"] ?? position;
-        return still ? 0 : Math.max(-0.02, Math.min(0.02, wanted - position));
+        const target = this.newest()?.[index === 0 ? "a" : "b"] ?? position;
+        return still ? 0 : Math.max(-0.02, Math.min(0.02, target - position));
       });
       this.position = this.position.map((position, index) => position + (moved[index] ?? 0));
       this.measure(moved);
@@ -89,7 +89,7 @@ async function expectNothingMoreSent(): Promise<void> {
 }
 
 describe("a stream of joint targets", () => {
-  it("starts at the robot's positions, and sends nothing by itself", async () => {
+  it("starts at the robot's positions, and sends nothing without input", async () => {
     expect(streamer.targets.value).toEqual({ a: 0.5, b: 0.25 });
     await robot.run(1_000);
     expect(robot.sent).toEqual([]);
@@ -142,7 +142,7 @@ describe("a stream of joint targets", () => {
     expect(streamer.state.value).toBe("streaming");
     robot.silent = true;
     await robot.run(FRESH_MS + ABANDON_MS + 100);
-    expect(streamer.ended.value).toBe("lost-sight");
+    expect(streamer.ended.value).toBe("no-telemetry");
     robot.silent = false;
     await expectNothingMoreSent();
     expect(streamer.targets.value["a"]).toBeCloseTo(robot.position[0] ?? NaN);
@@ -190,7 +190,7 @@ describe("a stream of joint targets", () => {
     ["is idle", null],
     ["has a velocity", { kind: "jog", linear_m_s: [0, 0, 0.05], angular_rad_s: [0, 0, 0], frame: "tool", tool: false }],
   ])("takes the robot's positions as targets while it %s", async (_, velocity) => {
-    if (velocity !== null) streamer.hold(velocity);
+    if (velocity !== null) streamer.setVelocity(velocity);
     robot.position = [1.25, -0.5];
     await robot.run(40);
     expect(streamer.targets.value).toEqual({ a: 1.25, b: -0.5 });
@@ -207,43 +207,43 @@ describe("a velocity", () => {
   const newest = (): Setpoint["target"] | undefined => robot.sent.at(-1)?.target;
 
   it("is sent while its control is held, and zero immediately after the release", async () => {
-    streamer.hold(up);
+    streamer.setVelocity(up);
     expect(robot.sent).toHaveLength(1);
     await robot.run(1_000);
     expect(robot.sent.length).toBeGreaterThan(25);
     for (const { target } of robot.sent) expect(target).toEqual(up);
-    expect([streamer.way.value, streamer.velocity.value]).toEqual(["jog", up]);
+    expect([streamer.steeringMode.value, streamer.velocity.value]).toEqual(["jog", up]);
 
-    const held = robot.sent.length;
-    streamer.letGo();
-    expect(robot.sent).toHaveLength(held + 1);
+    const count = robot.sent.length;
+    streamer.release();
+    expect(robot.sent).toHaveLength(count + 1);
     expect(streamer.velocity.value).toBeNull();
     await robot.run(SETTLE_MS + 100);
-    for (const { target } of robot.sent.slice(held)) expect(target).toEqual(upAtRest);
-    expect([streamer.state.value, streamer.ended.value]).toEqual(["idle", "let-go"]);
+    for (const { target } of robot.sent.slice(count)) expect(target).toEqual(upAtRest);
+    expect([streamer.state.value, streamer.ended.value]).toEqual(["idle", "released"]);
     await expectNothingMoreSent();
   });
 
   it("can change while it is held, and ends when it becomes zero", async () => {
-    streamer.hold(ahead);
+    streamer.setVelocity(ahead);
     await robot.run(60);
-    streamer.hold({ ...ahead, turn_rad_s: 0.5 });
+    streamer.setVelocity({ ...ahead, turn_rad_s: 0.5 });
     await robot.run(60);
     expect(newest()).toEqual({ ...ahead, turn_rad_s: 0.5 });
-    streamer.hold(atRest);
+    streamer.setVelocity(atRest);
     expect(newest()).toEqual(atRest);
     expect(streamer.velocity.value).toBeNull();
   });
 
   it("does not start a stream if it is zero or invalid", async () => {
-    streamer.hold(atRest);
-    streamer.hold({ ...ahead, forward_m_s: NaN });
+    streamer.setVelocity(atRest);
+    streamer.setVelocity({ ...ahead, forward_m_s: NaN });
     await robot.run(100);
     expect(robot.sent).toEqual([]);
   });
 
   it.each(["hidden", "stopped", null] as const)("ends with zero when the stream ends (%s)", async (because) => {
-    streamer.hold(ahead);
+    streamer.setVelocity(ahead);
     await robot.run(100);
     streamer.end(because);
     expect(newest()).toEqual(atRest);
@@ -252,17 +252,17 @@ describe("a velocity", () => {
   });
 
   it("does not resume after telemetry was missing for longer than the robot's watchdog", async () => {
-    streamer.hold(ahead);
+    streamer.setVelocity(ahead);
     await robot.run(100);
     robot.silent = true;
     await robot.run(FRESH_MS + LOST_MS + 100);
-    expect(streamer.ended.value).toBe("lost-sight");
+    expect(streamer.ended.value).toBe("no-telemetry");
     robot.silent = false;
     await expectNothingMoreSent();
   });
 
   it("ends at the first setpoint that cannot be sent", async () => {
-    streamer.hold(ahead);
+    streamer.setVelocity(ahead);
     await robot.run(100);
     robot.connected = false;
     await robot.run(60);
@@ -275,7 +275,7 @@ describe("a velocity", () => {
     streamer.setTarget("a", 2);
     await robot.run(200);
     const [position] = robot.position;
-    streamer.hold(ahead);
+    streamer.setVelocity(ahead);
     expect(robot.newest()?.["a"]).toBeCloseTo(position ?? NaN);
     const count = robot.sent.length;
     await robot.run(100);
@@ -284,9 +284,9 @@ describe("a velocity", () => {
   });
 
   it("becomes zero before another kind of velocity or joint targets start", async () => {
-    streamer.hold(up);
+    streamer.setVelocity(up);
     await robot.run(60);
-    streamer.hold(ahead);
+    streamer.setVelocity(ahead);
     expect(newest()).toEqual(upAtRest);
     await robot.run(60);
     expect(newest()).toEqual(ahead);
@@ -294,8 +294,8 @@ describe("a velocity", () => {
     expect(newest()).toEqual(atRest);
     await robot.run(60);
     expect(robot.newest()).toEqual({ a: 2, b: 0.25 });
-    streamer.letGo(); // No velocity is active: nothing ends.
+    streamer.release(); // No velocity is active, so this has no effect.
     await robot.run(60);
-    expect(streamer.way.value).toBe("joints");
+    expect(streamer.steeringMode.value).toBe("joints");
   });
 });

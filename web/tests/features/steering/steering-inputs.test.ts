@@ -2,7 +2,7 @@ import { describe, expect, it } from "vitest";
 import { DEAD_ZONE, readPad, type Pad } from "../../../src/features/steering/model/gamepad-mapping";
 import { PressedInputs } from "../../../src/features/steering/model/pressed-inputs";
 import { DRIVE_KEYS, JOG_KEYS, jointOfKey } from "../../../src/features/steering/model/keymap";
-import { direction, driveOf, jogOf, pushed, restOf, sumOf, steeringModesOf } from "../../../src/features/steering/model/steerable-parts";
+import { direction, driveOf, jogOf, sumOfPushes, zeroOf, sumOf, steeringModesOf } from "../../../src/features/steering/model/steerable-parts";
 import { readDescription } from "../../../src/shared/mqtt/parse-messages";
 import { bytes, description } from "../../support/messages";
 
@@ -19,7 +19,7 @@ describe("steering modes", () => {
   });
 
   it("keep a base within its limits", () => {
-    const all = pushed([DRIVE_KEYS["KeyW"], DRIVE_KEYS["ArrowUp"], DRIVE_KEYS["KeyA"]].filter((part) => part !== undefined));
+    const all = sumOfPushes([DRIVE_KEYS["KeyW"], DRIVE_KEYS["ArrowUp"], DRIVE_KEYS["KeyA"]].filter((part) => part !== undefined));
     expect(driveOf(all, LIMITS, 1)).toEqual({ kind: "drive", forward_m_s: 0.3, left_m_s: 0, turn_rad_s: 1.5 });
     expect(driveOf({ forward: 5, left: 5, turn: -5 }, LIMITS, 0.5)).toMatchObject({ forward_m_s: 0.15, left_m_s: 0, turn_rad_s: -0.75 });
     expect(driveOf({ forward: 1, left: 0, turn: 0 }, LIMITS, 9).forward_m_s).toBe(0.3);
@@ -31,7 +31,7 @@ describe("steering modes", () => {
     expect(Math.hypot(...(jog.linear_m_s ?? []))).toBeCloseTo(0.1);
     expect(jog).toMatchObject({ angular_rad_s: [0, 0.2, 0], frame: "tool0", tool: true });
     expect(jogOf(sumOf([direction("along", 0, 1), direction("along", 0, -1)]), speed, "", false).linear_m_s).toEqual([0, 0, 0]);
-    expect(restOf(jog)).toEqual({ ...jog, linear_m_s: [0, 0, 0], angular_rad_s: [0, 0, 0] });
+    expect(zeroOf(jog)).toEqual({ ...jog, linear_m_s: [0, 0, 0], angular_rad_s: [0, 0, 0] });
   });
 
   it("have one key for each direction", () => {
@@ -52,10 +52,10 @@ describe("pressed inputs", () => {
     expect(reports.splice(0)).toEqual([[1], [1, 2], [2], []]);
     inputs.press("pad", 1);
     inputs.spend();
-    inputs.keep("pad", 2);
+    inputs.update("pad", 2);
     expect(reports).toEqual([[1]]);
     inputs.release("pad");
-    inputs.keep("pad", 4);
+    inputs.update("pad", 4);
     expect(reports.at(-1)).toEqual([4]);
     inputs.spend();
     inputs.press("pad", 5);
@@ -84,9 +84,9 @@ describe("a gamepad", () => {
   });
 
   it("has shoulder buttons as dead-man's switches, triggers to lift, and a stop button", () => {
-    expect(readPad(pad([0, 0, 0, 0]))).toMatchObject({ held: false, stop: false, lift: 0, cross: [0, 0] });
-    expect(readPad(pad([0, 0, 0, 0], { 4: 1 }))?.held).toBe(true);
-    expect(readPad(pad([0, 0, 0, 0], { 5: 1, 7: 1 }))).toMatchObject({ held: true, lift: 1 });
+    expect(readPad(pad([0, 0, 0, 0]))).toMatchObject({ enabled: false, stop: false, lift: 0, cross: [0, 0] });
+    expect(readPad(pad([0, 0, 0, 0], { 4: 1 }))?.enabled).toBe(true);
+    expect(readPad(pad([0, 0, 0, 0], { 5: 1, 7: 1 }))).toMatchObject({ enabled: true, lift: 1 });
     expect(readPad(pad([0, 0, 0, 0], { 6: 0.5, 1: 1, 12: 1, 14: 1 }))).toMatchObject({ stop: true, lift: -0.5, cross: [-1, 1] });
   });
 
@@ -94,6 +94,6 @@ describe("a gamepad", () => {
     expect(readPad(pad([0, 0, 0, 0], {}, { mapping: "" }))).toBeNull();
     expect(readPad(pad([], {}, { connected: false }))).toBeNull();
     expect(readPad(null)).toBeNull();
-    expect(readPad(pad([NaN, 0], {}, { buttons: [] }))).toMatchObject({ held: false, left: [0, 0] });
+    expect(readPad(pad([NaN, 0], {}, { buttons: [] }))).toMatchObject({ enabled: false, left: [0, 0] });
   });
 });

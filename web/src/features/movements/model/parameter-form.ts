@@ -16,20 +16,20 @@ export interface Field {
   schema: Schema;
   choices: readonly string[];
   /** In the displayed unit. */
-  least: number | null;
-  most: number | null;
+  min: number | null;
+  max: number | null;
 }
 
-export type Wrong =
+export type FieldError =
   | { kind: "missing" | "number" | "whole" | "json" }
   | { kind: "above" | "below" | "least" | "most" | "shorter" | "longer" | "fewer" | "more"; limit: number };
 
 /** The entered text by field. */
-export type Filled = Readonly<Record<string, string>>;
+export type FieldTexts = Readonly<Record<string, string>>;
 
 interface Read {
   values: Parameters;
-  wrong: Readonly<Record<string, Wrong>>;
+  errors: Readonly<Record<string, FieldError>>;
 }
 
 const DEGREES: Readonly<Record<string, string>> = { rad: "°", "rad/s": "°/s", "rad/s²": "°/s²" };
@@ -40,40 +40,40 @@ export function fieldsOf(schema: ObjectSchema | null): Field[] {
   return Object.entries(schema?.properties ?? {}).map(([name, one]) => ({
     name,
     kind: kindOf(one),
-    title: one.title ?? named(name),
+    title: one.title ?? titleOf(name),
     description: one.description ?? "",
     unit: DEGREES[one.unit ?? ""] ?? one.unit ?? "",
     required: required.has(name) && one.default === undefined,
     schema: one,
     choices: one.type === "string" ? (one.enum ?? []) : [],
-    least: limit(one, "minimum"),
-    most: limit(one, "maximum"),
+    min: limit(one, "minimum"),
+    max: limit(one, "maximum"),
   }));
 }
 
 /** Initial texts: the last used values if they are still valid, otherwise the defaults. */
-export function fill(fields: readonly Field[], used: Parameters = {}): Filled {
-  return Object.fromEntries(fields.map((field) => [field.name, startText(field, used[field.name])]));
+export function initialTexts(fields: readonly Field[], lastUsed: Parameters = {}): FieldTexts {
+  return Object.fromEntries(fields.map((field) => [field.name, startText(field, lastUsed[field.name])]));
 }
 
 /** The values of a form. Empty optional fields are omitted, so that the script's default applies. */
-export function read(fields: readonly Field[], filled: Filled): Read {
+export function read(fields: readonly Field[], fieldTexts: FieldTexts): Read {
   const values: Parameters = {};
-  const wrong: Record<string, Wrong> = {};
+  const errors: Record<string, FieldError> = {};
   for (const field of fields) {
-    const found = readField(field, filled[field.name] ?? "");
-    if ("wrong" in found) wrong[field.name] = found.wrong;
+    const found = readField(field, fieldTexts[field.name] ?? "");
+    if ("error" in found) errors[field.name] = found.error;
     else if (found.value !== undefined) values[field.name] = found.value;
   }
-  return { values, wrong };
+  return { values, errors };
 }
 
-type Found = { value: unknown } | { wrong: Wrong };
+type Found = { value: unknown } | { error: FieldError };
 
 function readField(field: Field, text: string): Found {
   if (field.kind === "yes-no") return { value: text === TRUE };
   const empty = field.kind === "text" || field.kind === "choice" ? text === "" : text.trim() === "";
-  if (empty) return field.required ? { wrong: { kind: "missing" } } : { value: undefined };
+  if (empty) return field.required ? { error: { kind: "missing" } } : { value: undefined };
   switch (field.kind) {
     case "number":
     case "integer":
@@ -84,7 +84,7 @@ function readField(field: Field, text: string): Found {
       try {
         return { value: JSON.parse(text) as unknown };
       } catch {
-        return { wrong: { kind: "json" } };
+        return { error: { kind: "json" } };
       }
     case "text":
     case "choice":
@@ -93,51 +93,51 @@ function readField(field: Field, text: string): Found {
 }
 
 function readNumber(schema: Schema, text: string, whole: boolean): Found {
-  const shown = Number(text.trim().replace(",", "."));
-  if (!Number.isFinite(shown)) return { wrong: { kind: "number" } };
-  if (whole && !Number.isSafeInteger(shown)) return { wrong: { kind: "whole" } };
-  const value = inDegrees(schema) ? radians(shown) : shown;
-  const wrong = outside(schema, shown);
-  if (wrong !== null) return { wrong };
+  const displayed = Number(text.trim().replace(",", "."));
+  if (!Number.isFinite(displayed)) return { error: { kind: "number" } };
+  if (whole && !Number.isSafeInteger(displayed)) return { error: { kind: "whole" } };
+  const value = inDegrees(schema) ? radians(displayed) : displayed;
+  const error = outside(schema, displayed);
+  if (error !== null) return { error };
   if (schema.type !== "number" && schema.type !== "integer") return { value };
   // A limit in degrees is rounded for display: use the exact limit at the limit.
   return { value: Math.min(Math.max(value, schema.minimum ?? value), schema.maximum ?? value) };
 }
 
-function outside(schema: Schema, shown: number): Wrong | null {
+function outside(schema: Schema, displayed: number): FieldError | null {
   const bound = (key: Limit): number | null => limit(schema, key);
-  const [least, most, above, below] = [bound("minimum"), bound("maximum"), bound("exclusiveMinimum"), bound("exclusiveMaximum")];
-  if (least !== null && shown < least) return { kind: "least", limit: least };
-  if (most !== null && shown > most) return { kind: "most", limit: most };
-  if (above !== null && shown <= above) return { kind: "above", limit: above };
-  if (below !== null && shown >= below) return { kind: "below", limit: below };
+  const [min, max, above, below] = [bound("minimum"), bound("maximum"), bound("exclusiveMinimum"), bound("exclusiveMaximum")];
+  if (min !== null && displayed < min) return { kind: "least", limit: min };
+  if (max !== null && displayed > max) return { kind: "most", limit: max };
+  if (above !== null && displayed <= above) return { kind: "above", limit: above };
+  if (below !== null && displayed >= below) return { kind: "below", limit: below };
   return null;
 }
 
 function readText(schema: Schema, text: string): Found {
   const { minLength, maxLength } = schema.type === "string" ? schema : {};
   const length = Array.from(text).length;
-  if (minLength !== undefined && length < minLength) return { wrong: { kind: "shorter", limit: minLength } };
-  if (maxLength !== undefined && length > maxLength) return { wrong: { kind: "longer", limit: maxLength } };
+  if (minLength !== undefined && length < minLength) return { error: { kind: "shorter", limit: minLength } };
+  if (maxLength !== undefined && length > maxLength) return { error: { kind: "longer", limit: maxLength } };
   return { value: text };
 }
 
 function readList(schema: Schema, text: string): Found {
-  if (schema.type !== "array") return { wrong: { kind: "json" } };
+  if (schema.type !== "array") return { error: { kind: "json" } };
   const values: unknown[] = [];
   for (const part of text.split(/[;\s]+|,\s+|,(?=\S)/).filter((one) => one !== "")) {
     const found = readNumber(schema.items, part, schema.items.type === "integer");
-    if ("wrong" in found) return found;
+    if ("error" in found) return found;
     values.push(found.value);
   }
-  if (values.length < (schema.minItems ?? 0)) return { wrong: { kind: "fewer", limit: schema.minItems ?? 0 } };
-  if (values.length > (schema.maxItems ?? Infinity)) return { wrong: { kind: "more", limit: schema.maxItems ?? 0 } };
+  if (values.length < (schema.minItems ?? 0)) return { error: { kind: "fewer", limit: schema.minItems ?? 0 } };
+  if (values.length > (schema.maxItems ?? Infinity)) return { error: { kind: "more", limit: schema.maxItems ?? 0 } };
   return { value: values };
 }
 
-function startText(field: Field, used: unknown): string {
-  const text = textOf(field, used);
-  if (text !== "" && !("wrong" in readField(field, text))) return text;
+function startText(field: Field, lastUsed: unknown): string {
+  const text = textOf(field, lastUsed);
+  if (text !== "" && !("error" in readField(field, text))) return text;
   return textOf(field, field.schema.default);
 }
 
@@ -191,8 +191,8 @@ function rounded(value: number): number {
   return Math.round(value * 100) / 100;
 }
 
-/** `pause_s` → "Pause": the unit is shown beside the field. */
-function named(name: string): string {
+/** `pause_s` → "Pause": the unit is shown next to the field. */
+function titleOf(name: string): string {
   const words = name.replace(/_(m|s|ms|rad|rad_s|m_s)$/, "").replaceAll("_", " ");
   return words.charAt(0).toUpperCase() + words.slice(1);
 }

@@ -4,7 +4,7 @@ import { ApiError, sentence } from "../../../shared/api/http";
 import type { Draft, StoredValue } from "../../../shared/lib/local-storage";
 import { MovementChanged, type Library, type Movement, type MovementSource } from "../../../shared/api/movement-library";
 
-type Loading = { kind: "loading" } | { kind: "there" } | { kind: "failed"; why: string };
+type Loading = { kind: "loading" } | { kind: "loaded" } | { kind: "failed"; saveError: string };
 
 /** Another user saved meanwhile; `theirs` is `null` if the movement was deleted. */
 interface Conflict {
@@ -15,13 +15,13 @@ export class ScriptDraft {
   readonly robotType: string;
   readonly name: string;
   readonly #library: Library;
-  readonly #kept: StoredValue<Draft>;
+  readonly #storedDraft: StoredValue<Draft>;
   readonly #template: string;
   readonly #loading = signal<Loading>({ kind: "loading" });
   readonly #base = signal<MovementSource | null>(null);
   readonly #text = signal("");
   readonly #saving = signal(false);
-  readonly #why = signal("");
+  readonly #saveError = signal("");
   readonly #conflict = signal<Conflict | null>(null);
   readonly #restored = signal<number | null>(null);
   #basedOn = 0;
@@ -32,18 +32,18 @@ export class ScriptDraft {
   readonly text: ReadonlySignal<string> = this.#text;
   readonly saving: ReadonlySignal<boolean> = this.#saving;
   /** Why the last save was rejected; empty otherwise. */
-  readonly why: ReadonlySignal<string> = this.#why;
+  readonly saveError: ReadonlySignal<string> = this.#saveError;
   readonly conflict: ReadonlySignal<Conflict | null> = this.#conflict;
   /** When the restored text was written [ms since 1970]; `null`: not restored. */
   readonly restored: ReadonlySignal<number | null> = this.#restored;
   readonly changed = computed(() => this.#base.value === null || this.#text.value !== this.#base.value.source);
 
   /** `template`: the initial text of a new movement. */
-  constructor(library: Library, robotType: string, name: string, kept: StoredValue<Draft>, template: string) {
+  constructor(library: Library, robotType: string, name: string, storedDraft: StoredValue<Draft>, template: string) {
     this.#library = library;
     this.robotType = robotType;
     this.name = name;
-    this.#kept = kept;
+    this.#storedDraft = storedDraft;
     this.#template = template;
   }
 
@@ -52,33 +52,33 @@ export class ScriptDraft {
     try {
       this.#base.value = await this.#newest();
     } catch (error) {
-      this.#loading.value = { kind: "failed", why: sentence(error) };
+      this.#loading.value = { kind: "failed", saveError: sentence(error) };
       return;
     }
     const saved = this.#base.value?.source ?? this.#template;
-    const draft = this.#kept.read();
-    const fits = draft !== null && draft.source !== saved;
-    this.#text.value = fits ? draft.source : saved;
-    this.#restored.value = fits ? draft.at : null;
-    this.#basedOn = fits ? draft.basedOn : (this.#base.value?.version ?? 0);
-    this.#loading.value = { kind: "there" };
+    const draft = this.#storedDraft.read();
+    const useDraft = draft !== null && draft.source !== saved;
+    this.#text.value = useDraft ? draft.source : saved;
+    this.#restored.value = useDraft ? draft.at : null;
+    this.#basedOn = useDraft ? draft.basedOn : (this.#base.value?.version ?? 0);
+    this.#loading.value = { kind: "loaded" };
   }
 
   edit(text: string): void {
     if (text === this.#text.value) return;
     this.#text.value = text;
-    this.#keep();
+    this.#storeDraft();
   }
 
   /** Discards the changes; returns the discarded text. */
   discard(): string {
-    const given = this.#text.value;
+    const discarded = this.#text.value;
     this.#text.value = this.#base.value?.source ?? this.#template;
     this.#basedOn = this.#base.value?.version ?? 0;
     this.#restored.value = null;
     this.#conflict.value = null;
-    this.#kept.remove();
-    return given;
+    this.#storedDraft.remove();
+    return discarded;
   }
 
   /** Saves the text and returns whether it was saved. The text stays after an error. */
@@ -86,14 +86,14 @@ export class ScriptDraft {
     if (this.#saving.value) return false;
     const source = this.#text.value;
     this.#saving.value = true;
-    this.#why.value = "";
+    this.#saveError.value = "";
     try {
       const saved = await this.#library.save(this.robotType, this.name, source, this.#basedOn);
-      this.#take(saved, source);
+      this.#applySaved(saved, source);
       return true;
     } catch (error) {
-      if (error instanceof MovementChanged) await this.#find();
-      else this.#why.value = sentence(error);
+      if (error instanceof MovementChanged) await this.#loadConflict();
+      else this.#saveError.value = sentence(error);
       return false;
     } finally {
       this.#saving.value = false;
@@ -114,25 +114,25 @@ export class ScriptDraft {
     return this.discard();
   }
 
-  #take(saved: Movement, source: string): void {
+  #applySaved(saved: Movement, source: string): void {
     this.#base.value = { ...saved, source };
     this.#basedOn = saved.version;
     this.#conflict.value = null;
     this.#restored.value = null;
     // The user may have edited the text during the save.
-    this.#keep();
+    this.#storeDraft();
   }
 
-  #keep(): void {
-    if (this.#text.value === (this.#base.value?.source ?? this.#template)) this.#kept.remove();
-    else this.#kept.write({ source: this.#text.value, basedOn: this.#basedOn, at: Date.now() });
+  #storeDraft(): void {
+    if (this.#text.value === (this.#base.value?.source ?? this.#template)) this.#storedDraft.remove();
+    else this.#storedDraft.write({ source: this.#text.value, basedOn: this.#basedOn, at: Date.now() });
   }
 
-  async #find(): Promise<void> {
+  async #loadConflict(): Promise<void> {
     try {
       this.#conflict.value = { theirs: await this.#newest() };
     } catch (error) {
-      this.#why.value = sentence(error);
+      this.#saveError.value = sentence(error);
     }
   }
 

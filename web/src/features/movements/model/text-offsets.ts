@@ -1,7 +1,7 @@
 /** Converts script positions: the server counts characters, the editor UTF-16 units. */
 import type { Mark } from "../../../shared/api/movement-library";
 
-export interface Place {
+export interface TextRange {
   from: number;
   to: number;
   severity: Mark["severity"];
@@ -9,7 +9,7 @@ export interface Place {
 }
 
 /** The offsets of a mark in a text: never outside of it, and not empty if possible. */
-export function placed(text: string, { severity, message, line, column, end_line, end_column }: Mark): Place {
+export function rangeOf(text: string, { severity, message, line, column, end_line, end_column }: Mark): TextRange {
   const lines = text.split(/\r\n?|\n/);
   const starts = [0];
   for (const each of lines) starts.push((starts.at(-1) ?? 0) + each.length + 1);

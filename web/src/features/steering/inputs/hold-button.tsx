@@ -3,7 +3,7 @@ import { useEffect } from "preact/hooks";
 import type { PressedInputs } from "../model/pressed-inputs";
 
 interface HoldButtonProps<T> {
-  held: PressedInputs<T>;
+  inputs: PressedInputs<T>;
   name: string;
   part: T;
   label: string;
@@ -13,9 +13,9 @@ interface HoldButtonProps<T> {
 }
 
 /** Active while held with the pointer, Space or Enter. Losing the pointer or the focus releases it. */
-export function HoldButton<T>({ held, name, part, label, disabled, children, ...rest }: HoldButtonProps<T>) {
-  useEffect(() => () => held.release(name), [held, name]);
-  const letGo = (): void => held.release(name);
+export function HoldButton<T>({ inputs, name, part, label, disabled, children, ...rest }: HoldButtonProps<T>) {
+  useEffect(() => () => inputs.release(name), [inputs, name]);
+  const release = (): void => inputs.release(name);
   return (
     <button
       type="button"
@@ -27,20 +27,20 @@ export function HoldButton<T>({ held, name, part, label, disabled, children, ...
       onPointerDown={(event) => {
         if (event.button !== 0) return;
         event.currentTarget.setPointerCapture(event.pointerId);
-        held.press(name, part);
+        inputs.press(name, part);
       }}
-      onPointerUp={letGo}
-      onPointerCancel={letGo}
-      onLostPointerCapture={letGo}
-      onBlur={letGo}
+      onPointerUp={release}
+      onPointerCancel={release}
+      onLostPointerCapture={release}
+      onBlur={release}
       onContextMenu={(event) => event.preventDefault()}
       onKeyDown={(event) => {
         if (event.key !== " " && event.key !== "Enter") return;
         event.preventDefault();
-        if (!event.repeat) held.press(name, part);
+        if (!event.repeat) inputs.press(name, part);
       }}
       onKeyUp={(event) => {
-        if (event.key === " " || event.key === "Enter") letGo();
+        if (event.key === " " || event.key === "Enter") release();
       }}
     >
       {children}

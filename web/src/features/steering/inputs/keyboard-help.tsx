@@ -5,16 +5,16 @@ import type { PressedInputs } from "../model/pressed-inputs";
 import type { SteeringMode } from "../model/steerable-parts";
 import { texts } from "../texts";
 
-const STORED = "telescope-keys";
+const STORAGE_KEY = "telescope-keys";
 /** Whether keys work everywhere on the page, or only while the focus is on the robot's controls. */
-const everywhere = signal(localStorage.getItem(STORED) !== "off");
+const everywhere = signal(localStorage.getItem(STORAGE_KEY) !== "off");
 
 const TEXT = 'input:not([type="range"], [type="checkbox"], [type="radio"]), textarea, select, [contenteditable], .cm-editor';
 /** Elements that use the arrow keys themselves. */
 const ARROWS_TAKEN = 'input, [role="tab"], [role="radiogroup"], [tabindex="0"]:not([data-takes-keys])';
 
-/** Whether a key event is for the robot, and not for the focused element. */
-function forTheRobot(event: KeyboardEvent): boolean {
+/** Whether a key event controls the robot, and not the focused element. */
+function controlsRobot(event: KeyboardEvent): boolean {
   if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return false;
   const at = event.target instanceof Element ? event.target : null;
   if (at === null) return true;
@@ -29,38 +29,38 @@ export function useKey(active: boolean, onKey: (event: KeyboardEvent) => boolean
   newest.current = onKey;
   useEffect(() => {
     if (!active) return;
-    const down = (event: KeyboardEvent): void => {
-      if (forTheRobot(event) && newest.current(event)) event.preventDefault();
+    const onKeyDown = (event: KeyboardEvent): void => {
+      if (controlsRobot(event) && newest.current(event)) event.preventDefault();
     };
-    addEventListener("keydown", down);
-    return () => removeEventListener("keydown", down);
+    addEventListener("keydown", onKeyDown);
+    return () => removeEventListener("keydown", onKeyDown);
   }, [active]);
 }
 
 /** Presses an input while its key is down. The key's release is detected even if the focus has moved. */
-export function useHeldKeys<T>(active: boolean, held: PressedInputs<T>, map: Readonly<Record<string, T>>): void {
+export function useHeldKeys<T>(active: boolean, inputs: PressedInputs<T>, map: Readonly<Record<string, T>>): void {
   useKey(active, (event) => {
     const part = map[event.code];
     if (part === undefined) return false;
-    if (!event.repeat) held.press(event.code, part);
+    if (!event.repeat) inputs.press(event.code, part);
     return true;
   });
   useEffect(() => {
     if (!active) return;
-    const up = (event: KeyboardEvent): void => {
-      if (event.code in map) held.release(event.code);
+    const onKeyUp = (event: KeyboardEvent): void => {
+      if (event.code in map) inputs.release(event.code);
     };
-    addEventListener("keyup", up, { capture: true });
+    addEventListener("keyup", onKeyUp, { capture: true });
     return () => {
-      removeEventListener("keyup", up, { capture: true });
-      held.releaseAll();
+      removeEventListener("keyup", onKeyUp, { capture: true });
+      inputs.releaseAll();
     };
-  }, [active, held, map]);
+  }, [active, inputs, map]);
 }
 
 /** The keys of the visible panel, shown inline so that nothing covers Stop. */
-export function KeyboardHelp({ way }: { way: SteeringMode }) {
-  const rows = [...texts.steer.keys[way], ...texts.steer.keys.always];
+export function KeyboardHelp({ mode }: { mode: SteeringMode }) {
+  const rows = [...texts.steer.keys[mode], ...texts.steer.keys.always];
   return (
     <div class="keys" data-testid="keys">
       <dl>
@@ -82,12 +82,12 @@ export function KeyboardHelp({ way }: { way: SteeringMode }) {
           checked={everywhere.value}
           onChange={(event) => {
             everywhere.value = event.currentTarget.checked;
-            localStorage.setItem(STORED, everywhere.value ? "on" : "off");
+            localStorage.setItem(STORAGE_KEY, everywhere.value ? "on" : "off");
           }}
         />
         {texts.steer.everywhere}
       </label>
-      <p class="quiet small">{texts.steer.padKeys[way]}</p>
+      <p class="quiet small">{texts.steer.padKeys[mode]}</p>
     </div>
   );
 }

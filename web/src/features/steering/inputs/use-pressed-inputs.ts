@@ -6,44 +6,44 @@ import type { SetpointStreamer } from "../model/setpoint-streamer";
 import type { Velocity } from "../model/steerable-parts";
 
 /**
- * The pressed inputs of a panel. `asked` converts them to a velocity.
+ * The pressed inputs of a panel. `toVelocity` converts them to a velocity.
  *
  * @param streamer Set while this page may move the robot.
  */
-export function usePressedInputs<T>(streamer: SetpointStreamer | null, asked: (parts: readonly T[]) => Velocity): PressedInputs<T> {
-  const newest = useRef({ streamer, asked });
-  newest.current = { streamer, asked };
-  const held = useMemo(
+export function usePressedInputs<T>(streamer: SetpointStreamer | null, toVelocity: (parts: readonly T[]) => Velocity): PressedInputs<T> {
+  const newest = useRef({ streamer, toVelocity });
+  newest.current = { streamer, toVelocity };
+  const inputs = useMemo(
     () =>
       new PressedInputs<T>((parts) => {
-        const { streamer: to, asked: ask } = newest.current;
-        if (parts.length === 0) to?.letGo();
-        else to?.hold(ask(parts));
+        const { streamer: to, toVelocity: convert } = newest.current;
+        if (parts.length === 0) to?.release();
+        else to?.setVelocity(convert(parts));
       }),
     [],
   );
   // The speed or axes may have changed: send the velocity again.
   useEffect(() => {
-    if (held.any) held.again();
+    if (inputs.any) inputs.notify();
   });
   useEffect(
     () =>
       effect(() => {
         // The stream ended for another reason: inputs that are still pressed must not restart it.
-        if ((streamer?.velocity.value ?? null) === null) held.spend();
+        if ((streamer?.velocity.value ?? null) === null) inputs.spend();
       }),
-    [held, streamer],
+    [inputs, streamer],
   );
   useEffect(() => {
-    const drop = (): void => held.releaseAll();
-    addEventListener("blur", drop);
-    document.addEventListener("visibilitychange", drop);
+    const releaseInputs = (): void => inputs.releaseAll();
+    addEventListener("blur", releaseInputs);
+    document.addEventListener("visibilitychange", releaseInputs);
     return () => {
-      removeEventListener("blur", drop);
-      document.removeEventListener("visibilitychange", drop);
-      held.releaseAll();
-      streamer?.letGo();
+      removeEventListener("blur", releaseInputs);
+      document.removeEventListener("visibilitychange", releaseInputs);
+      inputs.releaseAll();
+      streamer?.release();
     };
-  }, [held, streamer]);
-  return held;
+  }, [inputs, streamer]);
+  return inputs;
 }

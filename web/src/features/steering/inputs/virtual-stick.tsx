@@ -5,26 +5,26 @@ import type { Push } from "../model/steerable-parts";
 import { texts } from "../texts";
 
 /** Dead zone around the centre. */
-const MIDDLE = 0.1;
+const DEAD_ZONE = 0.1;
 const NAME = "stick";
 
 interface StickProps {
-  held: PressedInputs<Push>;
+  inputs: PressedInputs<Push>;
   disabled: boolean;
 }
 
 /** A virtual stick: up is forward, sideways turns. It returns to the centre on release or pointer loss. */
-export function VirtualStick({ held, disabled }: StickProps) {
+export function VirtualStick({ inputs, disabled }: StickProps) {
   const [at, setAt] = useState<[number, number]>([0, 0]);
-  const letGo = (): void => {
+  const release = (): void => {
     setAt([0, 0]);
-    held.release(NAME);
+    inputs.release(NAME);
   };
   useEffect(() => {
     if (disabled) setAt([0, 0]);
-    return () => held.release(NAME);
-  }, [held, disabled]);
-  const place = (event: PointerEvent & { currentTarget: HTMLElement }): [number, number] => {
+    return () => inputs.release(NAME);
+  }, [inputs, disabled]);
+  const deflection = (event: PointerEvent & { currentTarget: HTMLElement }): [number, number] => {
     const box = event.currentTarget.getBoundingClientRect();
     const radius = box.width * 0.38;
     const x = (event.clientX - box.left - box.width / 2) / radius;
@@ -33,7 +33,7 @@ export function VirtualStick({ held, disabled }: StickProps) {
     return [clamp(x / length, -1, 1), clamp(y / length, -1, 1)];
   };
   const part = ([x, y]: [number, number]): Push => {
-    const small = Math.hypot(x, y) < MIDDLE;
+    const small = Math.hypot(x, y) < DEAD_ZONE;
     return { forward: small ? 0 : y, turn: small ? 0 : -x, left: 0 };
   };
   return (
@@ -48,20 +48,20 @@ export function VirtualStick({ held, disabled }: StickProps) {
       onPointerDown={(event) => {
         if (disabled || event.button !== 0) return;
         event.currentTarget.setPointerCapture(event.pointerId);
-        const now = place(event);
+        const now = deflection(event);
         setAt(now);
-        held.press(NAME, part(now));
+        inputs.press(NAME, part(now));
       }}
       onPointerMove={(event) => {
         if (disabled || !event.currentTarget.hasPointerCapture(event.pointerId)) return;
-        const now = place(event);
+        const now = deflection(event);
         setAt(now);
-        held.keep(NAME, part(now));
+        inputs.update(NAME, part(now));
       }}
-      onPointerUp={letGo}
-      onPointerCancel={letGo}
-      onLostPointerCapture={letGo}
-      onBlur={letGo}
+      onPointerUp={release}
+      onPointerCancel={release}
+      onLostPointerCapture={release}
+      onBlur={release}
       onContextMenu={(event) => event.preventDefault()}
     >
       <span class="stick-mark up" aria-hidden="true">

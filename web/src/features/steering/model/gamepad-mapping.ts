@@ -15,7 +15,7 @@ export interface PadReading {
   id: string;
   index: number;
   /** Whether an upper shoulder button is held (dead-man button). */
-  held: boolean;
+  enabled: boolean;
   stop: boolean;
   /** Right and up, -1…1. */
   left: readonly [number, number];
@@ -54,7 +54,7 @@ export function readPad(pad: Pad | null | undefined): PadReading | null {
   return {
     id: pad.id,
     index: pad.index,
-    held: SHOULDERS.some(pressed),
+    enabled: SHOULDERS.some(pressed),
     stop: pressed(B),
     left: [leftX, leftY],
     right: [rightX, rightY],

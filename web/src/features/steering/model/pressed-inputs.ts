@@ -5,29 +5,29 @@
 export class PressedInputs<T> {
   readonly #parts = new Map<string, T>();
   readonly #spent = new Set<string>();
-  readonly #tell: (parts: readonly T[]) => void;
+  readonly #onChange: (parts: readonly T[]) => void;
 
-  /** `tell`: called after every change; an empty list means that no input is pressed. */
-  constructor(tell: (parts: readonly T[]) => void) {
-    this.#tell = tell;
+  /** `onChange`: called after every change; an empty list means that no input is pressed. */
+  constructor(onChange: (parts: readonly T[]) => void) {
+    this.#onChange = onChange;
   }
 
   /** A new press. */
   press(name: string, part: T): void {
     this.#spent.delete(name);
-    this.keep(name, part);
+    this.update(name, part);
   }
 
   /** Updates a pressed input, for example a moved stick. */
-  keep(name: string, part: T): void {
+  update(name: string, part: T): void {
     if (this.#spent.has(name)) return;
     this.#parts.set(name, part);
-    this.again();
+    this.notify();
   }
 
   release(name: string): void {
     this.#spent.delete(name);
-    if (this.#parts.delete(name)) this.again();
+    if (this.#parts.delete(name)) this.notify();
   }
 
   /** Spends all pressed inputs after the end of a stream. */
@@ -39,12 +39,12 @@ export class PressedInputs<T> {
   releaseAll(): void {
     if (this.#parts.size === 0) return;
     this.spend();
-    this.again();
+    this.notify();
   }
 
-  /** Calls `tell` again, because the meaning of the inputs changed. */
-  again(): void {
-    this.#tell([...this.#parts.values()]);
+  /** Calls `onChange` again after the meaning of the inputs changed. */
+  notify(): void {
+    this.#onChange([...this.#parts.values()]);
   }
 
   get any(): boolean {

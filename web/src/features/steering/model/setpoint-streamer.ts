@@ -1,6 +1,6 @@
 /**
- * Streams setpoints to one device at 40 Hz while the lease is held and telemetry is fresh: joint targets until they are
- * reached, or a velocity of a frame or the base while an input is held. Only the newest of them is active. Any doubt ends
+ * Streams setpoints to one device at 40 Hz while the lease is held and telemetry is recent: joint targets until they are
+ * reached, or a velocity of a frame or the base while an input is held. Only the newest of them is active. Missing data ends
  * the stream, which never resumes automatically.
  */
 import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-core";
@@ -8,28 +8,28 @@ import { clamp, radians } from "../../../shared/lib/angles";
 import { now } from "../../../shared/lib/clock";
 import type { KnownTelemetry } from "../../../shared/mqtt/parse-messages";
 import type { Joint, Setpoint } from "../../../shared/mqtt/protocol.generated";
-import { restOf, type Velocity, type SteeringMode } from "./steerable-parts";
+import { zeroOf, type Velocity, type SteeringMode } from "./steerable-parts";
 
 export const PERIOD_MS = 25;
 /** Telemetry older than this is stale: the agent would reject a setpoint that echoes it [ms]. */
 export const FRESH_MS = 200;
-/** Without fresh telemetry for this long the target is abandoned, to prevent unexpected motion later [ms]. */
+/** Without recent telemetry for this long the target is abandoned, to prevent unexpected motion later [ms]. */
 export const ABANDON_MS = 1_000;
 /** The same for a velocity: the robot's watchdog has stopped it by then, and it must not restart [ms]. */
 export const LOST_MS = 400;
 /** After release, zero velocity is sent for this long and until the robot rests, so that its watchdog is not needed [ms]. */
 export const SETTLE_MS = 400;
-const SETTLE_AT_MOST_MS = 1_500;
+const MAX_SETTLE_MS = 1_500;
 /** Tolerance of the measured position at the target [rad]. */
 const REACHED_RAD = radians(0.2);
 /** Tolerance of the commanded position at the target [rad]. */
 const COMMANDED_RAD = radians(0.02);
-const STILL_RAD_S = 0.005;
+const AT_REST_RAD_S = 0.005;
 /** Without motion for this long before the target, the robot is blocked and the stream ends [ms]. */
 export const STUCK_MS = 2_000;
 
 type StreamState = "idle" | "streaming" | "waiting";
-export type EndedBecause = "reached" | "stuck" | "let-go" | "stopped" | "hidden" | "lost-sight" | "busy" | "no-connection" | null;
+export type EndedBecause = "reached" | "stuck" | "released" | "stopped" | "hidden" | "no-telemetry" | "busy" | "no-connection" | null;
 
 /** Joint name → position [rad]. */
 export type Targets = Readonly<Record<string, number>>;
@@ -40,18 +40,18 @@ interface StreamerOptions {
   /** Sends one setpoint; rejects without a connection. */
   send: (setpoint: Setpoint) => Promise<void>;
   /** The newest telemetry of the device, if any, with its arrival time on the page's clock [ms]. */
-  telemetry: () => Seen | null;
+  telemetry: () => ReceivedTelemetry | null;
 }
 
-interface Seen {
+interface ReceivedTelemetry {
   message: KnownTelemetry;
   receivedAt: number;
 }
 
-/** An active velocity, or, after `letGoAt`, the zero velocity that follows it. */
-interface Held {
+/** An active velocity, or, after `releasedAt`, the zero velocity that follows it. */
+interface ActiveVelocity {
   velocity: Velocity;
-  letGoAt: number | null;
+  releasedAt: number | null;
 }
 
 export class SetpointStreamer {
@@ -59,7 +59,7 @@ export class SetpointStreamer {
   readonly #targets = signal<Targets>({});
   readonly #state = signal<StreamState>("idle");
   readonly #ended = signal<EndedBecause>(null);
-  readonly #held = signal<Held | null>(null);
+  readonly #active = signal<ActiveVelocity | null>(null);
   readonly #timer: ReturnType<typeof setInterval>;
   #sequence = 0;
   #sending = 0;
@@ -72,16 +72,16 @@ export class SetpointStreamer {
   /** Why the last stream ended. */
   readonly ended: ReadonlySignal<EndedBecause> = this.#ended;
   /** The active stream; `null`: none. */
-  readonly way = computed<SteeringMode | null>(() => {
+  readonly steeringMode = computed<SteeringMode | null>(() => {
     if (this.#state.value === "idle") return null;
-    return this.#held.value?.velocity.kind ?? "joints";
+    return this.#active.value?.velocity.kind ?? "joints";
   });
   /** Joint targets, if known: a velocity has no target. */
-  readonly goal = computed<Targets | null>(() => (this.way.value === "joints" ? this.#targets.value : null));
+  readonly goal = computed<Targets | null>(() => (this.steeringMode.value === "joints" ? this.#targets.value : null));
   /** The active velocity; `null`: none. */
   readonly velocity = computed<Velocity | null>(() => {
-    const held = this.#held.value;
-    return held?.letGoAt === null ? held.velocity : null;
+    const active = this.#active.value;
+    return active?.releasedAt === null ? active.velocity : null;
   });
 
   constructor(options: StreamerOptions) {
@@ -93,10 +93,10 @@ export class SetpointStreamer {
   /** At rest, targets follow the commanded positions, so that a small step stays small. */
   follow(): void {
     const latest = this.#options.telemetry();
-    if (this.way.peek() === "joints" || latest === null) return;
+    if (this.steeringMode.peek() === "joints" || latest === null) return;
     const next = named(this.#options.joints, latest.message.commanded_rad);
-    const known = this.#targets.value;
-    if (Object.entries(next).some(([name, position]) => known[name] !== position)) this.#targets.value = next;
+    const current = this.#targets.value;
+    if (Object.entries(next).some(([name, position]) => current[name] !== position)) this.#targets.value = next;
   }
 
   /** Sets a joint's target [rad], clamped to the joint's range. */
@@ -105,51 +105,51 @@ export class SetpointStreamer {
     if (joint === undefined || !Number.isFinite(positionRad)) return;
     const at = now();
     const target = clamp(positionRad, joint.lower_rad, joint.upper_rad);
-    this.#leaveFor("joints");
+    this.#endOtherMode("joints");
     batch(() => {
-      // Start from the robot's current position, not from the slider's last value.
+      // Start at the robot's current position, not at the slider's last value.
       this.follow();
       this.#targets.value = { ...this.#targets.value, [name]: target };
       this.#movedAt = at;
-      this.#begin(at);
+      this.#startStream(at);
     });
     this.tick();
   }
 
   /**
-   * Starts or changes a velocity of a frame or the base, until `letGo`. A zero velocity does not start a stream.
+   * Starts or changes a velocity of a frame or the base, until `release`. A zero velocity does not start a stream.
    */
-  hold(velocity: Velocity): void {
+  setVelocity(velocity: Velocity): void {
     if (!parts(velocity).every(Number.isFinite)) return;
     if (parts(velocity).every((part) => part === 0)) {
-      this.letGo();
+      this.release();
       return;
     }
     const at = now();
-    this.#leaveFor(velocity.kind);
+    this.#endOtherMode(velocity.kind);
     batch(() => {
-      this.#held.value = { velocity, letGoAt: null };
-      this.#begin(at);
+      this.#active.value = { velocity, releasedAt: null };
+      this.#startStream(at);
     });
     this.tick();
   }
 
   /** Releases the velocity: sends zero velocity until the robot rests. Joint targets stay. */
-  letGo(): void {
-    const held = this.#held.value;
-    if (held?.letGoAt !== null) return;
-    this.#held.value = { velocity: restOf(held.velocity), letGoAt: now() };
-    this.#say();
+  release(): void {
+    const active = this.#active.value;
+    if (active?.releasedAt !== null) return;
+    this.#active.value = { velocity: zeroOf(active.velocity), releasedAt: now() };
+    this.#sendNow();
   }
 
   /** Ends the stream; targets return to the robot's positions. A velocity ends with zero velocity. */
   end(because: EndedBecause): void {
     if (this.#state.value === "idle") return;
-    this.letGo();
+    this.release();
     batch(() => {
       this.#state.value = "idle";
       this.#ended.value = because;
-      this.#held.value = null;
+      this.#active.value = null;
       this.follow();
     });
   }
@@ -163,10 +163,10 @@ export class SetpointStreamer {
   tick(): void {
     if (this.#state.value === "idle") return;
     const at = now();
-    const latest = this.#seen(at);
+    const latest = this.#freshTelemetry(at);
     if (latest === null) {
       this.#state.value = "waiting";
-      if (at - this.#sentAt > this.#patienceMs) this.end("lost-sight");
+      if (at - this.#sentAt > this.#timeoutMs) this.end("no-telemetry");
       return;
     }
     const { message } = latest;
@@ -180,16 +180,16 @@ export class SetpointStreamer {
   }
 
   /** The newest telemetry, if an agent would still accept a setpoint that echoes it. */
-  #seen(at: number): Seen | null {
+  #freshTelemetry(at: number): ReceivedTelemetry | null {
     const latest = this.#options.telemetry();
     return latest === null || at - latest.receivedAt > FRESH_MS ? null : latest;
   }
 
-  get #patienceMs(): number {
-    return this.#held.value === null ? ABANDON_MS : LOST_MS;
+  get #timeoutMs(): number {
+    return this.#active.value === null ? ABANDON_MS : LOST_MS;
   }
 
-  #begin(at: number): void {
+  #startStream(at: number): void {
     if (this.#state.value !== "idle") return;
     this.#startedAt = at;
     this.#sentAt = at;
@@ -198,31 +198,31 @@ export class SetpointStreamer {
   }
 
   /** Ends the previous steering mode, so that two modes are never active together. */
-  #leaveFor(next: SteeringMode): void {
-    const way = this.way.value;
-    if (way === next) return;
-    if (this.#held.value !== null) {
-      this.end("let-go");
-    } else if (way === "joints") {
+  #endOtherMode(next: SteeringMode): void {
+    const steeringMode = this.steeringMode.value;
+    if (steeringMode === next) return;
+    if (this.#active.value !== null) {
+      this.end("released");
+    } else if (steeringMode === "joints") {
       const latest = this.#options.telemetry();
       // Moving joints stop at their current positions.
       this.#targets.value = named(this.#options.joints, latest?.message.commanded_rad ?? []);
-      this.#say();
+      this.#sendNow();
       this.end(null);
     }
   }
 
   /** Sends the current setpoint once, even if earlier ones are still in flight. */
-  #say(): void {
-    const latest = this.#seen(now());
+  #sendNow(): void {
+    const latest = this.#freshTelemetry(now());
     if (latest !== null) this.#send(latest.message, now());
   }
 
   #stream(message: KnownTelemetry, at: number): void {
-    if (this.#held.value === null ? this.#reached(message, at) : this.#settled(this.#held.value, message, at)) return;
+    if (this.#active.value === null ? this.#reached(message, at) : this.#settled(this.#active.value, message, at)) return;
     if (this.#sending > 0) {
       // The previous setpoint is still being sent. Do not queue: the newest target is sent next.
-      if (at - this.#sentAt > this.#patienceMs) this.end("no-connection");
+      if (at - this.#sentAt > this.#timeoutMs) this.end("no-connection");
       return;
     }
     this.#send(message, at);
@@ -234,7 +234,7 @@ export class SetpointStreamer {
     if (message.epoch === epoch) this.#sequence = Math.max(this.#sequence, message.setpoint_sequence);
     this.#sequence += 1;
     this.#sending += 1;
-    const velocity = this.#held.value?.velocity;
+    const velocity = this.#active.value?.velocity;
     const setpoint: Setpoint = {
       epoch,
       sequence: this.#sequence,
@@ -258,10 +258,10 @@ export class SetpointStreamer {
   }
 
   /** Whether the robot rests after a release. */
-  #settled({ letGoAt }: Held, message: KnownTelemetry, at: number): boolean {
-    if (letGoAt === null || at - letGoAt < SETTLE_MS) return false;
-    if (!still(message) && at - letGoAt < SETTLE_AT_MOST_MS) return false;
-    this.end("let-go");
+  #settled({ releasedAt }: ActiveVelocity, message: KnownTelemetry, at: number): boolean {
+    if (releasedAt === null || at - releasedAt < SETTLE_MS) return false;
+    if (!isAtRest(message) && at - releasedAt < MAX_SETTLE_MS) return false;
+    this.end("released");
     return true;
   }
 
@@ -275,9 +275,9 @@ export class SetpointStreamer {
       this.end("reached");
       return true;
     }
-    const rests = still(message);
-    if (!rests) this.#movedAt = at;
-    if (rests && at - this.#movedAt > STUCK_MS && at - this.#startedAt > STUCK_MS) {
+    const atRest = isAtRest(message);
+    if (!atRest) this.#movedAt = at;
+    if (atRest && at - this.#movedAt > STUCK_MS && at - this.#startedAt > STUCK_MS) {
       // Commanded at the target counts as reached: a servo may deviate by more than the page's tolerance.
       this.end(commanded ? "reached" : "stuck");
       return true;
@@ -286,8 +286,8 @@ export class SetpointStreamer {
   }
 }
 
-function still(message: KnownTelemetry): boolean {
-  return message.velocity_rad_s.every((velocity) => Math.abs(velocity) < STILL_RAD_S);
+function isAtRest(message: KnownTelemetry): boolean {
+  return message.velocity_rad_s.every((velocity) => Math.abs(velocity) < AT_REST_RAD_S);
 }
 
 function named(joints: readonly Joint[], positions: readonly number[]): Targets {

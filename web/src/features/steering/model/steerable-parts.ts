@@ -8,19 +8,19 @@ export type SteeringMode = "joints" | "jog" | "drive";
 /** A velocity, active only while an input is held. */
 export type Velocity = JogTarget | DriveTarget;
 
-/** The kinds of setpoint that this device follows. */
+/** The steering modes that a device supports. */
 export function steeringModesOf(description: KnownDescription | null): SteeringMode[] {
   if (description === null) return [];
-  const ways: SteeringMode[] = [];
-  if (description.joints.length > 0) ways.push("joints");
+  const modes: SteeringMode[] = [];
+  if (description.joints.length > 0) modes.push("joints");
   // A robot that can move a frame to a pose can also jog it: both need its kinematics.
-  if (description.actions.includes("move_pose") && description.frames.length > 0) ways.push("jog");
-  if (description.base !== null) ways.push("drive");
-  return ways;
+  if (description.actions.includes("move_pose") && description.frames.length > 0) modes.push("jog");
+  if (description.base !== null) modes.push("drive");
+  return modes;
 }
 
-/** What a velocity that has been let go leaves behind: rest, said in its own words. */
-export function restOf(velocity: Velocity): Velocity {
+/** The zero velocity of the same kind. */
+export function zeroOf(velocity: Velocity): Velocity {
   if (velocity.kind === "drive") return { kind: "drive", forward_m_s: 0, left_m_s: 0, turn_rad_s: 0 };
   return { ...velocity, linear_m_s: [0, 0, 0], angular_rad_s: [0, 0, 0] };
 }
@@ -31,7 +31,7 @@ export interface Direction {
   about: Vector3;
 }
 
-/** Where a stick is pushed, -1…1 each: forward, to the left, turning counter-clockwise. */
+/** Deflection of a stick, -1…1 each: forward, left, counter-clockwise. */
 export interface Push {
   forward: number;
   left: number;
@@ -45,13 +45,13 @@ interface JogSpeed {
   angular_rad_s: number;
 }
 
-function most(vector: Vector3): number {
+function scaleOf(vector: Vector3): number {
   return Math.max(1, Math.hypot(...vector));
 }
 
-/** As fast in every direction: two buttons at once are no faster than one. */
+/** The jog velocity for a direction. Diagonal motion is limited to the same speed. */
 export function jogOf({ along, about }: Direction, speed: JogSpeed, frame: string, tool: boolean): JogTarget {
-  const scaled = (vector: Vector3, by: number): Vector3 => vector.map((part) => (part * by) / most(vector)) as Vector3;
+  const scaled = (vector: Vector3, by: number): Vector3 => vector.map((part) => (part * by) / scaleOf(vector)) as Vector3;
   return {
     kind: "jog",
     linear_m_s: scaled(along, speed.linear_m_s),
@@ -61,7 +61,7 @@ export function jogOf({ along, about }: Direction, speed: JogSpeed, frame: strin
   };
 }
 
-/** `share`: of the speed that the base can have, 0…1. */
+/** `share`: share of the base's maximum speed, 0…1. */
 export function driveOf(push: Push, limits: BaseLimits, share: number): DriveTarget {
   const part = (value: number, limit: number): number => clamp(value, -1, 1) * limit * clamp(share, 0, 1);
   return {
@@ -72,7 +72,7 @@ export function driveOf(push: Push, limits: BaseLimits, share: number): DriveTar
   };
 }
 
-/** The sum of all that is held at once. */
+/** The sum of all pressed directions. */
 export function sumOf(directions: Iterable<Direction>): Direction {
   const sum: Direction = { along: [0, 0, 0], about: [0, 0, 0] };
   for (const { along, about } of directions) {
@@ -84,7 +84,7 @@ export function sumOf(directions: Iterable<Direction>): Direction {
   return sum;
 }
 
-export function pushed(pushes: Iterable<Push>): Push {
+export function sumOfPushes(pushes: Iterable<Push>): Push {
   const sum = { ...AT_REST };
   for (const push of pushes) {
     sum.forward = clamp(sum.forward + push.forward, -1, 1);
@@ -95,7 +95,7 @@ export function pushed(pushes: Iterable<Push>): Push {
 }
 
 export function direction(kind: keyof Direction, axis: 0 | 1 | 2, sign: 1 | -1): Direction {
-  const made: Direction = { along: [0, 0, 0], about: [0, 0, 0] };
-  made[kind][axis] = sign;
-  return made;
+  const result: Direction = { along: [0, 0, 0], about: [0, 0, 0] };
+  result[kind][axis] = sign;
+  return result;
 }

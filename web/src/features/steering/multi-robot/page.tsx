@@ -13,21 +13,21 @@ import { deviceAddress, deviceListAddress } from "../../../shared/routing/routes
 import { SteeringCard } from "../steering-card";
 import "./multi-robot.css";
 
-interface TogetherPageProps {
+interface MultiRobotPageProps {
   api: Api;
   fleet: Fleet;
-  /** Of the devices, with commas between. */
+  /** Device ids, separated by commas. */
   ids: string;
   account: Account;
 }
 
-export function MultiRobotPage({ api, fleet, ids: asked, account }: TogetherPageProps) {
-  const ids = useMemo(() => [...new Set(asked.split(","))], [asked]);
+export function MultiRobotPage({ api, fleet, ids: idList, account }: MultiRobotPageProps) {
+  const ids = useMemo(() => [...new Set(idList.split(","))], [idList]);
   const all = fleet.devices.value;
   const devices = ids.map((id) => all?.get(id)).filter((device) => device !== undefined);
   const sessions = useDeviceSessions(api, fleet, devices, account);
-  const [chosen, setChosen] = useState<string | null>(null);
-  const active = sessions.find(({ device }) => device.id === chosen) ?? sessions[0];
+  const [selectedId, setSelectedId] = useState<string | null>(null);
+  const active = sessions.find(({ device }) => device.id === selectedId) ?? sessions[0];
   const stopAll = (): void => {
     for (const session of sessions) session.stopNow();
   };
@@ -63,7 +63,7 @@ export function MultiRobotPage({ api, fleet, ids: asked, account }: TogetherPage
               key={session.device.id}
               session={session}
               active={session === active}
-              onChoose={() => setChosen(session.device.id)}
+              onSelect={() => setSelectedId(session.device.id)}
               onStop={stopAll}
             />
           ))}
@@ -76,12 +76,12 @@ export function MultiRobotPage({ api, fleet, ids: asked, account }: TogetherPage
 interface RobotPanelProps {
   session: DeviceSession;
   active: boolean;
-  onChoose: () => void;
+  onSelect: () => void;
   onStop: () => void;
 }
 
-/** One robot: who touches it chooses it for keys and gamepad. */
-function RobotPanel({ session, active, onChoose, onStop }: RobotPanelProps) {
+/** One robot. A pointer press or focus inside selects it for keyboard and gamepad. */
+function RobotPanel({ session, active, onSelect, onStop }: RobotPanelProps) {
   const { device, control, stop } = session;
   const { label } = device.info.value;
   return (
@@ -91,17 +91,17 @@ function RobotPanel({ session, active, onChoose, onStop }: RobotPanelProps) {
       data-testid="robot-panel"
       data-device={device.id}
       data-chosen={active}
-      onPointerDownCapture={onChoose}
-      onFocusCapture={onChoose}
+      onPointerDownCapture={onSelect}
+      onFocusCapture={onSelect}
     >
       <header class="robot-panel-head">
         <h2>
           <a href={deviceAddress(device.id)}>{label}</a>
         </h2>
         <ReachChip device={device} data-testid="online" />
-        <Doing device={device} />
-        {/* The same words either way: what moves under a pointer that has just gone down gets no click. */}
-        <button type="button" class="choose" aria-pressed={active} data-testid="choose" onClick={onChoose}>
+        <ModeAndLastSeen device={device} />
+        {/* The label never changes: a button that moves during a pointer press receives no click. */}
+        <button type="button" class="choose" aria-pressed={active} data-testid="choose" onClick={onSelect}>
           {texts.multiRobot.keysHere}
         </button>
       </header>
@@ -113,7 +113,7 @@ function RobotPanel({ session, active, onChoose, onStop }: RobotPanelProps) {
   );
 }
 
-function Doing({ device }: { device: DeviceStore }) {
+function ModeAndLastSeen({ device }: { device: DeviceStore }) {
   const state = device.state.value;
   return (
     <span class={`quiet small ${device.live.value ? "" : "old"}`}>

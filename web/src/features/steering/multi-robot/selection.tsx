@@ -1,10 +1,10 @@
-/** Which robots are ticked in the list, to be operated on one page. */
+/** Selection of robots in the device list, to operate them on one page. */
 import type { DeviceStore } from "../../devices/model";
 import { signal } from "@preact/signals";
 import { texts } from "../texts";
 import { multiRobotAddress } from "../../../shared/routing/routes";
 
-const ticked = signal<readonly string[]>([]);
+const selectedIds = signal<readonly string[]>([]);
 
 export function MultiRobotCheckbox({ device }: { device: DeviceStore }) {
   const { id } = device;
@@ -14,18 +14,18 @@ export function MultiRobotCheckbox({ device }: { device: DeviceStore }) {
       class="pick"
       data-testid="pick"
       aria-label={texts.multiRobot.pick(device.info.value.label)}
-      checked={ticked.value.includes(id)}
+      checked={selectedIds.value.includes(id)}
       onChange={(event) => {
-        const others = ticked.value.filter((each) => each !== id);
-        ticked.value = event.currentTarget.checked ? [...others, id] : others;
+        const others = selectedIds.value.filter((each) => each !== id);
+        selectedIds.value = event.currentTarget.checked ? [...others, id] : others;
       }}
     />
   );
 }
 
-/** `devices`: all that there are. What is ticked and has gone since does not count. */
+/** `devices`: all devices. Selected devices that no longer exist are ignored. */
 export function OperateSelected({ devices }: { devices: readonly DeviceStore[] }) {
-  const ids = ticked.value.filter((id) => devices.some((device) => device.id === id));
+  const ids = selectedIds.value.filter((id) => devices.some((device) => device.id === id));
   return (
     <div role="status">
       {ids.length > 0 && (
@@ -36,7 +36,7 @@ export function OperateSelected({ devices }: { devices: readonly DeviceStore[] }
               {texts.multiRobot.open}
             </a>
           )}
-          <button type="button" class="plain" onClick={() => (ticked.value = [])}>
+          <button type="button" class="plain" onClick={() => (selectedIds.value = [])}>
             {texts.multiRobot.none}
           </button>
         </p>

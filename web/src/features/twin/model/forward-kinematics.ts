@@ -45,7 +45,7 @@ function about(axis: Vector3, angle: number): Quaternion {
 }
 
 /** A joint's position [rad or m]: passive joints follow others; absent ones are at their reference. */
-export function standing(joint: TwinJoint | null, positions: Readonly<Record<string, number>>): number {
+export function jointPosition(joint: TwinJoint | null, positions: Readonly<Record<string, number>>): number {
   if (joint === null) return 0;
   const followed = Object.entries(joint.follows ?? {});
   if (followed.length === 0) return positions[joint.name] ?? joint.reference_rad ?? 0;
@@ -53,7 +53,7 @@ export function standing(joint: TwinJoint | null, positions: Readonly<Record<str
 }
 
 /** A body's placement in its parent's frame with its joint at `position` [rad or m]. */
-export function placed(body: KnownBody, position: number): Placement {
+export function placementOf(body: KnownBody, position: number): Placement {
   const quaternion = unit(body.quaternion);
   const { joint } = body;
   if (joint === null) return { position_m: body.position_m, quaternion };
@@ -74,7 +74,7 @@ export function placed(body: KnownBody, position: number): Placement {
 export function forward(twin: KnownTwin, positions: Readonly<Record<string, number>>): Placement[] {
   const world: Placement[] = [];
   for (const body of twin.bodies) {
-    const own = placed(body, standing(body.joint, positions));
+    const own = placementOf(body, jointPosition(body.joint, positions));
     const parent = world[body.parent];
     world.push(
       parent === undefined
