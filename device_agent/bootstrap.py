@@ -118,7 +118,7 @@ def create_driver(
     Args:
         entry: The device.
         kind: Its robot type.
-        trace: Folder for the obstacle_map truth of simulated devices.
+        trace: Folder for the ground truth of simulated devices.
         faults: Folder of injected faults of simulated robots, ``{device}.toml`` each.
 
     Raises:
@@ -199,7 +199,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
 
     Args:
         store: An enrolled and claimed agent.
-        trace: Folder for the obstacle_map truth of simulated devices, ``{device}.ndjson`` each.
+        trace: Folder for the ground truth of simulated devices, ``{device}.ndjson`` each.
 
     Raises:
         ConfigError: The agent is not enrolled or claimed, or a file is wrong.

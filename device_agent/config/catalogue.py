@@ -122,7 +122,7 @@ def entries_of(name: str) -> list[DeviceEntry]:
         DeviceEntry(name=robot.name, type=robot.type, room=name, label=robot.label or TYPES.load(robot.type).label)
         for robot in manifest.robots
     )
-    devices = (DeviceEntry(name=each.name, type=each.kind, room=name, label=each.label) for each in manifest.devices)
+    devices = (DeviceEntry(name=item.name, type=item.kind, room=name, label=item.label) for item in manifest.devices)
     return [*robots, *devices]
 
 

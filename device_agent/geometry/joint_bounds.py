@@ -58,11 +58,13 @@ class JointBounds:
         index = {joint.name: number for number, joint in enumerate(robot_type.joints)}
         self.lower = np.array([joint.lower_rad for joint in robot_type.joints])
         self.upper = np.array([joint.upper_rad for joint in robot_type.joints])
-        self._mirrors = [(index[one.joint], index[one.mimics], one.multiplier) for one in robot_type.mimic_joints]
+        self._mirrors = [
+            (index[mimic.joint], index[mimic.mimics], mimic.multiplier) for mimic in robot_type.mimic_joints
+        ]
         self.mirrored: Ints = np.array([joint for joint, _, _ in self._mirrors], dtype=np.intp)
         self._narrowed = [
-            _Narrowed(index[one.joint], index[one.depends_on], np.array(one.table).T)
-            for one in robot_type.position_dependent_limits
+            _Narrowed(index[rule.joint], index[rule.depends_on], np.array(rule.table).T)
+            for rule in robot_type.position_dependent_limits
         ]
 
     def apply_mirrors(self, position_rad: Floats) -> None:
@@ -73,11 +75,13 @@ class JointBounds:
     def clearance(self, start: Floats, goal: Floats) -> Floats:
         """Distance to keep from each dependent bound, shape (ranges,) [rad]; not more than at the ends."""
         ends = np.stack((start, goal))
-        return np.array([min(_INSIDE_RAD, max(0.0, float(one.distance_rad(ends).min()))) for one in self._narrowed])
+        return np.array(
+            [min(_INSIDE_RAD, max(0.0, float(narrowed.distance_rad(ends).min()))) for narrowed in self._narrowed]
+        )
 
     def admits(self, start: Floats, end: Floats, clearance: Floats) -> bool:
         """Whether a straight segment keeps these distances from all dependent bounds."""
         return all(
-            bool(np.all(one.distance_rad(one.critical_positions(start, end)) >= least - _SAME_RAD))
-            for one, least in zip(self._narrowed, clearance.tolist(), strict=True)
+            bool(np.all(narrowed.distance_rad(narrowed.critical_positions(start, end)) >= least - _SAME_RAD))
+            for narrowed, least in zip(self._narrowed, clearance.tolist(), strict=True)
         )

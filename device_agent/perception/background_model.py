@@ -109,14 +109,14 @@ class BackgroundModel:
         return file.getvalue()
 
     @classmethod
-    def from_bytes(cls, to_bytes: bytes) -> "BackgroundModel":
+    def from_bytes(cls, content: bytes) -> "BackgroundModel":
         """Load a background model.
 
         Raises:
             BackgroundModelError: The content is invalid.
         """
         try:
-            with np.load(io.BytesIO(to_bytes), allow_pickle=False) as file:
+            with np.load(io.BytesIO(content), allow_pickle=False) as file:
                 return cls._of({name: np.asarray(file[name], dtype=np.float64) for name in file.files})
         except (ValueError, OSError, KeyError, EOFError) as error:
             raise BackgroundModelError(f"this is not a survey of a room ({error}); take a new one") from error
@@ -149,5 +149,5 @@ def _pose(raw: Scan | Image) -> Floats:
     return np.concatenate((np.asarray(raw.position_m, dtype=np.float64), np.ravel(raw.rotation)))
 
 
-def _is_same_pose(one: Floats, other: Floats) -> bool:
-    return bool(np.all(np.abs(one - other) < POSE_M))
+def _is_same_pose(first: Floats, second: Floats) -> bool:
+    return bool(np.all(np.abs(first - second) < POSE_M))

@@ -67,7 +67,10 @@ def group(points_m: Floats, gap_m: float, min_points: int) -> list[Cluster]:
         count += 1
     of_point = label[cell_of_point.ravel()]
     clusters = [Cluster(points_m[of_point == number]) for number in range(count)]
-    return sorted((one for one in clusters if len(one.points_m) >= min_points), key=lambda one: -len(one.points_m))
+    return sorted(
+        (cluster for cluster in clusters if len(cluster.points_m) >= min_points),
+        key=lambda cluster: -len(cluster.points_m),
+    )
 
 
 def _keys(points_m: Floats, side_m: float) -> NDArray[np.int64]:

@@ -16,11 +16,11 @@ BASE_M = 0.4
 """The base is expected within this distance from its nominal position [m]."""
 MEMORY_S = 30.0
 """Time constant of the occupancy estimate [s]."""
-DOUBT = 4.0
+OCCLUDED_FACTOR = 4.0
 """Factor by which learning slows down when other points, but not the base, are visible."""
-MOSTLY = 0.5
+BASE_SHARE = 0.5
 """A cell belongs to the base if occupied at least this share of the most occupied cell's time."""
-OFTEN = 0.2
+MIN_OCCUPANCY = 0.2
 """Smallest occupancy of the most occupied cell; less indicates a passing object or noise."""
 VISIBLE_SHARE = 0.5
 """Share of the base's cells that must be occupied for the base to count as visible."""
@@ -54,17 +54,17 @@ class _CameraView:
             np.count_nonzero(base)
         )
         self._age_s += elapsed_s
-        memory_s = min(MEMORY_S, self._age_s) * (DOUBT if base.any() and not visible else 1.0)
+        memory_s = min(MEMORY_S, self._age_s) * (OCCLUDED_FACTOR if base.any() and not visible else 1.0)
         self._samples += 1
         self.share += min(1.0, elapsed_s / memory_s) * (occupied - self.share)
         return visible
 
     @property
     def base(self) -> Bools:
-        """Mask of the base's cells; empty until enough has been seen."""
+        """Mask of the base's cells; empty until there are enough samples."""
         most = float(self.share.max())
-        confident = self._samples >= MIN_SAMPLES and most >= OFTEN
-        result: Bools = self.share >= MOSTLY * most if confident else np.zeros(self.share.shape, dtype=bool)
+        confident = self._samples >= MIN_SAMPLES and most >= MIN_OCCUPANCY
+        result: Bools = self.share >= BASE_SHARE * most if confident else np.zeros(self.share.shape, dtype=bool)
         return result
 
 
@@ -73,7 +73,7 @@ class FixedRobot:
     """One robot with a fixed base. Not thread-safe.
 
     Attributes:
-        mount: Its description.
+        mount: Description of the robot's base.
     """
 
     mount: Mount
@@ -112,7 +112,7 @@ class FixedRobot:
         """Centre of the base, shape (2,) [m]: behind the surface that one camera sees."""
         cells = np.argwhere(view.base)
         weight = view.share[cells[:, 0], cells[:, 1]]
-        seen = (weight @ cells / weight.sum() - view.share.shape[0] // 2 + 0.5) * CELL_M + self.mount.near_m
-        direction = seen - view.from_m
-        result: Floats = seen + direction / max(float(np.hypot(*direction)), 1e-6) * self.mount.radius_m
+        surface = (weight @ cells / weight.sum() - view.share.shape[0] // 2 + 0.5) * CELL_M + self.mount.near_m
+        direction = surface - view.from_m
+        result: Floats = surface + direction / max(float(np.hypot(*direction)), 1e-6) * self.mount.radius_m
         return result

@@ -190,9 +190,9 @@ class SensorFusion:
         """``people``, ``people.{zone}`` and ``present.{zone}`` (people and moving robots)."""
         with self._lock:
             present = [
-                (_person(one), *one.ahead(now_s).tolist())
-                for one in self._tracks.all
-                if one.confirmed and now_s - one.seen_s < PRESENT_S
+                (_person(track), *track.ahead(now_s).tolist())
+                for track in self._tracks.all
+                if track.confirmed and now_s - track.seen_s < PRESENT_S
             ]
         result: dict[str, float | bool] = {"people": float(sum(person for person, _, _ in present))}
         for zone in self.zones:

@@ -294,7 +294,7 @@ class Tracker:
         for track in self.all:
             if track.kind is not None and track.kind.beyond_m(track.height_m) > DOUBTFUL_M:
                 track.kind, track.number, track.height_count = None, 1, 0
-        new = [one for one in self.all if one.kind is None and one.height_count >= MIN_HEIGHTS]
+        new = [track for track in self.all if track.kind is None and track.height_count >= MIN_HEIGHTS]
         # Most likely assignments first; they limit the remaining ones.
         for _, track, kind in sorted(
             (
@@ -312,9 +312,9 @@ class Tracker:
             if predecessor is not None:
                 track.number = predecessor.number
             elif track.several:
-                taken = {one.number for one in self.all if one is not track and one.kind == track.kind}
+                taken = {other.number for other in self.all if other is not track and other.kind == track.kind}
                 track.number = min(set(range(1, len(self.all) + 2)) - taken)
-            self.all = [one for one in self.all if one is not predecessor]
+            self.all = [other for other in self.all if other is not predecessor]
 
     def _cost(self, track: Track, kind: ObjectClass, now_s: float) -> float:
         """Cost of assigning a class to a track, by height and distance from the last or start position.
@@ -322,7 +322,7 @@ class Tracker:
         Negative log likelihood without constants; the position of an object last seen long ago is uncertain.
         """
         cost = kind.misfit(track.height_m) ** 2 / 2
-        last = next((one for one in self.all if one.kind == kind), None)
+        last = next((known for known in self.all if known.kind == kind), None)
         if kind.several or (last is None and kind.start_m is None):
             return cost + 2 * math.log(ANYWHERE_M)
         position = last.state[:2] if last is not None else np.array(kind.start_m)
@@ -333,18 +333,20 @@ class Tracker:
 
     def _is_available(self, kind: ObjectClass, now_s: float) -> bool:
         """Whether a class may be assigned: a unique object cannot be in two places."""
-        return kind.several or all(one.kind != kind or now_s - one.seen_s > MISSED_S for one in self.all)
+        return kind.several or all(track.kind != kind or now_s - track.seen_s > MISSED_S for track in self.all)
 
     def _predecessor(self, track: Track, now_s: float) -> Track | None:
         """The lost track that this one continues: the only one of its class, or the nearest reachable one."""
-        others = [one for one in self.all if one is not track and one.kind is not None and one.kind == track.kind]
+        others = [
+            other for other in self.all if other is not track and other.kind is not None and other.kind == track.kind
+        ]
         result = []
-        for one in others:
-            missed_s = now_s - one.seen_s
-            away_m = float(np.hypot(*(one.state[:2] - track.state[:2])))
-            within = missed_s > MISSED_S and away_m < WIDEST_GATE_M + missed_s * one.fastest_m_s
-            if within or not one.several:
-                result.append((away_m, one))
+        for other in others:
+            missed_s = now_s - other.seen_s
+            away_m = float(np.hypot(*(other.state[:2] - track.state[:2])))
+            within = missed_s > MISSED_S and away_m < WIDEST_GATE_M + missed_s * other.fastest_m_s
+            if within or not other.several:
+                result.append((away_m, other))
         return min(result, key=lambda entry: entry[0])[1] if result else None
 
 

@@ -115,23 +115,23 @@ def _server(
         advice = "Check the address in agent.toml, the network, and whether the server runs."
         yield problem("server", str(error), advice)
         return None
-    took_ms = (time.monotonic() - started_s) * 1000
-    yield ok("server", f"{configuration.server} responds in {took_ms:.0f} ms and knows this agent")
+    duration_ms = (time.monotonic() - started_s) * 1000
+    yield ok("server", f"{configuration.server} responds in {duration_ms:.0f} ms and knows this agent")
     return enrollment
 
 
 def _keys(enrollment: dict[str, Any], pairing: Pairing, clock: CloudClock) -> Finding:
     """Check that this agent trusts the key with which the cloud signs now."""
     try:
-        news = responses.read(enrollment, responses.News)
+        keys = responses.read(enrollment, responses.News)
         pins = PinnedKeys(pairing, save=lambda _: None, now_ms=clock.now_ms)
-        pins.follow(news.key_statements)
+        pins.follow(keys.key_statements)
     except (CloudError, Refused) as error:
         return problem("keys", f"the cloud's new key is not trusted: {error}", f"Then {ADVICE}.")
-    if news.signing_key and news.signing_key not in pins:
+    if keys.signing_key and keys.signing_key not in pins:
         return problem(
             "keys",
-            f"the cloud signs commands with key {news.signing_key}, which this agent does not trust: it was offline "
+            f"the cloud signs commands with key {keys.signing_key}, which this agent does not trust: it was offline "
             "for longer than the previous key was valid, or that key was revoked",
             "Stop the agent, run `python -m device_agent repin`, and start it again; or unpair and claim it again.",
         )
@@ -145,11 +145,11 @@ def _clocks(clock: CloudClock) -> Iterator[Finding]:
         return
     offset_ms = wall_ms() - now_ms
     if abs(offset_ms) > _MAX_CLOCK_OFFSET_MS:
-        ahead = "ahead of" if offset_ms > 0 else "behind"
+        direction = "ahead of" if offset_ms > 0 else "behind"
         yield warning(
             "clock",
-            f"this machine's clock is {abs(offset_ms) / 1000:.1f} s {ahead} the server's: its measurements get wrong "
-            "timestamps (commands are not affected: their expiry uses the server's clock)",
+            f"this machine's clock is {abs(offset_ms) / 1000:.1f} s {direction} the server's: its measurements get "
+            "wrong timestamps (commands are not affected: their expiry uses the server's clock)",
             "Synchronize it: timedatectl set-ntp true",
         )
     else:
@@ -192,11 +192,11 @@ def _connect(
         started_ms = tick_ms()
         transport.start(lambda _topic, _payload: None, lambda is_up: up.set() if is_up else None)
         connected = up.wait(_LINK_S)
-        took_ms = tick_ms() - started_ms
+        duration_ms = tick_ms() - started_ms
         transport.stop()
     journal.close()
     if connected:
-        yield ok("link", f"{configuration.transport}: connected in {took_ms} ms with the agent's credentials")
+        yield ok("link", f"{configuration.transport}: connected in {duration_ms} ms with the agent's credentials")
     else:
         yield problem(
             "link",

@@ -69,23 +69,23 @@ def folder(store: IdentityStore) -> Iterator[Finding]:
 
 
 def _readable_by_others(path: Path) -> Iterator[Finding]:
-    for each in (path, *sorted(path.iterdir())):
-        if each != path and not each.is_file():
+    for entry in (path, *sorted(path.iterdir())):
+        if entry != path and not entry.is_file():
             continue
-        if stat.S_IMODE(each.stat().st_mode) & 0o077:
-            mode = "700" if each == path else "600"
-            if each.name in _SECRET:
-                message = f"other users of this machine can read {each} and impersonate this agent"
+        if stat.S_IMODE(entry.stat().st_mode) & 0o077:
+            mode = "700" if entry == path else "600"
+            if entry.name in _SECRET:
+                message = f"other users of this machine can read {entry} and impersonate this agent"
                 yield problem(
-                    "folder", message, f"chmod {mode} {each}; if others use this machine, delete it and enroll."
+                    "folder", message, f"chmod {mode} {entry}; if others use this machine, delete it and enroll."
                 )
             else:
-                yield warning("folder", f"other users of this machine can read {each}", f"chmod {mode} {each}")
+                yield warning("folder", f"other users of this machine can read {entry}", f"chmod {mode} {entry}")
 
 
 def disk(store: IdentityStore) -> Iterator[Finding]:
     """Check free space and integrity of the databases; the agent does not run without its journal."""
-    existing = next(each for each in (store.folder, *store.folder.resolve().parents) if each.is_dir())
+    existing = next(folder for folder in (store.folder, *store.folder.resolve().parents) if folder.is_dir())
     free = shutil.disk_usage(existing).free
     message = f"{free / 1e9:.1f} GB free at {existing}"
     if free < _PROBLEM_BYTES:

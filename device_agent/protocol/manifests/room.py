@@ -293,8 +293,8 @@ def _check_supervision(device: RoomDeviceManifest, where: str) -> None:
         raise ProtocolError(f"{where}: {error}") from error
     streams = [stream.name for stream in device.streams]
     sources = [*streams, *(camera.name for camera in device.cameras)]
-    references = [("diagnostics", each.stream, streams) for each in device.diagnostics]
-    references += [("watch", each.source, sources) for each in device.watch]
+    references = [("diagnostics", diagnostic.stream, streams) for diagnostic in device.diagnostics]
+    references += [("watch", watch.source, sources) for watch in device.watch]
     for what, name, known in references:
         if name not in known:
             raise ProtocolError(f"{what} of {where}: there is no '{name}'; known: {', '.join(known) or 'none'}")

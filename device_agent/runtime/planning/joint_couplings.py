@@ -66,12 +66,12 @@ class Couplings:
         self._names = [joint.name for joint in robot_type.joints]
         index = {name: number for number, name in enumerate(self._names)}
         self._mirrors = [
-            _Mirror(index[one.joint], index[one.mimics], one.multiplier) for one in robot_type.mimic_joints
+            _Mirror(index[mimic.joint], index[mimic.mimics], mimic.multiplier) for mimic in robot_type.mimic_joints
         ]
-        self._followers = {one.joint: one for one in robot_type.mimic_joints}
+        self._followers = {mimic.joint: mimic for mimic in robot_type.mimic_joints}
         self._dependent = [
-            _DependentRange(index[one.joint], index[one.depends_on], one)
-            for one in robot_type.position_dependent_limits
+            _DependentRange(index[rule.joint], index[rule.depends_on], rule)
+            for rule in robot_type.position_dependent_limits
         ]
 
     def __bool__(self) -> bool:
@@ -102,17 +102,17 @@ class Couplings:
     def find_violations(self, position_rad: Sequence[float]) -> list[tuple[int, float, float, str]]:
         """The joints outside their dependent range: index, lower, upper, name of the other joint."""
         violations = []
-        for one in self._dependent:
-            lower, upper = one.rule.at(position_rad[one.by])
-            if not lower <= position_rad[one.joint] <= upper:
-                violations.append((one.joint, lower, upper, one.rule.depends_on))
+        for dependent in self._dependent:
+            lower, upper = dependent.rule.at(position_rad[dependent.by])
+            if not lower <= position_rad[dependent.joint] <= upper:
+                violations.append((dependent.joint, lower, upper, dependent.rule.depends_on))
         return violations
 
     def confine(self, position_rad: Floats) -> None:
         """Move a path, shape (samples, n) [rad], into the allowed ranges, in place."""
-        for one in self._dependent:
-            by, lower, upper = np.array(one.rule.table).T
-            by_rad, joint_rad = position_rad[:, one.by], position_rad[:, one.joint]
+        for dependent in self._dependent:
+            by, lower, upper = np.array(dependent.rule.table).T
+            by_rad, joint_rad = position_rad[:, dependent.by], position_rad[:, dependent.joint]
             joint_rad[:] = np.clip(joint_rad, np.interp(by_rad, by, lower), np.interp(by_rad, by, upper))
         for joint, of, factor in self._mirrors:
             position_rad[:, joint] = position_rad[:, of] * factor
@@ -122,12 +122,12 @@ class Couplings:
         for joint, of, factor in self._mirrors:
             if np.any(np.abs(position_rad[:, joint] - position_rad[:, of] * factor) > _MIMIC_TOLERANCE_RAD):
                 return f"separates {self._names[joint]} from {self._names[of]}, which the same motor moves"
-        for one in self._dependent:
-            by, lower, upper = np.array(one.rule.table).T
-            by_rad, joint_rad = position_rad[:, one.by], position_rad[:, one.joint]
+        for dependent in self._dependent:
+            by, lower, upper = np.array(dependent.rule.table).T
+            by_rad, joint_rad = position_rad[:, dependent.by], position_rad[:, dependent.joint]
             low, high = np.interp(by_rad, by, lower), np.interp(by_rad, by, upper)
             if np.any((joint_rad < low - _SAME_RAD) | (joint_rad > high + _SAME_RAD)):
-                return f"leads {self._names[one.joint]} where {one.rule.depends_on} does not allow it"
+                return f"leads {self._names[dependent.joint]} where {dependent.rule.depends_on} does not allow it"
         return ""
 
     def limit_target(
@@ -144,15 +144,15 @@ class Couplings:
             The target for now, and the waiting joints, as ``limited`` names them.
         """
         limited, waits = list(target_rad), []
-        for one in self._dependent:
-            joint, by = one.joint, one.by
+        for dependent in self._dependent:
+            joint, by = dependent.joint, dependent.by
             end = target_rad[by]
-            lower, upper = one.common_range(*swing_rad[by], end)
+            lower, upper = dependent.common_range(*swing_rad[by], end)
             if lower > upper:  # no position is valid for the whole path: go as far as one is, and continue from there
-                end = one.reachable(position_rad[by], end, swing_rad[by], swing_rad[joint])
-                lower, upper = one.common_range(*swing_rad[by], end)
+                end = dependent.reachable(position_rad[by], end, swing_rad[by], swing_rad[joint])
+                lower, upper = dependent.common_range(*swing_rad[by], end)
             limited[joint] = min(max(target_rad[joint], lower), upper) if lower <= upper else position_rad[joint]
-            limited[by] = one.reachable(position_rad[by], end, swing_rad[by], swing_rad[joint])
+            limited[by] = dependent.reachable(position_rad[by], end, swing_rad[by], swing_rad[joint])
             if abs(limited[by] - target_rad[by]) > _SAME_RAD:
                 waits.append(f"{self._names[by]}: waits for {self._names[joint]}")
         self.apply_mirrors(limited)
@@ -163,11 +163,11 @@ class Couplings:
 
         A joint that was already outside, for example pushed by hand, may stay there but not move further out.
         """
-        for one in self._dependent:
-            before = before_rad[one.joint]
-            lower, upper = one.rule.at(before_rad[one.by])
+        for dependent in self._dependent:
+            before = before_rad[dependent.joint]
+            lower, upper = dependent.rule.at(before_rad[dependent.by])
             inside = lower - _SAME_RAD <= before <= upper + _SAME_RAD
-            lower, upper = one.rule.at(position_rad[one.by])
+            lower, upper = dependent.rule.at(position_rad[dependent.by])
             if not inside:
                 lower, upper = min(lower, before), max(upper, before)
-            position_rad[one.joint] = min(max(position_rad[one.joint], lower), upper)
+            position_rad[dependent.joint] = min(max(position_rad[dependent.joint], lower), upper)

@@ -71,7 +71,7 @@ def visemes_of(text: str, duration_s: float, available: Collection[str]) -> list
     total = sum(weight for _, weight in parts)
     visemes, start = [], 0.0
     for shape, weight in parts:
-        substitute = next((one for one in (shape, *_NEAREST.get(shape, ())) if one in available), None)
+        substitute = next((name for name in (shape, *_NEAREST.get(shape, ())) if name in available), None)
         if substitute is not None:
             visemes.append(((start + weight / 2) / total * duration_s, substitute))
         start += weight

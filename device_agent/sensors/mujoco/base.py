@@ -73,7 +73,7 @@ class SimulatedSensor:
                 raise SensorError(str(error)) from error
             try:
                 model = self._world.model
-                self._servos = {each.name: self._servo(model, each) for each in self._device.controls}
+                self._servos = {control.name: self._servo(model, control) for control in self._device.controls}
                 self.on_connect(model)
             except BaseException:
                 self._world.close()
@@ -84,7 +84,7 @@ class SimulatedSensor:
         """See ``RoomDriver``."""
         self.require()
         if stream != SETTINGS or not self._servos:
-            self._reject_unknown("stream", stream, [each.name for each in self._device.streams])
+            self._reject_unknown("stream", stream, [known.name for known in self._device.streams])
         with self.view.current() as (data, _):
             now = {name: float(data.qpos[servo.qpos]) for name, servo in self._servos.items() if servo.qpos is not None}
         settings = self._world.settings
@@ -162,7 +162,7 @@ class SimulatedSensor:
         code, count = _KINDS[kind]
         index = int(mujoco.mj_name2id(model, code, name))
         if index < 0:
-            every = (mujoco.mj_id2name(model, code, each) for each in range(getattr(model, count)))
+            every = (mujoco.mj_id2name(model, code, number) for number in range(getattr(model, count)))
             known = ", ".join(filter(None, every))
             raise SensorError(f"'{self._device.name}': the room has no {kind} '{name}'; it has: {known[:600]}")
         return index

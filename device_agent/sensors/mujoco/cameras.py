@@ -111,7 +111,7 @@ class ColourCamera(Camera):
 
     def frame(self, camera: str) -> Frame:
         """See ``ports.sensor.Camera``."""
-        cameras = [each.name for each in self._device.cameras]
+        cameras = [known.name for known in self._device.cameras]
         if camera not in cameras:
             self._reject_unknown("camera", camera, cameras)
         image = self._take()

@@ -30,7 +30,7 @@ class Meter(SimulatedSensor):
 
     def read(self, stream: str) -> Values:
         """See ``RoomDriver``."""
-        if stream not in {each.name for each in self._device.streams}:
+        if stream not in {known.name for known in self._device.streams}:
             return super().read(stream)
         self.require()
         quantities = self._world.quantities
@@ -60,7 +60,7 @@ class Contact(SimulatedSensor):
 
     def read(self, stream: str) -> Values:
         """See ``RoomDriver``."""
-        if stream not in {each.name for each in self._device.streams}:
+        if stream not in {known.name for known in self._device.streams}:
             return super().read(stream)
         self.require()
         with self.view.current() as (data, _):

@@ -269,7 +269,7 @@ class PerceptionDriver:
         for mount in self._options.mounts:
             robot = room.robot(mount.name)
             if robot is None:
-                known = ", ".join(one.name for one in room.robots) or "none"
+                known = ", ".join(robot.name for robot in room.robots) or "none"
                 raise SensorError(f"mounts of '{self._device.name}': no robot '{mount.name}'; the room has: {known}")
             result.append(Mount(**msgspec.structs.asdict(mount), near_m=(robot.position_m[0], robot.position_m[1])))
         return result

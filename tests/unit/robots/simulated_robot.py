@@ -41,14 +41,14 @@ class ControlledRobot:
         self.period_s = self.type.period_ms / 1000
         self.now_s = 0.0
 
-    def period(self) -> None:
+    def run_period(self) -> None:
         """One control period."""
         self.now_s += self.period_s
         self.controller.update(self.now_s)
 
     def wait(self, seconds: float) -> None:
         for _ in range(math.ceil(seconds / self.period_s - 1e-9)):
-            self.period()
+            self.run_period()
 
     def move(self, position_rad: Mapping[str, float], *, speed: float = 0.3) -> None:
         """Move the joints and wait for arrival."""
@@ -62,7 +62,7 @@ class ControlledRobot:
         """
         end_s = self.now_s + LONGEST_S
         while not goal.finished.is_set():
-            self.period()
+            self.run_period()
             assert self.now_s < end_s, "did not arrive"
         if goal.result is not GoalResult.REACHED:
             raise goal.why or AssertionError("interrupted without a reason")
@@ -125,7 +125,7 @@ class SimulatedRobot(ControlledRobot):
         if seed is not None:
             self.world.add(Disturbance(self.driver._actuators, self.driver._qpos, seed))
 
-    def period(self) -> None:
+    def run_period(self) -> None:
         """One period of the control loop, then the physics."""
         self.now_s += self.period_s
         self.driver.observe()

@@ -118,8 +118,8 @@ class ScriptedRobot(SimulatedRobot):
         self.limited |= {limit for limit in goal.limited if not limit.endswith(": driver")}
         self.moves += 1
 
-    def period(self) -> None:
-        super().period()
+    def run_period(self) -> None:
+        super().run_period()
         assert self.upright > UPRIGHT, "it fell"
         self.touched |= contacts(self.model, self.world._data, only=self.body if self._walks else None)
         self.touched -= self._initial_contacts

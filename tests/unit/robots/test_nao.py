@@ -131,7 +131,7 @@ def test_feet_leave_the_ground_in_turn(nao: SimulatedRobot) -> None:
     goal = start_walk(nao, 4.0)
     steps: list[str] = []
     while not goal.finished.is_set():
-        nao.period()
+        nao.run_period()
         left, right = soles_m(nao) > 0.01
         assert not (left and right), "both feet are in the air"
         lifted = "left" if left else "right" if right else ""
@@ -170,7 +170,7 @@ def test_a_stop_ends_a_walk_on_both_feet_within_the_brakes(nao: SimulatedRobot) 
     start_walk(nao)
     nao.wait(2.0)
     while soles_m(nao).max() < 0.015:  # with a foot in the air
-        nao.period()
+        nao.run_period()
     nao.controller.stop(StopLatch(caller="ann", at_ms=0, reason=""))
     nao.wait(0.1 / TYPE.base.braking_linear_m_s2 + 0.05)
     assert nao.twist == pytest.approx(REST, abs=1e-6)
@@ -235,7 +235,7 @@ def test_the_torso_support_is_limited_and_only_active_during_a_walk() -> None:
     goal = start_walk(nao, 3.0)
     strongest = np.zeros(2)
     while not goal.finished.is_set():
-        nao.period()
+        nao.run_period()
         strongest = np.maximum(strongest, [np.linalg.norm(support[:3]), np.linalg.norm(support[3:])])
     assert 0 < strongest[0] <= walk.support_n + 1e-9
     assert 0 < strongest[1] <= walk.support_nm + 1e-9

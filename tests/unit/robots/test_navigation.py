@@ -50,7 +50,7 @@ class SteppingEvent(threading.Event):
     def wait(self, timeout: float | None = None) -> bool:
         until_s = self._lab.now_s + (60.0 if timeout is None else timeout)
         while not self.is_set() and self._lab.now_s < until_s - PERIOD_S / 2:
-            self._lab.period()
+            self._lab.run_period()
         return self.is_set()
 
 
@@ -106,8 +106,8 @@ class Laboratory(SimulatedRobot):
         self.wait(settle_s)
         self.robot.reserve(1, lambda _: None)
 
-    def period(self) -> None:
-        super().period()
+    def run_period(self) -> None:
+        super().run_period()
         if self.room.now_s - self.sampled_s >= SAMPLE_S - PERIOD_S / 2:
             self.sample()
 

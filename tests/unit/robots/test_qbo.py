@@ -27,20 +27,20 @@ class DrivenQbo(SimulatedRobot):
         self.motion = BaseMotion(self.type.base, self.period_s)
         self.driver.observe()
 
-    def period(self) -> None:
+    def run_period(self) -> None:
         self.driver.drive(self.motion.update())
         self.world.step(self.type.period_ms // 2)
         self.driver.observe()
 
-    def go(self, twist: Twist, duration_s: float) -> None:
+    def drive_for(self, twist: Twist, duration_s: float) -> None:
         for _ in range(round(duration_s / self.period_s)):
             self.motion.follow(twist)
-            self.period()
+            self.run_period()
 
-    def rest(self, duration_s: float = 0.6) -> None:
+    def brake_for(self, duration_s: float = 0.6) -> None:
         for _ in range(round(duration_s / self.period_s)):
             self.motion.brake()
-            self.period()
+            self.run_period()
 
     @property
     def speed(self) -> tuple[float, float]:
@@ -55,8 +55,8 @@ def qbo() -> DrivenQbo:
 
 
 def test_it_drives_straight(qbo: DrivenQbo) -> None:
-    qbo.go(Twist(0.3), 5.0)
-    qbo.rest()
+    qbo.drive_for(Twist(0.3), 5.0)
+    qbo.brake_for()
     x, y, yaw = qbo.pose
     assert x == pytest.approx(0.3 * 5.0, abs=0.1)
     assert abs(y) < 0.005
@@ -69,8 +69,8 @@ def test_it_drives_straight(qbo: DrivenQbo) -> None:
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_it_turns_on_the_spot(qbo: DrivenQbo, side: int) -> None:
-    qbo.go(Twist(0.0, 0.0, side * 1.0), 3.0)
-    qbo.rest()
+    qbo.drive_for(Twist(0.0, 0.0, side * 1.0), 3.0)
+    qbo.brake_for()
     x, y, yaw = qbo.pose
     assert math.hypot(x, y) < 0.005
     assert side * yaw == pytest.approx(3.0, abs=0.25)
@@ -79,8 +79,8 @@ def test_it_turns_on_the_spot(qbo: DrivenQbo, side: int) -> None:
 
 def test_odometry_follows_a_long_path_and_drifts_a_little(qbo: DrivenQbo) -> None:
     for forward_m_s, turn_rad_s in ((0.3, 0.0), (0.0, 0.8), (0.2, 0.6), (-0.2, 0.3), (0.25, -0.7)):
-        qbo.go(Twist(forward_m_s, 0.0, turn_rad_s), 3.0)
-    qbo.rest()
+        qbo.drive_for(Twist(forward_m_s, 0.0, turn_rad_s), 3.0)
+    qbo.brake_for()
     x, y, yaw = qbo.pose
     odometry = qbo.driver.report("odometry")
     assert 0 < math.dist((odometry["x_m"], odometry["y_m"]), (x, y)) < 0.05, "small error by wheel slip"
@@ -95,7 +95,7 @@ def test_odometry_starts_at_the_true_pose_and_includes_wheel_slip(qbo: DrivenQbo
     qbo.driver.observe()
     start = qbo.driver.report("odometry")
     assert (start["x_m"], start["y_m"], start["yaw_rad"]) == pytest.approx((0.7, -0.4, 1.0), abs=0.01)
-    qbo.go(Twist(0.3), 1.0)
+    qbo.drive_for(Twist(0.3), 1.0)
     assert qbo.pose[:2] == pytest.approx((0.7, -0.4), abs=0.02)
     odometry = qbo.driver.report("odometry")
     assert math.dist((odometry["x_m"], odometry["y_m"]), (0.7, -0.4)) > 0.15
@@ -103,18 +103,18 @@ def test_odometry_starts_at_the_true_pose_and_includes_wheel_slip(qbo: DrivenQbo
 
 @pytest.mark.parametrize("twist", [Twist(0.3), Twist(-0.3), Twist(0.0, 0.0, 1.5), Twist(0.2, 0.0, -1.0)])
 def test_it_stops_within_its_braking_limits(qbo: DrivenQbo, twist: Twist) -> None:
-    qbo.go(twist, 2.0)
+    qbo.drive_for(twist, 2.0)
     linear, angular = qbo.speed
     assert max(linear / 0.3, abs(angular) / 1.5) > 0.6
     start_m = qbo.pose[:2]
     periods = 0
     while qbo.motion.moving:
         qbo.motion.brake()
-        qbo.period()
+        qbo.run_period()
         periods += 1
     assert periods * qbo.type.period_ms <= 180, "0.15 s at full speed, plus ramps"
     for _ in range(2):
-        qbo.period()
+        qbo.run_period()
     linear, angular = qbo.speed
     assert linear < 0.03
     assert abs(angular) < 0.05
@@ -125,9 +125,9 @@ def test_it_never_tips_over(qbo: DrivenQbo) -> None:
     random = np.random.default_rng(4)
     upright = 1.0
     for _ in range(40):
-        qbo.go(Twist(random.uniform(-0.3, 0.3), 0.0, random.uniform(-1.5, 1.5)), 0.25)
+        qbo.drive_for(Twist(random.uniform(-0.3, 0.3), 0.0, random.uniform(-1.5, 1.5)), 0.25)
         if random.random() < 0.3:
-            qbo.rest(0.2)
+            qbo.brake_for(0.2)
         upright = min(upright, qbo.upright)
     assert upright > math.cos(0.06)
     assert not qbo.world._data.warning.number.any()
@@ -144,7 +144,7 @@ def test_sideways_motion_is_ignored_and_fast_curves_keep_their_radius(qbo: Drive
 
 def test_wheels_stop_without_commands(qbo: DrivenQbo) -> None:
     """Commands end during motion, as after a fault of the control loop."""
-    qbo.go(Twist(0.3), 2.0)
+    qbo.drive_for(Twist(0.3), 2.0)
     x_m = qbo.pose[0]
     assert qbo.speed[0] > 0.25
     qbo.world.step(500)
@@ -153,7 +153,7 @@ def test_wheels_stop_without_commands(qbo: DrivenQbo) -> None:
     qbo.world.step(500)
     assert qbo.speed[0] < 0.002
     qbo.motion.start()
-    qbo.go(Twist(0.3), 2.0)
+    qbo.drive_for(Twist(0.3), 2.0)
     assert qbo.speed[0] > 0.25, "new commands are executed"
 
 
@@ -161,9 +161,9 @@ def test_sonars_measure_an_approaching_wall(qbo: DrivenQbo) -> None:
     """The wall is at x = 2.0 m, the sonars 0.156 m in front of the axle."""
     readings = [qbo.driver.report("sonar")]
     while qbo.pose[0] < 1.0:
-        qbo.go(Twist(0.3), 0.4)
+        qbo.drive_for(Twist(0.3), 0.4)
         readings.append(qbo.driver.report("sonar"))
-    qbo.rest()
+    qbo.brake_for()
     readings.append(qbo.driver.report("sonar"))
     for part in ("left", "right"):
         values = [float(values[f"distance_m.{part}"]) for values in readings]

@@ -16,7 +16,7 @@ MakeDevice = Callable[..., DeviceHarness]
 
 @pytest.fixture(autouse=True)
 def short_periods(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reconnections and states need not wait a second each."""
+    """Shorten the periods of reconnections and states."""
     for module, name in (
         (control_loop, "_RECONNECT_PERIOD_S"),
         (sensor_loop, "_RECONNECT_PERIOD_S"),
@@ -27,7 +27,7 @@ def short_periods(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def make_device(tmp_path: Path) -> Iterator[MakeDevice]:
-    """Starts and connects devices; the second one is the first one after a restart."""
+    """Starts and connects devices; another call restarts the device."""
     made: list[DeviceHarness] = []
 
     def make(**parts: Any) -> DeviceHarness:

@@ -50,43 +50,43 @@ class AgentFixture:
 
 
 @pytest.fixture
-def whole(tmp_path: Path) -> Iterator[AgentFixture]:
-    whole = AgentFixture(tmp_path)
-    whole.agent.start()
-    whole.link.link_changed(True)
-    yield whole
-    whole.agent.stop()
-    whole.harness.outbox.stop()
-    whole.harness.journal.close()
+def fixture(tmp_path: Path) -> Iterator[AgentFixture]:
+    fixture = AgentFixture(tmp_path)
+    fixture.agent.start()
+    fixture.link.link_changed(True)
+    yield fixture
+    fixture.agent.stop()
+    fixture.harness.outbox.stop()
+    fixture.harness.journal.close()
 
 
-def test_a_device_holds_before_the_link_starts_and_stop_is_idempotent(whole: AgentFixture) -> None:
-    assert whole.link.observed_first
-    assert whole.agent.quiet
-    whole.agent.stop()
-    whole.agent.stop()
-    assert whole.link.stopped == 2
+def test_a_device_holds_before_the_link_starts_and_stop_is_idempotent(fixture: AgentFixture) -> None:
+    assert fixture.link.observed_first
+    assert fixture.agent.quiet
+    fixture.agent.stop()
+    fixture.agent.stop()
+    assert fixture.link.stopped == 2
 
 
-def test_only_messages_for_the_device_reach_it(whole: AgentFixture) -> None:
+def test_only_messages_for_the_device_reach_it(fixture: AgentFixture) -> None:
     stop = codec.encode(Stop(id="s1", caller="bob"))
     for topic in ("ts/v1/s/a/leg/stop", "ts/v2/s/a/arm/stop", "$SYS", "", "ts/v1/x/y/arm/stop"):
-        whole.link.receive(topic, stop)
-    assert whole.harness.device._controller.latch is None
-    whole.link.receive("ts/v1/s/a/arm/stop", stop)
-    eventually(lambda: whole.harness.telemetry().mode is Mode.STOPPED)
+        fixture.link.receive(topic, stop)
+    assert fixture.harness.device._controller.latch is None
+    fixture.link.receive("ts/v1/s/a/arm/stop", stop)
+    eventually(lambda: fixture.harness.telemetry().mode is Mode.STOPPED)
 
 
-def test_measurements_of_other_agents_are_cached(whole: AgentFixture) -> None:
+def test_measurements_of_other_agents_are_cached(fixture: AgentFixture) -> None:
     measured = Measurements(tick_ms=1, at_ms=1, sequence=1, values={"present": True})
-    whole.link.receive(topics.device("s", "other", "pir", topics.TELE, "presence"), codec.encode(measured))
-    reading = whole.readings.latest("other-pir", "presence")
+    fixture.link.receive(topics.device("s", "other", "pir", topics.TELE, "presence"), codec.encode(measured))
+    reading = fixture.readings.latest("other-pir", "presence")
     assert reading is not None
     assert reading.values == {"present": True}
 
 
-def test_a_lost_link_reaches_every_device(whole: AgentFixture) -> None:
-    running = whole.harness.running(whole.harness.script("wait(600)"), epoch=1)
-    assert not whole.agent.quiet
-    whole.link.link_changed(False)
-    assert whole.harness.end_code(running) == "link_lost"
+def test_a_lost_link_reaches_every_device(fixture: AgentFixture) -> None:
+    running = fixture.harness.running(fixture.harness.script("wait(600)"), epoch=1)
+    assert not fixture.agent.quiet
+    fixture.link.link_changed(False)
+    assert fixture.harness.end_code(running) == "link_lost"

@@ -18,7 +18,7 @@ from tests.harness.agent.controller_fixture import Wall
 from tests.harness.agent.device_harness import DeviceHarness
 
 
-class AbleDriver(FakeDriver):
+class CapableDriver(FakeDriver):
     """A driver that executes every skill immediately and records it."""
 
     performs = ("speech", "stiffness", "gaze", "expressions", "behaviours", "postures")
@@ -46,13 +46,13 @@ class AbleDriver(FakeDriver):
                 self.interrupted.set()
             case RunBehaviour(name="sulk"):
                 context.wait(60)
-                raise SkillError("it broke off")
+                raise SkillError("the skill failed")
             case Express(name="frown"):
                 raise SkillError("no expression 'frown'; there are smile")
 
 
 class Head(Wall):
-    """A geometry: the shoulder turns it left, the elbow turns it up; it looks along its x axis, from 1 m above."""
+    """Geometry of a head 1 m above the base. The shoulder turns it left, the elbow up; it views along its x axis."""
 
     frames = ("face",)
 
@@ -79,7 +79,7 @@ class Head(Wall):
         return (tuple(start_rad), (0.0, 0.2), tuple(goal_rad))
 
 
-def able_type() -> RobotType:
+def capable_type() -> RobotType:
     return robot_type(
         BASE,
         capabilities=("cartesian", "speech", "stiffness", "expressions", "behaviours", "postures"),
@@ -89,8 +89,8 @@ def able_type() -> RobotType:
     )
 
 
-def driver_of(harness: DeviceHarness) -> AbleDriver:
-    assert isinstance(harness.driver, AbleDriver)
+def driver_of(harness: DeviceHarness) -> CapableDriver:
+    assert isinstance(harness.driver, CapableDriver)
     return harness.driver
 
 
@@ -99,7 +99,7 @@ def play(harness: DeviceHarness, source: str) -> str:
     return harness.done(harness.script(source), epoch=1).output
 
 
-def device_context(kind: RobotType, *, measured: bool = True, skills: AbleDriver | None = None) -> DeviceContext:
+def device_context(kind: RobotType, *, measured: bool = True, skills: CapableDriver | None = None) -> DeviceContext:
     observation = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
     controller = Controller(kind, LeaseGate())
     controller.start_at((0.0, 0.0))

@@ -31,9 +31,9 @@ from device_agent.runtime.readings import ReadingCache
 from tests.fakes.drivers import joint, robot_type
 from tests.harness.agent.device_harness import DeviceHarness, eventually
 from tests.unit.device_agent.runtime.actions.robot_api_fixture import (
-    AbleDriver,
+    CapableDriver,
     Head,
-    able_type,
+    capable_type,
     device_context,
     driver_of,
     play,
@@ -163,8 +163,8 @@ def test_a_script_reads_room_measurements() -> None:
 
 
 def test_no_skill_runs_after_the_action_has_ended() -> None:
-    driver = AbleDriver()
-    kind = msgspec.structs.replace(able_type(), gaze=None, capabilities=("gaze", "speech"))
+    driver = CapableDriver()
+    kind = msgspec.structs.replace(capable_type(), gaze=None, capabilities=("gaze", "speech"))
     robot = RobotApi(device_context(kind, skills=driver))
     robot.execute(LookAt(position_m=(1.0, 0.0, 0.0)))
     robot.end()
@@ -192,7 +192,7 @@ def test_calls_without_model_skills_measurement_or_reservation() -> None:
 
 @pytest.mark.parametrize("point", [(1.0, 1.0, 1.0), (2.0, -1.0, 0.2), (0.3, 0.1, 1.8), (-0.5, 0.8, 1.0)])
 def test_gaze_reaches_the_point(point: tuple[float, float, float]) -> None:
-    target = gaze.solve_gaze(able_type(), Head(), (0.1, -0.1), point)
+    target = gaze.solve_gaze(capable_type(), Head(), (0.1, -0.1), point)
     left, up = math.atan2(point[1], point[0]), math.atan2(point[2] - 1, math.hypot(point[0], point[1]))
     assert target == pytest.approx({"shoulder": left, "elbow": up}, abs=5e-3)
 
@@ -200,7 +200,7 @@ def test_gaze_reaches_the_point(point: tuple[float, float, float]) -> None:
 def test_gaze_out_of_reach_is_rejected() -> None:
     narrow = tuple(joint(name, lower_rad=-0.2, upper_rad=0.2) for name in ("shoulder", "elbow"))
     with pytest.raises(Refused, match="shoulder, elbow cannot turn far enough"):
-        gaze.solve_gaze(msgspec.structs.replace(able_type(), joints=narrow), Head(), (0.0, 0.0), (0.0, 1.0, 1.0))
+        gaze.solve_gaze(msgspec.structs.replace(capable_type(), joints=narrow), Head(), (0.0, 0.0), (0.0, 1.0, 1.0))
 
 
 # ---------------------------------------------------------------- expressions and postures of the manifest

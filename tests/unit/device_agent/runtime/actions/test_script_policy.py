@@ -58,23 +58,23 @@ def test_a_modified_script_is_rejected(journal: Journal, changes: Any, code: str
         policy.verify(msgspec.structs.replace(movement(), **changes))
 
 
-def test_every_character_counts(journal: Journal) -> None:
-    good, policy = movement(), policy_of(journal)
+def test_a_change_of_any_character_is_rejected(journal: Journal) -> None:
+    valid, policy = movement(), policy_of(journal)
     for field in ("source", "sha256", "name", "robot_type", "signature", "key"):
-        text: str = getattr(good, field)
-        for place in range(len(text)):
-            other = "b" if text[place] != "b" else "c"
-            changed: Any = {field: text[:place] + other + text[place + 1 :]}
+        text: str = getattr(valid, field)
+        for index in range(len(text)):
+            other = "b" if text[index] != "b" else "c"
+            changed: Any = {field: text[:index] + other + text[index + 1 :]}
             with pytest.raises(Refused):
-                policy.verify(msgspec.structs.replace(good, **changed))
+                policy.verify(msgspec.structs.replace(valid, **changed))
 
 
 def test_a_command_signature_is_not_valid_for_a_movement(journal: Journal) -> None:
-    good = movement()
-    text = signing.movement_text(good.robot_type, good.name, good.version, good.sha256)
-    stolen = signing.sign_text(text, KEY, context=signing.COMMAND_CONTEXT)
+    valid = movement()
+    text = signing.movement_text(valid.robot_type, valid.name, valid.version, valid.sha256)
+    signature = signing.sign_text(text, KEY, context=signing.COMMAND_CONTEXT)
     with refuses("bad_signature"):
-        policy_of(journal).verify(msgspec.structs.replace(good, signature=stolen))
+        policy_of(journal).verify(msgspec.structs.replace(valid, signature=signature))
 
 
 def test_an_older_version_than_one_that_ran_is_refused_also_after_a_restart(journal: Journal) -> None:
@@ -85,11 +85,11 @@ def test_an_older_version_than_one_that_ran_is_refused_also_after_a_restart(jour
     policy.record_version(movement(2))
     journal.close()
     journal.open(now_ms=0)
-    again = policy_of(journal)
+    restarted = policy_of(journal)
     with refuses("rolled_back"):
-        again.verify(movement(2))
-    again.verify(movement(3))
-    again.verify(movement(4))
+        restarted.verify(movement(2))
+    restarted.verify(movement(3))
+    restarted.verify(movement(4))
 
 
 @pytest.mark.parametrize(

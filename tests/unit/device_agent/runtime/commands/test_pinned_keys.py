@@ -109,16 +109,16 @@ def test_statements_without_a_pinned_signer_are_rejected(fixture: PinsFixture, t
 
 
 def test_a_statement_with_a_changed_byte_is_rejected(fixture: PinsFixture) -> None:
-    good = statement(SECOND, FIRST, 2).encode()
-    for place in range(len(good)):
-        bad = bytearray(good)
-        bad[place] ^= 1
+    valid = statement(SECOND, FIRST, 2).encode()
+    for index in range(len(valid)):
+        changed = bytearray(valid)
+        changed[index] ^= 1
         try:
-            text = bytes(bad).decode()
+            text = bytes(changed).decode()
         except UnicodeDecodeError:
             continue
         assert rejection(fixture.pins, text) in {"bad_signature", "malformed"}
-    fixture.pins.follow([good.decode()])
+    fixture.pins.follow([valid.decode()])
 
 
 def test_older_keys_and_keys_with_a_successor_sign_no_other(fixture: PinsFixture) -> None:

@@ -23,7 +23,7 @@ from tests.harness.network.brokers import SILENCE_S, wait_until
 from tests.unit.device_agent.runtime.conftest import MakeDevice
 
 LONG_MS = 600_000
-"""No test waits for a period of this length."""
+"""Longer than any test waits."""
 AT_REST = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
 LATCH = StopLatch(caller="bob", reason="", at_ms=1)
 
@@ -138,8 +138,8 @@ def test_concurrent_wakes_run_one_period(make_loop: MakeLoop) -> None:
     setup = make_loop(driver)
     real = setup.loop._period_lock
 
-    class Turn:
-        """A lock after whose acquisition another thread has just run a period."""
+    class InterceptedLock:
+        """Simulates that another thread ran a period while this one acquired the lock."""
 
         def acquire(self, **options: Any) -> bool:
             acquired = real.acquire(**options)
@@ -155,7 +155,7 @@ def test_concurrent_wakes_run_one_period(make_loop: MakeLoop) -> None:
         def __exit__(self, *_: object) -> None:
             self.release()
 
-    setup.loop._period_lock = Turn()  # type: ignore[assignment]
+    setup.loop._period_lock = InterceptedLock()  # type: ignore[assignment]
     setup.send_setpoint(0.5)
     time.sleep(SILENCE_S)
     assert len(driver.threads) == 1
