@@ -14,7 +14,7 @@ from benchmarks.faults.action_load import ActionLoad, count_returns
 from benchmarks.faults.operator import FULL_SPEED, FaultOperator
 from benchmarks.faults.processes import ACTION_ARM, STREAMING_ARM, ProductProcesses
 from tests.faults import cuts
-from tests.faults.cuts import Bench, Mend
+from tests.faults.cuts import Bench, Repair
 from tests.faults.judge import Verdict, judge
 from tests.faults.stack import now_ms
 from tests.harness.network.brokers import wait_until
@@ -23,10 +23,10 @@ _KILLED: Final = "console killed"
 """Additional fault that stops the arm if the fault itself does not."""
 _CUTS: Final = {
     "operator killed": _KILLED,
-    "operator's link cut": "operator cut off",
-    "operator's link silent": "operator's link forgotten",
-    "agent's link cut": "agent cut off",
-    "agent's link silent": "agent's link forgotten",
+    "operator's link cut": "operator disconnected",
+    "operator's link silent": "operator's link dropped",
+    "agent's link cut": "agent disconnected",
+    "agent's link silent": "agent's link dropped",
     "agent's link stalls": "agent's link stalls",
     "broker killed": "broker killed",
     "functions killed": "functions killed",
@@ -122,25 +122,25 @@ class FaultRuns(Bench):
     def _cut(self, cut: str) -> Verdict:
         for _ in range(_ATTEMPTS):
             if cut in cuts.OPERATOR:
-                found = self._operator_round(self.arm, cut, self.chance).verdict
+                found = self._operator_round(self.arm, cut, self.rng).verdict
             else:
                 found = self._round_of_all(cut)[0].verdict
             if found.in_motion:
                 break
         return found
 
-    def _cut_operator(self, arm: cuts.Arm, cut: str) -> Mend:
+    def _cut_operator(self, arm: cuts.Arm, cut: str) -> Repair:
         return self._timed(super()._cut_operator(arm, cut))
 
-    def _cut_all(self, cut: str) -> Mend:
+    def _cut_all(self, cut: str) -> Repair:
         return self._timed(super()._cut_all(cut))
 
-    def _timed(self, repair: Mend) -> Mend:
+    def _timed(self, repair: Repair) -> Repair:
         """Records the time of the repair; for a fault without repair, the time of the fault."""
         self._repaired_ms = now_ms()
 
         def timed() -> None:
-            if repair is not cuts.mends_itself:
+            if repair is not cuts.no_repair:
                 self._repaired_ms = now_ms()
             repair()
 
@@ -152,7 +152,7 @@ class FaultRuns(Bench):
             while not self.arm.set_in_motion():
                 pass
             begin()
-            time.sleep(self.chance.uniform(0.5, 0.9))
+            time.sleep(self.rng.uniform(0.5, 0.9))
             assert self.arm.console is not None
             self.arm.console.signal(signal.SIGKILL)
             cut_ms = now_ms()
@@ -166,14 +166,14 @@ class FaultRuns(Bench):
                 found = self.arm.verdict(_KILLED, cut_ms, since_ms)
             self._repaired_ms = now_ms()
             repair()
-            self.arm.leave()
+            self.arm.close_console()
             if found.in_motion:
                 break
         return found
 
     def _shuffled(self) -> tuple[Verdict, int]:
         """Sends setpoints twice and out of order, and repeats commands to the other arm in reversed pairs."""
-        self.arm.leave()
+        self.arm.close_console()
         topic = f"{self.product.topic(ACTION_ARM)}/cmd"
         started_ms = now_ms()
         with (
@@ -183,7 +183,7 @@ class FaultRuns(Bench):
             commands: list[bytes] = []
             client.on_payload = commands.append
             operator.await_motion()
-            time.sleep(self.chance.uniform(0.8, 1.2))
+            time.sleep(self.rng.uniform(0.8, 1.2))
             client.on_payload = lambda _payload: None
             for first in range(0, len(commands), 2):
                 for payload in reversed(commands[first : first + 2]):
@@ -206,7 +206,7 @@ class FaultRuns(Bench):
         self.product.signal(self.product.agent, signal.SIGKILL)
         time.sleep(0.3)
         self._repaired_ms = now_ms()
-        self.product.revive(self.product.agent)
+        self.product.restart(self.product.agent)
 
     def _recover(self) -> float:
         while not self.arm.set_in_motion():

@@ -1,8 +1,8 @@
 """An operator without a browser: takes control and streams setpoints by the rules of the console.
 
-``python -m tests.faults.console`` is a warm parent process. For each input line (JSON, see ``Seat``) it forks an
-operator and prints the process id. An operator receives the orders ``take``, ``sweep`` and ``rest`` over its Unix
-socket, and sends the events ``held``, ``moving``, ``lost`` and ``ended``.
+``python -m tests.faults.console`` is a warm parent process. For each ``OperatorConfig`` (a line of JSON) it forks an
+operator and prints the process id. An operator receives the requests ``take``, ``sweep`` and ``rest`` over its Unix
+socket, and sends the events ``granted``, ``moving``, ``lost`` and ``ended``.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ _NEAR_RAD = 0.3
 _MOVING_RAD_S = 0.3
 
 
-class Seat(msgspec.Struct):
+class OperatorConfig(msgspec.Struct):
     """Configuration of one operator process.
 
     Attributes:
@@ -64,10 +64,12 @@ class Seat(msgspec.Struct):
 class Link:
     """A connection to the broker that reconnects with new credentials until it is closed."""
 
-    def __init__(self, seat: Seat, obtain: Callable[[], dict[str, Any]], hear: Callable[[str, bytes], None]) -> None:
-        self._seat = seat
+    def __init__(
+        self, config: OperatorConfig, obtain: Callable[[], dict[str, Any]], receive: Callable[[str, bytes], None]
+    ) -> None:
+        self._seat = config
         self._obtain = obtain
-        self._hear = hear
+        self._receive = receive
         self._closed = threading.Event()
         self._client: paho.Client | None = None
         threading.Thread(target=self._run, daemon=True).start()
@@ -84,116 +86,116 @@ class Link:
     def _run(self) -> None:
         while not self._closed.is_set():
             with contextlib.suppress(OSError, ValueError, requests.RequestException):
-                self._once(self._obtain())
+                self._run_connection(self._obtain())
             self._closed.wait(_BACK_OFF_S)
 
-    def _once(self, issued: dict[str, Any]) -> None:
-        gone = threading.Event()
+    def _run_connection(self, issued: dict[str, Any]) -> None:
+        disconnected = threading.Event()
         client = paho.Client(
             CallbackAPIVersion.VERSION2, issued["client_id"], protocol=paho.MQTTv311, reconnect_on_failure=False
         )
         client.username_pw_set(issued["username"], issued["password"])
         client.connect_timeout = 5
-        client.on_socket_open = _send_at_once
-        client.on_disconnect = lambda *_: gone.set()
-        client.on_message = lambda _c, _u, message: self._hear(message.topic, bytes(message.payload))
-        wanted = [(topic, 0) for topic in issued["subscribe"] if topic.startswith(self._seat.topic + "/")]
+        client.on_socket_open = _disable_nagle
+        client.on_disconnect = lambda *_: disconnected.set()
+        client.on_message = lambda _c, _u, message: self._receive(message.topic, bytes(message.payload))
+        filters = [(topic, 0) for topic in issued["subscribe"] if topic.startswith(self._seat.topic + "/")]
 
         def subscribe(*_: Any) -> None:
-            if wanted:
-                client.subscribe(wanted)
+            if filters:
+                client.subscribe(filters)
 
         client.on_connect = subscribe
         client.connect("127.0.0.1", self._seat.mqtt_port, keepalive=60)
         self._client = client
         client.loop_start()
-        while not gone.wait(0.5) and not self._closed.is_set():
+        while not disconnected.wait(0.5) and not self._closed.is_set():
             pass
         client.disconnect()
         client.loop_stop()
 
 
-def _send_at_once(_client: paho.Client, _userdata: Any, opened: Any) -> None:
+def _disable_nagle(_client: paho.Client, _userdata: Any, opened: Any) -> None:
     opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 class Operator:
     """An operator of one device."""
 
-    def __init__(self, seat: Seat) -> None:
-        self.seat = seat
+    def __init__(self, config: OperatorConfig) -> None:
+        self.config = config
         self._http = requests.Session()
-        self._http.headers["Authorization"] = f"Bearer {seat.token}"
+        self._http.headers["Authorization"] = f"Bearer {config.token}"
         self._calls = ThreadPoolExecutor(2)
-        self._leader = socket.socket(socket.AF_UNIX)
-        self._leader.connect(seat.socket)
-        self._seen: tuple[JointTelemetry, float] | None = None
+        self._controller = socket.socket(socket.AF_UNIX)
+        self._controller.connect(config.socket)
+        self._telemetry: tuple[JointTelemetry, float] | None = None
         self._state_epoch = 0
         self._link: Link | None = None
-        self._watch = Link(seat, lambda: self._post("/mqtt/credentials", purpose="view"), self._heard)
+        self._watch = Link(config, lambda: self._post("/mqtt/credentials", purpose="view"), self._receive)
         self.epoch: int | None = None
-        self._obeyed = False
+        self._confirmed = False
         self._ends_s = 0.0
         self._renew_s = 0.0
         self._sweeping = False
-        self._told = True
+        self._motion_reported = True
         self._sequence = 0
         self._target_rad: list[float] = []
         self._sent_s = 0.0
 
     def run(self) -> None:
-        """Process orders and tick at 40 Hz until the controlling test disconnects."""
-        self._leader.settimeout(PERIOD_S)
-        orders = b""
+        """Process requests and tick at 40 Hz until the controlling test disconnects."""
+        self._controller.settimeout(PERIOD_S)
+        requests_read = b""
         next_s = time.monotonic()
         while True:
-            self._leader.settimeout(max(0.001, next_s - time.monotonic()))
+            self._controller.settimeout(max(0.001, next_s - time.monotonic()))
             try:
-                read = self._leader.recv(4096)
+                read = self._controller.recv(4096)
                 if not read:
                     return
-                orders += read
+                requests_read += read
             except TimeoutError:
                 pass
-            while b"\n" in orders:
-                line, _, orders = orders.partition(b"\n")
+            while b"\n" in requests_read:
+                line, _, requests_read = requests_read.partition(b"\n")
                 getattr(self, line.decode())()
             if time.monotonic() >= next_s:
                 next_s = max(next_s + PERIOD_S, time.monotonic())
                 self._tick()
 
-    # ------------------------------------------------------------ orders
+    # ------------------------------------------------------------ requests
 
     def take(self) -> None:
         """Release a remaining lease and take control."""
         if self.epoch is not None:
-            self._lose("taken again", tell=False)
-        asked_s = time.monotonic()
+            self._lose("retaken", report=False)
+        requested_s = time.monotonic()
         try:
             granted = self._lease(None)
         except (ValueError, requests.RequestException) as error:
-            self._tell(refused=str(error)[:200])
+            self._report(rejected=str(error)[:200])
             return
         epoch = self.epoch = granted["epoch"]
-        self._obeyed, self._sequence, self._sweeping = False, 0, False
-        self._renewed(granted, asked_s)
+        self._confirmed, self._sequence, self._sweeping = False, 0, False
+        self._renewed(granted, requested_s)
         self._link = Link(
-            self.seat,
-            lambda: self._post("/mqtt/credentials", purpose="control", device=self.seat.device, epoch=epoch),
+            self.config,
+            lambda: self._post("/mqtt/credentials", purpose="control", device=self.config.device, epoch=epoch),
             lambda _t, _p: None,
         )
-        self._tell(held=epoch, confirmed=granted["confirmed"])
+        self._report(granted=epoch, confirmed=granted["confirmed"])
 
     def sweep(self) -> None:
         """Sweep the slider between both ends."""
-        seen = self._seen
-        if self.epoch is None or seen is None:
-            self._tell(ended="blind")
+        telemetry = self._telemetry
+        if self.epoch is None or telemetry is None:
+            self._report(ended="no-telemetry")
             return
-        self._target_rad = list(seen[0].commanded_rad)
+        self._target_rad = list(telemetry[0].commanded_rad)
         self._turn()
         self._sent_s = time.monotonic()
-        self._sweeping, self._told = True, False
+        self._sweeping, self._motion_reported = True, False
 
     def rest(self) -> None:
         """Release the slider."""
@@ -203,13 +205,13 @@ class Operator:
 
     def _tick(self) -> None:
         self._keep_lease()
-        seen, now_s = self._seen, time.monotonic()
-        if self.epoch is None or not self._sweeping or seen is None:
+        telemetry, now_s = self._telemetry, time.monotonic()
+        if self.epoch is None or not self._sweeping or telemetry is None:
             return
-        message, received_s = seen
+        message, received_s = telemetry
         if now_s - received_s > FRESH_S:
             if now_s - self._sent_s > ABANDON_S:
-                self._end("lost-sight")
+                self._end("stale-telemetry")
         elif message.mode in (Mode.STOPPED, Mode.FAULT, Mode.ACTION):
             self._end(str(message.mode))
         else:
@@ -217,108 +219,110 @@ class Operator:
 
     def _stream(self, message: JointTelemetry, now_s: float) -> None:
         assert self.epoch is not None
-        at_rad = message.commanded_rad[self.seat.joint]
-        if abs(at_rad - self._target_rad[self.seat.joint]) < _NEAR_RAD:
+        at_rad = message.commanded_rad[self.config.joint]
+        if abs(at_rad - self._target_rad[self.config.joint]) < _NEAR_RAD:
             self._turn()
         if message.epoch == self.epoch:
             self._sequence = max(self._sequence, message.setpoint_sequence)
         self._sequence += 1
-        target = JointTarget(position_rad=dict(zip(self.seat.joints, self._target_rad, strict=True)))
+        target = JointTarget(position_rad=dict(zip(self.config.joints, self._target_rad, strict=True)))
         setpoint = Setpoint(
             epoch=self.epoch, sequence=self._sequence, echo_tick_ms=message.tick_ms, sent_ms=now_s * 1000, target=target
         )
-        if self._link is not None and self._link.publish(f"{self.seat.topic}/ctl/{self.epoch}", codec.encode(setpoint)):
+        if self._link is not None and self._link.publish(
+            f"{self.config.topic}/ctl/{self.epoch}", codec.encode(setpoint)
+        ):
             self._sent_s = now_s
         elif now_s - self._sent_s > ABANDON_S:
             self._end("no-connection")
-        if not self._told and abs(message.velocity_rad_s[self.seat.joint]) > _MOVING_RAD_S:
-            self._told = True
-            self._tell(moving=True)
+        if not self._motion_reported and abs(message.velocity_rad_s[self.config.joint]) > _MOVING_RAD_S:
+            self._motion_reported = True
+            self._report(moving=True)
 
     def _turn(self) -> None:
-        at_rad = self._target_rad[self.seat.joint]
-        middle = (self.seat.low_rad + self.seat.high_rad) / 2
-        self._target_rad[self.seat.joint] = self.seat.low_rad if at_rad > middle else self.seat.high_rad
+        at_rad = self._target_rad[self.config.joint]
+        middle = (self.config.low_rad + self.config.high_rad) / 2
+        self._target_rad[self.config.joint] = self.config.low_rad if at_rad > middle else self.config.high_rad
 
     def _keep_lease(self) -> None:
         epoch, now_s = self.epoch, time.monotonic()
         if epoch is None:
             return
-        seen = self._seen
-        heard = max(seen[0].epoch if seen else 0, self._state_epoch)
-        if heard > epoch:
+        telemetry = self._telemetry
+        newest_epoch = max(telemetry[0].epoch if telemetry else 0, self._state_epoch)
+        if newest_epoch > epoch:
             self._lose("another operator has control")
-        elif seen and seen[0].epoch == epoch:
-            self._obeyed = True
-        elif seen and self._obeyed and seen[0].epoch == 0:
-            self._lose("the robot has ended it")
+        elif telemetry and telemetry[0].epoch == epoch:
+            self._confirmed = True
+        elif telemetry and self._confirmed and telemetry[0].epoch == 0:
+            self._lose("the robot ended the lease")
         if self.epoch is None:
             return
-        if now_s > self._ends_s and not self.seat.stubborn:
-            self._lose("ran out")
+        if now_s > self._ends_s and not self.config.stubborn:
+            self._lose("expired")
         elif now_s > self._renew_s:
             self._renew_s = float("inf")
             self._calls.submit(self._renew, epoch)
 
     def _renew(self, epoch: int) -> None:
-        asked_s = time.monotonic()
+        requested_s = time.monotonic()
         try:
             granted = self._lease(epoch)
             if self.epoch == epoch:
-                self._renewed(granted, asked_s)
+                self._renewed(granted, requested_s)
         except ValueError:
             self._renew_s = float("inf")  # rejected; the robot's state decides
         except requests.RequestException:
             self._renew_s = time.monotonic() + RETRY_S
 
-    def _renewed(self, granted: dict[str, Any], asked_s: float) -> None:
-        self._ends_s = asked_s + granted["lease_ms"] / 1000
+    def _renewed(self, granted: dict[str, Any], requested_s: float) -> None:
+        self._ends_s = requested_s + granted["lease_ms"] / 1000
         self._renew_s = time.monotonic() + granted["lease_ms"] / 3000
 
-    def _lose(self, why: str, *, tell: bool = True) -> None:
+    def _lose(self, reason: str, *, report: bool = True) -> None:
         self.epoch = None
         self._sweeping = False
         if self._link is not None:
             self._link.close()
             self._link = None
-        if tell:
-            self._tell(lost=why)
+        if report:
+            self._report(lost=reason)
 
-    def _end(self, why: str) -> None:
+    def _end(self, reason: str) -> None:
         self._sweeping = False
-        self._tell(ended=why)
+        self._report(ended=reason)
 
     # ------------------------------------------------------------ connections
 
-    def _heard(self, topic: str, payload: bytes) -> None:
+    def _receive(self, topic: str, payload: bytes) -> None:
         if topic.endswith("/tele/joints"):
-            self._seen = (codec.decode(payload, JointTelemetry), time.monotonic())
+            self._telemetry = (codec.decode(payload, JointTelemetry), time.monotonic())
         elif topic.endswith("/state"):
             self._state_epoch = codec.decode(payload, State).epoch
 
     def _lease(self, epoch: int | None) -> dict[str, Any]:
-        asked = {"lease_ms": self.seat.lease_ms, "wait_ms": 2000} | ({} if epoch is None else {"epoch": epoch})
-        return self._post(f"/devices/{self.seat.device}/lease", **asked)
+        request = {"lease_ms": self.config.lease_ms, "wait_ms": 2000} | ({} if epoch is None else {"epoch": epoch})
+        return self._post(f"/devices/{self.config.device}/lease", **request)
 
     def _post(self, path: str, **body: Any) -> dict[str, Any]:
-        answer = self._http.post(self.seat.api + path, json=body, timeout=5)
+        answer = self._http.post(self.config.api + path, json=body, timeout=5)
         if answer.status_code >= 400:
             raise ValueError(f"{path}: {answer.status_code} {answer.text}")
         found: dict[str, Any] = answer.json()
         return found
 
-    def _tell(self, **what: Any) -> None:
-        self._leader.sendall(json.dumps(what).encode() + b"\n")
+    def _report(self, **message: Any) -> None:
+        self._controller.sendall(json.dumps(message).encode() + b"\n")
 
 
 def main() -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     for line in sys.stdin:
-        seat = msgspec.json.decode(line, type=Seat)
+        config = msgspec.json.decode(line, type=OperatorConfig)
         child = os.fork()
         if child == 0:
             with contextlib.suppress(ConnectionError):  # the controlling test has disconnected
-                Operator(seat).run()
+                Operator(config).run()
             os._exit(0)
         print(child, flush=True)
 

@@ -17,31 +17,31 @@ from dataclasses import dataclass, field
 import httpx
 
 from infra.local.supervisor import SupervisedProcess
-from tests.faults.judge import MOST_MS, Record, Verdict, judge, share
+from tests.faults.judge import MOST_MS, Record, Verdict, judge, quantile
 from tests.faults.stack import MOVEMENT, PATIENCE_S, Console, Stack, now_ms
 
-Mend = Callable[[], None]
+Repair = Callable[[], None]
 OPERATOR = (
     "console killed",
     "console stopped",
-    "operator cut off",
+    "operator disconnected",
     "operator's link stalls",
-    "operator's link forgotten",
+    "operator's link dropped",
 )
 SCRIPT = ("script's processes killed",)
 SHARED = (
-    "agent cut off", "agent's link stalls", "agent's link forgotten", "broker killed", "broker stopped",
+    "agent disconnected", "agent's link stalls", "agent's link dropped", "broker killed", "broker stopped",
     "functions killed", "functions stopped", "agent stopped",
 )  # fmt: skip
-WATCHED = (*OPERATOR, "agent's link stalls", "agent's link forgotten", "broker stopped")
+WATCHED = (*OPERATOR, "agent's link stalls", "agent's link dropped", "broker stopped")
 """Interruptions that the agent detects only by its watchdog."""
 LEASE_MS = 30_000
 SHORT_LEASE_MS = 1_500
-_ON_THE_WAY_MS = 200.0
+_MAX_SETPOINT_AGE_MS = 200.0
 """Maximum age of a setpoint that the agent accepts [ms]. On a busy machine one may arrive after a cut."""
-_LOOK_MS = 400.0
-_WORTH_TELLING_MS = 10.0
-_UNDER_WAY_S = 0.4
+_CONTEXT_MS = 400.0
+_REPORTED_STARVATION_MS = 10.0
+_SCRIPT_START_S = 0.4
 """Time until the first move of a script is at speed [s]."""
 
 
@@ -60,16 +60,16 @@ class Tally:
 
     Attributes:
         cuts: Number of cuts of each kind with an arm in motion.
-        spoilt: Rounds without motion at the cut; they are repeated.
+        repeated: Rounds without motion at the cut; they are repeated.
     """
 
     results: list[Result] = field(default_factory=list)
     cuts: dict[str, int] = field(default_factory=dict)
-    spoilt: int = 0
+    repeated: int = 0
 
     @property
     def broken(self) -> list[Result]:
-        return [each for each in self.results if not each.verdict.kept]
+        return [each for each in self.results if not each.verdict.met_limit]
 
     @property
     def late(self) -> list[Result]:
@@ -85,7 +85,7 @@ class Tally:
         moving = [each for each in results if each.verdict.in_motion]
         self.results += moving
         if not moving:
-            self.spoilt += 1
+            self.repeated += 1
             return False
         self.cuts[cut] = self.cuts.get(cut, 0) + 1
         return True
@@ -95,14 +95,14 @@ class Tally:
         yield "| cut | cuts | arms in motion | p50 ms | p99 ms | max ms | from the cut, max ms | starved | broken |"
         yield "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
         for cut in (*self.cuts, "all"):
-            found = [each.verdict for each in self.results if cut in (each.cut, "all")]
-            rest = [each.rest_ms for each in found]
-            starved = sum(each.starved_ms > _WORTH_TELLING_MS for each in found)
-            broken = sum(not each.kept for each in found)
-            figures = (share(rest, 0.5), share(rest, 0.99), max(rest), max(each.cut_ms for each in found))
-            shown = " | ".join(f"{figure:.0f}" for figure in figures)
+            verdicts = [each.verdict for each in self.results if cut in (each.cut, "all")]
+            rest = [each.rest_ms for each in verdicts]
+            starved = sum(each.starved_ms > _REPORTED_STARVATION_MS for each in verdicts)
+            broken = sum(not each.met_limit for each in verdicts)
+            figures = (quantile(rest, 0.5), quantile(rest, 0.99), max(rest), max(each.cut_ms for each in verdicts))
+            cells = " | ".join(f"{figure:.0f}" for figure in figures)
             cuts = self.count if cut == "all" else self.cuts[cut]
-            yield f"| {cut} | {cuts} | {len(found)} | {shown} | {starved} | {broken} |"
+            yield f"| {cut} | {cuts} | {len(verdicts)} | {cells} | {starved} | {broken} |"
 
 
 class Arm:
@@ -115,15 +115,15 @@ class Arm:
         self.console: Console | None = None
         self.kind = (0, False)
 
-    def sit(self, lease_ms: int = LEASE_MS, *, stubborn: bool = False) -> Console:
+    def open_console(self, lease_ms: int = LEASE_MS, *, stubborn: bool = False) -> Console:
         """Return an operator of this kind; start a new one if needed."""
         if self.console is None or self.kind != (lease_ms, stubborn):
-            self.leave()
+            self.close_console()
             self.console = self.stack.console(self.name, lease_ms=lease_ms, stubborn=stubborn)
             self.kind = (lease_ms, stubborn)
         return self.console
 
-    def leave(self) -> None:
+    def close_console(self) -> None:
         if self.console is not None:
             self.console.end()
             self.console = None
@@ -132,21 +132,21 @@ class Arm:
         """Take control and sweep. Returns True if the arm moves."""
         deadline_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline_s:
-            console = self.sit(lease_ms, stubborn=stubborn)
-            console.order("take")
-            held = console.hear("held", "refused", within_s=10)
-            if held is None:
-                self.leave()
-            elif held.get("confirmed"):
+            console = self.open_console(lease_ms, stubborn=stubborn)
+            console.send("take")
+            granted = console.receive("granted", "rejected", within_s=10)
+            if granted is None:
+                self.close_console()
+            elif granted.get("confirmed"):
                 break
             time.sleep(0.1)
         else:
             raise AssertionError(f"{self.name}: no control within {PATIENCE_S} s")
         for _ in range(20):
-            console.order("sweep")
-            said = console.hear("moving", "lost", "ended", within_s=3)
-            if said != {"ended": "blind"}:
-                return said is not None and "moving" in said
+            console.send("sweep")
+            message = console.receive("moving", "lost", "ended", within_s=3)
+            if message != {"ended": "no-telemetry"}:
+                return message is not None and "moving" in message
             time.sleep(0.1)
         return False
 
@@ -155,25 +155,25 @@ class Arm:
         device = f"/devices/{self.stack.agent_id}-{self.name}"
         try:
             epoch = self.stack.post(f"{device}/lease", lease_ms=LEASE_MS, wait_ms=2_000)["epoch"]
-            asked = {"kind": "run_movement", "name": MOVEMENT}
-            action = self.stack.post(f"{device}/actions", request=asked, epoch=epoch, wait_ms=10_000)
+            request = {"kind": "run_movement", "name": MOVEMENT}
+            action = self.stack.post(f"{device}/actions", request=request, epoch=epoch, wait_ms=10_000)
         except httpx.HTTPError:
             return False
-        time.sleep(_UNDER_WAY_S)
+        time.sleep(_SCRIPT_START_S)
         return bool(action["status"] == "started")
 
     def verdict(self, cut: str, cut_ms: float, since_ms: float, *, begin_ms: float | None = None) -> Verdict:
         """Judge the motion until now; ``begin_ms`` is the time of the last free motion if it is not the cut."""
         end_ms, begin_ms = now_ms(), cut_ms if begin_ms is None else begin_ms
-        rows = [row for row in self.record.read() if begin_ms - _LOOK_MS <= row.tick_ms <= end_ms]
-        self.record.forget(end_ms - _LOOK_MS)
+        rows = [row for row in self.record.read() if begin_ms - _CONTEXT_MS <= row.tick_ms <= end_ms]
+        self.record.discard(end_ms - _CONTEXT_MS)
         return judge(rows, cut_ms=cut_ms, since_ms=since_ms, watched=cut in WATCHED)
 
     def last_setpoint_ms(self, cut_ms: float) -> float:
         """Time at which the agent received the last setpoint sent before the cut."""
-        given = self.stack.setpoints[self.name]
-        self.stack.setpoints[self.name] = given[-200:]
-        return max((at_ms for at_ms in given if at_ms <= cut_ms + _ON_THE_WAY_MS), default=cut_ms)
+        setpoints_ms = self.stack.setpoints[self.name]
+        self.stack.setpoints[self.name] = setpoints_ms[-200:]
+        return max((at_ms for at_ms in setpoints_ms if at_ms <= cut_ms + _MAX_SETPOINT_AGE_MS), default=cut_ms)
 
 
 class Bench:
@@ -181,72 +181,72 @@ class Bench:
 
     def __init__(self, stack: Stack, *, seed: int) -> None:
         self.stack = stack
-        self.chance = random.Random(seed)
+        self.rng = random.Random(seed)
         self.arms = [Arm(stack, name) for name in stack.names]
         self.tally = Tally()
 
     def close(self) -> None:
         for arm in self.arms:
-            arm.leave()
+            arm.close_console()
             arm.record.close()
 
-    def one_by_one(self, rounds: int) -> None:
+    def cut_each_operator(self, rounds: int) -> None:
         """Run this number of rounds on each arm in parallel."""
-        chances = [random.Random(self.chance.random()) for _ in self.arms]
+        rngs = [random.Random(self.rng.random()) for _ in self.arms]
 
-        def work(arm: Arm, chance: random.Random) -> None:
+        def run_rounds(arm: Arm, rng: random.Random) -> None:
             for number in range(rounds):
                 cut = OPERATOR[(number + self.arms.index(arm)) % len(OPERATOR)]
-                while not self.tally.add(cut, [self._operator_round(arm, cut, chance)]):
+                while not self.tally.add(cut, [self._operator_round(arm, cut, rng)]):
                     pass
 
         with ThreadPoolExecutor(len(self.arms)) as pool:
-            for done in [pool.submit(work, arm, chance) for arm, chance in zip(self.arms, chances, strict=True)]:
+            for done in [pool.submit(run_rounds, arm, rng) for arm, rng in zip(self.arms, rngs, strict=True)]:
                 done.result()
 
-    def together(self, cut: str) -> None:
+    def cut_all_arms(self, cut: str) -> None:
         """Make one cut that affects all arms."""
         while not self.tally.add(cut, self._round_of_all(cut)):
             pass
 
     # ------------------------------------------------------------ rounds
 
-    def _operator_round(self, arm: Arm, cut: str, chance: random.Random) -> Result:
+    def _operator_round(self, arm: Arm, cut: str, rng: random.Random) -> Result:
         while not arm.set_in_motion():
             pass
-        time.sleep(chance.uniform(0, 0.6))
-        mend = self._cut_operator(arm, cut)
+        time.sleep(rng.uniform(0, 0.6))
+        repair = self._cut_operator(arm, cut)
         cut_ms = now_ms()
-        time.sleep(chance.uniform(0.45, 0.9))
-        mend()
+        time.sleep(rng.uniform(0.45, 0.9))
+        repair()
         time.sleep(0.5)
         return Result(cut, arm.name, arm.verdict(cut, cut_ms, arm.last_setpoint_ms(cut_ms)))
 
-    def _cut_operator(self, arm: Arm, cut: str) -> Mend:
+    def _cut_operator(self, arm: Arm, cut: str) -> Repair:
         console = arm.console
         assert console is not None
         match cut:
             case "console killed":
                 console.signal(signal.SIGKILL)
-                return arm.leave
+                return arm.close_console
             case "console stopped":
                 console.signal(signal.SIGSTOP)
                 return lambda: console.signal(signal.SIGCONT)
-            case "operator cut off":
+            case "operator disconnected":
                 console.proxy.cut()
                 console.proxy.freeze()
                 return console.proxy.thaw
             case "operator's link stalls":
                 console.proxy.freeze()
                 return console.proxy.thaw
-            case "operator's link forgotten":
+            case "operator's link dropped":
                 console.proxy.swallow()
-                return arm.leave
+                return arm.close_console
         raise AssertionError(cut)
 
     def _round_of_all(self, cut: str) -> list[Result]:
         functions, script = cut.startswith("functions"), cut in SCRIPT
-        stubborn = functions and self.chance.random() < 0.5
+        stubborn = functions and self.rng.random() < 0.5
 
         def begin(arm: Arm) -> bool:
             if script:
@@ -255,17 +255,17 @@ class Bench:
 
         with ThreadPoolExecutor(len(self.arms)) as pool:
             list(pool.map(begin, self.arms))
-        time.sleep(self.chance.uniform(0, 0.6))
-        mend = self._cut_all(cut)
+        time.sleep(self.rng.uniform(0, 0.6))
+        repair = self._cut_all(cut)
         cut_ms = now_ms()
-        time.sleep(self.chance.uniform(0.45, 1.2) + functions * SHORT_LEASE_MS / 1000)
+        time.sleep(self.rng.uniform(0.45, 1.2) + functions * SHORT_LEASE_MS / 1000)
         since_ms = {arm.name: self._since_ms(arm, cut, cut_ms) for arm in self.arms}
-        mended_ms = now_ms()
-        mend()
+        repaired_ms = now_ms()
+        repair()
         time.sleep(0.6)
         begin_ms = cut_ms
         if cut == "agent stopped":  # the stopped agent did not move; the limit counts from its resumption
-            cut_ms, since_ms = mended_ms, dict.fromkeys(since_ms, mended_ms)
+            cut_ms, since_ms = repaired_ms, dict.fromkeys(since_ms, repaired_ms)
         return [
             Result(cut, arm.name, arm.verdict(cut, cut_ms, since_ms[arm.name], begin_ms=begin_ms)) for arm in self.arms
         ]
@@ -273,51 +273,51 @@ class Bench:
     def _since_ms(self, arm: Arm, cut: str, cut_ms: float) -> float:
         """Time from which the arm had no permission to move."""
         if cut.startswith("functions"):
-            grants = [at_ms for at_ms in self.stack.commands[arm.name] if at_ms <= cut_ms + _ON_THE_WAY_MS]
+            grants = [at_ms for at_ms in self.stack.commands[arm.name] if at_ms <= cut_ms + _MAX_SETPOINT_AGE_MS]
             return max(grants) + SHORT_LEASE_MS
         return cut_ms if cut in SCRIPT else arm.last_setpoint_ms(cut_ms)
 
-    def _cut_all(self, cut: str) -> Mend:
+    def _cut_all(self, cut: str) -> Repair:
         stack = self.stack
-        what, _, how = cut.rpartition(" ")
-        match how:
+        target, _, kind = cut.rpartition(" ")
+        match kind:
             case "stopped":
-                return self._stopped(self._children[what])
-            case "killed" if what in self._children:
-                stack.signal(self._children[what], signal.SIGKILL)
-                return lambda: self._revive(self._children[what])
+                return self._stopped(self._children[target])
+            case "killed" if target in self._children:
+                stack.signal(self._children[target], signal.SIGKILL)
+                return lambda: self._restart(self._children[target])
             case "killed":
-                for process in stack.below(stack.agent):
+                for process in stack.descendants(stack.agent):
                     with contextlib.suppress(ProcessLookupError):
                         os.kill(process, signal.SIGKILL)
-                return mends_itself
+                return no_repair
             case _:
-                return self._cut_link(how)
+                return self._cut_link(kind)
 
-    def _cut_link(self, how: str) -> Mend:
+    def _cut_link(self, kind: str) -> Repair:
         link = self.stack.agent_mqtt
-        match how:
-            case "off":
+        match kind:
+            case "disconnected":
                 link.cut()
-            case "forgotten":
+            case "dropped":
                 link.swallow()
             case "stalls":
                 link.freeze()
                 return link.thaw
-        return mends_itself
+        return no_repair
 
     @property
     def _children(self) -> dict[str, SupervisedProcess]:
         return {"broker": self.stack.broker, "functions": self.stack.functions, "agent": self.stack.agent}
 
-    def _stopped(self, child: SupervisedProcess) -> Mend:
+    def _stopped(self, child: SupervisedProcess) -> Repair:
         self.stack.signal(child, signal.SIGSTOP)
         return lambda: self.stack.signal(child, signal.SIGCONT)
 
-    def _revive(self, child: SupervisedProcess) -> None:
-        self.stack.revive(child)
+    def _restart(self, child: SupervisedProcess) -> None:
+        self.stack.restart(child)
         self.stack.await_health()
 
 
-def mends_itself() -> None:
+def no_repair() -> None:
     """No repair is needed."""

@@ -16,8 +16,8 @@ _REST_ROWS = 10
 """Duration of rest: a reversal passes through zero, and a late control loop pauses shortly."""
 _ROW_MS = 20.0
 """Rows are due every 10 ms; in a longer gap the agent's process did not run."""
-_LET_GO_RAD_S = 0.03
-_LET_GO_AFTER_MS = 140.0
+_RELEASED_RAD_S = 0.03
+_RELEASED_AFTER_MS = 140.0
 """Braking starts later than this. An arm that hardly moves by then had its slider released."""
 
 
@@ -39,7 +39,7 @@ class Verdict:
         starved_ms: Time in which the control loop was not scheduled: late rows, or rows without a
             new command of a moving arm (due every 8 ms). A property of the machine, not of the agent.
         moved_again: Whether a motion was commanded after rest.
-        let_go: Whether the arm hardly moved when braking would have started.
+        slider_released: Whether the arm hardly moved when braking would have started.
     """
 
     speed_rad_s: float
@@ -47,15 +47,15 @@ class Verdict:
     cut_ms: float
     starved_ms: float
     moved_again: bool
-    let_go: bool = False
+    slider_released: bool = False
 
     @property
     def in_motion(self) -> bool:
-        return self.speed_rad_s > 0.05 and not self.let_go
+        return self.speed_rad_s > 0.05 and not self.slider_released
 
     @property
-    def kept(self) -> bool:
-        most_ms = MOST_MS + self.starved_ms + (_ROW_MS if self.starved_ms else 0.0)  # known to one or two rows
+    def met_limit(self) -> bool:
+        most_ms = MOST_MS + self.starved_ms + (_ROW_MS if self.starved_ms else 0.0)  # resolution of one or two rows
         return self.rest_ms <= most_ms and not self.moved_again
 
 
@@ -71,8 +71,8 @@ def judge(rows: list[Row], *, cut_ms: float, since_ms: float, watched: bool = Tr
     before = [row for row in rows if row.tick_ms <= cut_ms][-3:]
     speed = _speed(before[0], before[-1]) if len(before) > 1 else 0.0
     after = [row for row in rows if row.tick_ms > min(cut_ms, since_ms)]
-    later = [row for row in after if row.tick_ms <= since_ms + _LET_GO_AFTER_MS][-3:]
-    let_go = watched and len(later) > 1 and _speed(later[0], later[-1]) < _LET_GO_RAD_S
+    later = [row for row in after if row.tick_ms <= since_ms + _RELEASED_AFTER_MS][-3:]
+    slider_released = watched and len(later) > 1 and _speed(later[0], later[-1]) < _RELEASED_RAD_S
     still = 0
     for index in range(1, len(after)):
         still = still + 1 if _same(after[index - 1], after[index]) else 0
@@ -80,8 +80,8 @@ def judge(rows: list[Row], *, cut_ms: float, since_ms: float, watched: bool = Tr
             rest = after[index - still]
             moved_again = not all(_same(rest, later) for later in after[index:])
             starved = _starved(after[: index - still + 1])
-            return Verdict(speed, rest.tick_ms - since_ms, rest.tick_ms - cut_ms, starved, moved_again, let_go)
-    return Verdict(speed, math.inf, math.inf, 0.0, moved_again=True, let_go=let_go)
+            return Verdict(speed, rest.tick_ms - since_ms, rest.tick_ms - cut_ms, starved, moved_again, slider_released)
+    return Verdict(speed, math.inf, math.inf, 0.0, moved_again=True, slider_released=slider_released)
 
 
 class Record:
@@ -89,30 +89,30 @@ class Record:
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb")
-        self._torn = b""
+        self._incomplete = b""
         self.rows: list[Row] = []
 
     def read(self) -> list[Row]:
-        """All rows since ``forget``."""
-        lines = (self._torn + self._file.read()).split(b"\n")
-        self._torn = lines.pop()
+        """All rows since ``discard``."""
+        lines = (self._incomplete + self._file.read()).split(b"\n")
+        self._incomplete = lines.pop()
         for line in lines:
             row = json.loads(line)
             if "target" in row:
                 self.rows.append(Row(row["tick_ms"], tuple(row["target"])))
         return self.rows
 
-    def forget(self, before_ms: float) -> None:
+    def discard(self, before_ms: float) -> None:
         self.rows = [row for row in self.rows if row.tick_ms >= before_ms]
 
     def close(self) -> None:
         self._file.close()
 
 
-def share(values: Iterable[float], part: float) -> float:
-    """The quantile ``part`` of the values."""
+def quantile(values: Iterable[float], share: float) -> float:
+    """The quantile ``share`` of the values."""
     ordered = sorted(values)
-    return ordered[min(len(ordered) - 1, math.ceil(part * len(ordered)) - 1)] if ordered else math.nan
+    return ordered[min(len(ordered) - 1, math.ceil(share * len(ordered)) - 1)] if ordered else math.nan
 
 
 def _speed(first: Row, last: Row) -> float:

@@ -21,7 +21,7 @@ import httpx
 import msgspec
 
 from infra.local.supervisor import SupervisedProcess
-from tests.faults.console import Seat
+from tests.faults.console import OperatorConfig
 from tests.harness.browser.product import free_ports
 from tests.harness.network.brokers import MODULES, BrokerKind, wait_until
 from tests.harness.network.proxy import HOST, Proxy
@@ -29,7 +29,7 @@ from tests.harness.paths import ROOT
 
 PATIENCE_S = 60.0
 _AGENT_NICE = -10
-_ORDERS = re.compile(rb"/(arm[0-9])/(ctl|cmd)\b")
+_COMMANDS = re.compile(rb"/(arm[0-9])/(ctl|cmd)\b")
 MOVEMENT = "sweep"
 SCRIPT = """
 while True:
@@ -49,27 +49,27 @@ class Console:
     def __init__(self, process: int, listener: socket.socket, proxy: Proxy) -> None:
         self.process = process
         self.proxy = proxy
-        self.said: list[dict[str, Any]] = []
-        self._line, _ = listener.accept()
-        self._line.settimeout(0.05)
-        self._torn = b""
+        self.messages: list[dict[str, Any]] = []
+        self._connection, _ = listener.accept()
+        self._connection.settimeout(0.05)
+        self._incomplete = b""
 
-    def order(self, what: str) -> None:
+    def send(self, request: str) -> None:
         """Raises: OSError: The process has exited."""
-        self.said.clear()
-        self._line.sendall(what.encode() + b"\n")
+        self.messages.clear()
+        self._connection.sendall(request.encode() + b"\n")
 
-    def hear(self, *kinds: str, within_s: float) -> dict[str, Any] | None:
-        """The first message of one of these kinds after the last order."""
+    def receive(self, *kinds: str, within_s: float) -> dict[str, Any] | None:
+        """The first message of one of these kinds after the last request."""
         deadline_s = time.monotonic() + within_s
         while True:
-            found = next((each for each in self.said if set(kinds) & set(each)), None)
-            if found is not None or time.monotonic() > deadline_s:
-                return found
+            message = next((each for each in self.messages if set(kinds) & set(each)), None)
+            if message is not None or time.monotonic() > deadline_s:
+                return message
             with contextlib.suppress(TimeoutError, ConnectionError):
-                self._torn += self._line.recv(4096)
-            *lines, self._torn = self._torn.split(b"\n")
-            self.said += [json.loads(line) for line in lines]
+                self._incomplete += self._connection.recv(4096)
+            *lines, self._incomplete = self._incomplete.split(b"\n")
+            self.messages += [json.loads(line) for line in lines]
 
     def signal(self, number: int) -> None:
         with contextlib.suppress(ProcessLookupError):
@@ -77,7 +77,7 @@ class Console:
 
     def end(self) -> None:
         self.signal(signal.SIGKILL)
-        self._line.close()
+        self._connection.close()
         self.proxy.end()
 
 
@@ -106,14 +106,14 @@ class Stack:
         self._closing = contextlib.ExitStack()
         self._watchdog_s = watchdog_s
         self._kind = kind
-        self._dying: list[int] = []
+        self._killed: list[int] = []
 
     def begin(self) -> None:
         link = self._program("function_app", "sign-in-link", "--account", "ann").partition("#sign-in=")[2]
         ports = ["--tcp-port", str(self.port + 1), "--websocket-port", str(self.port + 2)]
         keys = ["--keys", str(self.home / "keys" / "public.json")]
-        site = ["--home", str(self.home / "mosquitto")]
-        self.broker = self._child("broker", MODULES[self._kind], *ports, *(keys if self._kind == "amqtt" else site))
+        folder = ["--home", str(self.home / "mosquitto")]
+        self.broker = self._child("broker", MODULES[self._kind], *ports, *(keys if self._kind == "amqtt" else folder))
         self.broker.wait_for_line("ready", PATIENCE_S)
         self.functions = self._child("functions", "function_app", "serve")
         self._child("worker", "function_app", "work")
@@ -123,22 +123,22 @@ class Stack:
         self.token = self.post("/auth/sign-in", link=link)["access_token"]
         self.http.headers["Authorization"] = f"Bearer {self.token}"
         self.http.cookies.clear()
-        self.agent_mqtt = self._proxy(self.port + 1, self._heard)
-        self._begin_agent()
+        self.agent_mqtt = self._proxy(self.port + 1, self._on_received)
+        self._start_agent()
         saved = self.http.put(f"/robot-types/ur5/movements/{MOVEMENT}", json={"source": SCRIPT})
         assert saved.is_success, saved.text
         self.token = self.post("/api-keys", name="bench", role="operator", days=1)["token"]
         self.http.headers["Authorization"] = f"Bearer {self.token}"
-        self._consoles = self._warm("tests.faults.console")
+        self._consoles = self._start_parent("tests.faults.console")
 
-    def _begin_agent(self) -> None:
+    def _start_agent(self) -> None:
         devices = [part for name in self.names for part in ("--device", f"{name}=ur5")]
         home = self._agent_home
-        said = self._program(
+        output = self._program(
             "device_agent", "enroll", *home, "--server", f"http://{HOST}:{self.port}", "--name", "bench", *devices,
             "--no-wait",
         ).split()  # fmt: skip
-        self.agent_id = self.post("/agents/claim", code=said[said.index("code") + 1])["agent"]
+        self.agent_id = self.post("/agents/claim", code=output[output.index("code") + 1])["agent"]
         self.agent = self._child("agent", self.AGENT, *self.agent_arguments(self.agent_mqtt.port))
         self.agent.wait_for_line("running", PATIENCE_S)
         with contextlib.suppress(PermissionError):  # raise the priority of the agent's control loop, if permitted
@@ -164,12 +164,12 @@ class Stack:
         return found
 
     def await_health(self) -> None:
-        def well() -> bool:
+        def healthy() -> bool:
             with contextlib.suppress(httpx.HTTPError, ValueError):
                 return bool(self.http.get("/health", timeout=1).json()["broker"] == "ok")
             return False
 
-        wait_until(well, "the functions to be well", PATIENCE_S)
+        wait_until(healthy, "healthy functions", PATIENCE_S)
 
     def console(self, name: str, *, lease_ms: int, stubborn: bool) -> Console:
         """A new operator of this arm."""
@@ -180,15 +180,15 @@ class Stack:
             listener.bind(str(path))
             listener.listen(1)
             listener.settimeout(PATIENCE_S)
-            seat = Seat(
+            config = OperatorConfig(
                 socket=str(path), api=self.api, token=self.token, mqtt_port=proxy.port,
                 device=f"{self.agent_id}-{name}", topic=f"ts/v1/{self.space}/{self.agent_id}/{name}",
                 joints=["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"], joint=0,
                 low_rad=-1.4, high_rad=1.4, lease_ms=lease_ms, stubborn=stubborn,
             )  # fmt: skip
-            return Console(int(self._consoles(msgspec.json.encode(seat).decode())), listener, proxy)
+            return Console(int(self._consoles(msgspec.json.encode(config).decode())), listener, proxy)
 
-    def below(self, child: SupervisedProcess) -> list[int]:
+    def descendants(self, child: SupervisedProcess) -> list[int]:
         """Ids of all descendants of a process."""
         parents = {}
         for folder in Path("/proc").glob("[0-9]*"):
@@ -206,24 +206,24 @@ class Stack:
 
     def signal(self, child: SupervisedProcess, number: int) -> None:
         """Send a signal to a process and its descendants; mosquitto is a child of the broker program."""
-        below = self.below(child)
-        self._dying = below if number == signal.SIGKILL else []
-        for process in (self.pid(child), *below):
+        descendants = self.descendants(child)
+        self._killed = descendants if number == signal.SIGKILL else []
+        for process in (self.pid(child), *descendants):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, number)
 
-    def revive(self, child: SupervisedProcess) -> None:
+    def restart(self, child: SupervisedProcess) -> None:
         """Restart a killed program after its child processes have released their ports."""
         assert child._process is not None
         child._process.wait(PATIENCE_S)
-        wait_until(lambda: not any(map(_alive, self._dying)), "what was killed to be gone", PATIENCE_S)
+        wait_until(lambda: not any(map(_alive, self._killed)), "the end of the killed processes", PATIENCE_S)
         child.start()
 
     # ------------------------------------------------------------ processes
 
-    def _heard(self, content: bytes) -> None:
+    def _on_received(self, content: bytes) -> None:
         at_ms = now_ms()
-        for name, kind in _ORDERS.findall(content):
+        for name, kind in _COMMANDS.findall(content):
             (self.setpoints if kind == b"ctl" else self.commands)[name.decode()].append(at_ms)
 
     def _program(self, *arguments: str) -> str:
@@ -248,12 +248,12 @@ class Stack:
         self.signal(child, signal.SIGCONT)
         child.stop()
 
-    def _proxy(self, behind: int, heard: Callable[[bytes], None]) -> Proxy:
-        proxy = Proxy(behind, heard)
+    def _proxy(self, behind: int, received: Callable[[bytes], None]) -> Proxy:
+        proxy = Proxy(behind, received)
         self._closing.callback(proxy.end)
         return proxy
 
-    def _warm(self, module: str) -> Callable[[str], str]:
+    def _start_parent(self, module: str) -> Callable[[str], str]:
         parent = self._closing.enter_context(
             subprocess.Popen(
                 [sys.executable, "-m", module], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -262,7 +262,7 @@ class Stack:
 
         lock = threading.Lock()
 
-        def ask(line: str) -> str:
+        def request(line: str) -> str:
             assert parent.stdout is not None
             with lock:
                 print(line, file=parent.stdin, flush=True)
@@ -270,7 +270,7 @@ class Stack:
 
         assert parent.stdin is not None
         self._closing.callback(parent.stdin.close)
-        return ask
+        return request
 
     def close(self) -> None:
         self._closing.close()

@@ -21,22 +21,22 @@ def bench(
         more: Additional operator cuts at the end.
     """
     with start(kind, arms, watchdog_s=watchdog_s) as stack:
-        made = Bench(stack, seed=seed)
+        runner = Bench(stack, seed=seed)
         try:
             for cut in ("", *plan):
                 if cut:
-                    made.together(cut)
-                made.one_by_one(rounds)
-            made.one_by_one(more)
+                    runner.cut_all_arms(cut)
+                runner.cut_each_operator(rounds)
+            runner.cut_each_operator(more)
         finally:
-            made.close()
-            print(*made.tally.table(), f"spoilt {made.tally.spoilt}", sep="\n")
-            print(*made.tally.broken, sep="\n")
-    return made.tally
+            runner.close()
+            print(*runner.tally.table(), f"repeated {runner.tally.repeated}", sep="\n")
+            print(*runner.tally.broken, sep="\n")
+    return runner.tally
 
 
 def test_a_moving_arm_rests_in_time_after_each_kind_of_cut() -> None:
-    tally = bench("amqtt", 3, ["agent cut off", "script's processes killed"], rounds=2, seed=4)
+    tally = bench("amqtt", 3, ["agent disconnected", "script's processes killed"], rounds=2, seed=4)
     assert not tally.broken
     assert tally.count >= 20
 
@@ -66,10 +66,10 @@ def rows(*targets: float) -> list[Row]:
 
 def test_the_judge_measures_to_the_first_row_of_rest() -> None:
     moving = [0.01 * index for index in range(31)]
-    found = judge(rows(*moving, *[0.4] * 40), cut_ms=1100, since_ms=1090)
-    assert found.in_motion
-    assert (found.rest_ms, found.cut_ms, found.starved_ms) == (220, 210, 0)
-    assert found.kept
+    verdict = judge(rows(*moving, *[0.4] * 40), cut_ms=1100, since_ms=1090)
+    assert verdict.in_motion
+    assert (verdict.rest_ms, verdict.cut_ms, verdict.starved_ms) == (220, 210, 0)
+    assert verdict.met_limit
 
 
 @pytest.mark.parametrize(
@@ -81,27 +81,27 @@ def test_the_judge_measures_to_the_first_row_of_rest() -> None:
     ],
     ids=["never at rest", "too late", "moves again"],
 )
-def test_the_judge_finds(targets: list[float]) -> None:
-    assert not judge(rows(*targets), cut_ms=1100, since_ms=1100).kept
+def test_the_judge_reports(targets: list[float]) -> None:
+    assert not judge(rows(*targets), cut_ms=1100, since_ms=1100).met_limit
 
 
 def test_a_starved_control_loop_differs_from_a_late_one() -> None:
     moving = [0.01 * index for index in range(15)]
-    found = judge(
+    verdict = judge(
         rows(*moving, *[0.14] * 5, *(0.14 + each for each in moving), *[0.28] * 40), cut_ms=1100, since_ms=1100
     )
-    assert (found.rest_ms, found.starved_ms) == (240, 60)
+    assert (verdict.rest_ms, verdict.starved_ms) == (240, 60)
 
 
 def test_a_released_slider_is_not_motion() -> None:
     settled = [0.01 * index for index in range(12)]
-    found = judge(rows(*settled, *[0.11] * 40, 0.5), cut_ms=1100, since_ms=1100)
-    assert found.moved_again
-    assert not found.in_motion
-    assert not judge(rows(*settled, *[0.11] * 40, 0.5), cut_ms=1100, since_ms=1100, watched=False).kept
+    verdict = judge(rows(*settled, *[0.11] * 40, 0.5), cut_ms=1100, since_ms=1100)
+    assert verdict.moved_again
+    assert not verdict.in_motion
+    assert not judge(rows(*settled, *[0.11] * 40, 0.5), cut_ms=1100, since_ms=1100, watched=False).met_limit
 
 
 def test_a_reversal_is_not_rest() -> None:
     up = [0.01 * index for index in range(15)]
-    found = judge(rows(*up, up[-1], *reversed(up), *[0.0] * 40), cut_ms=1100, since_ms=1100)
-    assert found.rest_ms == 200
+    verdict = judge(rows(*up, up[-1], *reversed(up), *[0.0] * 40), cut_ms=1100, since_ms=1100)
+    assert verdict.rest_ms == 200

@@ -142,14 +142,14 @@ def run_here(place: Place, work: Callable[[Functions], Awaitable[T]], kill_point
 Work = Callable[..., Awaitable[object]]
 
 
-def _in_child(place: Place, work: Work, arguments: tuple[Any, ...], dies_at: int | None) -> None:
+def _in_child(place: Place, work: Work, arguments: tuple[Any, ...], kill_at: int | None) -> None:
     os.environ.update(place.environment)
-    run_here(place, lambda functions: work(functions, *arguments), KillPoint(dies_at))
+    run_here(place, lambda functions: work(functions, *arguments), KillPoint(kill_at))
 
 
-def begin(place: Place, work: Work, *arguments: Any, dies_at: int | None = None) -> Any:
+def begin(place: Place, work: Work, *arguments: Any, kill_at: int | None = None) -> Any:
     """Do ``work`` (a function of a module) in a process of its own; returns the process."""
-    process = PROCESSES.Process(target=_in_child, args=(place, work, arguments, dies_at))
+    process = PROCESSES.Process(target=_in_child, args=(place, work, arguments, kill_at))
     process.start()
     return process
 
@@ -164,7 +164,7 @@ def killed(process: Any) -> bool:
 def kill(place: Place, work: Work, *arguments: Any, at: int) -> bool:
     """Do ``work`` in a process that is killed instead of its step ``at``. Returns False if it ends before."""
     if place.memory is None:
-        return killed(begin(place, work, *arguments, dies_at=at))
+        return killed(begin(place, work, *arguments, kill_at=at))
     kill_point = KillPoint(at, simulated=True)
     with contextlib.suppress(Killed):
         run_here(place, lambda functions: work(functions, *arguments), kill_point)

@@ -81,7 +81,7 @@ def check_that_all_actions_end(place: Place, *, kills: int, seed: int, steps: in
     crowd: list[Any] = []
     for number in range(kills):
         place = place.later(rng.uniform(0, 2))
-        crowd.append(begin(place, run_random_operations, scenes, seed + number, dies_at=rng.randrange(steps)))
+        crowd.append(begin(place, run_random_operations, scenes, seed + number, kill_at=rng.randrange(steps)))
         if len(crowd) >= CROWD:
             assert killed(crowd.pop(rng.randrange(CROWD)))
     for process in crowd:

@@ -1,10 +1,10 @@
 """A real device with a fake arm, in processes that kill themselves at any step.
 
-``python -m tests.faults.mortal_agent`` is a warm parent process. Each input line is one run (JSON, see ``Life``). The
+``python -m tests.faults.killable_agent`` is a warm parent process. Each input line is one run (JSON, see ``Run``). The
 parent executes it in a fork and prints the exit status. A step is a write to the journal, a published message or the
 start of a move; a ``kill -9`` can occur between steps.
 
-A run appends to files that persist: ``heard`` contains each published acknowledgement, one per line; ``moved`` each
+A run appends to files that persist: ``published`` contains each published acknowledgement, one per line; ``moved`` each
 move of the arm, with the number of the command and the cloud time.
 """
 
@@ -40,36 +40,36 @@ from tests.harness.agent.sandbox import LateSandbox
 TARGET_RAD = 1e-4
 """Factor from the elbow's target [rad] to the number of the command, so that each move identifies its command."""
 SPACE, AGENT, DEVICE = "s", "a", "arm"
-_GIVE_UP_S = 60.0
+_TIMEOUT_S = 60.0
 _LINK_LOST = 0.03
-_UNHEARD = 0.25
+_UNACKNOWLEDGED = 0.25
 
 
-class Life(msgspec.Struct):
+class Run(msgspec.Struct):
     """One run of the agent process.
 
     Attributes:
-        folder: Folder of the journal, ``heard`` and ``moved``.
+        folder: Folder of the journal, ``published`` and ``moved``.
         key: The cloud's private key, base64.
-        dies_at: Step at which the process is killed; ``None``: runs until all commands have ended.
+        kill_at_step: Step at which the process is killed; ``None``: runs until all commands have ended.
         cloud_ms: Cloud time at the start; independent of the machine's clock [ms].
         seed: Seed of the simulated link.
-        orders: Command bodies in order of arrival, with duplicates.
+        commands: Command bodies in command of arrival, with duplicates.
     """
 
     folder: str
     key: bytes
-    dies_at: int | None
+    kill_at_step: int | None
     cloud_ms: int
     seed: int
-    orders: list[Command]
+    commands: list[Command]
 
 
 class Steps:
     """Counts steps and kills the process at the chosen one."""
 
-    def __init__(self, dies_at: int | None) -> None:
-        self._dies_at = dies_at
+    def __init__(self, kill_at_step: int | None) -> None:
+        self._dies_at = kill_at_step
         self._lock = threading.Lock()
         self.count = 0
 
@@ -77,23 +77,23 @@ class Steps:
         with self._lock:
             if self._dies_at is not None and self.count >= self._dies_at:
                 os.kill(os.getpid(), signal.SIGKILL)
-                time.sleep(_GIVE_UP_S)  # wait for the signal; no further step may run
+                time.sleep(_TIMEOUT_S)  # wait for the signal; no further step may run
             self.count += 1
 
     def around(self, owner: Any, name: str) -> Any:
         """A patch that counts a step before and after a call."""
-        real = getattr(owner, name)
+        original = getattr(owner, name)
 
         def stepping(*arguments: Any, **options: Any) -> Any:
             self.step()
-            result = real(*arguments, **options)
+            result = original(*arguments, **options)
             self.step()
             return result
 
         return mock.patch.object(owner, name, stepping)
 
 
-class Ledger:
+class AppendOnlyFile:
     """An append-only file of whole lines; written lines survive a kill of the process."""
 
     def __init__(self, path: Path) -> None:
@@ -104,22 +104,22 @@ class Ledger:
         os.fsync(self._file)
 
 
-class Body:
+class DeviceRun:
     """The device of one run."""
 
-    def __init__(self, life: Life) -> None:
-        self.life = life
-        self.folder = Path(life.folder)
-        self.steps = Steps(life.dies_at)
-        self.chance = random.Random(life.seed)
-        self.heard = Ledger(self.folder / "heard")
-        self.moved = Ledger(self.folder / "moved")
+    def __init__(self, run: Run) -> None:
+        self.run = run
+        self.folder = Path(run.folder)
+        self.steps = Steps(run.kill_at_step)
+        self.rng = random.Random(run.seed)
+        self.published = AppendOnlyFile(self.folder / "published")
+        self.moved = AppendOnlyFile(self.folder / "moved")
         self.ended: set[str] = set()
         self.clock = CloudClock()
-        self.clock.observe(server_ms=life.cloud_ms, sent_tick_ms=tick_ms(), received_tick_ms=tick_ms())
+        self.clock.observe(server_ms=run.cloud_ms, sent_tick_ms=tick_ms(), received_tick_ms=tick_ms())
 
-    def live(self) -> None:
-        key = Ed25519PrivateKey.from_private_bytes(self.life.key)
+    def execute(self) -> None:
+        key = Ed25519PrivateKey.from_private_bytes(self.run.key)
         writes = [self.steps.around(Journal, name) for name in ("begin", "record", "delivered", "save_epoch")]
         with mock.patch.object(Controller, "start_joint_goal", self._counted(Controller.start_joint_goal)):
             for write in writes:
@@ -128,7 +128,7 @@ class Body:
             journal.open(now_ms=wall_ms())
             journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
             device = Device(
-                name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=FakeDriver(),
+                name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=fast_arm(), driver=FakeDriver(),
                 journal=journal, cloud_clock=self.clock, publish=self._publish, sandbox=LateSandbox(),
                 keys=pinned_keys_of(key),
                 readings=ReadingCache(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
@@ -141,27 +141,27 @@ class Body:
 
     def _outbox(self) -> Outbox:
         own = f"ts/v1/{SPACE}/{AGENT}/"
-        shelf = OutboxStore(self.folder / "outbox.db", own=own, max_bytes=10**7, max_age_ms=3_600_000)
-        return Outbox(shelf, publish=self._publish, device_topic=own + DEVICE)
+        store = OutboxStore(self.folder / "outbox.db", own=own, max_bytes=10**7, max_age_ms=3_600_000)
+        return Outbox(store, publish=self._publish, device_topic=own + DEVICE)
 
     def _deliver(self, device: Device, key: Ed25519PrivateKey) -> None:
         topic = topics.Topic(SPACE, AGENT, DEVICE, topics.CMD)
-        for order in self.life.orders:
-            device.receive(topic, signing.sign(codec.encode(order), key))
-            if self.chance.random() < _LINK_LOST:
+        for command in self.run.commands:
+            device.receive(topic, signing.sign(codec.encode(command), key))
+            if self.rng.random() < _LINK_LOST:
                 device.link_changed(False)
                 device.link_changed(True)
-            time.sleep(self.chance.choice((0, 0.005, 0.03)))
-        deadline_s = time.monotonic() + _GIVE_UP_S
-        orders = {order.id for order in self.life.orders}
-        while not orders <= self.ended:
-            assert time.monotonic() < deadline_s, f"without an end: {orders - self.ended}"
+            time.sleep(self.rng.choice((0, 0.005, 0.03)))
+        deadline_s = time.monotonic() + _TIMEOUT_S
+        commands = {command.id for command in self.run.commands}
+        while not commands <= self.ended:
+            assert time.monotonic() < deadline_s, f"without a final state: {commands - self.ended}"
             time.sleep(0.002)
 
-    def _counted(self, real: Callable[..., Any]) -> Callable[..., Any]:
+    def _counted(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def move(controller: Controller, reservation: Any, position_rad: dict[str, float], **options: Any) -> Any:
             self.steps.step()
-            moving = real(controller, reservation, position_rad, **options)
+            moving = original(controller, reservation, position_rad, **options)
             self.moved.add(number=round(position_rad["elbow"] / TARGET_RAD), cloud_ms=self.clock.now_ms())
             self.steps.step()
             return moving
@@ -177,17 +177,19 @@ class Body:
             return True
         self.steps.step()
         ack = codec.decode(payload, Ack)
-        self.heard.add(id=ack.id, status=ack.status, code=ack.reason.code if ack.reason else "", progress=ack.progress)
+        self.published.add(
+            id=ack.id, status=ack.status, code=ack.reason.code if ack.reason else "", progress=ack.progress
+        )
         self.steps.step()
-        if delivered is not None and self.chance.random() > _UNHEARD:
+        if delivered is not None and self.rng.random() > _UNACKNOWLEDGED:
             delivered()
         if ack.status.terminal:
             self.ended.add(ack.id)
         return True
 
 
-def swift() -> Any:
-    """A fake arm that reaches each target at once, so that a thousand runs take minutes."""
+def fast_arm() -> Any:
+    """A fake arm that reaches each target immediately, so that a thousand runs take minutes."""
     slow = robot_type()
     joints = tuple(
         msgspec.structs.replace(
@@ -206,13 +208,13 @@ def swift() -> Any:
 def main() -> None:
     logging.disable()
     for line in sys.stdin:
-        life = msgspec.json.decode(line, type=Life)
+        run = msgspec.json.decode(line, type=Run)
         child = os.fork()
         if child == 0:
             code = 1
             try:
-                body = Body(life)
-                body.live()
+                device_run = DeviceRun(run)
+                device_run.execute()
                 code = 0
             except BaseException as error:
                 print(f"{type(error).__name__}: {error}", file=sys.stderr)
