@@ -1,6 +1,6 @@
-"""The adapters that settings choose between: signing keys, stores, the broker's access, what goes there and comes.
+"""Creates the adapters that the settings select: signing keys, stores, broker access, command bus and feeds.
 
-Of the stores, and of the clouds' adapters, only those in use are imported, and they their SDKs only when needed.
+Only the selected store and cloud adapters are imported. They import their SDKs at the first call.
 """
 
 import hashlib
@@ -35,7 +35,7 @@ from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Ke
 
 TABLES_FILE = "tables.sqlite"
 BLOBS_PATH = "/api/v1/blobs"
-"""Where the addresses of blobs in files lead to."""
+"""Path of presigned URLs of ``FileBlobs``."""
 MOSQUITTO_SERVICE = "service"
 
 
@@ -69,15 +69,15 @@ def adapters(settings: Settings, clock: Clock) -> Adapters:
     async def publish(topic: str, payload: bytes) -> None:
         await command_bus.publish(topic, payload)
 
-    granted = access(settings, signing, tables, publish)
-    command_bus = bus(settings, granted)
-    feed, telemetry, late = feeds(settings, granted)
+    broker_access = access(settings, signing, tables, publish)
+    command_bus = bus(settings, broker_access)
+    feed, telemetry, late = feeds(settings, broker_access)
     return Adapters(
         keys=signing,
         tables=tables,
         blobs=blobs,
         transfers=blobs if isinstance(blobs, FileBlobs) else None,
-        access=granted,
+        access=broker_access,
         bus=command_bus,
         feed=feed,
         telemetry=telemetry,
@@ -89,18 +89,18 @@ def adapters(settings: Settings, clock: Clock) -> Adapters:
 
 
 def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:
-    """The signing keys; files are read, a vault is not asked yet.
+    """The signing keys. Reads key files; makes no request to a vault.
 
     Raises:
         StoreError: They cannot be used.
     """
     match settings.keys:
         case KeyVault() as vault:
-            from function_app.adapters.azure.client import Place  # noqa: PLC0415 (only where it is in use)
+            from function_app.adapters.azure.client import Endpoint  # noqa: PLC0415 (only where it is in use)
             from function_app.adapters.azure.signing_keys import KeyVaultKeys  # noqa: PLC0415
 
-            place = Place(url=vault.url, identity=vault.identity)
-            return KeyVaultKeys(secret=vault.secret, place=place, now_ms=now_ms)
+            endpoint = Endpoint(url=vault.url, identity=vault.identity)
+            return KeyVaultKeys(secret=vault.secret, endpoint=endpoint, now_ms=now_ms)
         case SecretsManager() as manager:
             from function_app.adapters.aws.signing_keys import SecretsManagerKeys  # noqa: PLC0415
 
@@ -112,21 +112,19 @@ def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:
                 now_ms=now_ms,
             )
         case None:
-            found = FileKeys(settings.home / "keys", now_ms=now_ms)
-            found.load()
-            return found
+            file_keys = FileKeys(settings.home / "keys", now_ms=now_ms)
+            file_keys.load()
+            return file_keys
 
 
 def oidc_provider(settings: Settings, clock: Clock) -> OidcProvider | None:
-    """Where people may sign in, beside here."""
+    """The configured OpenID Connect provider, or ``None``."""
     if settings.oidc is None:
         return None
     from function_app.adapters.oidc.provider import HttpOidcProvider  # noqa: PLC0415 (only where it is in use)
 
-    known = settings.oidc
-    return HttpOidcProvider(
-        issuer=known.issuer, client_id=known.client_id, client_secret=known.client_secret, clock=clock
-    )
+    oidc = settings.oidc
+    return HttpOidcProvider(issuer=oidc.issuer, client_id=oidc.client_id, client_secret=oidc.client_secret, clock=clock)
 
 
 def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables, Blobs]:
@@ -134,14 +132,14 @@ def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables,
     match settings.store:
         case AzureStore() as azure:
             from function_app.adapters.azure.blobs import AzureBlobs  # noqa: PLC0415
-            from function_app.adapters.azure.client import Place  # noqa: PLC0415
+            from function_app.adapters.azure.client import Endpoint  # noqa: PLC0415
             from function_app.adapters.azure.tables import AzureTables  # noqa: PLC0415
 
-            tables_place = Place(azure.connection, azure.tables_url, azure.identity)
-            blobs_place = Place(azure.connection, azure.blobs_url, azure.identity)
+            tables = Endpoint(azure.connection, azure.tables_url, azure.identity)
+            blobs = Endpoint(azure.connection, azure.blobs_url, azure.identity)
             return (
-                AzureTables(place=tables_place, prefix=azure.prefix),
-                AzureBlobs(place=blobs_place, container=azure.container),
+                AzureTables(endpoint=tables, prefix=azure.prefix),
+                AzureBlobs(endpoint=blobs, container=azure.container),
             )
         case AwsStore() as aws:
             from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
@@ -165,7 +163,7 @@ def access(
         from function_app.adapters.aws.broker_access import IotBrokerAccess  # noqa: PLC0415 (only where it is in use)
 
         iot = settings.bus
-        assert isinstance(iot, IotBus)  # noqa: S101 (the settings see to it)
+        assert isinstance(iot, IotBus)  # noqa: S101 (validated by the settings)
         return IotBrokerAccess(keys=signing, tables=tables, region=iot.region, endpoint=iot.endpoint)
     if settings.broker == "eventgrid":
         return _event_grid(settings, signing, tables)
@@ -183,20 +181,20 @@ def access(
 def _event_grid(settings: Settings, signing: RingKeys, tables: Tables) -> BrokerAccess:
     from function_app.adapters.azure.broker_access import EventGridBrokerAccess  # noqa: PLC0415 (only where in use)
     from function_app.adapters.azure.session_takeover import SessionTakeover  # noqa: PLC0415
-    from function_app.adapters.azure.webhook_auth import EntraCallers  # noqa: PLC0415
+    from function_app.adapters.azure.webhook_auth import EntraTokenVerifier  # noqa: PLC0415
 
     grid = settings.bus
-    assert isinstance(grid, EventGridBus)  # noqa: S101 (the settings see to it)
+    assert isinstance(grid, EventGridBus)  # noqa: S101 (validated by the settings)
     assert grid.webhook is not None  # noqa: S101
     webhook = grid.webhook
-    callers = EntraCallers(tenant=webhook.tenant, audience=webhook.audience, identity=webhook.caller)
+    verifier = EntraTokenVerifier(tenant=webhook.tenant, audience=webhook.audience, identity=webhook.caller)
     # Its certificate has a public CA, independent of the CA of this installation.
-    taker = SessionTakeover(host=settings.mqtt_host, port=settings.mqtt_port, tls=client_context(None))
-    return EventGridBrokerAccess(keys=signing, tables=tables, take=taker, known=callers.knows)
+    takeover = SessionTakeover(host=settings.mqtt_host, port=settings.mqtt_port, tls=client_context(None))
+    return EventGridBrokerAccess(keys=signing, tables=tables, take_over=takeover, verify_caller=verifier.verify)
 
 
-def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
-    """What publishes commands."""
+def bus(settings: Settings, broker_access: BrokerAccess) -> CommandBus:
+    """The command bus."""
     match settings.bus:
         case IotBus() as iot:
             from function_app.adapters.aws.command_bus import IotCommandBus  # noqa: PLC0415 (only where it is in use)
@@ -207,22 +205,22 @@ def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
 
             return EventGridCommandBus(endpoint=grid.endpoint, identity=grid.identity)
         case None:
-            return MqttCommandBus(_broker(settings, granted))
+            return MqttCommandBus(_broker(settings, broker_access))
 
 
-def feeds(settings: Settings, granted: BrokerAccess) -> tuple[DeviceFeed, TelemetryFeed, TelemetryFeed]:
-    """What brings what devices say, what they measure, and what they measured while their link was down."""
-    broker = _broker(settings, granted)
+def feeds(settings: Settings, broker_access: BrokerAccess) -> tuple[DeviceFeed, TelemetryFeed, TelemetryFeed]:
+    """The feeds of device messages, of telemetry, and of telemetry that was recorded during a disconnection."""
+    broker = _broker(settings, broker_access)
     return MqttDeviceFeed(broker), MqttTelemetryFeed(broker), MqttTelemetryFeed(broker, late=True)
 
 
 def certificates(settings: Settings) -> Certificates:
-    """The authority for agents."""
+    """The certificate authority for agents."""
     if settings.broker == "iot":
         from function_app.adapters.aws.certificates import IotCertificates  # noqa: PLC0415 (only where it is in use)
 
         iot = settings.bus
-        assert isinstance(iot, IotBus)  # noqa: S101 (the settings see to it)
+        assert isinstance(iot, IotBus)  # noqa: S101 (validated by the settings)
         return IotCertificates(region=iot.region, policy=iot.policy)
     if settings.tls is None or settings.tls.agents is None:
         return NoCertificates()
@@ -230,27 +228,27 @@ def certificates(settings: Settings) -> Certificates:
 
 
 def broker_tls(settings: Settings) -> ssl.SSLContext | None:
-    """How connections to the broker are kept from others.
+    """The TLS context of connections to the broker; ``None`` for connections without TLS.
 
     Raises:
-        BrokerAccessError: The authority's certificate cannot be read.
+        BrokerAccessError: The certificate of the authority cannot be read.
     """
     return None if settings.tls is None else client_context(settings.tls.ca, settings.tls.agents)
 
 
 async def prepare(settings: Settings) -> None:
-    """Make what store and vault must have before their first use. Safe to repeat.
+    """Create the cloud resources that must exist before the first use. Idempotent.
 
-    Of the stores only Amazon's needs it: a file, and Azure's tables and container, are made when first written to.
+    This covers AWS stores, IoT policies and vault secrets. Files and Azure stores are created at the first write.
 
     Raises:
-        StoreError: It cannot be made.
+        StoreError: A resource cannot be created.
     """
     if settings.broker == "iot":
         from function_app.adapters.aws.certificates import IotCertificates  # noqa: PLC0415
 
         agents = certificates(settings)
-        assert isinstance(agents, IotCertificates)  # noqa: S101 (the settings say so)
+        assert isinstance(agents, IotCertificates)  # noqa: S101 (validated by the settings)
         try:
             await agents.prepare()
         except BrokerAccessError as error:
@@ -258,36 +256,36 @@ async def prepare(settings: Settings) -> None:
         finally:
             await agents.close()
     if settings.keys is not None:
-        held = keys(settings, SystemClock().now_ms)
-        assert isinstance(held, VaultKeys)  # noqa: S101 (the settings say so)
+        vault = keys(settings, SystemClock().now_ms)
+        assert isinstance(vault, VaultKeys)  # noqa: S101 (validated by the settings)
         try:
-            await held.prepare()
+            await vault.prepare()
         finally:
-            await held.close()
+            await vault.close()
     if isinstance(settings.store, AwsStore):
         from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
         from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415
 
         for store in stores(settings):
-            assert isinstance(store, DynamoTables | S3Blobs)  # noqa: S101 (the settings say so)
+            assert isinstance(store, DynamoTables | S3Blobs)  # noqa: S101 (validated by the settings)
             try:
                 await store.prepare()
             finally:
                 await store.close()
 
 
-def _broker(settings: Settings, granted: BrokerAccess) -> Broker:
-    """The broker, as the functions themselves meet it."""
+def _broker(settings: Settings, broker_access: BrokerAccess) -> Broker:
+    """The broker, with the credentials of the functions."""
     return Broker(
         host=settings.mqtt_host,
         port=settings.mqtt_port,
-        credentials=granted.service_credentials,
+        credentials=broker_access.service_credentials,
         tls=broker_tls(settings),
     )
 
 
 def _files(settings: Settings, signing: RingKeys | None) -> FileBlobs:
-    """Blobs in files, whose addresses any instance with the same signing keys makes and knows."""
+    """Blobs in files. Instances with the same signing keys accept each other's presigned URLs."""
 
     def derived() -> list[bytes]:
         secrets = () if signing is None else signing.secrets()

@@ -26,7 +26,7 @@ class Certificates(Protocol):
     """
 
     @property
-    def wanted(self) -> bool:
+    def required(self) -> bool:
         """Whether the broker requires a client certificate."""
 
     async def issue(self, agent: str, request: str) -> Issued:
@@ -39,7 +39,7 @@ class Certificates(Protocol):
             BrokerAccessError: The certificate cannot be issued or stored.
         """
 
-    async def place(self, agent: str, space: str) -> None:
+    async def set_space(self, agent: str, space: str) -> None:
         """Restrict the agent's certificates to one space, where the broker authorizes by certificate alone.
 
         Raises:

@@ -23,7 +23,7 @@ class CommandFeed(Protocol):
     def up(self) -> bool:
         """Whether the feed is connected and subscribed."""
 
-    async def run(self, hear: OnMessage) -> None:
+    async def run(self, on_message: OnMessage) -> None:
         """Deliver messages until cancelled; reconnects without limit."""
 
     async def add(self, space: str, agent: str, listen: Sequence[str] = ()) -> None:

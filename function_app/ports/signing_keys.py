@@ -84,7 +84,7 @@ class SigningKeys(Protocol):
     async def archive(self) -> Mapping[str, Ed25519PublicKey]:
         """All keys whose signatures on stored data are valid: also former keys, except leaked ones."""
 
-    async def news(self) -> KeyAnnouncement:
+    async def announcement(self) -> KeyAnnouncement:
         """The keys to announce to agents."""
 
     async def rotate(

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from function_app.adapters.azure import topic_spaces
-from function_app.adapters.azure.topic_spaces import FUNCTIONS_SAY
+from function_app.adapters.azure.topic_spaces import FUNCTIONS_SPACE
 
 API_VERSION = "2025-02-15"
 PUBLISHER_ROLE = "a12b0b94-b317-4dcd-84a8-502ce99884c6"
@@ -66,14 +66,14 @@ def template() -> dict[str, Any]:
 
 
 def _role() -> dict[str, Any]:
-    where = f"{_NAMESPACE}/topicSpaces/{FUNCTIONS_SAY}"
+    where = f"{_NAMESPACE}/topicSpaces/{FUNCTIONS_SPACE}"
     role = f"subscriptionResourceId('Microsoft.Authorization/roleDefinitions', '{PUBLISHER_ROLE}')"
     return {
         "type": "Microsoft.Authorization/roleAssignments",
         "apiVersion": "2022-04-01",
         "name": f"[guid(parameters('namespace'), parameters('functions'), '{where}')]",
-        "scope": f"[format('{_NAMESPACE}/{{0}}/topicSpaces/{FUNCTIONS_SAY}', parameters('namespace'))]",
-        "dependsOn": [_id("topicSpaces", FUNCTIONS_SAY)],
+        "scope": f"[format('{_NAMESPACE}/{{0}}/topicSpaces/{FUNCTIONS_SPACE}', parameters('namespace'))]",
+        "dependsOn": [_id("topicSpaces", FUNCTIONS_SPACE)],
         "properties": {
             "roleDefinitionId": f"[{role}]",
             "principalId": "[parameters('functions')]",

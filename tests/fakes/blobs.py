@@ -70,9 +70,9 @@ class MemoryBlobs:
     async def receive(self, token: str, headers: Mapping[str, str], content: AsyncIterator[bytes]) -> None:
         address = self._address(token, upload=True)
         if headers.get("content-length", str(address.length)) != str(address.length):
-            raise TransferRefused(403, f"The address is for exactly {address.length} bytes.")
+            raise TransferRefused(403, f"The URL is for exactly {address.length} bytes.")
         if headers.get("content-type") != address.content_type:
-            raise TransferRefused(403, f"The address is for content of the type {address.content_type}.")
+            raise TransferRefused(403, f"The URL is for content of the type {address.content_type}.")
         if address.name in self.contents:
             raise TransferRefused(409, "A blob with this name exists.")
         received = b"".join([part async for part in content])
@@ -83,7 +83,7 @@ class MemoryBlobs:
     async def send(self, token: str) -> Download:
         address = self._address(token, upload=False)
         if address.name not in self.contents:
-            raise TransferRefused(404, "There is nothing at this address any more.")
+            raise TransferRefused(404, "The blob does not exist.")
         content = self.contents[address.name]
         return Download(_parts(content), len(content), address.content_type)
 
@@ -98,7 +98,7 @@ class MemoryBlobs:
     def _address(self, token: str, *, upload: bool) -> _Address:
         address = self._addresses.get(token)
         if address is None or address.upload != upload or address.expires_s <= self._now_s():
-            raise TransferRefused(403, "The address is not one of ours, or has expired. Ask for a new one.")
+            raise TransferRefused(403, "The URL is invalid or expired. Request a new one.")
         return address
 
 

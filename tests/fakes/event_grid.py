@@ -26,7 +26,7 @@ import pytest
 from function_app.adapters.azure.broker_access import EventGridBrokerAccess
 from function_app.adapters.azure.command_bus import EventGridCommandBus
 from function_app.adapters.azure.session_takeover import SessionTakeover
-from function_app.adapters.azure.topic_spaces import FUNCTIONS_SAY
+from function_app.adapters.azure.topic_spaces import FUNCTIONS_SPACE
 from function_app.entrypoints.broker_auth.event_grid import admit
 from function_app.ports.command_bus import BusUnavailable
 from function_app.settings import EventGridBus, EventGridWebhook
@@ -223,8 +223,8 @@ def event_grid_cloud(home: Path) -> Iterator[tuple[Cloud, RunningBroker, EventGr
         with Cloud(chosen) as cloud:
             access = cloud.functions.access
             assert isinstance(access, EventGridBrokerAccess)
-            access._take = SessionTakeover(host=HOST, port=ports[TCP], tls=None)
-            access.known = _known
+            access._take_over = SessionTakeover(host=HOST, port=ports[TCP], tls=None)
+            access.verify_caller = _verify_caller
             grid.webhook = lambda asked: _ask(cloud, asked)
             process: Any = None
             kind: Any = "eventgrid"
@@ -232,7 +232,7 @@ def event_grid_cloud(home: Path) -> Iterator[tuple[Cloud, RunningBroker, EventGr
             yield cloud, broker, grid
 
 
-async def _known(token: str) -> bool:
+async def _verify_caller(token: str) -> bool:
     return token == CALLER
 
 
@@ -248,7 +248,7 @@ def _publisher(grid: EventGrid) -> Callable[..., Any]:
     """What publishing over HTTPS does, with the functions' role on their one topic space."""
 
     async def publish(_: Any, topic: str, *__: Any, **___: Any) -> None:
-        if not any(covers(each, topic) for each in grid.namespace.spaces[FUNCTIONS_SAY]):
+        if not any(covers(each, topic) for each in grid.namespace.spaces[FUNCTIONS_SPACE]):
             raise BusUnavailable(f"Event Grid does not let the functions publish to {topic}")
         grid.said.append(topic)
 

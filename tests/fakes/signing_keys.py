@@ -14,14 +14,14 @@ class MemorySigningKeys(RingKeys):
         super().__init__(now_ms=now_ms)
         self._stored = Ring.first(signing.generate())
 
-    async def _ring(self, *, fresh: bool = False) -> Ring:
-        del fresh
-        return self._known()
+    async def _ring(self, *, refresh: bool = False) -> Ring:
+        del refresh
+        return self._cached()
 
     async def _change(self, change: Callable[[Ring], Ring]) -> Ring:
         self._stored = change(self._stored)
-        return self._known()
+        return self._cached()
 
-    def _known(self) -> Ring:
+    def _cached(self) -> Ring:
         self._stored = self._stored.pruned(self._now_ms())
         return self._stored

@@ -1,1 +1,1 @@
-"""Amazon: DynamoDB and S3."""
+"""AWS: DynamoDB, S3, Secrets Manager and IoT Core."""

@@ -1,7 +1,7 @@
 """Blobs in one S3 bucket.
 
-An object's key is the blob's name, but for what S3 or the way to it does not take (``encode``), and for names over 240
-characters (``names``), which are whole in the object's metadata.
+An object's key is the blob's name with two exceptions. Characters that S3 or URLs do not accept are encoded
+(``encode``). Names over 240 characters are truncated (``names``); the object's metadata contain the full name.
 """
 
 import asyncio
@@ -10,99 +10,100 @@ import re
 from typing import Any
 
 from function_app.adapters.aws import names
-from function_app.adapters.aws.client import Client, Refused
+from function_app.adapters.aws.client import Client, ServiceError
 from function_app.adapters.shared.appending import Appends
 from function_app.ports.blobs import Upload, check_name, check_size, check_upload
 
 _PAGE = 1_000
-"""Most keys that S3 lists at once."""
-_FIRST = "us-east-1"
-"""Amazon's first region, which is not named when a bucket is made there."""
+"""Maximum number of keys in a response of S3."""
+_DEFAULT_REGION = "us-east-1"
+"""S3 rejects this region as a location constraint."""
 _TAIL = "tail"
-_NOT_THERE = frozenset({"404", "NoSuchKey"})
-_WRITTEN_MEANWHILE = frozenset({"ConditionalRequestConflict", "PreconditionFailed", "NoSuchKey"})
-_HIDDEN = re.compile(r"[\x00-!]|(?:(?<=/)|^)\.", re.ASCII)
-_SHOWN = re.compile(r"!([0-9a-f]{2})|(?:(?<=/)|^)\._")
+_NOT_FOUND = frozenset({"404", "NoSuchKey"})
+_CONCURRENT_WRITE = frozenset({"ConditionalRequestConflict", "PreconditionFailed", "NoSuchKey"})
+_DECODED = re.compile(r"[\x00-!]|(?:(?<=/)|^)\.", re.ASCII)
+_ENCODED = re.compile(r"!([0-9a-f]{2})|(?:(?<=/)|^)\._")
 
 
 class S3Blobs:
     """``Blobs`` in ``bucket``. Connects at the first call."""
 
     def __init__(self, *, bucket: str, region: str, endpoint: str | None = None) -> None:
-        """``endpoint`` is an emulator's address. Credentials come the SDK's own way: a role, or the environment."""
+        """``endpoint`` is an emulator's address. The SDK reads credentials from the role or the environment."""
         self._bucket = bucket
         self._region = region
         self._client = Client(
             "s3",
-            what=f"the S3 bucket '{bucket}'",
+            resource=f"the S3 bucket '{bucket}'",
             setting="TELESCOPE_AWS_BUCKET",
-            how="private, without versions",
+            creation="private, without versions",
             region=region,
             endpoint=endpoint,
         )
         self._appends = Appends()
 
     async def prepare(self) -> None:
-        """Make the bucket where there is none. Safe to repeat, by many at once.
+        """Create the bucket if it does not exist. Idempotent; allows concurrent calls.
 
         Raises:
-            StoreError: It cannot be made; its name may be another account's.
+            StoreError: It cannot be created; another account may own the name.
         """
-        place = {"CreateBucketConfiguration": {"LocationConstraint": self._region}}
+        options: dict[str, Any] = {}
+        if self._region != _DEFAULT_REGION:
+            options["CreateBucketConfiguration"] = {"LocationConstraint": self._region}
         try:
-            await self._client.call("create_bucket", Bucket=self._bucket, **(place if self._region != _FIRST else {}))
-        except Refused as error:
+            await self._client.call("create_bucket", Bucket=self._bucket, **options)
+        except ServiceError as error:
             if error.code != "BucketAlreadyOwnedByYou":
                 raise
 
     async def put(self, name: str, content: bytes) -> None:
         check_size(len(content))
-        place = self._place(name)
-        await self._client.call("put_object", **place, **_metadata(name), Body=content)
+        await self._client.call("put_object", **self._location(name), **_metadata(name), Body=content)
 
     async def get(self, name: str) -> bytes | None:
-        found = await self._read(self._place(name))
+        found = await self._read(self._location(name))
         return None if found is None else found[0]
 
     async def append(self, name: str, content: bytes) -> None:
         check_size(len(content))
-        place, metadata = self._place(name), _metadata(name)
-        # S3 only writes whole objects; the ETag detects other instances.
-        await self._appends.run(name, lambda: self._append(place, metadata, content))
+        location, metadata = self._location(name), _metadata(name)
+        # S3 writes whole objects; the ETag detects writes of other instances.
+        await self._appends.run(name, lambda: self._append(location, metadata, content))
 
     async def delete(self, name: str) -> None:
-        await self._client.call("delete_object", **self._place(name))
+        await self._client.call("delete_object", **self._location(name))
 
     async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
         if limit < 1:
             return ()
-        question = {"Bucket": self._bucket, "Prefix": encode(prefix[: names.HEAD]), "MaxKeys": min(limit, _PAGE)}
+        request = {"Bucket": self._bucket, "Prefix": encode(prefix[: names.HEAD]), "MaxKeys": min(limit, _PAGE)}
         found: list[str] = []
         while True:
-            answer = await self._client.call("list_objects_v2", **question)
-            some = await asyncio.gather(*(self._name(each["Key"]) for each in answer.get("Contents", ())))
-            found += (name for name in some if name is not None and name.startswith(prefix))
-            if not answer["IsTruncated"] or _whole(found, limit):
+            response = await self._client.call("list_objects_v2", **request)
+            page = await asyncio.gather(*(self._name(item["Key"]) for item in response.get("Contents", ())))
+            found += (name for name in page if name is not None and name.startswith(prefix))
+            if not response["IsTruncated"] or _is_complete(found, limit):
                 break
-            question["ContinuationToken"] = answer["NextContinuationToken"]
+            request["ContinuationToken"] = response["NextContinuationToken"]
         return tuple(sorted(found)[:limit])
 
     async def size(self, name: str) -> int | None:
         try:
-            found = await self._client.call("head_object", **self._place(name))
-        except Refused as error:
-            if error.code in _NOT_THERE:
+            found = await self._client.call("head_object", **self._location(name))
+        except ServiceError as error:
+            if error.code in _NOT_FOUND:
                 return None
             raise
         return int(found["ContentLength"])
 
     async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
-        """See ``Blobs``. Length, type and that nothing is there yet are part of what is signed."""
+        """See ``Blobs``. The signature covers the length, the type and the condition that the object does not exist."""
         check_upload(length)
         url = await self._client.presign(
             "put_object",
             lifetime_s=lifetime_s,
-            **self._place(name),
+            **self._location(name),
             **_metadata(name),
             ContentLength=length,
             ContentType=content_type,
@@ -117,7 +118,7 @@ class S3Blobs:
         return await self._client.presign(
             "get_object",
             lifetime_s=lifetime_s,
-            **self._place(name),
+            **self._location(name),
             ResponseContentType=content_type,
             ResponseContentDisposition="attachment",
         )
@@ -126,70 +127,70 @@ class S3Blobs:
         await self._client.close()
 
     async def _name(self, key: str) -> str | None:
-        """The name of an object; ``None`` when it has gone meanwhile."""
-        shown = decode(key)
-        if not names.is_long(shown):
-            return shown
+        """The name of an object; ``None`` if it was deleted in the meantime."""
+        name = decode(key)
+        if not names.is_long(name):
+            return name
         try:
             found = await self._client.call("head_object", Bucket=self._bucket, Key=key)
-        except Refused as error:
-            if error.code in _NOT_THERE:
+        except ServiceError as error:
+            if error.code in _NOT_FOUND:
                 return None
             raise
-        return shown[: names.HEAD] + base64.b64decode(found["Metadata"][_TAIL]).decode()
+        return name[: names.HEAD] + base64.b64decode(found["Metadata"][_TAIL]).decode()
 
-    def _place(self, name: str) -> dict[str, str]:
+    def _location(self, name: str) -> dict[str, str]:
         check_name(name)
         key = encode(name[: names.HEAD])
         return {"Bucket": self._bucket, "Key": key if not names.is_long(name) else key + names.digest(name)}
 
-    async def _read(self, place: dict[str, str]) -> tuple[bytes, str] | None:
+    async def _read(self, location: dict[str, str]) -> tuple[bytes, str] | None:
         """Content and ETag."""
         try:
-            found = await self._client.call("get_object", **place)
-        except Refused as error:
-            if error.code in _NOT_THERE:
+            found = await self._client.call("get_object", **location)
+        except ServiceError as error:
+            if error.code in _NOT_FOUND:
                 return None
             raise
         return found["Body"], found["ETag"]
 
-    async def _append(self, place: dict[str, str], metadata: dict[str, Any], content: bytes) -> bool:
+    async def _append(self, location: dict[str, str], metadata: dict[str, Any], content: bytes) -> bool:
         """Write the object with data appended. ``False``: another process wrote it since it was read."""
-        found = await self._read(place)
+        found = await self._read(location)
         if found is not None and not content:
             return True
         old, condition = (b"", {"IfNoneMatch": "*"}) if found is None else (found[0], {"IfMatch": found[1]})
         new = old + content
         check_size(len(new))
         try:
-            await self._client.call("put_object", **place, **metadata, **condition, Body=new)
-        except Refused as error:
-            if error.code not in _WRITTEN_MEANWHILE:
+            await self._client.call("put_object", **location, **metadata, **condition, Body=new)
+        except ServiceError as error:
+            if error.code not in _CONCURRENT_WRITE:
                 raise
-            if not error.tried_again:
+            if not error.retried:
                 return False
-            # Its answer may have been lost, and what the SDK then sent again found our own writing.
-            now = await self._read(place)
-            return now is not None and now[0].startswith(new)
+            # If the first response was lost, the retry of the SDK conflicts with our own write.
+            current = await self._read(location)
+            return current is not None and current[0].startswith(new)
         return True
 
 
 def encode(name: str) -> str:
-    """A name, or the beginning of one, as (the beginning of) a key; keys sort as names do.
+    """The key of a name, or the prefix of the keys of a name's prefix. Keys sort like names.
 
-    ``!`` and what sorts before it, control characters and the space, are written ``!00`` to ``!21``. A dot that begins
-    a part of a path is written ``._``, so that no part is ``.`` or ``..``, on which URLs turn.
+    Control characters, the space and ``!`` are written ``!00`` to ``!21``. A dot at the start of a path segment is
+    written ``._``: URLs resolve the segments ``.`` and ``..``.
     """
-    return _HIDDEN.sub(lambda found: "._" if found[0] == "." else f"!{ord(found[0]):02x}", name)
+    return _DECODED.sub(lambda match: "._" if match[0] == "." else f"!{ord(match[0]):02x}", name)
 
 
 def decode(key: str) -> str:
-    """The name that ``encode`` was given."""
-    return _SHOWN.sub(lambda found: chr(int(found[1], 16)) if found[1] else ".", key)
+    """The inverse of ``encode``."""
+    return _ENCODED.sub(lambda match: chr(int(match[1], 16)) if match[1] else ".", key)
 
 
-def _whole(found: list[str], limit: int) -> bool:
-    """Whether the first ``limit`` names have been read, for any order of the long names."""
+def _is_complete(found: list[str], limit: int) -> bool:
+    """Whether ``found`` contains the first ``limit`` names, for any order of the long names."""
     return len(found) >= limit and not names.same_head(found[limit - 1], found[-1])
 
 

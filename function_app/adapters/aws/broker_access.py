@@ -1,7 +1,7 @@
-"""Broker rights in AWS IoT Core: signed grants as passwords, of which its custom authoriser (``admit``) makes policies.
+"""Broker permissions in AWS IoT Core: passwords are signed grants, which the custom authorizer turns into policies.
 
-IoT Core asks the authoriser at each connection, and again before the grant's end. What was taken back is a row in the
-tables, which ``admit`` looks at; who is connected is cut by IoT Core's own call for it.
+IoT Core calls the authorizer (``admit``) at each connection, and again before the grant expires. Revocations are rows
+in the tables, which ``admit`` checks. Connected clients are disconnected through the IoT Core API.
 """
 
 import time
@@ -9,46 +9,47 @@ from typing import Any
 
 from device_agent.protocol.security.grants import Grant
 from function_app.adapters.aws import iot_policies
-from function_app.adapters.aws.client import Refused, iot_data_client
+from function_app.adapters.aws.client import ServiceError, iot_data_client
 from function_app.adapters.shared.webhook_access import WebhookBrokerAccess
 from function_app.ports.broker_access import BrokerAccessError, ServiceCredentials
 from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import StoreError, Tables
 
 _MISSING = "ResourceNotFoundException"
-_LONGEST = "arn:aws:iot:ap-southeast-1:123456789012"
-"""As long as a place can be."""
 
 
 class IotBrokerAccess(WebhookBrokerAccess):
-    """``BrokerAccess`` in AWS IoT Core, which ends connections with their grants, and its authoriser's judgement."""
+    """``BrokerAccess`` in AWS IoT Core, including the decisions of its custom authorizer."""
 
     def __init__(self, *, keys: SigningKeys, tables: Tables, region: str, endpoint: str) -> None:
         super().__init__(keys=keys, tables=tables)
         self._client = iot_data_client(region, endpoint)
 
     def service_credentials(self) -> ServiceCredentials:
-        """None: the functions reach AWS IoT Core by its API, and hear of it by its rules."""
+        """Always raises: the functions publish through the API and receive messages through IoT rules."""
         raise BrokerAccessError("the functions have no connection of their own to AWS IoT Core")
 
-    async def admit(self, *, username: str, password: str, client_id: str, place: str) -> dict[str, Any]:
-        """What IoT Core's custom authoriser answers at ``place``, ``arn:aws:iot:<region>:<account>``.
+    async def admit(self, *, username: str, password: str, client_id: str, arn_prefix: str) -> dict[str, Any]:
+        """The custom authorizer's response; ``arn_prefix`` is ``arn:aws:iot:<region>:<account>``.
 
         Raises:
             StoreError: The revocation state cannot be read; the client is not admitted.
         """
-        grant = await self._rights.judge(username=username.partition("?")[0], password=password, client_id=client_id)
-        return iot_policies.refusal() if grant is None else iot_policies.answer(grant, place=place, now_s=time.time())
+        principal = username.partition("?")[0]
+        grant = await self._registry.verify(username=principal, password=password, client_id=client_id)
+        if grant is None:
+            return iot_policies.rejection()
+        return iot_policies.admission(grant, arn_prefix=arn_prefix, now_s=time.time())
 
     async def close(self) -> None:
         await self._client.close()
 
-    def _check_room(self, grant: Grant) -> None:
-        iot_policies.documents(grant, place=_LONGEST)
+    def _check_size(self, grant: Grant) -> None:
+        iot_policies.documents(grant, arn_prefix=iot_policies.LONGEST_ARN_PREFIX)
 
-    async def _cut(self, client_id: str) -> None:
+    async def _disconnect(self, client_id: str) -> None:
         try:
             await self._client.call("delete_connection", clientId=client_id, cleanSession=True)
         except StoreError as error:
-            if not isinstance(error, Refused) or error.code != _MISSING:  # it is not connected
+            if not isinstance(error, ServiceError) or error.code != _MISSING:  # not connected
                 raise BrokerAccessError(str(error).rstrip(".")) from error

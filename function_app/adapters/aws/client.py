@@ -1,6 +1,6 @@
-"""How the adapters talk to Amazon: one client each, made at the first call, in threads of its own.
+"""Clients of AWS services. Each adapter has one client with its own thread pool, created at the first call.
 
-The SDK is imported at the first call too: it takes a third of a second, which the functions' start need not wait for.
+The SDK is also imported at the first call: the import takes a third of a second and would slow down a cold start.
 """
 
 import asyncio
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from botocore.exceptions import ClientError
 
 THREADS = 16
-"""Calls under way at once; more wait for one of them."""
+"""Maximum number of concurrent calls; further calls wait."""
 ATTEMPTS = 3
-"""How often the SDK tries in all, with its own pauses between."""
+"""Maximum number of attempts of the SDK per call."""
 CONNECT_TIMEOUT_S = 3
 READ_TIMEOUT_S = 10
 
 _MISSING = frozenset({"ResourceNotFoundException", "NoSuchBucket"})
-_NO_RIGHTS = frozenset(
+_ACCESS_DENIED = frozenset(
     {
         "403",
         "AccessDenied",
@@ -39,78 +39,88 @@ _NO_RIGHTS = frozenset(
         "UnrecognizedClientException",
     }
 )
-_TOO_MUCH = frozenset(
+_THROTTLED = frozenset(
     {"ProvisionedThroughputExceededException", "RequestLimitExceeded", "SlowDown", "ThrottlingException"}
 )
 
 T = TypeVar("T")
 
 
-class Refused(StoreError):  # noqa: N818 (an outcome that callers look at)
-    """The service refused a request. The text says what it means and what to do, in one line.
+class ServiceError(StoreError):
+    """The service responded with an error. The text states the cause and the remedy in one line.
 
     Attributes:
-        code: The service's word for why.
-        reasons: Of a transaction, the word for each of its writes.
-        tried_again: The SDK sent the request more than once: an earlier one may have been obeyed.
+        code: The error code of the service.
+        reasons: The error code of each write of a transaction.
+        retried: Whether the SDK sent the request more than once, so that an earlier attempt may have succeeded.
     """
 
-    def __init__(self, message: str, *, code: str, reasons: tuple[str, ...] = (), tried_again: bool = False) -> None:
+    def __init__(self, message: str, *, code: str, reasons: tuple[str, ...] = (), retried: bool = False) -> None:
         super().__init__(message)
         self.code = code
         self.reasons = reasons
-        self.tried_again = tried_again
+        self.retried = retried
 
 
 class Client:
-    """One service as one adapter uses it. Any number of calls at once; opens nothing before the first."""
+    """The client of one service. Allows concurrent calls; connects at the first call."""
 
     def __init__(
-        self, service: str, *, what: str, setting: str, how: str, region: str, endpoint: str | None, address: str = ""
+        self,
+        service: str,
+        *,
+        resource: str,
+        setting: str,
+        creation: str,
+        region: str,
+        endpoint: str | None,
+        endpoint_setting: str = "",
     ) -> None:
-        """Remember the place.
+        """Open no connection.
 
         Args:
-            service: The SDK's name of it.
-            what: What is used there, for errors: ``the S3 bucket 'telescope'``.
-            setting: The setting that names it, for errors.
-            how: How it is to be created when it is not there, for errors.
-            region: Amazon's region.
-            endpoint: The address of an emulator; ``None`` for Amazon's own.
-            address: The setting that holds ``endpoint``, where that is not an emulator's.
+            service: The service name in the SDK.
+            resource: The resource, for error messages: ``the S3 bucket 'telescope'``.
+            setting: The setting that names the resource, for error messages.
+            creation: How to create a missing resource, for error messages.
+            region: The AWS region.
+            endpoint: The address of an emulator; ``None`` for the public endpoint of AWS.
+            endpoint_setting: The setting that holds ``endpoint`` if it is not an emulator.
         """
         self._service = service
-        self._where = f"{what} in {region}" + ("" if endpoint is None else f" at {endpoint}")
+        self._resource = f"{resource} in {region}" + ("" if endpoint is None else f" at {endpoint}")
         self._setting = setting
-        self._how = how
+        self._creation = creation
         self._region = region
         self._endpoint = endpoint
-        self._address = address or ("TELESCOPE_AWS_REGION" if endpoint is None else "TELESCOPE_AWS_ENDPOINT")
+        self._endpoint_setting = endpoint_setting or (
+            "TELESCOPE_AWS_REGION" if endpoint is None else "TELESCOPE_AWS_ENDPOINT"
+        )
         self._lock = threading.Lock()
         self._client: Any = None
         self._threads: ThreadPoolExecutor | None = None
 
     async def call(self, operation: str, **parameters: Any) -> dict[str, Any]:
-        """The answer to one of the SDK's operations. A body in it has been read.
+        """Call an operation of the SDK and return its response, including a streamed body.
 
         Raises:
-            Refused: The service refused the request.
+            ServiceError: The service responded with an error.
             StoreError: The service cannot be used.
         """
 
-        def ask(client: Any) -> dict[str, Any]:
-            answer: dict[str, Any] = getattr(client, operation)(**parameters)
-            if "Body" in answer:
-                answer["Body"] = answer["Body"].read()
-            return answer
+        def send(client: Any) -> dict[str, Any]:
+            response: dict[str, Any] = getattr(client, operation)(**parameters)
+            if "Body" in response:
+                response["Body"] = response["Body"].read()
+            return response
 
-        return await self._in_thread(ask)
+        return await self._in_thread(send)
 
     async def presign(self, operation: str, *, lifetime_s: int, **parameters: Any) -> str:
-        """A presigned URL for one of the SDK's operations.
+        """A presigned URL for an operation of the SDK.
 
         Raises:
-            StoreError: There are no credentials to sign it with.
+            StoreError: There are no credentials to sign it.
         """
 
         def sign(client: Any) -> str:
@@ -120,7 +130,7 @@ class Client:
         return await self._in_thread(sign)
 
     async def close(self) -> None:
-        """Close connections and threads. A later call opens them again."""
+        """Close connections and threads. A later call reopens them."""
         threads, self._threads = self._threads, None
         if threads is not None:
             await asyncio.to_thread(threads.shutdown)
@@ -128,19 +138,19 @@ class Client:
         if client is not None:
             client.close()
 
-    async def _in_thread(self, do: Callable[[Any], T]) -> T:
+    async def _in_thread(self, operation: Callable[[Any], T]) -> T:
         if self._threads is None:
             self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=self._service)
-        return await asyncio.get_running_loop().run_in_executor(self._threads, self._guarded, do)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, self._run, operation)
 
-    def _guarded(self, do: Callable[[Any], T]) -> T:
-        """Do it with the SDK's client, and say what is wrong in our own words."""
-        from botocore import exceptions as sdk  # noqa: PLC0415 (see this page's first lines)
+    def _run(self, operation: Callable[[Any], T]) -> T:
+        """Run an operation and translate exceptions of the SDK."""
+        from botocore import exceptions as sdk  # noqa: PLC0415 (see the module docstring)
 
         try:
-            return do(self._open())
+            return operation(self._open())
         except sdk.ClientError as error:
-            raise self._refusal(error) from error
+            raise self._service_error(error) from error
         except (
             sdk.CredentialRetrievalError,
             sdk.NoCredentialsError,
@@ -148,35 +158,34 @@ class Client:
             sdk.TokenRetrievalError,
         ) as error:
             raise StoreError(
-                f"{self._where} cannot be used: {_line(error)}. Give this program a role, or set AWS_ACCESS_KEY_ID and "
-                "AWS_SECRET_ACCESS_KEY."
+                f"{self._resource} cannot be used: {_line(error)}. Give this program a role, or set AWS_ACCESS_KEY_ID "
+                "and AWS_SECRET_ACCESS_KEY."
             ) from error
         except (sdk.ConnectionError, sdk.HTTPClientError) as error:
             raise StoreError(
-                f"{self._where} cannot be reached: {_line(error)}. Check {self._address} and the network."
+                f"{self._resource} cannot be reached: {_line(error)}. Check {self._endpoint_setting} and the network."
             ) from error
         except sdk.BotoCoreError as error:
-            raise StoreError(f"{self._where} cannot be used: {_line(error)}. Check its configuration.") from error
+            raise StoreError(f"{self._resource} cannot be used: {_line(error)}. Check its configuration.") from error
 
-    def _refusal(self, error: "ClientError") -> Refused:
-        """What a refusal means and what to do."""
+    def _service_error(self, error: "ClientError") -> ServiceError:
         response: dict[str, Any] = error.response
         code = str(response.get("Error", {}).get("Code", ""))
         reasons = tuple(str(each.get("Code")) for each in response.get("CancellationReasons", ()))
         codes = {code, *reasons}
         if codes & _MISSING:
             text = (
-                f"does not exist. Check {self._setting} and TELESCOPE_AWS_REGION, or create it: {self._how}; "
-                "`python -m function_app prepare` does."
+                f"does not exist. Check {self._setting} and TELESCOPE_AWS_REGION, or create it with "
+                f"`python -m function_app prepare` ({self._creation})."
             )
-        elif codes & _NO_RIGHTS:
-            text = f"may not be used: {_line(error)}. Check the credentials and the rights of their role."
-        elif codes & _TOO_MUCH:
-            text = f"has too much to do: {_line(error)}. Try again, or raise its limits."
+        elif codes & _ACCESS_DENIED:
+            text = f"denied access: {_line(error)}. Check the credentials and the permissions of their role."
+        elif codes & _THROTTLED:
+            text = f"is overloaded: {_line(error)}. Try again, or raise its limits."
         else:
             text = f"cannot be used: {_line(error)}. Check its configuration."
-        tried_again = bool(response.get("ResponseMetadata", {}).get("RetryAttempts"))
-        return Refused(f"{self._where} {text}", code=code, reasons=reasons, tried_again=tried_again)
+        retried = bool(response.get("ResponseMetadata", {}).get("RetryAttempts"))
+        return ServiceError(f"{self._resource} {text}", code=code, reasons=reasons, retried=retried)
 
     def _open(self) -> Any:
         from botocore.config import Config  # noqa: PLC0415
@@ -194,9 +203,9 @@ class Client:
                         retries={"mode": "standard", "total_max_attempts": ATTEMPTS},
                         max_pool_connections=THREADS,
                         tcp_keepalive=True,
-                        # What the SDK signs addresses with otherwise leaves out the length of what is uploaded.
+                        # The default signature of presigned URLs does not cover the length of the upload.
                         signature_version="s3v4" if self._service == "s3" else None,
-                        # The region in the host's name, or S3 redirects what was signed. Emulators have one name only.
+                        # Without the region in the host name, S3 redirects presigned URLs. Emulators have one host.
                         s3={"addressing_style": "virtual" if self._endpoint is None else "path"},
                     ),
                 )
@@ -208,13 +217,13 @@ def _line(error: Exception) -> str:
 
 
 def iot_data_client(region: str, endpoint: str) -> Client:
-    """Messages and connections of AWS IoT Core, at the account's address for data."""
+    """The client of the IoT Core data plane: messages and connections."""
     return Client(
         "iot-data",
-        what="AWS IoT Core",
+        resource="AWS IoT Core",
         setting="TELESCOPE_IOT_ENDPOINT",
-        how="aws iot describe-endpoint --endpoint-type iot:Data-ATS",
+        creation="aws iot describe-endpoint --endpoint-type iot:Data-ATS",
         region=region,
         endpoint=endpoint,
-        address="TELESCOPE_IOT_ENDPOINT",
+        endpoint_setting="TELESCOPE_IOT_ENDPOINT",
     )

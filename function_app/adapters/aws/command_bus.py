@@ -1,4 +1,4 @@
-"""Commands through AWS IoT Core, which publishes what it is given over HTTPS. Acks arrive by an IoT rule."""
+"""Publishes commands over the HTTPS API of AWS IoT Core. Acks arrive by an IoT rule."""
 
 from function_app.adapters.aws.client import iot_data_client
 from function_app.adapters.shared.publishing_bus import PublishingBus

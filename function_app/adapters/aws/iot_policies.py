@@ -1,7 +1,7 @@
-"""A grant as AWS IoT Core reads it: policy documents, with which its custom authoriser answers.
+"""Converts grants to policy documents of AWS IoT Core, for the responses of its custom authorizer.
 
-A ``*`` of a policy also matches slashes, which a ``+`` of MQTT does not. So each pattern with a ``+`` brings a denial
-of the same with one level more: what the star matches in excess is denied.
+In a policy, ``*`` also matches slashes; in MQTT, ``+`` does not. Therefore each topic filter with a ``+`` also yields a
+Deny statement for the same filter with one more level.
 Limits (AWS IoT Core, custom authentication): 10 documents of 2,048 characters, a principal of 128 letters and digits.
 """
 
@@ -17,22 +17,23 @@ MAX_DOCUMENTS = 10
 MAX_CHARACTERS = 2048
 MIN_REFRESH_S, MAX_DISCONNECT_S = 300, 86_400
 _VERSION = "2012-10-17"
-_LONGEST = "arn:aws:iot:ap-southeast-1:123456789012"
+LONGEST_ARN_PREFIX = "arn:aws:iot:ap-southeast-1:123456789012"
+"""Has the maximum length of a prefix."""
 
 
-def answer(grant: Grant, *, place: str, now_s: float) -> dict[str, Any]:
-    """The authoriser's response that admits a connection at ``place``, ``arn:aws:iot:<region>:<account>``.
+def admission(grant: Grant, *, arn_prefix: str, now_s: float) -> dict[str, Any]:
+    """The authorizer's response that admits a connection; ``arn_prefix`` is ``arn:aws:iot:<region>:<account>``.
 
     Raises:
         BrokerAccessError: The grant names more topics than a response may contain.
     """
     duration_s = max(MIN_REFRESH_S, min(int(grant.expires_at - now_s), MAX_DISCONNECT_S))
     principal = hashlib.sha256(grant.principal.encode()).hexdigest()
-    return _response(principal, duration_s, documents(grant, place=place))
+    return _response(principal, duration_s, documents(grant, arn_prefix=arn_prefix))
 
 
-def refusal() -> dict[str, Any]:
-    """The authoriser's response that rejects a connection, without a reason."""
+def rejection() -> dict[str, Any]:
+    """The authorizer's response that rejects a connection, without a reason."""
     return _response("denied", MIN_REFRESH_S, [])
 
 
@@ -46,21 +47,22 @@ def _response(principal: str, duration_s: int, policies: list[str]) -> dict[str,
     }
 
 
-def agents(*, place: str) -> list[str]:
-    """What agents may do that show certificates: what their grant would say, of the thing that they are."""
+def agents(*, arn_prefix: str) -> list[str]:
+    """Policy documents of agents with certificates: the agent's grant, with variables of its thing."""
     thing = "${iot:Connection.Thing.ThingName}"
     grant = agent_grant("${iot:Connection.Thing.Attributes[space]}", thing, token_id="", lifetime_s=0)
-    # Parted as for the longest place, so that there are as many everywhere.
-    return [document.replace(_LONGEST, place) for document in documents(grant, place=_LONGEST)]
+    # Split for the longest prefix, so that the number of documents is the same in every region.
+    texts = documents(grant, arn_prefix=LONGEST_ARN_PREFIX)
+    return [text.replace(LONGEST_ARN_PREFIX, arn_prefix) for text in texts]
 
 
-def documents(grant: Grant, *, place: str) -> list[str]:
-    """Exactly what a grant allows.
+def documents(grant: Grant, *, arn_prefix: str) -> list[str]:
+    """Policy documents that allow exactly what a grant allows.
 
     Raises:
-        BrokerAccessError: It names more topics than there is room for.
+        BrokerAccessError: The grant names more topics than the documents may contain.
     """
-    statements = [_statement("Allow", "iot:Connect", [f"{place}:client/{grant.client_id}"])]
+    statements = [_statement("Allow", "iot:Connect", [f"{arn_prefix}:client/{grant.client_id}"])]
     for action, kind, patterns in (
         ("iot:Publish", "topic", grant.publish),
         ("iot:RetainPublish", "topic", grant.publish),
@@ -68,40 +70,40 @@ def documents(grant: Grant, *, place: str) -> list[str]:
         ("iot:Receive", "topic", grant.subscribe),
     ):
         for pattern in patterns:
-            statements.append(_statement("Allow", action, [f"{place}:{kind}/{_stars(pattern)}"]))
-            denied = [f"{place}:{kind}/{each}" for each in _deeper(pattern)]
+            statements.append(_statement("Allow", action, [f"{arn_prefix}:{kind}/{_resource(pattern)}"]))
+            denied = [f"{arn_prefix}:{kind}/{each}" for each in _with_extra_level(pattern)]
             if denied:
                 statements.append(_statement("Deny", action, denied))
-    return _packed(statements)
+    return _pack(statements)
 
 
-def _stars(pattern: str) -> str:
+def _resource(pattern: str) -> str:
     return "/".join("*" if level in {"+", "#"} else level for level in pattern.split("/"))
 
 
-def _deeper(pattern: str) -> list[str]:
-    """The pattern with one level more at each ``+``."""
+def _with_extra_level(pattern: str) -> list[str]:
+    """The pattern with an additional level at each ``+`` in turn."""
     levels = pattern.split("/")
     if levels[-1] == "#":
         return []
-    deeper = ([*levels[:place], "+", *levels[place:]] for place, level in enumerate(levels) if level == "+")
-    return list(dict.fromkeys(_stars("/".join(each)) for each in deeper))
+    deeper = ([*levels[:index], "+", *levels[index:]] for index, level in enumerate(levels) if level == "+")
+    return list(dict.fromkeys(_resource("/".join(each)) for each in deeper))
 
 
 def _statement(effect: str, action: str, resources: list[str]) -> dict[str, Any]:
     return {"Effect": effect, "Action": action, "Resource": resources}
 
 
-def _packed(statements: Iterable[dict[str, Any]]) -> list[str]:
-    """As few documents as hold them all."""
-    found: list[list[dict[str, Any]]] = [[]]
+def _pack(statements: Iterable[dict[str, Any]]) -> list[str]:
+    """The statements in as few documents as possible."""
+    groups: list[list[dict[str, Any]]] = [[]]
     for statement in statements:
-        if len(_text([*found[-1], statement])) > MAX_CHARACTERS:
-            found.append([])
-        found[-1].append(statement)
-    texts = [_text(each) for each in found]
+        if len(_text([*groups[-1], statement])) > MAX_CHARACTERS:
+            groups.append([])
+        groups[-1].append(statement)
+    texts = [_text(group) for group in groups]
     if len(texts) > MAX_DOCUMENTS or any(len(text) > MAX_CHARACTERS for text in texts):
-        raise BrokerAccessError("AWS IoT Core takes no policy for so many topics; watch fewer spaces at once")
+        raise BrokerAccessError("too many topics for the policies of AWS IoT Core; watch fewer spaces at the same time")
     return texts
 
 

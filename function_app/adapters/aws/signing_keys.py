@@ -1,8 +1,8 @@
-"""Signing keys in Amazon's Secrets Manager, which encrypts them with a key of KMS."""
+"""Signing keys in AWS Secrets Manager, which encrypts them with a KMS key."""
 
 from collections.abc import Callable
 
-from function_app.adapters.aws.client import Client, Refused
+from function_app.adapters.aws.client import Client, ServiceError
 from function_app.adapters.shared.key_ring_keys import wall_ms
 from function_app.adapters.shared.vault_keys import Secret, VaultKeys
 
@@ -11,7 +11,7 @@ _EXISTS = "ResourceExistsException"
 
 
 class SecretsManagerKeys(VaultKeys):
-    """``SigningKeys`` in one secret. An empty ``kms_key`` (an id) stands for the account's default key."""
+    """``SigningKeys`` in one secret. An empty ``kms_key`` (an id) selects the account's default key."""
 
     def __init__(
         self,
@@ -22,15 +22,15 @@ class SecretsManagerKeys(VaultKeys):
         kms_key: str = "",
         now_ms: Callable[[], int] = wall_ms,
     ) -> None:
-        what = f"the secret '{secret}'"
-        super().__init__(what=what, now_ms=now_ms)
+        resource = f"the secret '{secret}'"
+        super().__init__(resource=resource, now_ms=now_ms)
         self._secret = secret
         self._kms_key = kms_key
         self._client = Client(
             "secretsmanager",
-            what=what,
+            resource=resource,
             setting="TELESCOPE_KEYS_SECRET",
-            how="a secret of text",
+            creation="a text secret",
             region=region,
             endpoint=endpoint,
         )
@@ -41,7 +41,7 @@ class SecretsManagerKeys(VaultKeys):
     async def _fetch(self) -> Secret | None:
         try:
             found = await self._client.call("get_secret_value", SecretId=self._secret)
-        except Refused as error:
+        except ServiceError as error:
             if error.code == _MISSING:
                 return None
             raise
@@ -57,7 +57,7 @@ class SecretsManagerKeys(VaultKeys):
                 Description="Signing keys of Telescope: a reader of this secret can command every robot",
                 **encrypted,
             )
-        except Refused as error:
+        except ServiceError as error:
             if error.code != _EXISTS:  # another process created it
                 raise
 

@@ -1,13 +1,13 @@
 """Tables in one DynamoDB table.
 
-All of the port's tables share it: one thing to deploy, to back up at one moment and to give rights on, and a new
-release that brings a table needs no change there. An item has the attributes
+All tables of the port share one DynamoDB table: one deployment, backup and permission, and no change for a new table.
+An item has the attributes
 
 - ``p``: the port's table and the partition, ``Agents/pandora``
-- ``k``: the key, so that Amazon's order of strings (their UTF-8 bytes) is the port's; ``names`` tells of long ones
-- ``name``: the whole key of a long one
-- ``etag``: random, another with each write
-- ``data``: the JSON, as text, since Amazon's numbers are not JSON's
+- ``k``: the key; DynamoDB also sorts strings by their UTF-8 bytes; ``names`` truncates long keys
+- ``name``: the full key if ``k`` is truncated
+- ``etag``: random, new with each write
+- ``data``: the JSON as text, because DynamoDB numbers differ from JSON numbers
 """
 
 import asyncio
@@ -18,21 +18,20 @@ from collections.abc import Sequence
 from typing import Any
 
 from function_app.adapters.aws import names
-from function_app.adapters.aws.client import Client, Refused
+from function_app.adapters.aws.client import Client, ServiceError
 from function_app.adapters.shared import row_codec
 from function_app.ports.tables import Conflict, Page, Row, StoreError, Write
 
 TRIES = 8
-"""How often a write is sent that another transaction stood in the way of: they take some milliseconds."""
+"""Attempts of a write that conflicts with other transactions, which take some milliseconds."""
 _PAUSE_S = 0.01
-_READY_WITHIN_S = 120
-_LOOK_EVERY_S = 0.5
+_CREATION_TIMEOUT_S = 120
+_POLL_S = 0.5
 
 _KEYS = [{"AttributeName": "p", "KeyType": "HASH"}, {"AttributeName": "k", "KeyType": "RANGE"}]
 _TYPES = [{"AttributeName": "p", "AttributeType": "S"}, {"AttributeName": "k", "AttributeType": "S"}]
-_HOW = "partition key 'p' and sort key 'k', both strings"
-_UNFIT = frozenset({"ConditionalCheckFailed", "ConditionalCheckFailedException"})
-_IN_THE_WAY = frozenset(
+_CONDITION_FAILED = frozenset({"ConditionalCheckFailed", "ConditionalCheckFailedException"})
+_TRANSIENT = frozenset(
     {"TransactionConflict", "TransactionConflictException", "ThrottlingError", "ProvisionedThroughputExceeded"}
 )
 
@@ -41,22 +40,22 @@ class DynamoTables:
     """``Tables`` in the DynamoDB table ``table``. Connects at the first call."""
 
     def __init__(self, *, table: str, region: str, endpoint: str | None = None) -> None:
-        """``endpoint`` is an emulator's address. Credentials come the SDK's own way: a role, or the environment."""
+        """``endpoint`` is an emulator's address. The SDK reads credentials from the role or the environment."""
         self._table = table
         self._client = Client(
             "dynamodb",
-            what=f"the DynamoDB table '{table}'",
+            resource=f"the DynamoDB table '{table}'",
             setting="TELESCOPE_AWS_TABLE",
-            how=_HOW,
+            creation="partition key 'p' and sort key 'k', both strings",
             region=region,
             endpoint=endpoint,
         )
 
     async def prepare(self) -> None:
-        """Make the table where there is none, and wait until it can be used. Safe to repeat, by many at once.
+        """Create the table if it does not exist, and wait until it is active. Idempotent; allows concurrent calls.
 
         Raises:
-            StoreError: It cannot be made.
+            StoreError: It cannot be created.
         """
         try:
             await self._client.call(
@@ -66,22 +65,22 @@ class DynamoTables:
                 AttributeDefinitions=_TYPES,
                 BillingMode="PAY_PER_REQUEST",
             )
-        except Refused as error:
+        except ServiceError as error:
             if error.code != "ResourceInUseException":
                 raise
-        end = time.monotonic() + _READY_WITHIN_S
+        end = time.monotonic() + _CREATION_TIMEOUT_S
         while (await self._client.call("describe_table", TableName=self._table))["Table"]["TableStatus"] != "ACTIVE":
             if time.monotonic() > end:
-                raise StoreError(f"the DynamoDB table '{self._table}' is still being made. Try again in a minute.")
-            await asyncio.sleep(_LOOK_EVERY_S)
+                raise StoreError(f"the DynamoDB table '{self._table}' is still being created. Try again in a minute.")
+            await asyncio.sleep(_POLL_S)
 
     async def get(self, table: str, partition: str, key: str) -> Row | None:
         _check_text(partition, key)
         if not key:
             return None
-        place = _place(table, partition, key)
-        found = await self._client.call("get_item", TableName=self._table, Key=place, ConsistentRead=True)
-        return _row(partition, found["Item"]) if "Item" in found else None
+        item_key = _item_key(table, partition, key)
+        response = await self._client.call("get_item", TableName=self._table, Key=item_key, ConsistentRead=True)
+        return _row(partition, response["Item"]) if "Item" in response else None
 
     async def create(self, table: str, row: Row) -> Row:
         return await self._put(table, Write("create", row))
@@ -90,8 +89,8 @@ class DynamoTables:
         return await self._put(table, Write("replace", row))
 
     async def delete(self, table: str, row: Row) -> None:
-        # As a transaction: the SDK gives it a token, so that when an answer is lost and it asks again, Amazon knows
-        # the request. A plain delete would then find nothing and be taken for another's.
+        # A transaction has an idempotency token. If the response to a plain delete were lost, the retry of the SDK
+        # would find no item and report a conflict.
         await self.batch(table, [Write("delete", row)])
 
     async def query(
@@ -109,21 +108,21 @@ class DynamoTables:
         _check_text(partition, start, last or "")
         if last is not None and last <= start:
             return Page((), None)
-        question = {
+        request = {
             "TableName": self._table,
             "ConsistentRead": True,
-            # One more tells whether there is another page, one more may be ``last`` itself.
+            # One extra row shows whether there is another page; another one may be ``last`` itself.
             "Limit": limit + 2,
             **_range(_partition(table, partition), start, last),
         }
         found: list[Row] = []
         while True:
-            answer = await self._client.call("query", **question)
-            some = (_row(partition, item) for item in answer["Items"])
-            found += (row for row in some if row.key >= start and (last is None or row.key < last))
-            if "LastEvaluatedKey" not in answer or _whole(found, limit):
+            response = await self._client.call("query", **request)
+            rows = (_row(partition, item) for item in response["Items"])
+            found += (row for row in rows if row.key >= start and (last is None or row.key < last))
+            if "LastEvaluatedKey" not in response or _is_complete(found, limit):
                 break
-            question["ExclusiveStartKey"] = answer["LastEvaluatedKey"]
+            request["ExclusiveStartKey"] = response["LastEvaluatedKey"]
         found.sort(key=lambda row: row.key)
         return Page(tuple(found[:limit]), row_codec.write_cursor(found[limit].key) if len(found) > limit else None)
 
@@ -131,14 +130,15 @@ class DynamoTables:
         texts = row_codec.check_batch(writes)
         written = tuple(_written(write) for write in writes)
         items = [_change(table, *each) for each in zip(writes, written, texts, strict=True)]
-        changes = [{kind: {"TableName": self._table, **what} for kind, what in item.items()} for item in items]
+        changes = [{kind: {"TableName": self._table, **change} for kind, change in item.items()} for item in items]
         try:
             await self._write("transact_write_items", TransactItems=changes)
-        except Refused as error:
-            wrong = next((row for row, why in zip(written, error.reasons, strict=False) if why in _UNFIT), None)
-            if wrong is None:
+        except ServiceError as error:
+            outcomes = zip(written, error.reasons, strict=False)
+            conflicting = next((row for row, reason in outcomes if reason in _CONDITION_FAILED), None)
+            if conflicting is None:
                 raise
-            raise Conflict(f"{table}: '{wrong.key}' is not as the writer believed") from error
+            raise Conflict(f"{table}: '{conflicting.key}' does not have the expected ETag") from error
         return written
 
     async def close(self) -> None:
@@ -150,38 +150,38 @@ class DynamoTables:
         change = _change(table, write, row, row_codec.encode(row.data))["Put"]
         try:
             await self._write("put_item", TableName=self._table, **change)
-        except Refused as error:
-            if error.code not in _UNFIT:
+        except ServiceError as error:
+            if error.code not in _CONDITION_FAILED:
                 raise
-            if not (error.tried_again and await self._has(table, row)):
-                raise Conflict(f"{table}: '{row.key}' is not as the writer believed") from error
+            if not (error.retried and await self._has(table, row)):
+                raise Conflict(f"{table}: '{row.key}' does not have the expected ETag") from error
         return row
 
     async def _has(self, table: str, row: Row) -> bool:
-        """Whether this very write is there: its answer was lost, and what the SDK then sent again came too late."""
+        """Whether this write is stored: after a lost response, the retry of the SDK conflicts with it."""
         found = await self.get(table, row.partition, row.key)
         return found is not None and found.etag == row.etag
 
     async def _write(self, operation: str, **parameters: Any) -> None:
-        """Write, again while another transaction stands in the way of this one.
+        """Write, and retry while other transactions conflict.
 
         Raises:
-            Refused: The row is not as the writer believed, or something is wrong.
+            ServiceError: The condition of a write failed, or the service cannot be used.
             StoreError: Concurrent writes caused a conflict at every attempt.
         """
         for attempt in range(TRIES):
             try:
                 await self._client.call(operation, **parameters)
-            except Refused as error:
-                why = {error.code, *error.reasons}
-                if not why.isdisjoint(_UNFIT) or why.isdisjoint(_IN_THE_WAY):
+            except ServiceError as error:
+                codes = {error.code, *error.reasons}
+                if not codes.isdisjoint(_CONDITION_FAILED) or codes.isdisjoint(_TRANSIENT):
                     raise
                 reason = error
             else:
                 return
             await asyncio.sleep(random.uniform(0.5, 1) * _PAUSE_S * 2**attempt)  # noqa: S311 (spreads writers)
         raise StoreError(
-            f"the DynamoDB table '{self._table}' has too much to do: {reason.__cause__}. Try again."
+            f"the DynamoDB table '{self._table}' is overloaded: {reason.__cause__}. Try again."
         ) from reason
 
 
@@ -191,8 +191,8 @@ def _written(write: Write) -> Row:
 
 
 def _change(table: str, write: Write, row: Row, text: bytes) -> dict[str, dict[str, Any]]:
-    """A write of ``text`` as Amazon's transactions have it; ``row`` has the new ETag."""
-    place = _place(table, row.partition, row.key)
+    """The transaction item of a write of ``text``; ``row`` has the new ETag."""
+    item_key = _item_key(table, row.partition, row.key)
     condition: dict[str, Any] = {"ConditionExpression": "attribute_not_exists(p)"}
     if write.kind != "create":
         condition = {
@@ -200,14 +200,14 @@ def _change(table: str, write: Write, row: Row, text: bytes) -> dict[str, dict[s
             "ExpressionAttributeValues": {":etag": {"S": write.row.etag}},
         }
     if write.kind == "delete":
-        return {"Delete": {"Key": place, **condition}}
-    item = {**place, "etag": {"S": row.etag}, "data": {"S": text.decode()}}
+        return {"Delete": {"Key": item_key, **condition}}
+    item = {**item_key, "etag": {"S": row.etag}, "data": {"S": text.decode()}}
     if names.is_long(row.key):
         item["name"] = {"S": row.key}
     return {"Put": {"Item": item, **condition}}
 
 
-def _place(table: str, partition: str, key: str) -> dict[str, Any]:
+def _item_key(table: str, partition: str, key: str) -> dict[str, Any]:
     return {"p": {"S": _partition(table, partition)}, "k": {"S": names.key(key)}}
 
 
@@ -220,15 +220,15 @@ def _row(partition: str, item: dict[str, Any]) -> Row:
     return Row(partition, key, row_codec.decode(item["data"]["S"]), item["etag"]["S"])
 
 
-def _range(place: str, start: str, last: str | None) -> dict[str, Any]:
-    """The condition on ``p`` and ``k`` that all rows from ``start`` to before ``last`` fulfil, and few others."""
+def _range(partition: str, start: str, last: str | None) -> dict[str, Any]:
+    """A condition on ``p`` and ``k`` that matches all rows with ``start`` ≤ key < ``last``, and few others."""
     low = start[: names.HEAD]
-    values = {":p": {"S": place}}
+    values = {":p": {"S": partition}}
     condition = "p = :p"
     if low:
         values[":low"] = {"S": low}
     if last is not None:
-        values[":high"] = {"S": last if not names.is_long(last) else last[: names.HEAD] + names.BEHIND_HASHES}
+        values[":high"] = {"S": last if not names.is_long(last) else last[: names.HEAD] + names.AFTER_HASHES}
     if low and last is not None:
         condition += " AND k BETWEEN :low AND :high"
     elif low:
@@ -238,8 +238,8 @@ def _range(place: str, start: str, last: str | None) -> dict[str, Any]:
     return {"KeyConditionExpression": condition, "ExpressionAttributeValues": values}
 
 
-def _whole(found: list[Row], limit: int) -> bool:
-    """Whether a page's rows and the next one have been read, for any order of the long keys."""
+def _is_complete(found: list[Row], limit: int) -> bool:
+    """Whether ``found`` contains the page and the next row, for any order of the long keys."""
     return len(found) > limit and not names.same_head(found[limit].key, found[-1].key)
 
 

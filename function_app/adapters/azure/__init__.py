@@ -1,1 +1,1 @@
-"""Azure: Tables and Blob storage."""
+"""Azure: Table and Blob storage, Key Vault and Event Grid."""

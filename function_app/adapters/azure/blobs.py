@@ -1,10 +1,10 @@
 """Blobs in one container of a storage account.
 
-All are block blobs: an append is a block and a new list of blocks, which Azure puts in place at once and only while the
-blob is as it was read. Append blobs would save requests, but the SDK's second try after a lost answer would append
-twice, and ``put`` and ``append`` on one name would meet two kinds of blob.
+All blobs are block blobs. An append stages a block and commits a new block list, atomically and on condition of the
+ETag. Append blobs would need fewer requests, but a retry of the SDK after a lost response would append twice, and
+``put`` and ``append`` of the same name would use different blob types.
 
-A blob's name is the code of the port's (``names``); where that is too long, the whole is in the metadata ``name``.
+The name in Azure is the code of the port's name (``names``). If the code is too long, the metadata contain it in full.
 """
 
 import contextlib
@@ -15,8 +15,8 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from function_app.adapters.azure import names
-from function_app.adapters.azure.client import ATTEMPTS, Client, Place, Refused, code_of, credential, transport
-from function_app.adapters.azure.sas_keys import SigningKeys
+from function_app.adapters.azure.client import ATTEMPTS, Client, Endpoint, ServiceError, code_of, credential, transport
+from function_app.adapters.azure.sas_keys import SasKeys
 from function_app.adapters.shared.appending import TRIES, Appends, pause
 from function_app.ports.blobs import MAX_BYTES, Upload, check_name, check_size, check_upload
 from function_app.ports.tables import StoreError
@@ -27,70 +27,70 @@ if TYPE_CHECKING:
     from azure.storage.blob import BlobClient, BlobProperties, ContainerClient
 
 MANY_BLOCKS = 1_000
-"""From so many appends on, the early ones become one block: Azure takes 50,000, and the list is sent each time."""
-RETRY_WITHIN_S = 1
-"""The SDK's pause before it tries again is up to this long."""
-KEPT_BLOCKS = 100
-"""Appends that stay blocks then, to be known again should their answer have been lost."""
+"""From this number on, early blocks are merged: Azure accepts 50,000, and each append sends the whole list."""
+MAX_RETRY_PAUSE_S = 1
+"""Maximum pause of the SDK before a retry."""
+UNMERGED_BLOCKS = 100
+"""Number of latest blocks that are not merged, so that a retry after a lost response finds its block."""
 _PAGE = 1_000
 _NAME = "name"
 _BLOCK_BYTES = 16
-"""Random bytes that name a block."""
+"""Random bytes of a block id."""
 _NO_CONTAINER = "ContainerNotFound"
-_GONE = 404
-_CHANGED = 412
-_WRITTEN_MEANWHILE = frozenset({"BlobAlreadyExists", "BlobNotFound", "InvalidBlobOrBlock", "InvalidBlockList"})
-"""A list of blocks drops those that are not in it, also what another has just sent and not yet listed."""
+_NOT_FOUND = 404
+_PRECONDITION_FAILED = 412
+_CONCURRENT_WRITE = frozenset({"BlobAlreadyExists", "BlobNotFound", "InvalidBlobOrBlock", "InvalidBlockList"})
+"""Committing a block list also drops blocks that another process has staged and not committed."""
 
 T = TypeVar("T")
 
 
 class AzureBlobs:
-    """``Blobs`` in ``container``, which the first writing makes. Connects at the first call."""
+    """``Blobs`` in ``container``, which the first write creates. Connects at the first call."""
 
-    def __init__(self, *, place: Place, container: str) -> None:
+    def __init__(self, *, endpoint: Endpoint, container: str) -> None:
         self._client = Client(
-            lambda things: things.enter_context(_open(place, container, things)),
-            place=place,
-            what=f"the Azure container '{container}'",
+            lambda exit_stack: exit_stack.enter_context(_open(endpoint, container, exit_stack)),
+            endpoint=endpoint,
+            resource=f"the Azure container '{container}'",
             role="Storage Blob Data Contributor",
         )
         self._appends = Appends()
-        self._keys = SigningKeys(place)
+        self._keys = SasKeys(endpoint)
 
     async def put(self, name: str, content: bytes) -> None:
         check_size(len(content))
-        written = _written(name)
+        blob_name = _blob_name(name)
         metadata = _metadata(name)
-        await self._write(lambda to: to.upload_blob(written, content, overwrite=True, metadata=metadata))
+        await self._write(lambda to: to.upload_blob(blob_name, content, overwrite=True, metadata=metadata))
 
     async def get(self, name: str) -> bytes | None:
-        written = _written(name)
+        blob_name = _blob_name(name)
         for attempt in range(TRIES):
             try:
-                return await self._client.call(lambda container: container.download_blob(written).readall())
-            except Refused as error:
-                if error.status == _GONE:
+                return await self._client.call(lambda container: container.download_blob(blob_name).readall())
+            except ServiceError as error:
+                if error.status == _NOT_FOUND:
                     return None
-                if error.status != _CHANGED:
+                if error.status != _PRECONDITION_FAILED:
                     raise
-            await pause(attempt)  # written over between two parts of a large one
-        raise StoreError(f"the blob '{name}' is written all the time. Try again.")
+            await pause(attempt)  # replaced between two ranges of a large blob
+        raise StoreError(f"the blob '{name}' is replaced too often. Try again.")
 
     async def append(self, name: str, content: bytes) -> None:
         check_size(len(content))
-        written, metadata = _written(name), _metadata(name)
+        blob_name, metadata = _blob_name(name), _metadata(name)
         block = secrets.token_hex(_BLOCK_BYTES)
         await self._appends.run(
-            name, lambda: self._write(lambda to: _append(to.get_blob_client(written), block, content, metadata))
+            name, lambda: self._write(lambda to: _append(to.get_blob_client(blob_name), block, content, metadata))
         )
 
     async def delete(self, name: str) -> None:
-        written = _written(name)
+        blob_name = _blob_name(name)
         try:
-            await self._client.call(lambda container: container.delete_blob(written))
-        except Refused as error:
-            if error.status != _GONE:
+            await self._client.call(lambda container: container.delete_blob(blob_name))
+        except ServiceError as error:
+            if error.status != _NOT_FOUND:
                 raise
 
     async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
@@ -100,32 +100,34 @@ class AzureBlobs:
 
         def read(container: "ContainerClient") -> tuple[str, ...]:
             found = container.list_blobs(begin, include=["metadata"], results_per_page=min(limit, _PAGE))
-            ordered = names.in_order(found, written=_written_of, name=_name_of, limit=names.MAX_BLOB_NAME)
-            inside = (name for name in map(_name_of, ordered) if name.startswith(prefix))
-            return tuple(itertools.islice(inside, limit))
+            ordered = names.sort_by_name(found, key=_key, name=_name, limit=names.MAX_BLOB_NAME)
+            matching = (name for name in map(_name, ordered) if name.startswith(prefix))
+            return tuple(itertools.islice(matching, limit))
 
         try:
             return await self._client.call(read)
-        except Refused as error:
+        except ServiceError as error:
             if error.code == _NO_CONTAINER:
                 return ()
             raise
 
     async def size(self, name: str) -> int | None:
-        written = _written(name)
+        blob_name = _blob_name(name)
         try:
-            found = await self._client.call(lambda container: container.get_blob_client(written).get_blob_properties())
-        except Refused as error:
-            if error.status == _GONE:
+            properties = await self._client.call(
+                lambda container: container.get_blob_client(blob_name).get_blob_properties()
+            )
+        except ServiceError as error:
+            if error.status == _NOT_FOUND:
                 return None
             raise
-        return int(found.size)
+        return int(properties.size)
 
     async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
-        """See ``Blobs``. Signed is the right to create this blob; what its length may be, Azure cannot say."""
+        """See ``Blobs``. The signature permits creating this blob; it cannot limit the length."""
         check_upload(length)
         metadata = {f"x-ms-meta-{key}": value for key, value in _metadata(name).items()}
-        await self._client.call(_make)  # must exist before the upload
+        await self._client.call(_create)  # must exist before the upload
         url = await self._presign(name, lifetime_s, permission="c")
         headers = {"Content-Length": str(length), "Content-Type": content_type, "x-ms-blob-type": "BlockBlob"}
         return Upload("PUT", url, headers | metadata | {"If-None-Match": "*"})
@@ -135,20 +137,20 @@ class AzureBlobs:
             name, lifetime_s, permission="r", content_type=content_type, content_disposition="attachment"
         )
 
-    async def _presign(self, name: str, lifetime_s: int, **rights: Any) -> str:
-        written = _written(name)
+    async def _presign(self, name: str, lifetime_s: int, **permissions: Any) -> str:
+        blob_name = _blob_name(name)
 
         def sign(container: "ContainerClient") -> str:
             from azure.storage.blob import generate_blob_sas  # noqa: PLC0415 (only when the SDK is in use)
 
-            blob = container.get_blob_client(written)
+            blob = container.get_blob_client(blob_name)
             token = generate_blob_sas(
                 str(container.account_name),
                 container.container_name,
-                written,
+                blob_name,
                 **self._keys.of(container, lifetime_s),
                 expiry=datetime.now(UTC) + timedelta(seconds=lifetime_s),
-                **rights,
+                **permissions,
             )
             return f"{blob.url}?{token}"
 
@@ -158,38 +160,38 @@ class AzureBlobs:
         await self._client.close()
 
     async def _write(self, write: "Callable[[ContainerClient], T]") -> T:
-        """Do it, and make the container for it where there is none."""
+        """Run a write, and create the container if it does not exist."""
         try:
             return await self._client.call(write)
-        except Refused as error:
+        except ServiceError as error:
             if error.code != _NO_CONTAINER:
                 raise
-        await self._client.call(_make)
+        await self._client.call(_create)
         return await self._client.call(write)
 
 
-def _open(place: Place, container: str, things: contextlib.ExitStack) -> "ContainerClient":
+def _open(endpoint: Endpoint, container: str, exit_stack: contextlib.ExitStack) -> "ContainerClient":
     from azure.storage.blob import ContainerClient, LinearRetry  # noqa: PLC0415 (costs half a second)
 
     options: dict[str, Any] = {
         "transport": transport(),
-        "retry_policy": LinearRetry(backoff=0, retry_total=ATTEMPTS - 1, random_jitter_range=RETRY_WITHIN_S),
-        "raw_response_hook": _read_refusal,
+        "retry_policy": LinearRetry(backoff=0, retry_total=ATTEMPTS - 1, random_jitter_range=MAX_RETRY_PAUSE_S),
+        "raw_response_hook": _read_error_body,
         "max_single_put_size": MAX_BYTES,
         "max_single_get_size": MAX_BYTES,
     }
-    if place.url:
-        return ContainerClient(place.url, container, credential=credential(place, things), **options)
-    return ContainerClient.from_connection_string(place.connection, container, **options)
+    if endpoint.url:
+        return ContainerClient(endpoint.url, container, credential=credential(endpoint, exit_stack), **options)
+    return ContainerClient.from_connection_string(endpoint.connection, container, **options)
 
 
-def _read_refusal(response: Any) -> None:
-    """Read an answer whose body is an error's, so that its connection is free: of a download the SDK leaves it."""
+def _read_error_body(response: Any) -> None:
+    """Read the body of an error response to free its connection; the SDK does not read it for downloads."""
     if response.http_response.status_code >= HTTPStatus.BAD_REQUEST:
         response.http_response.read()
 
 
-def _make(container: "ContainerClient") -> None:
+def _create(container: "ContainerClient") -> None:
     from azure.core.exceptions import ResourceExistsError  # noqa: PLC0415 (only when the SDK is in use)
 
     try:
@@ -200,9 +202,9 @@ def _make(container: "ContainerClient") -> None:
 
 
 def _append(blob: "BlobClient", block: str, content: bytes, metadata: dict[str, str]) -> bool:
-    """Append one block. ``False``: another process wrote the blob meanwhile.
+    """Append one block. ``False``: another process wrote the blob in the meantime.
 
-    ``block`` is new with each append, and known again in the list: an answer may be lost and the SDK ask again.
+    ``block`` is unique to this append, so that a retry after a lost response finds it in the block list.
     """
     from azure.core import MatchConditions  # noqa: PLC0415 (only when the SDK is in use)
     from azure.core.exceptions import HttpResponseError, ResourceNotFoundError  # noqa: PLC0415
@@ -211,12 +213,12 @@ def _append(blob: "BlobClient", block: str, content: bytes, metadata: dict[str, 
     try:
         condition: dict[str, Any]
         try:
-            found = blob.get_blob_properties()
+            properties = blob.get_blob_properties()
         except ResourceNotFoundError:
             size, blocks, condition = 0, [], {"match_condition": MatchConditions.IfMissing}
         else:
-            size = found.size
-            condition = {"match_condition": MatchConditions.IfNotModified, "etag": found.etag}
+            size = properties.size
+            condition = {"match_condition": MatchConditions.IfNotModified, "etag": properties.etag}
             blocks = _blocks(blob, size, condition)
         if block in blocks:
             return True
@@ -226,40 +228,40 @@ def _append(blob: "BlobClient", block: str, content: bytes, metadata: dict[str, 
             blocks.append(block)
         blob.commit_block_list([BlobBlock(each) for each in blocks], metadata=metadata, **condition)
     except HttpResponseError as error:
-        if error.status_code == _CHANGED or code_of(error) in _WRITTEN_MEANWHILE:
+        if error.status_code == _PRECONDITION_FAILED or code_of(error) in _CONCURRENT_WRITE:
             return False
         raise
     return True
 
 
 def _blocks(blob: "BlobClient", size: int, condition: dict[str, Any]) -> list[str]:
-    """The blocks that a blob of ``size`` bytes consists of. What ``put`` wrote is in none, and is sent as one first."""
-    listed = blob.get_block_list("committed")[0]
-    kept = listed if len(listed) < MANY_BLOCKS else listed[-KEPT_BLOCKS:]
-    early = size - sum(each.size for each in kept)
-    if early > MAX_BYTES:
-        return [each.id for each in listed]
-    blocks = [each.id for each in kept]
-    if early:
-        content = blob.download_blob(0, early, **condition).readall()
+    """The block ids of a blob of ``size`` bytes. Stages content outside of blocks (written by ``put``) as a block."""
+    committed = blob.get_block_list("committed")[0]
+    unmerged = committed if len(committed) < MANY_BLOCKS else committed[-UNMERGED_BLOCKS:]
+    merged_size = size - sum(each.size for each in unmerged)
+    if merged_size > MAX_BYTES:
+        return [each.id for each in committed]
+    blocks = [each.id for each in unmerged]
+    if merged_size:
+        content = blob.download_blob(0, merged_size, **condition).readall()
         blocks.insert(0, secrets.token_hex(_BLOCK_BYTES))
         blob.stage_block(blocks[0], content)
     return blocks
 
 
-def _written(name: str) -> str:
+def _blob_name(name: str) -> str:
     check_name(name)
-    return names.fit(names.encode(name), names.MAX_BLOB_NAME)
+    return names.truncate(names.encode(name), names.MAX_BLOB_NAME)
 
 
 def _metadata(name: str) -> dict[str, str]:
     code = names.encode(name)
-    return {_NAME: code} if names.is_cut(code, names.MAX_BLOB_NAME) else {}
+    return {_NAME: code} if names.is_truncated(code, names.MAX_BLOB_NAME) else {}
 
 
-def _written_of(blob: "BlobProperties") -> str:
+def _key(blob: "BlobProperties") -> str:
     return str(blob.name)
 
 
-def _name_of(blob: "BlobProperties") -> str:
+def _name(blob: "BlobProperties") -> str:
     return names.decode((blob.metadata or {}).get(_NAME) or str(blob.name))

@@ -1,17 +1,17 @@
-"""Broker rights in an Event Grid namespace: signed grants as passwords, of which our webhook makes attributes.
+"""Broker permissions in an Event Grid namespace: passwords are signed grants, converted to client attributes.
 
-The namespace asks the webhook (``admit``) about each connection: whether, as whom, with what attributes of the client
-and until when. They come to exactly the grant (``topic_spaces``). A client's authentication name is its client id, so
-no client takes over another client's session, and there is one at a time.
+The namespace calls the webhook (``admit``) for each connection. The response contains the authentication name, the
+client attributes and the expiration. The attributes express exactly the grant (``topic_spaces``). The authentication
+name is the client id, so that no client can take over the session of another client.
 
-What was taken back is a row in the tables, which ``admit`` looks at. There is no call to end a connection of a client
-that the namespace knows from its webhook alone; but the same client that connects again takes its session over, and the
-connection before is ended: so the functions connect as the client that is to be cut, with no rights at all, and go. So
-they do when a grant has run out: whether the namespace ends a connection at its ``expiration`` is not written anywhere.
+Revocations are rows in the tables, which ``admit`` checks. Event Grid has no API to disconnect a client that
+authenticates by webhook. Therefore the functions connect with the same client id and no permissions, which takes over
+the session and ends the previous connection. They do the same when a grant expires: Microsoft does not document
+whether the namespace ends a connection at its ``expiration``.
 
-Sources: Microsoft, "Authenticate with the MQTT broker by using custom webhook authentication" (what is asked and
-answered), "MQTT features supported" (a session is taken over by the same authentication name, and by no other),
-"MQTT clients life cycle events" (``SessionTakenOver``).
+Sources: Microsoft, "Authenticate with the MQTT broker by using custom webhook authentication" (request and response),
+"MQTT features supported" (session takeover requires the same authentication name), "MQTT clients life cycle events"
+(``SessionTakenOver``).
 """
 
 import asyncio
@@ -27,52 +27,51 @@ from function_app.ports.broker_access import BrokerAccessError, Credentials, Ser
 from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import StoreError, Tables
 
-CUTTER = "service:cutter"
-"""Client that takes over a session to end it. Its credentials never leave the server."""
-CUT_S = 60
-"""So long its password is good."""
-CUTS_AT_ONCE = 16
+DISCONNECTOR = "service:disconnector"
+"""Principal that takes over a session to end it. Its credentials never leave the server."""
+DISCONNECTOR_LIFETIME_S = 60
+MAX_CONCURRENT_TAKEOVERS = 16
 
-Take = Callable[[str, Credentials], Awaitable[None]]
-"""Connects with a client id and credentials, and disconnects; raises ``BrokerAccessError`` where it is not let in."""
+TakeOver = Callable[[str, Credentials], Awaitable[None]]
+"""Connects with a client id and credentials, and disconnects; raises ``BrokerAccessError`` on rejection."""
 
 
 class EventGridBrokerAccess(WebhookBrokerAccess):
-    """``BrokerAccess`` in an Event Grid namespace, and its webhook's judgement.
+    """``BrokerAccess`` in an Event Grid namespace, including the decisions of its webhook.
 
     Args:
         keys: Sign and check grants.
         tables: Store issued and revoked grants.
-        take: Takes a session over and ends it.
-        known: Whether a token is of the namespace's own identity, which alone may ask.
+        take_over: Takes over a session and ends it.
+        verify_caller: Whether a token identifies the namespace, the only permitted caller.
     """
 
-    ends_expired = False
+    disconnects_expired = False
 
     def __init__(
-        self, *, keys: SigningKeys, tables: Tables, take: Take, known: Callable[[str], Awaitable[bool]]
+        self, *, keys: SigningKeys, tables: Tables, take_over: TakeOver, verify_caller: Callable[[str], Awaitable[bool]]
     ) -> None:
         super().__init__(keys=keys, tables=tables)
-        self.known = known
-        self._take = take
-        self._cuts = asyncio.Semaphore(CUTS_AT_ONCE)
+        self.verify_caller = verify_caller
+        self._take_over = take_over
+        self._takeovers = asyncio.Semaphore(MAX_CONCURRENT_TAKEOVERS)
 
     def service_credentials(self) -> ServiceCredentials:
-        """None: the functions publish over HTTPS, and hear by the namespace's routing."""
+        """Always raises: the functions publish over HTTPS and receive messages through the namespace's routing."""
         raise BrokerAccessError("the functions have no connection of their own to Event Grid")
 
     async def admit(self, *, username: str, password: str, client_id: str) -> dict[str, Any]:
-        """What the webhook answers about a connection.
+        """The webhook's response for a connection.
 
         Raises:
             StoreError: The revocation state cannot be read; the client is not admitted.
         """
-        grant = await self._rights.judge(username=username, password=password, client_id=client_id)
+        grant = await self._registry.verify(username=username, password=password, client_id=client_id)
         if grant is None:
             return _DENIED
         try:
-            attributes = {} if grant.principal == CUTTER else topic_spaces.attributes(grant)
-        except BrokerAccessError:  # signed when there was room for it
+            attributes = {} if grant.principal == DISCONNECTOR else topic_spaces.attributes(grant)
+        except BrokerAccessError:  # issued by a release with larger limits
             return _DENIED
         return {
             "decision": "allow",
@@ -82,26 +81,26 @@ class EventGridBrokerAccess(WebhookBrokerAccess):
         }
 
     async def close(self) -> None:
-        """As the port says: nothing is kept open."""
+        """No connection remains open."""
 
-    def _check_room(self, grant: Grant) -> None:
+    def _check_size(self, grant: Grant) -> None:
         topic_spaces.attributes(grant)
 
-    async def _cut(self, client_id: str) -> None:
+    async def _disconnect(self, client_id: str) -> None:
         grant = Grant(
-            principal=CUTTER,
+            principal=DISCONNECTOR,
             client_id=client_id,
             publish=(),
             subscribe=(),
             token_id=secrets.token_hex(16),
-            expires_at=int(time.time()) + CUT_S,
+            expires_at=int(time.time()) + DISCONNECTOR_LIFETIME_S,
         )
         try:
-            password = await self._rights.signed(grant)
+            password = await self._registry.sign(grant)
         except StoreError as error:
             raise BrokerAccessError(str(error).rstrip(".")) from error
-        async with self._cuts:
-            await self._take(client_id, Credentials(CUTTER, password))
+        async with self._takeovers:
+            await self._take_over(client_id, Credentials(DISCONNECTOR, password))
 
 
 _DENIED = {"decision": "deny", "errorReason": "not authorised"}

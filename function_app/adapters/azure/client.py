@@ -1,6 +1,6 @@
-"""How the adapters talk to Azure: one client of the SDK each, made at the first call, in threads of its own.
+"""Clients of Azure services. Each adapter has one client with its own thread pool, created at the first call.
 
-The SDK costs a quarter of a second to import, so that, too, waits for the first call: blobs are seldom needed.
+The SDK is also imported at the first call: the import takes a quarter of a second and would slow down a cold start.
 """
 
 import asyncio
@@ -17,26 +17,26 @@ if TYPE_CHECKING:
     from azure.core.exceptions import HttpResponseError
 
 THREADS = 16
-"""Calls under way at once; more wait for one of them."""
+"""Maximum number of concurrent calls; further calls wait."""
 ATTEMPTS = 3
-"""How often the SDK tries in all, with its own pauses between."""
+"""Maximum number of attempts of the SDK per call."""
 CONNECT_TIMEOUT_S = 3
 READ_TIMEOUT_S = 10
 
-_CONNECTION = "TELESCOPE_STORAGE_CONNECTION"
-_NO_ANSWER = 0
-_NO_RIGHTS = frozenset({_NO_ANSWER, 401, 403})
-_TOO_MUCH = frozenset({429, 503})
+_CONNECTION_SETTING = "TELESCOPE_STORAGE_CONNECTION"
+_NO_STATUS = 0
+_ACCESS_DENIED = frozenset({_NO_STATUS, 401, 403})
+_THROTTLED = frozenset({429, 503})
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """A storage account, and what to show there: its connection string, or a service's address and an identity.
+class Endpoint:
+    """The endpoint of a service and its credentials: a connection string, or a URL and a managed identity.
 
     Attributes:
-        connection: The account's connection string.
-        url: The address of the tables or of the blobs. The functions then show their managed identity.
-        identity: Client id of that identity, where they have not only the one that the host gives them.
+        connection: The connection string of a storage account.
+        url: The URL of the service, for access with the managed identity of the functions.
+        identity: Client id of a user-assigned identity; empty for the identity of the host.
     """
 
     connection: str = field(default="", repr=False)
@@ -44,14 +44,14 @@ class Place:
     identity: str = ""
 
 
-class Refused(StoreError):  # noqa: N818 (an outcome that callers look at)
-    """Azure refused a request. The text says what it means and what to do, in one line."""
+class ServiceError(StoreError):
+    """Azure responded with an error. The text states the cause and the remedy in one line."""
 
     def __init__(self, message: str, *, status: int, code: str) -> None:
         super().__init__(message)
         self.status = status
         self.code = code
-        """Azure's word for it. Empty where there is none: Azurite leaves some out, as do answers without a body."""
+        """Azure's error code. Empty for responses without a body and for some responses of Azurite."""
 
 
 Sdk = TypeVar("Sdk")
@@ -59,43 +59,45 @@ T = TypeVar("T")
 
 
 class Client(Generic[Sdk]):
-    """One service as one adapter uses it. Any number of calls at once; opens nothing before the first."""
+    """The client of one service. Allows concurrent calls; connects at the first call."""
 
     def __init__(
         self,
         open_: Callable[[contextlib.ExitStack], Sdk],
         *,
-        place: Place,
-        what: str,
+        endpoint: Endpoint,
+        resource: str,
         role: str,
         settings: str = "the addresses in TELESCOPE_STORAGE_*, this machine's managed identity",
         service: str = "the storage account",
     ) -> None:
-        """Remember the place.
+        """Open no connection.
 
         Args:
-            open_: Makes the SDK's client, in a thread; what is to be closed with it enters the stack.
-            place: Where it is, for errors.
-            what: What is used there, for errors: ``the container 'telescope'``.
-            role: Azure's role that allows what the adapter does, for errors.
-            settings: What names the place, where it is an address.
-            service: What is to be checked where it is there and of no use.
+            open_: Creates the SDK's client, in a thread; registers resources to close in the stack.
+            endpoint: The endpoint, for error messages.
+            resource: The resource, for error messages: ``the container 'telescope'``.
+            role: The Azure role that the adapter requires, for error messages.
+            settings: What to check if a URL cannot be reached, for error messages.
+            service: What to check if the service returns another error, for error messages.
         """
         self._open = open_
-        self._what = what + (f" at {place.url}" if place.url else "")
-        self._settings = settings if place.url else _CONNECTION
+        self._resource = resource + (f" at {endpoint.url}" if endpoint.url else "")
+        self._settings = settings if endpoint.url else _CONNECTION_SETTING
         self._service = service
-        self._right = f"Give the functions' identity the role '{role}'" if place.url else f"Check {_CONNECTION}"
+        self._access_hint = (
+            f"Give the functions' identity the role '{role}'" if endpoint.url else f"Check {_CONNECTION_SETTING}"
+        )
         self._lock = threading.Lock()
         self._sdk: Sdk | None = None
-        self._open_things = contextlib.ExitStack()
+        self._exit_stack = contextlib.ExitStack()
         self._threads: ThreadPoolExecutor | None = None
 
     async def call(self, operation: Callable[[Sdk], T]) -> T:
-        """What ``operation`` returns, which runs in a thread and may use all of the SDK.
+        """Run ``operation`` in a thread with the SDK's client, and return its result.
 
         Raises:
-            Refused: Azure refused the request.
+            ServiceError: Azure responded with an error.
             StoreError: The service cannot be used.
         """
         if self._threads is None:
@@ -103,60 +105,61 @@ class Client(Generic[Sdk]):
         return await asyncio.get_running_loop().run_in_executor(self._threads, self._call, operation)
 
     async def close(self) -> None:
-        """Close connections and threads. A later call opens them again."""
+        """Close connections and threads. A later call reopens them."""
         threads, self._threads = self._threads, None
         if threads is not None:
             await asyncio.to_thread(threads.shutdown)
         self._sdk = None
-        self._open_things.close()
+        self._exit_stack.close()
 
     def _call(self, operation: Callable[[Sdk], T]) -> T:
-        from azure.core import exceptions as sdk  # noqa: PLC0415 (see this page's first lines)
+        from azure.core import exceptions as sdk  # noqa: PLC0415 (see the module docstring)
 
         try:
-            return operation(self._opened())
+            return operation(self._client())
         except sdk.HttpResponseError as error:
-            raise self._refusal(error) from error
+            raise self._service_error(error) from error
         except (sdk.ServiceRequestError, sdk.ServiceResponseError) as error:
             raise StoreError(
-                f"{self._what} cannot be reached: {_reason(error)}. Check {self._settings} and the network."
+                f"{self._resource} cannot be reached: {_reason(error)}. Check {self._settings} and the network."
             ) from error
         except sdk.AzureError as error:
-            raise StoreError(f"{self._what} cannot be used: {_line(error)}. Check {self._service}.") from error
+            raise StoreError(f"{self._resource} cannot be used: {_line(error)}. Check {self._service}.") from error
         except AttributeError as error:
-            # How the SDK ends on an error whose answer it cannot read, as one from a proxy.
+            # The SDK raises this for an error response that it cannot parse, for example from a proxy.
             raise StoreError(
-                f"{self._what} gives answers that are not Azure's ({_line(error)}). Check {self._settings}."
+                f"{self._resource} returned an invalid response ({_line(error)}). Check {self._settings}."
             ) from error
 
-    def _refusal(self, error: "HttpResponseError") -> Refused:
-        """What a refusal means and what to do."""
-        # Without a status, it is the credentials that the SDK itself finds wrong, or cannot get.
-        status, code = error.status_code or _NO_ANSWER, code_of(error)
+    def _service_error(self, error: "HttpResponseError") -> ServiceError:
+        # The SDK raises an error without a status if it rejects the credentials or cannot get any.
+        status, code = error.status_code or _NO_STATUS, code_of(error)
         text = _line(str(error.message).split("\nErrorCode:")[0].split("\nRequestId:")[0])
-        if status != _NO_ANSWER:
+        if status != _NO_STATUS:
             text += f" ({status}{' ' if code else ''}{code})"
-        if status in _NO_RIGHTS:
-            text = f"{self._what} may not be used: {text}. {self._right}."
-        elif status in _TOO_MUCH:
-            text = f"{self._what} has too much to do: {text}. Try again."
+        if status in _ACCESS_DENIED:
+            text = f"{self._resource} denied access: {text}. {self._access_hint}."
+        elif status in _THROTTLED:
+            text = f"{self._resource} is overloaded: {text}. Try again."
         else:
-            text = f"{self._what} cannot be used: {text}. Check {self._service}."
-        return Refused(text, status=status, code=code)
+            text = f"{self._resource} cannot be used: {text}. Check {self._service}."
+        return ServiceError(text, status=status, code=code)
 
-    def _opened(self) -> Sdk:
+    def _client(self) -> Sdk:
         with self._lock:
             if self._sdk is None:
                 try:
-                    self._sdk = self._open(self._open_things)
+                    self._sdk = self._open(self._exit_stack)
                 except ValueError as error:
-                    raise StoreError(f"{self._what} cannot be used: {_line(error)}. Check {self._settings}.") from error
+                    raise StoreError(
+                        f"{self._resource} cannot be used: {_line(error)}. Check {self._settings}."
+                    ) from error
             return self._sdk
 
 
 def transport() -> Any:
-    """HTTP for one client, with a kept connection for each of its threads."""
-    import requests  # noqa: PLC0415 (see this page's first lines)
+    """The HTTP transport of one client, with a persistent connection per thread."""
+    import requests  # noqa: PLC0415 (see the module docstring)
     from azure.core.pipeline.transport import RequestsTransport  # noqa: PLC0415
     from requests.adapters import HTTPAdapter  # noqa: PLC0415
 
@@ -166,23 +169,24 @@ def transport() -> Any:
     return RequestsTransport(session=session, connection_timeout=CONNECT_TIMEOUT_S, read_timeout=READ_TIMEOUT_S)
 
 
-def credential(place: Place, things: contextlib.ExitStack) -> Any:
-    """The functions' managed identity."""
-    from azure.identity import ManagedIdentityCredential  # noqa: PLC0415 (see this page's first lines)
+def credential(endpoint: Endpoint, exit_stack: contextlib.ExitStack) -> Any:
+    """The credential of the functions' managed identity."""
+    from azure.identity import ManagedIdentityCredential  # noqa: PLC0415 (see the module docstring)
 
-    return things.enter_context(
-        ManagedIdentityCredential(client_id=place.identity or None, retry_total=ATTEMPTS - 1, retry_backoff_factor=0.1)
+    identity = endpoint.identity or None
+    return exit_stack.enter_context(
+        ManagedIdentityCredential(client_id=identity, retry_total=ATTEMPTS - 1, retry_backoff_factor=0.1)
     )
 
 
 def code_of(error: Exception) -> str:
-    """Azure's word for what is wrong, as the SDK hangs it on its exceptions; empty where there is none."""
+    """Azure's error code in an exception of the SDK; empty if there is none."""
     code = getattr(error, "error_code", None) or ""
     return str(getattr(code, "value", code))
 
 
 def _reason(error: Any) -> str:
-    """What is wrong with the connection, without what the libraries between wrap around it."""
+    """The cause of a connection error, without the exceptions of the HTTP libraries."""
     inner = getattr(error, "inner_exception", None)
     cause = inner.args[0] if inner is not None and inner.args else error
     return _line(getattr(cause, "reason", None) or cause)

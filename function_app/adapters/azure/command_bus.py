@@ -1,8 +1,7 @@
-"""Commands through an Event Grid namespace, which publishes over MQTT what it is given over HTTPS.
+"""Publishes commands over the HTTP API of an Event Grid namespace. Acks arrive as events at the ingest.
 
-``POST {endpoint}/mqtt/messages?topic=…&api-version=…`` with a token of the functions' managed identity; QoS and retain
-are headers. Source: Microsoft, "HTTP Publish of MQTT messages with Azure Event Grid (preview)". Acks come as events, to
-the ingest.
+The request is ``POST {endpoint}/mqtt/messages?topic=…&api-version=…`` with a token of the functions' managed identity;
+QoS and retain are headers. Source: Microsoft, "HTTP Publish of MQTT messages with Azure Event Grid (preview)".
 """
 
 import asyncio
@@ -12,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from urllib.parse import quote
 
-from function_app.adapters.azure.client import THREADS, Place, credential, transport
+from function_app.adapters.azure.client import THREADS, Endpoint, credential, transport
 from function_app.adapters.shared.publishing_bus import PublishingBus
 from function_app.ports.command_bus import BusUnavailable
 
@@ -20,23 +19,22 @@ API_VERSION = "2025-08-01-preview"
 SCOPE = "https://eventgrid.azure.net/.default"
 ROLE = "EventGrid TopicSpaces Publisher"
 TRIES = 2
-"""A connection that lay idle may turn out to be gone at the next message. A device drops doubles."""
-_TAKEN = frozenset({200, 202, 204})
-_NO_RIGHTS = frozenset({401, 403})
-_TOO_MUCH = frozenset({429, 503})
+"""The server may have closed an idle connection. Devices drop duplicates."""
+_ACCEPTED = frozenset({200, 202, 204})
+_ACCESS_DENIED = frozenset({401, 403})
+_THROTTLED = frozenset({429, 503})
 
 
 class EventGridCommandBus(PublishingBus):
     """``CommandBus`` over a namespace's HTTP publish. Imports the SDK and connects at the first message."""
 
     def __init__(self, *, endpoint: str, identity: str = "") -> None:
-        """``endpoint``: ``https://<name>.<region>-1.ts.eventgrid.azure.net``; ``identity``: see ``Place``."""
-        self._endpoint = endpoint.rstrip("/")
-        super().__init__(f"Event Grid at {self._endpoint}")
-        self._place = Place(url=endpoint, identity=identity)
+        """``endpoint``: ``https://<name>.<region>-1.ts.eventgrid.azure.net``; ``identity``: see ``Endpoint``."""
+        self._endpoint = Endpoint(url=endpoint.rstrip("/"), identity=identity)
+        super().__init__(f"Event Grid at {self._endpoint.url}")
         self._lock = threading.Lock()
         self._pipeline: Any = None
-        self._things = contextlib.ExitStack()
+        self._exit_stack = contextlib.ExitStack()
         self._threads: ThreadPoolExecutor | None = None
 
     async def close(self) -> None:
@@ -44,7 +42,7 @@ class EventGridCommandBus(PublishingBus):
         if threads is not None:
             await asyncio.to_thread(threads.shutdown)
         self._pipeline = None
-        self._things.close()
+        self._exit_stack.close()
 
     async def _publish(self, topic: str, payload: bytes, qos: int, retain: bool) -> None:
         if self._threads is None:
@@ -56,10 +54,10 @@ class EventGridCommandBus(PublishingBus):
         from azure.core import exceptions as sdk  # noqa: PLC0415 (see the class)
         from azure.core.rest import HttpRequest  # noqa: PLC0415
 
-        for left in reversed(range(TRIES)):
+        for remaining in reversed(range(TRIES)):
             request = HttpRequest(
                 "POST",
-                f"{self._endpoint}/mqtt/messages?topic={quote(topic, safe='')}&api-version={API_VERSION}",
+                f"{self._endpoint.url}/mqtt/messages?topic={quote(topic, safe='')}&api-version={API_VERSION}",
                 headers={
                     "mqtt-qos": str(qos),
                     "mqtt-retain": str(int(retain)),
@@ -68,9 +66,9 @@ class EventGridCommandBus(PublishingBus):
                 content=payload,
             )
             try:
-                response = self._opened().send_request(request)
+                response = self._client().send_request(request)
             except (sdk.ServiceRequestError, sdk.ServiceResponseError) as error:
-                if left:
+                if remaining:
                     continue
                 raise BusUnavailable(
                     f"{self._name} cannot be reached: {_line(error)}. Check "
@@ -80,29 +78,29 @@ class EventGridCommandBus(PublishingBus):
                 raise BusUnavailable(
                     f"{self._name} cannot be used: {_line(error)}. Check this machine's managed identity"
                 ) from error
-            if response.status_code not in _TAKEN:
-                raise BusUnavailable(f"{self._name} {_refusal(response)}")
+            if response.status_code not in _ACCEPTED:
+                raise BusUnavailable(f"{self._name} {_problem(response)}")
             return
 
-    def _opened(self) -> Any:
+    def _client(self) -> Any:
         from azure.core import PipelineClient  # noqa: PLC0415 (see the class)
         from azure.core.pipeline.policies import BearerTokenCredentialPolicy  # noqa: PLC0415
 
         with self._lock:
             if self._pipeline is None:
-                policies = [BearerTokenCredentialPolicy(credential(self._place, self._things), SCOPE)]
-                client: Any = PipelineClient(self._endpoint, policies=policies, transport=transport())
-                self._pipeline = self._things.enter_context(client)
+                policies = [BearerTokenCredentialPolicy(credential(self._endpoint, self._exit_stack), SCOPE)]
+                client: Any = PipelineClient(self._endpoint.url, policies=policies, transport=transport())
+                self._pipeline = self._exit_stack.enter_context(client)
             return self._pipeline
 
 
-def _refusal(response: Any) -> str:
-    said = f"{response.status_code} {_line(response.text())}".strip()
-    if response.status_code in _NO_RIGHTS:
-        return f"may not be used: {said}. Give the functions' identity the role '{ROLE}'"
-    if response.status_code in _TOO_MUCH:
-        return f"has too much to do: {said}. Try again, or raise its throughput units"
-    return f"refused a message: {said}. Look at the namespace's metrics and logs"
+def _problem(response: Any) -> str:
+    detail = f"{response.status_code} {_line(response.text())}".strip()
+    if response.status_code in _ACCESS_DENIED:
+        return f"denied access: {detail}. Give the functions' identity the role '{ROLE}'"
+    if response.status_code in _THROTTLED:
+        return f"is overloaded: {detail}. Try again, or raise its throughput units"
+    return f"rejected a message: {detail}. Check the namespace's metrics and logs"
 
 
 def _line(error: object) -> str:

@@ -1,13 +1,13 @@
-"""Names of any text and length as plain ASCII that sorts alike.
+"""Encodes names of any text and length as ASCII with the same sort order.
 
-Azure's keys take neither slashes, ``#``, ``?`` nor control characters, blobs' names know paths, and no order is
-promised beyond that of UTF-16, in which an emoji sorts before a ligature. So letters, digits and ``- : _`` stand for
-themselves, and every other character is written as a sign that sorts where it does, and digits of base 64 (``_SIGNS``):
-a full stop is ``.-``, a slash ``.0``, an emoji ``}`` and three digits.
+Azure keys exclude slashes, ``#``, ``?`` and control characters, blob names are interpreted as paths, and Azure sorts by
+UTF-16, in which an emoji sorts before a ligature. Therefore letters, digits and ``- : _`` remain unchanged. Every other
+character becomes a prefix with the same sort position and digits of base 64 (``_RANGES``): a full stop is ``.-``, a
+slash ``.0``, an emoji ``}`` and three digits.
 
-512 characters of 21 bits have no room in the 512 of 16 that Azure's keys have, with any encoding. Of a name that
-comes out too long, which none is that Telescope makes, only the head is written, and a hash behind it; the whole is
-kept beside it. Such names sort as they should save among those with one head: ``in_order`` puts these right.
+No encoding fits 512 characters of 21 bits into the 512 characters of 16 bits of an Azure key. A code that is too long
+(no name that Telescope generates) is truncated to its head and a hash, and the full code is stored in an attribute.
+Keys sort like names, except among names with the same head, which ``sort_by_name`` sorts.
 """
 
 import bisect
@@ -20,13 +20,13 @@ from typing import TypeVar
 MAX_KEY = 512
 """Azure Tables' limit: 1 KiB in UTF-16."""
 MAX_BLOB_NAME = 1024
-BEHIND_HASHES = "~"
-"""Sorts behind every letter of a hash."""
+AFTER_HASHES = "~"
+"""Sorts after every character of a hash."""
 
 _PLAIN = frozenset("-0123456789:ABCDEFGHIJKLMNOPQRSTUVWXYZ_abcdefghijklmnopqrstuvwxyz")
 _DIGITS = "-0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ_abcdefghijklmnopqrstuvwxyz"
 _BITS = 6
-_SIGNS = (  # the first character, its sign, digits
+_RANGES = (  # first character, prefix, number of digits
     (0x00, "!", 1),
     (0x2E, ".", 1),
     (0x3B, "=", 1),
@@ -37,73 +37,73 @@ _SIGNS = (  # the first character, its sign, digits
     (0x7B + 2**6 + 2**12, "}", 3),
     (0x7B + 2**6 + 2**12 + 2**18, "~", 4),
 )
-_FIRST = [first for first, _, _ in _SIGNS]
-_BY_SIGN = {sign: (first, digits) for first, sign, digits in _SIGNS}
+_FIRST = [first for first, _, _ in _RANGES]
+_BY_PREFIX = {prefix: (first, digits) for first, prefix, digits in _RANGES}
 _HASH = 43
-"""Letters of a SHA-256 in base 64."""
+"""Characters of a SHA-256 in base 64."""
 
 T = TypeVar("T")
 
 
 def encode(name: str) -> str:
-    """``name`` in ASCII. What begins with it has a code that begins with its code; codes sort as names do.
+    """The ASCII code of ``name``. A name's prefix has a prefix of the name's code; codes sort like names.
 
     Raises:
-        ValueError: It is no Unicode text.
+        ValueError: The name contains a lone surrogate.
     """
-    return "".join(letter if letter in _PLAIN else _written(letter) for letter in name)
+    return "".join(character if character in _PLAIN else _encoded(character) for character in name)
 
 
 def decode(code: str) -> str:
-    """The name that ``encode`` was given."""
-    letters = []
+    """The inverse of ``encode``."""
+    characters = []
     rest = iter(code)
-    for letter in rest:
-        if letter in _PLAIN:
-            letters.append(letter)
+    for character in rest:
+        if character in _PLAIN:
+            characters.append(character)
             continue
-        first, digits = _BY_SIGN[letter]
+        first, digits = _BY_PREFIX[character]
         offset = 0
         for _ in range(digits):
             offset = (offset << _BITS) + _DIGITS.index(next(rest))
-        letters.append(chr(first + offset))
-    return "".join(letters)
+        characters.append(chr(first + offset))
+    return "".join(characters)
 
 
 def head(code: str, limit: int) -> str:
-    """As much of a code as is written where ``limit`` characters are taken."""
+    """The part of a code that remains in a key of at most ``limit`` characters."""
     return code[: limit - _HASH]
 
 
-def is_cut(written: str, limit: int) -> bool:
-    """Whether what is written has only the head of its name's code."""
-    return len(written) > limit - _HASH
+def is_truncated(key: str, limit: int) -> bool:
+    """Whether a key contains only the head of its name's code."""
+    return len(key) > limit - _HASH
 
 
-def fit(code: str, limit: int) -> str:
-    """What is written for a code where ``limit`` characters are taken. Different for different codes."""
-    if not is_cut(code, limit):
+def truncate(code: str, limit: int) -> str:
+    """A unique key of at most ``limit`` characters for a code."""
+    if not is_truncated(code, limit):
         return code
     return head(code, limit) + urlsafe_b64encode(hashlib.sha256(code.encode()).digest()).decode().rstrip("=")
 
 
-def in_order(found: Iterable[T], *, written: Callable[[T], str], name: Callable[[T], str], limit: int) -> Iterator[T]:
-    """What was found in the order of what is written, in the order of names. Reads no further than it has to."""
+def sort_by_name(items: Iterable[T], *, key: Callable[[T], str], name: Callable[[T], str], limit: int) -> Iterator[T]:
+    """Items in the order of their names, from items in the order of their keys. Evaluates ``items`` lazily."""
 
-    def group(each: T) -> tuple[str, bool]:
-        return head(written(each), limit), is_cut(written(each), limit)
+    def group(item: T) -> tuple[str, bool]:
+        return head(key(item), limit), is_truncated(key(item), limit)
 
-    for (_, cut), members in groupby(found, key=group):
-        if cut:
+    for (_, truncated), members in groupby(items, key=group):
+        if truncated:
             yield from sorted(members, key=name)
         else:
             yield from members
 
 
-def _written(letter: str) -> str:
-    value = ord(letter)
-    first, sign, digits = _SIGNS[bisect.bisect_right(_FIRST, value) - 1]
-    if "\ud800" <= letter <= "\udfff":
+def _encoded(character: str) -> str:
+    value = ord(character)
+    first, prefix, digits = _RANGES[bisect.bisect_right(_FIRST, value) - 1]
+    if "\ud800" <= character <= "\udfff":
         raise ValueError("names are Unicode text without lone surrogates")
     offset = value - first
-    return sign + "".join(_DIGITS[offset >> shift & 63] for shift in range((digits - 1) * _BITS, -1, -_BITS))
+    return prefix + "".join(_DIGITS[offset >> shift & 63] for shift in range((digits - 1) * _BITS, -1, -_BITS))

@@ -1,4 +1,4 @@
-"""Ends a connection by connecting with its client id: any broker then ends the one before (MQTT, 3.1.4)."""
+"""Disconnects a client by connecting with its client id: the broker then ends the previous connection (MQTT, 3.1.4)."""
 
 import asyncio
 import ssl
@@ -10,12 +10,12 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from function_app.ports.broker_access import BrokerAccessError, Credentials
 
-WITHIN_S = 10.0
+TIMEOUT_S = 10.0
 _KEEP_ALIVE_S = 30
 
 
 class SessionTakeover:
-    """Connects and disconnects, with a new connection each time."""
+    """Connects with the client id of another client, and disconnects."""
 
     def __init__(self, *, host: str, port: int, tls: ssl.SSLContext | None) -> None:
         self._host = host
@@ -23,13 +23,13 @@ class SessionTakeover:
         self._tls = tls
 
     async def __call__(self, client_id: str, credentials: Credentials) -> None:
-        """Take over a client id's session and end it.
+        """Take over and end the session of a client id.
 
         Raises:
-            BrokerAccessError: The broker is not reached, or does not let us in.
+            BrokerAccessError: The broker is not reachable or rejects the connection.
         """
         loop = asyncio.get_running_loop()
-        answered: asyncio.Future[str] = loop.create_future()
+        outcome: asyncio.Future[str] = loop.create_future()
         client = paho.Client(
             CallbackAPIVersion.VERSION2,
             client_id=client_id,
@@ -38,13 +38,13 @@ class SessionTakeover:
             reconnect_on_failure=False,
         )
         client.username_pw_set(*credentials)
-        client.connect_timeout = WITHIN_S
+        client.connect_timeout = TIMEOUT_S
         if self._tls is not None:
             client.tls_set_context(self._tls)
 
-        def settle(trouble: str) -> None:
-            if not answered.done():
-                answered.set_result(trouble)
+        def settle(problem: str) -> None:
+            if not outcome.done():
+                outcome.set_result(problem)
 
         def connected(_: Any, __: Any, ___: Any, reason: ReasonCode, ____: Any) -> None:
             loop.call_soon_threadsafe(settle, str(reason) if reason.is_failure else "")
@@ -53,18 +53,18 @@ class SessionTakeover:
             loop.call_soon_threadsafe(settle, f"the connection broke: {reason}")
 
         client.on_connect, client.on_disconnect = connected, disconnected
-        where = f"the broker at {self._host}:{self._port}"
+        broker = f"the broker at {self._host}:{self._port}"
         try:
-            async with asyncio.timeout(WITHIN_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 await asyncio.to_thread(client.connect, self._host, self._port, _KEEP_ALIVE_S)
                 client.loop_start()
-                trouble = await answered
+                problem = await outcome
         except TimeoutError as error:
-            raise BrokerAccessError(f"{where} did not answer in {WITHIN_S:.0f} s") from error
+            raise BrokerAccessError(f"{broker} did not answer in {TIMEOUT_S:.0f} s") from error
         except OSError as error:
-            raise BrokerAccessError(f"{where} cannot be reached: {error}") from error
+            raise BrokerAccessError(f"{broker} cannot be reached: {error}") from error
         finally:
             client.disconnect()
             await asyncio.to_thread(client.loop_stop)
-        if trouble:
-            raise BrokerAccessError(f"{where} does not let the functions end the connection of {client_id}: {trouble}")
+        if problem:
+            raise BrokerAccessError(f"{broker} does not let the functions disconnect {client_id}: {problem}")

@@ -1,10 +1,10 @@
-"""Signing keys in Azure's Key Vault, as one of its secrets: its keys know no Ed25519."""
+"""Signing keys as a secret in Azure Key Vault, whose own keys do not support Ed25519."""
 
 import contextlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from function_app.adapters.azure.client import ATTEMPTS, Client, Place, Refused, credential, transport
+from function_app.adapters.azure.client import ATTEMPTS, Client, Endpoint, ServiceError, credential, transport
 from function_app.adapters.shared.key_ring_keys import wall_ms
 from function_app.adapters.shared.vault_keys import Secret, VaultKeys
 
@@ -16,20 +16,20 @@ _TYPE = "application/json"
 
 
 class KeyVaultKeys(VaultKeys):
-    """``SigningKeys`` in one secret of the vault at ``place``."""
+    """``SigningKeys`` in one secret of the vault at ``endpoint``."""
 
-    def __init__(self, *, secret: str, place: Place, now_ms: Callable[[], int] = wall_ms) -> None:
-        what = f"the secret '{secret}'"
-        super().__init__(what=what, now_ms=now_ms)
+    def __init__(self, *, secret: str, endpoint: Endpoint, now_ms: Callable[[], int] = wall_ms) -> None:
+        resource = f"the secret '{secret}'"
+        super().__init__(resource=resource, now_ms=now_ms)
         self._secret = secret
 
-        def open_(things: contextlib.ExitStack) -> "SecretClient":
-            from azure.keyvault.secrets import SecretClient  # noqa: PLC0415 (see the client's first lines)
+        def open_(exit_stack: contextlib.ExitStack) -> "SecretClient":
+            from azure.keyvault.secrets import SecretClient  # noqa: PLC0415 (see ``client``)
 
-            return things.enter_context(
+            return exit_stack.enter_context(
                 SecretClient(
-                    place.url,
-                    credential(place, things),
+                    endpoint.url,
+                    credential(endpoint, exit_stack),
                     transport=transport(),
                     retry_total=ATTEMPTS - 1,
                     retry_backoff_factor=0.1,
@@ -38,9 +38,9 @@ class KeyVaultKeys(VaultKeys):
 
         self._client = Client(
             open_,
-            place=place,
-            what=what,
-            role="Key Vault Secrets User' (to make and rotate them: 'Key Vault Secrets Officer",
+            endpoint=endpoint,
+            resource=resource,
+            role="Key Vault Secrets User' (to create and rotate keys: 'Key Vault Secrets Officer",
             settings="TELESCOPE_KEYVAULT_URL, this machine's managed identity",
             service="the key vault",
         )
@@ -50,12 +50,12 @@ class KeyVaultKeys(VaultKeys):
 
     async def _fetch(self) -> Secret | None:
         try:
-            found = await self._client.call(lambda sdk: sdk.get_secret(self._secret))
-        except Refused as error:
+            secret = await self._client.call(lambda sdk: sdk.get_secret(self._secret))
+        except ServiceError as error:
             if error.status == _MISSING:
                 return None
             raise
-        return Secret(found.value or "", found.properties.version or "")
+        return Secret(secret.value or "", secret.properties.version or "")
 
     async def _create(self, text: str) -> None:
         await self._put(text)

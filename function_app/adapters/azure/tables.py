@@ -1,13 +1,13 @@
 """Tables in one storage account.
 
-Each of the port's tables is one of Azure's, named with a prefix and made at the first write. An entity has, beside
-Azure's own properties,
+Each table of the port is an Azure table, named with a prefix and created at the first write. In addition to the system
+properties, an entity has
 
-- ``Data0``, ``Data1`` …: the JSON as text, cut where a property is full
-- ``Write``: random, another with each write, so that a write whose answer was lost is known again
-- ``Name``: the code of the whole key where ``RowKey`` has only its head (``names``)
+- ``Data0``, ``Data1`` …: the JSON as text, split at the maximum size of a property
+- ``Write``: random, new with each write, to identify a write whose response was lost
+- ``Name``: the code of the full key if ``RowKey`` is truncated (``names``)
 
-The ETag is Azure's. Azure's batches are its entity group transactions.
+The ETag is Azure's. Batches are entity group transactions.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from function_app.adapters.azure import names
-from function_app.adapters.azure.client import ATTEMPTS, Client, Place, Refused, credential, transport
+from function_app.adapters.azure.client import ATTEMPTS, Client, Endpoint, ServiceError, credential, transport
 from function_app.adapters.shared import row_codec
 from function_app.ports.tables import Conflict, Page, Row, Write
 
@@ -27,59 +27,59 @@ if TYPE_CHECKING:
     from azure.data.tables import TableClient
 
 PROPERTY_BYTES = 64 * 1024
-"""Most that one property holds, in UTF-16."""
+"""Maximum size of a property in UTF-16."""
 _PAGE = 1_000
-"""Most entities that Azure gives at once."""
+"""Maximum number of entities in a response of Azure."""
 _RETRY_S = 0.1
-_LONGEST_RETRY_S = 2
+_MAX_RETRY_S = 2
 _ETAG = re.compile(r'\AW/"[!#-~]+"\Z')
 _EXISTS = frozenset({"", "EntityAlreadyExists"})
-_WHOLE: Any = {"mode": "replace"}
-"""Not "merge", the SDK's own choice, which leaves properties that the new row does not have."""
-_GONE = 404
-_TAKEN = 409
-_CHANGED = 412
-_ALWAYS = frozenset({"GET", "PUT", "POST"})
-"""What is sent again when the connection breaks: each of our writes is known again by ``Write``."""
+_REPLACE: Any = {"mode": "replace"}
+"""The default ("merge") would retain properties that the new row does not have."""
+_NOT_FOUND = 404
+_CONFLICT = 409
+_PRECONDITION_FAILED = 412
+_RETRIED = frozenset({"GET", "PUT", "POST"})
+"""Methods that the SDK retries after a connection error. ``Write`` identifies repeated writes."""
 
 T = TypeVar("T")
 
 
 class AzureTables:
-    """``Tables`` in a storage account, whose names begin with ``prefix``. Connects at the first call."""
+    """``Tables`` in a storage account. Table names begin with ``prefix``. Connects at the first call."""
 
-    def __init__(self, *, place: Place, prefix: str) -> None:
+    def __init__(self, *, endpoint: Endpoint, prefix: str) -> None:
         """``prefix``: letters and digits, a letter first."""
         self._prefix = prefix
         self._client = Client(
-            lambda things: _Service(place, things),
-            place=place,
-            what=f"the Azure tables '{prefix}…'",
+            lambda exit_stack: _Service(endpoint, exit_stack),
+            endpoint=endpoint,
+            resource=f"the Azure tables '{prefix}…'",
             role="Storage Table Data Contributor",
         )
 
     async def get(self, table: str, partition: str, key: str) -> Row | None:
-        place = _place(partition, key)
+        entity_key = _entity_key(partition, key)
         if not partition or not key:
             return None
-        found = await self._read(table, place)
-        return None if found is None else _row(partition, found)
+        entity = await self._read(table, entity_key)
+        return None if entity is None else _row(partition, entity)
 
     async def create(self, table: str, row: Row) -> Row:
         row_codec.check(row)
         entity = _entity(row, row_codec.encode(row.data))
-        return await self._put(table, row, entity, lambda to: to.create_entity(entity, retry_on_methods=_ALWAYS))
+        return await self._put(table, row, entity, lambda to: to.create_entity(entity, retry_on_methods=_RETRIED))
 
     async def replace(self, table: str, row: Row) -> Row:
         row_codec.check(row)
         _check_etag(table, row)
         entity = _entity(row, row_codec.encode(row.data))
         return await self._put(
-            table, row, entity, lambda to: to.update_entity(entity, **_unchanged(row), **_WHOLE), makes=False
+            table, row, entity, lambda to: to.update_entity(entity, **_if_match(row), **_REPLACE), create_table=False
         )
 
     async def delete(self, table: str, row: Row) -> None:
-        # As a transaction: for a plain delete of what is not there the SDK says nothing.
+        # A transaction fails if the entity does not exist; the SDK ignores that for a plain delete.
         await self.batch(table, [Write("delete", row)])
 
     async def query(
@@ -97,47 +97,47 @@ class AzureTables:
         condition, parameters = _range(partition, start, last)
         if last is not None and last <= start:
             return Page((), None)
-        wanted = limit + 1  # one more tells whether there is another page
-        pages = -(-wanted // _PAGE)
+        count = limit + 1  # one extra row shows whether there is another page
+        pages = -(-count // _PAGE)
 
         def read(service: _Service) -> list[Row]:
             found = service.table(self._prefix + table).query_entities(
-                condition, parameters=parameters, results_per_page=-(-wanted // pages)
+                condition, parameters=parameters, results_per_page=-(-count // pages)
             )
-            ordered = names.in_order(found, written=_row_key, name=_key, limit=names.MAX_KEY)
-            inside = (each for each in ordered if start <= _key(each) and (last is None or _key(each) < last))
-            return [_row(partition, each) for each in itertools.islice(inside, wanted)]
+            ordered = names.sort_by_name(found, key=_row_key, name=_key, limit=names.MAX_KEY)
+            matching = (each for each in ordered if start <= _key(each) and (last is None or _key(each) < last))
+            return [_row(partition, each) for each in itertools.islice(matching, count)]
 
         try:
             found = await self._client.call(read)
-        except Refused as error:
-            if error.status != _GONE:
+        except ServiceError as error:
+            if error.status != _NOT_FOUND:
                 raise
             found = []
         return Page(tuple(found[:limit]), row_codec.write_cursor(found[limit].key) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
         entities = [
-            _place(write.row.partition, write.row.key) if write.kind == "delete" else _entity(write.row, text)
+            _entity_key(write.row.partition, write.row.key) if write.kind == "delete" else _entity(write.row, text)
             for write, text in zip(writes, row_codec.check_batch(writes), strict=True)
         ]
         for write in writes:
             if write.kind != "create":
                 _check_etag(table, write.row)
-        again = {"retry_on_methods": _ALWAYS} if any("Write" in entity for entity in entities) else {}
+        retry = {"retry_on_methods": _RETRIED} if any("Write" in entity for entity in entities) else {}
 
         def submit(to: "TableClient") -> list[Mapping[str, Any]]:
             pairs = zip(writes, entities, strict=True)
-            return to.submit_transaction([_operation(write, entity) for write, entity in pairs], **again)
+            return to.submit_transaction([_operation(write, entity) for write, entity in pairs], **retry)
 
         try:
-            answers = await self._write(table, submit, makes=all(write.kind == "create" for write in writes))
-            etags = [str(answer.get("etag")) for answer in answers]
+            responses = await self._write(table, submit, create_table=all(write.kind == "create" for write in writes))
+            etags = [str(response.get("etag")) for response in responses]
         except Conflict:
-            known = await self._known(table, entities)
-            if known is None:
+            stored = await self._etags_of_earlier_attempt(table, entities)
+            if stored is None:
                 raise
-            etags = known
+            etags = stored
         return tuple(
             write.row if write.kind == "delete" else replace(write.row, etag=etag)
             for write, etag in zip(writes, etags, strict=True)
@@ -153,95 +153,97 @@ class AzureTables:
         entity: dict[str, str],
         write: "Callable[[TableClient], Mapping[str, Any]]",
         *,
-        makes: bool = True,
+        create_table: bool = True,
     ) -> Row:
         try:
-            answer = await self._write(table, write, makes=makes)
-            etag = str(answer["etag"])
+            response = await self._write(table, write, create_table=create_table)
+            etag = str(response["etag"])
         except Conflict:
-            known = await self._known(table, [entity])
-            if known is None:
+            stored = await self._etags_of_earlier_attempt(table, [entity])
+            if stored is None:
                 raise
-            (etag,) = known
+            (etag,) = stored
         return replace(row, etag=etag)
 
-    async def _write(self, table: str, write: "Callable[[TableClient], T]", *, makes: bool = True) -> T:
-        """Do it, and with ``makes`` (all it does is create) make the table for it where there is none."""
+    async def _write(self, table: str, write: "Callable[[TableClient], T]", *, create_table: bool = True) -> T:
+        """Run a write; ``create_table`` creates a missing table, for writes that only create rows."""
         try:
             return await self._client.call(lambda service: write(service.table(self._prefix + table)))
-        except Refused as error:
-            if error.status == _GONE and makes:
-                await self._client.call(lambda service: service.make(self._prefix + table))
-                return await self._write(table, write, makes=False)
-            if error.status in {_GONE, _CHANGED} or (error.status == _TAKEN and error.code in _EXISTS):
-                raise Conflict(f"{table}: a row is not as the writer believed ({error.code})") from error
+        except ServiceError as error:
+            if error.status == _NOT_FOUND and create_table:
+                await self._client.call(lambda service: service.create(self._prefix + table))
+                return await self._write(table, write, create_table=False)
+            if error.status in {_NOT_FOUND, _PRECONDITION_FAILED} or (
+                error.status == _CONFLICT and error.code in _EXISTS
+            ):
+                raise Conflict(f"{table}: a row does not have the expected ETag ({error.code})") from error
             raise
 
-    async def _read(self, table: str, place: dict[str, str]) -> Mapping[str, Any] | None:
+    async def _read(self, table: str, key: dict[str, str]) -> Mapping[str, Any] | None:
         try:
             return await self._client.call(
-                lambda service: service.table(self._prefix + table).get_entity(place["PartitionKey"], place["RowKey"])
+                lambda service: service.table(self._prefix + table).get_entity(key["PartitionKey"], key["RowKey"])
             )
-        except Refused as error:
-            if error.status == _GONE:
+        except ServiceError as error:
+            if error.status == _NOT_FOUND:
                 return None
             raise
 
-    async def _known(self, table: str, entities: Sequence[dict[str, str]]) -> list[str] | None:
-        """ETags of what is there when it is these very writes; ``None`` when another's are there, or one to delete is.
+    async def _etags_of_earlier_attempt(self, table: str, entities: Sequence[dict[str, str]]) -> list[str] | None:
+        """ETags if an earlier attempt of these writes succeeded, otherwise ``None``.
 
-        When an answer was lost, what the SDK then sends again finds its own first writing, which is no conflict.
+        After a lost response, the retry of the SDK conflicts with its own first attempt.
         """
         etags = []
         for entity in entities:
-            found = await self._read(table, entity)
-            if entity.get("Write") != (found or {}).get("Write"):
+            stored = await self._read(table, entity)
+            if entity.get("Write") != (stored or {}).get("Write"):
                 return None
-            etags.append("" if found is None else _etag(found))
+            etags.append("" if stored is None else _etag(stored))
         return etags if any("Write" in entity for entity in entities) else None
 
 
 class _Service:
-    """The SDK's client, and one for each table: making one costs as much as a call."""
+    """The SDK's service client, and a cached client per table: creating one is as slow as a call."""
 
-    def __init__(self, place: Place, things: contextlib.ExitStack) -> None:
+    def __init__(self, endpoint: Endpoint, exit_stack: contextlib.ExitStack) -> None:
         from azure.data.tables import TableServiceClient  # noqa: PLC0415 (costs a quarter of a second)
 
         options: dict[str, Any] = {
             "transport": transport(),
             "retry_total": ATTEMPTS - 1,
             "retry_backoff_factor": _RETRY_S,
-            "retry_backoff_max": _LONGEST_RETRY_S,
+            "retry_backoff_max": _MAX_RETRY_S,
         }
-        if place.url:
-            service = TableServiceClient(place.url, credential=credential(place, things), **options)
+        if endpoint.url:
+            service = TableServiceClient(endpoint.url, credential=credential(endpoint, exit_stack), **options)
         else:
-            service = TableServiceClient.from_connection_string(place.connection, **options)
-        self._service = things.enter_context(service)
+            service = TableServiceClient.from_connection_string(endpoint.connection, **options)
+        self._service = exit_stack.enter_context(service)
         self._tables: dict[str, TableClient] = {}
 
     def table(self, name: str) -> "TableClient":
-        """One table's client."""
-        found = self._tables.get(name)
-        if found is None:
-            found = self._tables.setdefault(name, self._service.get_table_client(name))
-        return found
+        """The client of one table."""
+        client = self._tables.get(name)
+        if client is None:
+            client = self._tables.setdefault(name, self._service.get_table_client(name))
+        return client
 
-    def make(self, name: str) -> None:
-        """Make a table; others may do so at the same time."""
+    def create(self, name: str) -> None:
+        """Create a table. Idempotent; allows concurrent calls."""
         self._service.create_table_if_not_exists(name)
 
 
-def _place(partition: str, key: str) -> dict[str, str]:
+def _entity_key(partition: str, key: str) -> dict[str, str]:
     return {
-        "PartitionKey": names.fit(names.encode(partition), names.MAX_KEY),
-        "RowKey": names.fit(names.encode(key), names.MAX_KEY),
+        "PartitionKey": names.truncate(names.encode(partition), names.MAX_KEY),
+        "RowKey": names.truncate(names.encode(key), names.MAX_KEY),
     }
 
 
 def _entity(row: Row, text: bytes) -> dict[str, str]:
-    entity = {**_place(row.partition, row.key), "Write": secrets.token_hex(8)}
-    if names.is_cut(entity["RowKey"], names.MAX_KEY):
+    entity = {**_entity_key(row.partition, row.key), "Write": secrets.token_hex(8)}
+    if names.is_truncated(entity["RowKey"], names.MAX_KEY):
         entity["Name"] = names.encode(row.key)
     for number, part in enumerate(_parts(text.decode())):
         entity[f"Data{number}"] = part
@@ -249,7 +251,7 @@ def _entity(row: Row, text: bytes) -> dict[str, str]:
 
 
 def _parts(text: str) -> Iterator[str]:
-    """A text in parts that each fit into a property."""
+    """The text in parts that fit into a property each."""
     units = text.encode("utf-16-le")
     start = 0
     while start < len(units):
@@ -278,13 +280,13 @@ def _etag(entity: Any) -> str:
 
 
 def _check_etag(table: str, row: Row) -> None:
-    """What is no ETag of Azure's, ``*`` above all, is never sent: it is not the row's."""
+    """Never send an invalid ETag: ``*`` would match every row."""
     if not _ETAG.match(row.etag):
-        raise Conflict(f"{table}: '{row.key}' has changed or is gone")
+        raise Conflict(f"{table}: '{row.key}' does not have the expected ETag")
 
 
-def _unchanged(row: Row) -> dict[str, Any]:
-    """The condition that the row still has its ETag."""
+def _if_match(row: Row) -> dict[str, Any]:
+    """The condition that the stored row has the same ETag."""
     from azure.core import MatchConditions  # noqa: PLC0415 (only when the SDK is in use)
 
     return {"etag": row.etag, "match_condition": MatchConditions.IfNotModified}
@@ -294,20 +296,20 @@ def _operation(write: Write, entity: dict[str, str]) -> tuple[str, dict[str, str
     if write.kind == "create":
         return "create", entity, {}
     if write.kind == "delete":
-        return "delete", entity, _unchanged(write.row)
-    return "update", entity, {**_unchanged(write.row), **_WHOLE}
+        return "delete", entity, _if_match(write.row)
+    return "update", entity, {**_if_match(write.row), **_REPLACE}
 
 
 def _range(partition: str, start: str, last: str | None) -> tuple[str, dict[str, str]]:
-    """A filter that all rows from ``start`` to before ``last`` pass, and few others."""
+    """A filter that matches all rows with ``start`` ≤ key < ``last``, and few others."""
     condition = "PartitionKey eq @partition and RowKey ge @low"
     parameters = {
-        "partition": names.fit(names.encode(partition), names.MAX_KEY),
+        "partition": names.truncate(names.encode(partition), names.MAX_KEY),
         "low": names.head(names.encode(start), names.MAX_KEY),
     }
     if last is not None:
         code = names.encode(last)
-        cut = names.is_cut(code, names.MAX_KEY)
+        truncated = names.is_truncated(code, names.MAX_KEY)
         condition += " and RowKey lt @high"
-        parameters["high"] = names.head(code, names.MAX_KEY) + names.BEHIND_HASHES if cut else code
+        parameters["high"] = names.head(code, names.MAX_KEY) + names.AFTER_HASHES if truncated else code
     return condition, parameters

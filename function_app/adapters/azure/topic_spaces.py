@@ -1,15 +1,15 @@
-"""Grants as an Event Grid namespace reads them: topic spaces, the same for all clients, and attributes of a client.
+"""Converts grants to client attributes of an Event Grid namespace, and defines its topic spaces.
 
-A topic space holds templates of topics, with variables that stand for a client's attributes; a permission binding lets
-a client group say or hear one; a client is in a group by its attributes. So what one client may comes from its
-attributes alone, which our webhook gives with each connection (``broker_access``). A variable covers one level at most
-and a client without the attribute has no right by that template, so several devices are several numbered sets of
-attributes: there are as many as there is room for templates.
+A topic space is a set of topic templates with variables for client attributes. A permission binding allows a client
+group to publish or subscribe to a topic space. Attributes also select the client group. Therefore the attributes, which
+the webhook returns for each connection (``broker_access``), determine all permissions of a client. A variable covers at
+most one topic level, and a template does not apply to a client without the attribute. Several devices therefore need
+several numbered sets of attributes, as many as the limits on templates allow.
 
 Sources: Microsoft, "Topic spaces", "Client groups", "Access control for MQTT clients", "MQTT clients" (attributes: text
-below 4 KB in all, names of letters, digits and underscores), "Quotas and limits" (10 topic spaces of 10 templates, 10
-client groups, 100 bindings). What those pages leave open is not relied upon: lists as attributes, wildcards in them,
-whole numbers in templates.
+below 4 KB in total, names of letters, digits and underscores), "Quotas and limits" (10 topic spaces of 10 templates, 10
+client groups, 100 bindings). The code does not use features that these pages do not define: lists as attributes,
+wildcards in attributes, integers in templates.
 """
 
 import functools
@@ -26,192 +26,188 @@ from device_agent.protocol.security.grants import Grant
 from function_app.ports.broker_access import BrokerAccessError
 
 KIND = "kind"
-"""The attribute by which a client is in its group."""
-FUNCTIONS_SAY = "functions-say"
-"""The topic space of what the functions publish, over HTTPS and by a role of Azure's: no client has part in it."""
+"""The attribute that selects the client group."""
+FUNCTIONS_SPACE = "functions-publish"
+"""The topic space to which the functions publish over HTTPS with an Azure role. No client group has access."""
 MAX_SPACES, MAX_TEMPLATES, MAX_GROUPS, MAX_BINDINGS = 10, 10, 10, 100
 MAX_ATTRIBUTES_BYTES = 4096 - 1
 SPACES, DEVICES, STOPS = 3, 4, 6
-"""Most whole spaces, and devices besides, that one connection watches; and devices besides that it may stop."""
+"""Limits of one connection: spaces to watch, single devices to watch, and single devices to stop."""
 
-Permission = Literal["Publisher", "Subscriber"]
-_Said = tuple[Sequence[str], Sequence[str]]
-"""What is published, what is subscribed to."""
+BindingKind = Literal["Publisher", "Subscriber"]
+_Topics = tuple[Sequence[str], Sequence[str]]
+"""Topics to publish, topic filters to subscribe."""
 _VARIABLE = re.compile(r"\$\{client\.attributes\.([A-Za-z0-9_]+)\}")
 
 
 class Binding(NamedTuple):
-    """A group's right to a topic space."""
+    """The permission of a client group on a topic space."""
 
     group: str
     space: str
-    permission: Permission
+    permission: BindingKind
 
 
-class _Family(NamedTuple):
-    """Topics that are given together, so many times over, each time with other attributes."""
+class _Permission(NamedTuple):
+    """Topics that are granted together, up to ``copies`` times with different attributes."""
 
     name: str
     copies: int
     variables: tuple[str, ...]
-    topics: Callable[[Mapping[str, str]], _Said]
+    topics: Callable[[Mapping[str, str]], _Topics]
 
     def attributes(self, copy: int, values: Mapping[str, str]) -> dict[str, str]:
         return {f"{self.name}_{copy}_{variable}": values[variable] for variable in self.variables}
 
-    def templates(self, copy: int) -> _Said:
+    def templates(self, copy: int) -> _Topics:
         names = self.attributes(copy, {variable: variable for variable in self.variables})
         return self.topics({variable: f"${{client.attributes.{name}}}" for name, variable in names.items()})
 
 
-def _of_agent(at: Mapping[str, str]) -> _Said:
-    grant = grants.agent_grant(at["space"], at["agent"], token_id="", lifetime_s=0)
+def _agent_topics(values: Mapping[str, str]) -> _Topics:
+    grant = grants.agent_grant(values["space"], values["agent"], token_id="", lifetime_s=0)
     return grant.publish, grant.subscribe
 
 
-def _of_holder(at: Mapping[str, str]) -> _Said:
-    return [topics.device(at["space"], at["agent"], at["device"], topics.CTL, at["epoch"])], ()
+def _setpoint_topics(values: Mapping[str, str]) -> _Topics:
+    return [topics.device(values["space"], values["agent"], values["device"], topics.CTL, values["epoch"])], ()
 
 
-def _space_stop(at: Mapping[str, str]) -> _Said:
-    return [topics.device(at["space"], topics.ANY, topics.ANY, topics.STOP)], ()
+def _space_stop_topics(values: Mapping[str, str]) -> _Topics:
+    return [topics.device(values["space"], topics.ANY, topics.ANY, topics.STOP)], ()
 
 
-def _device_stop(at: Mapping[str, str]) -> _Said:
-    return [topics.device(at["space"], at["agent"], at["device"], topics.STOP)], ()
+def _device_stop_topics(values: Mapping[str, str]) -> _Topics:
+    return [topics.device(values["space"], values["agent"], values["device"], topics.STOP)], ()
 
 
-def _space_heard(at: Mapping[str, str]) -> _Said:
-    return (), grants.device_subscriptions(at["space"], topics.ANY, topics.ANY)
+def _space_filters(values: Mapping[str, str]) -> _Topics:
+    return (), grants.device_subscriptions(values["space"], topics.ANY, topics.ANY)
 
 
-def _device_heard(at: Mapping[str, str]) -> _Said:
-    return (), grants.device_subscriptions(at["space"], at["agent"], at["device"])
+def _device_filters(values: Mapping[str, str]) -> _Topics:
+    return (), grants.device_subscriptions(values["space"], values["agent"], values["device"])
 
 
 _DEVICE = ("space", "agent", "device")
-_GROUPS: Mapping[str, tuple[str, tuple[_Family, ...]]] = {
-    "agents": ("agent", (_Family("own", 1, ("space", "agent"), _of_agent),)),
-    "people": (
+_GROUPS: Mapping[str, tuple[str, tuple[_Permission, ...]]] = {
+    "agents": ("agent", (_Permission("agent", 1, ("space", "agent"), _agent_topics),)),
+    "accounts": (
         "account",
         (
-            _Family("steers", 1, (*_DEVICE, "epoch"), _of_holder),
-            _Family("stops_all", SPACES, ("space",), _space_stop),
-            _Family("stops", STOPS, _DEVICE, _device_stop),
-            _Family("hears_all", SPACES, ("space",), _space_heard),
-            _Family("hears", DEVICES, _DEVICE, _device_heard),
+            _Permission("control", 1, (*_DEVICE, "epoch"), _setpoint_topics),
+            _Permission("stop_all", SPACES, ("space",), _space_stop_topics),
+            _Permission("stop", STOPS, _DEVICE, _device_stop_topics),
+            _Permission("watch_all", SPACES, ("space",), _space_filters),
+            _Permission("watch", DEVICES, _DEVICE, _device_filters),
         ),
     ),
 }
-"""Group → the kind of its clients, which is how their principals begin; and what they may."""
+"""Client group → kind of its clients (the first part of their principals), and their permissions."""
 
 
 def groups() -> dict[str, str]:
-    """Client group → the query that says who is in it."""
+    """Client group → membership query."""
     return {group: f'attributes.{KIND} = "{kind}"' for group, (kind, _) in _GROUPS.items()}
 
 
 @functools.cache
 def spaces() -> dict[str, tuple[str, ...]]:
     """Topic space → its templates."""
-    found: dict[str, tuple[str, ...]] = {}
-    for group, (_, families) in _GROUPS.items():
-        said, heard = _templates(families)
-        found |= _parted(f"{group}-say", said) | _parted(f"{group}-hear", heard)
-    # Revocations need no topic here: they are rows, which the webhook looks at.
-    ours = tuple(topic for topic in grants.SERVICE_PUBLISH if topic != revocation.TOPIC)
-    return found | _parted(FUNCTIONS_SAY, ours)
+    result: dict[str, tuple[str, ...]] = {}
+    for group, (_, permissions) in _GROUPS.items():
+        publish, subscribe = _templates(permissions)
+        result |= _split(f"{group}-publish", publish) | _split(f"{group}-subscribe", subscribe)
+    # Revocations are rows that the webhook checks, not messages.
+    functions = tuple(topic for topic in grants.SERVICE_PUBLISH if topic != revocation.TOPIC)
+    return result | _split(FUNCTIONS_SPACE, functions)
 
 
 def bindings() -> tuple[Binding, ...]:
-    """Who may say and hear which topic space."""
-    found: list[Binding] = []
-    permissions: tuple[tuple[str, Permission], ...] = (("say", "Publisher"), ("hear", "Subscriber"))
-    for group, (verb, permission) in itertools.product(_GROUPS, permissions):
-        found += [
-            Binding(group, space, permission) for space in spaces() if re.fullmatch(f"{group}-{verb}(-[0-9]+)?", space)
-        ]
-    return tuple(found)
+    """The permissions of all client groups."""
+    kinds: tuple[tuple[str, BindingKind], ...] = (("publish", "Publisher"), ("subscribe", "Subscriber"))
+    return tuple(
+        Binding(group, space, kind)
+        for group, (operation, kind) in itertools.product(_GROUPS, kinds)
+        for space in spaces()
+        if re.fullmatch(f"{group}-{operation}(-[0-9]+)?", space)
+    )
 
 
 def attributes(grant: Grant) -> dict[str, str]:
-    """What a client is to have so that it may exactly what its grant says.
+    """Client attributes that permit exactly what the grant allows.
 
     Raises:
-        BrokerAccessError: The grant names too many topics, or topics that are never granted.
+        BrokerAccessError: The grant names too many topics, or topics without a template.
     """
     kind = grant.principal.partition(":")[0]
-    families = next((families for known, families in _GROUPS.values() if known == kind), ())
-    found = {KIND: kind}
-    for family in families:
-        fitting = list(_fitting(family, grant))
-        if len(fitting) > family.copies:
-            raise BrokerAccessError(
-                "Event Grid takes no rights to so many topics; watch fewer spaces and devices at once"
-            )
-        for copy, values in enumerate(fitting, 1):
-            found |= family.attributes(copy, values)
-    if _granted(families, found) != (frozenset(grant.publish), frozenset(grant.subscribe)):
-        raise BrokerAccessError(
-            f"the topic spaces in Event Grid have no room for what '{grant.principal}' is to be given"
-        )
-    if len(msgspec.json.encode(found)) > MAX_ATTRIBUTES_BYTES:
-        raise BrokerAccessError("Event Grid takes no rights to topics of such long names")
-    return found
+    permissions = next((permissions for each, permissions in _GROUPS.values() if each == kind), ())
+    result = {KIND: kind}
+    for permission in permissions:
+        matches = list(_matches(permission, grant))
+        if len(matches) > permission.copies:
+            raise BrokerAccessError("too many topics for Event Grid; watch fewer spaces and devices at the same time")
+        for copy, values in enumerate(matches, 1):
+            result |= permission.attributes(copy, values)
+    if _granted(permissions, result) != (frozenset(grant.publish), frozenset(grant.subscribe)):
+        raise BrokerAccessError(f"the topic spaces in Event Grid cannot express the grant of '{grant.principal}'")
+    if len(msgspec.json.encode(result)) > MAX_ATTRIBUTES_BYTES:
+        raise BrokerAccessError("the topic names are too long for the client attributes of Event Grid")
+    return result
 
 
-def _granted(families: Iterable[_Family], given: Mapping[str, str]) -> tuple[frozenset[str], frozenset[str]]:
-    """What attributes come to: publish, subscribe."""
-    said, heard = (
+def _granted(permissions: Iterable[_Permission], values: Mapping[str, str]) -> tuple[frozenset[str], frozenset[str]]:
+    """The topics and topic filters that a client with these attributes may use."""
+    publish, subscribe = (
         frozenset(
-            _VARIABLE.sub(lambda found: given[found[1]], template)
+            _VARIABLE.sub(lambda match: values[match[1]], template)
             for template in templates
-            if all(name in given for name in _VARIABLE.findall(template))
+            if all(name in values for name in _VARIABLE.findall(template))
         )
-        for templates in _templates(families)
+        for templates in _templates(permissions)
     )
-    return said, heard
+    return publish, subscribe
 
 
-def _templates(families: Iterable[_Family]) -> _Said:
-    said: list[str] = []
-    heard: list[str] = []
-    for family in families:
-        for copy in range(1, family.copies + 1):
-            publish, subscribe = family.templates(copy)
-            said += publish
-            heard += subscribe
-    return said, heard
+def _templates(permissions: Iterable[_Permission]) -> _Topics:
+    publish: list[str] = []
+    subscribe: list[str] = []
+    for permission in permissions:
+        for copy in range(1, permission.copies + 1):
+            topics_, filters = permission.templates(copy)
+            publish += topics_
+            subscribe += filters
+    return publish, subscribe
 
 
-def _parted(name: str, templates: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """As few topic spaces as hold them all."""
+def _split(name: str, templates: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The templates in as few topic spaces as possible."""
     parts = [tuple(templates[start : start + MAX_TEMPLATES]) for start in range(0, len(templates), MAX_TEMPLATES)]
     return {f"{name}-{number}" if len(parts) > 1 else name: part for number, part in enumerate(parts, 1)}
 
 
-def _fitting(family: _Family, grant: Grant) -> Iterator[dict[str, str]]:
-    """The values with which all topics of a family are in a grant."""
-    shape = family.topics({variable: f"{{{variable}}}" for variable in family.variables})
-    patterns = (grant.publish, grant.subscribe)
-    side = 0 if shape[0] else 1
-    anchor = next(each for each in shape[side] if all(f"{{{variable}}}" in each for variable in family.variables))
-    for pattern in patterns[side]:
+def _matches(permission: _Permission, grant: Grant) -> Iterator[dict[str, str]]:
+    """Variable values for which the grant contains all topics of a permission."""
+    templates = permission.topics({variable: f"{{{variable}}}" for variable in permission.variables})
+    granted = (grant.publish, grant.subscribe)
+    index = 0 if templates[0] else 1
+    variables = [f"{{{variable}}}" for variable in permission.variables]
+    anchor = next(each for each in templates[index] if all(variable in each for variable in variables))
+    for pattern in granted[index]:
         values = _values(anchor, pattern)
         if values is None:
             continue
-        wanted = family.topics(values)
-        if all(set(one) <= set(other) for one, other in zip(wanted, patterns, strict=True)):
+        if all(set(one) <= set(other) for one, other in zip(permission.topics(values), granted, strict=True)):
             yield values
 
 
-def _values(shape: str, pattern: str) -> dict[str, str] | None:
-    """What stands in a pattern where a shape has ``{names}``. Only ids do: no wildcard, no slash, no variable."""
-    wanted, given = shape.split("/"), pattern.split("/")
-    if len(wanted) != len(given):
+def _values(template: str, pattern: str) -> dict[str, str] | None:
+    """The levels of a pattern at the ``{names}`` of a template. Only ids match: no wildcard, slash or variable."""
+    expected, actual = template.split("/"), pattern.split("/")
+    if len(expected) != len(actual):
         return None
     values: dict[str, str] = {}
-    for level, text in zip(wanted, given, strict=True):
+    for level, text in zip(expected, actual, strict=True):
         if level.startswith("{") and topics.is_id(text):
             values[level[1:-1]] = text
         elif level != text:

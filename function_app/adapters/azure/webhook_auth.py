@@ -1,8 +1,8 @@
-"""Who asks our webhook: the namespace's managed identity, by a token of Microsoft Entra's for our application.
+"""Authenticates the caller of the webhook: the namespace's managed identity, with a Microsoft Entra access token.
 
-Checked are signature, issuer, audience, times, and the identity (``oid``): any identity of the tenant may ask Entra
-for a token for our application. Sources: Microsoft, "Custom webhook authentication for MQTT clients" (what a webhook
-has to check), "Access token claims reference" (``aud`` and ``iss`` of versions 1 and 2, ``oid``).
+Signature, issuer, audience, times and identity (``oid``) are checked: any identity of the tenant can get a token for
+this application. Sources: Microsoft, "Custom webhook authentication for MQTT clients" (required checks), "Access token
+claims reference" (``aud`` and ``iss`` of versions 1 and 2, ``oid``).
 """
 
 import asyncio
@@ -17,15 +17,15 @@ AUTHORITY = "https://login.microsoftonline.com"
 ISSUER_V1 = "https://sts.windows.net"
 ALGORITHM = "RS256"
 SKEW_S = 60
-KEPT_S = 3600
-AGAIN_S = 10.0
-"""A key that is not known yet has the keys fetched anew, but not more often."""
-WITHIN_S = 4.0
-"""The namespace waits about five."""
+CACHE_S = 3600
+MIN_REFRESH_S = 10.0
+"""Minimum time between two fetches due to an unknown key id."""
+TIMEOUT_S = 4.0
+"""Event Grid waits about five seconds for the response of the webhook."""
 
 
-class EntraCallers:
-    """Knows one caller, by the object id of its ``identity``. Fetches Entra's keys at the first token.
+class EntraTokenVerifier:
+    """Verifies tokens of one caller, the ``identity`` (object id). Fetches Entra's keys at the first token.
 
     ``audience`` is the application's id URI, ``api://<client id>``, or its client id.
     """
@@ -35,19 +35,19 @@ class EntraCallers:
         self._audiences = sorted({audience, audience.removeprefix("api://")})
         self._issuers = [f"{authority}/{tenant}/v2.0", f"{ISSUER_V1}/{tenant}/"]
         keys = f"{authority}/{tenant}/discovery/v2.0/keys"
-        self._keys = jwt.PyJWKClient(keys, lifespan=KEPT_S, timeout=WITHIN_S)
-        self._fetched_s = -AGAIN_S
+        self._keys = jwt.PyJWKClient(keys, lifespan=CACHE_S, timeout=TIMEOUT_S)
+        self._fetched_s = -MIN_REFRESH_S
         self._lock = asyncio.Lock()
 
-    async def knows(self, token: str) -> bool:
-        """Whether this is the namespace.
+    async def verify(self, token: str) -> bool:
+        """Whether the token is valid and identifies the caller.
 
         Raises:
-            StoreError: Entra's keys cannot be had.
+            StoreError: Entra's keys cannot be fetched.
         """
         try:
-            name = jwt.get_unverified_header(token).get("kid")
-            key = await self._key(name) if isinstance(name, str) else None
+            key_id = jwt.get_unverified_header(token).get("kid")
+            key = await self._key(key_id) if isinstance(key_id, str) else None
             if key is None:
                 return False
             claims: dict[str, Any] = jwt.decode(
@@ -60,21 +60,21 @@ class EntraCallers:
                 options={"require": ["iss", "aud", "exp", "nbf", "oid"]},
             )
         except jwt.PyJWKClientError as error:
-            raise StoreError(f"Microsoft Entra's keys cannot be had: {error}.") from error
+            raise StoreError(f"the keys of Microsoft Entra cannot be fetched: {error}.") from error
         except jwt.PyJWTError:
             return False
         return bool(claims["oid"] == self._identity)
 
-    async def _key(self, name: str) -> Any:
+    async def _key(self, key_id: str) -> Any:
         async with self._lock:
-            found = await self._among(name, refresh=False)
-            if found is None and time.monotonic() - self._fetched_s >= AGAIN_S:
-                found = await self._among(name, refresh=True)
-            return found
+            key = await self._find(key_id, refresh=False)
+            if key is None and time.monotonic() - self._fetched_s >= MIN_REFRESH_S:
+                key = await self._find(key_id, refresh=True)
+            return key
 
-    async def _among(self, name: str, *, refresh: bool) -> Any:
-        known = self._keys.jwk_set_cache
-        if refresh or known is None or known.get() is None:
+    async def _find(self, key_id: str, *, refresh: bool) -> Any:
+        cache = self._keys.jwk_set_cache
+        if refresh or cache is None or cache.get() is None:
             self._fetched_s = time.monotonic()
-        shown = await asyncio.to_thread(self._keys.get_jwk_set, refresh)
-        return next((key.key for key in shown.keys if key.key_id == name), None)
+        key_set = await asyncio.to_thread(self._keys.get_jwk_set, refresh)
+        return next((key.key for key in key_set.keys if key.key_id == key_id), None)

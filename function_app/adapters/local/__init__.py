@@ -1,1 +1,1 @@
-"""One machine or one site: SQLite, files, and a broker of our own."""
+"""Adapters for one machine or one site: SQLite, files, and a local broker."""

@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Atomic file writes."""
 
 import os
 import secrets
@@ -6,24 +6,24 @@ from pathlib import Path
 
 
 def write(path: Path, content: bytes, *, mode: int) -> None:
-    """Write a file, at no moment there in part and at no moment open to more than ``mode`` says.
+    """Replace a file atomically; no other permissions than ``mode`` ever apply.
 
     Raises:
         OSError: It cannot be written.
     """
-    write_beside(path, content, mode=mode).replace(path)
+    write_temporary(path, content, mode=mode).replace(path)
 
 
-def write_beside(path: Path, content: bytes, *, mode: int) -> Path:
-    """What is to become ``path``, safe on the disk under a name of its own; gives that.
+def write_temporary(path: Path, content: bytes, *, mode: int) -> Path:
+    """Write the content for ``path`` to a temporary file next to it, synchronized to disk; returns its path.
 
     Raises:
         OSError: It cannot be written.
     """
-    beside = path.with_name(f"{path.name}.{secrets.token_hex(8)}.new")
-    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    temporary = path.with_name(f"{path.name}.{secrets.token_hex(8)}.new")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     with os.fdopen(descriptor, "wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    return beside
+    return temporary

@@ -1,4 +1,4 @@
-"""Blobs as files. Names are encoded, so that none leaves the folder and every name is a file's name."""
+"""Blobs as files. Names are encoded as valid file names, so that no blob is outside the folder."""
 
 import asyncio
 import base64
@@ -25,13 +25,13 @@ from function_app.ports.blobs import (
 from function_app.ports.tables import StoreError
 
 _PART = 120
-"""An encoded name longer than this is cut into folders: file systems take 255 bytes a name."""
+"""An encoded name longer than this is split into folders: file systems limit a name to 255 bytes."""
 _READABLE = 3 * MAX_NAME_LENGTH
-"""A path has at most 4,096 bytes: what percent signs would make longer than this is written in base64."""
+"""Names whose percent encoding is longer than this are encoded in base64: a path has at most 4,096 bytes."""
 _COMPACT = "~"
-_TAIL = ".blob"
+_SUFFIX = ".blob"
 _TEMPORARY = ".part"
-_LEFT_S = 86_400
+_ABANDONED_S = 86_400
 _READ_BYTES = 1024 * 1024
 _ALGORITHM = "HS256"
 _UPLOAD = "telescope/blobs/upload"
@@ -39,13 +39,13 @@ _DOWNLOAD = "telescope/blobs/download"
 
 
 class FileBlobs:
-    """``Blobs`` in ``folder``. Files are read and written in a thread: a disk may be slow, and blobs are large."""
+    """``Blobs`` in ``folder``. Reads and writes files in threads."""
 
     def __init__(self, folder: Path, *, keys: Callable[[], Sequence[bytes]] | None = None, url: str = "") -> None:
-        """The first of ``keys`` signs addresses below ``url``, at which ``receive`` and ``send`` are to be reached."""
+        """The first of ``keys`` signs presigned URLs below ``url``, where ``receive`` and ``send`` are served."""
         self._folder = folder
-        own = (secrets.token_bytes(32),)
-        self._keys = keys or (lambda: own)
+        random_keys = (secrets.token_bytes(32),)
+        self._keys = keys or (lambda: random_keys)
         self._url = url
 
     async def put(self, name: str, content: bytes) -> None:
@@ -75,34 +75,34 @@ class FileBlobs:
             raise _unusable(path, error) from error
 
     async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
-        """See ``Blobs``. The address is the functions' own."""
+        """See ``Blobs``. The functions serve the URL."""
         check_upload(length)
         self._path(name)
         claims = {"aud": _UPLOAD, "sub": name, "length": length, "type": content_type}
         headers = {"Content-Length": str(length), "Content-Type": content_type}
-        return Upload("PUT", self._address(claims, lifetime_s), headers)
+        return Upload("PUT", self._presigned_url(claims, lifetime_s), headers)
 
     async def presign_download(self, name: str, *, content_type: str, lifetime_s: int) -> str:
         self._path(name)
-        return self._address({"aud": _DOWNLOAD, "sub": name, "type": content_type}, lifetime_s)
+        return self._presigned_url({"aud": _DOWNLOAD, "sub": name, "type": content_type}, lifetime_s)
 
     async def receive(self, token: str, headers: Mapping[str, str], content: AsyncIterator[bytes]) -> None:
         claims = self._claims(token, _UPLOAD)
         length = claims["length"]
         if headers.get("content-length", str(length)) != str(length):
-            raise TransferRefused(403, f"The address is for exactly {length} bytes.")
+            raise TransferRefused(403, f"The URL is for exactly {length} bytes.")
         if headers.get("content-type") != claims["type"]:
-            raise TransferRefused(403, f"The address is for content of the type {claims['type']}.")
+            raise TransferRefused(403, f"The URL is for content of the type {claims['type']}.")
         path = self._path(claims["sub"])
-        await asyncio.to_thread(self._refuse_second, path)
-        await asyncio.to_thread(self._clear)
+        await asyncio.to_thread(self._prepare_upload, path)
+        await asyncio.to_thread(self._delete_abandoned)
         temporary = self._folder / f"{secrets.token_hex(8)}{_TEMPORARY}"
         try:
-            if await self._fill(temporary, content, length) != length:
+            if await self._write(temporary, content, length) != length:
                 raise TransferRefused(400, f"The body must have {length} bytes.")
             await asyncio.to_thread(os.link, temporary, path)
         except FileExistsError as error:
-            raise _there_already() from error
+            raise _exists_already() from error
         except OSError as error:
             raise _unusable(path, error) from error
         finally:
@@ -115,50 +115,50 @@ class FileBlobs:
         try:
             file = await asyncio.to_thread(path.open, "rb")
         except FileNotFoundError as error:
-            raise TransferRefused(404, "There is nothing at this address any more.") from error
+            raise TransferRefused(404, "The blob does not exist.") from error
         except OSError as error:
             raise _unusable(path, error) from error
         return Download(_parts(file), os.fstat(file.fileno()).st_size, claims["type"])
 
-    def _address(self, claims: dict[str, Any], lifetime_s: int) -> str:
+    def _presigned_url(self, claims: dict[str, Any], lifetime_s: int) -> str:
         token = jwt.encode({**claims, "exp": time.time() + lifetime_s}, self._keys()[0], _ALGORITHM)
         return f"{self._url}/{token}"
 
     def _claims(self, token: str, audience: str) -> dict[str, Any]:
-        why: Exception | None = None
+        cause: Exception | None = None
         for key in self._keys():
             try:
                 claims: dict[str, Any] = jwt.decode(
                     token, key, [_ALGORITHM], audience=audience, options={"require": ["exp", "aud", "sub"]}
                 )
             except (jwt.PyJWTError, ValueError) as error:
-                why = error
+                cause = error
             else:
                 return claims
-        raise TransferRefused(403, "The address is not one of ours, or is over. Ask for a new one.") from why
+        raise TransferRefused(403, "The URL is invalid or expired. Request a new one.") from cause
 
     @staticmethod
-    def _refuse_second(path: Path) -> None:
+    def _prepare_upload(path: Path) -> None:
         if path.exists():
-            raise _there_already()
+            raise _exists_already()
         path.parent.mkdir(parents=True, exist_ok=True)
 
-    def _clear(self) -> None:
-        """Delete what uploads have left that were cut off by the end of a process."""
+    def _delete_abandoned(self) -> None:
+        """Delete temporary files of interrupted uploads."""
         for path in self._folder.glob(f"*{_TEMPORARY}"):
             with contextlib.suppress(OSError):
-                if time.time() - path.stat().st_mtime > _LEFT_S:
+                if time.time() - path.stat().st_mtime > _ABANDONED_S:
                     path.unlink()
 
     @staticmethod
-    async def _fill(path: Path, content: AsyncIterator[bytes], most: int) -> int:
-        """Write at most ``most`` bytes of the content. Returns how many were received."""
+    async def _write(path: Path, content: AsyncIterator[bytes], max_length: int) -> int:
+        """Write at most ``max_length`` bytes of the content; returns the number of received bytes."""
         length = 0
         file = await asyncio.to_thread(path.open, "xb")
         try:
             async for part in content:
                 length += len(part)
-                if length > most:
+                if length > max_length:
                     break
                 await asyncio.to_thread(file.write, part)
             await asyncio.to_thread(_flush, file)
@@ -173,7 +173,7 @@ class FileBlobs:
         check_name(name)
         encoded = _encode(name)
         parts = [encoded[start : start + _PART] for start in range(0, len(encoded), _PART)]
-        return self._folder.joinpath(*(f"{part}+" for part in parts[:-1]), parts[-1] + _TAIL)
+        return self._folder.joinpath(*(f"{part}+" for part in parts[:-1]), parts[-1] + _SUFFIX)
 
     def _put(self, path: Path, content: bytes) -> None:
         temporary = self._folder / f"{secrets.token_hex(8)}{_TEMPORARY}"
@@ -221,9 +221,9 @@ class FileBlobs:
 
     def _list(self, prefix: str, limit: int) -> tuple[str, ...]:
         names = []
-        for path in self._folder.rglob(f"*{_TAIL}"):
+        for path in self._folder.rglob(f"*{_SUFFIX}"):
             *folders, last = path.relative_to(self._folder).parts
-            name = _decode("".join(part.removesuffix("+") for part in folders) + last.removesuffix(_TAIL))
+            name = _decode("".join(part.removesuffix("+") for part in folders) + last.removesuffix(_SUFFIX))
             if name.startswith(prefix):
                 names.append(name)
         return tuple(sorted(names)[:limit])
@@ -242,12 +242,12 @@ def _flush(file: BinaryIO) -> None:
     os.fsync(file.fileno())
 
 
-def _there_already() -> TransferRefused:
-    return TransferRefused(409, "There is a blob at this address already; it is not written over.")
+def _exists_already() -> TransferRefused:
+    return TransferRefused(409, "The blob exists already and cannot be replaced.")
 
 
 def _encode(name: str) -> str:
-    """A name in characters that every file system takes: readable where it stays short enough."""
+    """A name in characters that every file system accepts; percent-encoded if short enough."""
     text = name.encode()
     readable = quote(text, safe="").replace(".", "%2E").replace(_COMPACT, "%7E")
     if len(readable) <= _READABLE:

@@ -1,4 +1,4 @@
-"""Broker rights: signed tokens for the embedded broker, clients and roles written into a site's mosquitto."""
+"""Broker permissions: signed tokens for the embedded broker, or clients and roles in mosquitto."""
 
 import asyncio
 import math
@@ -24,13 +24,13 @@ from device_agent.protocol.security.revocation import Control, Revoke
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials, check_revocation
 
 Publish = Callable[[str, bytes], Awaitable[None]]
-"""Publishes as a service at QoS 1 and returns once the broker has acknowledged; raises when it has not."""
+"""Publishes as a service at QoS 1; returns when the broker has acknowledged the message, otherwise raises."""
 
 _SERVICE_TOKEN_S = 24 * 3_600.0
 _SECURITY = "$CONTROL/dynamic-security/v1"
-_ANSWERS = f"{_SECURITY}/response"
-_ANSWER_S = 10.0
-_COMMANDS_AT_ONCE = 100
+_RESPONSES = f"{_SECURITY}/response"
+_TIMEOUT_S = 10.0
+_MAX_COMMANDS = 100
 
 
 def _service_client_id() -> str:
@@ -38,33 +38,33 @@ def _service_client_id() -> str:
 
 
 class TokenBrokerAccess:
-    """Rights for the embedded broker: the grant itself, signed. The broker needs the public key alone."""
+    """Permissions for the embedded broker: a signed grant. The broker verifies it with the public key."""
 
     def __init__(self, *, signer: Callable[[], Ed25519PrivateKey], publish: Publish) -> None:
-        """``signer`` returns the current key, which the broker knows; ``publish`` sends revocations."""
+        """``signer`` returns the current signing key; ``publish`` sends revocations."""
         self._signer = signer
         self._publish = publish
 
     async def issue(self, grant: Grant) -> Credentials:
-        """As the port says; no broker is asked."""
+        """See ``BrokerAccess``. Makes no request."""
         grants.check(grant)
         return Credentials(grant.principal, grants.issue(grant, self._signer()))
 
     def accepts(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:  # noqa: ARG002
-        """As the port says: a token has no bound of its own."""
+        """See ``BrokerAccess``. The embedded broker has no limit."""
         return True
 
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
-        """As the port says; tokens made until now are refused, by the clock that stamps them."""
+        """See ``BrokerAccess``. The broker rejects tokens with an earlier timestamp."""
         check_revocation(client_id, principal)
         message = Control(revoke=Revoke(client_id=client_id, principal=principal, before_s=time.time()))
         try:
             await self._publish(revocation.TOPIC, codec.encode(message))
         except Exception as error:
-            raise BrokerAccessError(f"the broker could not be told of a revocation: {error}") from error
+            raise BrokerAccessError(f"a revocation could not be published to the broker: {error}") from error
 
     async def expire(self, now_s: float) -> None:
-        """Nothing: the broker ends connections with their tokens."""
+        """Does nothing: the broker disconnects clients whose tokens expire."""
 
     def service_credentials(self) -> ServiceCredentials:
         client_id = _service_client_id()
@@ -74,11 +74,11 @@ class TokenBrokerAccess:
         )
 
     async def close(self) -> None:
-        """Nothing is open."""
+        """Does nothing."""
 
 
 class _Entry(NamedTuple):
-    """What a user name in mosquitto says; the role of the same name holds its topics."""
+    """The parts of a username in mosquitto. The role with the same name contains the topics."""
 
     username: str
     principal: str
@@ -86,39 +86,38 @@ class _Entry(NamedTuple):
     expires_at: int
 
 
-class _Answer(msgspec.Struct, frozen=True, rename={"question": "correlationData"}):
-    """One answer of the dynamic security plugin."""
+class _Response(msgspec.Struct, frozen=True, rename={"request_id": "correlationData"}):
+    """The response of the dynamic security plugin to one command."""
 
     command: str = ""
-    question: str = ""
+    request_id: str = ""
     error: str = ""
     data: dict[str, Any] = {}
 
 
-class _Answers(msgspec.Struct, frozen=True):
-    """All answers to one message."""
+class _Responses(msgspec.Struct, frozen=True):
+    """The responses to all commands of one message."""
 
-    responses: list[_Answer]
+    responses: list[_Response]
 
 
 class MosquittoBrokerAccess:
-    """Rights in mosquitto's dynamic security: for each grant a client bound to the client id, and a role of its own.
+    """Permissions in mosquitto's dynamic security plugin: for each grant a client with a client id, and a role.
 
-    The user name says all there is to know, ``principal/client id/end/token id``, so that any instance can find what to
-    revoke and what has run out by listing names, and renewing an agent's credentials does not touch its connection
-    (the plugin cuts a client whose password is changed).
+    The username is ``principal/client id/expiration/token id``, so that any instance finds revoked and expired grants
+    by listing usernames. Renewed credentials are a new client: the plugin disconnects a client whose password changes.
     """
 
     def __init__(
         self, *, host: str, port: int, username: str, password_file: Path, tls: ssl.SSLContext | None = None
     ) -> None:
-        """``username`` is the client that the broker's configuration made for the functions."""
+        """``username`` is the functions' client in the broker's configuration."""
         self._username = username
         self._password_file = password_file
-        self._line = _ControlLine(host, port, tls)
+        self._control = _ControlConnection(host, port, tls)
 
     async def issue(self, grant: Grant) -> Credentials:
-        """As the port says; role and client are made in one message, the role first."""
+        """See ``BrokerAccess``. One message creates the role and the client."""
         grants.check(grant)
         if "/" in grant.principal or "/" in grant.token_id:
             raise ProtocolError("a principal and a token id have no slash")
@@ -132,18 +131,18 @@ class MosquittoBrokerAccess:
             "clientid": grant.client_id,
             "roles": [{"rolename": username}],
         }
-        for answer in await self._ask([role, client]):
-            if answer.error:
+        for response in await self._execute([role, client]):
+            if response.error:
                 await self._delete([username])
-                raise BrokerAccessError(f"mosquitto refused to {answer.command}: {answer.error}")
+                raise BrokerAccessError(f"mosquitto rejected {response.command}: {response.error}")
         return Credentials(username, password)
 
     def accepts(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:  # noqa: ARG002
-        """As the port says: a role has none."""
+        """See ``BrokerAccess``. Roles have no limit."""
         return True
 
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
-        """As the port says; deleting a client cuts its connection."""
+        """See ``BrokerAccess``. Mosquitto disconnects a deleted client."""
         check_revocation(client_id, principal)
         entries = await self._entries()
         await self._delete(
@@ -158,7 +157,7 @@ class MosquittoBrokerAccess:
         await self._delete([entry.username for entry in await self._entries() if entry.expires_at <= now_s])
 
     def service_credentials(self) -> ServiceCredentials:
-        """As the port says; mosquitto's own client for the functions, with another client id each time."""
+        """See ``BrokerAccess``. The functions' client in mosquitto, with a new client id for each call."""
         try:
             password = self._password_file.read_text().strip()
         except OSError as error:
@@ -169,39 +168,39 @@ class MosquittoBrokerAccess:
         return ServiceCredentials(_service_client_id(), self._username, password, math.inf)
 
     async def close(self) -> None:
-        await self._line.close()
+        await self._control.close()
 
     async def _entries(self) -> list[_Entry]:
-        """Every client that ``issue`` made, by any instance."""
-        answer = (await self._ask([{"command": "listClients", "verbose": False, "count": -1, "offset": 0}]))[0]
-        if answer.error:
-            raise BrokerAccessError(f"mosquitto refused to list its clients: {answer.error}")
+        """All clients that ``issue`` created in any instance."""
+        response = (await self._execute([{"command": "listClients", "verbose": False, "count": -1, "offset": 0}]))[0]
+        if response.error:
+            raise BrokerAccessError(f"mosquitto rejected listClients: {response.error}")
         entries = []
-        for username in answer.data.get("clients", []):
+        for username in response.data.get("clients", []):
             match username.split("/"):
                 case [principal, client_id, end, _] if end.isdecimal():
                     entries.append(_Entry(username, principal, client_id, int(end)))
         return entries
 
     async def _delete(self, usernames: list[str]) -> None:
-        """Delete clients and their roles; those that are gone already, by another instance, are no error."""
+        """Delete clients and their roles. No error if another instance has deleted them."""
         commands: list[Mapping[str, Any]] = []
         for username in usernames:
             commands += [
                 {"command": "deleteClient", "username": username},
                 {"command": "deleteRole", "rolename": username},
             ]
-        for start in range(0, len(commands), _COMMANDS_AT_ONCE):
-            for answer in await self._ask(commands[start : start + _COMMANDS_AT_ONCE]):
-                if answer.error and "not found" not in answer.error:
-                    raise BrokerAccessError(f"mosquitto refused to {answer.command}: {answer.error}")
+        for start in range(0, len(commands), _MAX_COMMANDS):
+            for response in await self._execute(commands[start : start + _MAX_COMMANDS]):
+                if response.error and "not found" not in response.error:
+                    raise BrokerAccessError(f"mosquitto rejected {response.command}: {response.error}")
 
-    async def _ask(self, commands: Sequence[Mapping[str, Any]]) -> list[_Answer]:
-        return await self._line.ask(self.service_credentials, commands)
+    async def _execute(self, commands: Sequence[Mapping[str, Any]]) -> list[_Response]:
+        return await self._control.execute(self.service_credentials, commands)
 
 
-class _ControlLine:
-    """One warm connection to the dynamic security plugin, made when it is needed and made anew after it broke."""
+class _ControlConnection:
+    """A persistent connection to the dynamic security plugin. Connects on demand, also after a disconnection."""
 
     def __init__(self, host: str, port: int, tls: ssl.SSLContext | None) -> None:
         self._tls = tls
@@ -209,38 +208,38 @@ class _ControlLine:
         self._port = port
         self._client: paho.Client | None = None
         self._opening = asyncio.Lock()
-        self._waiting: dict[str, asyncio.Future[_Answers]] = {}
+        self._waiting: dict[str, asyncio.Future[_Responses]] = {}
 
-    async def ask(
+    async def execute(
         self, service: Callable[[], ServiceCredentials], commands: Sequence[Mapping[str, Any]]
-    ) -> list[_Answer]:
-        """The answers to some commands, in their order.
+    ) -> list[_Response]:
+        """Execute commands and return their responses, in order.
 
         Raises:
-            BrokerAccessError: No connection, or no answer in time; the commands may have been executed.
+            BrokerAccessError: No connection or no response in time; the commands may have been executed.
         """
         loop = asyncio.get_running_loop()
-        question = secrets.token_hex(8)
-        payload = msgspec.json.encode({"commands": [{**each, "correlationData": question} for each in commands]})
+        request_id = secrets.token_hex(8)
+        payload = msgspec.json.encode({"commands": [{**each, "correlationData": request_id} for each in commands]})
         try:
-            async with asyncio.timeout(_ANSWER_S):
+            async with asyncio.timeout(_TIMEOUT_S):
                 async with self._opening:
                     if self._client is None or not self._client.is_connected():
                         await self._open(service())
-                self._waiting[question] = loop.create_future()
+                self._waiting[request_id] = loop.create_future()
                 if self._client is not None:
                     self._client.publish(_SECURITY, payload, qos=1)
-                answers = (await self._waiting[question]).responses
+                responses = (await self._waiting[request_id]).responses
         except TimeoutError as error:
             await self.close()
             raise BrokerAccessError(
-                f"mosquitto at {self._host}:{self._port} did not answer in {_ANSWER_S} s"
+                f"mosquitto at {self._host}:{self._port} did not answer in {_TIMEOUT_S} s"
             ) from error
         finally:
-            self._waiting.pop(question, None)
-        if len(answers) != len(commands):
-            raise BrokerAccessError(f"mosquitto gave {len(answers)} answers to {len(commands)} commands")
-        return answers
+            self._waiting.pop(request_id, None)
+        if len(responses) != len(commands):
+            raise BrokerAccessError(f"mosquitto returned {len(responses)} responses to {len(commands)} commands")
+        return responses
 
     async def close(self) -> None:
         """Disconnect."""
@@ -259,26 +258,26 @@ class _ControlLine:
         client.username_pw_set(service.username, service.password)
         if self._tls is not None:
             client.tls_set_context(self._tls)
-        client.connect_timeout = _ANSWER_S
+        client.connect_timeout = _TIMEOUT_S
 
         def connected(_: Any, __: Any, ___: Any, reason: ReasonCode, ____: Any) -> None:
             if reason.is_failure:
-                loop.call_soon_threadsafe(_fail, ready, f"mosquitto refuses the functions: {reason}")
+                loop.call_soon_threadsafe(_fail, ready, f"mosquitto rejected the connection of the functions: {reason}")
             else:
-                client.subscribe(_ANSWERS, qos=1)
+                client.subscribe(_RESPONSES, qos=1)
 
         def subscribed(*_: Any) -> None:
             loop.call_soon_threadsafe(_settle, ready, None)
 
-        def answered(_: Any, __: Any, message: paho.MQTTMessage) -> None:
-            loop.call_soon_threadsafe(self._take, message.payload)
+        def received(_: Any, __: Any, message: paho.MQTTMessage) -> None:
+            loop.call_soon_threadsafe(self._receive, message.payload)
 
         def disconnected(_: Any, __: Any, ___: Any, reason: ReasonCode, ____: Any) -> None:
-            loop.call_soon_threadsafe(self._broken, ready, f"the connection to mosquitto broke: {reason}")
+            loop.call_soon_threadsafe(self._fail_all, ready, f"the connection to mosquitto was lost: {reason}")
 
         client.on_connect, client.on_subscribe = connected, subscribed
-        client.on_message, client.on_disconnect = answered, disconnected
-        client.on_socket_open = _send_at_once
+        client.on_message, client.on_disconnect = received, disconnected
+        client.on_socket_open = _set_no_delay
         try:
             await asyncio.to_thread(client.connect, self._host, self._port, 30)
         except OSError as error:
@@ -287,19 +286,19 @@ class _ControlLine:
         client.loop_start()
         await ready
 
-    def _take(self, payload: bytes | bytearray) -> None:
+    def _receive(self, payload: bytes | bytearray) -> None:
         try:
-            answers = msgspec.json.decode(payload, type=_Answers)
+            message = msgspec.json.decode(payload, type=_Responses)
         except msgspec.MsgspecError:
             return  # not a response; the caller times out and reports it
-        question = answers.responses[0].question if answers.responses else ""
-        if question in self._waiting:
-            _settle(self._waiting[question], answers)
+        request_id = message.responses[0].request_id if message.responses else ""
+        if request_id in self._waiting:
+            _settle(self._waiting[request_id], message)
 
-    def _broken(self, ready: asyncio.Future[None], why: str) -> None:
-        _fail(ready, why)
+    def _fail_all(self, ready: asyncio.Future[None], reason: str) -> None:
+        _fail(ready, reason)
         for future in self._waiting.values():
-            _fail(future, why)
+            _fail(future, reason)
 
 
 def _acls(grant: Grant) -> list[dict[str, Any]]:
@@ -309,8 +308,8 @@ def _acls(grant: Grant) -> list[dict[str, Any]]:
     return [{"acltype": kind, "topic": topic, "priority": 0, "allow": True} for kind, topic in acls]
 
 
-def _send_at_once(_: Any, __: Any, opened: Any) -> None:
-    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+def _set_no_delay(_: Any, __: Any, connection: Any) -> None:
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 def _settle(future: asyncio.Future[Any], value: Any) -> None:
@@ -318,6 +317,6 @@ def _settle(future: asyncio.Future[Any], value: Any) -> None:
         future.set_result(value)
 
 
-def _fail(future: asyncio.Future[Any], why: str) -> None:
+def _fail(future: asyncio.Future[Any], reason: str) -> None:
     if not future.done():
-        future.set_exception(BrokerAccessError(why))
+        future.set_exception(BrokerAccessError(reason))

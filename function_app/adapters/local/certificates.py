@@ -1,6 +1,7 @@
-"""A site's authority for agents, in files that ``python -m infra.tls --devices`` has made; mosquitto reads two of them.
+"""The certificate authority for agents of a site, in files that ``python -m infra.tls --devices`` creates.
 
-``devices-ca.crt`` and ``devices-ca.key``, ``devices.crl`` with what is revoked, ``devices.json`` with what was issued.
+The files are ``devices-ca.crt`` and ``devices-ca.key``, the revocation list ``devices.crl``, and ``devices.json`` with
+the issued certificates. Mosquitto reads the CA certificate and the revocation list.
 """
 
 import asyncio
@@ -20,33 +21,33 @@ CA_CERTIFICATE, CA_KEY, REVOKED, LEDGER = "devices-ca.crt", "devices-ca.key", "d
 _LOCK = "devices.lock"
 DAYS = 397
 _SKEW = dt.timedelta(minutes=5)
-"""The broker's clock may be behind."""
+"""Maximum lag of the broker's clock."""
 
 
 class NoCertificates:
-    """``Certificates`` where the broker wants none."""
+    """``Certificates`` for a broker without client certificates."""
 
-    wanted = False
+    required = False
 
     async def issue(self, agent: str, request: str) -> Issued:
-        """Never asked for."""
+        """Always raises."""
         del agent, request
-        raise BrokerAccessError("the broker wants no certificates of agents")
+        raise BrokerAccessError("the broker requires no client certificates")
 
-    async def place(self, agent: str, space: str) -> None:
-        """There are none."""
+    async def set_space(self, agent: str, space: str) -> None:
+        """Does nothing."""
 
     async def revoke(self, agent: str) -> None:
-        """There are none."""
+        """Does nothing."""
 
     async def close(self) -> None:
-        """Nothing is open."""
+        """Does nothing."""
 
 
 class FileCertificates:
-    """``Certificates`` in ``folder``. One process at a time changes them, by a lock."""
+    """``Certificates`` in ``folder``. A lock serializes changes of several processes."""
 
-    wanted = True
+    required = True
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -54,14 +55,14 @@ class FileCertificates:
     async def issue(self, agent: str, request: str) -> Issued:
         return await asyncio.to_thread(self._issue, agent, request)
 
-    async def place(self, agent: str, space: str) -> None:
-        """Nothing: at mosquitto credentials say which space."""
+    async def set_space(self, agent: str, space: str) -> None:
+        """Does nothing: the roles in mosquitto contain the space."""
 
     async def revoke(self, agent: str) -> None:
         await asyncio.to_thread(self._revoke, agent)
 
     async def close(self) -> None:
-        """Nothing is open."""
+        """Does nothing."""
 
     def _issue(self, agent: str, text: str) -> Issued:
         from cryptography import x509  # noqa: PLC0415 (only where certificates are in use)
@@ -69,13 +70,13 @@ class FileCertificates:
         from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID  # noqa: PLC0415
 
         request = csr.read(text)
-        with self._changing() as ledger:
+        with self._ledger() as ledger:
             authority, signer = self._authority()
             now = dt.datetime.now(dt.UTC)
             end = min(now + dt.timedelta(days=DAYS), authority.not_valid_after_utc)
             serial = x509.random_serial_number()
             ledger.setdefault(agent, []).append({"serial": str(serial), "revoked_at": None})
-            made = (
+            certificate = (
                 x509.CertificateBuilder()
                 .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, agent)]))
                 .issuer_name(authority.subject)
@@ -88,32 +89,32 @@ class FileCertificates:
                 .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
                 .sign(signer, hashes.SHA256())
             )
-        chain = made.public_bytes(serialization.Encoding.PEM).decode()
+        chain = certificate.public_bytes(serialization.Encoding.PEM).decode()
         return Issued(chain, int(end.timestamp() * 1000))
 
     def _revoke(self, agent: str) -> None:
         from cryptography import x509  # noqa: PLC0415
         from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415
 
-        with self._changing() as ledger:
+        with self._ledger() as ledger:
             now = dt.datetime.now(dt.UTC)
             for entry in ledger.get(agent, []):
                 entry["revoked_at"] = entry["revoked_at"] or now.isoformat()
             authority, signer = self._authority()
-            listed = (
+            revocations = (
                 x509.CertificateRevocationListBuilder()
                 .issuer_name(authority.subject)
                 .last_update(now)
                 .next_update(authority.not_valid_after_utc)  # an expired list would reject every client
             )
             for entry in (entry for entries in ledger.values() for entry in entries if entry["revoked_at"]):
-                listed = listed.add_revoked_certificate(
+                revocations = revocations.add_revoked_certificate(
                     x509.RevokedCertificateBuilder()
                     .serial_number(int(entry["serial"]))
                     .revocation_date(dt.datetime.fromisoformat(entry["revoked_at"]))
                     .build()
                 )
-            content = listed.sign(signer, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+            content = revocations.sign(signer, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
             atomic_files.write(self._folder / REVOKED, content, mode=0o644)
 
     def _authority(self) -> tuple[Any, Any]:
@@ -125,8 +126,8 @@ class FileCertificates:
         return certificate, key
 
     @contextlib.contextmanager
-    def _changing(self) -> Iterator[dict[str, list[dict[str, Any]]]]:
-        """What was issued, by agent; written down at the end of the ``with``."""
+    def _ledger(self) -> Iterator[dict[str, list[dict[str, Any]]]]:
+        """The issued certificates by agent, under a lock. Stores them at the end of the ``with`` block."""
         import sqlite3  # noqa: PLC0415 (only where something is written)
 
         try:
@@ -139,5 +140,5 @@ class FileCertificates:
         except (OSError, ValueError, sqlite3.Error) as error:
             raise BrokerAccessError(
                 f"the authority for agents in {self._folder} cannot be used: {error}; "
-                "`python -m infra.tls --devices` makes one"
+                "`python -m infra.tls --devices` creates one"
             ) from error

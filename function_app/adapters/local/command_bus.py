@@ -1,4 +1,4 @@
-"""Commands and acks over one warm MQTT connection."""
+"""Commands and acks over one persistent MQTT connection."""
 
 import asyncio
 import contextlib
@@ -51,7 +51,7 @@ class MqttCommandBus:
 
     async def status(self) -> str:
         await self._connection.attempted(_READY_S)
-        return self._connection.trouble or "ok"
+        return self._connection.problem or "ok"
 
     async def close(self) -> None:
         await self._connection.close()
@@ -64,13 +64,13 @@ class MqttCommandBus:
         try:
             ack = codec.decode(bytes(message.payload), Ack)
         except ProtocolError:
-            return  # the ingest worker says so in the log
+            return  # the ingest worker logs it
         for queue in waiting.get(ack.id, ()):
             queue.put_nowait(ack)
 
 
 class _Acks(AsyncIterator[Ack]):
-    """Acks as they come. Not a generator: that would end with the first wait that is given up."""
+    """Acks in order of arrival. Not a generator: cancelling a wait would end a generator."""
 
     def __init__(self, queue: asyncio.Queue[Ack]) -> None:
         self._queue = queue

@@ -1,4 +1,4 @@
-"""Commands, Stop and setpoints to chosen agents, heard on the broker."""
+"""Subscribes to commands, Stop and setpoints for chosen agents."""
 
 import asyncio
 import secrets
@@ -18,21 +18,21 @@ LIFETIME_S = 24 * 3600.0
 
 
 class MqttCommandFeed:
-    """``CommandFeed`` over MQTT, by a connection with rights of its own."""
+    """``CommandFeed`` over a separate MQTT connection with its own permissions."""
 
     def __init__(self, *, host: str, port: int, access: BrokerAccess, tls: ssl.SSLContext | None = None) -> None:
-        self._hear: OnMessage | None = None
-        self._wanted: dict[tuple[str, str], tuple[str, ...]] = {}
+        self._on_message: OnMessage | None = None
+        self._filters: dict[tuple[str, str], tuple[str, ...]] = {}
         self._connection = MqttConnection(
-            Broker(host=host, port=port, credentials=_credentials(access), tls=tls), receive=self._arrived
+            Broker(host=host, port=port, credentials=_credentials(access), tls=tls), receive=self._receive
         )
 
     @property
     def up(self) -> bool:
-        return not self._connection.trouble
+        return not self._connection.problem
 
-    async def run(self, hear: OnMessage) -> None:
-        self._hear = hear
+    async def run(self, on_message: OnMessage) -> None:
+        self._on_message = on_message
         self._connection.start()
         try:
             await asyncio.Event().wait()
@@ -41,22 +41,22 @@ class MqttCommandFeed:
 
     async def add(self, space: str, agent: str, listen: Sequence[str] = ()) -> None:
         self.drop(space, agent)
-        wanted = (*_patterns(space, agent), *listen)
-        fresh = [pattern for pattern in dict.fromkeys(wanted) if not self._heard(pattern)]
-        self._wanted[space, agent] = wanted
-        await self._connection.subscribe(fresh)
+        filters = (*_patterns(space, agent), *listen)
+        new = [pattern for pattern in dict.fromkeys(filters) if not self._is_used(pattern)]
+        self._filters[space, agent] = filters
+        await self._connection.subscribe(new)
 
     def drop(self, space: str, agent: str) -> None:
-        gone = self._wanted.pop((space, agent), ())
-        self._connection.unsubscribe([pattern for pattern in gone if not self._heard(pattern)])
+        removed = self._filters.pop((space, agent), ())
+        self._connection.unsubscribe([pattern for pattern in removed if not self._is_used(pattern)])
 
-    def _heard(self, pattern: str) -> bool:
-        return any(pattern in wanted for wanted in self._wanted.values())
+    def _is_used(self, pattern: str) -> bool:
+        return any(pattern in filters for filters in self._filters.values())
 
-    def _arrived(self, message: MQTTMessage) -> None:
-        # An order that a broker kept is not an order of now.
-        if self._hear is not None and not message.retain:
-            self._hear(message.topic, bytes(message.payload))
+    def _receive(self, message: MQTTMessage) -> None:
+        # A retained command is outdated.
+        if self._on_message is not None and not message.retain:
+            self._on_message(message.topic, bytes(message.payload))
 
 
 def _patterns(space: str, agent: str) -> tuple[str, ...]:
@@ -69,11 +69,11 @@ def _patterns(space: str, agent: str) -> tuple[str, ...]:
 
 
 def _credentials(access: BrokerAccess) -> Callable[[], Awaitable[ServiceCredentials]]:
-    async def issued() -> ServiceCredentials:
+    async def issue() -> ServiceCredentials:
         grant = grants.gateway_grant(
-            client_id=f"speaker-{secrets.token_hex(8)}", token_id=secrets.token_hex(16), lifetime_s=LIFETIME_S
+            client_id=f"gateway-{secrets.token_hex(8)}", token_id=secrets.token_hex(16), lifetime_s=LIFETIME_S
         )
-        given = await access.issue(grant)
-        return ServiceCredentials(grant.client_id, given.username, given.password, float(grant.expires_at))
+        issued = await access.issue(grant)
+        return ServiceCredentials(grant.client_id, issued.username, issued.password, float(grant.expires_at))
 
-    return issued
+    return issue

@@ -1,4 +1,4 @@
-"""Messages of devices, from MQTT subscriptions of the server's own."""
+"""Messages of devices from MQTT subscriptions of the server."""
 
 import asyncio
 import logging
@@ -103,13 +103,13 @@ class MqttDeviceFeed:
 
 
 class MqttTelemetryFeed:
-    """``TelemetryFeed`` over a connection of its own, so that queued measurements delay no ack.
+    """``TelemetryFeed`` over a separate connection, so that queued measurements do not delay acks.
 
     Args:
-        broker: Where to connect.
+        broker: The broker.
         late: Subscribe to measurements that were taken while an agent was offline. They are acknowledged after storage
-            and retried without limit: agents keep what is not acknowledged. Live measurements are dropped instead,
-            after some attempts or if too many wait.
+            and retried without limit: agents store them until acknowledgement. Live measurements are dropped after
+            some attempts or if too many wait.
     """
 
     def __init__(self, broker: Broker, *, late: bool = False) -> None:
@@ -146,7 +146,7 @@ class MqttTelemetryFeed:
             await self._connection.close()
 
     async def store(self, batch: list[tuple[str, bytes]], handler: BatchHandler) -> None:
-        """Store one batch, with the attempts that its kind of measurement gets."""
+        """Store one batch. Late telemetry is retried without limit."""
         what = f"{len(batch)} messages of {'late ' if self._late else ''}telemetry"
         pauses_s = repeat(COLLECT_S) if self._late else repeat(COLLECT_S, TELEMETRY_TRIES)
         if not await _store(lambda: handler(batch), what, pauses_s):

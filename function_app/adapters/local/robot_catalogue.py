@@ -13,7 +13,7 @@ from function_app.ports.robot_catalogue import BuiltInMovement
 from function_app.ports.tables import StoreError
 
 DRAWING = "drawing.json"
-"""In each type's folder; made by ``python -m robots.draw``."""
+"""File in each type's folder, created by ``python -m robots.draw``."""
 _SUFFIXES = frozenset({".toml", ".xml", ".stl", ".obj", ".png", ".md", ".py"})
 
 
@@ -48,12 +48,12 @@ class FolderCatalogue:
         return self._files[robot_type]
 
     async def movements(self, robot_type: str) -> Mapping[str, BuiltInMovement]:
-        known = (await self.types()).get(robot_type)
-        if known is None:
+        robot = (await self.types()).get(robot_type)
+        if robot is None:
             return {}
         if robot_type not in self._movements:
             scripts = sorted((self._folder / robot_type / manifest.MOVEMENTS).glob("*.py"))
-            self._movements[robot_type] = {path.stem: _read(path, known.version) for path in scripts}
+            self._movements[robot_type] = {path.stem: _read(path, robot.version) for path in scripts}
         return self._movements[robot_type]
 
     async def drawing(self, robot_type: str) -> bytes | None:
@@ -74,7 +74,7 @@ def _read(path: Path, version: int) -> BuiltInMovement:
     except (OSError, ValueError, SyntaxError) as error:
         raise StoreError(f"{path}: {error}") from error
     if not is_id(path.stem):
-        raise StoreError(f"{path}: a movement's name has letters, digits, _ and -, 1 to 64 of them")
+        raise StoreError(f"{path}: a movement's name has 1 to 64 letters, digits, _ and -")
     return BuiltInMovement(
         name=path.stem,
         description=docstring.partition("\n")[0],

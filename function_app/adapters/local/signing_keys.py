@@ -1,7 +1,7 @@
 """Signing keys in files: ``ring.json`` (mode 0600), and ``public.json``, which the embedded broker reads.
 
-Each call looks whether the file is still the one that was read, which costs microseconds: another process's rotation
-is followed at once.
+Each call checks whether the file has changed, which takes microseconds, so that a rotation by another process takes
+effect immediately.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from function_app.ports.tables import StoreError
 RING = "ring.json"
 PUBLIC = "public.json"
 FORMER = "signing.pem"
-"""Where the only key was before there were rings; taken over as the first."""
+"""File of the single key of earlier versions; becomes the first key of the ring."""
 _LOCK = "ring.lock"
 _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 class FileKeys(RingKeys):
-    """``SigningKeys`` in ``folder``, which contains nothing else; made at first use."""
+    """``SigningKeys`` in ``folder``, which contains no other files. The first use creates it."""
 
     def __init__(self, folder: Path, *, now_ms: Callable[[], int] = wall_ms) -> None:
         super().__init__(now_ms=now_ms)
@@ -43,31 +43,31 @@ class FileKeys(RingKeys):
         self._changes_ms = 0
 
     def load(self) -> Ed25519PrivateKey:
-        """Read the keys, and make them when there are none. No other user of the machine can read them.
+        """Read or create the keys, and restrict the files to this user.
 
         Raises:
-            StoreError: A file cannot be read or is not what it should be; the text names it.
+            StoreError: A file cannot be read or is not valid; the text names it.
         """
         key = self.signer()
         with self._guarded():
-            self._close_to_others()
+            self._restrict_access()
         return key
 
-    async def _ring(self, *, fresh: bool = False) -> Ring:
-        del fresh  # it always is
-        return self._known()
+    async def _ring(self, *, refresh: bool = False) -> Ring:
+        del refresh  # reads are not cached
+        return self._cached()
 
     async def _change(self, change: Callable[[Ring], Ring]) -> Ring:
-        self._known()
+        self._cached()
         with self._guarded(), self._locked():
             self._write(change(self._parse()))
-        return self._known()
+        return self._cached()
 
-    def _known(self) -> Ring:
-        """The ring in the file. What has just ended is taken out of it, and out of what the broker reads."""
+    def _cached(self) -> Ring:
+        """The ring in the file. Removes retired keys from the file and from the broker's public keys."""
         with self._guarded():
             if self._seen is None and not (self._folder / RING).exists():
-                self._make()
+                self._create()
             if self._stamp() != self._seen or self._now_ms() >= self._changes_ms:
                 with self._locked():
                     stored = self._parse()
@@ -80,18 +80,18 @@ class FileKeys(RingKeys):
             return self._read
 
     def _stamp(self) -> tuple[int, int, int]:
-        found = (self._folder / RING).stat()
-        return found.st_mtime_ns, found.st_size, found.st_ino
+        status = (self._folder / RING).stat()
+        return status.st_mtime_ns, status.st_size, status.st_ino
 
     def _parse(self) -> Ring:
         return Ring.read((self._folder / RING).read_bytes())
 
-    def _make(self) -> None:
-        """Of several processes that make a key at once, one wins: a link is made only where there is none."""
+    def _create(self) -> None:
+        """Create the ring. ``os.link`` fails if another process created it at the same time."""
         self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         former = self._folder / FORMER
         key = key_ring.from_pem(former.read_bytes()) if former.exists() else signing.generate()
-        temporary = atomic_files.write_beside(self._folder / RING, Ring.first(key).text.encode(), mode=0o600)
+        temporary = atomic_files.write_temporary(self._folder / RING, Ring.first(key).text.encode(), mode=0o600)
         with contextlib.suppress(FileExistsError):
             os.link(temporary, self._folder / RING)
         temporary.unlink()
@@ -101,14 +101,14 @@ class FileKeys(RingKeys):
         atomic_files.write(self._folder / RING, ring.text.encode(), mode=0o600)
 
     def _publish(self, ring: Ring) -> None:
-        """Tell the embedded broker which keys' tokens count."""
+        """Write the valid public keys for the embedded broker."""
         path = self._folder / PUBLIC
-        wanted = {key.id: key.public for key in ring.live(self._now_ms())}
-        if not path.exists() or json.loads(path.read_bytes()) != wanted:
-            atomic_files.write(path, json.dumps(wanted, indent=1).encode(), mode=0o644)
+        public = {key.id: key.public for key in ring.valid(self._now_ms())}
+        if not path.exists() or json.loads(path.read_bytes()) != public:
+            atomic_files.write(path, json.dumps(public, indent=1).encode(), mode=0o644)
 
-    def _close_to_others(self) -> None:
-        """Keep others of this machine from the keys. Windows has no such rights: there it is the folder's own."""
+    def _restrict_access(self) -> None:
+        """Remove access of other users. On Windows, the folder's access control applies."""
         if os.name == "nt":
             return
         for path, forbidden in (
@@ -119,8 +119,8 @@ class FileKeys(RingKeys):
             if path.exists() and (mode := stat.S_IMODE(path.stat().st_mode)) & forbidden:
                 path.chmod(mode & ~forbidden)
                 _log.warning(
-                    "%s was open to others of this machine (mode %03o) and is no longer; if one of them may have read "
-                    "it, run `python -m function_app rotate-keys --leaked`",
+                    "removed access of other users to %s (mode was %03o); if another user may have read it, run "
+                    "`python -m function_app rotate-keys --leaked`",
                     path,
                     mode,
                 )
@@ -130,11 +130,13 @@ class FileKeys(RingKeys):
         try:
             yield
         except (OSError, ValueError, TypeError, AttributeError, ProtocolError, RingError) as error:
-            raise StoreError(f"the signing keys in {self._folder} cannot be used: {error}. Put back a copy.") from error
+            raise StoreError(
+                f"the signing keys in {self._folder} cannot be used: {error}. Restore a backup."
+            ) from error
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
-        """One process at a time changes the ring. SQLite's lock: the same on every system, gone with its holder."""
+        """An exclusive lock between processes. SQLite's lock is portable and is released when its process ends."""
         import sqlite3  # noqa: PLC0415 (only where something is written)
 
         with contextlib.closing(sqlite3.connect(self._folder / _LOCK, timeout=10, isolation_level=None)) as lock:

@@ -1,7 +1,7 @@
 """Tables in one SQLite file.
 
-Used straight from the event loop: a read or a write costs microseconds, a thread would cost more. Any number of
-processes share the file; SQLite's own lock makes each statement and each batch atomic.
+Statements run in the event loop: a read or write takes microseconds, less than a switch to a thread. Several processes
+may share the file; SQLite's lock makes each statement and each batch atomic.
 """
 
 import os
@@ -16,7 +16,7 @@ from function_app.adapters.shared import row_codec
 from function_app.ports.tables import Conflict, Page, Row, StoreError, Write
 
 BUSY_TIMEOUT_MS = 5_000
-"""A writer waits this long for another process's write: they take well under a millisecond each."""
+"""Maximum time that a writer waits for the writes of other processes, which take less than a millisecond each."""
 _PAUSE_S = 0.002
 
 _SCHEMA = """
@@ -35,7 +35,7 @@ _QUERY_CLOSED = _QUERY.format(last="AND key<?")
 
 
 class SqliteTables:
-    """``Tables`` in the file ``path``, which is made when it is not there. Opened at the first call."""
+    """``Tables`` in the file ``path``. The first call opens or creates it."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -96,8 +96,7 @@ class SqliteTables:
     def _write(self, table: str, write: Write, data: bytes) -> Row:
         row = write.row
         if write.kind == "delete":
-            done = self._run(_DELETE, (table, row.partition, row.key, row.etag))
-            self._expect_one(done, table, row)
+            self._expect_one(self._run(_DELETE, (table, row.partition, row.key, row.etag)), table, row)
             return row
         etag = secrets.token_hex(8)
         if write.kind == "create":
@@ -106,14 +105,14 @@ class SqliteTables:
             except sqlite3.IntegrityError as error:
                 raise Conflict(f"{table}: '{row.key}' exists") from error
         else:
-            done = self._run(_REPLACE, (etag, data, table, row.partition, row.key, row.etag))
-            self._expect_one(done, table, row)
+            cursor = self._run(_REPLACE, (etag, data, table, row.partition, row.key, row.etag))
+            self._expect_one(cursor, table, row)
         return Row(row.partition, row.key, row.data, etag)
 
     @staticmethod
-    def _expect_one(done: sqlite3.Cursor, table: str, row: Row) -> None:
-        if done.rowcount != 1:
-            raise Conflict(f"{table}: '{row.key}' has changed or is gone")
+    def _expect_one(cursor: sqlite3.Cursor, table: str, row: Row) -> None:
+        if cursor.rowcount != 1:
+            raise Conflict(f"{table}: '{row.key}' does not have the expected ETag")
 
     def _rollback(self) -> None:
         if self._db is not None and self._db.in_transaction:
@@ -156,13 +155,13 @@ class SqliteTables:
         if isinstance(error, sqlite3.OperationalError | OSError):
             return StoreError(f"the tables in {self._path} cannot be used: {error}. Check disk space and permissions.")
         return StoreError(
-            f"the tables in {self._path} are damaged ({error}). Put back a copy of the file, or move it away to start "
-            "empty; nothing was deleted."
+            f"the tables in {self._path} are damaged ({error}). Restore a backup, or move the file away to start with "
+            "empty tables; no data were deleted."
         )
 
 
 def _prepare(db: sqlite3.Connection) -> None:
-    """Journal and schema. SQLite does not wait by itself while another process does the same to a new file."""
+    """Set the journal mode and create the schema. SQLite's busy timeout does not cover these on a new file."""
     end = time.monotonic() + BUSY_TIMEOUT_MS / 1000
     while True:
         try:

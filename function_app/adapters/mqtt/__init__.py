@@ -1,1 +1,1 @@
-"""Mqtt."""
+"""The MQTT connection of the functions."""

@@ -1,10 +1,11 @@
-"""One warm MQTT connection inside an event loop.
+"""A persistent MQTT connection in an event loop.
 
-A message goes out, and comes in, on the loop's own thread: no hand-over between threads lies in a command's way. A
-connection lives as long as its credentials; then, or when it breaks, a new client with new ones takes over.
+Messages are sent and received in the loop's thread, without a switch between threads. When a connection is lost or its
+credentials expire, a new client connects with new credentials.
 
-Some hosts let the loop turn during a call only, and freeze the process between two. A connection from before the frost
-may be dead without a sign: it has to prove itself with the first message, which goes out again over a new one if not.
+Some hosts run the event loop only during a request and freeze the process between requests. A connection may break
+undetected during a freeze. Therefore the first message after a freeze needs a fast acknowledgement; otherwise the
+connection is replaced and the message is sent again.
 """
 
 import asyncio
@@ -29,25 +30,25 @@ KEEP_ALIVE_S = 30
 CONNECT_TIMEOUT_S = 5.0
 CONFIRM_TIMEOUT_S = 5.0
 READY_TIMEOUT_S = 2.0
-"""A caller waits this long for a connection that is just being made."""
+"""Maximum time that a caller waits for a connection in progress."""
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 5.0
 RENEW_BEFORE_S = 30.0
-FROST_S = 3.0
-"""So long without a turn of the loop, which has one each second at least, and the process was frozen."""
-DEAD_S = 1.5 * KEEP_ALIVE_S
+FREEZE_S = 3.0
+"""The process was frozen if the loop, which runs at least once per second, did not run for this time."""
+SESSION_TIMEOUT_S = 1.5 * KEEP_ALIVE_S
 """The broker closes the connection after this time without a packet (MQTT, 3.1.2.10)."""
-PROOF_TIMEOUT_S = 1.0
-"""A connection that was frozen has this long to confirm a message."""
+VERIFY_TIMEOUT_S = 1.0
+"""Maximum time for the first acknowledgement after a freeze."""
 MAX_FILTERS = 8
-"""Filters in one SUBSCRIBE (facts: AWS IoT Core takes eight)."""
+"""Maximum number of filters in one SUBSCRIBE: the limit of AWS IoT Core."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Broker:
-    """Where a broker is, and how to be let in. ``credentials`` is asked for each connection; may raise the port's."""
+    """The address of a broker. ``credentials`` is called for each connection; may raise ``BrokerAccessError``."""
 
     host: str
     port: int
@@ -78,27 +79,27 @@ class MqttConnection:
         self._every_s = every_s
         self._tls = broker.tls
         self._client: mqtt.Client | None = None
-        self._keeper: asyncio.Task[None] | None = None
+        self._task: asyncio.Task[None] | None = None
         self._ready = asyncio.Event()
         self._attempted = asyncio.Event()
         self._lost = asyncio.Event()
         self._waiting: dict[int, asyncio.Future[None]] = {}
         self._subscribed: dict[int, asyncio.Future[None]] = {}
-        self._trouble = "not connected yet"
-        self._turn_at = self._clocks()
-        self._unproven = False
+        self._problem = "not connected yet"
+        self._last_run = self._clocks()
+        self._unverified = False
         self.generation = 0
-        """Number of the present connection: a message can only be confirmed on the one it came by."""
+        """Number of the current connection: a message can only be acknowledged on the connection that delivered it."""
 
     @property
-    def trouble(self) -> str:
-        """Empty while connected, else a sentence."""
-        return "" if self._ready.is_set() else self._trouble
+    def problem(self) -> str:
+        """Empty while connected, otherwise a description of the problem."""
+        return "" if self._ready.is_set() else self._problem
 
     def start(self) -> None:
-        """Begin to connect; returns at once. Does nothing the second time."""
-        if self._keeper is None:
-            self._keeper = asyncio.get_running_loop().create_task(self._keep(), name="mqtt link")
+        """Start connecting, without waiting. Idempotent."""
+        if self._task is None:
+            self._task = asyncio.get_running_loop().create_task(self._run(), name="mqtt link")
 
     async def ready(self, timeout_s: float) -> bool:
         """Wait until connected and subscribed."""
@@ -114,7 +115,7 @@ class MqttConnection:
         return True
 
     async def attempted(self, timeout_s: float) -> None:
-        """Wait until it is known whether the broker can be reached, but no longer than the first try takes."""
+        """Wait until the first connection attempt has succeeded or failed."""
         self.start()
         self._detect_freeze()
         with contextlib.suppress(TimeoutError):
@@ -122,57 +123,57 @@ class MqttConnection:
                 await self._attempted.wait()
 
     async def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool = False) -> None:
-        """Send, and for QoS 1 wait for the broker's word. After a frost it may be sent twice.
+        """Publish; for QoS 1, wait for the acknowledgement. After a freeze, the message may be sent twice.
 
         Raises:
-            BusUnavailable: Not connected, or not confirmed in time.
+            BusUnavailable: Not connected, or not acknowledged in time.
         """
         self._detect_freeze()
         generation = self.generation
-        if self._unproven:
-            if qos == 0:  # never confirmed
-                self._abandon(generation, "it was frozen")
+        if self._unverified:
+            if qos == 0:  # never acknowledged
+                self._replace(generation, "the process was frozen")
             else:
                 try:
-                    await self._publish(topic, payload, qos, retain=retain, timeout_s=PROOF_TIMEOUT_S)
+                    await self._publish(topic, payload, qos, retain=retain, timeout_s=VERIFY_TIMEOUT_S)
                 except BusUnavailable as error:
-                    self._abandon(generation, str(error))
+                    self._replace(generation, str(error))
                 else:
-                    self._unproven = False
+                    self._unverified = False
                     return
         await self._publish(topic, payload, qos, retain=retain, timeout_s=CONFIRM_TIMEOUT_S)
 
     async def _publish(self, topic: str, payload: bytes, qos: int, *, retain: bool, timeout_s: float) -> None:
         if not self._ready.is_set() and not await self.ready(READY_TIMEOUT_S):
-            raise BusUnavailable(f"the broker at {self._host}:{self._port} cannot be reached: {self._trouble}")
+            raise BusUnavailable(f"the broker at {self._host}:{self._port} cannot be reached: {self._problem}")
         client = self._client
         if client is None:
-            raise BusUnavailable(f"the broker at {self._host}:{self._port} went away")
+            raise BusUnavailable(f"the broker at {self._host}:{self._port} disconnected")
         information = client.publish(topic, payload, qos, retain)
         event_loop.flush(client)
         if information.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
-            raise BusUnavailable(f"the broker at {self._host}:{self._port} went away: {information.rc.name}")
+            raise BusUnavailable(f"the broker at {self._host}:{self._port} disconnected: {information.rc.name}")
         if qos == 0:
             return
-        confirmed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._waiting[information.mid] = confirmed
+        acknowledged: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting[information.mid] = acknowledged
         try:
             async with asyncio.timeout(timeout_s):
-                await confirmed
+                await acknowledged
         except TimeoutError as error:
-            detail = f"the broker at {self._host}:{self._port} did not confirm a message in {timeout_s:.0f} s"
+            detail = f"the broker at {self._host}:{self._port} did not acknowledge a message in {timeout_s:.0f} s"
             raise BusUnavailable(detail) from error
         finally:
             self._waiting.pop(information.mid, None)
 
     def acknowledge(self, message: mqtt.MQTTMessage, generation: int) -> None:
-        """Confirm a message that came with ``manual_ack``; nothing happens when its connection is gone."""
+        """Acknowledge a message that was received with ``manual_ack``. Does nothing if its connection was closed."""
         if self._client is not None and generation == self.generation:
             self._client.ack(message.mid, message.qos)
             event_loop.flush(self._client)
 
     async def subscribe(self, patterns: Sequence[str]) -> None:
-        """Subscribe to these too, on this connection and on those that follow."""
+        """Add subscriptions, on this connection and on later ones."""
         self._subscriptions = tuple(dict.fromkeys((*self._subscriptions, *patterns)))
         client, generation = self._client, self.generation
         if client is None:
@@ -180,73 +181,73 @@ class MqttConnection:
         try:
             await self._subscribe(client, patterns)
         except (BusUnavailable, TimeoutError) as error:
-            self._abandon(generation, str(error) or "a subscription was not confirmed")
+            self._replace(generation, str(error) or "a subscription was not acknowledged")
 
     def unsubscribe(self, patterns: Iterable[str]) -> None:
-        """Subscribe to these no longer."""
-        gone = set(patterns)
-        self._subscriptions = tuple(pattern for pattern in self._subscriptions if pattern not in gone)
-        if self._client is not None and gone:
-            self._client.unsubscribe(sorted(gone))
+        """Remove subscriptions."""
+        removed = set(patterns)
+        self._subscriptions = tuple(pattern for pattern in self._subscriptions if pattern not in removed)
+        if self._client is not None and removed:
+            self._client.unsubscribe(sorted(removed))
             event_loop.flush(self._client)
 
     async def close(self) -> None:
         """Disconnect. May be called twice."""
-        if self._keeper is not None:
-            self._keeper.cancel()
+        if self._task is not None:
+            self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
-                await self._keeper
-            self._keeper = None
+                await self._task
+            self._task = None
 
-    async def _keep(self) -> None:
-        """Connect, stay, and connect again, for ever."""
+    async def _run(self) -> None:
+        """Connect and reconnect until cancelled."""
         pause_s = FIRST_RETRY_S
         while True:
             client: mqtt.Client | None = None
             try:
-                given = self._credentials()
-                credentials = given if isinstance(given, ServiceCredentials) else await given
+                result = self._credentials()
+                credentials = result if isinstance(result, ServiceCredentials) else await result
                 client = await self._connect(credentials)
                 pause_s = FIRST_RETRY_S
-                await self._stay(client, credentials.expires_at)
+                await self._maintain(client, credentials.expires_at)
                 continue
             except (BrokerAccessError, BusUnavailable, OSError, ValueError) as error:
-                if str(error) != self._trouble:
+                if str(error) != self._problem:
                     _log.warning("broker: %s", error)
-                self._trouble = str(error)
+                self._problem = str(error)
                 self._attempted.set()
             finally:
                 self._disconnect(client)
-            await asyncio.sleep(pause_s * random.uniform(0.5, 1.0))  # noqa: S311 (spreads reconnects, hides nothing)
+            await asyncio.sleep(pause_s * random.uniform(0.5, 1.0))  # noqa: S311 (spreads reconnects)
             pause_s = min(2 * pause_s, LAST_RETRY_S)
 
     async def _connect(self, credentials: ServiceCredentials) -> mqtt.Client:
         """A connected and subscribed client."""
-        answered: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        client = self._make(credentials, answered)
+        connected: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        client = self._create_client(credentials, connected)
         try:
             await asyncio.to_thread(client.connect, self._host, self._port, KEEP_ALIVE_S)
             event_loop.listen(client, every_s=self._every_s)
             async with asyncio.timeout(CONNECT_TIMEOUT_S):
-                await answered
+                await connected
             self._client = client
             self.generation += 1
             await self._subscribe(client, self._subscriptions)
         except TimeoutError as error:
             event_loop.drop(client)
-            raise BusUnavailable(f"no answer from the broker at {self._host}:{self._port}") from error
+            raise BusUnavailable(f"no response from the broker at {self._host}:{self._port}") from error
         except BaseException:
             event_loop.drop(client)
             raise
-        self._turn_at, self._unproven = self._clocks(), False
+        self._last_run, self._unverified = self._clocks(), False
         self._ready.set()
         self._attempted.set()
         return client
 
-    def _make(  # noqa: C901 (one short callback after another)
-        self, credentials: ServiceCredentials, answered: asyncio.Future[None]
+    def _create_client(  # noqa: C901 (one short callback after another)
+        self, credentials: ServiceCredentials, connected: asyncio.Future[None]
     ) -> mqtt.Client:
-        # All brokers speak 3.1.1. Nothing here needs the properties of 5, which paho takes long to read.
+        # All brokers support 3.1.1. This client needs no properties of version 5, which paho parses slowly.
         client = mqtt.Client(
             CallbackAPIVersion.VERSION2,
             client_id=credentials.client_id,
@@ -261,20 +262,20 @@ class MqttConnection:
         client.max_inflight_messages_set(1000)
         event_loop.prepare(client)
 
-        def connected(_client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
-            if answered.done():
+        def on_connect(_client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
+            if connected.done():
                 return
             if reason.is_failure:
-                refusal = f"the broker at {self._host}:{self._port} refused us: {reason.getName()}"
-                answered.set_exception(BusUnavailable(refusal))
+                problem = f"the broker at {self._host}:{self._port} rejected the connection: {reason.getName()}"
+                connected.set_exception(BusUnavailable(problem))
             else:
-                answered.set_result(None)
+                connected.set_result(None)
 
         def disconnected(_client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
-            if not answered.done():
-                answered.set_exception(BusUnavailable(f"the broker closed the connection: {reason.getName()}"))
+            if not connected.done():
+                connected.set_exception(BusUnavailable(f"the broker closed the connection: {reason.getName()}"))
             if _client is self._client:
-                self._trouble = f"the connection was lost: {reason.getName()}"
+                self._problem = f"the connection was lost: {reason.getName()}"
                 self._lost.set()
 
         def published(_client: mqtt.Client, _data: Any, mid: int, _reason: Any, _properties: Any) -> None:
@@ -286,13 +287,13 @@ class MqttConnection:
             waiting = self._subscribed.pop(mid, None)
             if waiting is None or waiting.done():
                 return
-            refused = [reason.getName() for reason in reasons if reason.is_failure]
-            if refused:
-                waiting.set_exception(BusUnavailable(f"the broker refused a subscription: {refused[0]}"))
+            rejected = [reason.getName() for reason in reasons if reason.is_failure]
+            if rejected:
+                waiting.set_exception(BusUnavailable(f"the broker rejected a subscription: {rejected[0]}"))
             else:
                 waiting.set_result(None)
 
-        client.on_connect = connected
+        client.on_connect = on_connect
         client.on_disconnect = disconnected
         client.on_publish = published
         client.on_subscribe = subscribed
@@ -306,15 +307,15 @@ class MqttConnection:
             filters = [(pattern, self._qos) for pattern in patterns[start : start + MAX_FILTERS]]
             result, mid = client.subscribe(filters)
             if result != MQTTErrorCode.MQTT_ERR_SUCCESS or mid is None:
-                raise BusUnavailable("the broker went away")
-            done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-            self._subscribed[mid] = done
+                raise BusUnavailable("the broker disconnected")
+            acknowledged: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            self._subscribed[mid] = acknowledged
             event_loop.flush(client)
             async with asyncio.timeout(CONNECT_TIMEOUT_S):
-                await done
+                await acknowledged
 
-    async def _stay(self, client: mqtt.Client, expires_at: float) -> None:
-        """Keep the connection alive until it breaks or its credentials are about to end."""
+    async def _maintain(self, client: mqtt.Client, expires_at: float) -> None:
+        """Maintain the connection until it is lost or its credentials are about to expire."""
         while not self._lost.is_set():
             self._detect_freeze()
             client.loop_misc()
@@ -324,22 +325,22 @@ class MqttConnection:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(1.0):
                     await self._lost.wait()
-        raise BusUnavailable(self._trouble)
+        raise BusUnavailable(self._problem)
 
     def _detect_freeze(self) -> None:
-        """Called whenever the loop turns. Both clocks, since some hosts stop the monotonic one too."""
+        """Compares both clocks, because some hosts also stop the monotonic clock."""
         now = self._clocks()
-        still_s = max(new - old for new, old in zip(now, self._turn_at, strict=True))
-        self._turn_at = now
-        if still_s > FROST_S and self._ready.is_set():
-            self._unproven = True
-            if still_s > DEAD_S:
-                self._abandon(self.generation, "the process was frozen too long")
+        paused_s = max(new - old for new, old in zip(now, self._last_run, strict=True))
+        self._last_run = now
+        if paused_s > FREEZE_S and self._ready.is_set():
+            self._unverified = True
+            if paused_s > SESSION_TIMEOUT_S:
+                self._replace(self.generation, "the process was frozen too long")
 
-    def _abandon(self, generation: int, reason: str) -> None:
-        """Have another connection made, unless that has happened since this one."""
+    def _replace(self, generation: int, reason: str) -> None:
+        """Replace the connection unless it has already been replaced."""
         if generation == self.generation and self._ready.is_set():
-            self._trouble = f"the connection was given up: {reason}"
+            self._problem = f"the connection was replaced: {reason}"
             self._ready.clear()
             self._lost.set()
 
@@ -353,8 +354,8 @@ class MqttConnection:
         self._client = None
         for waiting in (*self._waiting.values(), *self._subscribed.values()):
             if not waiting.done():
-                waiting.set_exception(BusUnavailable(f"the broker at {self._host}:{self._port} went away"))
-                waiting.exception()  # retrieved here too: an exception without a waiting caller is no error
+                waiting.set_exception(BusUnavailable(f"the broker at {self._host}:{self._port} disconnected"))
+                waiting.exception()  # marks the exception as retrieved
         self._waiting.clear()
         self._subscribed.clear()
         if client is not None:

@@ -1,4 +1,4 @@
-"""TLS towards the broker."""
+"""TLS context of broker connections."""
 
 import ssl
 from pathlib import Path
@@ -6,20 +6,22 @@ from pathlib import Path
 from function_app.ports.broker_access import BrokerAccessError
 
 
-def client_context(ca: Path | None, own: Path | None = None) -> ssl.SSLContext:
-    """Trusts one authority, or those that the machine trusts; shows ``service.crt`` of the folder ``own``.
+def client_context(ca: Path | None, service_folder: Path | None = None) -> ssl.SSLContext:
+    """A context that trusts ``ca`` (``None``: the system's CAs) and uses the certificate in ``service_folder``.
 
     Raises:
-        BrokerAccessError: Its certificate cannot be read.
+        BrokerAccessError: A certificate cannot be read.
     """
     try:
         context = ssl.create_default_context(cafile=None if ca is None else str(ca))
     except OSError as error:  # SSLError is one
         raise BrokerAccessError(f"the authority in {ca} cannot be read: {error}") from error
-    if own is not None:
+    if service_folder is not None:
         try:
-            context.load_cert_chain(own / "service.crt", own / "service.key")
+            context.load_cert_chain(service_folder / "service.crt", service_folder / "service.key")
         except OSError as error:
-            raise BrokerAccessError(f"the functions' own certificate in {own} cannot be read: {error}") from error
+            raise BrokerAccessError(
+                f"the functions' certificate in {service_folder} cannot be read: {error}"
+            ) from error
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     return context

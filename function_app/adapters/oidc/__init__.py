@@ -1,1 +1,1 @@
-"""Oidc."""
+"""OpenID Connect."""

@@ -1,1 +1,1 @@
-"""Shared."""
+"""Code that several adapters share."""

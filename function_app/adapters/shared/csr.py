@@ -1,4 +1,4 @@
-"""What every authority for agents looks at before it signs."""
+"""Validation of certificate signing requests of agents."""
 
 from typing import TYPE_CHECKING
 
@@ -8,14 +8,14 @@ if TYPE_CHECKING:
     from cryptography.x509 import CertificateSigningRequest
 
 MAX_REQUEST = 4096
-"""Characters; a request for a key on P-256 has 400."""
+"""Maximum length in characters; a request for a P-256 key has 400."""
 
 
 def read(text: str) -> "CertificateSigningRequest":
-    """A request for a key on P-256, which all brokers take, signed by that key.
+    """Parse a request for a P-256 key, which all brokers support, and verify its signature.
 
     Raises:
-        CertificateRefused: It is not one.
+        CertificateRefused: The request is not valid.
     """
     from cryptography import x509  # noqa: PLC0415 (only where certificates are in use)
     from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415
@@ -25,11 +25,11 @@ def read(text: str) -> "CertificateSigningRequest":
     try:
         request = x509.load_pem_x509_csr(text.encode())
         key = request.public_key()
-        good = request.is_signature_valid
+        is_signed = request.is_signature_valid
     except ValueError as error:
         raise CertificateRefused("not a certificate request (PKCS 10, PEM)") from error
-    if not good:
-        raise CertificateRefused("the request is not signed by the key that it is for")
+    if not is_signed:
+        raise CertificateRefused("the request is not signed by its own key")
     if not isinstance(key, ec.EllipticCurvePublicKey) or not isinstance(key.curve, ec.SECP256R1):
-        raise CertificateRefused("the key must be one on P-256")
+        raise CertificateRefused("the key is not a P-256 key")
     return request

@@ -1,4 +1,4 @@
-"""``SigningKeys`` of a ring, wherever it is stored: what all adapters have in common."""
+"""``SigningKeys`` of a key ring, independent of its storage."""
 
 import time
 from abc import ABC, abstractmethod
@@ -18,7 +18,7 @@ def wall_ms() -> int:
 
 
 class RingKeys(ABC):
-    """``SigningKeys`` of a ring. Overlaps end by the wall clock ``now_ms``."""
+    """``SigningKeys`` of a key ring. Overlaps end by the wall clock ``now_ms``."""
 
     def __init__(self, *, now_ms: Callable[[], int] = wall_ms) -> None:
         self._now_ms = now_ms
@@ -31,16 +31,16 @@ class RingKeys(ABC):
         return self._private((await self._ring()).for_devices(self._now_ms()))
 
     async def public(self, wanted: str = "") -> Mapping[str, Ed25519PublicKey]:
-        found = key_ring.public((await self._ring()).live(self._now_ms()))
-        if wanted and wanted not in found:
-            found = key_ring.public((await self._ring(fresh=True)).live(self._now_ms()))
-        return found
+        keys = key_ring.public((await self._ring()).valid(self._now_ms()))
+        if wanted and wanted not in keys:
+            keys = key_ring.public((await self._ring(refresh=True)).valid(self._now_ms()))
+        return keys
 
     async def archive(self) -> Mapping[str, Ed25519PublicKey]:
         return key_ring.public(tuple(key for key in (await self._ring()).keys if not key.leaked))
 
-    async def news(self) -> KeyAnnouncement:
-        return self._told(await self._ring())
+    async def announcement(self) -> KeyAnnouncement:
+        return self._announcement(await self._ring())
 
     async def rotate(
         self, *, learn_ms: int = LEARN_MS, overlap_ms: int = OVERLAP_MS, leaked: bool = False
@@ -52,43 +52,47 @@ class RingKeys(ABC):
                 return ring.replaced(new, now_ms=now_ms)
             return ring.rotated(new, now_ms=now_ms, learn_ms=learn_ms, overlap_ms=overlap_ms)
 
-        return self._told(await self._change(change))
+        return self._announcement(await self._change(change))
 
-    async def close(self) -> None:  # noqa: B027 (who has nothing open need not say so)
+    async def close(self) -> None:  # noqa: B027 (optional to override)
         """See ``SigningKeys``."""
 
     def signer(self) -> Ed25519PrivateKey:
-        """``current``, for who cannot wait.
+        """``current`` from the cache, for synchronous callers.
 
         Raises:
-            StoreError: The keys cannot be read, or have not been yet.
+            StoreError: The keys cannot be read or have not been read yet.
         """
-        return self._private(self._known().newest)
+        return self._private(self._cached().newest)
 
     def secrets(self) -> tuple[bytes, ...]:
-        """The private keys that are still kept, the newest first: what was made from one outlives a rotation.
+        """The stored private keys, newest first, so that values derived from them remain valid after a rotation.
 
         Raises:
             StoreError: See ``signer``.
         """
-        return tuple(self._private(key).private_bytes_raw() for key in reversed(self._known().keys) if key.private)
+        return tuple(self._private(key).private_bytes_raw() for key in reversed(self._cached().keys) if key.private)
 
     @abstractmethod
-    def _known(self) -> Ring:
-        """The ring as this process knows it."""
+    def _cached(self) -> Ring:
+        """The cached ring.
+
+        Raises:
+            StoreError: The ring cannot be read or has not been read yet.
+        """
 
     @abstractmethod
-    async def _ring(self, *, fresh: bool = False) -> Ring:
-        """The ring as it is, or lately was; ``fresh``: looked at again as soon as that is no burden."""
+    async def _ring(self, *, refresh: bool = False) -> Ring:
+        """The current ring, possibly from the cache; ``refresh`` reads it again, at a limited rate."""
 
     @abstractmethod
     async def _change(self, change: Callable[[Ring], Ring]) -> Ring:
-        """Write what ``change`` makes of the ring; what was written."""
+        """Write the result of ``change``, and return it."""
 
-    def _told(self, ring: Ring) -> KeyAnnouncement:
+    def _announcement(self, ring: Ring) -> KeyAnnouncement:
         now_ms = self._now_ms()
         pins = tuple(
-            PinnedKey(key.id, signing.public_key(key.public), key.serial, key.until_ms) for key in ring.live(now_ms)
+            PinnedKey(key.id, signing.public_key(key.public), key.serial, key.until_ms) for key in ring.valid(now_ms)
         )
         return KeyAnnouncement(pins, ring.statements(now_ms), ring.for_devices(now_ms).id)
 

@@ -1,4 +1,4 @@
-"""A command bus that only publishes, over HTTPS. Acks arrive at the ingest."""
+"""A command bus that publishes over HTTPS. Acks arrive at the ingest."""
 
 import asyncio
 import contextlib
@@ -17,30 +17,30 @@ class PublishingBus(ABC):
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._trouble = ""
+        self._problem = ""
 
     async def start(self) -> None:  # noqa: B027 (nothing to override)
-        """There is no connection to make before the first message."""
+        """Does nothing: the bus connects at the first message."""
 
     async def publish(self, topic: str, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
         try:
             async with asyncio.timeout(GIVE_UP_S):
                 await self._publish(topic, payload, qos, retain)
         except TimeoutError as error:
-            self._trouble = f"{self._name} did not answer in {GIVE_UP_S:.0f} s"
-            raise BusUnavailable(self._trouble) from error
+            self._problem = f"{self._name} did not answer in {GIVE_UP_S:.0f} s"
+            raise BusUnavailable(self._problem) from error
         except BusUnavailable as error:
-            self._trouble = str(error)
+            self._problem = str(error)
             raise
-        self._trouble = ""
+        self._problem = ""
 
     @contextlib.asynccontextmanager
     async def acks(self, device_topic: str, command: str) -> AsyncGenerator[AsyncIterator[Ack] | None]:  # noqa: ARG002
         yield None
 
     async def status(self) -> str:
-        """The result of the last message: without publishing, nothing can be checked."""
-        return self._trouble or "ok"
+        """The result of the last message."""
+        return self._problem or "ok"
 
     @abstractmethod
     async def _publish(self, topic: str, payload: bytes, qos: int, retain: bool) -> None:

@@ -1,4 +1,4 @@
-"""What every adapter of ``Tables`` checks and writes in the same way."""
+"""Validation and serialization that all adapters of ``Tables`` share."""
 
 import base64
 import binascii
@@ -16,10 +16,10 @@ _decode = msgspec.json.Decoder(dict[str, Any]).decode
 
 
 def check(row: Row) -> None:
-    """Refuse a row whose partition or key no store could take.
+    """Check the partition and key of a row.
 
     Raises:
-        ValueError: One is empty, too long, or no Unicode text.
+        ValueError: One is empty, too long, or contains a lone surrogate.
     """
     for text in (row.partition, row.key):
         if not 1 <= len(text) <= MAX_KEY_LENGTH:
@@ -32,8 +32,7 @@ def check_batch(writes: Sequence[Write]) -> tuple[bytes, ...]:
     """The data of each write as JSON, empty for a deletion.
 
     Raises:
-        ValueError: It is no batch: empty, too many writes or too much data, two partitions, a key twice, or a row that
-            cannot be.
+        ValueError: No writes, too many writes, too much data, two partitions, a repeated key, or an invalid row.
     """
     if not 1 <= len(writes) <= MAX_BATCH:
         raise ValueError(f"a batch has 1 to {MAX_BATCH} writes, not {len(writes)}")
@@ -49,15 +48,15 @@ def check_batch(writes: Sequence[Write]) -> tuple[bytes, ...]:
         texts.append(b"" if write.kind == "delete" else encode(write.row.data))
     size = sum(map(len, texts))
     if size > MAX_BATCH_BYTES:
-        raise ValueError(f"a batch writes at most {MAX_BATCH_BYTES} bytes, not {size}; make it smaller")
+        raise ValueError(f"a batch writes at most {MAX_BATCH_BYTES} bytes, not {size}; split it")
     return tuple(texts)
 
 
 def check_limit(limit: int) -> None:
-    """Refuse a page of no rows or of too many.
+    """Check the maximum number of rows of a page.
 
     Raises:
-        ValueError: It is so.
+        ValueError: It is not 1 to ``MAX_PAGE``.
     """
     if not 1 <= limit <= MAX_PAGE:
         raise ValueError(f"limit must be 1 to {MAX_PAGE}, not {limit}")
@@ -81,15 +80,15 @@ def decode(text: bytes | str) -> dict[str, Any]:
 
 
 def write_cursor(key: str) -> str:
-    """A cursor that goes on with ``key``."""
+    """The cursor of a page that starts at ``key``."""
     return base64.urlsafe_b64encode(key.encode()).decode().rstrip("=")
 
 
 def read_cursor(cursor: str) -> str:
-    """The key that a cursor goes on with.
+    """The first key of the page of a cursor.
 
     Raises:
-        ValueError: It is no cursor.
+        ValueError: It is not a cursor.
     """
     try:
         return base64.b64decode(cursor + "=" * (-len(cursor) % 4), altchars=b"-_", validate=True).decode()
@@ -98,7 +97,7 @@ def read_cursor(cursor: str) -> str:
 
 
 def is_text(text: str) -> bool:
-    """Whether it can be written as UTF-8: Python's strings may hold lone surrogates."""
+    """Whether a string can be encoded as UTF-8: Python strings may contain lone surrogates."""
     try:
         text.encode()
     except UnicodeEncodeError:

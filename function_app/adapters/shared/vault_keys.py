@@ -1,11 +1,11 @@
-"""``SigningKeys`` of a ring that is one secret of a cloud's vault.
+"""``SigningKeys`` of a key ring that is stored as one secret in a cloud vault.
 
-Why a secret and no key of the vault's own: Azure's Key Vault has no Ed25519 among its key types (P-256, P-256K, P-384,
-P-521, RSA). Amazon's KMS has it since 2025, but signs at most 4,096 bytes, where an order with a script has 64 KB, and
-each order and token would wait for a call. The vault keeps the secret encrypted, says who may read it, and logs it.
+The keys are a secret and not keys of the vault. Azure Key Vault supports no Ed25519 keys (P-256, P-256K, P-384, P-521,
+RSA). AWS KMS has supported them since 2025, but signs at most 4,096 bytes; a command with a script has up to 64 KB.
+Each command and token would also require a request. The vault encrypts the secret, controls access and logs reads.
 
 The functions only read. ``python -m function_app prepare`` creates the secret and ``rotate-keys`` changes it, with the
-rights of the person who deploys. Two concurrent runs are detected only as far as the vault supports it.
+permissions of the person who deploys. Two concurrent runs are detected only as far as the vault supports it.
 """
 
 import asyncio
@@ -19,45 +19,45 @@ from function_app.adapters.shared.key_ring import Ring, RingError
 from function_app.adapters.shared.key_ring_keys import RingKeys, wall_ms
 from function_app.ports.tables import StoreError
 
-LOOK_EVERY_MS = 60_000
-"""How long a process goes on with what it has read: less than what devices are given to learn a key."""
-AGAIN_MS = 5_000
+CACHE_MS = 60_000
+"""Lifetime of the cached ring: less than the time for devices to learn a key."""
+MIN_REFRESH_MS = 5_000
 """Minimum time between two reads for unknown keys: any client can send an unknown key id."""
 _log = logging.getLogger(__name__)
 
 
 class Secret(NamedTuple):
-    """What the vault holds, and which version of it."""
+    """The text and version of the vault's secret."""
 
     text: str
     version: str
 
 
 class VaultKeys(RingKeys):
-    """``SigningKeys`` in a vault; errors name the secret as ``what``."""
+    """``SigningKeys`` in a vault; error messages name the secret as ``resource``."""
 
-    def __init__(self, *, what: str, now_ms: Callable[[], int] = wall_ms) -> None:
+    def __init__(self, *, resource: str, now_ms: Callable[[], int] = wall_ms) -> None:
         super().__init__(now_ms=now_ms)
-        self._what = what
-        self._read: Ring | None = None
+        self._resource = resource
+        self._cache: Ring | None = None
         self._read_ms = 0
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
 
     async def prepare(self) -> None:
-        """Make the secret, with a first key, where there is none. Safe to repeat.
+        """Create the secret with a first key if it does not exist. Idempotent.
 
         Raises:
-            StoreError: It cannot be made.
+            StoreError: It cannot be created.
         """
         if await self._fetch() is None:
             await self._create(Ring.first(signing.generate()).text)
 
     @abstractmethod
     async def _fetch(self) -> Secret | None:
-        """What the vault holds now; ``None`` where there is no such secret.
+        """Read the secret; ``None`` if it does not exist.
 
         Raises:
-            StoreError: It does not say.
+            StoreError: The vault cannot be used.
         """
 
     @abstractmethod
@@ -66,44 +66,46 @@ class VaultKeys(RingKeys):
 
     @abstractmethod
     async def _put(self, text: str) -> None:
-        """A new version of the secret."""
+        """Write a new version of the secret."""
 
-    def _known(self) -> Ring:
-        if self._read is None:
-            raise StoreError(f"{self._what} has not been read yet")
-        return self._read
+    def _cached(self) -> Ring:
+        if self._cache is None:
+            raise StoreError(f"{self._resource} has not been read yet")
+        return self._cache
 
-    async def _ring(self, *, fresh: bool = False) -> Ring:
-        async with self._turn:
+    async def _ring(self, *, refresh: bool = False) -> Ring:
+        async with self._lock:
             age_ms = self._now_ms() - self._read_ms
-            if self._read is None or not 0 <= age_ms < (AGAIN_MS if fresh else LOOK_EVERY_MS):
-                await self._look()
-            return self._known()
+            if self._cache is None or not 0 <= age_ms < (MIN_REFRESH_MS if refresh else CACHE_MS):
+                await self._update()
+            return self._cached()
 
-    async def _look(self) -> None:
-        """Read it; what was read before stays in force while the vault does not answer."""
+    async def _update(self) -> None:
+        """Read the secret. If the vault cannot be used, the cached ring remains in use."""
         self._read_ms = self._now_ms()
         try:
-            self._read = self._parse(await self._fetch())
+            self._cache = self._parse(await self._fetch())
         except StoreError as error:
-            if self._read is None:
+            if self._cache is None:
                 raise
-            _log.warning("%s; the keys from before stay in force", error)
+            _log.warning("%s; the cached keys remain in use", error)
 
     async def _change(self, change: Callable[[Ring], Ring]) -> Ring:
-        before = await self._fetch()
-        ring = change(self._parse(before))
-        if await self._fetch() != before:
-            raise StoreError(f"{self._what} was changed by another process at the same time. Check it, and try again.")
+        secret = await self._fetch()
+        ring = change(self._parse(secret))
+        if await self._fetch() != secret:
+            raise StoreError(f"{self._resource} was changed by another process. Check it, and try again.")
         await self._put(ring.text)
-        async with self._turn:
-            self._read, self._read_ms = ring, self._now_ms()
+        async with self._lock:
+            self._cache, self._read_ms = ring, self._now_ms()
         return ring
 
     def _parse(self, secret: Secret | None) -> Ring:
         if secret is None:
-            raise StoreError(f"{self._what} does not exist. Make it: `python -m function_app prepare`.")
+            raise StoreError(f"{self._resource} does not exist. Create it: `python -m function_app prepare`.")
         try:
             return Ring.read(secret.text)
         except RingError as error:
-            raise StoreError(f"{self._what} holds no signing keys: {error}. Restore an earlier version.") from error
+            raise StoreError(
+                f"{self._resource} contains no valid signing keys: {error}. Restore an earlier version."
+            ) from error

@@ -1,1 +1,1 @@
-"""Xmpp."""
+"""The XMPP connection of the functions."""

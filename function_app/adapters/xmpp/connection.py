@@ -1,4 +1,4 @@
-"""The cloud's own connection to the XMPP server, through slixmpp."""
+"""The connection of the cloud to the XMPP server, with slixmpp."""
 
 import asyncio
 import logging
@@ -14,13 +14,13 @@ from function_app.ports.xmpp_connection import Listener
 
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 5.0
-MOST_UNSENT_BYTES = 1024 * 1024
+MAX_UNSENT_BYTES = 1024 * 1024
 
 _log = logging.getLogger(__name__)
 
 
 class SlixmppConnection:
-    """``XmppConnection`` to one server, each connection with a new password and a place (resource) of its own."""
+    """``XmppConnection`` to one server. Each connection uses a new password and a new resource."""
 
     def __init__(self, *, host: str, port: int, domain: str, password: Callable[[], Awaitable[str]]) -> None:
         self._host = host
@@ -28,7 +28,7 @@ class SlixmppConnection:
         self._domain = domain
         self._password = password
         self._stream: Stream | None = None
-        self._trouble = ""
+        self._problem = ""
 
     @property
     def domain(self) -> str:
@@ -40,17 +40,17 @@ class SlixmppConnection:
             try:
                 stream = await self._open(listener)
                 try:
-                    self._stream, self._trouble, pause_s = stream, "", FIRST_RETRY_S
-                    _log.info("speaking XMPP at %s:%d", self._host, self._port)
+                    self._stream, self._problem, pause_s = stream, "", FIRST_RETRY_S
+                    _log.info("connected to the XMPP server at %s:%d", self._host, self._port)
                     await stream.stay()
                 finally:
                     self._stream = None
                     await stream.close()
                     listener.lost()
             except (OSError, StoreError, Problem) as error:
-                if str(error) != self._trouble:
+                if str(error) != self._problem:
                     _log.warning("XMPP: %s", error)
-                self._trouble = str(error)
+                self._problem = str(error)
             await asyncio.sleep(pause_s * random.uniform(0.5, 1.0))  # noqa: S311 (spreads reconnects, hides nothing)
             pause_s = min(2 * pause_s, LAST_RETRY_S)
 
@@ -69,4 +69,4 @@ class SlixmppConnection:
         return self._stream is not None and self._stream.send(stanza)
 
     def congested(self) -> bool:
-        return self._stream is not None and self._stream.unsent_bytes > MOST_UNSENT_BYTES
+        return self._stream is not None and self._stream.unsent_bytes > MAX_UNSENT_BYTES

@@ -21,7 +21,7 @@ _DENIED = {"decision": "deny", "errorReason": "the request is not a valid CONNEC
 
 @runtime_checkable
 class _ConnectAuthorizer(Protocol):
-    async def known(self, token: str) -> bool: ...
+    async def verify_caller(self, token: str) -> bool: ...
 
     async def admit(self, *, username: str, password: str, client_id: str) -> dict[str, Any]: ...
 
@@ -42,7 +42,7 @@ async def admit(functions: Functions, authorization: str, body: bytes) -> tuple[
     if not isinstance(access, _ConnectAuthorizer):
         return _NOT_FOUND, {}
     scheme, _, token = authorization.partition(" ")
-    if scheme.lower() != "bearer" or len(body) > MAX_BYTES or not await access.known(token.strip()):
+    if scheme.lower() != "bearer" or len(body) > MAX_BYTES or not await access.verify_caller(token.strip()):
         return _UNAUTHORIZED, {}
     try:
         connect = msgspec.json.decode(body, type=_ConnectRequest)

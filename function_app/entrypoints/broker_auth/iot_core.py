@@ -14,7 +14,7 @@ from function_app.bootstrap import Functions
 
 @runtime_checkable
 class _ConnectAuthorizer(Protocol):
-    async def admit(self, *, username: str, password: str, client_id: str, place: str) -> dict[str, Any]: ...
+    async def admit(self, *, username: str, password: str, client_id: str, arn_prefix: str) -> dict[str, Any]: ...
 
 
 async def authorise(functions: Functions, event: Mapping[str, Any], function_arn: str) -> dict[str, Any]:
@@ -38,5 +38,5 @@ async def authorise(functions: Functions, event: Mapping[str, Any], function_arn
         username=str(connect.get("username", "")),
         password=password,
         client_id=str(connect.get("clientId", "")),
-        place=f"arn:aws:iot:{region}:{account}",
+        arn_prefix=f"arn:aws:iot:{region}:{account}",
     )

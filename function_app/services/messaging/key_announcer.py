@@ -29,7 +29,7 @@ class KeyAnnouncer:
         Raises:
             StoreError: The keys cannot be read.
         """
-        news = await self._keys.news()
+        news = await self._keys.announcement()
         learning = news.signing != news.pins[-1].id
         if not learning or not news.statements:
             return

@@ -21,11 +21,11 @@ class AgentCertificates:
                 not valid; ``broker-unavailable``.
         """
         space = require_claimed(agent)
-        if not self._certificates.wanted:
+        if not self._certificates.required:
             detail = "This broker does not use certificates of agents."
             raise Problem("certificates-unused", 409, "No certificates here", detail)
         try:
-            await self._certificates.place(agent.id, space)
+            await self._certificates.set_space(agent.id, space)
             return await self._certificates.issue(agent.id, request)
         except CertificateRefused as refused:
             raise invalid(f"request: {refused}.") from refused

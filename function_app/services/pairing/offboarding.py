@@ -157,7 +157,7 @@ class Offboarding:
             if leaving.why == "unpaired":
                 await self._certificates.revoke(agent_id)
             elif now is not None and now.space is not None:
-                await self._certificates.place(agent_id, now.space)
+                await self._certificates.set_space(agent_id, now.space)
             await self._access.revoke(principal=f"agent:{agent_id}")
         if leaving.why == "unpaired":
             for name in leaving.devices:

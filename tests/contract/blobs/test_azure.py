@@ -11,7 +11,7 @@ import pytest
 
 from function_app.adapters.azure import blobs as adapter
 from function_app.adapters.azure.blobs import AzureBlobs
-from function_app.adapters.azure.client import Place
+from function_app.adapters.azure.client import Endpoint
 from function_app.ports.blobs import MAX_BYTES, Blobs
 from tests.contract.blobs.suite import Again, BlobsSuite, Direct
 from tests.contract.conftest import Closing
@@ -29,7 +29,7 @@ def container() -> str:
 
 @pytest.fixture
 def again(azurite: str, container: str, closing: Closing) -> Again:
-    return lambda: closing(AzureBlobs(place=Place(azurite), container=container))
+    return lambda: closing(AzureBlobs(endpoint=Endpoint(azurite), container=container))
 
 
 @pytest.fixture
@@ -58,8 +58,8 @@ async def over_wire(
     azurite: str, proxy: FaultProxy, container: str, closing: Closing, monkeypatch: pytest.MonkeyPatch
 ) -> Blobs:
     """The same store over a proxy with faults; its container exists."""
-    monkeypatch.setattr(adapter, "RETRY_WITHIN_S", 0)
-    blobs = closing(AzureBlobs(place=Place(through(azurite, proxy.endpoint, "Blob")), container=container))
+    monkeypatch.setattr(adapter, "MAX_RETRY_PAUSE_S", 0)
+    blobs = closing(AzureBlobs(endpoint=Endpoint(through(azurite, proxy.endpoint, "Blob")), container=container))
     await blobs.put("first", b"")
     return blobs
 
@@ -98,7 +98,7 @@ async def test_many_appends_are_merged_into_one_block(
     blobs: Blobs, again: Again, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(adapter, "MANY_BLOCKS", 6)
-    monkeypatch.setattr(adapter, "KEPT_BLOCKS", 2)
+    monkeypatch.setattr(adapter, "UNMERGED_BLOCKS", 2)
     await blobs.put("log", b"begin,")
     for number, instance in zip(range(20), itertools.cycle((blobs, again())), strict=False):
         await instance.append("log", b"%d," % number)

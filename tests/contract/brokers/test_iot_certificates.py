@@ -39,7 +39,7 @@ async def test_certificates_belong_to_the_agents_thing_and_end_with_the_pairing(
     for _ in range(2):
         await authority.prepare()
     for space in ("spaceone", "spacetwo"):
-        await authority.place(AGENT, space)
+        await authority.set_space(AGENT, space)
     assert iot.describe_thing(thingName=AGENT)["attributes"] == {"space": "spacetwo"}
     for _ in range(2):
         issued = await authority.issue(AGENT, request())
@@ -55,6 +55,6 @@ async def test_certificates_belong_to_the_agents_thing_and_end_with_the_pairing(
 
 async def test_a_missing_policy_is_reported(moto: str, closing: Closing) -> None:
     authority = closing(IotCertificates(region=REGION, policy="missing", endpoint=moto))
-    await authority.place("agentccccc", "space")
+    await authority.set_space("agentccccc", "space")
     with pytest.raises(BrokerAccessError, match="TELESCOPE_IOT_POLICY"):
         await authority.issue("agentccccc", request())

@@ -121,7 +121,7 @@ def test_decrypted_data_is_processed_completely(broker: RunningBroker, trusting:
     )
 
     async def connect_link() -> None:
-        assert await link.ready(PATIENCE_S), link.trouble
+        assert await link.ready(PATIENCE_S), link.problem
 
     broker.run(connect_link())
     publisher = connect(broker, "tcp", trusting)

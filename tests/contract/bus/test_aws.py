@@ -63,8 +63,8 @@ class TestIot(BusContract):
     @pytest.mark.parametrize(
         ("refusal", "words"),
         [
-            (Refusal(403, "ForbiddenException", {}, "application/json"), "AWS IoT Core in .*may not be used.* role"),
-            (Refusal(429, "ThrottlingException", {}, "application/json"), "too much to do"),
+            (Refusal(403, "ForbiddenException", {}, "application/json"), "AWS IoT Core in .*denied access.* role"),
+            (Refusal(429, "ThrottlingException", {}, "application/json"), "is overloaded"),
             (Refusal(400, "InvalidRequestException", {}, "application/json"), "cannot be used"),
         ],
         ids=["rights", "throttled", "invalid"],

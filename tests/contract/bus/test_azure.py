@@ -163,10 +163,10 @@ class TestEventGrid(BusContract):
     @pytest.mark.parametrize(
         ("status", "words"),
         [
-            (401, "may not be used: 401 .*'EventGrid TopicSpaces Publisher'"),
-            (403, "may not be used: 403 .*'EventGrid TopicSpaces Publisher'"),
-            (429, "too much to do: 429"),
-            (500, "refused a message: 500 .*not now"),
+            (401, "denied access: 401 .*'EventGrid TopicSpaces Publisher'"),
+            (403, "denied access: 403 .*'EventGrid TopicSpaces Publisher'"),
+            (429, "is overloaded: 429"),
+            (500, "rejected a message: 500 .*not now"),
         ],
     )
     async def test_a_refusal_is_reported_in_one_sentence(

@@ -21,13 +21,13 @@ COUNT = 300
 def rounds_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The start of each round [s]."""
     starts: list[float] = []
-    begin = event_loop._Unhurried._begin
+    start_reading = event_loop._PeriodicReader._start_reading
 
-    def observed(reader: event_loop._Unhurried) -> None:
+    def observed(reader: event_loop._PeriodicReader) -> None:
         starts.append(time.monotonic())
-        begin(reader)
+        start_reading(reader)
 
-    monkeypatch.setattr(event_loop._Unhurried, "_begin", observed)
+    monkeypatch.setattr(event_loop._PeriodicReader, "_start_reading", observed)
     return starts
 
 
@@ -39,7 +39,7 @@ async def test_all_messages_arrive_in_order_and_in_few_rounds(broker: RunningBro
         at, subscriptions=(TOPIC,), receive=lambda message: received.append(int(message.payload)), every_s=EVERY_S
     )
     try:
-        assert await link.ready(PATIENCE_S), link.trouble
+        assert await link.ready(PATIENCE_S), link.problem
         began_s, before = time.monotonic(), len(rounds_s)
         with await asyncio.to_thread(broker.client, "rounds", publish=(TOPIC,)) as robot:
             for number in range(COUNT):
@@ -69,14 +69,14 @@ async def test_it_sleeps_between_messages_and_detects_a_lost_broker(
     at = Broker(host=HOST, port=stoppable.tcp_port, credentials=stoppable.access.service_credentials)
     link = MqttConnection(at, subscriptions=(TOPIC,), every_s=EVERY_S)
     try:
-        assert await link.ready(PATIENCE_S), link.trouble
+        assert await link.ready(PATIENCE_S), link.problem
         await asyncio.sleep(3 * EVERY_S)
         before = len(rounds_s)
         await asyncio.sleep(5 * EVERY_S)
         assert len(rounds_s) == before
         await asyncio.to_thread(stoppable.stop)
         async with asyncio.timeout(PATIENCE_S):
-            while not link.trouble:  # noqa: ASYNC110 (there is no event for it)
+            while not link.problem:  # noqa: ASYNC110 (there is no event for it)
                 await asyncio.sleep(EVERY_S / 10)
     finally:
         await link.close()

@@ -11,8 +11,8 @@ import pytest
 
 from function_app.adapters.azure import blobs as adapter
 from function_app.adapters.azure.blobs import AzureBlobs
-from function_app.adapters.azure.client import ATTEMPTS, Place
-from function_app.adapters.azure.sas_keys import SigningKeys
+from function_app.adapters.azure.client import ATTEMPTS, Endpoint
+from function_app.adapters.azure.sas_keys import SasKeys
 from function_app.adapters.azure.tables import AzureTables
 from function_app.ports.tables import Row, StoreError
 from tests.contract.conftest import Closing
@@ -30,10 +30,10 @@ from tests.harness.stores.azure import KEY, endpoint, start_azurite, through
 
 CLIENT_ID = "11059fcc-5514-4800-b5f8-49808b9cfab6"
 WRONG_KEY = "d3Jvbmc="
-NONSENSE = {"Table": "not Azure's", "Blob": "cannot be used"}
+NONSENSE = {"Table": "invalid response", "Blob": "cannot be used"}
 """What an unreadable response is reported as."""
 Calls = tuple[Callable[[], Awaitable[object]], ...]
-OpenStore = Callable[[Place], Calls]
+OpenStore = Callable[[Endpoint], Calls]
 
 pytestmark = pytest.mark.anyio
 
@@ -65,11 +65,11 @@ def service(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def open_store(service: str, closing: Closing, monkeypatch: pytest.MonkeyPatch) -> OpenStore:
     """Calls of a new adapter of the service."""
-    monkeypatch.setattr(adapter, "RETRY_WITHIN_S", 0)
+    monkeypatch.setattr(adapter, "MAX_RETRY_PAUSE_S", 0)
     name = f"test{secrets.token_hex(8)}"
     if service == "Table":
-        return lambda place: table_calls(closing(AzureTables(place=place, prefix=name)))
-    return lambda place: blob_calls(closing(AzureBlobs(place=place, container=name)))
+        return lambda target: table_calls(closing(AzureTables(endpoint=target, prefix=name)))
+    return lambda target: blob_calls(closing(AzureBlobs(endpoint=target, container=name)))
 
 
 async def error_of(call: Callable[[], Awaitable[object]]) -> str:
@@ -91,7 +91,7 @@ async def error_of(call: Callable[[], Awaitable[object]]) -> str:
 async def test_an_invalid_connection_is_reported_at_each_call(
     service: str, open_store: OpenStore, connection: str, expected: str
 ) -> None:
-    calls = open_store(Place(connection.format(service)))
+    calls = open_store(Endpoint(connection.format(service)))
     for call in itertools.islice(itertools.cycle(calls), len(calls) + 1):
         text = await error_of(call)
         assert expected in text
@@ -99,21 +99,21 @@ async def test_an_invalid_connection_is_reported_at_each_call(
 
 
 async def test_a_wrong_key_is_reported_but_not_shown(azurite: str, open_store: OpenStore) -> None:
-    for call in open_store(Place(azurite.replace(KEY, WRONG_KEY))):
+    for call in open_store(Endpoint(azurite.replace(KEY, WRONG_KEY))):
         text = await error_of(call)
-        assert "may not be used" in text
+        assert "denied access" in text
         assert "Check TELESCOPE_STORAGE_CONNECTION" in text
         assert WRONG_KEY not in text
 
 
-async def test_a_failing_store_is_tried_a_few_times(azurite: str, service: str, open_store: OpenStore) -> None:
+async def test_a_failing_store_is_retried_a_few_times(azurite: str, service: str, open_store: OpenStore) -> None:
     with start_fault_proxy(endpoint(azurite, service)) as proxy:
-        calls = open_store(Place(through(azurite, proxy.endpoint, service)))
+        calls = open_store(Endpoint(through(azurite, proxy.endpoint, service)))
         call = calls[2]
         await calls[0]()
         await call()
         for refusal, expected in (
-            (Refusal(503, "ServerBusy", {}), "too much to do"),
+            (Refusal(503, "ServerBusy", {}), "is overloaded"),
             (Refusal(500, "InternalError", {}), "cannot be used"),
             (Refusal(502, "BadGateway", {}, "application/x-nonsense"), NONSENSE[service]),
         ):
@@ -149,11 +149,11 @@ def host(monkeypatch: pytest.MonkeyPatch, certificate: Path) -> Iterator[Identit
 async def test_tables_and_blobs_are_used_with_the_identity(
     secure_azurite: str, host: IdentityEndpoint, closing: Closing, identity: str
 ) -> None:
-    places = {name: Place(url=endpoint(secure_azurite, name), identity=identity) for name in ("Table", "Blob")}
-    tables = closing(AzureTables(place=places["Table"], prefix="test"))
+    endpoints = {name: Endpoint(url=endpoint(secure_azurite, name), identity=identity) for name in ("Table", "Blob")}
+    tables = closing(AzureTables(endpoint=endpoints["Table"], prefix="test"))
     row = await tables.create("T", Row(f"p{identity}", "k", {"n": 1}))
     assert await tables.get("T", f"p{identity}", "k") == row
-    blobs = closing(AzureBlobs(place=places["Blob"], container="test"))
+    blobs = closing(AzureBlobs(endpoint=endpoints["Blob"], container="test"))
     await blobs.put("a", b"content")
     await blobs.append("a", b"!")
     assert await blobs.get("a") == b"content!"
@@ -162,18 +162,18 @@ async def test_tables_and_blobs_are_used_with_the_identity(
 
 
 @pytest.mark.usefixtures("host")
-async def test_blob_addresses_are_signed_with_a_borrowed_key(
+async def test_blob_urls_are_signed_with_a_user_delegation_key(
     secure_azurite: str, closing: Closing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Azurite 3.35 lends the key but cannot check what today's SDK signs with it."""
-    blobs = closing(AzureBlobs(place=Place(url=endpoint(secure_azurite, "Blob")), container="test"))
-    borrow, borrowed = SigningKeys._borrow, []
+    """Azurite 3.35 issues the key but cannot verify signatures of the current SDK."""
+    blobs = closing(AzureBlobs(endpoint=Endpoint(url=endpoint(secure_azurite, "Blob")), container="test"))
+    request_key, requests = SasKeys._request, []
 
-    def counted(keys: SigningKeys, *arguments: Any) -> Any:
-        borrowed.append(arguments)
-        return borrow(keys, *arguments)
+    def counted(keys: SasKeys, *arguments: Any) -> Any:
+        requests.append(arguments)
+        return request_key(keys, *arguments)
 
-    monkeypatch.setattr(SigningKeys, "_borrow", counted)
+    monkeypatch.setattr(SasKeys, "_request", counted)
     upload = await blobs.presign_upload("up", length=3, content_type="image/png", lifetime_s=60)
     download = await blobs.presign_download("up", content_type="image/png", lifetime_s=60)
     for address, right in ((upload.url, "c"), (download, "r")):
@@ -181,18 +181,18 @@ async def test_blob_addresses_are_signed_with_a_borrowed_key(
         assert (query["sp"], query["sr"], query["skoid"], query["sktid"]) == (right, "b", OBJECT_ID, TENANT_ID)
         assert query["skt"] < query["se"] < query["ske"]
         assert query["sig"]
-    assert len(borrowed) == 1
+    assert len(requests) == 1
     await blobs.presign_download("up", content_type="image/png", lifetime_s=24 * 3600)
-    assert len(borrowed) == 2
+    assert len(requests) == 2
 
 
-async def test_a_refused_identity_is_reported_with_the_role_that_it_needs(
+async def test_a_rejected_identity_is_reported_with_the_required_role(
     secure_azurite: str, host: IdentityEndpoint, closing: Closing
 ) -> None:
     host.lifetime_s = -30
-    tables = closing(AzureTables(place=Place(url=endpoint(secure_azurite, "Table")), prefix="test"))
+    tables = closing(AzureTables(endpoint=Endpoint(url=endpoint(secure_azurite, "Table")), prefix="test"))
     text = await error_of(lambda: tables.get("T", "p", "k"))
-    assert "may not be used: " in text
+    assert "denied access: " in text
     assert "'Storage Table Data Contributor'" in text
 
 
@@ -202,8 +202,8 @@ async def test_a_machine_without_identity_is_reported(
     monkeypatch.setenv("REQUESTS_CA_BUNDLE", str(certificate))
     monkeypatch.setenv("IDENTITY_ENDPOINT", f"http://{HOST}:1/msi/token")
     monkeypatch.setenv("IDENTITY_HEADER", SECRET)
-    monkeypatch.setattr(adapter, "RETRY_WITHIN_S", 0)
-    blobs = closing(AzureBlobs(place=Place(url=endpoint(secure_azurite, "Blob")), container="test"))
+    monkeypatch.setattr(adapter, "MAX_RETRY_PAUSE_S", 0)
+    blobs = closing(AzureBlobs(endpoint=Endpoint(url=endpoint(secure_azurite, "Blob")), container="test"))
     text = await error_of(lambda: blobs.get("a"))
     assert "Check " in text
     assert "this machine's managed identity" in text

@@ -59,11 +59,11 @@ class KeysSuite:
         assert await key_ids(keys) == (new, new)
         time.ms += OVERLAP_MS - LEARN_MS - 1
         assert set(await keys.public()) == {old, new}
-        assert (await keys.news()).statements != ()
+        assert (await keys.announcement()).statements != ()
         time.ms += 1
         assert set(await keys.public()) == {new}
-        assert [pin.id for pin in (await keys.news()).pins] == [new]
-        assert (await keys.news()).statements == ()
+        assert [pin.id for pin in (await keys.announcement()).pins] == [new]
+        assert (await keys.announcement()).statements == ()
         assert set(await keys.archive()) == {old, new}
 
     async def test_statements_lead_from_an_old_key_over_each_rotation_to_the_newest(
@@ -73,14 +73,14 @@ class KeysSuite:
         pinned = dict(await keys.public())
         new = await rotate(keys)
         until_ms = time.ms + OVERLAP_MS
-        assert [(pin.id, pin.serial, pin.until_ms) for pin in (await keys.news()).pins] == [
+        assert [(pin.id, pin.serial, pin.until_ms) for pin in (await keys.announcement()).pins] == [
             (old, 1, until_ms),
             (new, 2, 0),
         ]
         time.ms += LEARN_MS
         newest = await rotate(keys)
         learned = []
-        for statement in (await keys.news()).statements:
+        for statement in (await keys.announcement()).statements:
             with pytest.raises(SignatureError):
                 signing.verify(statement.encode(), pinned)
             message = codec.decode(signing.verify(statement.encode(), pinned, context=KEYS_CONTEXT), NewKey)
@@ -103,8 +103,8 @@ class KeysSuite:
         assert new == devices
         assert set(await keys.public()) == set(await keys.archive()) == {new}
         assert new not in {old, middle}
-        assert (await keys.news()).statements == ()
-        assert (await keys.news()).serial == 3
+        assert (await keys.announcement()).statements == ()
+        assert (await keys.announcement()).serial == 3
 
     async def test_another_process_finds_a_new_key_by_the_id_in_a_token(self, keys: SigningKeys, again: Again) -> None:
         other = again()

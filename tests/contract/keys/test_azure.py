@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from function_app.adapters.azure.client import Place
+from function_app.adapters.azure.client import Endpoint
 from function_app.adapters.azure.signing_keys import KeyVaultKeys
 from function_app.ports.tables import StoreError
 from tests.contract.conftest import Closing
@@ -76,7 +76,7 @@ class TestKeyVaultKeys(VaultSuite):
 
     @pytest.fixture
     def again(self, vault: FakeVault, time: Time, closing: Closing) -> Again:
-        return lambda: closing(KeyVaultKeys(secret=SECRET, place=Place(url=vault.url), now_ms=time.now_ms))
+        return lambda: closing(KeyVaultKeys(secret=SECRET, endpoint=Endpoint(url=vault.url), now_ms=time.now_ms))
 
     @pytest.mark.usefixtures("keys")
     async def test_preparing_again_keeps_the_secret(self, vault: FakeVault) -> None:
@@ -84,11 +84,11 @@ class TestKeyVaultKeys(VaultSuite):
 
     async def test_a_secret_without_keys_is_reported(self, vault: FakeVault, again: Again) -> None:
         vault.secrets[SECRET] = ["no ring"]
-        with pytest.raises(StoreError, match="holds no signing keys"):
+        with pytest.raises(StoreError, match="contains no valid signing keys"):
             await again().current()
 
     @pytest.mark.usefixtures("vault")
     async def test_an_unreachable_vault_is_reported(self, closing: Closing) -> None:
-        keys = closing(KeyVaultKeys(secret=SECRET, place=Place(url="https://127.0.0.1:9")))
+        keys = closing(KeyVaultKeys(secret=SECRET, endpoint=Endpoint(url="https://127.0.0.1:9")))
         with pytest.raises(StoreError, match="TELESCOPE_KEYVAULT_URL"):
             await keys.current()

@@ -25,13 +25,13 @@ class VaultSuite(KeysSuite):
         return keys
 
     def wait_for_followers(self, time: Time) -> None:
-        time.ms += vault_keys.LOOK_EVERY_MS
+        time.ms += vault_keys.CACHE_MS
 
     @pytest.fixture(autouse=True)
-    def _read_unknown_keys_at_once(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(vault_keys, "AGAIN_MS", 0)
+    def _read_unknown_keys_immediately(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(vault_keys, "MIN_REFRESH_MS", 0)
 
-    async def test_a_missing_secret_is_reported_with_the_command_that_makes_it(
+    async def test_a_missing_secret_is_reported_with_the_command_that_creates_it(
         self, erase: Erase, again: Again
     ) -> None:
         erase()
@@ -45,6 +45,6 @@ class VaultSuite(KeysSuite):
         other = again()
         before = (await other.current()).private_bytes_raw()
         erase()
-        time.ms += vault_keys.LOOK_EVERY_MS
+        time.ms += vault_keys.CACHE_MS
         assert (await other.current()).private_bytes_raw() == before
-        assert "stay in force" in caplog.text
+        assert "remain in use" in caplog.text

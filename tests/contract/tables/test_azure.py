@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 
-from function_app.adapters.azure.client import Place
+from function_app.adapters.azure.client import Endpoint
 from function_app.adapters.azure.tables import AzureTables
 from function_app.ports.tables import (
     MAX_BATCH,
@@ -35,7 +35,7 @@ def prefix() -> str:
 
 @pytest.fixture
 def again(azurite: str, prefix: str, closing: Closing) -> Again:
-    return lambda: closing(AzureTables(place=Place(azurite), prefix=prefix))
+    return lambda: closing(AzureTables(endpoint=Endpoint(azurite), prefix=prefix))
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def proxy(azurite: str) -> Iterator[FaultProxy]:
 @pytest.fixture
 async def over_wire(azurite: str, proxy: FaultProxy, prefix: str, closing: Closing) -> Tables:
     """The same store over a proxy with faults; its table exists."""
-    tables = closing(AzureTables(place=Place(through(azurite, proxy.endpoint, "Table")), prefix=prefix))
+    tables = closing(AzureTables(endpoint=Endpoint(through(azurite, proxy.endpoint, "Table")), prefix=prefix))
     await tables.create("T", Row("p", "first"))
     return tables
 
@@ -180,7 +180,7 @@ async def test_a_delete_without_response_is_an_error(over_wire: Tables, tables: 
 async def test_a_missing_right_to_make_a_table_is_reported(
     azurite: str, proxy: FaultProxy, prefix: str, closing: Closing
 ) -> None:
-    tables = closing(AzureTables(place=Place(through(azurite, proxy.endpoint, "Table")), prefix=prefix))
+    tables = closing(AzureTables(endpoint=Endpoint(through(azurite, proxy.endpoint, "Table")), prefix=prefix))
     proxy.inject("pass", Refusal(403, "AuthorizationPermissionMismatch", {}))
-    with pytest.raises(StoreError, match=f"'{prefix}…' may not be used"):
+    with pytest.raises(StoreError, match=f"'{prefix}…' denied access"):
         await tables.create("T", Row("p", "k"))

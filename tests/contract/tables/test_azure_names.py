@@ -1,4 +1,4 @@
-"""Codes of names sort as the names do, contain only what Azure accepts, and fit."""
+"""Codes of names sort like the names, contain only characters that Azure accepts, and respect the length limits."""
 
 import re
 
@@ -10,12 +10,12 @@ from tests.contract.tables.suite import HOSTILE, KEYS
 
 TEXTS = st.text(max_size=40)
 ACCEPTED = re.compile(r"(?:(?![/\\#?%+])[!-~])*")
-EDGES = "".join(chr(first + step) for first, _, _ in names._SIGNS for step in (-1, 0, 1) if first + step >= 0)
+EDGES = "".join(chr(first + step) for first, _, _ in names._RANGES for step in (-1, 0, 1) if first + step >= 0)
 LONG_STARTS = ("n" * 469, "n" * 468 + "m", "🤖" * 118)
 
 
-def written(name: str) -> str:
-    return names.fit(names.encode(name), names.MAX_KEY)
+def key_of(name: str) -> str:
+    return names.truncate(names.encode(name), names.MAX_KEY)
 
 
 @settings(max_examples=300, deadline=None)
@@ -30,10 +30,10 @@ def test_a_code_is_reversible_and_sorts_as_its_name(one: str, other: str) -> Non
 
 def test_characters_of_every_plane_sort_as_in_utf_8() -> None:
     points = sorted({*range(0x3000), *range(0x3000, 0x110000, 61), *map(ord, EDGES)})
-    letters = [chr(point) for point in points if not 0xD800 <= point < 0xE000]
-    codes = [names.encode(letter) for letter in letters]
+    characters = [chr(point) for point in points if not 0xD800 <= point < 0xE000]
+    codes = [names.encode(character) for character in characters]
     assert codes == sorted(set(codes))
-    assert [names.decode(code) for code in codes] == letters
+    assert [names.decode(code) for code in codes] == characters
     assert all(ACCEPTED.fullmatch(code) for code in codes)
 
 
@@ -45,26 +45,26 @@ def test_names_of_telescope_stay_readable() -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(text=st.text(alphabet=st.sampled_from("a/ü🤖" + EDGES), min_size=1, max_size=512))
-def test_a_written_name_fits_and_is_cut_only_if_necessary(text: str) -> None:
+def test_a_key_respects_the_limit_and_is_truncated_only_if_necessary(text: str) -> None:
     code = names.encode(text)
     for limit in (names.MAX_KEY, names.MAX_BLOB_NAME):
-        fitted = names.fit(code, limit)
-        assert 0 < len(fitted) <= limit
-        assert (fitted == code) == (not names.is_cut(fitted, limit))
-        assert fitted.startswith(names.head(code, limit))
+        key = names.truncate(code, limit)
+        assert 0 < len(key) <= limit
+        assert (key == code) == (not names.is_truncated(key, limit))
+        assert key.startswith(names.head(code, limit))
 
 
 @settings(max_examples=200, deadline=None)
 @given(
-    found=st.lists(
+    texts=st.lists(
         st.builds(str.__add__, st.sampled_from(LONG_STARTS), st.text(max_size=3)) | st.text(min_size=1, max_size=5),
         unique=True,
         max_size=30,
     )
 )
-def test_written_names_differ_and_are_read_in_the_order_of_names(found: list[str]) -> None:
-    every = {*found, *KEYS, *HOSTILE}
-    stored = sorted(every, key=written)
-    assert len({*map(written, every)}) == len(every)
-    ordered = list(names.in_order(stored, written=written, name=str, limit=names.MAX_KEY))
-    assert ordered == sorted(every, key=str.encode)
+def test_keys_are_unique_and_sort_by_name(texts: list[str]) -> None:
+    all_names = {*texts, *KEYS, *HOSTILE}
+    stored = sorted(all_names, key=key_of)
+    assert len({*map(key_of, all_names)}) == len(all_names)
+    ordered = list(names.sort_by_name(stored, key=key_of, name=str, limit=names.MAX_KEY))
+    assert ordered == sorted(all_names, key=str.encode)

@@ -65,7 +65,7 @@ async def test_a_damaged_file_is_named_and_left_as_it_is(tables: Tables, path: P
         with pytest.raises(StoreError, match="are damaged") as caught:
             await call
         assert str(path) in str(caught.value)
-        assert "nothing was deleted" in str(caught.value)
+        assert "no data were deleted" in str(caught.value)
         assert "\n" not in str(caught.value)
     await tables.close()
     assert path.read_bytes() == content

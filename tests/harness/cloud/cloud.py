@@ -163,7 +163,7 @@ class Cloud:
         async def start() -> None:
             self._feeds.append(asyncio.ensure_future(feed.run(handle)))
             if self.memory is None:
-                assert await feed._connection.ready(PATIENCE_S), feed._connection.trouble
+                assert await feed._connection.ready(PATIENCE_S), feed._connection.problem
             else:
                 await asyncio.sleep(0)
 

@@ -117,10 +117,10 @@ class TestIotCore(WebhookSuite):
         assert isinstance(access, IotBrokerAccess)
         gate.cloud.run(access.revoke(client_id="w-gone"))
         gate.cloud.run(access.expire(time.time() + 1000))
-        assert gate.cloud.run(access._rights._rows("issued")) == []
-        assert gate.cloud.run(access._rights._rows("revoked")) != []
+        assert gate.cloud.run(access._registry._rows("issued")) == []
+        assert gate.cloud.run(access._registry._rows("revoked")) != []
         gate.cloud.run(access.expire(time.time() + 100_000))
-        assert gate.cloud.run(access._rights._rows("revoked")) == []
+        assert gate.cloud.run(access._registry._rows("revoked")) == []
 
     def test_a_request_without_client_or_with_another_broker_is_rejected(self, gate: IotGate, tmp_path: Path) -> None:
         request: dict[str, Any] = {"protocolData": {}}
@@ -191,13 +191,13 @@ class TestEventGrid(WebhookSuite):
     ) -> None:
         used: list[Credentials] = []
         access: Any = gate.cloud.functions.access
-        take = access._take
+        take_over = access._take_over
 
         async def remember(client_id: str, credentials: Credentials) -> None:
             used.append(credentials)
-            await take(client_id, credentials)
+            await take_over(client_id, credentials)
 
-        monkeypatch.setattr(access, "_take", remember)
+        monkeypatch.setattr(access, "_take_over", remember)
         gate.broker.revoke(client_id=f"w-{account}")
         answer = gate.authorize(used[0], f"w-{account}")
         assert (answer["decision"], answer["attributes"]) == ("allow", {})
@@ -241,7 +241,7 @@ class TestEventGrid(WebhookSuite):
         own = grant(account)
         credentials = gate.connect(own)
         with monkeypatch.context() as patch:
-            patch.setattr(gate.cloud.functions.access, "_take", SessionTakeover(host=HOST, port=1, tls=None))
+            patch.setattr(gate.cloud.functions.access, "_take_over", SessionTakeover(host=HOST, port=1, tls=None))
             with pytest.raises(BrokerAccessError, match="cannot be reached"):
                 gate.broker.revoke(principal=f"account:{account}")
         assert gate.authorize(credentials, own.client_id)["decision"] == "deny"

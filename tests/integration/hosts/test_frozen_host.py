@@ -58,7 +58,7 @@ class Frozen:
 
 @pytest.fixture
 def frozen(broker: RunningBroker, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> Iterator[Frozen]:
-    monkeypatch.setattr(connection, "FROST_S", FREEZE_S - 0.1)
+    monkeypatch.setattr(connection, "FREEZE_S", FREEZE_S - 0.1)
     for module, name in ((connection, "READY_TIMEOUT_S"), (connection, "CONFIRM_TIMEOUT_S"), (command_bus, "_READY_S")):
         monkeypatch.setattr(module, name, PATIENCE_S)
     frozen = Frozen(broker, proxy)
@@ -78,7 +78,7 @@ def test_a_message_arrives_although_the_connection_died_while_frozen(
     getattr(proxy, end)()
     time.sleep(FREEZE_S)
     frozen.publish("after", qos)
-    monkeypatch.setattr(connection, "FROST_S", PATIENCE_S)
+    monkeypatch.setattr(connection, "FREEZE_S", PATIENCE_S)
     frozen.publish("again")
     assert robot.payloads(3) == [b"before", b"after", b"again"]
     assert proxy.accepted == accepted + 1
@@ -87,7 +87,7 @@ def test_a_message_arrives_although_the_connection_died_while_frozen(
 def test_a_connection_that_survived_is_reused(
     frozen: Frozen, proxy: Proxy, robot: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection, "PROOF_TIMEOUT_S", PATIENCE_S)
+    monkeypatch.setattr(connection, "VERIFY_TIMEOUT_S", PATIENCE_S)
     frozen.publish("0")
     accepted = proxy.accepted
     for number in (1, 2):
@@ -101,8 +101,8 @@ def test_a_connection_that_survived_is_reused(
 def test_a_connection_that_the_broker_must_have_closed_is_not_used_first(
     frozen: Frozen, proxy: Proxy, robot: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection, "DEAD_S", FREEZE_S - 0.05)
-    monkeypatch.setattr(connection, "PROOF_TIMEOUT_S", PATIENCE_S)
+    monkeypatch.setattr(connection, "SESSION_TIMEOUT_S", FREEZE_S - 0.05)
+    monkeypatch.setattr(connection, "VERIFY_TIMEOUT_S", PATIENCE_S)
     frozen.publish("before")
     accepted = proxy.accepted
     proxy.swallow()
@@ -114,12 +114,12 @@ def test_a_connection_that_the_broker_must_have_closed_is_not_used_first(
 
 def test_the_status_is_of_a_working_connection(frozen: Frozen, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
     assert frozen.status() == "ok"
-    monkeypatch.setattr(connection, "DEAD_S", FREEZE_S - 0.05)
+    monkeypatch.setattr(connection, "SESSION_TIMEOUT_S", FREEZE_S - 0.05)
     proxy.swallow()
     time.sleep(FREEZE_S)
-    assert "given up" in frozen.status()
+    assert "connection was replaced" in frozen.status()
     frozen.loop.run_until_complete(frozen.bus.start())
-    monkeypatch.setattr(connection, "DEAD_S", PATIENCE_S)
+    monkeypatch.setattr(connection, "SESSION_TIMEOUT_S", PATIENCE_S)
     assert frozen.status() == "ok"
 
 

@@ -31,9 +31,9 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         payload: Any = await read(request, schemas.MqttCredentialsRequest)
         agent = await auth.agent(request) if isinstance(payload, schemas.AgentCredentialsRequest) else None
         issued = await _issue(request, payload, agent)
-        certificate_after_ms = agent.claimed_ms if agent is not None and functions.certificates.wanted else None
+        certificate_after_ms = agent.claimed_ms if agent is not None and functions.certificates.required else None
         settings = functions.settings
-        keys = await functions.keys.news() if agent is not None else None
+        keys = await functions.keys.announcement() if agent is not None else None
         body = schemas.MqttCredentialsOut(
             client_id=issued.client_id,
             username=issued.credentials.username,

@@ -40,7 +40,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         else:
             given = await functions.xmpp_credentials.account(await auth.account(request))
         settings = functions.settings
-        news = None if space is None else await functions.keys.news()
+        news = None if space is None else await functions.keys.announcement()
         body = schemas.XmppCredentialsOut(
             jid=f"{given.user}@{settings.xmpp.domain}",
             password=given.password,

@@ -62,7 +62,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     async def enrollment(request: Request, wait_ms: Wait = 0) -> Response:
         """Called by an agent: its space, its owner, and the keys whose commands it must accept."""
         agent = await functions.enroll.wait(await auth.agent(request), wait_ms)
-        news = await functions.keys.news()
+        news = await functions.keys.announcement()
         body = schemas.EnrollmentState(
             agent=agent.id,
             state="claimed" if agent.claimed else "waiting",

@@ -1,4 +1,4 @@
-"""Policies of AWS IoT Core for grants, evaluated as its documentation says."""
+"""Policies of AWS IoT Core for grants, evaluated by the documented rules of AWS."""
 
 import json
 import re
@@ -13,12 +13,12 @@ from device_agent.protocol.security.grants import Grant, agent_grant
 from function_app.adapters.aws import iot_policies
 from function_app.ports.broker_access import BrokerAccessError
 
-PLACE = "arn:aws:iot:eu-west-1:123456789012"
+ARN_PREFIX = "arn:aws:iot:eu-west-1:123456789012"
 AGENT = agent_grant("space", "agentaaaaa", token_id="t", lifetime_s=3600)
 
 
 def is_allowed(documents: list[str], action: str, resource: str) -> bool:
-    """A denial wins, then any allowance; a star matches anything."""
+    """Deny overrides Allow; ``*`` matches any text."""
     effects = {"Allow": False, "Deny": False}
     for document in documents:
         for statement in json.loads(document)["Statement"]:
@@ -32,7 +32,9 @@ def _matches(pattern: str, resource: str) -> bool:
 
 
 def may(grant: Grant, action: str, kind: str, name: str) -> bool:
-    return is_allowed(iot_policies.documents(grant, place=PLACE), f"iot:{action}", f"{PLACE}:{kind}/{name}")
+    return is_allowed(
+        iot_policies.documents(grant, arn_prefix=ARN_PREFIX), f"iot:{action}", f"{ARN_PREFIX}:{kind}/{name}"
+    )
 
 
 OWN = "ts/v1/space/agentaaaaa"
@@ -71,7 +73,7 @@ ELSEWHERE = "ts/v1/other/agentaaaaa"
         ),
     ],
 )
-def test_an_agent_may_do_what_its_grant_says_and_nothing_else(
+def test_an_agent_may_do_exactly_what_its_grant_allows(
     action: str, kind: str, allowed: list[str], denied: list[str]
 ) -> None:
     for topic in (*allowed, *denied):
@@ -95,31 +97,33 @@ def grant_of(spaces: int) -> Grant:
     return Grant(principal="account:a:s", client_id="w", publish=(), subscribe=patterns, token_id="t", expires_at=10**9)
 
 
-def test_documents_keep_to_amazons_limits() -> None:
-    found = iot_policies.documents(grant_of(4), place=PLACE)
-    assert 1 < len(found) <= iot_policies.MAX_DOCUMENTS
-    assert all(len(document) <= iot_policies.MAX_CHARACTERS for document in found)
-    with pytest.raises(BrokerAccessError, match="so many topics"):
-        iot_policies.documents(grant_of(100), place=PLACE)
+def test_documents_respect_the_limits_of_aws() -> None:
+    documents = iot_policies.documents(grant_of(4), arn_prefix=ARN_PREFIX)
+    assert 1 < len(documents) <= iot_policies.MAX_DOCUMENTS
+    assert all(len(document) <= iot_policies.MAX_CHARACTERS for document in documents)
+    with pytest.raises(BrokerAccessError, match="too many topics"):
+        iot_policies.documents(grant_of(100), arn_prefix=ARN_PREFIX)
 
 
-def test_the_response_has_the_form_of_an_authoriser() -> None:
-    answer = iot_policies.answer(AGENT, place=PLACE, now_s=AGENT.expires_at - 1000)
-    assert answer["isAuthenticated"] is True
-    assert re.fullmatch("[a-zA-Z0-9]{1,128}", answer["principalId"])
-    assert answer["disconnectAfterInSeconds"] == 1000
-    assert iot_policies.refusal()["isAuthenticated"] is False
+def test_the_response_has_the_format_of_an_authorizer() -> None:
+    response = iot_policies.admission(AGENT, arn_prefix=ARN_PREFIX, now_s=AGENT.expires_at - 1000)
+    assert response["isAuthenticated"] is True
+    assert re.fullmatch("[a-zA-Z0-9]{1,128}", response["principalId"])
+    assert response["disconnectAfterInSeconds"] == 1000
+    assert iot_policies.rejection()["isAuthenticated"] is False
 
 
-def test_agents_with_certificates_have_the_rights_of_their_grant_in_the_space_of_their_thing() -> None:
-    found = [
+def test_policies_of_agents_with_certificates_equal_their_grants() -> None:
+    documents = [
         document.replace("${iot:Connection.Thing.Attributes[space]}", "space").replace(
             "${iot:Connection.Thing.ThingName}", "agentaaaaa"
         )
-        for document in iot_policies.agents(place=PLACE)
+        for document in iot_policies.agents(arn_prefix=ARN_PREFIX)
     ]
-    assert {*map(str, _statements(found))} == {*map(str, _statements(iot_policies.documents(AGENT, place=PLACE)))}
-    assert all(len(document) <= iot_policies.MAX_CHARACTERS for document in iot_policies.agents(place=PLACE))
+    assert {*map(str, _statements(documents))} == {
+        *map(str, _statements(iot_policies.documents(AGENT, arn_prefix=ARN_PREFIX)))
+    }
+    assert all(len(document) <= iot_policies.MAX_CHARACTERS for document in iot_policies.agents(arn_prefix=ARN_PREFIX))
 
 
 def _statements(documents: list[str]) -> list[Any]:

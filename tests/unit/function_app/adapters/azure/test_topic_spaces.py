@@ -106,12 +106,12 @@ def test_a_grant_that_cannot_be_expressed_exactly_is_refused(grant: Grant) -> No
 
 
 def test_the_topic_space_of_the_functions_has_no_clients() -> None:
-    space = topic_spaces.spaces()[topic_spaces.FUNCTIONS_SAY]
+    space = topic_spaces.spaces()[topic_spaces.FUNCTIONS_SPACE]
     assert {f"ts/v1/+/+/+/{kind}" for kind in ("cmd", "stop", "state", "ack")} <= set(space)
     assert not any(
         covers(template, "ts/v1/s/a/arm/ctl/1") or covers(template, "ts/v1/s/a/arm/cam/x") for template in space
     )
-    assert topic_spaces.FUNCTIONS_SAY not in {bound.space for bound in topic_spaces.bindings()}
+    assert topic_spaces.FUNCTIONS_SPACE not in {bound.space for bound in topic_spaces.bindings()}
 
 
 def test_microsofts_limits_are_respected() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import jwt
 import pytest
 
-from function_app.adapters.azure.webhook_auth import AGAIN_S, EntraCallers
+from function_app.adapters.azure.webhook_auth import MIN_REFRESH_S, EntraTokenVerifier
 from function_app.ports.tables import StoreError
 from tests.harness.cloud.oidc_provider import SigningKey, new_key
 from tests.harness.network.http_server import QuietHandler, running
@@ -47,8 +47,8 @@ def entra(keys: tuple[SigningKey, SigningKey]) -> Iterator[Entra]:
         yield entra
 
 
-def callers_of(entra: Entra) -> EntraCallers:
-    return EntraCallers(tenant=TENANT, audience=f"api://{APPLICATION}", identity=IDENTITY, authority=entra.url)
+def verifier_of(entra: Entra) -> EntraTokenVerifier:
+    return EntraTokenVerifier(tenant=TENANT, audience=f"api://{APPLICATION}", identity=IDENTITY, authority=entra.url)
 
 
 def token(key: SigningKey, entra: Entra, *, name: str = "", **changed: Any) -> str:
@@ -66,15 +66,15 @@ def token(key: SigningKey, entra: Entra, *, name: str = "", **changed: Any) -> s
 
 
 def test_tokens_of_both_versions_identify_the_namespace(entra: Entra, keys: tuple[SigningKey, SigningKey]) -> None:
-    caller = callers_of(entra)
+    verifier = verifier_of(entra)
     first = {"iss": f"https://sts.windows.net/{TENANT}/", "aud": f"api://{APPLICATION}"}
     for each in (token(keys[0], entra), token(keys[0], entra, **first)):
-        assert asyncio.run(caller.knows(each))
+        assert asyncio.run(verifier.verify(each))
     assert entra.requests == [f"/{TENANT}/discovery/v2.0/keys"]
 
 
 def test_other_callers_are_rejected(entra: Entra, keys: tuple[SigningKey, SigningKey]) -> None:
-    callers = callers_of(entra)
+    verifier = verifier_of(entra)
     changes: tuple[dict[str, Any], ...] = (
         {"oid": APPLICATION},
         {"oid": [IDENTITY]},
@@ -85,7 +85,7 @@ def test_other_callers_are_rejected(entra: Entra, keys: tuple[SigningKey, Signin
         *({claim: None} for claim in ("oid", "aud", "iss", "exp", "nbf")),
     )
     for changed in changes:
-        assert not asyncio.run(callers.knows(token(keys[0], entra, **changed))), changed
+        assert not asyncio.run(verifier.verify(token(keys[0], entra, **changed))), changed
 
 
 def test_tokens_without_entras_signature_are_rejected(entra: Entra, keys: tuple[SigningKey, SigningKey]) -> None:
@@ -94,26 +94,26 @@ def test_tokens_without_entras_signature_are_rejected(entra: Entra, keys: tuple[
     shared = jwt.encode(claims, "x" * 64, "HS256", headers={"kid": "one"})
     nameless = jwt.encode(claims, keys[0].private, "RS256")
     for each in (token(keys[1], entra, name="one"), token(keys[1], entra), unsigned, shared, nameless, "", "a.b.c"):
-        assert not asyncio.run(callers_of(entra).knows(each)), each
+        assert not asyncio.run(verifier_of(entra).verify(each)), each
 
 
 def test_a_new_key_is_fetched_but_not_for_every_unknown_key_id(
     entra: Entra, keys: tuple[SigningKey, SigningKey]
 ) -> None:
-    caller = callers_of(entra)
+    verifier = verifier_of(entra)
 
     async def many() -> list[bool]:
-        return [await caller.knows(token(keys[1], entra, name=f"made-up-{number}")) for number in range(20)]
+        return [await verifier.verify(token(keys[1], entra, name=f"made-up-{number}")) for number in range(20)]
 
     assert not any(asyncio.run(many()))
     assert len(entra.requests) == 1
     entra.keys = keys
-    caller._fetched_s -= AGAIN_S
-    assert asyncio.run(caller.knows(token(keys[1], entra)))
+    verifier._fetched_s -= MIN_REFRESH_S
+    assert asyncio.run(verifier.verify(token(keys[1], entra)))
     assert len(entra.requests) == 2
 
 
 def test_an_unreachable_entra_is_an_error(keys: tuple[SigningKey, SigningKey], entra: Entra) -> None:
-    away = EntraCallers(tenant=TENANT, audience=APPLICATION, identity=IDENTITY, authority="http://127.0.0.1:1")
+    away = EntraTokenVerifier(tenant=TENANT, audience=APPLICATION, identity=IDENTITY, authority="http://127.0.0.1:1")
     with pytest.raises(StoreError, match="Entra"):
-        asyncio.run(away.knows(token(keys[0], entra)))
+        asyncio.run(away.verify(token(keys[0], entra)))
