@@ -58,12 +58,12 @@ def group(points_m: Floats, gap_m: float, min_points: int) -> list[Cluster]:
         label[start] = count
         pending = [key]
         while pending:
-            here = pending.pop()
+            cell = pending.pop()
             for step in _AROUND:
-                other = index.get(here + step)
+                other = index.get(cell + step)
                 if other is not None and label[other] < 0:
                     label[other] = count
-                    pending.append(here + step)
+                    pending.append(cell + step)
         count += 1
     of_point = label[cell_of_point.ravel()]
     clusters = [Cluster(points_m[of_point == number]) for number in range(count)]

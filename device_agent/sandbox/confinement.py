@@ -39,7 +39,7 @@ def enter(link: int, parent: int, task: Mapping[str, Any], filter_: seccomp.Filt
 
     Args:
         link: Socket to the agent; becomes descriptor ``LINK``. All others but the null device are closed.
-        parent: Process id of the zygote; this process dies with it.
+        parent: Process id of the zygote; this process ends with it.
         task: ``layers`` to apply, ``cpu_s`` [s], ``memory_bytes``.
         filter_: The seccomp filter.
 

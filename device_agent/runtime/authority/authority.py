@@ -1,6 +1,6 @@
 """Control authority of one device: leases, Stop, faults, restrictions and the reservation of an action.
 
-Nothing here moves the device. When the right to move ends, ``hold`` is called, which brings the device to rest.
+This module does not move the device. When the right to move ends, it calls ``hold``, which brings the device to rest.
 """
 
 import threading

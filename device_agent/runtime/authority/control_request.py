@@ -31,7 +31,7 @@ class PendingControlRequest:
             Refused: The requested lease is not in force.
         """
         if lease is None or lease.epoch != epoch:
-            raise Refused("no_lease", f"lease {epoch} is not in force here, so it cannot be requested")
+            raise Refused("no_lease", f"lease {epoch} is not in force, so control cannot be requested")
         # Two cloud processes may have sent the request and its withdrawal in the opposite order.
         if request.request != self._withdrawn:
             self._request = ControlRequest(

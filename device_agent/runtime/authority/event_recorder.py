@@ -97,7 +97,7 @@ class EventRecorder:
                 events.append(EventRecord(newest.kind, newest.message, newest.severity, data, newest.at_ms))
                 repeated.published_s, repeated.count = now_s, 0
             if self._lost:
-                message = f"{self._lost} events were not recorded individually: too many occurred at once"
+                message = f"{self._lost} events were not recorded individually: too many occurred in a short time"
                 events.append(
                     _stamped(EventRecord(EventKind.EVENTS_DROPPED, message, "warning", {"count": self._lost}))
                 )

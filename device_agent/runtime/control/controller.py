@@ -142,7 +142,7 @@ class Controller:
             state = self._state
             lease = state.authority.lease(now_s)
             if lease is None or setpoint.epoch != lease.epoch:
-                raise Refused("no_lease", f"lease {setpoint.epoch} is not in force here")
+                raise Refused("no_lease", f"lease {setpoint.epoch} is not in force")
             state.stream.check(setpoint, tick_ms=tick_ms)
             try:
                 state.authority.check_free()

@@ -169,7 +169,7 @@ class JointMotion:
         self._follower.follow(share)
 
     def _rests_at(self, position_rad: Sequence[float]) -> bool:
-        """Whether a trajectory that starts there starts here; otherwise the first period would be a jump."""
+        """Whether the device rests at the start of a trajectory; otherwise the first period would be a jump."""
         pairs = zip(self.position_rad, position_rad, strict=True)
         return all(abs(a - b) <= _REACHED_RAD or index in self._tracked for index, (a, b) in enumerate(pairs))
 

@@ -32,7 +32,7 @@ class AsciiTerminal(Terminal):
         (Terminal, True, 20, False),
     ],
 )
-def test_the_qr_code_is_shown_if_wanted_and_displayable(
+def test_the_qr_code_is_shown_if_requested_and_displayable(
     terminal: type[io.StringIO], qr: bool, columns: int, shown: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))

@@ -71,7 +71,7 @@ def test_a_signed_command_is_verified_with_the_pinned_key() -> None:
     assert codec.decode(signing.verify(signing.sign(BODY, KEY), KEYS), Command) == COMMAND
 
 
-def test_each_byte_of_a_signed_command_counts() -> None:
+def test_a_change_of_any_byte_of_a_signed_command_is_rejected() -> None:
     payload = signing.sign(BODY, KEY)
     accepted = []
     for index in range(len(payload)):

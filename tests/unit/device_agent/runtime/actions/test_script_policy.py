@@ -112,5 +112,7 @@ def test_versions_count_per_device_and_author(journal: Journal, device: str, aut
         (SHIPPED, "", False),
     ],
 )
-def test_which_authors_are_untrusted(journal: Journal, author: str, owner: str, untrusted: bool) -> None:
+def test_authors_other_than_owner_and_project_are_untrusted(
+    journal: Journal, author: str, owner: str, untrusted: bool
+) -> None:
     assert policy_of(journal, owner=owner).is_untrusted(movement(author=author)) is untrusted

@@ -16,7 +16,7 @@ from tests.harness.agent.device_harness import eventually
 from tests.unit.device_agent.runtime.actions.script_action_fixture import FakeProcess, FakeSandbox, Run, run_fake
 
 
-def test_a_script_is_killed_at_once() -> None:
+def test_kill_ends_a_script_that_ignores_signals() -> None:
     source = "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('here')\nwhile True: pass"
     started, failures = Run(source), list[str]()
 
@@ -35,7 +35,7 @@ def test_a_script_is_killed_at_once() -> None:
     assert failures == ["the script's process ended before the script did"]
 
 
-def test_a_script_that_dies_in_a_call_releases_the_robot_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_end_of_a_process_in_a_call_releases_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
     released = threading.Event()
     started = Run("robot.home()", on_exit=released.set)
 
@@ -51,7 +51,7 @@ def test_a_script_that_dies_in_a_call_releases_the_robot_at_once(monkeypatch: py
         started.script.run()
 
 
-def test_a_process_that_survives_kill_does_not_block_the_action() -> None:
+def test_a_process_that_does_not_exit_does_not_block_the_action() -> None:
     process, exited = FakeProcess(exits=False), threading.Event()
     process.send(b'{"kind":"ready"}', b'{"kind":"ended"}')
     Run(sandbox=FakeSandbox(process), on_exit=exited.set).script.run()

@@ -121,7 +121,7 @@ def test_a_statement_with_a_changed_byte_is_rejected(fixture: PinsFixture) -> No
     fixture.pins.follow([valid.decode()])
 
 
-def test_older_keys_and_keys_with_a_successor_sign_no_other(fixture: PinsFixture) -> None:
+def test_older_keys_and_keys_with_a_successor_cannot_introduce_keys(fixture: PinsFixture) -> None:
     fixture.pins.follow([statement(SECOND, FIRST, 2)])
     for pins in (fixture.pins, fixture.load()):
         assert rejection(pins, statement(THIRD, FIRST, 3)) == "rolled_back"

@@ -89,7 +89,7 @@ class InlineDriver(FakeDriver):
         return super().send(position_rad)
 
 
-def test_a_device_at_rest_follows_one_of_several_setpoints_at_once(make_loop: MakeLoop) -> None:
+def test_a_device_at_rest_follows_one_of_several_setpoints_early(make_loop: MakeLoop) -> None:
     setup = make_loop()
     setup.send_setpoint(0.5)
     wait_until(lambda: setup.published[-1].setpoint_sequence == 1, "telemetry of it")
@@ -225,7 +225,7 @@ def moving(monkeypatch: pytest.MonkeyPatch) -> LoopFixture:
     return setup
 
 
-def test_a_stop_in_motion_brakes_at_once_for_the_elapsed_time(moving: LoopFixture) -> None:
+def test_a_stop_in_motion_brakes_immediately_for_the_elapsed_time(moving: LoopFixture) -> None:
     setup = moving
     assert isinstance(setup.driver, InlineDriver)
     before_rad, speed_rad_s = setup.driver.position[1], setup.controller._state.motion.velocity_rad_s[1]

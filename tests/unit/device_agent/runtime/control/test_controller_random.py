@@ -137,7 +137,7 @@ class RandomRun:
             )
             self.controller.accept_setpoint(setpoint, now_s=self.now_s, tick_ms=tick_ms)
             assert self.epoch > self.burned, "accepted although the lease has ended"
-            assert self.speed() > 0, "motion although the room holds the device"
+            assert self.speed() > 0, "accepted although the room holds the device"
             self.may_move_until_s = self.now_s + REST_WITHIN_S
             self.rest_from_s = self.now_s + REST_WITHIN_S
             for _ in range(3):
@@ -164,7 +164,7 @@ class RandomRun:
             self.epoch += self.random.choice((0, 1))
         self.reservation = self.controller.reserve(epoch=self.epoch, on_revoked=self.on_revoked)
         assert self.epoch > self.burned, "accepted although the lease has ended"
-        assert self.speed() > 0, "motion although the room holds the device"
+        assert self.speed() > 0, "accepted although the room holds the device"
 
     def on_revoked(self, _why: Refused) -> None:
         self.reservation = None

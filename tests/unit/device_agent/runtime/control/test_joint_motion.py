@@ -30,7 +30,7 @@ def test_a_trajectory_that_starts_elsewhere_is_not_followed() -> None:
     assert motion.fastest_rad_s > 0.1
     follow(motion, turn_to(-1.0), 50)
     assert not motion.moving
-    assert 0.4 < motion.position_rad[0] < 0.7, "it came to rest on its trajectory"
+    assert 0.4 < motion.position_rad[0] < 0.7, "the joint rests on its trajectory"
 
 
 def test_a_device_without_joints_needs_no_plan() -> None:
@@ -74,4 +74,4 @@ def test_a_short_brake_does_not_reverse_the_motion() -> None:
                 motion.follow([0.0, 0.0])
             motion.update()
             assert max(motion.position_rad) <= 3.0 + 1e-9, "out of its range"
-        assert motion.velocity_rad_s[0] < -0.1, "it goes on"
+        assert motion.velocity_rad_s[0] < -0.1, "the motion continues"

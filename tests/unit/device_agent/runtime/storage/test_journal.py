@@ -103,7 +103,7 @@ def test_old_terminal_commands_are_deleted(open_journal: OpenJournal) -> None:
     assert after.begin("arm", ack("open")) is not None
 
 
-def test_an_invalid_journal_file_is_named_and_kept(tmp_path: Path) -> None:
+def test_an_invalid_journal_file_is_named_and_not_deleted(tmp_path: Path) -> None:
     path = tmp_path / "journal.db"
     path.write_bytes(b"this is not a database, but as long as one" * 100)
     journal = Journal(path)
