@@ -72,7 +72,7 @@ def test_a_password_is_set_after_a_link_and_signs_in(browser: Browser, environme
 
 
 def test_sign_in_at_a_provider_returns_with_a_lasting_session(browser: Browser, environment: dict[str, str]) -> None:
-    """Only a browser can show that the strict cookie set by the redirect is kept."""
+    """Only a browser can show that the strict cookie set by the redirect is stored."""
     with person(browser, environment["TELESCOPE_PUBLIC_URL"]) as page:
         sign_in_at_the_provider(page, "bob")
         page.reload()

@@ -44,15 +44,15 @@ class Terminal:
     def _read(self) -> None:
         with contextlib.suppress(OSError):  # its end
             decoder = codecs.getincrementaldecoder("utf-8")()
-            while said := os.read(self._ours, 4096):
-                self.text += decoder.decode(said)
+            while output := os.read(self._ours, 4096):
+                self.text += decoder.decode(output)
 
     def link(self) -> str:
-        def found() -> re.Match[str] | None:
+        def pairing_link() -> re.Match[str] | None:
             return re.search(r"(http\S+#pair=\S+)\s", self.text)
 
-        wait_until(lambda: found() is not None, "the link")
-        match = found()
+        wait_until(lambda: pairing_link() is not None, "the link")
+        match = pairing_link()
         assert match
         return match[1]
 
@@ -81,13 +81,13 @@ def test_a_robot_is_paired_by_the_link_in_the_terminal(browser: Browser, machine
     drawn = claim_prompt.qr_lines(link)
     wait_until(lambda: all(line in terminal.text for line in drawn), "the QR code")
     with machine.api() as api, person(browser, link) as page:
-        known = {device["id"] for device in api.get("/devices")["items"]}
+        existing = {device["id"] for device in api.get("/devices")["items"]}
         # Without a session the code is removed from the address and restored after sign-in. Claiming needs a click.
         expect(page.get_by_text("You followed a pairing link. Sign in to continue")).to_be_visible()
         assert "pair=" not in page.url
         page.goto(machine.sign_in_link())
         expect(page.get_by_test_id("claim-code")).to_have_value(link.partition("=")[2])
-        assert {device["id"] for device in api.get("/devices")["items"]} == known
+        assert {device["id"] for device in api.get("/devices")["items"]} == existing
         assert_good_page(page, "pairing")
 
         # A wrong code is rejected with a message; the form keeps its input.
@@ -130,5 +130,5 @@ def test_a_robot_is_paired_by_the_link_in_the_terminal(browser: Browser, machine
         page.get_by_test_id("claim-code").fill(right)
         page.get_by_test_id("claim").click()
         expect(page.get_by_role("alert")).to_contain_text("already used")
-        (paired,) = [device for device in api.get("/devices")["items"] if device["id"] not in known]
+        (paired,) = [device for device in api.get("/devices")["items"] if device["id"] not in existing]
         api.http.delete(f"/agents/{paired['agent']}").raise_for_status()

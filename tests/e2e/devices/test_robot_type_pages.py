@@ -72,7 +72,7 @@ SCENE = """<mujoco model="reacher_scene">
   </worldbody>
 </mujoco>
 """
-BOW = '"""Bow, and come up again."""\nrobot.move_joints({"shoulder": 0.6}, speed=0.5)\nrobot.home()\n'
+BOW = '"""Bow and return."""\nrobot.move_joints({"shoulder": 0.6}, speed=0.5)\nrobot.home()\n'
 GOOD = {"robot.toml": MANIFEST, "reacher.xml": MODEL, "scene.xml": SCENE, "movements/bow.py": BOW}
 WORSE = MODEL.replace("<worldbody>", '<asset><mesh name="hand" file="hand.stl"/></asset><worldbody>', 1).replace(
     '<site name="tip"', '<geom type="mesh" mesh="hand"/><site name="tip"'
@@ -88,12 +88,12 @@ BROKEN = {
 
 def archive(files: Mapping[str, str]) -> FilePayload:
     """A zip archive of a folder, with the entries that file managers add."""
-    held = io.BytesIO()
-    with zipfile.ZipFile(held, "w") as made:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive_file:
         for name, text in files.items():
-            made.writestr(f"reacher/{name}", text)
-        made.writestr("__MACOSX/reacher/._robot.toml", "x")
-    return {"name": "reacher.zip", "mimeType": "application/zip", "buffer": held.getvalue()}
+            archive_file.writestr(f"reacher/{name}", text)
+        archive_file.writestr("__MACOSX/reacher/._robot.toml", "x")
+    return {"name": "reacher.zip", "mimeType": "application/zip", "buffer": buffer.getvalue()}
 
 
 def at_step(page: Page, step: str) -> None:
@@ -123,11 +123,11 @@ def test_a_robot_type_is_corrected_previewed_saved_and_deleted(
         expect(page.locator("[data-type='ur5']")).to_contain_text("1 device")
         page.get_by_test_id("add-robot-type").click()
         assert_good_page(page, "robot-type-add")
-        is_refused(page)
-        is_mended(page, tmp_path)
-        is_looked_at(page, machine)
-        is_saved(page, machine)
-        is_deleted(page, machine)
+        check_rejection(page)
+        check_correction(page, tmp_path)
+        check_preview(page, machine)
+        check_saving(page, machine)
+        check_deletion(page, machine)
 
         # A built-in type has a picture too.
         page.locator("[data-type='ur5'] a").click()
@@ -136,10 +136,10 @@ def test_a_robot_type_is_corrected_previewed_saved_and_deleted(
         expect(page.get_by_test_id("delete-type")).to_have_count(0)
 
 
-def is_refused(page: Page) -> None:
+def check_rejection(page: Page) -> None:
     """An invalid archive is rejected; all errors in a valid one are listed with file and advice."""
-    torn: FilePayload = {"name": "torn.zip", "mimeType": "application/zip", "buffer": b"PK\x03\x04 and no more"}
-    page.get_by_test_id("type-files").set_input_files([torn])
+    invalid: FilePayload = {"name": "torn.zip", "mimeType": "application/zip", "buffer": b"PK\x03\x04 and no more"}
+    page.get_by_test_id("type-files").set_input_files([invalid])
     expect(page.get_by_role("alert").filter(has_text="torn.zip cannot be extracted")).to_be_visible()
 
     page.get_by_test_id("type-files").set_input_files([archive(BROKEN)])
@@ -155,7 +155,7 @@ def is_refused(page: Page) -> None:
     expect(rows).to_have_count(4)
 
 
-def is_mended(page: Page, folder: Path) -> None:
+def check_correction(page: Page, folder: Path) -> None:
     """The selected files remain and can be replaced one by one."""
     replace(page, folder, "scene.xml", SCENE)
     replace(page, folder, "robot.toml", MANIFEST)
@@ -165,7 +165,7 @@ def is_mended(page: Page, folder: Path) -> None:
     at_step(page, "good")
 
 
-def is_looked_at(page: Page, machine: Machine) -> None:
+def check_preview(page: Page, machine: Machine) -> None:
     """The preview moves each joint; the type is not in the list before it is saved."""
     view = page.get_by_test_id("model-view")
     wait_until(lambda: frames(view) > 0, "a picture")
@@ -174,7 +174,7 @@ def is_looked_at(page: Page, machine: Machine) -> None:
     page.keyboard.press("End")
     wait_until(lambda: frames(view) > before, "another picture")
     expect(page.locator("output[for=model-joint-elbow]")).to_have_text("85.9°")
-    assert view.locator("canvas").screenshot() != first, "the elbow has moved"
+    assert view.locator("canvas").screenshot() != first, "the picture must change"
     expect(page.get_by_test_id("found")).to_contain_text("Movements: 1")
     expect(page.get_by_test_id("found")).to_contain_text("picture")
     with machine.api() as api:
@@ -182,17 +182,17 @@ def is_looked_at(page: Page, machine: Machine) -> None:
     assert_good_page(page, "robot-type-look")
 
 
-def is_saved(page: Page, machine: Machine) -> None:
+def check_saving(page: Page, machine: Machine) -> None:
     """The saved type has a page and is in the list."""
     page.get_by_test_id("save-type").click()
     expect(page.get_by_test_id("type-saved")).to_be_visible()
     expect(page.locator("[data-testid=saved-movements] [data-accepted=true]")).to_have_text("bow accepted")
-    expect(page.get_by_test_id("command-enroll")).to_have_value(enrolment(machine))
+    expect(page.get_by_test_id("command-enroll")).to_have_value(enroll_command(machine))
     assert_good_page(page, "robot-type-saved")
 
     view = page.get_by_test_id("model-view")
     page.get_by_test_id("open-type").click()
-    expect(page.get_by_test_id("type-movements")).to_contain_text("Bow, and come up again.")
+    expect(page.get_by_test_id("type-movements")).to_contain_text("Bow and return.")
     wait_until(lambda: frames(view) > 0, "a picture")
     expect(page.get_by_test_id("joint-table").locator("tbody tr")).to_have_count(2)
     assert_good_page(page, "robot-type")
@@ -201,7 +201,7 @@ def is_saved(page: Page, machine: Machine) -> None:
     assert_good_page(page, "robot-types")
 
 
-def is_deleted(page: Page, machine: Machine) -> None:
+def check_deletion(page: Page, machine: Machine) -> None:
     """A type in use cannot be deleted; an unused one can."""
     page.locator("[data-type='reacher'] a").click()
     page.get_by_test_id("delete-type").click()
@@ -214,6 +214,6 @@ def is_deleted(page: Page, machine: Machine) -> None:
     expect(page.locator("[data-type='reacher']")).to_have_count(0)
 
 
-def enrolment(machine: Machine) -> str:
+def enroll_command(machine: Machine) -> str:
     words = "python -m device_agent enroll --home ~/reacher-agent"
     return f"{words} --server {machine.url} --device reacher=reacher --no-wait"

@@ -17,12 +17,12 @@ UR5_HTTP_MS, UR5_XMPP_MS = "2994.6", "824.25"
 
 
 @contextlib.contextmanager
-def ill(machine: Machine, device: str, ailment: str) -> Iterator[Path]:
+def inject_fault(machine: Machine, device: str, fault: str) -> Iterator[Path]:
     """Inject a fault into a simulated device until the context exits or the file is deleted."""
     (folder,) = {path.parent / "faults" for path in machine.home.rglob("agent.toml")}
     folder.mkdir(exist_ok=True)
     file = folder / f"{device}.toml"
-    file.write_text(ailment)
+    file.write_text(fault)
     try:
         yield file
     finally:
@@ -40,18 +40,18 @@ def test_a_fault_is_raised_shown_and_ended_and_a_trend_shows_measurements(
 ) -> None:
     with laboratory.api() as api:
         ids = {name: api.device(name)["id"] for name in ("thermometer", "co2")}
-        # Wild values appear in the trend at once; the detectors find them during the other checks.
+        # The trend shows the wrong values immediately; the detectors raise a fault during the other checks.
         with (
-            ill(laboratory, "co2", "drift = { co2_ppm = 90000.0 }"),
+            inject_fault(laboratory, "co2", "drift = { co2_ppm = 90000.0 }"),
             pages(browser, laboratory) as (ann,),
-            ill(laboratory, "thermometer", "unreachable = true") as file,
+            inject_fault(laboratory, "thermometer", "unreachable = true") as file,
         ):
-            raised(ann, laboratory, ids["thermometer"])
-            seen_and_ended(ann, file)
-            trend(ann, laboratory, ids["co2"])
+            check_raised(ann, laboratory, ids["thermometer"])
+            check_acknowledged_and_ended(ann, file)
+            check_trend(ann, laboratory, ids["co2"])
 
 
-def raised(page: Page, machine: Machine, device: str) -> None:
+def check_raised(page: Page, machine: Machine, device: str) -> None:
     """The device list, the health page and the device page show the fault without a reload."""
     row = page.locator(f"[data-testid=device-row][data-device='{device}']")
     expect(row.get_by_text("1 fault")).to_be_visible()
@@ -67,7 +67,7 @@ def raised(page: Page, machine: Machine, device: str) -> None:
     go(page, machine, f"#/devices/{device}/health")
 
 
-def seen_and_ended(page: Page, cause: Path) -> None:
+def check_acknowledged_and_ended(page: Page, cause: Path) -> None:
     """Acknowledge by keyboard; the fault ends with its cause."""
     fault = page.get_by_test_id("fault")
     expect(fault).to_have_attribute("data-state", "raised")
@@ -89,12 +89,12 @@ def seen_and_ended(page: Page, cause: Path) -> None:
     expect(past.locator(".event-list")).to_contain_text("Fault acknowledged")
 
 
-def trend(page: Page, machine: Machine, device: str) -> None:
+def check_trend(page: Page, machine: Machine, device: str) -> None:
     """The trend shows the excursion, the band and the fault; keyboard and table access work."""
     go(page, machine, f"#/devices/{device}/health")
     page.get_by_text("10 min", exact=True).click()
     now = page.get_by_test_id("trend-now")
-    wait_until(lambda: float(now.get_attribute("data-value") or "0") > 2000, "a wild value")
+    wait_until(lambda: float(now.get_attribute("data-value") or "0") > 2000, "a wrong value")
     expect(now).to_contain_text("outside its limits")
     expect(page.get_by_test_id("trend-fault")).to_have_attribute("data-code", "co2.co2_ppm", timeout=2 * PATIENCE_MS)
     row = page.get_by_test_id("watched-row").first
@@ -134,8 +134,8 @@ def test_latencies_are_measured_plotted_with_reference_values_and_saved(browser:
                 assert int(line.get_attribute("data-count") or "0") >= MEASURED
             # The cloud stores its own measurements of the same requests asynchronously.
             kinds = (("http", "operator-device"), ("mqtt", "command-started"))
-            wait_until(lambda: all(counted(api, device)[kind] >= MEASURED for kind in kinds), "all to be stored")
-            counts = counted(api, device)
+            wait_until(lambda: all(count_samples(api, device)[kind] >= MEASURED for kind in kinds), "all to be stored")
+            counts = count_samples(api, device)
             ann.get_by_test_id("times-path").select_option("operator-device")
             assert chart.get_attribute("data-samples") == str(counts["http", "operator-device"])
             for ms in (UR5_HTTP_MS, UR5_XMPP_MS):
@@ -156,7 +156,7 @@ def test_latencies_are_measured_plotted_with_reference_values_and_saved(browser:
             assert_good_page(ann, "times")
 
 
-def counted(api: Api, device: str) -> dict[tuple[str, str], int]:
+def count_samples(api: Api, device: str) -> dict[tuple[str, str], int]:
     """Number of stored samples by transport and path."""
     items = api.get(f"/devices/{device}/latency")["items"]
     return defaultdict(int, {(item["transport"], item["path"]): item["count"] for item in items})

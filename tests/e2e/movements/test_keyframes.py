@@ -36,10 +36,10 @@ def keyframes(page: Page) -> list[dict[str, Any]]:
     """Keyframes in the generated script."""
     source = page.get_by_test_id("kf-source").text_content() or ""
     tree = ast.parse(source)
-    found = next(
+    statement = next(
         each for each in tree.body if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == "KEYFRAMES"
     )
-    read: list[dict[str, Any]] = ast.literal_eval(found.value)
+    read: list[dict[str, Any]] = ast.literal_eval(statement.value)
     return read
 
 
@@ -80,7 +80,7 @@ def test_keyframes_of_an_arm_are_edited_saved_and_run(drawing_browser: Browser, 
         expect(page.get_by_test_id("kf-problems")).to_have_attribute("data-count", "0")
         assert number(page, "kf-marker-2", "time") > 0.6
 
-        undone_and_done_again(page)
+        check_undo_and_redo(page)
         page.get_by_test_id("kf-duplicate").click()
         set_joint(page, "shoulder_pan", 75)
         set_joint(page, "shoulder_lift", -80)
@@ -109,15 +109,15 @@ def test_keyframes_of_an_arm_are_edited_saved_and_run(drawing_browser: Browser, 
         run(page)
         reached = laboratory.trace().rows(3000)
         for one in made[1:]:
-            wanted = one["position_rad"]
-            assert any(all(abs(row["qpos"][joint] - at) < 0.05 for joint, at in wanted.items()) for row in reached), (
-                wanted
+            expected = one["position_rad"]
+            assert any(all(abs(row["qpos"][joint] - at) < 0.05 for joint, at in expected.items()) for row in reached), (
+                expected
             )
 
-        opened_again(page, laboratory, made)
+        check_reopening(page, laboratory, made)
 
 
-def undone_and_done_again(page: Page) -> None:
+def check_undo_and_redo(page: Page) -> None:
     """Edit keyframes by keyboard."""
     page.get_by_test_id("kf-marker-2").focus()
     page.keyboard.press("ArrowRight")
@@ -128,7 +128,7 @@ def undone_and_done_again(page: Page) -> None:
     assert number(page, "kf-marker-2", "time") == later
 
 
-def opened_again(page: Page, laboratory: Machine, made: list[dict[str, Any]]) -> None:
+def check_reopening(page: Page, laboratory: Machine, made: list[dict[str, Any]]) -> None:
     """Saved keyframes open again; a script that was edited by hand does not open as keyframes."""
     page.reload()
     expect(page.get_by_test_id("kf-track")).to_be_visible()
@@ -152,8 +152,8 @@ def test_a_recorded_motion_is_trimmed_and_becomes_keyframes(drawing_browser: Bro
         with laboratory.api() as api:
             for position_rad in ({"shoulder_pan": home["shoulder_pan"] + 0.6}, home):
                 request = {"kind": "move_joints", "position_rad": position_rad, "speed": 0.7}
-                asked = {"request": request, "wait_ms": 10_000, "wait_for": "done"}
-                done = api.post(f"/devices/{api.device('ur5')['id']}/actions", asked)
+                body = {"request": request, "wait_ms": 10_000, "wait_for": "done"}
+                done = api.post(f"/devices/{api.device('ur5')['id']}/actions", body)
                 assert done["status"] == "done", done
         page.get_by_test_id("kf-record").click()
         assert number(page, "kf-recorded", "samples") > 10
@@ -224,7 +224,7 @@ def test_keyframes_are_made_for_a_robot_type_without_a_robot(browser: Browser, l
         ann.get_by_test_id("kf-name").fill("at_ease")
         expect(ann.get_by_text("No robot is selected")).to_be_visible()
         for part in ("kf-run", "kf-record", "stop"):
-            assert ann.get_by_test_id(part).count() == 0, f"{part}: there is no robot"
+            assert ann.get_by_test_id(part).count() == 0, f"{part}: no robot is selected"
         ann.get_by_test_id("kf-save").click()
         expect(ann.get_by_test_id("kf-save-status")).to_have_attribute("data-version", "1")
         assert_good_page(ann, "keyframes-type")

@@ -59,9 +59,9 @@ def second(machine: Machine, api: Api) -> Iterator[Trace]:
 @pytest.fixture
 def name(api: Api, request: pytest.FixtureRequest) -> Iterator[str]:
     """Name of a movement for one test; version numbers are never reused."""
-    found = "".join(part[0] for part in request.node.name.split("_")[1:])
-    yield found
-    api.http.delete(f"/robot-types/ur5/movements/{found}")
+    name = "".join(part[0] for part in request.node.name.split("_")[1:])
+    yield name
+    api.http.delete(f"/robot-types/ur5/movements/{name}")
     device = api.device()["id"]
     home: dict[str, Any] = {"kind": "run_movement", "name": "home"}
     # Queued, because an action of the test may still run.

@@ -14,11 +14,11 @@ from tests.harness.network.brokers import BROKERS, MODULES, wait_until
 
 NOTE = """() => {
     window.bannerTexts = [];
-    const look = () => {
+    const record = () => {
         const banner = document.querySelector("[data-testid=link-banner]");
         if (banner !== null) window.bannerTexts.push(banner.textContent);
     };
-    new MutationObserver(look).observe(document.body, {subtree: true, childList: true, characterData: true});
+    new MutationObserver(record).observe(document.body, {subtree: true, childList: true, characterData: true});
 }"""
 """Records every text of the link banner, because the broker may recover before the test reads it."""
 TYPED = "0.123"
@@ -42,8 +42,8 @@ def kill(machine: Machine, program: str) -> None:
 def control_views(page: Page, api: Api, device: str) -> list[bool]:
     """Whether an operator has control according to the page, the cloud and the robot."""
     cloud = api.get(f"/devices/{device}")
-    shown = page.get_by_test_id("control-state").get_attribute("data-state")
-    return [shown == "mine", cloud["lease"] is not None, cloud["state"]["lease"] is not None]
+    displayed = page.get_by_test_id("control-state").get_attribute("data-state")
+    return [displayed == "mine", cloud["lease"] is not None, cloud["state"]["lease"] is not None]
 
 
 def test_a_broker_failure_ends_only_the_running_motion(browser: Browser, site: tuple[Machine, str]) -> None:
@@ -63,7 +63,7 @@ def test_a_broker_failure_ends_only_the_running_motion(browser: Browser, site: t
             return moved_on_ms
 
         assert stopped_in_time(attempt)
-        assert any("No connection to the broker" in said for said in page.evaluate("() => window.bannerTexts"))
+        assert any("No connection to the broker" in text for text in page.evaluate("() => window.bannerTexts"))
 
         # The robot held, which ended control: page, cloud and robot agree.
         wait_until(lambda: not any(control_views(page, api, device)), "page, cloud and robot to agree on control")

@@ -14,15 +14,15 @@ CLOCKS_AGREE_MS = 15.0
 
 def test_every_part_of_a_press_is_measured_and_in_order(drawing_browser: Browser, machine: Machine) -> None:
     with pages(drawing_browser, machine) as (page,):
-        found = slider.measure(page, machine, 2)
+        presses = slider.measure(page, machine, 2)
         for _ in range(5):  # a busy machine may render none of six presses in time
-            found = found or slider.presses(page, machine, 2)
+            presses = presses or slider.presses(page, machine, 2)
         if page.get_by_test_id("release-control").count():
             page.get_by_test_id("release-control").click()
-    assert found, "no press was rendered in time"
-    for press in found:
+    assert presses, "no press was rendered in time"
+    for press in presses:
         assert tuple(press.at_ms) == slider.PARTS
         times = list(press.at_ms.values())
         assert times[0] >= 0
         assert all(after > before - CLOCKS_AGREE_MS for before, after in pairwise(times)), press
-    slider.show(found)
+    slider.show(presses)

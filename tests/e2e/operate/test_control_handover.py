@@ -35,13 +35,13 @@ def move(api: Api, device: str, epoch: int, target: dict[str, float]) -> str:
 
 
 def state(api: Api, device: str) -> dict[str, Any]:
-    found: dict[str, Any] = api.get(f"/devices/{device}")["state"]
-    return found
+    body: dict[str, Any] = api.get(f"/devices/{device}")["state"]
+    return body
 
 
 def ended(api: Api, action: str) -> dict[str, Any]:
-    found: dict[str, Any] = api.get(f"/actions/{action}", wait_ms=20_000, wait_for="done")
-    return found
+    body: dict[str, Any] = api.get(f"/actions/{action}", wait_ms=20_000, wait_for="done")
+    return body
 
 
 def kinds(api: Api, device: str) -> set[str]:
@@ -63,23 +63,23 @@ def test_a_handover_stops_the_arm_and_the_former_holder_cannot_move_it(
     epoch = ann.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
     action = move(ann, device, epoch, FAR)
     wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion")
-    asked = bob.post(f"/devices/{device}/lease/requests", {"lease_ms": 60_000})
-    assert asked["confirmed"] is True
-    request = asked["request"]["id"]
+    requested = bob.post(f"/devices/{device}/lease/requests", {"lease_ms": 60_000})
+    assert requested["confirmed"] is True
+    request = requested["request"]["id"]
     wait_until(lambda: (state(ann, device)["lease"] or {}).get("request"), "the request in the device's state")
     assert state(ann, device)["lease"]["request"]["id"] == request
     assert commanded_speed(trace) > 0, "a request does not affect the motion"
-    given = ann.post(f"/devices/{device}/lease/requests/{request}/accept")
-    assert (given["epoch"], given["confirmed"]) == (epoch + 1, True)
+    granted = ann.post(f"/devices/{device}/lease/requests/{request}/accept")
+    assert (granted["epoch"], granted["confirmed"]) == (epoch + 1, True)
     last = ended(ann, action)
     assert (last["status"], last["reason"]["code"]) == ("failed", "lease_lost")
     wait_until(lambda: commanded_speed(trace) == 0, "rest")
     wait_until(lambda: state(bob, device)["lease"]["epoch"] == epoch + 1, "the new holder in the state")
     request_body = {"request": {"kind": "move_joints", "position_rad": FAR}, "epoch": epoch}
     assert refused(ann, f"/devices/{device}/actions", request_body) == "lease-lost"
-    taken = ann.post(f"/devices/{device}/lease", {"take_over": True, "reason": "to try it"})
+    taken = ann.post(f"/devices/{device}/lease", {"take_over": True, "reason": "test"})
     assert (taken["epoch"], taken["confirmed"]) == (epoch + 2, True)
-    wait_until(lambda: state(bob, device)["lease"]["reason"] == "to try it", "the reason in the state")
+    wait_until(lambda: state(bob, device)["lease"]["reason"] == "test", "the reason in the state")
     ann.http.delete(f"/devices/{device}/lease", params={"epoch": epoch + 2})
 
 
@@ -89,7 +89,7 @@ def test_after_stop_all_motion_needs_new_control(machine: Machine, two: tuple[Ap
     epoch = ann.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
     action = move(ann, device, epoch, NEAR)
     wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion")
-    answer = bob.post("/stop", {"reason": "to try it"})
+    answer = bob.post("/stop", {"reason": "test"})
     assert [item["confirmed"] for item in answer["items"] if item["device"] == device] == [True]
     assert ended(ann, action)["reason"]["code"] == "stopped"
     wait_until(lambda: commanded_speed(trace) == 0, "rest")
@@ -103,12 +103,12 @@ def test_after_stop_all_motion_needs_new_control(machine: Machine, two: tuple[Ap
     request_body = {"request": {"kind": "move_joints", "position_rad": NEAR}, "epoch": other}
     assert refused(bob, f"/devices/{device}/actions", request_body) == "lease-lost"
     assert_at_rest(trace)  # the reset resumes nothing
-    fresh = bob.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
-    again = move(bob, device, fresh, NEAR)
+    new_epoch = bob.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
+    again = move(bob, device, new_epoch, NEAR)
     wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion")
     bob.post(f"/actions/{again}/cancel")
     ended(bob, again)
-    bob.http.delete(f"/devices/{device}/lease", params={"epoch": fresh})
-    told = {"stop-ordered", "stop-latched", "stop-reset-ordered", "stop-reset", "control-taken"}
+    bob.http.delete(f"/devices/{device}/lease", params={"epoch": new_epoch})
+    expected = {"stop-ordered", "stop-latched", "stop-reset-ordered", "stop-reset", "control-taken"}
     # Events of the device arrive when its link is stable.
-    wait_until(lambda: told <= kinds(ann, device), "the events of cloud and device")
+    wait_until(lambda: expected <= kinds(ann, device), "the events of cloud and device")

@@ -37,11 +37,11 @@ def expect_state(page: Page, state: str) -> None:
     expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", state)
 
 
-def ask(asker: Page, holder: Page) -> None:
+def request_control(requester: Page, holder: Page) -> None:
     take_control(holder)
-    asker.get_by_test_id("ask-control").click()
+    requester.get_by_test_id("ask-control").click()
     expect(holder.get_by_test_id("asks")).to_contain_text("requests control")
-    expect(asker.get_by_test_id("asked")).to_contain_text("You requested control from demo")
+    expect(requester.get_by_test_id("asked")).to_contain_text("You requested control from demo")
 
 
 def take_over(owner: Page, holder: Page) -> bool:
@@ -69,7 +69,7 @@ def test_control_is_handed_over_and_viewers_are_listed(two: tuple[Page, Page], m
     demo.get_by_test_id("watchers").press("Enter")
 
     # Requested and rejected, by keyboard.
-    ask(carol, demo)
+    request_control(carol, demo)
     assert_good_page(demo, "asked-for-control")
     assert_good_page(carol, "asking-for-control")
     demo.get_by_test_id("refuse-request").press("Enter")
@@ -77,13 +77,13 @@ def test_control_is_handed_over_and_viewers_are_listed(two: tuple[Page, Page], m
     expect(demo.get_by_test_id("answered")).to_contain_text("You keep control")
 
     # Requested and withdrawn.
-    ask(carol, demo)
+    request_control(carol, demo)
     carol.get_by_test_id("withdraw-request").press("Enter")
     expect(demo.get_by_test_id("accept-request")).to_have_count(0)
     expect(carol.get_by_test_id("asked")).to_contain_text("You withdrew your request")
 
     # Requested and granted: the former holder's sliders are disabled, the new holder's move the arm.
-    ask(carol, demo)
+    request_control(carol, demo)
     demo.get_by_test_id("accept-request").press("Enter")
     expect_state(demo, "handed")
     expect(demo.get_by_test_id("slider-elbow")).to_be_disabled()
@@ -104,16 +104,16 @@ def test_control_is_handed_over_and_viewers_are_listed(two: tuple[Page, Page], m
     expect(demo.get_by_test_id("watchers")).to_have_count(0, timeout=2 * PATIENCE_MS)
 
 
-def shorter(route: Route) -> None:
+def shorten_timeout(route: Route) -> None:
     """The holder has 30 s to answer; this test uses less."""
-    asked: dict[str, Any] = route.request.post_data_json or {}
-    route.continue_(post_data=json.dumps(asked | {"within_ms": SILENCE_MS}))
+    body: dict[str, Any] = route.request.post_data_json or {}
+    route.continue_(post_data=json.dumps(body | {"within_ms": SILENCE_MS}))
 
 
 def test_an_unanswered_request_does_not_take_control(two: tuple[Page, Page]) -> None:
     demo, carol = two
-    carol.route("**/lease/requests", shorter)
-    ask(carol, demo)
+    carol.route("**/lease/requests", shorten_timeout)
+    request_control(carol, demo)
     expect(carol.get_by_test_id("asked")).to_contain_text("did not respond in time")
     expect(demo.get_by_test_id("accept-request")).to_have_count(0)
     demo.get_by_test_id("release-control").click()

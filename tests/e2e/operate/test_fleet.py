@@ -13,8 +13,8 @@ from tests.harness.browser.browser import pages
 from tests.harness.browser.product import Machine, start_machine
 from tests.harness.network.brokers import wait_until
 
-SHOWN_MS = 8_000
-KEEPS = 1.5
+DISPLAY_MS = 8_000
+MAX_GROWTH = 1.5
 """Maximum growth factor of the memory; the buffers of 20 s of telemetry still fill."""
 PANS = (
     """() => [...document.querySelectorAll("[data-testid=measured-shoulder_pan]")].map((each) => each.dataset.value)"""
@@ -29,15 +29,15 @@ def own_machine(tmp_path: Path) -> Iterator[Machine]:
 
 
 def pans(page: Page) -> list[str]:
-    found: list[str] = page.evaluate(PANS)
-    return found
+    texts: list[str] = page.evaluate(PANS)
+    return texts
 
 
-def shows_nothing_of_who_says_nothing(page: Page, machine: Machine, silent: str, arm: str) -> None:
+def check_silent_robot_shows_no_values(page: Page, machine: Machine, silent: str, arm: str) -> None:
     page.goto(f"{machine.url}/#/operate/{silent},{arm}")
     station = page.locator(f"[data-testid=robot-panel][data-device='{silent}']")
     expect(station).to_be_visible()
-    wait_until(lambda: len(pans(page)) == 1 and pans(page)[0] != "", "the other's joints")
+    wait_until(lambda: len(pans(page)) == 1 and pans(page)[0] != "", "the joints of the other robot")
     expect(station.get_by_test_id("view-3d")).to_have_attribute("data-frames", "0")
     expect(station.locator(".joint")).to_have_count(0)
 
@@ -49,13 +49,15 @@ def test_ten_robots_show_their_own_values_in_bounded_memory(own_machine: Machine
         pages(drawing_browser, own_machine) as (page,),
     ):
         open_together(page, own_machine, ids)
-        wait_until(lambda: len(pans(page)) == ROBOTS and "" not in pans(page), "the joints of each")
+        wait_until(lambda: len(pans(page)) == ROBOTS and "" not in pans(page), "the joints of each robot")
         session = page.context.new_cdp_session(page)
         before, at = memory_samples(session), pans(page)
-        wait_until(lambda: all(now != was for now, was in zip(pans(page), at, strict=True)), "each to move")
-        page.wait_for_timeout(SHOWN_MS)
+        wait_until(
+            lambda: all(now != earlier for now, earlier in zip(pans(page), at, strict=True)), "each robot to move"
+        )
+        page.wait_for_timeout(DISPLAY_MS)
         after = memory_samples(session)
-        assert after.heap_mb < KEEPS * before.heap_mb, f"{before}, then {after}"
-        assert after.nodes < KEEPS * before.nodes, f"{before}, then {after}"
-        assert after.listeners < KEEPS * before.listeners, f"{before}, then {after}"
-        shows_nothing_of_who_says_nothing(page, own_machine, silent.device, ids[0])
+        assert after.heap_mb < MAX_GROWTH * before.heap_mb, f"{before}, then {after}"
+        assert after.nodes < MAX_GROWTH * before.nodes, f"{before}, then {after}"
+        assert after.listeners < MAX_GROWTH * before.listeners, f"{before}, then {after}"
+        check_silent_robot_shows_no_values(page, own_machine, silent.device, ids[0])

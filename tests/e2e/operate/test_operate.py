@@ -39,12 +39,12 @@ def test_the_elbow_slider_works_only_for_the_operator_in_control(browser: Browse
 
         away = 0.4 if before > 0 else 0.6  # towards zero, so the elbow always moves
         drive(ann, away, lambda: abs(elbow(trace) - before) > 0.2 and arrived(), "the elbow following the slider")
-        wait_until(lambda: abs(shown(ann) - math.degrees(elbow(trace))) < 0.5, "the page to show it")
+        wait_until(lambda: abs(shown(ann) - math.degrees(elbow(trace))) < 0.5, "the page to show the position")
         round_trip = ann.get_by_test_id("round-trip")
         assert float(round_trip.get_attribute("data-value") or "nan") > 0
 
         # The other browser shows the motion and cannot control it.
-        wait_until(lambda: abs(shown(bob) - math.degrees(elbow(trace))) < 0.5, "the other page to show it")
+        wait_until(lambda: abs(shown(bob) - math.degrees(elbow(trace))) < 0.5, "the other page to show the position")
         expect(bob.get_by_test_id("slider-elbow")).to_be_disabled()
         take_control(ann)  # the robot may have ended control on a busy machine
         rest = elbow(trace)
@@ -60,14 +60,14 @@ def assert_not_moved_by_force(page: Page) -> None:
     """Direct requests of a page without the lease get no credentials and no action."""
     device = page.evaluate("() => fetch('/api/v1/devices').then(r => r.json())")["items"][0]
     csrf = page.evaluate("() => fetch('/api/v1/accounts/me').then(r => r.json())")["csrf_token"]
-    ask = """([path, body, csrf]) => fetch('/api/v1' + path, {method: 'POST', body: JSON.stringify(body),
+    post = """([path, body, csrf]) => fetch('/api/v1' + path, {method: 'POST', body: JSON.stringify(body),
         headers: {'Content-Type': 'application/json', 'X-CSRF-Token': csrf}}).then(r => r.status)"""
     epoch = device["lease"]["epoch"]
     credentials = {"purpose": "control", "device": device["id"], "epoch": epoch}
-    assert page.evaluate(ask, ["/mqtt/credentials", credentials, csrf]) in {403, 409}
+    assert page.evaluate(post, ["/mqtt/credentials", credentials, csrf]) in {403, 409}
     move = {"kind": "move_joints", "position_rad": {"elbow": 0.0}}
     for body in ({"request": move}, {"request": move, "epoch": epoch}):
-        assert page.evaluate(ask, [f"/devices/{device['id']}/actions", body, csrf]) == 409
+        assert page.evaluate(post, [f"/devices/{device['id']}/actions", body, csrf]) == 409
 
 
 def test_stop_latches_until_it_is_reset(browser: Browser, machine: Machine) -> None:
@@ -94,7 +94,7 @@ def test_closing_the_browser_in_mid_motion_stops_the_arm(browser: Browser, machi
     assert stopped_in_time(attempt)
 
 
-def test_the_view_the_plot_and_the_pose_table_are_alive(drawing_browser: Browser, machine: Machine) -> None:
+def test_the_view_the_plot_and_the_pose_table_are_updated(drawing_browser: Browser, machine: Machine) -> None:
     with operator(drawing_browser, machine) as page:
         view = page.get_by_test_id("view-3d")
         view.scroll_into_view_if_needed()
@@ -145,19 +145,19 @@ def mosquitto_sub(machine: Machine, topic: str, *more: str) -> "subprocess.Compl
 
 def test_mosquitto_sub_prints_the_telemetry_with_credentials_of_the_api_and_only_then(machine: Machine) -> None:
     with machine.api() as api:
-        device, given = api.device(), api.post("/mqtt/credentials", {"purpose": "view"})
-    who = ("-i", given["client_id"], "-u", given["username"], "-P", given["password"])
+        device, issued = api.device(), api.post("/mqtt/credentials", {"purpose": "view"})
+    login = ("-i", issued["client_id"], "-u", issued["username"], "-P", issued["password"])
     topic = f"{device['topic']}/tele/joints"
-    allowed = mosquitto_sub(machine, topic, *who, "-C", "3")
+    allowed = mosquitto_sub(machine, topic, *login, "-C", "3")
     assert allowed.returncode == 0, allowed.stderr
     rows = [json.loads(line) for line in allowed.stdout.splitlines()]
     assert len(rows) == 3
     assert all(len(row["position_rad"]) == 6 and len(row["frames"]) >= 6 for row in rows)
     for refused in (
         mosquitto_sub(machine, topic),
-        mosquitto_sub(machine, topic, *who[:4], "-P", "wrong"),
-        mosquitto_sub(machine, "#", *who, "-C", "1"),
-        mosquitto_sub(machine, f"{device['topic']}/cmd", *who, "-C", "1"),
+        mosquitto_sub(machine, topic, *login[:4], "-P", "wrong"),
+        mosquitto_sub(machine, "#", *login, "-C", "1"),
+        mosquitto_sub(machine, f"{device['topic']}/cmd", *login, "-C", "1"),
     ):
         assert refused.stdout == ""
         assert refused.returncode != 0 or "denied" in refused.stderr

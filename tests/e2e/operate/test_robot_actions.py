@@ -22,7 +22,7 @@ def open_robot(page: Page, machine: Machine, name: str) -> None:
     expect(page.get_by_test_id("online")).to_have_attribute("data-status", "online")
 
 
-def ask(page: Page, button: str) -> None:
+def press(page: Page, button: str) -> None:
     """Press a button once it is enabled, after the previous action ended."""
     expect(page.get_by_test_id(button)).to_be_enabled()
     page.get_by_test_id(button).click()
@@ -60,61 +60,61 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
         wait_until(lambda: height.input_value() != "", "the pose to be filled in")
         before = {name: joint(laboratory, "ur5", name) for name in ("shoulder_lift", "elbow", "wrist_1")}
         height.fill(f"{float(height.input_value()) - 0.08:.3f}")
-        ask(page, "pose-go")
+        press(page, "pose-go")
         assert_done(page, "move_pose")
         assert abs(joint(laboratory, "ur5", "elbow") - before["elbow"]) > 0.02
         # By the Denavit-Hartenberg convention, the second joint is at the frame of the first.
-        told = frame(page, 0)
+        position_m = frame(page, 0)
         page.get_by_text("All joints", exact=True).click()
         expect(page.get_by_test_id("poses").locator("tbody tr")).to_have_count(6)
-        assert frame(page, 1) == pytest.approx(told, abs=0.002)
+        assert frame(page, 1) == pytest.approx(position_m, abs=0.002)
         assert_good_page(page, "arm")
         assert_good_page(page, "latency", part="command-trace")
 
-        ask(page, "back")
+        press(page, "back")
         assert_done(page, "move_joints")
         for name, was in before.items():
             assert joint(laboratory, "ur5", name) == pytest.approx(was, abs=0.02), name
 
         # An impossible pose is rejected with the robot's reason.
         height.fill("3")
-        ask(page, "pose-go")
+        press(page, "pose-go")
         status = page.get_by_test_id("action-status")
         expect(status).to_have_attribute("data-status", "failed")
         expect(status.locator(".field-error")).not_to_be_empty()
         assert height.input_value() == "3"
 
 
-def test_the_humanoid_takes_a_posture_shows_a_behaviour_and_softens_a_joint(
+def test_the_humanoid_assumes_a_posture_runs_a_behaviour_and_reduces_stiffness(
     browser: Browser, laboratory: Machine
 ) -> None:
     with pages(browser, laboratory) as (page,):
         open_robot(page, laboratory, "nao")
         knee = joint(laboratory, "nao", "LKneePitch")
-        ask(page, "posture-Crouch")
+        press(page, "posture-Crouch")
         expect(page.get_by_test_id("behaviour-Hello")).to_be_disabled()
         assert_done(page, "take_posture")
         assert abs(joint(laboratory, "nao", "LKneePitch") - knee) > 0.2
-        ask(page, "back")
+        press(page, "back")
         assert_done(page, "move_joints")
         assert joint(laboratory, "nao", "LKneePitch") == pytest.approx(knee, abs=0.1)
 
-        ask(page, "behaviour-Hello")
+        press(page, "behaviour-Hello")
         expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "started")
         page.get_by_test_id("cancel-action").click()
         expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "cancelled")
 
         page.get_by_test_id("stiffness-joint").select_option("LHand")
         page.get_by_test_id("stiffness-value").fill("0.5")
-        ask(page, "stiffness-set")
+        press(page, "stiffness-set")
         assert_done(page, "set_stiffness", seen="state")
         expect(page.get_by_test_id("stiffness-told")).to_have_attribute("data-less", "1")
         assert_good_page(page, "humanoid")
-        ask(page, "back")
+        press(page, "back")
         expect(page.get_by_test_id("stiffness-told")).to_have_attribute("data-less", "0")
 
 
-def test_the_robot_on_wheels_goes_to_a_place_on_the_plan(browser: Browser, laboratory: Machine) -> None:
+def test_the_mobile_robot_drives_to_a_goal_on_the_plan(browser: Browser, laboratory: Machine) -> None:
     with pages(browser, laboratory) as (page,):
         open_robot(page, laboratory, "qbo")
         mark = page.get_by_test_id("place-qbo")
@@ -129,7 +129,7 @@ def test_the_robot_on_wheels_goes_to_a_place_on_the_plan(browser: Browser, labor
         )
         expect(page.get_by_test_id("goal")).to_be_visible()
         assert float(page.get_by_test_id("place-x").input_value()) == pytest.approx(was[0], abs=0.6)
-        ask(page, "place-go")
+        press(page, "place-go")
         assert_done(page, "go_to")
         x_m, y_m = (float(page.get_by_test_id(f"place-{axis}").input_value()) for axis in "xy")
         wait_until(
@@ -140,7 +140,7 @@ def test_the_robot_on_wheels_goes_to_a_place_on_the_plan(browser: Browser, labor
                 )
                 < 0.3
             ),
-            "the room to see it there",
+            "the room to measure the robot there",
             30,
         )
         # The robot's camera and the room's camera show frames.
@@ -150,7 +150,7 @@ def test_the_robot_on_wheels_goes_to_a_place_on_the_plan(browser: Browser, labor
             wait_until(lambda: page.get_by_test_id("camera-picture").get_attribute("data-sequence"), "a picture")
         assert_good_page(page, "wheels")
         assert_good_page(page, "place", part="plan")
-        ask(page, "back")
+        press(page, "back")
         assert_done(page, "go_to")
 
 
@@ -158,7 +158,7 @@ def test_the_head_shows_an_expression_and_says_a_sentence(browser: Browser, labo
     with pages(browser, laboratory, 2) as (page, other):
         open_robot(page, laboratory, "hanson")
         page.get_by_test_id("strength").fill("0.8")
-        ask(page, "expression-happy")
+        press(page, "expression-happy")
         assert_done(page, "express")
         assert abs(joint(laboratory, "hanson", "Smile-L")) > 0.02
 
@@ -178,5 +178,5 @@ def test_the_head_shows_an_expression_and_says_a_sentence(browser: Browser, labo
         assert other.get_by_test_id("say").get_attribute("title")
         assert other.get_by_test_id("say-text").input_value() == "This waits."
         page.get_by_test_id("release-control").click()
-        ask(page, "expression-neutral")
+        press(page, "expression-neutral")
         assert_done(page, "express")

@@ -20,13 +20,13 @@ from tests.harness.browser.steering import (
 from tests.harness.network.brokers import wait_until
 
 GAMEPAD = """() => {
-    const made = {
+    const pad = {
         id: "Scripted pad", index: 0, connected: true, mapping: "standard", timestamp: 0,
         axes: [0, 0, 0, 0],
         buttons: Array.from({length: 17}, () => ({pressed: false, touched: false, value: 0})),
     };
-    window.scriptedPad = made;
-    navigator.getGamepads = () => (made.connected ? [made] : []);
+    window.scriptedPad = pad;
+    navigator.getGamepads = () => (pad.connected ? [pad] : []);
 }"""
 PRESS = (
     "([index, down]) => { window.scriptedPad.buttons[index] = {pressed: down, touched: down, value: down ? 1 : 0}; }"
@@ -46,11 +46,11 @@ def speed(trace: Trace) -> float:
     return max(abs(float(each)) for each in trace.now()["qvel"].values())
 
 
-def rolls(trace: Trace) -> bool:
+def is_driving(trace: Trace) -> bool:
     return all(each > 0.5 for each in wheels(trace))
 
 
-def stands(trace: Trace) -> bool:
+def is_at_rest(trace: Trace) -> bool:
     return all(abs(each) < 0.05 for each in wheels(trace))
 
 
@@ -69,23 +69,23 @@ def test_the_base_moves_while_stick_or_keys_are_pressed(browser: Browser, labora
             page.mouse.down()
             page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 2, steps=4)
 
-        press_until(page, stick, page.mouse.up, lambda: rolls(trace), "the stick driving")
-        wait_until(lambda: stands(trace), "rest after the stick was released")
+        press_until(page, stick, page.mouse.up, lambda: is_driving(trace), "the stick driving")
+        wait_until(lambda: is_at_rest(trace), "rest after the stick was released")
 
         page.get_by_test_id("stick").focus()
         press_key_until(page, "ArrowLeft", lambda: wheels(trace)[1] > 0.3 > -0.3 > wheels(trace)[0], "a turn")
-        wait_until(lambda: stands(trace), "rest after the key was released")
+        wait_until(lambda: is_at_rest(trace), "rest after the key was released")
 
         # Letter keys work anywhere except in text fields; a window without focus releases all inputs.
         page.get_by_test_id("tab-drive").focus()
-        press_key_until(page, "w", lambda: rolls(trace), "driving by the letter key")
-        wait_until(lambda: stands(trace), "rest after the letter key was released")
+        press_key_until(page, "w", lambda: is_driving(trace), "driving by the letter key")
+        wait_until(lambda: is_at_rest(trace), "rest after the letter key was released")
 
         def leave() -> None:
             page.evaluate("() => dispatchEvent(new Event('blur'))")
 
-        press_until(page, lambda: page.keyboard.down("w"), leave, lambda: rolls(trace), "driving once more")
-        wait_until(lambda: stands(trace), "rest after the window lost focus")
+        press_until(page, lambda: page.keyboard.down("w"), leave, lambda: is_driving(trace), "driving once more")
+        wait_until(lambda: is_at_rest(trace), "rest after the window lost focus")
         page.keyboard.up("w")
         page.get_by_test_id("tab-joints").click()
         page.get_by_test_id("target-head_pan").focus()
@@ -144,19 +144,19 @@ def test_a_gamepad_needs_its_dead_man_button(browser: Browser, laboratory: Machi
         def press(down: bool) -> Callable[[], None]:
             return lambda: page.evaluate(PRESS, [SHOULDER, down])
 
-        press_until(page, press(True), press(False), lambda: rolls(trace), "the gamepad driving")
-        wait_until(lambda: stands(trace), "rest after the button was released")
+        press_until(page, press(True), press(False), lambda: is_driving(trace), "the gamepad driving")
+        wait_until(lambda: is_at_rest(trace), "rest after the button was released")
 
         # A disconnect releases the input.
-        def plug(there: bool) -> Callable[[], None]:
-            return lambda: page.evaluate("(there) => { window.scriptedPad.connected = there; }", there)
+        def plug(connected: bool) -> Callable[[], None]:
+            return lambda: page.evaluate("(connected) => { window.scriptedPad.connected = connected; }", connected)
 
         def plug_and_press() -> None:  # reconnect and press, because an earlier attempt may have disconnected it
             plug(True)()
             press(True)()
 
-        press_until(page, plug_and_press, plug(False), lambda: rolls(trace), "the gamepad driving again")
-        wait_until(lambda: stands(trace), "rest after the gamepad was disconnected")
+        press_until(page, plug_and_press, plug(False), lambda: is_driving(trace), "the gamepad driving again")
+        wait_until(lambda: is_at_rest(trace), "rest after the gamepad was disconnected")
         expect(page.get_by_test_id("gamepad")).to_contain_text("disconnected", ignore_case=True)
 
         plug(True)()
@@ -192,15 +192,15 @@ def test_a_page_of_two_robots_has_separate_control_and_one_stop(browser: Browser
         expect(qbo).to_have_attribute("data-chosen", "true")
         expect(arm).to_have_attribute("data-chosen", "false")
         wait_until(lambda: speed(arm_trace) < 0.01, "the arm to rest")
-        press_key_until(qbo, "w", lambda: rolls(trace), "driving the chosen one")
+        press_key_until(qbo, "w", lambda: is_driving(trace), "driving the chosen one")
         assert speed(arm_trace) < 0.05, "the key moved the other robot"
 
         # The Stop key stops all robots while one moves.
-        press_until(qbo, lambda: page.keyboard.down("w"), lambda: None, lambda: rolls(trace), "driving again")
+        press_until(qbo, lambda: page.keyboard.down("w"), lambda: None, lambda: is_driving(trace), "driving again")
         page.keyboard.press("Escape")
         for panel in (arm, qbo):
             expect(panel.get_by_test_id("stop-banner")).to_have_attribute("data-state", "latched")
-        wait_until(lambda: stands(trace), "rest after Stop")
+        wait_until(lambda: is_at_rest(trace), "rest after Stop")
         page.keyboard.up("w")
         for panel in (arm, qbo):
             reset_stop(panel)

@@ -16,11 +16,11 @@ from tests.harness.browser.product import Machine, free_ports, moves, ready_link
 from tests.harness.network.brokers import BROKERS, MODULES, wait_until
 
 
-def clear_line(machine: Machine) -> str:
+def error_line(machine: Machine) -> str:
     """The one error line of a failed start. Fails on a traceback."""
     assert machine.process.wait(30) != 0
     # Output may arrive after the exit.
-    wait_until(lambda: any(line.strip() and line != "telescope: starting\n" for line in machine.lines), "a word")
+    wait_until(lambda: any(line.strip() and line != "telescope: starting\n" for line in machine.lines), "output")
     text = "".join(machine.lines)
     assert "Traceback" not in text
     lines = [line for line in machine.lines if line.strip() and line != "telescope: starting\n"]
@@ -30,14 +30,14 @@ def clear_line(machine: Machine) -> str:
 
 def listeners(machine: Machine) -> list[str]:
     """Addresses on which the three ports of the product listen."""
-    found = []
+    hosts = []
     for family in ("tcp", "tcp6"):
         for line in Path(f"/proc/net/{family}").read_text().splitlines()[1:]:
             address, state = line.split()[1], line.split()[3]
             host, _, port = address.rpartition(":")
             if state == "0A" and 0 <= int(port, 16) - machine.port < 3:
-                found.append(host)
-    return found
+                hosts.append(host)
+    return hosts
 
 
 @pytest.mark.parametrize("broker", BROKERS)
@@ -90,20 +90,20 @@ def test_a_killed_supervisor_leaves_no_processes(tmp_path: Path) -> None:
             for words in ("infra.embedded_broker", "function_app serve", "function_app work", "-m device_agent")
         ]
         machine.process.send_signal(signal.SIGKILL)
-        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children), "the others to end")
+        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children), "the other processes to end")
 
 
 @pytest.mark.parametrize("offset", [0, 1, 2])
-def test_a_taken_port_is_named(tmp_path: Path, offset: int) -> None:
+def test_a_port_in_use_is_named(tmp_path: Path, offset: int) -> None:
     port = free_ports()
     with socket.create_server(("127.0.0.1", port + offset)), start_machine(tmp_path, port=port) as machine:
-        line = clear_line(machine)
+        line = error_line(machine)
         assert f"port {port + offset}" in line
         assert "TELESCOPE_PORT" in line
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("settings", "message"),
     [
         ({"TELESCOPE_PORT": "eighty"}, "TELESCOPE_PORT"),
         ({"TELESCOPE_PORT": "70000"}, "TELESCOPE_PORT"),
@@ -111,9 +111,9 @@ def test_a_taken_port_is_named(tmp_path: Path, offset: int) -> None:
         ({"TELESCOPE_HOME": "/proc/nothing"}, "TELESCOPE_HOME"),
     ],
 )
-def test_a_wrong_setting_is_named(tmp_path: Path, settings: dict[str, Any], says: str) -> None:
+def test_an_invalid_setting_is_named(tmp_path: Path, settings: dict[str, Any], message: str) -> None:
     with start_machine(tmp_path, **settings) as machine:
-        assert says in clear_line(machine)
+        assert message in error_line(machine)
 
 
 @pytest.mark.parametrize("package", ["ruckig", "fastapi"])
@@ -129,13 +129,13 @@ def test_a_missing_package_is_named(tmp_path: Path, package: str) -> None:
         "sys.meta_path.insert(0, Hide())\n"
     )
     with start_machine(tmp_path / "home", PYTHONPATH=str(hide)) as machine:
-        line = clear_line(machine)
+        line = error_line(machine)
         assert f"'{package}'" in line
         assert "make env" in line
 
 
 @pytest.mark.parametrize("damaged_from", [0, 4096], ids=["header", "pages"])
-def test_a_damaged_database_is_named_and_kept(tmp_path: Path, damaged_from: int) -> None:
+def test_a_damaged_database_is_named_and_unchanged(tmp_path: Path, damaged_from: int) -> None:
     with start_machine(tmp_path) as machine:
         machine.interrupt()
     (database,) = tmp_path.glob("*.sqlite")
@@ -145,7 +145,7 @@ def test_a_damaged_database_is_named_and_kept(tmp_path: Path, damaged_from: int)
     damaged = intact[:damaged_from] + os.urandom(len(intact) - damaged_from)
     database.write_bytes(damaged)
     with start_machine(tmp_path, port=machine.port) as again:
-        assert str(database) in clear_line(again)
+        assert str(database) in error_line(again)
     assert database.read_bytes() == damaged
 
 
@@ -164,8 +164,8 @@ def test_the_agent_reports_wrong_arguments_in_one_line(tmp_path: Path) -> None:
         ("enroll", "--server", "http://127.0.0.1:1", "--device", "arm=ur5:warp"): "mujoco",
         ("enroll", "--server", "http://127.0.0.1:1", "--device", "arm=ur5"): "cannot be reached",
     }
-    for number, (arguments, says) in enumerate(cases.items()):
+    for number, (arguments, message) in enumerate(cases.items()):
         done = run_module("device_agent", *arguments, "--home", str(tmp_path / str(number)))
         assert done.returncode != 0
-        assert says in done.stderr, arguments
+        assert message in done.stderr, arguments
         assert len(done.stderr.splitlines()) == 1, done.stderr

@@ -82,10 +82,10 @@ def agent(machine: Machine, api: Api) -> Iterator[Agent]:
 
 def nudge(api: Api, device: str, to_rad: float) -> dict[str, Any]:
     request = {**NUDGE, "position_rad": {"wrist_3": to_rad}}
-    found: dict[str, Any] = api.post(
+    action: dict[str, Any] = api.post(
         f"/devices/{device}/actions", {"request": request, "wait_ms": 20_000, "wait_for": "done"}
     )
-    return found
+    return action
 
 
 def test_an_action_from_start_to_end_over_xmpp(api: Api, agent: Agent) -> None:
@@ -142,7 +142,7 @@ def test_a_frozen_process_is_offline_within_ten_seconds(machine: Machine, api: A
     api.device(NAME)
     pid = agent.pid if who == "the agent" else machine.pid("function_app xmpp")
 
-    def gone() -> bool:
+    def offline() -> bool:
         if who == "the agent":
             return not next(each for each in api.get("/devices")["items"] if each["name"] == NAME)["online"]
         return (agent.home / "log").read_text().rstrip().endswith("link lost")
@@ -150,7 +150,7 @@ def test_a_frozen_process_is_offline_within_ten_seconds(machine: Machine, api: A
     os.kill(pid, signal.SIGSTOP)
     began_s = time.monotonic()
     try:
-        wait_until(gone, "it to be offline")
+        wait_until(offline, "the agent to be offline")
         assert time.monotonic() - began_s < 10
     finally:
         os.kill(pid, signal.SIGCONT)
@@ -165,8 +165,8 @@ def streaming(api: Api, device: dict[str, Any]) -> Iterator[tuple[Callable[[floa
     credentials = {"purpose": "control", "device": device["id"], "epoch": lease["epoch"]}
     seen: list[JointTelemetry] = []
     number = 0
-    with mqtt_client(api, purpose="view") as (watch, viewed), mqtt_client(api, **credentials) as (control, given):
-        (topic,) = given["publish"]
+    with mqtt_client(api, purpose="view") as (watch, viewed), mqtt_client(api, **credentials) as (control, issued):
+        (topic,) = issued["publish"]
         watched = [each for each in viewed["subscribe"] if each.split("/")[3] in device["id"] and "/tele/" in each]
         watch.paho.on_message = lambda _, __, message: seen.append(codec.decode(bytes(message.payload), JointTelemetry))
         assert all(topics.TELE in each for each in watched)

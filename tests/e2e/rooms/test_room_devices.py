@@ -29,9 +29,9 @@ def api(laboratory: Machine) -> Iterator[Api]:
 @contextlib.contextmanager
 def watching(api: Api, device: dict[str, Any], *names: str) -> Iterator[Client]:
     """A client with the account's read credentials, subscribed to one channel of a device."""
-    with mqtt_client(api, purpose="view") as (client, given):
-        wanted = [pattern for pattern in given["subscribe"] if f"/{device['name']}/" in pattern]
-        assert client.subscribe(*(each for each in wanted if each.split("/")[-2] in names), qos=0)
+    with mqtt_client(api, purpose="view") as (client, issued):
+        filters = [pattern for pattern in issued["subscribe"] if f"/{device['name']}/" in pattern]
+        assert client.subscribe(*(each for each in filters if each.split("/")[-2] in names), qos=0)
         yield client
 
 
@@ -70,7 +70,7 @@ def test_collected_data_reach_all_readers(api: Api) -> None:
     lidar = api.device("lidar")
     seen: dict[int, int] = {}
     with watching(api, lidar, topics.TELE) as one, watching(api, lidar, topics.TELE) as other:
-        begun = act(api, lidar, "started", kind="gather", streams=["range"], rate_hz=RATE_HZ, duration_s=FOR_S)
+        action = act(api, lidar, "started", kind="gather", streams=["range"], rate_hz=RATE_HZ, duration_s=FOR_S)
         again = refused(api, lidar, kind="gather", rate_hz=1.0, duration_s=1.0)
         assert again.status_code == 409
         assert again.json()["type"].endswith("/device-busy")
@@ -78,10 +78,10 @@ def test_collected_data_reach_all_readers(api: Api) -> None:
         def ended() -> bool:
             for number, client in enumerate((one, other)):
                 seen[number] = seen.get(number, 0) + len(measured(client))
-            return bool(api.get(f"/actions/{begun['id']}")["status"] == "done")
+            return bool(api.get(f"/actions/{action['id']}")["status"] == "done")
 
         wait_until(ended, "the collection to end")
-    done = api.get(f"/actions/{begun['id']}")
+    done = api.get(f"/actions/{action['id']}")
     gathered = done["result"]["samples"]["range"]
     # The rate must exceed the stream's own 5 Hz, also on a busy machine; all readers must receive it.
     assert gathered > 7 * FOR_S
@@ -95,7 +95,7 @@ def test_collected_data_reach_all_readers(api: Api) -> None:
             answer = reader.get(f"{base}/range", params={"resolution": "raw"})
             return len(answer.json()["at_ms"]) if answer.is_success else 0
 
-        wait_until(lambda: all(stored(reader) >= gathered for reader in readers), "all of it to be stored")
+        wait_until(lambda: all(stored(reader) >= gathered for reader in readers), "all data to be stored")
 
 
 def test_a_capture_is_stored_unchanged(api: Api) -> None:
@@ -103,11 +103,11 @@ def test_a_capture_is_stored_unchanged(api: Api) -> None:
         device = api.device(name)
         done = act(api, device, kind="capture", name=capture)
         assert done["status"] == "done", done
-        found = api.get(f"/devices/{device['id']}/uploads/{done['result']['upload']}")
-        assert (found["stream"], found["content_type"], found["verified"]) == (capture, media_type, True)
-        content = httpx.get(found["url"]).content
+        upload = api.get(f"/devices/{device['id']}/uploads/{done['result']['upload']}")
+        assert (upload["stream"], upload["content_type"], upload["verified"]) == (capture, media_type, True)
+        content = httpx.get(upload["url"]).content
         assert len(content) == done["result"]["length"]
-        assert hashlib.sha256(content).hexdigest() == found["sha256"]
+        assert hashlib.sha256(content).hexdigest() == upload["sha256"]
 
 
 def test_a_set_control_is_measured_by_other_devices_and_rejected_after_stop(api: Api) -> None:
@@ -142,10 +142,10 @@ def test_frames_reach_permitted_viewers(api: Api) -> None:
             return len(pictures) >= 5
 
         wait_until(enough, "pictures")
-    told = [camera_frames.decode(each) for each in pictures]
-    assert {(each.width, each.height) for each in told} == {(320, 240)}
-    assert [each.sequence for each in told] == sorted({each.sequence for each in told})
-    assert all(each.jpeg.startswith(b"\xff\xd8") for each in told)
+    frames = [camera_frames.decode(each) for each in pictures]
+    assert {(each.width, each.height) for each in frames} == {(320, 240)}
+    assert [each.sequence for each in frames] == sorted({each.sequence for each in frames})
+    assert all(each.jpeg.startswith(b"\xff\xd8") for each in frames)
 
 
 LOOKS = """
@@ -155,8 +155,8 @@ for _ in range(100):
         break
     wait(0.3)
 values = {name: reading["values"] for name, reading in seen.items()}
-there = values["positions"]["y_m.ur5"] > 1, values["light"]["light_lux"] > 1, "people" in values["presence"]
-print(*there, room.taken(2.5, -1.45))
+checks = values["positions"]["y_m.ur5"] > 1, values["light"]["light_lux"] > 1, "people" in values["presence"]
+print(*checks, room.taken(2.5, -1.45))
 """
 """Reads every stream of the room; the last one is the desk of the head."""
 
@@ -179,7 +179,7 @@ def test_a_collection_longer_than_its_action_is_rejected(api: Api) -> None:
 def test_home_assistant_shows_the_room_and_moves_its_door(laboratory: Machine, api: Api, tmp_path: Path) -> None:
     door = api.device("door")
     body = {"name": "Home Assistant", "role": "operator", "only": [f"space:{door['space']}"]}
-    shown: dict[str, bytes] = {}
+    published: dict[str, bytes] = {}
     with (
         home_assistant(laboratory, tmp_path, api.post("/api-keys", body)["token"]) as (bridge, port),
         Client("home", None, port=port).open() as client,
@@ -187,15 +187,17 @@ def test_home_assistant_shows_the_room_and_moves_its_door(laboratory: Machine, a
         client.subscribe("homeassistant/#", "telescope/#")
 
         def arrived(topic: str) -> bool:
-            shown.update((each.topic, each.payload) for each in client.pending())
-            return topic in shown
+            published.update((each.topic, each.payload) for each in client.pending())
+            return topic in published
 
         slider = f"homeassistant/number/{door['id']}/set-opening/config"
         wait_until(lambda: arrived(slider), "the door's slider")
-        topics_of_slider = json.loads(shown[slider])
+        topics_of_slider = json.loads(published[slider])
         client.publish(topics_of_slider["command_topic"], b"0.5")
         state = topics_of_slider["state_topic"]
-        wait_until(lambda: arrived(state) and json.loads(shown[state])["values"]["opening"] > 0.3, "the door to open")
+        wait_until(
+            lambda: arrived(state) and json.loads(published[state])["values"]["opening"] > 0.3, "the door to open"
+        )
         wait_until(lambda: arrived(f"telescope/{api.device('camera')['id']}/cam/colour"), "a picture")
     assert bridge.wait(30) == 0
     act(api, door, kind="set_control", control="opening", value=0.0)

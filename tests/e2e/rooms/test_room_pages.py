@@ -25,8 +25,8 @@ def place(page: Page, who: str) -> tuple[float, float]:
 
 def picture(page: Page) -> str:
     """Current pixels of the canvas."""
-    shown: str = page.get_by_test_id("camera-picture").evaluate("canvas => canvas.toDataURL()")
-    return shown
+    pixels: str = page.get_by_test_id("camera-picture").evaluate("canvas => canvas.toDataURL()")
+    return pixels
 
 
 def no_new_frame(page: Page) -> bool:

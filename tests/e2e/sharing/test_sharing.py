@@ -25,8 +25,8 @@ def test_revoking_a_moving_guest_stops_the_arm(machine: Machine) -> None:
         ended = owner.get(f"/actions/{action}", wait_ms=20_000, wait_for="done")
         # The cloud or the device may report the end first.
         assert (ended["status"], ended["reason"]["code"]) in {("failed", "unshared"), ("failed", "lease_lost")}
-        gone = guest.http.post(f"/devices/{device}/actions", json={"request": request})
-        assert gone.status_code == httpx.codes.NOT_FOUND
+        rejected = guest.http.post(f"/devices/{device}/actions", json={"request": request})
+        assert rejected.status_code == httpx.codes.NOT_FOUND
         assert_at_rest(trace)
         taken = owner.post(f"/devices/{device}/lease", {"lease_ms": 10_000})
         assert taken["confirmed"] is True, "the owner can take control"

@@ -70,7 +70,7 @@ def test_an_api_key_is_created_used_revoked_and_audited(browser: Browser, machin
             key = ann.get_by_test_id("key").filter(has_text="night shift")
             expect(key).to_contain_text("only Universal Robots UR5")
             expect(key).to_contain_text("last used")
-            assert ann.get_by_test_id("api-key-token").count() == 0, "it is shown once"
+            assert ann.get_by_test_id("api-key-token").count() == 0, "the token must be displayed once only"
             key.get_by_test_id("revoke-key").click()
             key.get_by_test_id("confirm-yes").click()
             expect(key).to_have_count(0)
