@@ -1,5 +1,5 @@
-"""``python -m function_app xmpp``: speaks XMPP for the cloud. Any number may run."""
+"""``python -m function_app xmpp``: the XMPP gateway of the cloud. Any number of instances may run."""
 
-from function_app.entrypoints.xmpp.program import speak
+from function_app.entrypoints.xmpp.program import run_gateway
 
-__all__ = ["speak"]
+__all__ = ["run_gateway"]

@@ -8,7 +8,7 @@ from function_app.bootstrap.xmpp import command_feed, xmpp_connection
 from function_app.entrypoints.xmpp.gateway import XmppGateway
 
 
-async def speak(functions: Functions) -> None:
+async def run_gateway(functions: Functions) -> None:
     """Run until SIGINT or SIGTERM.
 
     Raises:
@@ -20,12 +20,12 @@ async def speak(functions: Functions) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ending.set)
     await functions.health.require_tables()
-    speaker = XmppGateway(functions, xmpp_connection(functions), command_feed(functions))
-    speaking = asyncio.create_task(speaker.run())
+    gateway = XmppGateway(functions, xmpp_connection(functions), command_feed(functions))
+    running = asyncio.create_task(gateway.run())
     waiting = asyncio.create_task(ending.wait())
-    done, _ = await asyncio.wait((speaking, waiting), return_when=asyncio.FIRST_COMPLETED)
-    for task in (speaking, waiting):
+    done, _ = await asyncio.wait((running, waiting), return_when=asyncio.FIRST_COMPLETED)
+    for task in (running, waiting):
         task.cancel()
-    await asyncio.gather(speaking, waiting, return_exceptions=True)
-    if speaking in done:
-        speaking.result()
+    await asyncio.gather(running, waiting, return_exceptions=True)
+    if running in done:
+        running.result()
