@@ -19,7 +19,7 @@ def test_a_new_user_sees_the_first_steps(browser: Browser, machine: Machine) -> 
         expect(steps).to_contain_text("Pair it")
         assert command(page, "enroll").endswith(f"--server {machine.url} --device arm=ur5 --no-wait")
         assert command(page, "run") == "python -m device_agent run --home ~/arm-agent"
-        page.get_by_test_id("what-do-i-see").get_by_text("About this page").click()
+        page.get_by_test_id("page-explainer").get_by_text("About this page").click()
         expect(page.get_by_text("One operator at a time has control")).to_be_visible()
         assert_good_page(page, "first-steps")
 

@@ -45,7 +45,7 @@ def signed_in(page: Page, name: str) -> None:
 
 
 def sign_in_at_the_provider(page: Page, name: str) -> None:
-    page.get_by_test_id("sign-in-elsewhere").click()
+    page.get_by_test_id("sign-in-provider").click()
     page.locator("input[name=login]").fill(name)
     page.locator("input[name=password]").fill("any")
     page.locator("button[type=submit]").click()

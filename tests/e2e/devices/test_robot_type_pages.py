@@ -143,8 +143,8 @@ def check_rejection(page: Page) -> None:
     expect(page.get_by_role("alert").filter(has_text="torn.zip cannot be extracted")).to_be_visible()
 
     page.get_by_test_id("type-files").set_input_files([archive(BROKEN)])
-    at_step(page, "wrong")
-    expect(finding(page, "torn")).to_contain_text("scene.xml, line 6")
+    at_step(page, "invalid")
+    expect(finding(page, "malformed")).to_contain_text("scene.xml, line 6")
     expect(finding(page, "missing")).to_contain_text("reacher.xml, line 2")
     expect(finding(page, "missing")).to_contain_text("Add hand.stl, or remove the reference from reacher.xml.")
     expect(finding(page, "range").first).to_contain_text("limits joint shoulder to -91.7° to 91.7°")
@@ -162,7 +162,7 @@ def check_correction(page: Page, folder: Path) -> None:
     expect(page.get_by_test_id("error")).to_have_count(1)
     expect(finding(page, "missing")).to_be_visible()
     replace(page, folder, "reacher.xml", MODEL)
-    at_step(page, "good")
+    at_step(page, "valid")
 
 
 def check_preview(page: Page, machine: Machine) -> None:
@@ -175,8 +175,8 @@ def check_preview(page: Page, machine: Machine) -> None:
     wait_until(lambda: frames(view) > before, "another picture")
     expect(page.locator("output[for=model-joint-elbow]")).to_have_text("85.9°")
     assert view.locator("canvas").screenshot() != first, "the picture must change"
-    expect(page.get_by_test_id("found")).to_contain_text("Movements: 1")
-    expect(page.get_by_test_id("found")).to_contain_text("picture")
+    expect(page.get_by_test_id("type-contents")).to_contain_text("Movements: 1")
+    expect(page.get_by_test_id("type-contents")).to_contain_text("picture")
     with machine.api() as api:
         assert "reacher" not in [each["type"] for each in api.get("/robot-types")["items"]]
     assert_good_page(page, "robot-type-look")

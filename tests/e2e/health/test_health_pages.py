@@ -121,38 +121,38 @@ def test_latencies_are_measured_plotted_with_reference_values_and_saved(browser:
         with pages(browser, laboratory) as (ann,):
             go(ann, laboratory, f"#/devices/{device}/latency")
             ann.get_by_test_id("measure").click()
-            measured = ann.get_by_test_id("measured")
-            chart = ann.get_by_test_id("times-samples")
+            measured = ann.get_by_test_id("probe-samples")
+            chart = ann.get_by_test_id("latency-samples")
             wait_until(lambda: int(chart.get_attribute("data-samples") or "0") > 0, "samples while it measures")
             expect(measured).to_have_attribute("data-busy", "false", timeout=2 * PATIENCE_MS)
             expect(measured).to_have_attribute("data-count", str(3 * MEASURED))
 
             # All samples are stored and plotted once.
-            ann.get_by_test_id("times-path").select_option("operator-cloud")
+            ann.get_by_test_id("latency-path").select_option("operator-cloud")
             for transport in ("http", "websocket"):
-                line = ann.locator(f"[data-testid=times-line][data-transport={transport}]")
+                line = ann.locator(f"[data-testid=latency-line][data-transport={transport}]")
                 assert int(line.get_attribute("data-count") or "0") >= MEASURED
             # The cloud stores its own measurements of the same requests asynchronously.
             kinds = (("http", "operator-device"), ("mqtt", "command-started"))
             wait_until(lambda: all(count_samples(api, device)[kind] >= MEASURED for kind in kinds), "all to be stored")
             counts = count_samples(api, device)
-            ann.get_by_test_id("times-path").select_option("operator-device")
+            ann.get_by_test_id("latency-path").select_option("operator-device")
             assert chart.get_attribute("data-samples") == str(counts["http", "operator-device"])
             for ms in (UR5_HTTP_MS, UR5_XMPP_MS):
                 expect(ann.locator(f"[data-testid=published][data-ms='{ms}']")).to_be_visible()
             assert int(chart.get_attribute("data-references") or "0") > 0
 
             # The saved file contains the plotted samples.
-            ann.get_by_test_id("times-path").select_option("")
+            ann.get_by_test_id("latency-path").select_option("")
             drawn = int(chart.get_attribute("data-samples") or "0")
             with ann.expect_download() as download:
-                ann.get_by_test_id("times-csv").click()
+                ann.get_by_test_id("latency-csv").click()
             rows = Path(download.value.path()).read_text().splitlines()
             assert rows[0] == "device,label,transport,path,at,ms"
             assert len(rows) - 1 == drawn >= 3 * MEASURED
             assert_good_page(ann, "times-device")
             go(ann, laboratory, "#/latency")
-            expect(ann.get_by_test_id("times-line").first).to_be_visible()
+            expect(ann.get_by_test_id("latency-line").first).to_be_visible()
             assert_good_page(ann, "times")
 
 

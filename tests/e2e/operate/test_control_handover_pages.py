@@ -39,9 +39,9 @@ def expect_state(page: Page, state: str) -> None:
 
 def request_control(requester: Page, holder: Page) -> None:
     take_control(holder)
-    requester.get_by_test_id("ask-control").click()
-    expect(holder.get_by_test_id("asks")).to_contain_text("requests control")
-    expect(requester.get_by_test_id("asked")).to_contain_text("You requested control from demo")
+    requester.get_by_test_id("request-control").click()
+    expect(holder.get_by_test_id("incoming-request")).to_contain_text("requests control")
+    expect(requester.get_by_test_id("control-request")).to_contain_text("You requested control from demo")
 
 
 def take_over(owner: Page, holder: Page) -> bool:
@@ -73,14 +73,14 @@ def test_control_is_handed_over_and_viewers_are_listed(two: tuple[Page, Page], m
     assert_good_page(demo, "asked-for-control")
     assert_good_page(carol, "asking-for-control")
     demo.get_by_test_id("refuse-request").press("Enter")
-    expect(carol.get_by_test_id("asked")).to_contain_text("demo keeps control")
-    expect(demo.get_by_test_id("answered")).to_contain_text("You keep control")
+    expect(carol.get_by_test_id("control-request")).to_contain_text("demo keeps control")
+    expect(demo.get_by_test_id("request-response")).to_contain_text("You keep control")
 
     # Requested and withdrawn.
     request_control(carol, demo)
     carol.get_by_test_id("withdraw-request").press("Enter")
     expect(demo.get_by_test_id("accept-request")).to_have_count(0)
-    expect(carol.get_by_test_id("asked")).to_contain_text("You withdrew your request")
+    expect(carol.get_by_test_id("control-request")).to_contain_text("You withdrew your request")
 
     # Requested and granted: the former holder's sliders are disabled, the new holder's move the arm.
     request_control(carol, demo)
@@ -88,7 +88,7 @@ def test_control_is_handed_over_and_viewers_are_listed(two: tuple[Page, Page], m
     expect_state(demo, "handed")
     expect(demo.get_by_test_id("slider-elbow")).to_be_disabled()
     expect_state(carol, "mine")
-    expect(carol.get_by_test_id("asked")).to_contain_text("demo handed control over to you")
+    expect(carol.get_by_test_id("control-request")).to_contain_text("demo handed control over to you")
     move_the_elbow(carol, machine)
     expect(demo.get_by_test_id("slider-elbow")).to_be_disabled()
 
@@ -114,6 +114,6 @@ def test_an_unanswered_request_does_not_take_control(two: tuple[Page, Page]) -> 
     demo, carol = two
     carol.route("**/lease/requests", shorten_timeout)
     request_control(carol, demo)
-    expect(carol.get_by_test_id("asked")).to_contain_text("did not respond in time")
+    expect(carol.get_by_test_id("control-request")).to_contain_text("did not respond in time")
     expect(demo.get_by_test_id("accept-request")).to_have_count(0)
     demo.get_by_test_id("release-control").click()

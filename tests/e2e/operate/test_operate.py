@@ -48,7 +48,7 @@ def test_the_elbow_slider_works_only_for_the_operator_in_control(browser: Browse
         expect(bob.get_by_test_id("slider-elbow")).to_be_disabled()
         take_control(ann)  # the robot may have ended control on a busy machine
         rest = elbow(trace)
-        expect(bob.get_by_test_id("ask-control")).to_be_visible()
+        expect(bob.get_by_test_id("request-control")).to_be_visible()
         expect(bob.get_by_test_id("take-control")).to_have_count(0)
         assert_not_moved_by_force(bob)
         assert abs(elbow(trace) - rest) < 0.005

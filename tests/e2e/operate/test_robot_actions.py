@@ -33,7 +33,7 @@ def assert_done(page: Page, kind: str, *, seen: str = "motion", nth: int = 0) ->
     row = page.get_by_test_id("command-trace-row").nth(nth)
     expect(row).to_have_attribute("data-kind", kind)
     expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "done")
-    expect(row).to_have_attribute("data-seen", seen)
+    expect(row).to_have_attribute("data-observed-by", seen)
     times = {step: float(row.get_attribute(f"data-{step}") or "nan") for step in STEPS}
     assert times["accepted"] > 0
     # Without motion the robot's state counts, which may arrive before the acknowledgement.
@@ -71,7 +71,7 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
         assert_good_page(page, "arm")
         assert_good_page(page, "latency", part="command-trace")
 
-        press(page, "back")
+        press(page, "undo-action")
         assert_done(page, "move_joints")
         for name, was in before.items():
             assert joint(laboratory, "ur5", name) == pytest.approx(was, abs=0.02), name
@@ -95,7 +95,7 @@ def test_the_humanoid_assumes_a_posture_runs_a_behaviour_and_reduces_stiffness(
         expect(page.get_by_test_id("behaviour-Hello")).to_be_disabled()
         assert_done(page, "take_posture")
         assert abs(joint(laboratory, "nao", "LKneePitch") - knee) > 0.2
-        press(page, "back")
+        press(page, "undo-action")
         assert_done(page, "move_joints")
         assert joint(laboratory, "nao", "LKneePitch") == pytest.approx(knee, abs=0.1)
 
@@ -108,10 +108,10 @@ def test_the_humanoid_assumes_a_posture_runs_a_behaviour_and_reduces_stiffness(
         page.get_by_test_id("stiffness-value").fill("0.5")
         press(page, "stiffness-set")
         assert_done(page, "set_stiffness", seen="state")
-        expect(page.get_by_test_id("stiffness-told")).to_have_attribute("data-less", "1")
+        expect(page.get_by_test_id("stiffness-reported")).to_have_attribute("data-reduced", "1")
         assert_good_page(page, "humanoid")
-        press(page, "back")
-        expect(page.get_by_test_id("stiffness-told")).to_have_attribute("data-less", "0")
+        press(page, "undo-action")
+        expect(page.get_by_test_id("stiffness-reported")).to_have_attribute("data-reduced", "0")
 
 
 def test_the_mobile_robot_drives_to_a_goal_on_the_plan(browser: Browser, laboratory: Machine) -> None:
@@ -150,7 +150,7 @@ def test_the_mobile_robot_drives_to_a_goal_on_the_plan(browser: Browser, laborat
             wait_until(lambda: page.get_by_test_id("camera-picture").get_attribute("data-sequence"), "a picture")
         assert_good_page(page, "wheels")
         assert_good_page(page, "place", part="plan")
-        press(page, "back")
+        press(page, "undo-action")
         assert_done(page, "go_to")
 
 

@@ -44,7 +44,7 @@ export function App({ api, session, followed, pairing }: AppProps) {
         </main>
       );
     case "out":
-      return <SignInPage api={api} session={session} followed={followed} pairing={pairing.code.value !== null} why={state.why} />;
+      return <SignInPage api={api} session={session} followed={followed} pairing={pairing.code.value !== null} error={state.reason} />;
     case "in":
       return (
         <SignedIn
@@ -109,7 +109,7 @@ async function checkSession(api: Api, session: Session): Promise<void> {
   try {
     await api.me();
   } catch (error) {
-    if (error instanceof ApiError && error.status === 401) session.ended(texts.sessionEnded);
+    if (error instanceof ApiError && error.status === 401) session.expire(texts.sessionEnded);
   }
 }
 

@@ -7,7 +7,7 @@ export const texts = {
   signedInAs: (name: string): string => `Signed in as ${name}`,
   signOut: "Sign out",
   checkingSession: "Checking your session…",
-  sessionEnded: "Your session has ended. Sign in again.",
+  sessionEnded: "retry",
   openIdExpired: "The sign-in took too long, or started in another browser. Start again.",
   openIdUninvited: "You have no invitation. Ask the administrator of this server for one.",
   openIdRefused: "The identity provider rejected the sign-in. Try again, or ask the administrator of this server.",

@@ -17,7 +17,7 @@ beforeEach(async () => {
   server = new FakeServer();
   link = new FakeLink();
   device = new DeviceStore(listed(), server.api, link);
-  ends = [startClock(), device.watch(), device.watchClosely()];
+  ends = [startClock(), device.watch(), device.watchDetails()];
   deliver("desc", description);
   await pass(250); // The clock's signal now follows the virtual time.
   deliver("tele/joints", telemetry());

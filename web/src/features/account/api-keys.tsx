@@ -1,6 +1,6 @@
 import type { Space } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
-import { MAY } from "../sharing";
+import { SHARED_ROLES } from "../sharing";
 import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
 import { useEffect, useRef, useState } from "preact/hooks";
@@ -21,26 +21,26 @@ type Names = ReadonlyMap<string, string>;
 export function ApiKeys({ api, fleet }: { api: Api; fleet: Fleet }) {
   const [keys, setKeys] = useState<readonly ApiKey[] | null>(null);
   const [spaces, setSpaces] = useState<readonly Space[]>([]);
-  const [wrong, setWrong] = useState("");
-  const [said, setSaid] = useState("");
-  const [making, setMaking] = useState(false);
-  const [made, setMade] = useState<CreatedApiKey | null>(null);
+  const [error, setError] = useState("");
+  const [message, setMessage] = useState("");
+  const [creating, setCreating] = useState(false);
+  const [created, setCreated] = useState<CreatedApiKey | null>(null);
 
-  const read = async (): Promise<void> => {
+  const load = async (): Promise<void> => {
     try {
-      const [found, rooms] = await Promise.all([api.apiKeys(), api.spaces()]);
-      setKeys(found);
-      setSpaces(rooms);
-      setWrong("");
+      const [items, spaceItems] = await Promise.all([api.apiKeys(), api.spaces()]);
+      setKeys(items);
+      setSpaces(spaceItems);
+      setError("");
     } catch (error) {
-      setWrong(texts.keys.failed(sentence(error)));
+      setError(texts.keys.failed(sentence(error)));
     }
   };
-  useEffect(() => void read(), [api]);
+  useEffect(() => void load(), [api]);
   const revoke = async ({ id, name }: ApiKey): Promise<void> => {
     await api.revokeApiKey(id);
-    setKeys((known) => known?.filter((each) => each.id !== id) ?? null);
-    setSaid(texts.keys.revoked(name));
+    setKeys((previous) => previous?.filter((each) => each.id !== id) ?? null);
+    setMessage(texts.keys.revoked(name));
   };
 
   const devices = [...(fleet.devices.value?.values() ?? [])];
@@ -48,47 +48,47 @@ export function ApiKeys({ api, fleet }: { api: Api; fleet: Fleet }) {
     ...spaces.map(({ id, name }) => [`space:${id}`, name] as const),
     ...devices.map(({ id, info }) => [id, info.value.label] as const),
   ]);
-  const busy = making || made !== null;
+  const busy = creating || created !== null;
   const opener = useReturnFocus(busy);
-  const open = busy ? null : (
-    <button type="button" ref={opener} data-testid="new-key" onClick={() => setMaking(true)}>
+  const createButton = busy ? null : (
+    <button type="button" ref={opener} data-testid="new-key" onClick={() => setCreating(true)}>
       {texts.keys.new}
     </button>
   );
   return (
-    <Card title={texts.keys.title} class="keys" aside={open}>
+    <Card title={texts.keys.title} class="keys" aside={createButton}>
       <p class="quiet">{texts.keys.explained}</p>
-      {made !== null && <MadeKey made={made} onDone={() => setMade(null)} />}
-      {making && (
+      {created !== null && <CreatedKey made={created} onDone={() => setCreated(null)} />}
+      {creating && (
         <KeyForm
           api={api}
           names={names}
-          onMade={(fresh) => {
-            setMaking(false);
-            setMade(fresh);
-            setKeys((known) => [fresh.api_key, ...(known ?? [])]);
+          onCreated={(result) => {
+            setCreating(false);
+            setCreated(result);
+            setKeys((previous) => [result.api_key, ...(previous ?? [])]);
           }}
-          onClose={() => setMaking(false)}
+          onClose={() => setCreating(false)}
         />
       )}
-      {keys === null && wrong === "" && <p class="quiet">{common.loading}</p>}
+      {keys === null && error === "" && <p class="quiet">{common.loading}</p>}
       {keys?.length === 0 && <p class="quiet">{texts.keys.none}</p>}
       <ul class="people" data-testid="keys">
         {keys?.map((key) => (
           <KeyRow key={key.id} of={key} names={names} onRevoke={() => revoke(key)} />
         ))}
       </ul>
-      <p class={wrong === "" ? "field-note" : "field-error"} role="status">
-        {wrong === "" ? said : wrong}
+      <p class={error === "" ? "field-note" : "field-error"} role="status">
+        {error === "" ? message : error}
       </p>
     </Card>
   );
 }
 
 function KeyRow({ of: key, names, onRevoke }: { of: ApiKey; names: Names; onRevoke: () => Promise<void> }) {
-  const only = key.only.map((each) => names.get(each) ?? texts.keys.nameless).join(", ");
-  const about = [
-    only === "" ? texts.keys.everything : texts.keys.onlyThese(only),
+  const only = key.only.map((each) => names.get(each) ?? texts.keys.deletedTarget).join(", ");
+  const details = [
+    only === "" ? texts.keys.everything : texts.keys.onlyScope(only),
     key.expired ? texts.keys.expired(key.expires_at) : texts.keys.until(key.expires_at),
     key.last_used_at === null ? texts.keys.unused : texts.keys.used(key.last_used_at),
     texts.keys.createdAt(key.created_at),
@@ -97,17 +97,17 @@ function KeyRow({ of: key, names, onRevoke }: { of: ApiKey; names: Names; onRevo
     <li data-testid="key" data-name={key.name}>
       <span class="person">
         {key.name}
-        <span class="quiet small">{about.join(" · ")}</span>
+        <span class="quiet small">{details.join(" · ")}</span>
       </span>
       {key.expired && <span class="chip bad">{texts.keys.expiredChip}</span>}
       <span class={`chip role-${key.role}`}>{common.role[key.role]}</span>
       <ConfirmButton
         label={texts.keys.revoke}
         description={texts.keys.revokeOf(key.name)}
-        question={texts.keys.revokeSure(key.name)}
-        confirmLabel={texts.keys.revokeYes}
+        question={texts.keys.revokeQuestion(key.name)}
+        confirmLabel={texts.keys.revokeConfirm}
         busyLabel={texts.keys.revoking}
-        cancelLabel={texts.keys.keep}
+        cancelLabel={texts.keys.cancel}
         data-testid="revoke-key"
         onConfirm={onRevoke}
       />
@@ -115,17 +115,17 @@ function KeyRow({ of: key, names, onRevoke }: { of: ApiKey; names: Names; onRevo
   );
 }
 
-function MadeKey({ made, onDone }: { made: CreatedApiKey; onDone: () => void }) {
+function CreatedKey({ made, onDone }: { made: CreatedApiKey; onDone: () => void }) {
   const box = useRef<HTMLDivElement>(null);
   useEffect(() => box.current?.querySelector("input")?.focus(), []);
   return (
     <div class="panel made" ref={box} role="group" aria-label={texts.keys.token}>
       <p>
-        <strong>{texts.keys.made(made.api_key.name)}</strong>
+        <strong>{texts.keys.created(made.api_key.name)}</strong>
       </p>
       <CopyOnce id="api-key-token" label={texts.keys.token} value={made.token} />
       <p class="quiet small">
-        {texts.keys.use} <code>Authorization: Bearer {made.token.slice(0, 3)}…</code>
+        {texts.keys.usage} <code>Authorization: Bearer {made.token.slice(0, 3)}…</code>
       </p>
       <div class="row">
         <button type="button" data-testid="key-done" onClick={onDone}>
@@ -139,42 +139,42 @@ function MadeKey({ made, onDone }: { made: CreatedApiKey; onDone: () => void }) 
 interface KeyFormProps {
   api: Api;
   names: Names;
-  onMade: (made: CreatedApiKey) => void;
+  onCreated: (made: CreatedApiKey) => void;
   onClose: () => void;
 }
 
-const REACH = [
+const SCOPES = [
   ["all", texts.keys.all],
   ["some", texts.keys.some],
 ] as const;
 
-function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
+function KeyForm({ api, names, onCreated, onClose }: KeyFormProps) {
   const [name, setName] = useState("");
   const [role, setRole] = useState<SharedRole>("viewer");
-  const [reach, setReach] = useState<"all" | "some">("all");
+  const [scope, setScope] = useState<"all" | "some">("all");
   const [only, setOnly] = useState<ReadonlySet<string>>(new Set());
   const [days, setDays] = useState("90");
   const [busy, setBusy] = useState(false);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
   const choose = (chosen: ReadonlySet<string>): void => {
     setOnly(chosen);
-    setWrong("");
+    setError("");
   };
   const first = useRef<HTMLInputElement>(null);
   useEffect(() => first.current?.focus(), []);
 
-  const make = async (): Promise<void> => {
-    const chosen = reach === "all" ? [] : [...only].filter((each) => names.has(each));
-    if (reach === "some" && chosen.length === 0) {
-      setWrong(texts.keys.chooseOne);
+  const create = async (): Promise<void> => {
+    const chosen = scope === "all" ? [] : [...only].filter((each) => names.has(each));
+    if (scope === "some" && chosen.length === 0) {
+      setError(texts.keys.chooseOne);
       return;
     }
     setBusy(true);
-    setWrong("");
+    setError("");
     try {
-      onMade(await api.createApiKey({ name: name.trim(), role, only: chosen, days: Number(days) }));
+      onCreated(await api.createApiKey({ name: name.trim(), role, only: chosen, days: Number(days) }));
     } catch (error) {
-      setWrong(sentence(error)); // What was typed stays.
+      setError(sentence(error)); // The input stays.
       setBusy(false);
     }
   };
@@ -182,12 +182,12 @@ function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
   return (
     <InlineForm
       label={texts.keys.new}
-      submitLabel={texts.keys.make}
-      busyLabel={texts.keys.making}
+      submitLabel={texts.keys.create}
+      busyLabel={texts.keys.creating}
       busy={busy}
-      error={wrong}
+      error={error}
       submitTestId="make-key"
-      onSubmit={make}
+      onSubmit={create}
       onClose={onClose}
     >
       <div class="field">
@@ -206,7 +206,7 @@ function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
       </div>
       <div class="field">
         <span class="label">{texts.keys.role}</span>
-        <Choice label={texts.keys.role} value={role} options={MAY} onChange={setRole} />
+        <Choice label={texts.keys.role} value={role} options={SHARED_ROLES} onChange={setRole} />
       </div>
       <div class="field">
         <label for="key-days">{texts.keys.days}</label>
@@ -225,21 +225,21 @@ function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
         </p>
       </div>
       <div class="field wide">
-        <span class="label">{texts.keys.only}</span>
-        <Choice label={texts.keys.only} value={reach} options={REACH} onChange={setReach} />
+        <span class="label">{texts.keys.scope}</span>
+        <Choice label={texts.keys.scope} value={scope} options={SCOPES} onChange={setScope} />
       </div>
-      {reach === "some" && <Which names={names} chosen={only} onChange={choose} />}
+      {scope === "some" && <ScopePicker names={names} chosen={only} onChange={choose} />}
     </InlineForm>
   );
 }
 
-interface WhichProps {
+interface ScopePickerProps {
   names: Names;
   chosen: ReadonlySet<string>;
   onChange: (chosen: ReadonlySet<string>) => void;
 }
 
-function Which({ names, chosen, onChange }: WhichProps) {
+function ScopePicker({ names, chosen, onChange }: ScopePickerProps) {
   const groups = [
     [texts.keys.spaces, [...names].filter(([id]) => id.startsWith("space:"))],
     [texts.keys.devices, [...names].filter(([id]) => !id.startsWith("space:"))],

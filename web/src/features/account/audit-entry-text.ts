@@ -5,15 +5,15 @@ import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 
-/** Names by record id. An id without a name is shown as it is. */
+/** Names by record id. Ids without a name are shown unchanged. */
 export interface Names {
   accounts: ReadonlyMap<string, string>;
   /** Devices and spaces. */
-  things: ReadonlyMap<string, string>;
+  targets: ReadonlyMap<string, string>;
   keys: ReadonlyMap<string, string>;
 }
 
-const says = texts.audit.says;
+const sentences = texts.audit.sentences;
 const ID_SHOWN = 8;
 
 export function entryText(record: AuditRecord, names: Names): string {
@@ -21,88 +21,88 @@ export function entryText(record: AuditRecord, names: Names): string {
   const message = data["message"];
   // Control entries carry their own text.
   if (typeof message === "string") return message;
-  const who = whoDid(record);
-  const on = thing(record.target, names);
+  const caller = callerName(record);
+  const target = targetName(record.target, names);
   switch (event) {
     case "signed-in":
-      return says.signedIn(who, says.how[text(data, "how")] ?? "");
+      return sentences.signedIn(caller, sentences.method[text(data, "how")] ?? "");
     case "sign-in-rejected":
-      return says.refusedSignIn;
+      return sentences.signInRejected;
     case "signed-out":
-      return record.key === "" ? says.signedOut(who) : says.keyEnded(who);
+      return record.key === "" ? sentences.signedOut(caller) : sentences.allSessionsEnded(caller);
     case "account-made":
-      return says.accountMade(who);
+      return sentences.accountCreated(caller);
     case "password-set":
-      return says.passwordSet(who);
+      return sentences.passwordSet(caller);
     case "api-key-made":
-      return says.keyMade(who, text(data, "name"), role(data), kept(data["only"], names));
+      return sentences.keyCreated(caller, text(data, "name"), role(data), scopeText(data["only"], names));
     case "api-key-revoked":
-      return says.keyRevoked(who, names.keys.get(subjectOf(record.target)[1]) ?? "");
+      return sentences.keyRevoked(caller, names.keys.get(subjectOf(record.target)[1]) ?? "");
     case "space-made":
-      return says.spaceMade(who, text(data, "name"));
+      return sentences.spaceCreated(caller, text(data, "name"));
     case "agent-claimed":
-      return says.claimed(who, on, thing(text(data, "space"), names));
+      return sentences.claimed(caller, target, targetName(text(data, "space"), names));
     case "claim-rejected":
-      return says.claimRefused(who);
+      return sentences.claimRejected(caller);
     case "agent-unpaired":
-      return says.unpaired(who, on);
+      return sentences.unpaired(caller, target);
     case "agent-moved":
-      return says.moved(who, on, thing(text(data, "space"), names));
+      return sentences.moved(caller, target, targetName(text(data, "space"), names));
     case "device-renamed":
-      return says.renamed(who, text(data, "label"), on);
+      return sentences.renamed(caller, text(data, "label"), target);
     case "shared":
-      return says.shared(who, on, other(data, names), role(data), until(data["expires_ms"]));
+      return sentences.shared(caller, target, otherAccount(data, names), role(data), until(data["expires_ms"]));
     case "unshared":
-      if (record.actor === "") return says.ranOut(on, other(data, names));
-      if (data["with"] === record.account) return says.left(who, on);
-      return says.unshared(who, on, other(data, names));
+      if (record.actor === "") return sentences.accessExpired(target, otherAccount(data, names));
+      if (data["with"] === record.account) return sentences.accessGivenUp(caller, target);
+      return sentences.unshared(caller, target, otherAccount(data, names));
     case "invited":
       return data["role"] === "owner"
-        ? says.offered(who, on)
-        : says.invited(who, on, role(data), texts.audit.usesLeft(Number(data["uses"] ?? 1)));
+        ? sentences.offered(caller, target)
+        : sentences.invited(caller, target, role(data), texts.audit.usesLeft(Number(data["uses"] ?? 1)));
     case "invitation-redeemed":
-      return says.redeemed(who, on);
+      return sentences.redeemed(caller, target);
     case "invitation-revoked":
-      return says.withdrawn(who, on);
+      return sentences.withdrawn(caller, target);
     case "transferred":
-      return says.transferred(who, on);
+      return sentences.transferred(caller, target);
     case "movement-saved":
-      return says.movementSaved(who, record.target);
+      return sentences.movementSaved(caller, record.target);
     case "movement-deleted":
-      return says.movementDeleted(who, record.target);
+      return sentences.movementDeleted(caller, record.target);
     case "robot-type-uploaded":
-      return says.typeUploaded(who, record.target);
+      return sentences.typeUploaded(caller, record.target);
     case "robot-type-deleted":
-      return says.typeDeleted(who, record.target);
+      return sentences.typeDeleted(caller, record.target);
     default:
-      return says.other(who, texts.audit.kinds[event] ?? event, on);
+      return sentences.other(caller, texts.audit.kinds[event] ?? event, target);
   }
 }
 
-function whoDid({ actor, account }: AuditRecord): string {
+function callerName({ actor, account }: AuditRecord): string {
   if (actor !== "") return actor;
-  return account === "" ? texts.audit.cloud : texts.audit.unknownAccount;
+  return account === "" ? texts.audit.server : texts.audit.unknownAccount;
 }
 
-function thing(on: string, names: Names): string {
-  const [, id] = subjectOf(on);
-  return names.things.get(id) ?? id;
+function targetName(target: string, names: Names): string {
+  const [, id] = subjectOf(target);
+  return names.targets.get(id) ?? id;
 }
 
-function other(data: AuditRecord["data"], names: Names): string {
+function otherAccount(data: AuditRecord["data"], names: Names): string {
   const id = text(data, "with");
   const name = text(data, "name");
-  return name === "" ? (names.accounts.get(id) ?? texts.audit.anAccount(id.slice(0, ID_SHOWN))) : name;
+  return name === "" ? (names.accounts.get(id) ?? texts.audit.deletedAccount(id.slice(0, ID_SHOWN))) : name;
 }
 
-function kept(only: unknown, names: Names): string {
+function scopeText(only: unknown, names: Names): string {
   if (!Array.isArray(only) || only.length === 0) return texts.keys.everything;
-  return texts.keys.onlyThese(only.map((each) => thing(String(each), names)).join(", "));
+  return texts.keys.onlyScope(only.map((each) => targetName(String(each), names)).join(", "));
 }
 
 function role(data: AuditRecord["data"]): string {
-  const given = text(data, "role");
-  return given in common.role ? common.role[given as Role] : given;
+  const value = text(data, "role");
+  return value in common.role ? common.role[value as Role] : value;
 }
 
 /** A missing end is stored as a time in the far future; times after this limit mean "no end". */

@@ -2,7 +2,7 @@ import type { Space } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
 import { useEffect, useMemo, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import { accountIdsOf, AuditReader, ALL_ENTRIES } from "./model/audit-log";
+import { accountNamesOf, AuditReader, ALL_ENTRIES } from "./model/audit-log";
 import type { ApiKey, AuditQuery, AuditRecord } from "../../shared/api/sharing";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
@@ -14,21 +14,21 @@ import "./account.css";
 const DAY_MS = 86_400_000;
 
 interface Filter {
-  what: string;
-  on: string;
+  event: string;
+  target: string;
   from: string;
   to: string;
 }
 
-const ALL: Filter = { what: "", on: "", from: "", to: "" };
+const ALL: Filter = { event: "", target: "", from: "", to: "" };
 
 /** Values of date inputs in local time; `to` includes the whole day. */
-function query({ what, on, from, to }: Filter): AuditQuery {
+function toQuery({ event, target, from, to }: Filter): AuditQuery {
   const start = (date: string): number => new Date(`${date}T00:00`).getTime();
   return {
     ...ALL_ENTRIES,
-    event: what,
-    target: on,
+    event,
+    target,
     sinceMs: from === "" ? null : start(from),
     untilMs: to === "" ? null : start(to) + DAY_MS,
   };
@@ -45,27 +45,27 @@ export function AuditLogPage({ api, fleet }: { api: Api; fleet: Fleet }) {
     api.spaces().then(setSpaces, () => undefined);
     api.apiKeys().then(setKeys, () => undefined);
   }, [api]);
-  useEffect(() => void reader.ask(query(filter)), [reader, filter]);
+  useEffect(() => void reader.load(toQuery(filter)), [reader, filter]);
 
   const records = reader.records.value;
   const devices = [...(fleet.devices.value?.values() ?? [])].map(({ info }) => info.value);
   const names: Names = useMemo(
     () => ({
-      accounts: accountIdsOf(records),
-      things: new Map([...spaces.map(({ id, name }) => [id, name] as const), ...devices.map(({ id, label }) => [id, label] as const)]),
+      accounts: accountNamesOf(records),
+      targets: new Map([...spaces.map(({ id, name }) => [id, name] as const), ...devices.map(({ id, label }) => [id, label] as const)]),
       keys: keyNames(keys, records),
     }),
     [records, spaces, keys, fleet.devices.value],
   );
-  const own = devices.filter(({ role }) => role === "owner");
-  const rooms = spaces.filter(({ role }) => role === "owner");
+  const ownDevices = devices.filter(({ role }) => role === "owner");
+  const ownSpaces = spaces.filter(({ role }) => role === "owner");
   const subjects: [string, [string, string][]][] = [
-    [texts.audit.control, own.map(({ id, label }) => [id, label])],
+    [texts.audit.control, ownDevices.map(({ id, label }) => [id, label])],
     [
       texts.audit.sharing,
       [
-        ...rooms.map(({ id, name }): [string, string] => [`space:${id}`, name]),
-        ...own.map(({ id, label }): [string, string] => [`device:${id}`, label]),
+        ...ownSpaces.map(({ id, name }): [string, string] => [`space:${id}`, name]),
+        ...ownDevices.map(({ id, label }): [string, string] => [`device:${id}`, label]),
       ],
     ],
     [texts.keys.title, [...names.keys].map(([id, name]) => [`key:${id}`, name])],
@@ -99,17 +99,17 @@ interface FiltersProps {
 }
 
 function Filters({ filter, subjects, onChange }: FiltersProps) {
-  const set = (part: Partial<Filter>): void => onChange({ ...filter, ...part });
+  const update = (part: Partial<Filter>): void => onChange({ ...filter, ...part });
   return (
     <fieldset class="card filters">
       <legend class="visually-hidden">{texts.audit.filters}</legend>
       <div class="field">
-        <label for="audit-what">{texts.audit.kind}</label>
+        <label for="audit-event">{texts.audit.type}</label>
         <select
-          id="audit-what"
-          data-testid="audit-what"
-          value={filter.what}
-          onChange={(event) => set({ what: event.currentTarget.value })}
+          id="audit-event"
+          data-testid="audit-event"
+          value={filter.event}
+          onChange={(event) => update({ event: event.currentTarget.value })}
         >
           <option value="">{texts.audit.any}</option>
           {Object.entries(texts.audit.kinds).map(([kind, name]) => (
@@ -120,8 +120,8 @@ function Filters({ filter, subjects, onChange }: FiltersProps) {
         </select>
       </div>
       <div class="field">
-        <label for="audit-on">{texts.audit.about}</label>
-        <select id="audit-on" value={filter.on} onChange={(event) => set({ on: event.currentTarget.value })}>
+        <label for="audit-target">{texts.audit.subject}</label>
+        <select id="audit-target" value={filter.target} onChange={(event) => update({ target: event.currentTarget.value })}>
           <option value="">{texts.audit.any}</option>
           {subjects.map(([title, entries]) =>
             entries.length === 0 ? null : (
@@ -143,7 +143,7 @@ function Filters({ filter, subjects, onChange }: FiltersProps) {
             id={`audit-${end}`}
             type="date"
             value={filter[end]}
-            onChange={(event) => set({ [end]: event.currentTarget.value })}
+            onChange={(event) => update({ [end]: event.currentTarget.value })}
           />
         </div>
       ))}
@@ -160,8 +160,8 @@ function Records({ reader, names, filtered }: { reader: AuditReader; names: Name
   const records = reader.records.value;
   const busy = reader.busy.value;
   const more = reader.more.value;
-  const trouble = reader.trouble.value;
-  const nothing = records.length === 0 && !busy && trouble === "";
+  const error = reader.error.value;
+  const empty = records.length === 0 && !busy && error === "";
   return (
     <>
       <ol class="card records" data-testid="audit" hidden={records.length === 0}>
@@ -172,21 +172,21 @@ function Records({ reader, names, filtered }: { reader: AuditReader; names: Name
       <p class="quiet" role="status">
         {busy
           ? common.loading
-          : nothing
+          : empty
             ? more
-              ? texts.audit.noneYet
+              ? texts.audit.noneSoFar
               : texts.audit.none
-            : trouble === "" && `${texts.audit.shown(records.length)}${more ? "" : ` · ${texts.audit.end}`}`}
+            : error === "" && `${texts.audit.shown(records.length)}${more ? "" : ` · ${texts.audit.end}`}`}
       </p>
-      {trouble !== "" && (
+      {error !== "" && (
         <p class="notice bad" role="alert">
-          {texts.audit.failed(trouble)}
+          {texts.audit.failed(error)}
         </p>
       )}
-      {(more || trouble !== "") && (
+      {(more || error !== "") && (
         <p>
-          <button type="button" disabled={busy} data-testid="older" onClick={() => void reader.older()}>
-            {trouble !== "" ? texts.audit.again : filtered ? texts.audit.further : texts.audit.more}
+          <button type="button" disabled={busy} data-testid="older" onClick={() => void reader.loadOlder()}>
+            {error !== "" ? texts.audit.retry : filtered ? texts.audit.searchFurther : texts.audit.loadOlder}
           </button>
         </p>
       )}
@@ -196,21 +196,21 @@ function Records({ reader, names, filtered }: { reader: AuditReader; names: Name
 
 function Line({ record, names }: { record: AuditRecord; names: Names }) {
   const { outcome, key, seq, at, target, account, session, hash } = record;
-  const words = texts.audit.key;
+  const labels = texts.audit.fields;
   const details = [
-    [words.number, String(seq)],
-    [words.on, target],
-    [words.account, account],
-    [words.session, session],
-    [words.key, key],
-    [words.hash, hash],
+    [labels.number, String(seq)],
+    [labels.on, target],
+    [labels.account, account],
+    [labels.session, session],
+    [labels.key, key],
+    [labels.hash, hash],
   ] as const;
   return (
-    <li data-what={record.event}>
+    <li data-event={record.event}>
       <details>
         <summary>
           <time dateTime={at}>{format.dateTime(at)}</time>
-          <span class="said">
+          <span class="record-text">
             {entryText(record, names)}
             {key !== "" && <span class="quiet"> ({texts.audit.byKey})</span>}{" "}
             {outcome !== "done" && (

@@ -27,24 +27,24 @@ export function AccountPage({ api, fleet }: { api: Api; fleet: Fleet }) {
 }
 
 function PasswordForm({ api, onDone }: { api: Api; onDone: () => void }) {
-  const [old, setOld] = useState("");
-  const [wanted, setWanted] = useState("");
+  const [oldPassword, setOldPassword] = useState("");
+  const [newPassword, setNewPassword] = useState("");
   const [busy, setBusy] = useState(false);
-  const [wrong, setWrong] = useState("");
-  const [done, setDone] = useState("");
+  const [error, setError] = useState("");
+  const [message, setMessage] = useState("");
 
   const change = async (): Promise<void> => {
-    setWrong("");
-    setDone("");
+    setError("");
+    setMessage("");
     setBusy(true);
     try {
-      await api.setPassword(wanted, old);
-      setOld("");
-      setWanted("");
-      setDone(texts.account.changed);
+      await api.setPassword(newPassword, oldPassword);
+      setOldPassword("");
+      setNewPassword("");
+      setMessage(texts.account.changed);
       onDone();
     } catch (error) {
-      setWrong(sentence(error));
+      setError(sentence(error));
     } finally {
       setBusy(false);
     }
@@ -66,8 +66,8 @@ function PasswordForm({ api, onDone }: { api: Api; onDone: () => void }) {
             id="old-password"
             type="password"
             autocomplete="current-password"
-            value={old}
-            onInput={(event) => setOld(event.currentTarget.value)}
+            value={oldPassword}
+            onInput={(event) => setOldPassword(event.currentTarget.value)}
           />
         </div>
         <label for="new-password">{texts.account.new}</label>
@@ -77,17 +77,17 @@ function PasswordForm({ api, onDone }: { api: Api; onDone: () => void }) {
             type="password"
             autocomplete="new-password"
             required
-            value={wanted}
-            aria-invalid={wrong !== ""}
+            value={newPassword}
+            aria-invalid={error !== ""}
             aria-describedby="password-answer"
-            onInput={(event) => setWanted(event.currentTarget.value)}
+            onInput={(event) => setNewPassword(event.currentTarget.value)}
           />
           <button type="submit" disabled={busy}>
             {texts.account.change}
           </button>
         </div>
-        <p id="password-answer" class={wrong === "" ? "field-note" : "field-error"} aria-live="polite">
-          {wrong === "" ? done : wrong}
+        <p id="password-answer" class={error === "" ? "field-note" : "field-error"} aria-live="polite">
+          {error === "" ? message : error}
         </p>
       </form>
     </Card>
@@ -96,33 +96,33 @@ function PasswordForm({ api, onDone }: { api: Api; onDone: () => void }) {
 
 function Sessions({ api }: { api: Api }) {
   const [sessions, setSessions] = useState<SignInSession[] | null>(null);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
 
-  const read = async (): Promise<void> => {
+  const load = async (): Promise<void> => {
     try {
       setSessions(await api.sessions());
     } catch (error) {
-      setWrong(sentence(error));
+      setError(sentence(error));
     }
   };
   const end = async (ending: Promise<void>): Promise<void> => {
-    setWrong("");
+    setError("");
     try {
       await ending;
     } catch (error) {
-      setWrong(sentence(error));
+      setError(sentence(error));
     }
-    await read();
+    await load();
   };
-  useEffect(() => void read(), [api]);
+  useEffect(() => void load(), [api]);
 
   return (
     <Card title={texts.account.sessions}>
-      {sessions === null && wrong === "" && <p class="quiet">{common.loading}</p>}
+      {sessions === null && error === "" && <p class="quiet">{common.loading}</p>}
       <ul class="devices">
         {sessions?.map((session) => (
           <li key={session.id}>
-            {texts.account.session(texts.account.how[session.method], new Date(session.created_at).toLocaleString("en"))}{" "}
+            {texts.account.session(texts.account.method[session.method], new Date(session.created_at).toLocaleString("en"))}{" "}
             <span class="quiet">
               {session.address} {session.program}
             </span>{" "}
@@ -144,7 +144,7 @@ function Sessions({ api }: { api: Api }) {
         </p>
       )}
       <p class="field-error" aria-live="polite">
-        {wrong}
+        {error}
       </p>
     </Card>
   );

@@ -13,17 +13,17 @@ interface SignInProps {
   followed: FollowedInvitation;
   /** The user followed an agent's pairing link. */
   pairing: boolean;
-  /** The previous error; empty on a first visit. */
-  why: string;
+  /** The error of the last sign-in; empty on a first visit. */
+  error: string;
 }
 
-export function SignInPage({ api, session, followed, pairing, why }: SignInProps) {
+export function SignInPage({ api, session, followed, pairing, error }: SignInProps) {
   const [methods, setMethods] = useState<SignInMethods | null>(null);
   useEffect(() => {
     // If the methods cannot be loaded, offer the default method.
     api.signInMethods().then(setMethods, () => setMethods({ password: true, oidc: null }));
   }, [api]);
-  const elsewhere = methods?.oidc ?? null;
+  const provider = methods?.oidc ?? null;
   const invited = followed.state.value;
   return (
     <main class="narrow" id="content">
@@ -32,8 +32,8 @@ export function SignInPage({ api, session, followed, pairing, why }: SignInProps
           <h1>{texts.followed.invitation}</h1>
           <p>{texts.followed.invitationExplained}</p>
           {methods?.password === true && <JoinForm session={session} followed={followed} secret={invited.secret} />}
-          {elsewhere !== null && (
-            <InvitedElsewhere api={api} followed={followed} secret={invited.secret} name={elsewhere.name} />
+          {provider !== null && (
+            <InvitedProviderSignIn api={api} followed={followed} secret={invited.secret} name={provider.name} />
           )}
           <h2>{texts.followed.haveAccount}</h2>
         </>
@@ -41,29 +41,29 @@ export function SignInPage({ api, session, followed, pairing, why }: SignInProps
         <h1>{texts.session.title}</h1>
       )}
       {pairing && invited.kind !== "open" && <p class="notice">{texts.followed.pairing}</p>}
-      {why !== "" && (
+      {error !== "" && (
         <p class="notice bad" role="alert">
-          <strong>{texts.session.failed}.</strong> {why}
+          <strong>{texts.session.failed}.</strong> {error}
         </p>
       )}
-      {elsewhere !== null && invited.kind !== "open" && (
+      {provider !== null && invited.kind !== "open" && (
         <p>
-          <a class="elsewhere" data-testid="sign-in-elsewhere" href={elsewhere.url}>
-            {texts.session.elsewhere(elsewhere.name)}
+          <a class="elsewhere" data-testid="sign-in-provider" href={provider.url}>
+            {texts.session.withProvider(provider.name)}
           </a>
         </p>
       )}
       {methods?.password === true && <PasswordForm session={session} />}
       <h2>{texts.session.byLink}</h2>
       <p>{texts.session.explain}</p>
-      <p>{texts.session.where}</p>
+      <p>{texts.session.linkSource}</p>
       <pre class="command">{texts.session.command}</pre>
       <LinkForm onToken={(token) => void session.start(token)} />
     </main>
   );
 }
 
-interface InvitedElsewhereProps {
+interface InvitedProviderSignInProps {
   api: Api;
   followed: FollowedInvitation;
   secret: string;
@@ -72,28 +72,28 @@ interface InvitedElsewhereProps {
 }
 
 /** Signs in at the provider with the invitation. A form sends its secret, so that no URL contains it. */
-function InvitedElsewhere({ api, followed, secret, name }: InvitedElsewhereProps) {
+function InvitedProviderSignIn({ api, followed, secret, name }: InvitedProviderSignInProps) {
   const [busy, setBusy] = useState(false);
-  const [wrong, setWrong] = useState("");
-  const go = async (): Promise<void> => {
+  const [error, setError] = useState("");
+  const redirect = async (): Promise<void> => {
     setBusy(true);
-    setWrong("");
+    setError("");
     try {
       const address = await api.startOpenIdSignIn(secret);
-      followed.leave();
+      followed.markAway();
       location.assign(address);
     } catch (error) {
-      setWrong(sentence(error));
+      setError(sentence(error));
       setBusy(false);
     }
   };
   return (
     <div>
-      <button type="button" class="primary" data-testid="sign-in-elsewhere" disabled={busy} onClick={() => void go()}>
-        {busy ? texts.session.leaving : texts.session.elsewhere(name)}
+      <button type="button" class="primary" data-testid="sign-in-provider" disabled={busy} onClick={() => void redirect()}>
+        {busy ? texts.session.redirecting : texts.session.withProvider(name)}
       </button>
       <p class="field-error" aria-live="polite">
-        {wrong}
+        {error}
       </p>
     </div>
   );
@@ -103,15 +103,15 @@ function PasswordForm({ session }: { session: Session }) {
   const [name, setName] = useState("");
   const [password, setPassword] = useState("");
   const [busy, setBusy] = useState(false);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
 
-  const enter = async (): Promise<void> => {
+  const signIn = async (): Promise<void> => {
     setBusy(true);
-    setWrong("");
+    setError("");
     try {
-      await session.enter(name, password);
+      await session.signInWithPassword(name, password);
     } catch (error) {
-      setWrong(sentence(error)); // What was typed stays.
+      setError(sentence(error)); // The input stays.
       setBusy(false);
     }
   };
@@ -121,7 +121,7 @@ function PasswordForm({ session }: { session: Session }) {
       class="row-form"
       onSubmit={(event) => {
         event.preventDefault();
-        void enter();
+        void signIn();
       }}
     >
       <label for="sign-in-name">{texts.session.name}</label>
@@ -148,16 +148,16 @@ function PasswordForm({ session }: { session: Session }) {
           autocomplete="current-password"
           required
           value={password}
-          aria-invalid={wrong !== ""}
+          aria-invalid={error !== ""}
           aria-describedby="password-wrong"
           onInput={(event) => setPassword(event.currentTarget.value)}
         />
         <button type="submit" class="primary" data-testid="sign-in" disabled={busy}>
-          {texts.session.enter}
+          {texts.session.signIn}
         </button>
       </div>
       <p id="password-wrong" class="field-error" aria-live="polite">
-        {wrong}
+        {error}
       </p>
     </form>
   );
@@ -165,17 +165,17 @@ function PasswordForm({ session }: { session: Session }) {
 
 function LinkForm({ onToken }: { onToken: (token: string) => void }) {
   const [pasted, setPasted] = useState("");
-  const [wrong, setWrong] = useState(false);
-  const use = (event: SubmitEvent): void => {
+  const [invalid, setInvalid] = useState(false);
+  const submit = (event: SubmitEvent): void => {
     event.preventDefault();
     const fragment = pasted.slice(Math.max(0, pasted.indexOf("#"))).trim();
     const token = signInToken(fragment);
-    setWrong(token === null);
+    setInvalid(token === null);
     if (token !== null) onToken(token);
   };
   return (
-    <form onSubmit={use} class="row-form">
-      <label for="sign-in-link">{texts.session.pasted}</label>
+    <form onSubmit={submit} class="row-form">
+      <label for="sign-in-link">{texts.session.pasteLink}</label>
       <div class="row">
         <input
           id="sign-in-link"
@@ -184,14 +184,14 @@ function LinkForm({ onToken }: { onToken: (token: string) => void }) {
           autocomplete="off"
           spellcheck={false}
           value={pasted}
-          aria-invalid={wrong}
+          aria-invalid={invalid}
           aria-describedby="sign-in-wrong"
           onInput={(event) => setPasted(event.currentTarget.value)}
         />
         <button type="submit">{texts.session.use}</button>
       </div>
       <p id="sign-in-wrong" class="field-error" aria-live="polite">
-        {wrong ? texts.session.notALink : ""}
+        {invalid ? texts.session.notALink : ""}
       </p>
     </form>
   );

@@ -19,37 +19,37 @@ export interface ActionCardProps {
   session: DeviceSession;
   description: KnownDescription;
   /** Why actions are unavailable now, or "". */
-  no: string;
+  disabledReason: string;
 }
 
-interface ActsProps {
+interface ActionCardsProps {
   fleet: Fleet;
   session: DeviceSession;
 }
 
-export function ActionCards({ fleet, session }: ActsProps) {
+export function ActionCards({ fleet, session }: ActionCardsProps) {
   const description = session.device.description.value;
   if (description === null) return null;
-  const no = actionUnavailableReason(session.device, session.control);
-  const common: ActionCardProps = { session, description, no };
-  const takes = (kind: AnyRequest["kind"]): boolean => description.actions.includes(kind);
+  const disabledReason = actionUnavailableReason(session.device, session.control);
+  const common: ActionCardProps = { session, description, disabledReason };
+  const supports = (kind: AnyRequest["kind"]): boolean => description.actions.includes(kind);
   const cards: [string, string, boolean, ComponentChildren][] = [
-    ["postures", texts.postures, takes("take_posture") && description.postures.length > 0, <PosturesCard {...common} />],
-    ["expressions", texts.expressions, takes("express") && description.expressions.length > 0, <ExpressionsCard {...common} />],
-    ["behaviours", texts.behaviours, takes("run_behaviour") && description.behaviours.length > 0, <BehavioursCard {...common} />],
-    ["speech", texts.speech, takes("say"), <SpeechCard {...common} />],
-    ["pose", texts.pose, takes("move_pose"), <MoveToPoseCard {...common} />],
-    ["place", texts.place, takes("go_to"), <GoToPlaceCard {...common} fleet={fleet} />],
-    ["look", texts.look, takes("look_at"), <LookAtCard {...common} />],
-    ["stiffness", texts.stiffness, takes("set_stiffness"), <StiffnessCard {...common} />],
+    ["postures", texts.postures, supports("take_posture") && description.postures.length > 0, <PosturesCard {...common} />],
+    ["expressions", texts.expressions, supports("express") && description.expressions.length > 0, <ExpressionsCard {...common} />],
+    ["behaviours", texts.behaviours, supports("run_behaviour") && description.behaviours.length > 0, <BehavioursCard {...common} />],
+    ["speech", texts.speech, supports("say"), <SpeechCard {...common} />],
+    ["pose", texts.pose, supports("move_pose"), <MoveToPoseCard {...common} />],
+    ["place", texts.place, supports("go_to"), <GoToPlaceCard {...common} fleet={fleet} />],
+    ["look", texts.look, supports("look_at"), <LookAtCard {...common} />],
+    ["stiffness", texts.stiffness, supports("set_stiffness"), <StiffnessCard {...common} />],
   ];
   return (
     <>
       {cards.map(
-        ([name, title, there, card]) =>
-          there && (
+        ([name, title, available, card]) =>
+          available && (
             <CollapsibleCard key={name} name={name} title={title} type={description.robot_type}>
-              <Card title={title} class="act" aside={no === "" ? undefined : <span class="quiet small act-no">{no}</span>}>
+              <Card title={title} class="act" aside={disabledReason === "" ? undefined : <span class="quiet small act-no">{disabledReason}</span>}>
                 {card}
               </Card>
             </CollapsibleCard>
@@ -60,6 +60,6 @@ export function ActionCards({ fleet, session }: ActsProps) {
 }
 
 /** Starts the action under this page's lease, or under one that the cloud takes for it. */
-export function startAction({ actions, control }: DeviceSession, request: AnyRequest, back?: AnyRequest): void {
-  void actions.start(request, control.epoch, back);
+export function startAction({ actions, control }: DeviceSession, request: AnyRequest, undo?: AnyRequest): void {
+  void actions.start(request, control.epoch, undo);
 }

@@ -2,17 +2,17 @@
 import { useId } from "preact/hooks";
 import { format } from "../../shared/i18n/format";
 
-interface ShareProps {
+interface FractionFieldProps {
   label: string;
   /** 0…1 */
   value: number;
-  least: number;
+  min: number;
   onChange: (value: number) => void;
   testid?: string;
 }
 
 /** A fraction, shown in percent. */
-export function ShareField({ label, value, least, onChange, testid }: ShareProps) {
+export function FractionField({ label, value, min, onChange, testid }: FractionFieldProps) {
   const id = useId();
   const percent = format.percent(value);
   return (
@@ -21,7 +21,7 @@ export function ShareField({ label, value, least, onChange, testid }: ShareProps
       <input
         id={id}
         type="range"
-        min={least}
+        min={min}
         max={1}
         step={0.05}
         value={value}
@@ -46,7 +46,7 @@ interface NumberFieldProps {
 
 export function NumberField({ label, unit, value, onInput, optional = false, testid }: NumberFieldProps) {
   const id = useId();
-  const wrong = numberOf(value) === null && !(optional && value.trim() === "");
+  const invalid = numberOf(value) === null && !(optional && value.trim() === "");
   return (
     <div class="act-number">
       <label for={id}>
@@ -57,7 +57,7 @@ export function NumberField({ label, unit, value, onInput, optional = false, tes
         type="text"
         inputMode="decimal"
         value={value}
-        aria-invalid={wrong && value !== ""}
+        aria-invalid={invalid && value !== ""}
         data-testid={testid}
         onInput={(event) => onInput(event.currentTarget.value)}
       />

@@ -10,7 +10,7 @@ import { NumberField, numberOf } from "./action-form-fields";
 
 const STEP_M = 0.1;
 
-export function GoToPlaceCard({ session, no, fleet }: ActionCardProps & { fleet: Fleet }) {
+export function GoToPlaceCard({ session, disabledReason, fleet }: ActionCardProps & { fleet: Fleet }) {
   const { device } = session;
   const { space, agent, name } = device.info.value;
   const plan = useFloorPlan(fleet, space, agent);
@@ -23,7 +23,7 @@ export function GoToPlaceCard({ session, no, fleet }: ActionCardProps & { fleet:
     return () => ends.forEach((end) => end());
   }, [ids]);
 
-  const mine = plan.places.find((place) => place.name === name) ?? null;
+  const current = plan.places.find((place) => place.name === name) ?? null;
   const [xM, yM, deg] = [numberOf(x), numberOf(y), numberOf(heading)];
   const target = useMemo(
     () => (xM === null || yM === null ? null : { xM, yM, yawRad: deg === null ? null : radians(deg) }),
@@ -33,13 +33,13 @@ export function GoToPlaceCard({ session, no, fleet }: ActionCardProps & { fleet:
     setX(pickedX.toFixed(2));
     setY(pickedY.toFixed(2));
   };
-  const headless = heading.trim() !== "" && deg === null;
+  const invalidHeading = heading.trim() !== "" && deg === null;
   const go = (event: SubmitEvent): void => {
     event.preventDefault();
-    if (target === null || no !== "" || headless) return;
-    const to: GoTo = { kind: "go_to", x_m: target.xM, y_m: target.yM, yaw_rad: target.yawRad };
-    if (mine === null) startAction(session, to);
-    else startAction(session, to, { kind: "go_to", x_m: mine.xM, y_m: mine.yM, yaw_rad: mine.yawRad });
+    if (target === null || disabledReason !== "" || invalidHeading) return;
+    const goal: GoTo = { kind: "go_to", x_m: target.xM, y_m: target.yM, yaw_rad: target.yawRad };
+    if (current === null) startAction(session, goal);
+    else startAction(session, goal, { kind: "go_to", x_m: current.xM, y_m: current.yM, yaw_rad: current.yawRad });
   };
   return (
     <form class="act-form" onSubmit={go}>
@@ -59,21 +59,21 @@ export function GoToPlaceCard({ session, no, fleet }: ActionCardProps & { fleet:
           type="submit"
           class="primary"
           data-testid="place-go"
-          disabled={target === null || headless || no !== ""}
-          title={no === "" ? undefined : no}
+          disabled={target === null || invalidHeading || disabledReason !== ""}
+          title={disabledReason === "" ? undefined : disabledReason}
         >
-          {texts.goThere}
+          {texts.go}
         </button>
         <button
           type="button"
-          disabled={mine === null}
+          disabled={current === null}
           onClick={() => {
-            if (mine === null) return;
-            pick(Math.round(mine.xM / STEP_M) * STEP_M, Math.round(mine.yM / STEP_M) * STEP_M);
-            setHeading(mine.yawRad === null ? "" : degrees(mine.yawRad).toFixed(0));
+            if (current === null) return;
+            pick(Math.round(current.xM / STEP_M) * STEP_M, Math.round(current.yM / STEP_M) * STEP_M);
+            setHeading(current.yawRad === null ? "" : degrees(current.yawRad).toFixed(0));
           }}
         >
-          {texts.whereItIs}
+          {texts.useCurrentPosition}
         </button>
       </div>
     </form>

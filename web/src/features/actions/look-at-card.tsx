@@ -4,16 +4,16 @@ import { startAction, type ActionCardProps } from "./action-cards";
 import { NumberField, numbersOf } from "./action-form-fields";
 
 /** Turns the gaze to a point in the robot's frame: x forward, y left, z up. */
-export function LookAtCard({ session, no }: ActionCardProps) {
+export function LookAtCard({ session, disabledReason }: ActionCardProps) {
   const [point, setPoint] = useState(["1.0", "0.0", "0.5"]);
   const [x, y, z] = numbersOf(point) ?? [];
-  const known = x !== undefined && y !== undefined && z !== undefined;
+  const valid = x !== undefined && y !== undefined && z !== undefined;
   return (
     <form
       class="act-form"
       onSubmit={(event) => {
         event.preventDefault();
-        if (known && no === "") startAction(session, { kind: "look_at", position_m: [x, y, z] });
+        if (valid && disabledReason === "") startAction(session, { kind: "look_at", position_m: [x, y, z] });
       }}
     >
       <div class="act-numbers">
@@ -29,8 +29,8 @@ export function LookAtCard({ session, no }: ActionCardProps) {
         ))}
       </div>
       <p class="quiet small">{texts.lookNote}</p>
-      <button type="submit" data-testid="look" disabled={!known || no !== ""} title={no === "" ? undefined : no}>
-        {texts.lookThere}
+      <button type="submit" data-testid="look" disabled={!valid || disabledReason !== ""} title={disabledReason === "" ? undefined : disabledReason}>
+        {texts.lookAt}
       </button>
     </form>
   );

@@ -3,7 +3,7 @@ import { useState } from "preact/hooks";
 import type { AnyRequest } from "../../shared/api/action-requests";
 import { texts } from "./texts";
 import { startAction, type ActionCardProps } from "./action-cards";
-import { ShareField } from "./action-form-fields";
+import { FractionField } from "./action-form-fields";
 
 interface ButtonsProps extends ActionCardProps {
   names: readonly string[];
@@ -11,7 +11,7 @@ interface ButtonsProps extends ActionCardProps {
   request: (name: string) => AnyRequest;
 }
 
-function Buttons({ session, no, names, testid, request }: ButtonsProps) {
+function Buttons({ session, disabledReason, names, testid, request }: ButtonsProps) {
   return (
     <div class="act-buttons">
       {names.map((name) => (
@@ -19,8 +19,8 @@ function Buttons({ session, no, names, testid, request }: ButtonsProps) {
           key={name}
           type="button"
           data-testid={`${testid}-${name}`}
-          disabled={no !== ""}
-          title={no === "" ? undefined : no}
+          disabled={disabledReason !== ""}
+          title={disabledReason === "" ? undefined : disabledReason}
           onClick={() => startAction(session, request(name))}
         >
           {name}
@@ -40,7 +40,7 @@ export function PosturesCard(props: ActionCardProps) {
         testid="posture"
         request={(name) => ({ kind: "take_posture", name, speed })}
       />
-      <ShareField label={texts.speed} value={speed} least={0.1} onChange={setSpeed} />
+      <FractionField label={texts.speed} value={speed} min={0.1} onChange={setSpeed} />
     </>
   );
 }
@@ -66,7 +66,7 @@ export function ExpressionsCard(props: ActionCardProps) {
         testid="expression"
         request={(name) => ({ kind: "express", name, strength })}
       />
-      <ShareField label={texts.strength} value={strength} least={0} onChange={setStrength} testid="strength" />
+      <FractionField label={texts.strength} value={strength} min={0} onChange={setStrength} testid="strength" />
     </>
   );
 }

@@ -16,23 +16,23 @@ interface RunStatusProps {
 
 export function RunStatusPanel({ device, control, actions }: RunStatusProps) {
   const [dismissed, setDismissed] = useState("");
-  const [problem, setProblem] = useState("");
+  const [error, setError] = useState("");
   const newest = actions.run.value;
   const run = newest === null || newest.key === dismissed ? null : newest;
-  const told = device.live.value ? (device.state.value?.action ?? null) : null;
-  const mineRuns = run !== null && !ended(run);
-  const others = !mineRuns && told !== null && told.id !== newest?.id ? told : null;
-  const shown = run !== null || others !== null;
-  const cancel = (): void => void actions.cancel(others?.id ?? null).then(setProblem);
+  const reported = device.live.value ? (device.state.value?.action ?? null) : null;
+  const ownRunning = run !== null && !ended(run);
+  const otherAction = !ownRunning && reported !== null && reported.id !== newest?.id ? reported : null;
+  const visible = run !== null || otherAction !== null;
+  const cancel = (): void => void actions.cancel(otherAction?.id ?? null).then(setError);
   return (
-    <div class={`doing ${mineRuns || others !== null ? "running" : ""} ${shown ? "" : "nothing"}`}>
+    <div class={`run-status ${ownRunning || otherAction !== null ? "running" : ""} ${visible ? "" : "empty"}`}>
       <div class={`run run-${run?.status ?? "none"}`} role="status" data-testid="action-status" data-status={run?.status ?? ""}>
         {run !== null && <RunSteps run={run} />}
-        {others !== null && <p>{texts.running(others.kind, others.name ?? "")}</p>}
-        {problem !== "" && <p class="field-error">{problem}</p>}
+        {otherAction !== null && <p>{texts.running(otherAction.kind, otherAction.name ?? "")}</p>}
+        {error !== "" && <p class="field-error">{error}</p>}
       </div>
       <div class="row">
-        {(mineRuns || others !== null) && device.info.value.role !== "viewer" && (
+        {(ownRunning || otherAction !== null) && device.info.value.role !== "viewer" && (
           <button type="button" data-testid="cancel-action" onClick={cancel}>
             {texts.cancel}
           </button>
@@ -47,7 +47,7 @@ export function RunStatusPanel({ device, control, actions }: RunStatusProps) {
         )}
       </div>
       {run !== null && run.output !== "" && (
-        <details class="printed" open>
+        <details class="run-output" open>
           <summary>{texts.output}</summary>
           <pre class="output" tabIndex={0}>
             {run.output}
@@ -73,7 +73,7 @@ export function RunSteps({ run }: { run: Run }) {
         ))}
       </ol>
       {run.progress !== null && !ended(run) && <progress value={run.progress} max={1} aria-label={name} />}
-      {run.why !== "" && <p class={run.status === "done" ? "" : "field-error"}>{run.why}</p>}
+      {run.reason !== "" && <p class={run.status === "done" ? "" : "field-error"}>{run.reason}</p>}
       {run.status === "unanswered" && <p class="field-error">{texts.unanswered}</p>}
     </>
   );
@@ -81,19 +81,19 @@ export function RunSteps({ run }: { run: Run }) {
 
 /** Undoes an ended action, including a partial one; not an action that never started. */
 function UndoButton({ device, control, actions, run }: RunStatusProps & { run: Run }) {
-  const { back } = run;
-  const begun = run.steps.some(({ status }) => status === "started");
-  if (back === null || !begun) return null;
-  const no = actionUnavailableReason(device, control);
+  const { undo } = run;
+  const started = run.steps.some(({ status }) => status === "started");
+  if (undo === null || !started) return null;
+  const disabledReason = actionUnavailableReason(device, control);
   return (
     <button
       type="button"
-      data-testid="back"
-      disabled={no !== ""}
-      title={no === "" ? undefined : no}
-      onClick={() => void actions.start(back, control.epoch)}
+      data-testid="undo-action"
+      disabled={disabledReason !== ""}
+      title={disabledReason === "" ? undefined : disabledReason}
+      onClick={() => void actions.start(undo, control.epoch)}
     >
-      {texts.back}
+      {texts.undo}
     </button>
   );
 }

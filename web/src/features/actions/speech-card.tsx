@@ -3,21 +3,21 @@ import type { ActionRunner } from "./model/action-runner";
 import { texts } from "./texts";
 import { startAction, type ActionCardProps } from "./action-cards";
 
-const LONGEST = 2000;
+const MAX_LENGTH = 2000;
 /** A BCP 47 tag: `en`, `sk`, `en-GB`; or empty. */
 const LANGUAGE = /^([A-Za-z]{1,8}(-[A-Za-z0-9]{1,8})*)?$/;
 
 /** Enter sends the text; Shift+Enter starts a new line. The text is cleared only after success. */
-export function SpeechCard({ session, no }: ActionCardProps) {
+export function SpeechCard({ session, disabledReason }: ActionCardProps) {
   const [text, setText] = useState("");
   const [language, setLanguage] = useState("");
-  const asked = useRef("");
-  useSaid(session.actions, asked, (said) => setText((now) => (now === said ? "" : now)));
-  const good = LANGUAGE.test(language.trim());
-  const ready = no === "" && text.trim() !== "" && good;
-  const say = (): void => {
+  const sentText = useRef("");
+  useSpeechStart(session.actions, sentText, (spoken) => setText((current) => (current === spoken ? "" : current)));
+  const validLanguage = LANGUAGE.test(language.trim());
+  const ready = disabledReason === "" && text.trim() !== "" && validLanguage;
+  const send = (): void => {
     if (!ready) return;
-    asked.current = text;
+    sentText.current = text;
     startAction(session, { kind: "say", text: text.trim(), language: language.trim() });
   };
   return (
@@ -25,21 +25,21 @@ export function SpeechCard({ session, no }: ActionCardProps) {
       class="act-speech"
       onSubmit={(event) => {
         event.preventDefault();
-        say();
+        send();
       }}
     >
       <label>
-        {texts.say}
+        {texts.textToSpeak}
         <textarea
           rows={2}
-          maxLength={LONGEST}
+          maxLength={MAX_LENGTH}
           value={text}
           data-testid="say-text"
           onInput={(event) => setText(event.currentTarget.value)}
           onKeyDown={(event) => {
             if (event.key !== "Enter" || event.shiftKey || event.isComposing) return;
             event.preventDefault();
-            say();
+            send();
           }}
         />
       </label>
@@ -50,8 +50,8 @@ export function SpeechCard({ session, no }: ActionCardProps) {
             type="text"
             list="say-languages"
             value={language}
-            placeholder={texts.ownLanguage}
-            aria-invalid={!good}
+            placeholder={texts.defaultLanguage}
+            aria-invalid={!validLanguage}
             autocapitalize="off"
             data-testid="say-language"
             onInput={(event) => setLanguage(event.currentTarget.value)}
@@ -64,8 +64,8 @@ export function SpeechCard({ session, no }: ActionCardProps) {
             </option>
           ))}
         </datalist>
-        <button type="submit" class="primary" data-testid="say" disabled={!ready} title={no === "" ? undefined : no}>
-          {texts.sayIt}
+        <button type="submit" class="primary" data-testid="say" disabled={!ready} title={disabledReason === "" ? undefined : disabledReason}>
+          {texts.speak}
         </button>
       </div>
     </form>
@@ -73,10 +73,10 @@ export function SpeechCard({ session, no }: ActionCardProps) {
 }
 
 /** Calls back once when the speech starts. */
-function useSaid(actions: ActionRunner, asked: { current: string }, said: (text: string) => void): void {
+function useSpeechStart(actions: ActionRunner, sentText: { current: string }, onStart: (text: string) => void): void {
   const run = actions.run.value;
-  const begun = run?.request.kind === "say" && (run.status === "started" || run.status === "done") ? run.key : "";
+  const startedKey = run?.request.kind === "say" && (run.status === "started" || run.status === "done") ? run.key : "";
   useEffect(() => {
-    if (begun !== "") said(asked.current);
-  }, [begun]);
+    if (startedKey !== "") onStart(sentText.current);
+  }, [startedKey]);
 }

@@ -2,18 +2,18 @@ import { useState } from "preact/hooks";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { startAction, type ActionCardProps } from "./action-cards";
-import { ShareField } from "./action-form-fields";
+import { FractionField } from "./action-form-fields";
 
 const ALL = "";
 
 /** Sets joint stiffness. The current values come from the device. */
-export function StiffnessCard({ session, description, no }: ActionCardProps) {
+export function StiffnessCard({ session, description, disabledReason }: ActionCardProps) {
   const [joint, setJoint] = useState(ALL);
   const [value, setValue] = useState(1);
   const { device } = session;
-  const stands = description.postures.some((name) => name.startsWith("Stand"));
-  const set = (share: number): void =>
-    startAction(session, { kind: "set_stiffness", value: share, joints: joint === ALL ? [] : [joint] });
+  const canStand = description.postures.some((name) => name.startsWith("Stand"));
+  const set = (fraction: number): void =>
+    startAction(session, { kind: "set_stiffness", value: fraction, joints: joint === ALL ? [] : [joint] });
   return (
     <div class="act-form">
       <label>
@@ -27,45 +27,45 @@ export function StiffnessCard({ session, description, no }: ActionCardProps) {
           ))}
         </select>
       </label>
-      <ShareField label={texts.stiffness} value={value} least={0} onChange={setValue} testid="stiffness-value" />
-      {stands && value < 0.3 && <p class="notice warn">{texts.limpWarning}</p>}
+      <FractionField label={texts.stiffness} value={value} min={0} onChange={setValue} testid="stiffness-value" />
+      {canStand && value < 0.3 && <p class="notice warn">{texts.limpWarning}</p>}
       <div class="row">
         <button
           type="button"
           data-testid="stiffness-set"
-          disabled={no !== ""}
-          title={no === "" ? undefined : no}
+          disabled={disabledReason !== ""}
+          title={disabledReason === "" ? undefined : disabledReason}
           onClick={() => set(value)}
         >
-          {value === 0 ? texts.letGo : texts.set}
+          {value === 0 ? texts.release : texts.set}
         </button>
         <button
           type="button"
           data-testid="stiffness-full"
-          disabled={no !== ""}
-          title={no === "" ? undefined : no}
+          disabled={disabledReason !== ""}
+          title={disabledReason === "" ? undefined : disabledReason}
           onClick={() => {
             setValue(1);
             set(1);
           }}
         >
-          {texts.holdFully}
+          {texts.fullStiffness}
         </button>
       </div>
-      <Told told={device.state.value?.stiffness ?? null} live={device.live.value} />
+      <ReportedStiffness stiffness={device.state.value?.stiffness ?? null} live={device.live.value} />
     </div>
   );
 }
 
 /** The device reports only joints with reduced stiffness. */
-function Told({ told, live }: { told: Readonly<Record<string, number>> | null; live: boolean }) {
-  if (told === null) return <p class="quiet small">{texts.stiffnessUnknown}</p>;
-  const less = Object.entries(told);
+function ReportedStiffness({ stiffness, live }: { stiffness: Readonly<Record<string, number>> | null; live: boolean }) {
+  if (stiffness === null) return <p class="quiet small">{texts.stiffnessUnknown}</p>;
+  const reduced = Object.entries(stiffness);
   return (
-    <p class={`small ${live ? "quiet" : "old"}`} data-testid="stiffness-told" data-less={less.length}>
-      {less.length === 0
-        ? texts.holdsFully
-        : texts.holdsLess(less.map(([name, value]) => `${name} ${format.percent(value)}`).join(", "))}
+    <p class={`small ${live ? "quiet" : "old"}`} data-testid="stiffness-reported" data-reduced={reduced.length}>
+      {reduced.length === 0
+        ? texts.allFullStiffness
+        : texts.reducedStiffness(reduced.map(([name, value]) => `${name} ${format.percent(value)}`).join(", "))}
     </p>
   );
 }

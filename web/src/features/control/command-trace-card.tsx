@@ -48,9 +48,9 @@ export function CommandTraceCard({ session }: { session: DeviceSession }) {
   );
 }
 
-function endText({ status, request, why }: TraceLine): string {
-  const reason = (steeringTexts.joints.ended as Readonly<Record<string, string>>)[why];
-  return request.kind === "stream" && reason !== undefined ? reason : actionTexts.status[status];
+function endText({ status, request, reason }: TraceLine): string {
+  const streamEnd = (steeringTexts.joints.ended as Readonly<Record<string, string>>)[reason];
+  return request.kind === "stream" && streamEnd !== undefined ? streamEnd : actionTexts.status[status];
 }
 
 function Row({ line }: { line: TraceLine }) {
@@ -62,7 +62,7 @@ function Row({ line }: { line: TraceLine }) {
       data-testid="command-trace-row"
       data-kind={line.request.kind}
       data-status={line.status}
-      data-seen={line.seenBy ?? ""}
+      data-observed-by={line.observedBy ?? ""}
       data-ended={end?.afterMs.toFixed(1) ?? ""}
       {...data}
     >
@@ -71,21 +71,21 @@ function Row({ line }: { line: TraceLine }) {
         <span class="quiet small">{format.age(Math.max(0, clock.value - line.clickedAt))}</span>
       </th>
       {COLUMNS.map((column) => (
-        <Cell key={column} step={of(column)} note={column === "observed" && line.seenBy !== null ? texts.trace.seenBy[line.seenBy] : ""} />
+        <Cell key={column} step={of(column)} note={column === "observed" && line.observedBy !== null ? texts.trace.observedBy[line.observedBy] : ""} />
       ))}
-      <Cell step={end} note={end === undefined ? "" : endText(line)} bad={end !== undefined && end.status !== "done"} />
+      <Cell step={end} note={end === undefined ? "" : endText(line)} failed={end !== undefined && end.status !== "done"} />
     </tr>
   );
 }
 
 /** Time and source of a step. */
-function Cell({ step, note, bad = false }: { step: Step<TraceStatus> | undefined; note: string; bad?: boolean }) {
+function Cell({ step, note, failed = false }: { step: Step<TraceStatus> | undefined; note: string; failed?: boolean }) {
   if (step === undefined) return <td class="quiet">{format.unknown}</td>;
-  const said = [note, note === "" || note === actionTexts.status.done ? texts.trace.heard[step.heard] : ""];
+  const notes = [note, note === "" || note === actionTexts.status.done ? texts.trace.source[step.source] : ""];
   return (
     <td>
       {format.milliseconds(step.afterMs)}
-      <span class={`small ${bad ? "ended-badly" : "quiet"}`}>{said.filter((one) => one !== "").join(", ")}</span>
+      <span class={`small ${failed ? "ended-badly" : "quiet"}`}>{notes.filter((one) => one !== "").join(", ")}</span>
     </td>
   );
 }

@@ -14,21 +14,21 @@ interface ControlBarProps {
   control: Control;
   stop: StopSwitch;
   /** Other viewers, if tracked. */
-  watching?: Watchers;
+  watchers?: Watchers;
 }
 
 /** Always visible: the lease holder, take, request and release control, other viewers, and Stop. */
-export function ControlBar({ device, control, stop, watching }: ControlBarProps) {
+export function ControlBar({ device, control, stop, watchers }: ControlBarProps) {
   const names = useId();
   const [open, setOpen] = useState(false);
   const [takingOver, setTakingOver] = useState(false);
   const opener = useReturnFocus(takingOver);
-  const watches = device.info.value.role === "viewer";
+  const isViewer = device.info.value.role === "viewer";
   return (
     <div class="control-bar" role="region" aria-label={texts.control.title}>
       <ControlState device={device} control={control} />
-      {watching !== undefined && <WatchersButton watching={watching} open={open} names={names} onToggle={() => setOpen(!open)} />}
-      <HoldButton device={device} control={control} />
+      {watchers !== undefined && <WatchersButton watchers={watchers} open={open} names={names} onToggle={() => setOpen(!open)} />}
+      <LeaseButton device={device} control={control} />
       {!takingOver && mayTakeOver(device, control) && (
         <button type="button" ref={opener} data-testid="take-over" onClick={() => setTakingOver(true)}>
           {texts.handover.takeOver}
@@ -38,11 +38,11 @@ export function ControlBar({ device, control, stop, watching }: ControlBarProps)
         type="button"
         class="stop"
         data-testid="stop"
-        disabled={watches}
-        title={watches ? texts.control.watches : texts.stop.keyExplained}
+        disabled={isViewer}
+        title={isViewer ? texts.control.viewer : texts.stop.keyExplained}
         aria-keyshortcuts="Escape"
         onClick={() => {
-          control.stopped();
+          control.onStop();
           stop.press();
         }}
       >
@@ -53,27 +53,27 @@ export function ControlBar({ device, control, stop, watching }: ControlBarProps)
       )}
       <PendingRequest control={control} />
       <AnswerRequest control={control} />
-      {watching !== undefined && open && <WatcherNames watching={watching} id={names} />}
+      {watchers !== undefined && open && <WatcherNames watchers={watchers} id={names} />}
     </div>
   );
 }
 
 /** Whether another operator has control, so that this page must request it. */
-function anothers(device: DeviceStore, control: Control): boolean {
+function heldByOther(device: DeviceStore, control: Control): boolean {
   const holder = device.holder.value;
   const { kind } = control.state.value;
   return holder !== null && !holder.mine && kind !== "held" && kind !== "taking";
 }
 
 function mayTakeOver(device: DeviceStore, control: Control): boolean {
-  return device.info.value.role === "owner" && anothers(device, control);
+  return device.info.value.role === "owner" && heldByOther(device, control);
 }
 
 /** Take, request or release control, depending on the state. */
-function HoldButton({ device, control }: { device: DeviceStore; control: Control }) {
+function LeaseButton({ device, control }: { device: DeviceStore; control: Control }) {
   const state = control.state.value;
-  const describedYet = device.description.value !== null;
-  const watches = device.info.value.role === "viewer";
+  const described = device.description.value !== null;
+  const isViewer = device.info.value.role === "viewer";
   if (state.kind === "held") {
     return (
       <button type="button" data-testid="release-control" onClick={() => void control.release()}>
@@ -81,17 +81,17 @@ function HoldButton({ device, control }: { device: DeviceStore; control: Control
       </button>
     );
   }
-  const asking = control.asking.state.value.kind;
+  const request = control.outgoingRequest.state.value.kind;
   // After a failed request the lease may have ended before the robot reports it: offer to take control.
-  if (anothers(device, control) && !watches && asking !== "failed") return <RequestControlButton control={control} />;
+  if (heldByOther(device, control) && !isViewer && request !== "failed") return <RequestControlButton control={control} />;
   const resumable = device.holder.value?.mine === true;
   return (
     <button
       type="button"
       class="primary"
       data-testid="take-control"
-      disabled={state.kind === "taking" || !describedYet || watches}
-      title={watches ? texts.control.watches : describedYet ? undefined : texts.control.needsDescription}
+      disabled={state.kind === "taking" || !described || isViewer}
+      title={isViewer ? texts.control.viewer : described ? undefined : texts.control.needsDescription}
       onClick={() => void control.take()}
     >
       {state.kind === "taking" ? texts.control.taking : resumable ? texts.control.resume : texts.control.take}
@@ -114,17 +114,17 @@ function ControlState({ device, control }: { device: DeviceStore; control: Contr
 function describe(device: DeviceStore, control: Control): [Shown, string] {
   const state = control.state.value;
   const holder = device.holder.value;
-  const told = device.state.value?.lease ?? null;
-  const reason = told !== null && told.holder === holder?.name ? (told.reason ?? "") : "";
+  const lease = device.state.value?.lease ?? null;
+  const reason = lease !== null && lease.holder === holder?.name ? (lease.reason ?? "") : "";
   switch (state.kind) {
     case "taking":
       return ["taking", texts.control.taking];
     case "held":
       return ["mine", state.confirmed ? texts.control.mine : texts.control.unconfirmed];
     case "lost":
-      return ["lost", texts.control.lost(holder === null || reason === "" ? state.why : texts.control.tookOver(holder.name, reason))];
+      return ["lost", texts.control.lost(holder === null || reason === "" ? state.reason : texts.control.tookOver(holder.name, reason))];
     case "refused":
-      return ["refused", texts.control.refused(state.why)];
+      return ["refused", texts.control.refused(state.reason)];
     case "handed":
       return ["handed", texts.control.handed(state.to)];
     case "none":

@@ -8,20 +8,20 @@ import type { Control } from "./model/lease";
 import { texts } from "./texts";
 
 /** Remaining seconds, hidden from screen readers, which would announce every second. */
-function Left({ until, as }: { until: number; as: (s: number) => string }) {
-  const text = useComputed(() => as(Math.max(0, Math.ceil((until - clock.value) / 1000))));
+function RemainingTime({ until, format }: { until: number; format: (s: number) => string }) {
+  const text = useComputed(() => format(Math.max(0, Math.ceil((until - clock.value) / 1000))));
   return (
-    <span class="left" aria-hidden="true">
+    <span class="remaining" aria-hidden="true">
       {text}
     </span>
   );
 }
 
 export function RequestControlButton({ control }: { control: Control }) {
-  const { kind } = control.asking.state.value;
+  const { kind } = control.outgoingRequest.state.value;
   if (kind === "open") {
     return (
-      <button type="button" data-testid="withdraw-request" onClick={() => void control.asking.withdraw()}>
+      <button type="button" data-testid="withdraw-request" onClick={() => void control.outgoingRequest.withdraw()}>
         {texts.handover.withdraw}
       </button>
     );
@@ -30,46 +30,46 @@ export function RequestControlButton({ control }: { control: Control }) {
     <button
       type="button"
       class="primary"
-      data-testid="ask-control"
+      data-testid="request-control"
       disabled={kind === "sending"}
-      onClick={() => void control.asking.ask()}
+      onClick={() => void control.outgoingRequest.send()}
     >
-      {kind === "sending" ? texts.handover.asking : texts.handover.ask}
+      {kind === "sending" ? texts.handover.requesting : texts.handover.request}
     </button>
   );
 }
 
 /** The outcome of the control request. */
 export function PendingRequest({ control }: { control: Control }) {
-  const state = control.asking.state.value;
+  const state = control.outgoingRequest.state.value;
   return (
-    <div role="status" class={state.kind === "none" || state.kind === "sending" ? undefined : "bar-row"} data-testid="asked">
+    <div role="status" class={state.kind === "none" || state.kind === "sending" ? undefined : "bar-row"} data-testid="control-request">
       {state.kind === "open" && (
         <>
           <span>
-            {texts.handover.asked(state.of || texts.handover.operator)} {!state.shown && texts.handover.notShown}
+            {texts.handover.requested(state.holder || texts.handover.operator)} {!state.published && texts.handover.notPublished}
           </span>
-          <Left until={state.until} as={texts.handover.left} />
+          <RemainingTime until={state.until} format={texts.handover.remainingToRespond} />
         </>
       )}
-      {(state.kind === "over" || state.kind === "failed") && (
-        <Read text={became(state)} control={control} wrong={state.kind === "failed"} />
+      {(state.kind === "ended" || state.kind === "failed") && (
+        <Message text={outcomeText(state)} control={control} isError={state.kind === "failed"} />
       )}
     </div>
   );
 }
 
-function became(state: Extract<ControlRequestState, { kind: "over" | "failed" }>): string {
-  if (state.kind === "failed") return texts.handover.failed(state.why);
-  return texts.handover.over[state.how](state.of || texts.handover.operator);
+function outcomeText(state: Extract<ControlRequestState, { kind: "ended" | "failed" }>): string {
+  if (state.kind === "failed") return texts.handover.failed(state.reason);
+  return texts.handover.outcome[state.outcome](state.holder || texts.handover.operator);
 }
 
-function Read({ text, control, wrong = false }: { text: string; control: Control; wrong?: boolean }) {
+function Message({ text, control, isError = false }: { text: string; control: Control; isError?: boolean }) {
   return (
     <>
-      <span class={wrong ? "bad-text" : undefined}>{text}</span>
-      <button type="button" class="plain" onClick={() => control.read()}>
-        {texts.control.read}
+      <span class={isError ? "bad-text" : undefined}>{text}</span>
+      <button type="button" class="plain" onClick={() => control.dismiss()}>
+        {texts.control.dismiss}
       </button>
     </>
   );
@@ -77,45 +77,45 @@ function Read({ text, control, wrong = false }: { text: string; control: Control
 
 /** The requester, the remaining time and both responses. Does not move the focus, because the operator is steering. */
 export function AnswerRequest({ control }: { control: Control }) {
-  const asked = control.asked.value;
-  const answered = control.answered.value;
-  const sending = answered.kind === "sending";
-  // The request ended without our response: withdrawn or expired.
-  const [gone, setGone] = useState("");
-  const last = useRef<string | null>(null);
+  const request = control.incomingRequest.value;
+  const response = control.response.value;
+  const sending = response.kind === "sending";
+  // The requester, if the request ended without a response: withdrawn or expired.
+  const [withdrawnBy, setWithdrawnBy] = useState("");
+  const lastRequester = useRef<string | null>(null);
   const held = control.state.value.kind === "held";
   useEffect(() => {
-    if (asked !== null) {
-      last.current = asked.by;
-      setGone("");
+    if (request !== null) {
+      lastRequester.current = request.by;
+      setWithdrawnBy("");
     } else {
-      if (last.current !== null && held && answered.kind === "none") setGone(last.current);
-      last.current = null;
+      if (lastRequester.current !== null && held && response.kind === "none") setWithdrawnBy(lastRequester.current);
+      lastRequester.current = null;
     }
-  }, [asked?.id]);
+  }, [request?.id]);
 
-  const said = answered.kind === "kept" ? texts.handover.kept(answered.from) : "";
+  const message = response.kind === "kept" ? texts.handover.declined(response.from) : "";
   return (
     <>
-      <div role="alert" class={asked === null ? undefined : "bar-row asks"} data-testid="asks">
-        {asked !== null && <strong>{texts.handover.wants(asked.by)}</strong>}
-        {asked !== null && <span class="quiet small">{texts.handover.effect}</span>}
+      <div role="alert" class={request === null ? undefined : "bar-row incoming-request"} data-testid="incoming-request">
+        {request !== null && <strong>{texts.handover.requests(request.by)}</strong>}
+        {request !== null && <span class="quiet small">{texts.handover.effect}</span>}
       </div>
-      {asked !== null && (
-        <div class="bar-row" role="group" aria-label={texts.handover.wants(asked.by)}>
-          <button type="button" class="primary" data-testid="accept-request" disabled={sending} onClick={() => void control.answer(true)}>
-            {sending && answered.accept ? texts.handover.accepting : texts.handover.accept(asked.by)}
+      {request !== null && (
+        <div class="bar-row" role="group" aria-label={texts.handover.requests(request.by)}>
+          <button type="button" class="primary" data-testid="accept-request" disabled={sending} onClick={() => void control.respond(true)}>
+            {sending && response.accept ? texts.handover.accepting : texts.handover.accept(request.by)}
           </button>
-          <button type="button" data-testid="refuse-request" disabled={sending} onClick={() => void control.answer(false)}>
-            {sending && !answered.accept ? texts.handover.refusing : texts.handover.keep}
+          <button type="button" data-testid="refuse-request" disabled={sending} onClick={() => void control.respond(false)}>
+            {sending && !response.accept ? texts.handover.declining : texts.handover.decline}
           </button>
-          <Left until={asked.until} as={texts.handover.leftFor} />
+          <RemainingTime until={request.until} format={texts.handover.remaining} />
         </div>
       )}
-      <div role="status" class={said === "" && answered.kind !== "failed" && gone === "" ? undefined : "bar-row"} data-testid="answered">
-        {said !== "" && asked === null && <Read text={said} control={control} />}
-        {answered.kind === "failed" && <Read text={texts.handover.failed(answered.why)} control={control} wrong />}
-        {gone !== "" && answered.kind === "none" && held && asked === null && <span>{texts.handover.gone(gone)}</span>}
+      <div role="status" class={message === "" && response.kind !== "failed" && withdrawnBy === "" ? undefined : "bar-row"} data-testid="request-response">
+        {message !== "" && request === null && <Message text={message} control={control} />}
+        {response.kind === "failed" && <Message text={texts.handover.failed(response.reason)} control={control} isError />}
+        {withdrawnBy !== "" && response.kind === "none" && held && request === null && <span>{texts.handover.withdrawn(withdrawnBy)}</span>}
       </div>
     </>
   );
@@ -159,7 +159,7 @@ export function TakeOverForm({ device, control, onClose }: TakeOverProps) {
         {texts.handover.takeOverNow}
       </button>
       <button type="button" onClick={onClose}>
-        {texts.handover.never}
+        {texts.handover.cancel}
       </button>
       <span class="quiet small" id={`${id}-note`}>
         {texts.handover.reasonNote}

@@ -11,24 +11,24 @@ interface StopBannerProps {
 /** The state of Stop. The live region always exists, so that screen readers announce changes. */
 export function StopBanner({ device, stop }: StopBannerProps) {
   const state = stop.state.value;
-  const problem = stop.problem.value;
+  const error = stop.error.value;
   return (
     <div role="alert" class="alert-slot">
       {state.kind !== "clear" && (
         <div class="banner stopped" data-testid="stop-banner" data-state={state.kind}>
-          {state.kind === "sending" && <strong>{state.doubtful ? texts.stop.doubtful : texts.stop.sending}</strong>}
+          {state.kind === "sending" && <strong>{state.overdue ? texts.stop.overdue : texts.stop.sending}</strong>}
           {state.kind === "unconfirmed" && <strong>{texts.stop.unconfirmed}</strong>}
           {state.kind === "latched" && <Latched device={device} stop={stop} />}
-          {problem !== null && <p>{problem}</p>}
+          {error !== null && <p>{error}</p>}
         </div>
       )}
-      {state.kind === "clear" && problem !== null && <p class="notice bad">{problem}</p>}
+      {state.kind === "clear" && error !== null && <p class="notice bad">{error}</p>}
     </div>
   );
 }
 
 function Latched({ device, stop }: StopBannerProps) {
-  const [asking, setAsking] = useState(false);
+  const [confirming, setConfirming] = useState(false);
   const latch = device.state.value?.stop;
   const resetting = stop.resetting.value;
   return (
@@ -38,23 +38,23 @@ function Latched({ device, stop }: StopBannerProps) {
         {latch !== undefined && latch !== null && texts.stop.by(latch.caller, latch.reason)}
         <p>{texts.stop.explain}</p>
       </div>
-      {asking ? (
+      {confirming ? (
         <div class="row" role="group" aria-label={texts.stop.confirmQuestion}>
           <span>{texts.stop.confirmQuestion}</span>
           <button
             type="button"
             data-testid="confirm-reset"
             disabled={resetting}
-            onClick={() => void stop.reset().then(() => setAsking(false))}
+            onClick={() => void stop.reset().then(() => setConfirming(false))}
           >
             {resetting ? texts.stop.resetting : texts.stop.confirm}
           </button>
-          <button type="button" data-testid="keep-stopped" disabled={resetting} onClick={() => setAsking(false)}>
+          <button type="button" data-testid="keep-stopped" disabled={resetting} onClick={() => setConfirming(false)}>
             {texts.stop.keep}
           </button>
         </div>
       ) : (
-        <button type="button" data-testid="reset-stop" onClick={() => setAsking(true)}>
+        <button type="button" data-testid="reset-stop" onClick={() => setConfirming(true)}>
           {texts.stop.reset}
         </button>
       )}

@@ -1,6 +1,6 @@
-import type { Channel } from "../actions/model";
-import type { SeenBy } from "./model/command-trace";
-import type { Ended } from "./model/control-request";
+import type { StepSource } from "../actions/model";
+import type { ObservedBy } from "./model/command-trace";
+import type { RequestOutcome } from "./model/control-request";
 
 export const texts = {
   control: {
@@ -12,7 +12,7 @@ export const texts = {
     mine: "You have control",
     unconfirmed: "You have control; not confirmed by the robot yet",
     free: "Available",
-    watches: "You are a viewer of this device. Ask its owner for operator access.",
+    viewer: "You are a viewer of this device. Ask its owner for operator access.",
     other: (holder: string): string => `${holder} has control`,
     elsewhere: "You have control in another tab",
     lost: (reason: string): string => `Control lost: ${reason}`,
@@ -20,41 +20,41 @@ export const texts = {
     needsDescription: "The robot has not published its description yet.",
     tookOver: (holder: string, reason: string): string => `${holder} took over: ${reason}`,
     handed: (to: string): string => `You handed control over to ${to}`,
-    read: "OK",
+    dismiss: "OK",
   },
 
   /** Requesting control, answering a request, and the owner's takeover. */
   handover: {
-    ask: "Request control",
-    asking: "Requesting…",
-    asked: (holder: string): string => `You requested control from ${holder}.`,
-    notShown: "The robot does not respond, so the request may be noticed late.",
-    left: (s: number): string => `${s} s to respond`,
-    leftFor: (s: number): string => `${s} s left`,
+    request: "Request control",
+    requesting: "Requesting…",
+    requested: (holder: string): string => `You requested control from ${holder}.`,
+    notPublished: "The robot does not respond, so the operator may see the request late.",
+    remainingToRespond: (s: number): string => `${s} s to respond`,
+    remaining: (s: number): string => `${s} s left`,
     withdraw: "Withdraw request",
     operator: "the operator",
-    wants: (by: string): string => `${by} requests control.`,
+    requests: (by: string): string => `${by} requests control.`,
     accept: (by: string): string => `Hand over to ${by}`,
-    keep: "Keep control",
+    decline: "Keep control",
     accepting: "Handing over…",
-    refusing: "Declining…",
+    declining: "Declining…",
     effect: "If you hand over, the robot holds its position. Without a response, you keep control.",
-    over: {
+    outcome: {
       accepted: (holder: string): string => `${holder} handed control over to you.`,
       rejected: (holder: string): string => `${holder} keeps control.`,
       withdrawn: (): string => "You withdrew your request.",
       expired: (holder: string): string => `${holder} did not respond in time and keeps control.`,
       ended: (holder: string): string => `${holder} no longer has control. You can take it if it is available.`,
-    } satisfies Record<Ended, (holder: string) => string>,
-    kept: (by: string): string => `You keep control; ${by} was notified.`,
-    gone: (by: string): string => `${by} withdrew the request.`,
+    } satisfies Record<RequestOutcome, (holder: string) => string>,
+    declined: (by: string): string => `You keep control; ${by} was notified.`,
+    withdrawn: (by: string): string => `${by} withdrew the request.`,
     failed: (reason: string): string => `The request failed: ${reason}`,
     takeOver: "Take over…",
     takeOverNow: "Take over",
     takingOver: "Taking over…",
     reason: (holder: string): string => `Reason for taking control from ${holder}`,
     reasonNote: "The operator sees this text. The robot holds its position.",
-    never: "Cancel",
+    cancel: "Cancel",
   },
 
   watchers: {
@@ -69,7 +69,7 @@ export const texts = {
     key: "Esc",
     keyExplained: "The Escape key stops the robot, regardless of the keyboard focus.",
     sending: "Stop sent. Waiting for confirmation from the robot…",
-    doubtful: "Stop sent, but not confirmed by the robot. It is sent repeatedly. If possible, use the emergency stop at the robot.",
+    overdue: "Stop sent, but not confirmed by the robot. It is sent repeatedly. If possible, use the emergency stop at the robot.",
     unconfirmed: "The robot did not confirm the stop. Go to the robot, or send a person there.",
     latched: "Stopped",
     by: (by: string, reason: string): string => (reason === "" ? `by ${by}` : `by ${by}: ${reason}`),
@@ -87,8 +87,8 @@ export const texts = {
     none: "No commands sent from this page.",
     command: "Command",
     column: { accepted: "accepted", started: "started", observed: "observed", ended: "ended" },
-    heard: { page: "by this page", device: "by the robot", cloud: "by the cloud" } satisfies Record<Channel, string>,
-    seenBy: { motion: "motion", state: "reported state" } satisfies Record<SeenBy, string>,
+    source: { page: "by this page", device: "by the robot", cloud: "by the cloud" } satisfies Record<StepSource, string>,
+    observedBy: { motion: "motion", state: "reported state" } satisfies Record<ObservedBy, string>,
     explained: "Time since the click, on this computer's clock. Observed: the first telemetry that shows motion.",
   },
 };

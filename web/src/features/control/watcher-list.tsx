@@ -6,15 +6,15 @@ import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 
 interface WatchersButtonProps {
-  watching: Watchers;
+  watchers: Watchers;
   open: boolean;
   /** The id of their names. */
   names: string;
   onToggle: () => void;
 }
 
-export function WatchersButton({ watching, open, names, onToggle }: WatchersButtonProps) {
-  const others = watching.others.value ?? [];
+export function WatchersButton({ watchers, open, names, onToggle }: WatchersButtonProps) {
+  const others = watchers.others.value ?? [];
   if (others.length === 0) return null;
   return (
     <button
@@ -31,8 +31,8 @@ export function WatchersButton({ watching, open, names, onToggle }: WatchersButt
   );
 }
 
-export function WatcherNames({ watching, id }: { watching: Watchers; id: string }) {
-  const others = watching.others.value ?? [];
+export function WatcherNames({ watchers, id }: { watchers: Watchers; id: string }) {
+  const others = watchers.others.value ?? [];
   if (others.length === 0) return null;
   return (
     <ul class="bar-row watcher-names" id={id} aria-label={texts.watchers.title} data-testid="watcher-names">

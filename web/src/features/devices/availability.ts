@@ -13,10 +13,10 @@ export function unavailableReason(device: DeviceStore): string {
 
 /** Why an exclusive action on a robot is unavailable, or "". */
 export function actionUnavailableReason(device: DeviceStore, control: Control): string {
-  const no = unavailableReason(device);
-  if (no !== "") return no;
+  const reason = unavailableReason(device);
+  if (reason !== "") return reason;
   const mode = device.live.value ? device.mode.value : undefined;
-  // Check this first: an action that runs without an operator has its own lease, which does not matter here.
+  // Check this before the lease: an action without an operator has a lease of its own.
   if (mode === "action") return texts.unavailable.busy;
   const holder = device.holder.value;
   if (holder !== null && !holder.mine && control.epoch === null) return texts.unavailable.held(holder.name);

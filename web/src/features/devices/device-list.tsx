@@ -14,10 +14,10 @@ interface DeviceListsProps {
   devices: readonly DeviceStore[];
   fleet: Fleet;
   /** The cloud's health results by id. Faults that a device reports are shown without them. */
-  found?: ReadonlyMap<string, HealthSummary> | undefined;
+  health?: ReadonlyMap<string, HealthSummary> | undefined;
 }
 
-export function DeviceLists({ devices, fleet, found }: DeviceListsProps) {
+export function DeviceLists({ devices, fleet, health }: DeviceListsProps) {
   const robots = devices.filter(({ info }) => !isRoomDevice(info.value));
   const sensors = devices.filter(({ info }) => isRoomDevice(info.value));
   return (
@@ -25,14 +25,14 @@ export function DeviceLists({ devices, fleet, found }: DeviceListsProps) {
       {robots.length > 0 && (
         <ul class="devices" aria-label={texts.list.robots}>
           {robots.map((device) => (
-            <RobotRow key={device.id} device={device} fleet={fleet} line={found?.get(device.id)} />
+            <RobotRow key={device.id} device={device} fleet={fleet} line={health?.get(device.id)} />
           ))}
         </ul>
       )}
       {sensors.length > 0 && (
         <ul class="tiles" aria-label={texts.list.sensors}>
           {sensors.map((device) => (
-            <SensorTile key={device.id} device={device} line={found?.get(device.id)} />
+            <SensorTile key={device.id} device={device} line={health?.get(device.id)} />
           ))}
         </ul>
       )}
@@ -59,15 +59,15 @@ function RobotRow({ device, fleet, line }: { device: DeviceStore; fleet: Fleet; 
           </dd>
         </div>
         <div>
-          <dt>{texts.list.heard}</dt>
+          <dt>{texts.list.lastSeen}</dt>
           <dd>
             <LastSeenAge device={device} />
           </dd>
         </div>
         <div>
-          <dt>{texts.list.doing}</dt>
+          <dt>{texts.list.activity}</dt>
           <dd>
-            <Doing device={device} line={line} />
+            <Activity device={device} line={line} />
           </dd>
         </div>
         <div>
@@ -96,25 +96,25 @@ function SensorTile({ device, line }: { device: DeviceStore; line: HealthSummary
           <LastSeenAge device={device} />
         </span>
       )}
-      {state !== null && (state.mode !== "idle" || faultsOf(device, line) > 0) && <Doing device={device} line={line} />}
+      {state !== null && (state.mode !== "idle" || faultsOf(device, line) > 0) && <Activity device={device} line={line} />}
     </li>
   );
 }
 
 /** Faults from the device or from its measurements, without informational ones. */
 export function faultsOf(device: DeviceStore, line: HealthSummary | undefined): number {
-  const found = line === undefined ? 0 : line.counts.error + line.counts.warning;
-  return Math.max(found, device.state.value?.faults.length ?? 0);
+  const stored = line === undefined ? 0 : line.counts.error + line.counts.warning;
+  return Math.max(stored, device.state.value?.faults.length ?? 0);
 }
 
-function Doing({ device, line }: { device: DeviceStore; line: HealthSummary | undefined }) {
+function Activity({ device, line }: { device: DeviceStore; line: HealthSummary | undefined }) {
   const state = device.state.value;
   if (state === null) return <span class="quiet">{format.unknown}</span>;
   const faults = faultsOf(device, line);
-  const what = state.action === null ? common.mode[state.mode] : texts.list.running(nameOf(state.action));
+  const activity = state.action === null ? common.mode[state.mode] : texts.list.running(nameOf(state.action));
   return (
     <span class={device.live.value ? "" : "old"}>
-      <span class={state.mode === "stopped" || state.mode === "fault" ? "chip bad" : ""}>{what}</span>
+      <span class={state.mode === "stopped" || state.mode === "fault" ? "chip bad" : ""}>{activity}</span>
       {faults > 0 && <span class="chip bad">{texts.list.faults(faults)}</span>}
     </span>
   );

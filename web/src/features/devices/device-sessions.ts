@@ -13,51 +13,51 @@ export function useDeviceSessions(
   devices: readonly DeviceStore[],
   account: Account,
 ): readonly DeviceSession[] {
-  const [sessions, setStations] = useState<readonly DeviceSession[]>([]);
+  const [sessions, setSessions] = useState<readonly DeviceSession[]>([]);
   const ids = devices.map(({ id }) => id).join(" ");
 
   useEffect(() => {
-    // Without a device the key stays unused.
+    // Without a device, do not handle the Stop key.
     if (devices.length === 0) return undefined;
-    const made = devices.map((device) => new DeviceSession(api, fleet.link, device, account.name));
-    setStations(made);
-    const look = (): void => {
-      for (const { watchers: watching } of made) watching.seen(document.visibilityState === "visible");
+    const created = devices.map((device) => new DeviceSession(api, fleet.link, device, account.name));
+    setSessions(created);
+    const reportVisibility = (): void => {
+      for (const { watchers: watching } of created) watching.setVisible(document.visibilityState === "visible");
     };
-    look();
+    reportVisibility();
 
-    const press = (event: KeyboardEvent): void => {
+    const stopOnEscape = (event: KeyboardEvent): void => {
       if (event.key !== "Escape" || event.repeat) return;
       event.preventDefault();
-      for (const session of made) session.stopNow();
+      for (const session of created) session.stopNow();
     };
     const visibility = (): void => {
-      look();
+      reportVisibility();
       if (document.visibilityState !== "hidden") return;
-      for (const { control } of made) control.hidden();
+      for (const { control } of created) control.onHidden();
     };
     // While the page has no focus it receives no keyup events.
     const blur = (): void => {
-      for (const { control } of made) control.streamer.value?.release();
+      for (const { control } of created) control.streamer.value?.release();
     };
     const leave = (): void => {
-      for (const { control, watchers: watching } of made) {
+      for (const { control, watchers: watching } of created) {
         void control.release(true);
-        watching.seen(false);
+        watching.setVisible(false);
       }
     };
     // In the capture phase, so that no field or menu can block the Stop key.
-    addEventListener("keydown", press, { capture: true });
+    addEventListener("keydown", stopOnEscape, { capture: true });
     document.addEventListener("visibilitychange", visibility);
     addEventListener("blur", blur);
     addEventListener("pagehide", leave);
     return () => {
-      removeEventListener("keydown", press, { capture: true });
+      removeEventListener("keydown", stopOnEscape, { capture: true });
       document.removeEventListener("visibilitychange", visibility);
       removeEventListener("blur", blur);
       removeEventListener("pagehide", leave);
-      for (const session of made) session.dispose();
-      setStations([]);
+      for (const session of created) session.dispose();
+      setSessions([]);
     };
     // Devices change only with their ids.
   }, [api, fleet, ids, account]);

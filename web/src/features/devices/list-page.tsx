@@ -14,7 +14,7 @@ import "./list.css";
 import { usePolling } from "../../shared/hooks/use-polling";
 import { pairAddress, spaceAddress } from "../../shared/routing/routes";
 
-const EVERYTHING: DeviceFilter = { search: "", kinds: "all", whose: "all", onlyTrouble: false };
+const NO_FILTER: DeviceFilter = { search: "", kinds: "all", owner: "all", needsAttention: false };
 /** Below this number of devices, no filter is shown. */
 const SEARCH_FROM = 5;
 /** Interval for reading open faults from the cloud; devices publish their own faults immediately [ms]. */
@@ -22,12 +22,12 @@ const HEALTH_EVERY_MS = 30_000;
 
 export function DeviceListPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const devices = fleet.devices.value;
-  const [wanted, setWanted] = useState(EVERYTHING);
+  const [filter, setFilter] = useState(NO_FILTER);
   const lines = usePolling(() => api.health.all(null), HEALTH_EVERY_MS, [api]).value;
   const health = useMemo(() => new Map(lines?.map((line) => [line.device, line])), [lines]);
   const all = [...(devices?.values() ?? [])];
   const shown = all.filter((device) =>
-    matchesFilter(device, fleet.spaceName(device.info.value.space), faultsOf(device, health.get(device.id)), wanted),
+    matchesFilter(device, fleet.spaceName(device.info.value.space), faultsOf(device, health.get(device.id)), filter),
   );
   const shared = all.some((device) => device.info.value.role !== "owner");
   return (
@@ -40,17 +40,17 @@ export function DeviceListPage({ api, fleet }: { api: Api; fleet: Fleet }) {
       </div>
       {devices === null && <p class="quiet">{common.loading}</p>}
       {devices?.size === 0 && <FirstSteps />}
-      {all.length >= SEARCH_FROM && <Search wanted={wanted} change={setWanted} shared={shared} shown={shown.length} all={all.length} />}
+      {all.length >= SEARCH_FROM && <Search filter={filter} change={setFilter} shared={shared} shown={shown.length} all={all.length} />}
       {all.length > 0 && shown.length === 0 && (
         <p class="row">
-          {texts.list.nothing}
-          <button type="button" onClick={() => setWanted(EVERYTHING)}>
+          {texts.list.noMatch}
+          <button type="button" onClick={() => setFilter(NO_FILTER)}>
             {texts.list.clear}
           </button>
         </p>
       )}
       <OperateSelected devices={all} />
-      {bySpace(shown, fleet).map(([space, found]) => (
+      {bySpace(shown, fleet).map(([space, spaceDevices]) => (
         <section key={space} class="space-group" aria-label={fleet.spaceName(space)} data-testid="space">
           <header class="space-head">
             <h2>{fleet.spaceName(space)}</h2>
@@ -58,7 +58,7 @@ export function DeviceListPage({ api, fleet }: { api: Api; fleet: Fleet }) {
               {texts.list.plan}
             </a>
           </header>
-          <DeviceLists devices={found} fleet={fleet} found={health} />
+          <DeviceLists devices={spaceDevices} fleet={fleet} health={health} />
         </section>
       ))}
       <SpaceList api={api} fleet={fleet} />
@@ -77,7 +77,7 @@ function bySpace(devices: readonly DeviceStore[], fleet: Fleet): [string, Device
 }
 
 interface SearchProps {
-  wanted: DeviceFilter;
+  filter: DeviceFilter;
   change: (wanted: DeviceFilter) => void;
   /** Whether some devices belong to other accounts. */
   shared: boolean;
@@ -85,7 +85,7 @@ interface SearchProps {
   all: number;
 }
 
-function Search({ wanted, change, shared, shown, all }: SearchProps) {
+function Search({ filter, change, shared, shown, all }: SearchProps) {
   return (
     <form class="row search" role="search" onSubmit={(event) => event.preventDefault()}>
       <label class="visually-hidden" for="search">
@@ -94,34 +94,34 @@ function Search({ wanted, change, shared, shown, all }: SearchProps) {
       <input
         id="search"
         type="text"
-        value={wanted.search}
+        value={filter.search}
         placeholder={texts.list.searchExample}
         autocomplete="off"
         spellcheck={false}
         data-testid="search"
-        onInput={(event) => change({ ...wanted, search: event.currentTarget.value })}
+        onInput={(event) => change({ ...filter, search: event.currentTarget.value })}
       />
       <Choice
         label={texts.list.show}
-        value={wanted.kinds}
-        onChange={(kinds) => change({ ...wanted, kinds })}
+        value={filter.kinds}
+        onChange={(kinds) => change({ ...filter, kinds })}
         options={Object.entries(texts.list.kinds) as [KindFilter, string][]}
       />
       {shared && (
         <Choice
-          label={texts.list.whose}
-          value={wanted.whose}
-          onChange={(whose) => change({ ...wanted, whose })}
-          options={Object.entries(texts.list.whoses) as [OwnerFilter, string][]}
+          label={texts.list.owner}
+          value={filter.owner}
+          onChange={(owner) => change({ ...filter, owner })}
+          options={Object.entries(texts.list.owners) as [OwnerFilter, string][]}
         />
       )}
       <label class="check">
         <input
           type="checkbox"
-          checked={wanted.onlyTrouble}
-          onChange={(event) => change({ ...wanted, onlyTrouble: event.currentTarget.checked })}
+          checked={filter.needsAttention}
+          onChange={(event) => change({ ...filter, needsAttention: event.currentTarget.checked })}
         />
-        {texts.list.onlyTrouble}
+        {texts.list.needsAttention}
       </label>
       <span class="quiet small" role="status">
         {texts.list.shown(shown, all)}

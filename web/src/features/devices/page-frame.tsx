@@ -18,14 +18,14 @@ interface DeviceFrameProps {
   fleet: Fleet;
   account: Account;
   id: string;
-  page: "health" | "times";
+  page: "health" | "latency";
   children: (session: DeviceSession) => ComponentChildren;
 }
 
 export function DevicePageFrame({ id, ...rest }: DeviceFrameProps) {
   const devices = rest.fleet.devices.value;
   const device = devices?.get(id);
-  if (device !== undefined) return <Framed key={id} device={device} {...rest} />;
+  if (device !== undefined) return <DevicePage key={id} device={device} {...rest} />;
   return (
     <main class="narrow" id="content">
       <p role="status">{devices === null ? common.loading : common.deviceMissing}</p>
@@ -38,14 +38,14 @@ interface FramedProps extends Omit<DeviceFrameProps, "id"> {
   device: DeviceStore;
 }
 
-function Framed({ api, fleet, account, device, page, children }: FramedProps) {
+function DevicePage({ api, fleet, account, device, page, children }: FramedProps) {
   const [session] = useDeviceSessions(api, fleet, [device], account);
   if (session === undefined) return null;
   const { label } = device.info.value;
   const pages = [
     [texts.pages.device, deviceAddress(device.id), false],
     [texts.pages.health, healthAddressOf("device", device.id), page === "health"],
-    [texts.pages.latency, latencyAddressOf(device.id), page === "times"],
+    [texts.pages.latency, latencyAddressOf(device.id), page === "latency"],
   ] as const;
   return (
     <>
@@ -57,12 +57,12 @@ function Framed({ api, fleet, account, device, page, children }: FramedProps) {
           <p class="reach">
             <ReachChip device={device} data-testid="online" />
             <span class="quiet">
-              {texts.list.heard}: <LastSeenAge device={device} />
+              {texts.list.lastSeen}: <LastSeenAge device={device} />
             </span>
           </p>
           <nav class="page-tabs" aria-label={texts.pages.of(label)}>
-            {pages.map(([name, address, here]) => (
-              <a key={address} href={address} aria-current={here ? "page" : undefined}>
+            {pages.map(([name, address, current]) => (
+              <a key={address} href={address} aria-current={current ? "page" : undefined}>
                 {name}
               </a>
             ))}

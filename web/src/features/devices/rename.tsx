@@ -10,23 +10,23 @@ export function RenameDevice({ api, device }: { api: Api; device: DeviceStore })
   const { label, role } = device.info.value;
   const [typed, setTyped] = useState<string | null>(null);
   const [busy, setBusy] = useState(false);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
   /** The name before the last change. */
-  const [before, setBefore] = useState<string | null>(null);
+  const [previousName, setPreviousName] = useState<string | null>(null);
   const opener = useReturnFocus(typed !== null);
   const field = useRef<HTMLInputElement>(null);
   useEffect(() => field.current?.select(), [typed === null]);
   if (role !== "owner") return null;
 
-  const call = async (wanted: string, was: string | null): Promise<void> => {
+  const call = async (name: string, previous: string | null): Promise<void> => {
     setBusy(true);
-    setWrong("");
+    setError("");
     try {
-      device.update(await api.rename(device.id, wanted));
-      setBefore(was);
+      device.update(await api.rename(device.id, name));
+      setPreviousName(previous);
       setTyped(null);
     } catch (error) {
-      setWrong(sentence(error)); // What was typed stays.
+      setError(sentence(error)); // The input stays.
     } finally {
       setBusy(false);
     }
@@ -76,15 +76,15 @@ export function RenameDevice({ api, device }: { api: Api; device: DeviceStore })
         </form>
       )}
       <span role="status" class="small">
-        {before !== null && typed === null && (
+        {previousName !== null && typed === null && (
           <>
-            {texts.naming.called(label)}{" "}
-            <button type="button" class="plain" data-testid="undo-name" disabled={busy} onClick={() => void call(before, null)}>
+            {texts.naming.renamed(label)}{" "}
+            <button type="button" class="plain" data-testid="undo-name" disabled={busy} onClick={() => void call(previousName, null)}>
               {texts.naming.undo}
             </button>
           </>
         )}
-        {wrong !== "" && <span class="field-error">{wrong}</span>}
+        {error !== "" && <span class="field-error">{error}</span>}
       </span>
     </div>
   );

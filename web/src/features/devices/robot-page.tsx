@@ -34,8 +34,8 @@ interface DevicePageProps {
 export function DevicePage({ api, fleet, id, account }: DevicePageProps) {
   const devices = fleet.devices.value;
   const device = devices?.get(id);
-  const shown = useRef("");
-  if (device !== undefined) shown.current = device.info.value.label;
+  const lastLabel = useRef("");
+  if (device !== undefined) lastLabel.current = device.info.value.label;
   if (devices === null) {
     return (
       <main class="page" id="content">
@@ -46,12 +46,12 @@ export function DevicePage({ api, fleet, id, account }: DevicePageProps) {
   if (device === undefined) {
     return (
       <main class="narrow" id="content">
-        {shown.current === "" ? (
+        {lastLabel.current === "" ? (
           <p>{common.deviceMissing}</p>
         ) : (
           <div role="alert" class="no-access" data-testid="no-access">
-            <h1>{texts.device.gone(shown.current)}</h1>
-            <p>{texts.device.goneWhy}</p>
+            <h1>{texts.device.accessLost(lastLabel.current)}</h1>
+            <p>{texts.device.accessLostReason}</p>
           </div>
         )}
         <p>
@@ -80,14 +80,14 @@ function Operate({ api, fleet, device, account }: OperateProps) {
   const access = <DeviceAccess api={api} fleet={fleet} device={device} account={account} />;
   return (
     <>
-      <ControlBar device={device} control={control} stop={stop} watching={session.watchers} />
+      <ControlBar device={device} control={control} stop={stop} watchers={session.watchers} />
       <main class="page operate" id="content">
         <Heading api={api} device={device} fleet={fleet} />
         <StopBanner device={device} stop={stop} />
         <PageExplainer page={robot ? "device" : "roomDevice"} />
         {robot && <RunStatusPanel device={device} control={control} actions={session.actions} />}
         {robot ? (
-          <Desk api={api} fleet={fleet} session={session} account={account} access={access} />
+          <RobotColumns api={api} fleet={fleet} session={session} account={account} access={access} />
         ) : (
           <RoomDevicePage api={api} fleet={fleet} session={session} access={access} />
         )}
@@ -96,7 +96,7 @@ function Operate({ api, fleet, device, account }: OperateProps) {
   );
 }
 
-interface DeskProps {
+interface RobotColumnsProps {
   api: Api;
   fleet: Fleet;
   session: DeviceSession;
@@ -105,7 +105,7 @@ interface DeskProps {
 }
 
 /** A robot's page: views, steering and actions in three columns; one column on a phone. */
-function Desk({ api, fleet, session, account, access }: DeskProps) {
+function RobotColumns({ api, fleet, session, account, access }: RobotColumnsProps) {
   const { device, control, actions } = session;
   const views = useCameraSources(fleet, device);
   const type = device.info.value.robot_type;
@@ -151,14 +151,14 @@ function Desk({ api, fleet, session, account, access }: DeskProps) {
 
 function DeviceAccess({ api, fleet, device, account }: OperateProps) {
   const { agent, id, owner, role, space } = device.info.value;
-  const behindIt = [...(fleet.devices.value?.values() ?? [])].filter(({ info }) => info.value.agent === agent);
+  const agentDevices = [...(fleet.devices.value?.values() ?? [])].filter(({ info }) => info.value.agent === agent);
   return (
     <AccessList
       api={api}
       account={account}
       target={{ kind: "device", id }}
-      whole={{ kind: "agent", id: agent }}
-      goes={behindIt.map(({ info }) => info.value.label)}
+      unit={{ kind: "agent", id: agent }}
+      included={agentDevices.map(({ info }) => info.value.label)}
       owner={owner}
       role={role}
       space={{ id: space, name: fleet.spaceName(space) }}
@@ -172,7 +172,7 @@ function DeviceAccess({ api, fleet, device, account }: OperateProps) {
 
 function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet: Fleet }) {
   const info = device.info.value;
-  const trouble = device.trouble.value;
+  const parseError = device.parseError.value;
   return (
     <div class="heading">
       <a href={deviceListAddress}>← {common.allDevices}</a>
@@ -188,7 +188,7 @@ function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet:
           {texts.pages.latency}
         </a>
         <span class="quiet">
-          {texts.list.heard}: <LastSeenAge device={device} />
+          {texts.list.lastSeen}: <LastSeenAge device={device} />
         </span>
         {(device.description.value?.joints.length ?? 0) > 0 && (
           <a href={keyframesAddress(info.id)} data-testid="to-keyframes">
@@ -200,7 +200,7 @@ function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet:
           {texts.cards.access}
         </button>
       </p>
-      {trouble !== null && <p class="notice warn">{texts.device.unreadable(trouble)}</p>}
+      {parseError !== null && <p class="notice warn">{texts.device.unreadable(parseError)}</p>}
     </div>
   );
 }

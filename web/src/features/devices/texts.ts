@@ -14,8 +14,8 @@ export const texts = {
     none: "No devices. Pair one with the code that its agent shows.",
     device: "Device",
     status: "Status",
-    heard: "Last seen",
-    doing: "Activity",
+    lastSeen: "Last seen",
+    activity: "Activity",
     control: "Controlled by",
     noOperator: "–",
     you: "you",
@@ -26,11 +26,11 @@ export const texts = {
     searchExample: "Name, type or room",
     show: "Show",
     kinds: { all: "All", robots: "Robots", sensors: "Room devices" },
-    whose: "Owner",
-    whoses: { all: "All", mine: "Mine", shared: "Shared with me" },
-    onlyTrouble: "Needs attention",
+    owner: "Owner",
+    owners: { all: "All", mine: "Mine", shared: "Shared with me" },
+    needsAttention: "Needs attention",
     shown: (shown: number, all: number): string => (shown === all ? `${all} devices` : `${shown} of ${all} devices`),
-    nothing: "No devices match the filters.",
+    noMatch: "No devices match the filters.",
     clear: "Clear filters",
     robots: "Robots",
     sensors: "Room devices",
@@ -45,13 +45,13 @@ export const texts = {
     save: "Save",
     saving: "Saving…",
     cancel: "Cancel",
-    called: (label: string): string => `Renamed to ${label}.`,
+    renamed: (label: string): string => `Renamed to ${label}.`,
     undo: "Undo",
   },
 
   device: {
-    gone: (label: string): string => `You no longer have access to ${label}.`,
-    goneWhy:
+    accessLost: (label: string): string => `You no longer have access to ${label}.`,
+    accessLostReason:
       "The owner revoked your access, it expired, or the device was unpaired. Your control and actions ended immediately. Ask the owner if you need access again.",
     simulated: "simulated",
     unreadable: (detail: string): string => `A message of this device is invalid: ${detail}.`,
@@ -90,7 +90,7 @@ export const texts = {
     of: (label: string): string => `Pages of ${label}`,
     title: {
       health: (name: string): string => `Health of ${name}`,
-      times: (name: string): string => `Latency of ${name}`,
+      latency: (name: string): string => `Latency of ${name}`,
     },
   },
 };

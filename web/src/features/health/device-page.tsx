@@ -7,7 +7,7 @@ import { Choice } from "../../shared/ui/choice";
 import type { DeviceHealth, Fault, StoredStream, MonitoredField } from "../../shared/api/health";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import { healthNow, isLate, newestOf, openCount, standings, reportedFaults, watchedQuantity, worstFirst } from "./model/health";
+import { healthNow, isLate, newestOf, openCount, compareFaults, reportedFaults, watchedQuantity, worstFirst } from "./model/health";
 import { sentence } from "../../shared/api/http";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
@@ -20,21 +20,21 @@ import { Trend } from "./trend-chart";
 const EVERY_MS = 5_000;
 const PAST = 50;
 
-interface Chosen {
+interface FieldKey {
   stream: string;
   field: string;
 }
 
 export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStore }) {
   const { value, error, refresh } = usePolling(() => api.health.of(device.id), EVERY_MS, [api, device]);
-  const told = reportedFaults(device);
-  useReportedFaults(codes(told), refresh);
-  const past = usePast(api, device, value?.faults.map(({ id }) => id).join(" ") ?? "");
-  const [chosen, setChosen] = useState<Chosen | null>(null);
+  const reported = reportedFaults(device);
+  useReportedFaults(codes(reported), refresh);
+  const past = usePastFaults(api, device, value?.faults.map(({ id }) => id).join(" ") ?? "");
+  const [chosen, setChosen] = useState<FieldKey | null>(null);
   const trend = useRef<HTMLDivElement>(null);
   const fields = useMemo(() => worstFirst(value?.fields ?? []), [value]);
   const first = fields[0] ?? null;
-  const at = chosen ?? first;
+  const selected = chosen ?? first;
   const show = (stream: string, field: string): void => {
     setChosen({ stream, field });
     trend.current?.scrollIntoView({ block: "nearest" });
@@ -43,32 +43,32 @@ export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStor
   return (
     <div class="desk health-columns">
       <div class="column">
-        <Now device={device} value={value} trouble={error} />
+        <HealthSummary device={device} value={value} trouble={error} />
         <Faults api={api} device={device} open={value?.faults ?? null} past={past} again={refresh} show={show} />
       </div>
       <div class="column">
-        <div ref={trend} tabIndex={-1} class="trend-place">
-          {at === null ? (
+        <div ref={trend} tabIndex={-1} class="trend-panel">
+          {selected === null ? (
             <Card title={texts.trend.title}>
-              <p class="quiet">{value === null ? common.loading : texts.health.nothingWatched}</p>
+              <p class="quiet">{value === null ? common.loading : texts.health.noMonitored}</p>
             </Card>
           ) : (
-            <Chart api={api} device={device} at={at} fields={fields} faults={[...(value?.faults ?? []), ...past.items]} />
+            <Chart api={api} device={device} selected={selected} fields={fields} faults={[...(value?.faults ?? []), ...past.items]} />
           )}
         </div>
-        <Fields device={device} fields={fields} at={at} show={(stream, field) => setChosen({ stream, field })} />
-        <Others api={api} device={device} fields={fields} at={at} choose={setChosen} />
+        <Fields device={device} fields={fields} selected={selected} show={(stream, field) => setChosen({ stream, field })} />
+        <OtherFields api={api} device={device} fields={fields} selected={selected} choose={setChosen} />
       </div>
     </div>
   );
 }
 
-function Now({ device, value, trouble }: { device: DeviceStore; value: DeviceHealth | null; trouble: string }) {
-  const told = reportedFaults(device);
-  const count = openCount(value?.faults ?? null, told);
+function HealthSummary({ device, value, trouble }: { device: DeviceStore; value: DeviceHealth | null; trouble: string }) {
+  const reported = reportedFaults(device);
+  const count = openCount(value?.faults ?? null, reported);
   return (
     <div class="row health-summary">
-      {value !== null && <HealthLabel health={healthNow(value.health, told, device.reach.value)} />}
+      {value !== null && <HealthLabel health={healthNow(value.health, reported, device.reach.value)} />}
       <p role="status" data-testid="open-faults" data-count={count}>
         {value === null && trouble === "" ? common.loading : texts.health.open(count)}
       </p>
@@ -80,67 +80,67 @@ function Now({ device, value, trouble }: { device: DeviceStore; value: DeviceHea
   );
 }
 
-interface Past {
+interface PastFaults {
   items: readonly Fault[];
   more: boolean;
-  why: string;
-  older: () => void;
+  error: string;
+  loadOlder: () => void;
 }
 
 /** Past faults, reloaded when the open ones change. */
-function usePast(api: Api, device: DeviceStore, open: string): Past {
+function usePastFaults(api: Api, device: DeviceStore, open: string): PastFaults {
   const [items, setItems] = useState<readonly Fault[]>([]);
   const [cursor, setCursor] = useState<string | null>(null);
-  const [why, setWhy] = useState("");
-  const asked = useRef(0);
-  const read = (from: string | null): void => {
-    const mine = ++asked.current;
+  const [error, setError] = useState("");
+  const generation = useRef(0);
+  const load = (from: string | null): void => {
+    const current = ++generation.current;
     api.health.clearedFaults(device.id, from, PAST).then(
       (page) => {
-        if (mine !== asked.current) return;
-        setItems((known) => (from === null ? page.items : [...known, ...page.items]));
+        if (current !== generation.current) return;
+        setItems((previous) => (from === null ? page.items : [...previous, ...page.items]));
         setCursor(page.cursor);
-        setWhy("");
+        setError("");
       },
-      (error: unknown) => mine === asked.current && setWhy(sentence(error)),
+      (error: unknown) => current === generation.current && setError(sentence(error)),
     );
   };
   useEffect(() => {
-    read(null);
-    return () => void (asked.current += 1);
+    load(null);
+    return () => void (generation.current += 1);
   }, [api, device, open]);
-  return { items, more: cursor !== null, why, older: () => read(cursor) };
+  return { items, more: cursor !== null, error, loadOlder: () => load(cursor) };
 }
 
-type Which = "open" | "past";
+type FaultFilter = "open" | "past";
 
 interface FaultsProps {
   api: Api;
   device: DeviceStore;
   open: readonly Fault[] | null;
-  past: Past;
+  past: PastFaults;
   again: () => void;
   show: (stream: string, field: string) => void;
 }
 
 function Faults({ api, device, open, past, again, show }: FaultsProps) {
-  const [which, setWhich] = useState<Which>("open");
-  const listed = which === "open" ? standings(open ?? [], reportedFaults(device)) : standings(past.items, []).map((one) => ({ ...one, agreement: "same" as const }));
+  const [filter, setFilter] = useState<FaultFilter>("open");
+  const listed = filter === "open" ? compareFaults(open ?? [], reportedFaults(device)) : compareFaults(past.items, []).map((one) => ({ ...one, agreement: "same" as const }));
   return (
     <Card
       title={texts.health.faults}
       class="fault-card"
-      aside={<Choice label={texts.health.whichFaults} value={which} onChange={setWhich} options={Object.entries(texts.health.faultLists) as [Which, string][]} />}
+      aside={<Choice label={texts.health.whichFaults} value={filter} onChange={setFilter} options={Object.entries(texts.health.faultLists) as [FaultFilter, string][]} />}
     >
-      {listed.length === 0 && <p class="quiet">{open === null ? common.loading : texts.health.noFaults[which]}</p>}
-      <ul class="fault-list" data-testid={`faults-${which}`}>
+      {listed.length === 0 && <p class="quiet">{open === null ? common.loading : texts.health.noFaults[filter]}</p>}
+      <ul class="fault-list" data-testid={`faults-${filter}`}>
         {listed.map((one) => (
-          <FaultItem key={one.stored?.id ?? one.told?.code} api={api} device={device} standing={one} changed={again} show={show} />
+          <FaultItem key={one.stored?.id ?? one.reported?.code} api={api} device={device} comparison={one} onChange={again} showTrend={show} />
         ))}
       </ul>
-      {which === "past" && past.why !== "" && <p class="notice bad">{texts.health.failed(past.why)}</p>}
-      {which === "past" && past.more && (
-        <button type="button" onClick={past.older}>
+      {filter === "past" && past.error !== "" && <p class="notice bad">{texts.health.failed(past.error)}</p>}
+      {filter === "past" && past.more && (
+        <button type="button" onClick={past.loadOlder}>
           {texts.health.older}
         </button>
       )}
@@ -151,12 +151,12 @@ function Faults({ api, device, open, past, again, show }: FaultsProps) {
 interface ChartProps {
   api: Api;
   device: DeviceStore;
-  at: Chosen;
+  selected: FieldKey;
   fields: readonly MonitoredField[];
   faults: readonly Fault[];
 }
 
-function Chart({ api, device, at: { stream, field }, fields, faults }: ChartProps) {
+function Chart({ api, device, selected: { stream, field }, fields, faults }: ChartProps) {
   const description = device.description.value;
   const watched = fields.find((one) => one.stream === stream && one.field === field) ?? null;
   // A new object with the same limits must not rebuild the chart.
@@ -171,12 +171,12 @@ function Chart({ api, device, at: { stream, field }, fields, faults }: ChartProp
 interface FieldsProps {
   device: DeviceStore;
   fields: readonly MonitoredField[];
-  at: Chosen | null;
+  selected: FieldKey | null;
   show: (stream: string, field: string) => void;
 }
 
 /** All monitored fields: current, usual and permitted values; a click shows the trend. */
-function Fields({ device, fields, at, show }: FieldsProps) {
+function Fields({ device, fields, selected, show }: FieldsProps) {
   const description = device.description.value;
   if (fields.length === 0) return null;
   return (
@@ -199,7 +199,7 @@ function Fields({ device, fields, at, show }: FieldsProps) {
                 device={device}
                 watched={one}
                 quantity={watchedQuantity(one, description)}
-                chosen={at?.stream === one.stream && at.field === one.field}
+                chosen={selected?.stream === one.stream && selected.field === one.field}
                 show={show}
               />
             ))}
@@ -232,7 +232,7 @@ function Field({ device, watched, quantity, chosen, show }: FieldProps) {
           {quantity.label}
         </button>
         {findings.length > 0 && (
-          <p class="found">
+          <p class="field-findings">
             {findings.map((kind) => (
               <span key={kind} class="chip reach-stale">
                 {texts.health.kind[kind] ?? kind}
@@ -251,34 +251,34 @@ function Field({ device, watched, quantity, chosen, show }: FieldProps) {
   );
 }
 
-interface OthersProps {
+interface OtherFieldsProps {
   api: Api;
   device: DeviceStore;
   fields: readonly MonitoredField[];
-  at: Chosen | null;
-  choose: (chosen: Chosen) => void;
+  selected: FieldKey | null;
+  choose: (chosen: FieldKey) => void;
 }
 
 /** Fields that are stored but not monitored. */
-function Others({ api, device, fields, at, choose }: OthersProps) {
+function OtherFields({ api, device, fields, selected, choose }: OtherFieldsProps) {
   const [streams, setStreams] = useState<readonly StoredStream[]>([]);
   useEffect(() => {
-    let wanted = true;
+    let mounted = true;
     // Without this list the monitored fields are still shown.
-    api.health.streams(device.id).then((found) => wanted && setStreams(found), () => undefined);
-    return () => void (wanted = false);
+    api.health.streams(device.id).then((items) => mounted && setStreams(items), () => undefined);
+    return () => void (mounted = false);
   }, [api, device]);
   const description = device.description.value ?? { controls: [], diagnostics: [] };
   const watched = new Set(fields.map(({ stream, field }) => `${stream}/${field}`));
   const others = streams
     .map(({ name, fields: all }) => [name, all.filter((field) => !watched.has(`${name}/${field}`))] as const)
-    .filter(([, left]) => left.length > 0);
+    .filter(([, unmonitored]) => unmonitored.length > 0);
   if (others.length === 0) return null;
-  const value = at === null || watched.has(`${at.stream}/${at.field}`) ? "" : `${at.stream}/${at.field}`;
+  const value = selected === null || watched.has(`${selected.stream}/${selected.field}`) ? "" : `${selected.stream}/${selected.field}`;
   return (
     <Card title={texts.health.others} class="no-print">
       <label class="field">
-        {texts.health.pickOther}
+        {texts.health.selectOther}
         <select
           value={value}
           data-testid="other-fields"

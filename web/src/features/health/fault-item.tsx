@@ -4,7 +4,7 @@ import { Age } from "../../shared/ui/age";
 import type { Fault, StoredEvent } from "../../shared/api/health";
 import { useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import { intervalAround, type Standing } from "./model/health";
+import { intervalAround, type FaultComparison } from "./model/health";
 import { toPageClock } from "../../shared/lib/clock";
 import { sentence } from "../../shared/api/http";
 import { common } from "../../shared/i18n/common";
@@ -14,56 +14,56 @@ import { texts } from "./texts";
 interface FaultItemProps {
   api: Api;
   device: DeviceStore;
-  standing: Standing;
+  comparison: FaultComparison;
   /** Called after an action, to reload the faults. */
-  changed: () => void;
+  onChange: () => void;
   /** Shows the trend of the measured field. */
-  show: (stream: string, field: string) => void;
+  showTrend: (stream: string, field: string) => void;
 }
 
 const CHIP = { error: "bad", warning: "reach-stale", info: "" } as const;
 
-export function FaultItem({ api, device, standing, changed, show }: FaultItemProps) {
-  const { stored, told, agreement } = standing;
+export function FaultItem({ api, device, comparison, onChange, showTrend }: FaultItemProps) {
+  const { stored, reported, agreement } = comparison;
   const head = useRef<HTMLHeadingElement>(null);
   const severity = stored?.severity ?? "error";
   return (
     <li
       class={`fault ${stored?.state === "cleared" ? "ended" : severity}`}
       data-testid="fault"
-      data-code={stored?.code ?? told?.code}
-      data-state={stored?.state ?? "told"}
+      data-code={stored?.code ?? reported?.code}
+      data-state={stored?.state ?? "reported"}
     >
       <h3 ref={head} tabIndex={-1}>
         <span class={`chip ${CHIP[severity]}`}>{texts.health.severity[severity]}</span>{" "}
-        {texts.health.kind[stored?.kind ?? "reported"] ?? stored?.kind} <span class="quiet">{stored?.code ?? told?.code}</span>
+        {texts.health.kind[stored?.kind ?? "reported"] ?? stored?.kind} <span class="quiet">{stored?.code ?? reported?.code}</span>
       </h3>
-      <p>{stored?.message ?? told?.message}</p>
+      <p>{stored?.message ?? reported?.message}</p>
       {agreement !== "same" && (
         <p class="quiet small" data-testid="agreement" data-agreement={agreement}>
           {texts.health.agreement[agreement]}
         </p>
       )}
       {stored === null ? (
-        told !== null && (
+        reported !== null && (
           <p class="quiet small">
-            <Age at={toPageClock(told.since_ms)} as={texts.health.saidSince} />
+            <Age at={toPageClock(reported.since_ms)} as={texts.health.raisedAgo} />
           </p>
         )
       ) : (
         <>
-          <Life fault={stored} />
+          <FaultHistory fault={stored} />
           <div class="row no-print">
             {stored.state === "raised" && (
-              <Acknowledge api={api} device={device} fault={stored} done={() => (changed(), head.current?.focus())} />
+              <Acknowledge api={api} device={device} fault={stored} onDone={() => (onChange(), head.current?.focus())} />
             )}
             {stored.stream !== "" && (
-              <button type="button" onClick={() => show(stored.stream, stored.field)}>
+              <button type="button" onClick={() => showTrend(stored.stream, stored.field)}>
                 {texts.health.showTrend}
               </button>
             )}
           </div>
-          <Around api={api} device={device} fault={stored} />
+          <RelatedEvents api={api} device={device} fault={stored} />
         </>
       )}
     </li>
@@ -71,11 +71,11 @@ export function FaultItem({ api, device, standing, changed, show }: FaultItemPro
 }
 
 /** Raised, acknowledged and cleared, each with its time. */
-function Life({ fault }: { fault: Fault }) {
-  const words = texts.health.life;
-  const moment = (at: string, what: string) => (
+function FaultHistory({ fault }: { fault: Fault }) {
+  const labels = texts.health.history;
+  const timedLabel = (at: string, label: string) => (
     <>
-      <strong>{what}</strong> <time dateTime={at}>{format.dateTime(at)}</time>{" "}
+      <strong>{label}</strong> <time dateTime={at}>{format.dateTime(at)}</time>{" "}
       <span class="quiet">
         <Age at={toPageClock(Date.parse(at))} />
       </span>
@@ -83,21 +83,21 @@ function Life({ fault }: { fault: Fault }) {
   );
   return (
     <>
-      <ol class="life" aria-label={words.title}>
-        <li class="past">{moment(fault.raised_at, words.raised)}</li>
+      <ol class="fault-history" aria-label={labels.title}>
+        <li class="past">{timedLabel(fault.raised_at, labels.raised)}</li>
         <li class={fault.acknowledged_at === null ? "" : "past"}>
           {fault.acknowledged_at === null
             ? fault.cleared_at === null
-              ? words.unseen
-              : words.neverSeen
-            : moment(fault.acknowledged_at, words.seen(fault.acknowledged_by))}
+              ? labels.notAcknowledged
+              : labels.clearedUnacknowledged
+            : timedLabel(fault.acknowledged_at, labels.acknowledgedBy(fault.acknowledged_by))}
         </li>
         <li class={fault.cleared_at === null ? "" : "past"}>
-          {fault.cleared_at === null ? words.open : moment(fault.cleared_at, words.cleared)}
+          {fault.cleared_at === null ? labels.open : timedLabel(fault.cleared_at, labels.cleared)}
         </li>
       </ol>
       <p class="quiet small">
-        {[words.source[fault.source], words.count(fault.count), words.worsened(fault.worsened)].filter((one) => one !== "").join(" · ")}
+        {[labels.source[fault.source], labels.count(fault.count), labels.worsened(fault.worsened)].filter((one) => one !== "").join(" · ")}
       </p>
     </>
   );
@@ -107,19 +107,19 @@ interface AcknowledgeProps {
   api: Api;
   device: DeviceStore;
   fault: Fault;
-  done: () => void;
+  onDone: () => void;
 }
 
-function Acknowledge({ api, device, fault, done }: AcknowledgeProps) {
+function Acknowledge({ api, device, fault, onDone }: AcknowledgeProps) {
   const [busy, setBusy] = useState(false);
-  const [why, setWhy] = useState("");
-  if (device.info.value.role === "viewer") return <span class="quiet small">{texts.health.watchOnly}</span>;
+  const [error, setError] = useState("");
+  if (device.info.value.role === "viewer") return <span class="quiet small">{texts.health.viewer}</span>;
   const acknowledge = (): void => {
     setBusy(true);
-    setWhy("");
-    api.health.acknowledge(device.id, fault.id).then(done, (error: unknown) => {
+    setError("");
+    api.health.acknowledge(device.id, fault.id).then(onDone, (error: unknown) => {
       setBusy(false);
-      setWhy(sentence(error));
+      setError(sentence(error));
     });
   };
   return (
@@ -128,9 +128,9 @@ function Acknowledge({ api, device, fault, done }: AcknowledgeProps) {
         {busy ? texts.health.saving : texts.health.acknowledge}
       </button>
       <span class="quiet small">{texts.health.noUndo}</span>
-      {why !== "" && (
+      {error !== "" && (
         <span role="alert" class="field-error">
-          {why}
+          {error}
         </span>
       )}
     </>
@@ -142,18 +142,18 @@ const PAGES = 5;
 const SHOWN = 50;
 
 /** Messages from one minute before the fault to one minute after it; loaded when opened. */
-function Around({ api, device, fault }: Pick<FaultItemProps, "api" | "device"> & { fault: Fault }) {
+function RelatedEvents({ api, device, fault }: Pick<FaultItemProps, "api" | "device"> & { fault: Fault }) {
   const [events, setEvents] = useState<readonly StoredEvent[] | null>(null);
-  const [why, setWhy] = useState("");
-  const open = (): void => {
-    setWhy("");
-    loadEventsAround(api, device.id, fault).then(setEvents, (error: unknown) => setWhy(sentence(error)));
+  const [error, setError] = useState("");
+  const load = (): void => {
+    setError("");
+    loadEventsAround(api, device.id, fault).then(setEvents, (error: unknown) => setError(sentence(error)));
   };
   return (
-    <details class="around no-print" onToggle={(event) => event.currentTarget.open && open()}>
-      <summary>{texts.health.around}</summary>
-      {why !== "" && <p class="notice bad">{why}</p>}
-      {events === null && why === "" && <p class="quiet">{common.loading}</p>}
+    <details class="related-events no-print" onToggle={(event) => event.currentTarget.open && load()}>
+      <summary>{texts.health.relatedEvents}</summary>
+      {error !== "" && <p class="notice bad">{error}</p>}
+      {events === null && error === "" && <p class="quiet">{common.loading}</p>}
       {events !== null && (
         <ul class="event-list">
           {events.slice(0, SHOWN).map((event) => (
@@ -164,7 +164,7 @@ function Around({ api, device, fault }: Pick<FaultItemProps, "api" | "device"> &
               {texts.health.event[event.kind] ?? event.kind.replaceAll("-", " ")}: {event.message}
             </li>
           ))}
-          {events.length === 0 && <li class="quiet">{texts.health.nothingAround}</li>}
+          {events.length === 0 && <li class="quiet">{texts.health.noRelatedEvents}</li>}
         </ul>
       )}
     </details>

@@ -41,32 +41,32 @@ export function HealthPage({ device, space, ...rest }: HealthPageProps) {
 }
 
 /** A device with this page's own observation. */
-interface Shown {
+interface DeviceLine {
   line: HealthSummary;
   device: DeviceStore | null;
   health: HealthState;
 }
 
-type Which = "all" | "look";
+type HealthFilter = "all" | "attention";
 
 function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: string }) {
   const { value, error, refresh } = usePolling(() => api.health.all(space === "" ? null : space), EVERY_MS, [api, space]);
-  const [which, setWhich] = useState<Which>("all");
+  const [filter, setFilter] = useState<HealthFilter>("all");
   const devices = fleet.devices.value;
-  const told = useComputed(() =>
+  const reported = useComputed(() =>
     [...(fleet.devices.value?.values() ?? [])].map((device) => `${device.id} ${codes(reportedFaults(device))}`).join(" "),
   );
-  useReportedFaults(told.value, refresh);
-  const lines = (value ?? []).map((line): Shown => {
+  useReportedFaults(reported.value, refresh);
+  const lines = (value ?? []).map((line): DeviceLine => {
     const device = devices?.get(line.device) ?? null;
     const health = device === null ? line.health : healthNow(line.health, reportedFaults(device), device.reach.value);
     return { line, device, health };
   });
   lines.sort((one, other) => RANK[other.health] - RANK[one.health]);
-  const counted = (["fault", "warning", "unknown", "ok"] as const).map(
+  const countsByHealth = (["fault", "warning", "unknown", "ok"] as const).map(
     (health) => [health, lines.filter((one) => one.health === health).length] as const,
   );
-  const shown = which === "all" ? lines : lines.filter(({ health }) => health !== "ok");
+  const shown = filter === "all" ? lines : lines.filter(({ health }) => health !== "ok");
   const spaces = [...new Set([...(devices?.values() ?? [])].map(({ info }) => info.value.space))];
   return (
     <main class="page fleet monitoring" id="content">
@@ -87,12 +87,12 @@ function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: stri
       {value !== null && (
         <div class="row health-summary">
           <p role="status" data-testid="health-counts">
-            {texts.health.counts(counted.filter(([, count]) => count > 0).map(([health, count]) => `${count} ${texts.health.state[health].toLowerCase()}`))}
+            {texts.health.counts(countsByHealth.filter(([, count]) => count > 0).map(([health, count]) => `${count} ${texts.health.state[health].toLowerCase()}`))}
           </p>
-          <Choice label={texts.health.show} value={which} onChange={setWhich} options={Object.entries(texts.health.which) as [Which, string][]} />
+          <Choice label={texts.health.show} value={filter} onChange={setFilter} options={Object.entries(texts.health.filters) as [HealthFilter, string][]} />
         </div>
       )}
-      {value !== null && shown.length === 0 && <p>{lines.length === 0 ? texts.health.noDevices : texts.health.allWell}</p>}
+      {value !== null && shown.length === 0 && <p>{lines.length === 0 ? texts.health.noDevices : texts.health.noneNeedAttention}</p>}
       <ul class="devices" aria-label={texts.health.devices}>
         {shown.map((one) => (
           <Line key={one.line.device} shown={one} fleet={fleet} />
@@ -103,11 +103,11 @@ function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: stri
   );
 }
 
-function Line({ shown: { line, device, health }, fleet }: { shown: Shown; fleet: Fleet }) {
-  const told = device === null ? null : reportedFaults(device);
+function Line({ shown: { line, device, health }, fleet }: { shown: DeviceLine; fleet: Fleet }) {
+  const reported = device === null ? null : reportedFaults(device);
   const { worst, counts } = line;
   // The list contains the worst stored fault; add those that only the device reports.
-  const news = (told ?? []).filter(({ code }) => code !== worst?.code);
+  const unstored = (reported ?? []).filter(({ code }) => code !== worst?.code);
   const stored = counts.error + counts.warning + counts.info;
   return (
     <li class="card health-row" data-testid="health-row" data-device={line.device} data-health={health}>
@@ -118,7 +118,7 @@ function Line({ shown: { line, device, health }, fleet }: { shown: Shown; fleet:
           {fleet.spaceName(line.space)}
         </span>
       </a>
-      <span class="health-words">
+      <span class="health-status">
         <HealthLabel health={health} />
         {device !== null && <ReachChip device={device} />}
         {device !== null && device.reach.value !== "online" && (
@@ -127,21 +127,21 @@ function Line({ shown: { line, device, health }, fleet }: { shown: Shown; fleet:
           </span>
         )}
       </span>
-      <div class="health-what">
+      <div class="health-message">
         {worst !== null && (
           <p>
             {worst.message}{" "}
             <span class="quiet">
               {texts.health.since(format.recentTime(Date.parse(worst.raised_at)))}, <Age at={toPageClock(Date.parse(worst.raised_at))} />
-              {worst.acknowledged_at !== null && ` · ${texts.health.life.seen(worst.acknowledged_by)}`}
+              {worst.acknowledged_at !== null && ` · ${texts.health.history.acknowledgedBy(worst.acknowledged_by)}`}
             </span>
           </p>
         )}
-        {news.map((fault) => (
+        {unstored.map((fault) => (
           <p key={fault.code}>{fault.message}</p>
         ))}
         {stored > 1 && <p class="quiet small">{texts.health.open(stored)}</p>}
-        {worst === null && news.length === 0 && <p class="quiet">{texts.health.nothing[health === "unknown" ? "unknown" : "ok"]}</p>}
+        {worst === null && unstored.length === 0 && <p class="quiet">{texts.health.noFault[health === "unknown" ? "unknown" : "ok"]}</p>}
       </div>
     </li>
   );

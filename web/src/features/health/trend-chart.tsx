@@ -37,9 +37,9 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
   const late = isLate(device, quantity.stream);
   const low = watched?.usual_low ?? null;
   const high = watched?.usual_high ?? null;
-  const own = faults.filter(({ stream, field }) => stream === quantity.stream && field === quantity.field);
+  const fieldFaults = faults.filter(({ stream, field }) => stream === quantity.stream && field === quantity.field);
   const since = serverNow() - spanMs;
-  const inSpan = own.filter(({ cleared_at: end }) => end === null || Date.parse(end) >= since);
+  const inSpan = fieldFaults.filter(({ cleared_at: end }) => end === null || Date.parse(end) >= since);
   const marks = {
     usual: low === null || high === null ? null : ([quantity.shown(low), quantity.shown(high)] as const),
     faults: inSpan.map(({ raised_at, cleared_at, severity }) => ({
@@ -57,7 +57,7 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
       <div class="row">
         <p class={`figure-now ${late ? "old" : ""}`} data-testid="trend-now" data-value={newest === null ? "" : Number(newest.value)}>
           {newest === null ? (
-            <span class="quiet small">{texts.trend.notHeard}</span>
+            <span class="quiet small">{texts.trend.noData}</span>
           ) : typeof newest.value === "boolean" ? (
             <strong>{common.yesNo[newest.value ? 0 : 1]}</strong>
           ) : (
@@ -92,13 +92,13 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
 }
 
 /** The learned range and trend as text. */
-function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_in_s: left }: MonitoredField, quantity: Quantity): string {
+function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_in_s: limitInS }: MonitoredField, quantity: Quantity): string {
   const text = (value: number): string => `${shown(quantity, value)} ${quantity.unit}`.trim();
-  const said = [low === null || high === null ? texts.trend.learning : texts.trend.usual(text(low), text(high))];
+  const sentences = [low === null || high === null ? texts.trend.learning : texts.trend.usual(text(low), text(high))];
   const perMinute = slope === null ? 0 : (quantity.shown(slope) - quantity.shown(0)) * 60;
-  if (Math.abs(perMinute) >= 0.0005) said.push(texts.trend.slope(perMinute > 0, `${Math.abs(perMinute).toPrecision(2)} ${quantity.unit}`));
-  if (left !== null) said.push(texts.trend.limitIn(format.duration(left)));
-  return said.join(" ");
+  if (Math.abs(perMinute) >= 0.0005) sentences.push(texts.trend.slope(perMinute > 0, `${Math.abs(perMinute).toPrecision(2)} ${quantity.unit}`));
+  if (limitInS !== null) sentences.push(texts.trend.limitIn(format.duration(limitInS)));
+  return sentences.join(" ");
 }
 
 /** The values as a table, newest first. */

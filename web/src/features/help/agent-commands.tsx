@@ -1,10 +1,10 @@
-/** The commands that make an agent and run it, to be copied: items of a list of steps. */
+/** List items with the commands that create and run an agent. */
 import { texts } from "./texts";
 import { CopyOnce } from "../../shared/ui/copy-once";
 import "./help.css";
 
 interface AgentCommandsProps {
-  /** Of the device at its agent, and of the agent's folder. */
+  /** The device's name at its agent; also names the agent's folder. */
   name: string;
   type: string;
 }

@@ -1,4 +1,4 @@
-/** What who has no device yet can do: make an agent, run it, pair it; with a simulated robot where there is no other. */
+/** Shown to an account without devices: create an agent, run it and pair it, also with a simulated robot. */
 import { Card } from "../../shared/ui/card";
 import { texts } from "./texts";
 import { robotTypesAddress } from "../../shared/routing/routes";

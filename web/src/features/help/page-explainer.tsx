@@ -1,10 +1,10 @@
-/** A page in few words, for who sees it for the first time; folded until it is asked for. */
+/** A short explanation of a page, collapsed by default. */
 import { texts } from "./texts";
 import "./help.css";
 
 export function PageExplainer({ page }: { page: keyof typeof texts.pages }) {
   return (
-    <details class="what-do-i-see" data-testid="what-do-i-see">
+    <details class="page-explainer" data-testid="page-explainer">
       <summary>{texts.title}</summary>
       <ul>
         {texts.pages[page].map((line) => (

@@ -20,13 +20,13 @@ import { LatencyPlots, type Axis, type Scale } from "./plots";
 import "./latency.css";
 
 const EVERY_MS = 10_000;
-const AT_ONCE = 4;
+const CONCURRENT_READS = 4;
 const HOUR_MS = 3_600_000;
 
 type Span = keyof typeof texts.spans;
 const SPAN_MS: Readonly<Record<Span, number>> = { hour: HOUR_MS, day: 24 * HOUR_MS, week: 7 * 24 * HOUR_MS, month: 30 * 24 * HOUR_MS };
 
-interface TimesPageProps {
+interface LatencyPageProps {
   api: Api;
   fleet: Fleet;
   account: Account;
@@ -34,12 +34,12 @@ interface TimesPageProps {
   device: string;
 }
 
-export function LatencyPage({ device, ...rest }: TimesPageProps) {
+export function LatencyPage({ device, ...rest }: LatencyPageProps) {
   const devices = rest.fleet.devices.value;
   if (device !== "") {
     return (
-      <DevicePageFrame {...rest} id={device} page="times">
-        {(session) => <OfDevice api={rest.api} fleet={rest.fleet} session={session} />}
+      <DevicePageFrame {...rest} id={device} page="latency">
+        {(session) => <DeviceLatency api={rest.api} fleet={rest.fleet} session={session} />}
       </DevicePageFrame>
     );
   }
@@ -47,21 +47,21 @@ export function LatencyPage({ device, ...rest }: TimesPageProps) {
     <main class="page monitoring latency-page" id="content">
       <h1>{texts.title}</h1>
       <p class="quiet">{texts.explained}</p>
-      {devices === null ? <p class="quiet">{common.loading}</p> : <Times api={rest.api} devices={[...devices.values()]} fresh={NONE} />}
+      {devices === null ? <p class="quiet">{common.loading}</p> : <LatencyView api={rest.api} devices={[...devices.values()]} unsaved={NONE} />}
     </main>
   );
 }
 
 const NONE: readonly Line[] = [];
 
-function OfDevice({ api, fleet, session }: { api: Api; fleet: Fleet; session: DeviceSession }) {
+function DeviceLatency({ api, fleet, session }: { api: Api; fleet: Fleet; session: DeviceSession }) {
   const { device, control } = session;
-  const measure = useMemo(() => new LatencyProbe(api, fleet.link, device, () => control.epoch), [api, fleet, device, control]);
+  const probe = useMemo(() => new LatencyProbe(api, fleet.link, device, () => control.epoch), [api, fleet, device, control]);
   return (
     <div class="latency-page">
       <p class="quiet">{texts.explained}</p>
-      <ProbePanel device={device} measure={measure} />
-      <Times api={api} devices={[device]} fresh={measure.lines} />
+      <ProbePanel device={device} probe={probe} />
+      <LatencyView api={api} devices={[device]} unsaved={probe.lines} />
     </div>
   );
 }
@@ -74,7 +74,7 @@ interface Filter {
   span: Span;
 }
 
-function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStore[]; fresh: readonly Line[] }) {
+function LatencyView({ api, devices, unsaved }: { api: Api; devices: readonly DeviceStore[]; unsaved: readonly Line[] }) {
   const [filter, setFilter] = useState<Filter>({ device: null, transport: null, path: undefined, span: "day" });
   const [axis, setAxis] = useState<Axis>("order");
   const [scale, setScale] = useState<Scale>("log");
@@ -83,10 +83,10 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
   const { value, error } = usePolling(
     () => readAll(api, ids, serverNow() - SPAN_MS[filter.span]),
     EVERY_MS,
-    [api, ids.join(" "), filter.span, fresh.length],
+    [api, ids.join(" "), filter.span, unsaved.length],
   );
-  const all = linesOf(value ?? new Map<string, StoredLatency[]>(), fresh, { device: filter.device, transport: filter.transport, path: null, sinceMs });
-  const path = filter.path === undefined ? mostOf(all) : filter.path;
+  const all = linesOf(value ?? new Map<string, StoredLatency[]>(), unsaved, { device: filter.device, transport: filter.transport, path: null, sinceMs });
+  const path = filter.path === undefined ? mostSampledPath(all) : filter.path;
   const lines = path === null ? all : all.filter((line) => line.path === path);
   const published = publishedFor(path);
   const label = (id: string): string => devices.find((device) => device.id === id)?.info.value.label ?? id;
@@ -99,7 +99,7 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
         <legend class="visually-hidden">{texts.filters}</legend>
         {devices.length > 1 && (
           <Pick
-            id="times-device"
+            id="latency-device"
             label={texts.device}
             all={texts.allDevices}
             value={filter.device}
@@ -108,16 +108,16 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
           />
         )}
         <Pick
-          id="times-path"
-          label={texts.part}
-          all={texts.allParts}
+          id="latency-path"
+          label={texts.stage}
+          all={texts.allStages}
           value={path}
           options={PATHS.map((one) => [one, texts.path[one]])}
           onChange={(chosen) => setFilter({ ...filter, path: chosen })}
         />
         <Pick
-          id="times-transport"
-          label={texts.via}
+          id="latency-transport"
+          label={texts.transportFilter}
           all={texts.allTransports}
           value={filter.transport}
           options={TRANSPORTS.map((one) => [one, texts.transport[one]])}
@@ -130,32 +130,32 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
       {error !== "" && <p class="notice bad">{texts.failed(error)}</p>}
       {value === null && error === "" && <p class="quiet">{common.loading}</p>}
       {value !== null && count === 0 && (
-        <p class="notice" data-testid="no-times">
-          {texts.none} {texts.how}
+        <p class="notice" data-testid="no-latency">
+          {texts.none} {texts.collection}
         </p>
       )}
       <LatencyPlots lines={lines} name={name} published={published} axis={axis} scale={scale} />
-      <FiguresCard lines={lines} name={name} save={() => save(csv(lines, label))} />
+      <FiguresCard lines={lines} name={name} save={() => download(csv(lines, label))} />
       <PublishedCard published={published} />
     </>
   );
 }
 
 /** The path with the most samples; `null`, for all, without any. */
-function mostOf(lines: readonly Line[]): Path | null {
+function mostSampledPath(lines: readonly Line[]): Path | null {
   const counts = PATHS.map((path) => [path, lines.filter((line) => line.path === path).reduce((sum, { samples }) => sum + samples.length, 0)] as const);
   const [path, most] = counts.reduce((best, one) => (one[1] > best[1] ? one : best), ["command-started", 0]);
   return most === 0 ? null : path;
 }
 
 async function readAll(api: Api, ids: readonly string[], fromMs: number): Promise<Map<string, StoredLatency[]>> {
-  const found = new Map<string, StoredLatency[]>();
-  for (let first = 0; first < ids.length; first += AT_ONCE) {
-    const part = ids.slice(first, first + AT_ONCE);
+  const byDevice = new Map<string, StoredLatency[]>();
+  for (let first = 0; first < ids.length; first += CONCURRENT_READS) {
+    const part = ids.slice(first, first + CONCURRENT_READS);
     const read = await Promise.all(part.map((id) => api.latency.of(id, fromMs)));
-    part.forEach((id, index) => found.set(id, read[index] ?? []));
+    part.forEach((id, index) => byDevice.set(id, read[index] ?? []));
   }
-  return found;
+  return byDevice;
 }
 
 interface PickProps<T extends string> {
@@ -202,13 +202,13 @@ function FiguresCard({ lines, name, save: press }: FiguresCardProps) {
     <Card
       title={texts.figures}
       aside={
-        <button type="button" data-testid="times-csv" onClick={press}>
+        <button type="button" data-testid="latency-csv" onClick={press}>
           {texts.csv}
         </button>
       }
     >
       <div class="scroll" tabIndex={0} role="region" aria-label={texts.figures}>
-        <table data-testid="times-figures">
+        <table data-testid="latency-figures">
           <thead>
             <tr>
               {texts.columns.map((column) => (
@@ -222,7 +222,7 @@ function FiguresCard({ lines, name, save: press }: FiguresCardProps) {
             {lines.map((line, index) => {
               const figures = figuresOf(line.samples);
               return (
-                <tr key={lineKey(line)} data-testid="times-line" data-count={figures.count} data-path={line.path} data-transport={line.transport}>
+                <tr key={lineKey(line)} data-testid="latency-line" data-count={figures.count} data-path={line.path} data-transport={line.transport}>
                   <th scope="row">
                     <span class={`key-line series-${(index % 8) + 1}`} aria-hidden="true" /> {name(line)}
                   </th>
@@ -262,7 +262,7 @@ function PublishedCard({ published }: { published: readonly Published[] }) {
   );
 }
 
-function save(content: string): void {
+function download(content: string): void {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([content], { type: "text/csv" }));
   link.download = texts.csvName;

@@ -24,24 +24,24 @@ export interface LatencyChart {
 }
 
 /** The x axis: sample number, time [s since 1970] or duration [ms]. */
-export type Along = "order" | "time" | "ms";
+export type XAxis = "order" | "time" | "ms";
 
 interface Options {
-  along: Along;
+  xAxis: XAxis;
   /** Whether durations use a logarithmic axis. */
   log: boolean;
 }
 
-/** uPlot's number for it: its own name for that is only there for a compiler that sees its source. */
+/** uPlot's value for a logarithmic scale: its `const enum` cannot be used with `isolatedModules`. */
 // eslint-disable-next-line @typescript-eslint/no-unsafe-enum-assignment
 const LOG: uPlot.Scale.Distr = 3;
 const LABEL_PX = 11;
 
-export function createLatencyChart(box: HTMLElement, { along, log }: Options): LatencyChart {
+export function createLatencyChart(box: HTMLElement, { xAxis, log }: Options): LatencyChart {
   let references: readonly Reference[] = [];
   let plot: uPlot | null = null;
   let drawn = "";
-  const reach = (low: number | null, high: number | null): [number, number] => {
+  const range = (low: number | null, high: number | null): [number, number] => {
     const all = [low, high, ...references.map(({ ms }) => ms)].filter((one) => one !== null && one > 0) as number[];
     if (all.length === 0) return [1, 1000];
     const [least, most] = [Math.min(...all), Math.max(...all)];
@@ -52,7 +52,7 @@ export function createLatencyChart(box: HTMLElement, { along, log }: Options): L
     // The end of a logarithmic axis is not a round number.
     const inMs = (ticks: (number | null)[]): string[] =>
       ticks.map((tick) => (tick === null ? "" : `${Number(tick.toPrecision(3))} ${texts.milliseconds}`));
-    const times = { ...(log ? { distr: LOG, log: 10 as const } : {}), range: (_: uPlot, low: number | null, high: number | null) => reach(low, high) };
+    const times = { ...(log ? { distr: LOG, log: 10 as const } : {}), range: (_: uPlot, low: number | null, high: number | null) => range(low, high) };
     const stepped = uPlot.paths.stepped?.({ align: 1 });
     return new uPlot(
       {
@@ -61,12 +61,12 @@ export function createLatencyChart(box: HTMLElement, { along, log }: Options): L
         legend: { show: false },
         cursor: { show: false },
         scales: {
-          x: along === "ms" ? { time: false, ...times } : { time: false },
-          y: along === "ms" ? { range: [0, 100] } : times,
+          x: xAxis === "ms" ? { time: false, ...times } : { time: false },
+          y: xAxis === "ms" ? { range: [0, 100] } : times,
         },
         axes: [
-          { ...axis, space: 60, values: (_, ticks) => (along === "ms" ? inMs(ticks) : ticks.map((tick) => (along === "time" ? format.recentTime(tick * 1000).slice(0, 14) : whole(tick)))) },
-          { ...axis, size: 70, values: (_, ticks) => (along === "ms" ? ticks.map((tick) => `${tick} ${texts.percent}`) : inMs(ticks)) },
+          { ...axis, space: 60, values: (_, ticks) => (xAxis === "ms" ? inMs(ticks) : ticks.map((tick) => (xAxis === "time" ? format.recentTime(tick * 1000).slice(0, 14) : whole(tick)))) },
+          { ...axis, size: 70, values: (_, ticks) => (xAxis === "ms" ? ticks.map((tick) => `${tick} ${texts.percent}`) : inMs(ticks)) },
         ],
         series: [
           {},
@@ -75,11 +75,11 @@ export function createLatencyChart(box: HTMLElement, { along, log }: Options): L
             stroke: line.colour,
             width: 1.75,
             spanGaps: true,
-            points: { show: along !== "ms", size: 5, fill: line.colour },
-            ...(along === "ms" && stepped !== undefined ? { paths: stepped } : {}),
+            points: { show: xAxis !== "ms", size: 5, fill: line.colour },
+            ...(xAxis === "ms" && stepped !== undefined ? { paths: stepped } : {}),
           })),
         ],
-        hooks: { draw: [(chart) => paint(chart, references, along)] },
+        hooks: { draw: [(chart) => paint(chart, references, xAxis)] },
       },
       aligned(lines),
       box,
@@ -90,8 +90,8 @@ export function createLatencyChart(box: HTMLElement, { along, log }: Options): L
   });
   observer.observe(box);
   return {
-    draw(lines, given) {
-      references = given;
+    draw(lines, newReferences) {
+      references = newReferences;
       // uPlot accepts new values for the same lines; other lines need a new plot.
       const names = lines.map((line) => `${line.label} ${line.colour}`).join("\n");
       if (plot !== null && names === drawn) {
@@ -119,10 +119,10 @@ function whole(tick: number): string {
 }
 
 /** Published figures as dashed lines, labelled where there is space. */
-function paint(plot: uPlot, references: readonly Reference[], along: Along): void {
+function paint(plot: uPlot, references: readonly Reference[], xAxis: XAxis): void {
   const { ctx, bbox } = plot;
   const ratio = devicePixelRatio;
-  const upright = along === "ms";
+  const vertical = xAxis === "ms";
   ctx.save();
   ctx.strokeStyle = colour("--marker");
   ctx.lineWidth = ratio;
@@ -132,9 +132,9 @@ function paint(plot: uPlot, references: readonly Reference[], along: Along): voi
   ctx.setLineDash([6 * ratio, 4 * ratio]);
   let last = Infinity;
   for (const { label, ms } of [...references].sort((one, other) => other.ms - one.ms)) {
-    const at = plot.valToPos(ms, upright ? "x" : "y", true);
+    const at = plot.valToPos(ms, vertical ? "x" : "y", true);
     ctx.beginPath();
-    if (upright) {
+    if (vertical) {
       ctx.moveTo(at, bbox.top);
       ctx.lineTo(at, bbox.top + bbox.height);
     } else {
@@ -142,8 +142,8 @@ function paint(plot: uPlot, references: readonly Reference[], along: Along): voi
       ctx.lineTo(bbox.left + bbox.width, at);
     }
     ctx.stroke();
-    // The list beside the chart names all; skip labels that would overlap.
-    if (upright || Math.abs(at - last) < LABEL_PX * 1.2 * ratio) continue;
+    // The list next to the chart contains all names; skip labels that would overlap.
+    if (vertical || Math.abs(at - last) < LABEL_PX * 1.2 * ratio) continue;
     const text = `${label}: ${ms} ${texts.milliseconds}`;
     ctx.fillStyle = colour("--surface");
     ctx.fillRect(bbox.left + 2 * ratio, at - (LABEL_PX + 3) * ratio, ctx.measureText(text).width + 4 * ratio, (LABEL_PX + 2) * ratio);

@@ -6,12 +6,12 @@ import { distribution, type Line } from "./model/latency-stats";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { onColourChange, seriesColour } from "../../shared/ui/canvas-theme";
-import type { Along, PlotSeries, Reference, LatencyChart } from "./plot-canvas";
+import type { XAxis, PlotSeries, Reference, LatencyChart } from "./plot-canvas";
 
 export type Axis = keyof typeof texts.axes;
 export type Scale = keyof typeof texts.scales;
 
-interface TimesPlotsProps {
+interface LatencyPlotsProps {
   lines: readonly Line[];
   name: (line: Line) => string;
   published: readonly Published[];
@@ -19,58 +19,58 @@ interface TimesPlotsProps {
   scale: Scale;
 }
 
-export function LatencyPlots({ lines, name, published, axis, scale }: TimesPlotsProps) {
+export function LatencyPlots({ lines, name, published, axis, scale }: LatencyPlotsProps) {
   const references = published.map(({ id, ms }) => ({ label: texts.published[id] ?? id, ms }));
-  const over = lines.map((line, index): PlotSeries => {
+  const overTime = lines.map((line, index): PlotSeries => {
     const x = line.samples.map(({ atMs }, place) => (axis === "time" ? atMs / 1000 + place / 1e6 : place + 1));
     return { label: name(line), colour: seriesColour(index), x, y: line.samples.map(({ ms }) => ms) };
   });
-  const share = lines.map((line, index): PlotSeries => {
+  const distributions = lines.map((line, index): PlotSeries => {
     const [x, y] = distribution(line.samples);
     return { label: name(line), colour: seriesColour(index), x, y: y.map((one) => one * 100) };
   });
   return (
     <div class="latency-charts">
-      <TimesCard title={texts.overTime} along={axis} scale={scale} lines={over} references={references} />
-      <TimesCard title={texts.shares} along="ms" scale={scale} lines={share} references={references} />
+      <PlotCard title={texts.overTime} xAxis={axis} scale={scale} lines={overTime} references={references} />
+      <PlotCard title={texts.shares} xAxis="ms" scale={scale} lines={distributions} references={references} />
     </div>
   );
 }
 
-interface TimesCardProps {
+interface PlotCardProps {
   title: string;
-  along: Along;
+  xAxis: XAxis;
   scale: Scale;
   lines: readonly PlotSeries[];
   references: readonly Reference[];
 }
 
-function TimesCard({ title, along, scale, lines, references }: TimesCardProps) {
+function PlotCard({ title, xAxis, scale, lines, references }: PlotCardProps) {
   const box = useRef<HTMLDivElement>(null);
   const chart = useRef<LatencyChart | null>(null);
   const [failed, setFailed] = useState(false);
   const [repaint, setRepaint] = useState(0);
-  const wanted = useRef({ lines, references });
-  wanted.current = { lines, references };
+  const latest = useRef({ lines, references });
+  latest.current = { lines, references };
   useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
   useEffect(() => {
     if (box.current === null) return;
     const element = box.current;
-    let alive = true;
+    let mounted = true;
     import("./plot-canvas").then(
       ({ createLatencyChart }) => {
-        if (!alive) return;
-        chart.current = createLatencyChart(element, { along, log: scale === "log" });
-        chart.current.draw(wanted.current.lines, wanted.current.references);
+        if (!mounted) return;
+        chart.current = createLatencyChart(element, { xAxis, log: scale === "log" });
+        chart.current.draw(latest.current.lines, latest.current.references);
       },
       () => setFailed(true),
     );
     return () => {
-      alive = false;
+      mounted = false;
       chart.current?.dispose();
       chart.current = null;
     };
-  }, [along, scale, repaint]);
+  }, [xAxis, scale, repaint]);
   useEffect(() => chart.current?.draw(lines, references), [lines, references]);
   const samples = lines.reduce((sum, { x }) => sum + x.length, 0);
   return (
@@ -79,7 +79,7 @@ function TimesCard({ title, along, scale, lines, references }: TimesCardProps) {
       <div
         ref={box}
         class="latency-chart"
-        data-testid={`times-${along === "ms" ? "shares" : "samples"}`}
+        data-testid={`latency-${xAxis === "ms" ? "shares" : "samples"}`}
         data-samples={samples}
         data-references={references.length}
         role="img"

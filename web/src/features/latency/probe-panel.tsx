@@ -1,16 +1,16 @@
 /** Measures latency now, without motion. */
 import type { DeviceStore } from "../devices/model";
 import { Card } from "../../shared/ui/card";
-import { TIMES, probeKindsOf, type LatencyProbe } from "./model/probe";
+import { SAMPLES_PER_KIND, probeKindsOf, type LatencyProbe } from "./model/probe";
 import { texts } from "./texts";
 
-export function ProbePanel({ device, measure }: { device: DeviceStore; measure: LatencyProbe }) {
-  const progress = measure.progress.value;
-  const why = measure.why.value;
-  const ways = probeKindsOf(device);
-  const count = measure.lines.reduce((sum, { samples }) => sum + samples.length, 0);
-  const watches = device.info.value.role === "viewer";
-  const done = progress === null ? 0 : ways.indexOf(progress.way) * TIMES + progress.done;
+export function ProbePanel({ device, probe }: { device: DeviceStore; probe: LatencyProbe }) {
+  const progress = probe.progress.value;
+  const error = probe.error.value;
+  const kinds = probeKindsOf(device);
+  const count = probe.lines.reduce((sum, { samples }) => sum + samples.length, 0);
+  const isViewer = device.info.value.role === "viewer";
+  const done = progress === null ? 0 : kinds.indexOf(progress.kind) * SAMPLES_PER_KIND + progress.done;
   return (
     <Card
       title={texts.measure}
@@ -22,39 +22,39 @@ export function ProbePanel({ device, measure }: { device: DeviceStore; measure: 
             class="primary"
             data-testid="measure"
             disabled={device.description.value === null}
-            onClick={() => void measure.run(ways)}
+            onClick={() => void probe.run(kinds)}
           >
             {texts.measure}
           </button>
         ) : (
-          <button type="button" data-testid="measure-stop" onClick={() => measure.stop()}>
+          <button type="button" data-testid="measure-stop" onClick={() => probe.stop()}>
             {texts.stop}
           </button>
         )
       }
     >
       <p class="quiet small">
-        {texts.measureExplained(ways.map((way) => texts.ways[way]))} {!ways.includes("device") && texts.robotNote}{" "}
-        {watches && texts.viewer}
+        {texts.measureExplained(kinds.map((kind) => texts.probes[kind]))} {!kinds.includes("device") && texts.robotNote}{" "}
+        {isViewer && texts.viewer}
       </p>
       {progress !== null && (
         <>
-          <progress max={ways.length * TIMES} value={done} aria-label={texts.measure} />
-          <p class="small">{texts.measuring(texts.ways[progress.way], progress.done, progress.of)}</p>
+          <progress max={kinds.length * SAMPLES_PER_KIND} value={done} aria-label={texts.measure} />
+          <p class="small">{texts.measuring(texts.probes[progress.kind], progress.done, progress.total)}</p>
         </>
       )}
-      <p class="small" role="status" data-testid="measured" data-count={count} data-busy={progress !== null}>
+      <p class="small" role="status" data-testid="probe-samples" data-count={count} data-busy={progress !== null}>
         {progress === null && count > 0 && texts.measureDone(count)}
       </p>
-      {why !== "" && (
+      {error !== "" && (
         <p class="notice bad" role="alert">
-          {texts.ended(why)}
+          {texts.ended(error)}
         </p>
       )}
-      {measure.unstored && !watches && (
+      {probe.unstored && !isViewer && (
         <p class="row">
           {texts.notStored}
-          <button type="button" onClick={() => void measure.store()}>
+          <button type="button" onClick={() => void probe.store()}>
             {texts.store}
           </button>
         </p>

@@ -209,7 +209,7 @@ function Code({ api, fleet, script, sessions, checked, onChecked }: CodeProps) {
     if (editor.current !== null && editor.current.text !== text) editor.current.replace(text);
   });
 
-  const why = sessions.map(({ actions }) => actions.run.value).find((run) => run?.status === "failed")?.why ?? "";
+  const why = sessions.map(({ actions }) => actions.run.value).find((run) => run?.status === "failed")?.reason ?? "";
   useEffect(() => {
     const mark = failureMark(why);
     const text = script.text.peek();

@@ -57,7 +57,7 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
   const [space, setSpace] = useState("");
   const [name, setName] = useState("");
   const [busy, setBusy] = useState(false);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
   const code = useRef<HTMLInputElement>(null);
 
   useEffect(() => {
@@ -65,36 +65,36 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
   }, [linked]);
   useEffect(() => {
     code.current?.focus();
-    // Where they cannot be read it goes into the first one, as the server has it.
+    // Without the list, the server pairs the agent into the first space.
     api.spaces().then(
       (all) => setSpaces(all.filter(({ role }) => role === "owner")),
       () => setSpaces([]),
     );
   }, [api]);
 
-  const into = async (): Promise<string | null> => {
+  const targetSpace = async (): Promise<string | null> => {
     if (space !== NEW) return space === "" ? null : space;
-    const made = await api.createSpace(name.trim());
+    const created = await api.createSpace(name.trim());
     // The space exists now, even if pairing fails: a retry uses it and does not create a second one.
-    setSpaces([...(spaces ?? []), made]);
-    setSpace(made.id);
-    return made.id;
+    setSpaces([...(spaces ?? []), created]);
+    setSpace(created.id);
+    return created.id;
   };
 
   const pair = async (): Promise<void> => {
-    const read = readCode(typed);
-    if (read === null) {
-      setWrong(texts.malformed);
+    const claimCode = readCode(typed);
+    if (claimCode === null) {
+      setError(texts.malformed);
       code.current?.focus();
       return;
     }
-    setWrong("");
+    setError("");
     setBusy(true);
     try {
-      onPaired(await fleet.claim(read, await into()));
+      onPaired(await fleet.claim(claimCode, await targetSpace()));
     } catch (error) {
       const unknown = error instanceof ApiError && error.code === "claim-code-unknown";
-      setWrong(unknown ? texts.unknown : sentence(error));
+      setError(unknown ? texts.unknown : sentence(error));
       setBusy(false);
       code.current?.focus();
     }
@@ -125,13 +125,13 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
             maxLength={20}
             required
             value={typed}
-            aria-invalid={wrong !== ""}
+            aria-invalid={error !== ""}
             aria-describedby="claim-answer"
             onInput={(event) => setTyped(event.currentTarget.value)}
           />
         </div>
         <div class="field">
-          <label for="claim-space">{texts.into}</label>
+          <label for="claim-space">{texts.space}</label>
           <select
             id="claim-space"
             data-testid="claim-space"
@@ -139,9 +139,9 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
             onChange={(event) => setSpace(event.currentTarget.value)}
           >
             {(spaces ?? []).length === 0 && <option value="">{texts.firstSpace}</option>}
-            {spaces?.map(({ id, name: called }, index) => (
+            {spaces?.map(({ id, name: label }, index) => (
               <option key={id} value={index === 0 && space === "" ? "" : id}>
-                {called}
+                {label}
               </option>
             ))}
             <option value={NEW}>{texts.newSpace}</option>
@@ -174,12 +174,12 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
                 setTyped("");
               }}
             >
-              {texts.notThis}
+              {texts.discard}
             </button>
           )}
         </div>
         <p id="claim-answer" class="field-error" role="alert">
-          {wrong}
+          {error}
         </p>
       </form>
     </Card>
@@ -219,12 +219,12 @@ function Paired({ api, fleet, devices, onAnother }: PairedProps) {
 
 function PairedDevice({ api, fleet, info }: { api: Api; fleet: Fleet; info: Device }) {
   const device = fleet.devices.value?.get(info.id);
-  const called = device?.info.value ?? info;
+  const current = device?.info.value ?? info;
   return (
     <li data-testid="paired-device">
-      <a href={deviceAddress(info.id)}>{called.label}</a>
+      <a href={deviceAddress(info.id)}>{current.label}</a>
       <span class="quiet small">
-        {called.robot_type.replaceAll("_", " ")} · {fleet.spaceName(called.space)}
+        {current.robot_type.replaceAll("_", " ")} · {fleet.spaceName(current.space)}
       </span>
       <span role="status">
         {device === undefined || device.lastSeenAt.value === null ? (

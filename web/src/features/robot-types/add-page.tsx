@@ -45,21 +45,21 @@ export function AddRobotTypePage({ api }: { api: Api }) {
 function Progress({ draft }: { draft: UploadDraft }) {
   const step = draft.step.value;
   const words = texts.adding;
-  const fault = draft.fault.value;
+  const fault = draft.localError.value;
   return (
     <div role="status" data-testid="type-progress">
       {(step === "sending" || step === "checking" || step === "saving") && (
         <div class="card">
           <p>
-            {words.under[step]} <span class="quiet">{texts.seconds((clock.value - draft.since.value) / 1000)}</span>
+            {words.progress[step]} <span class="quiet">{texts.seconds((clock.value - draft.since.value) / 1000)}</span>
           </p>
-          <progress aria-label={words.under[step]} />
+          <progress aria-label={words.progress[step]} />
         </div>
       )}
-      {step === "wrong" && fault !== null && <p class="notice bad">{words.fault[fault](MANIFEST)}</p>}
-      {draft.trouble.value !== "" && (
+      {step === "invalid" && fault !== null && <p class="notice bad">{words.localError[fault](MANIFEST)}</p>}
+      {draft.error.value !== "" && (
         <p class="notice bad row">
-          <span>{words.unsent(draft.trouble.value)}</span>
+          <span>{words.unsent(draft.error.value)}</span>
           {step === "unsent" && (
             <button type="button" onClick={() => void draft.check()}>
               {common.tryAgain}
@@ -73,18 +73,18 @@ function Progress({ draft }: { draft: UploadDraft }) {
 
 function Outcome({ draft }: { draft: UploadDraft }) {
   const words = texts.adding;
-  const look = draft.look.value;
+  const look = draft.preview.value;
   const model = draft.model.value;
   const step = draft.step.value;
-  const good = look !== null && (step === "good" || step === "saving");
+  const valid = look !== null && (step === "valid" || step === "saving");
   return (
     <>
       <FindingsList findings={draft.errors.value} level="error" />
       <FindingsList findings={draft.warnings.value} level="warning" />
-      {good && (
+      {valid && (
         <>
-          <Card title={words.good(look.robot_type.label)} class="save-type">
-            <p>{words.look}</p>
+          <Card title={words.valid(look.robot_type.label)} class="save-type">
+            <p>{words.previewNote}</p>
             <div class="row">
               <button
                 type="button"
@@ -124,10 +124,10 @@ function Saved({ draft }: { draft: UploadDraft }) {
         </p>
         {draft.movements.value.length > 0 && (
           <ul class="plain-list" data-testid="saved-movements">
-            {draft.movements.value.map(({ name, why }) => (
-              <li key={name} data-accepted={why === ""}>
+            {draft.movements.value.map(({ name, error }) => (
+              <li key={name} data-accepted={error === ""}>
                 <strong>{name}</strong>{" "}
-                <span class={why === "" ? "quiet" : "field-error"}>{why === "" ? words.accepted : why}</span>
+                <span class={error === "" ? "quiet" : "field-error"}>{error === "" ? words.accepted : error}</span>
               </li>
             ))}
           </ul>

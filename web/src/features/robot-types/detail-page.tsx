@@ -68,7 +68,7 @@ function Loaded({ api, type, devices }: { api: Api; type: RobotType; devices: re
         <Files api={api} type={type} />
       </div>
       {type.state === "ready" && devices.length === 0 && <StartAgent type={type.type} builtIn={type.built_in} />}
-      {!type.built_in && <Own api={api} type={type} />}
+      {!type.built_in && <OwnerActions api={api} type={type} />}
     </>
   );
 }
@@ -226,7 +226,7 @@ function Files({ api, type }: { api: Api; type: RobotType }) {
   );
 }
 
-function Own({ api, type }: { api: Api; type: RobotType }) {
+function OwnerActions({ api, type }: { api: Api; type: RobotType }) {
   const words = texts.owned;
   return (
     <Card title={words.title}>

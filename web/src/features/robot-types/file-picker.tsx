@@ -6,47 +6,47 @@ import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { ArchiveError, filesFromDrop, filesFromPicker, readFiles } from "./read-archive";
 
-const WANTED = ".zip,.toml,.xml,.stl,.obj,.png,.py";
+const ACCEPTED = ".zip,.toml,.xml,.stl,.obj,.png,.py";
 
 export function FilePicker({ draft }: { draft: UploadDraft }) {
-  const [over, setOver] = useState(false);
+  const [dragging, setDragging] = useState(false);
   const [reading, setReading] = useState(false);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
   const folder = useRef<HTMLInputElement>(null);
   const files = useRef<HTMLInputElement>(null);
   const words = texts.adding;
 
-  const take = async (chosen: Promise<[string, File][]>): Promise<void> => {
-    setWrong("");
+  const addFiles = async (chosen: Promise<[string, File][]>): Promise<void> => {
+    setError("");
     setReading(true);
     try {
-      const found = await readFiles(await chosen);
+      const contents = await readFiles(await chosen);
       setReading(false);
-      if (found.size > 0) await draft.add(found);
+      if (contents.size > 0) await draft.add(contents);
     } catch (error) {
-      setWrong(error instanceof ArchiveError ? words.badArchive(error.message) : words.unreadable);
+      setError(error instanceof ArchiveError ? words.badArchive(error.message) : words.unreadable);
     } finally {
       setReading(false);
     }
   };
   const input = (event: { currentTarget: HTMLInputElement }): void => {
-    void take(Promise.resolve(filesFromPicker(event.currentTarget.files)));
+    void addFiles(Promise.resolve(filesFromPicker(event.currentTarget.files)));
     // Allows choosing the same file again after a correction.
     event.currentTarget.value = "";
   };
   return (
     <div
-      class={`drop ${over ? "over-it" : ""}`}
+      class={`drop ${dragging ? "dragging" : ""}`}
       data-testid="drop-files"
       onDragOver={(event) => {
         event.preventDefault();
-        setOver(true);
+        setDragging(true);
       }}
-      onDragLeave={() => setOver(false)}
+      onDragLeave={() => setDragging(false)}
       onDrop={(event) => {
         event.preventDefault();
-        setOver(false);
-        if (event.dataTransfer !== null) void take(filesFromDrop(event.dataTransfer));
+        setDragging(false);
+        if (event.dataTransfer !== null) void addFiles(filesFromDrop(event.dataTransfer));
       }}
     >
       <p>{words.drop}</p>
@@ -63,7 +63,7 @@ export function FilePicker({ draft }: { draft: UploadDraft }) {
         class="visually-hidden"
         type="file"
         multiple
-        accept={WANTED}
+        accept={ACCEPTED}
         tabIndex={-1}
         aria-label={words.chooseFiles}
         data-testid="type-files"
@@ -82,7 +82,7 @@ export function FilePicker({ draft }: { draft: UploadDraft }) {
         onChange={input}
       />
       <p class="field-error" role="alert">
-        {wrong}
+        {error}
       </p>
       {reading && <p role="status">{words.reading}</p>}
     </div>
@@ -91,10 +91,10 @@ export function FilePicker({ draft }: { draft: UploadDraft }) {
 
 export function SelectedFiles({ draft }: { draft: UploadDraft }) {
   const names = [...draft.files.value.keys()].sort();
-  const left = draft.left.value;
+  const ignored = draft.ignored.value;
   const words = texts.adding;
-  if (names.length === 0 && left.length === 0) return null;
-  const wrong = new Set(draft.errors.value.map(({ file }) => file));
+  if (names.length === 0 && ignored.length === 0) return null;
+  const filesWithErrors = new Set(draft.errors.value.map(({ file }) => file));
   return (
     <Card
       title={words.chosen}
@@ -108,22 +108,22 @@ export function SelectedFiles({ draft }: { draft: UploadDraft }) {
     >
       <ul class="type-files" aria-label={words.chosen} data-testid="chosen-files">
         {names.map((name) => (
-          <FileRow key={name} draft={draft} name={name} wrong={wrong.has(name)} />
+          <FileRow key={name} draft={draft} name={name} hasErrors={filesWithErrors.has(name)} />
         ))}
       </ul>
-      {left.length > 0 && <p class="quiet small">{words.left(left)}</p>}
+      {ignored.length > 0 && <p class="quiet small">{words.ignored(ignored)}</p>}
     </Card>
   );
 }
 
-function FileRow({ draft, name, wrong }: { draft: UploadDraft; name: string; wrong: boolean }) {
+function FileRow({ draft, name, hasErrors }: { draft: UploadDraft; name: string; hasErrors: boolean }) {
   const input = useRef<HTMLInputElement>(null);
   const words = texts.adding;
   return (
     <li data-file={name}>
       <span class="file-name">
         {name} <span class="quiet small">{format.fileSize(draft.files.value.get(name)?.length ?? 0)}</span>{" "}
-        {wrong && <span class="chip bad">{words.wrong}</span>}
+        {hasErrors && <span class="chip bad">{words.hasErrors}</span>}
       </span>
       <button type="button" class="plain" aria-label={words.replaceNamed(name)} onClick={() => input.current?.click()}>
         {words.replace}

@@ -19,10 +19,10 @@ export function FindingsList({ findings, level }: FindingsProps) {
         {findings.map((finding, index) => (
           <li key={index} data-testid={level} data-kind={finding.kind}>
             <p class="where">
-              {finding.file === "" ? words.whole : finding.file}
+              {finding.file === "" ? words.robotType : finding.file}
               {finding.line !== null && <span>, {words.line(finding.line)}</span>}
             </p>
-            <p>{what(finding)}</p>
+            <p>{messageText(finding)}</p>
             {advice(finding) !== "" && <p class="quiet">{advice(finding)}</p>}
           </li>
         ))}
@@ -31,17 +31,17 @@ export function FindingsList({ findings, level }: FindingsProps) {
   );
 }
 
-function what({ kind, said, about, range_rad }: Finding): string {
+function messageText({ kind, message, subject, range_rad }: Finding): string {
   const words = texts.findings;
-  if (kind === "missing") return words.missing(about);
-  if (kind === "torn") return words.torn;
+  if (kind === "missing") return words.missing(subject);
+  if (kind === "malformed") return words.malformed;
   if (kind === "range" && range_rad !== null) {
     const [lower, upper] = range_rad.map((rad) => format.degrees(degrees(rad)));
-    return (said.includes("actuator") ? words.motorRange : words.range)(about, lower ?? "", upper ?? "");
+    return (message.includes("actuator") ? words.motorRange : words.range)(subject, lower ?? "", upper ?? "");
   }
-  return said;
+  return message;
 }
 
-function advice({ kind, file, about }: Finding): string {
-  return texts.findings.advice[kind](file, about);
+function advice({ kind, file, subject }: Finding): string {
+  return texts.findings.advice[kind](file, subject);
 }

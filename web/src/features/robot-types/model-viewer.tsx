@@ -59,7 +59,7 @@ export function ModelViewer({ twin, joints }: ModelViewProps) {
 }
 
 function JointSlider({ joint, at_rad, onChange }: { joint: Joint; at_rad: number; onChange: (at_rad: number) => void }) {
-  const { degrees: said, wholeDegrees } = format;
+  const { degrees: degreesText, wholeDegrees } = format;
   const id = `model-joint-${joint.name}`;
   return (
     <li>
@@ -72,10 +72,10 @@ function JointSlider({ joint, at_rad, onChange }: { joint: Joint; at_rad: number
         max={degrees(joint.upper_rad)}
         step="any"
         value={degrees(at_rad)}
-        aria-valuetext={said(degrees(at_rad))}
+        aria-valuetext={degreesText(degrees(at_rad))}
         onInput={(event) => onChange(radians(Number(event.currentTarget.value)))}
       />
-      <output for={id}>{said(degrees(at_rad))}</output>
+      <output for={id}>{degreesText(degrees(at_rad))}</output>
       <span class="quiet small">{texts.range(wholeDegrees(degrees(joint.lower_rad)), wholeDegrees(degrees(joint.upper_rad)))}</span>
     </li>
   );

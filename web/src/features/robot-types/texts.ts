@@ -74,25 +74,25 @@ export const texts = {
     badArchive: (name: string): string => `${name} cannot be extracted. The archive must be complete, without a password, and smaller than 50 MB.`,
     unreadable: "A file could not be read. Choose it again.",
     chosen: "Selected files",
-    left: (names: readonly string[]): string => `Ignored: ${names.slice(0, 5).join(", ")}${names.length > 5 ? ` and ${names.length - 5} more` : ""}`,
+    ignored: (names: readonly string[]): string => `Ignored: ${names.slice(0, 5).join(", ")}${names.length > 5 ? ` and ${names.length - 5} more` : ""}`,
     clear: "Remove all files",
-    wrong: "has errors",
+    hasErrors: "has errors",
     replace: "Replace…",
     replaceNamed: (name: string): string => `Replace ${name}`,
     remove: "Remove",
     removeNamed: (name: string): string => `Remove ${name}`,
-    under: {
+    progress: {
       sending: "Uploading files…",
       checking: "Compiling and validating the model…",
       saving: "Saving and validating…",
     },
-    fault: {
+    localError: {
       "no-manifest": (name: string): string => `${name} is missing. This file describes the robot's capabilities; add it.`,
       "too-large": (): string => "The files are larger than 6 MB in total. Simplify or remove meshes.",
     },
     unsent: (reason: string): string => `The upload failed; your files are still selected. ${reason}`,
-    good: (label: string): string => `${label} is ready to save`,
-    look: "Check the result: move each joint of the model and compare the limits.",
+    valid: (label: string): string => `${label} is ready to save`,
+    previewNote: "Check the result: move each joint of the model and compare the limits.",
     save: (type: string): string => `Save as ${type}`,
     expires: (at: string): string => `Only you can see this draft. It expires at ${at}.`,
     saved: (label: string, version: number): string => `${label}, version ${version}, was saved`,
@@ -102,7 +102,7 @@ export const texts = {
     another: "Add another",
   },
 
-  found: {
+  contents: {
     title: "Contents",
     joints: "Joints",
     joint: (label: string, range: string): string => `${label} (${range})`,
@@ -119,10 +119,10 @@ export const texts = {
       error: (count: number): string => format.count(count, "error"),
       warning: (count: number): string => format.count(count, "warning"),
     },
-    whole: "Robot type",
+    robotType: "Robot type",
     line: (line: number): string => `line ${line}`,
     missing: (name: string): string => `The file ${name} is required but missing.`,
-    torn: "This is not well-formed XML: a tag is not closed, or its end tag has a different name.",
+    malformed: "This is not well-formed XML: a tag is not closed, or its end tag has a different name.",
     range: (joint: string, from: string, to: string): string =>
       `The model limits joint ${joint} to ${from} to ${to}; robot.toml allows a wider range.`,
     motorRange: (motor: string, from: string, to: string): string =>
@@ -131,8 +131,8 @@ export const texts = {
       range: (file: string): string =>
         `Reduce lower_rad and upper_rad in robot.toml, or extend the range in ${file}. Without <compiler angle="radian"/>, the model's ranges are in degrees.`,
       missing: (file: string, name: string): string => `Add ${name}, or remove the reference from ${file}.`,
-      torn: (): string => "Check this line and the lines before it, correct them, and replace the file.",
-      word: (): string => "Check the spelling in MuJoCo's XML reference.",
+      malformed: (): string => "Check this line and the lines before it, correct them, and replace the file.",
+      keyword: (): string => "Check the spelling in MuJoCo's XML reference.",
       element: (): string => "MuJoCo has no such element here. Check its spelling and its parent element.",
       unnamed: (): string => "Joints, their actuators and robot.toml must use the same names.",
       servo: (): string => "Each joint needs a <position> actuator with the joint's name, for that joint only, with gear 1; a wheel needs a <velocity> actuator.",

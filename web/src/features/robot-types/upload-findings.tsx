@@ -6,14 +6,14 @@ import { packFiles, type Files } from "./model/upload-files";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 
-interface FoundProps {
+interface UploadSummaryProps {
   type: RobotType;
   model: TypeModel | null;
   files: Files;
 }
 
-export function UploadSummary({ type, model, files }: FoundProps) {
-  const words = texts.found;
+export function UploadSummary({ type, model, files }: UploadSummaryProps) {
+  const words = texts.contents;
   const { wholeDegrees } = format;
   const movements = Object.keys(packFiles(files)?.movements ?? {});
   const lists: [string, string[]][] = [
@@ -33,7 +33,7 @@ export function UploadSummary({ type, model, files }: FoundProps) {
   ];
   return (
     <Card title={words.title}>
-      <dl class="found" data-testid="found">
+      <dl class="type-contents" data-testid="type-contents">
         {lists.map(([name, entries]) => (
           <div key={name}>
             <dt>{words.count(name, entries.length)}</dt>

@@ -13,32 +13,32 @@ import { texts } from "./texts";
 import { InlineForm } from "../../shared/ui/inline-form";
 import { ConfirmButton } from "../../shared/ui/confirm-button";
 import { useReturnFocus } from "../../shared/hooks/use-return-focus";
-import { InviteForm, MAY } from "./invite-form";
+import { InviteForm, SHARED_ROLES } from "./invite-form";
 import { UNCHANGED, DurationPicker, seconds } from "../../shared/ui/duration-picker";
 import { spaceAddress } from "../../shared/routing/routes";
 import { TransferPanel } from "./transfer-panel";
 import "./sharing.css";
 
 /** An open invitation can be redeemed at any time, so the list is polled at this interval [ms]. */
-const LOOK_AGAIN_MS = 5_000;
-const LASTS = ["keep", "never", "hour", "workday", "day", "week", "month", "date"] as const;
+const REFRESH_MS = 5_000;
+const DURATIONS = ["keep", "never", "hour", "workday", "day", "week", "month", "date"] as const;
 
 interface AccessProps {
   api: Api;
   account: Account;
   target: Target;
-  /** What is handed over where it is, and the names of all that goes with it. */
-  whole: Transferable;
-  goes: readonly string[];
+  /** The unit of an ownership transfer, and the names of the included devices. */
+  unit: Transferable;
+  included: readonly string[];
   owner: Person;
   role: Role;
-  /** Of a device: the space through which others have access too. */
+  /** For a device: the space through which other accounts have access. */
   space?: { id: string; name: string };
-  /** One's own part was given up. */
+  /** The user gave up their own access. */
   onLeft: () => void;
 }
 
-type PartProps = Omit<AccessProps, "goes" | "role" | "whole">;
+type PartProps = Omit<AccessProps, "included" | "role" | "unit">;
 
 const ID = "access";
 
@@ -50,16 +50,16 @@ export function goToAccess(): void {
 }
 
 /** The access list of a device or space, with the owner's controls. */
-export function AccessList({ role, whole, goes, ...rest }: AccessProps) {
+export function AccessList({ role, unit, included, ...rest }: AccessProps) {
   return (
     <div id={ID} class="access" data-testid="access">
-      {role === "owner" ? <OwnersAccess {...rest} /> : <OwnPart role={role} {...rest} />}
-      {role === "owner" && <TransferPanel api={rest.api} of={whole} goes={goes} />}
+      {role === "owner" ? <OwnerView {...rest} /> : <OwnAccess role={role} {...rest} />}
+      {role === "owner" && <TransferPanel api={rest.api} unit={unit} included={included} />}
     </div>
   );
 }
 
-function OwnPart({ api, account, target, owner, role, onLeft }: PartProps & { role: SharedRole }) {
+function OwnAccess({ api, account, target, owner, role, onLeft }: PartProps & { role: SharedRole }) {
   const leave = async (): Promise<void> => {
     try {
       await api.unshare(target, account.id);
@@ -74,49 +74,49 @@ function OwnPart({ api, account, target, owner, role, onLeft }: PartProps & { ro
       <p>{texts.access.owned(owner.name, common.role[role])}</p>
       <ConfirmButton
         label={texts.access.leave}
-        question={texts.access.leaveSure}
-        confirmLabel={texts.access.leaveYes}
+        question={texts.access.leaveQuestion}
+        confirmLabel={texts.access.leaveConfirm}
         busyLabel={texts.access.leaving}
-        cancelLabel={texts.access.keep}
+        cancelLabel={texts.access.cancel}
         onConfirm={leave}
       />
     </Card>
   );
 }
 
-function OwnersAccess({ api, target, owner, space }: PartProps) {
+function OwnerView({ api, target, owner, space }: PartProps) {
   const { kind, id } = target;
   const sharing = useMemo(() => new ShareList(api, { kind, id }), [api, kind, id]);
   const [inviting, setInviting] = useState(false);
   useEffect(() => {
     void sharing.refresh();
     const timer = setInterval(() => {
-      if (sharing.waits.value && document.visibilityState === "visible") void sharing.refresh();
-    }, LOOK_AGAIN_MS);
+      if (sharing.hasInvitations.value && document.visibilityState === "visible") void sharing.refresh();
+    }, REFRESH_MS);
     return () => clearInterval(timer);
   }, [sharing]);
 
   const shares = sharing.shares.value;
-  const trouble = sharing.trouble.value;
+  const error = sharing.error.value;
   const opener = useReturnFocus(inviting);
-  const open = inviting ? null : (
+  const inviteButton = inviting ? null : (
     <button type="button" ref={opener} data-testid="invite" onClick={() => setInviting(true)}>
       {texts.invite.open}
     </button>
   );
   return (
-    <Card title={texts.access.title} aside={open}>
+    <Card title={texts.access.title} aside={inviteButton}>
       {kind === "space" && <p class="quiet small">{texts.access.spaceNote}</p>}
       {inviting && <InviteForm sharing={sharing} onClose={() => setInviting(false)} />}
-      {trouble !== "" && (
+      {error !== "" && (
         <p class="notice bad" role="alert">
-          {texts.access.failed(trouble)}{" "}
+          {texts.access.failed(error)}{" "}
           <button type="button" onClick={() => void sharing.refresh()}>
-            {texts.access.again}
+            {texts.access.retry}
           </button>
         </p>
       )}
-      {shares === null && trouble === "" && <p class="quiet">{texts.access.loading}</p>}
+      {shares === null && error === "" && <p class="quiet">{texts.access.loading}</p>}
       <Undo sharing={sharing} />
       <ul class="people" data-testid="people">
         <li>
@@ -136,25 +136,25 @@ function OwnersAccess({ api, target, owner, space }: PartProps) {
   );
 }
 
-/** What was taken away last, and the way back. */
+/** The revoked share, with an undo button. */
 function Undo({ sharing }: { sharing: ShareList }) {
   const ended = sharing.ended.value;
   const [busy, setBusy] = useState(false);
-  const [said, setSaid] = useState<{ text: string; wrong: boolean } | null>(null);
+  const [message, setMessage] = useState<{ text: string; isError: boolean } | null>(null);
   const button = useRef<HTMLButtonElement>(null);
   useEffect(() => {
     if (ended === null) return;
-    setSaid(null);
-    button.current?.focus(); // The button that was pressed has gone with its line.
+    setMessage(null);
+    button.current?.focus(); // The pressed button was removed with its row.
   }, [ended]);
   const undo = async (): Promise<void> => {
     const name = ended?.account.name ?? "";
     setBusy(true);
     try {
       await sharing.undo();
-      setSaid({ text: texts.access.restored(name), wrong: false });
+      setMessage({ text: texts.access.restored(name), isError: false });
     } catch (error) {
-      setSaid({ text: sentence(error), wrong: true });
+      setMessage({ text: sentence(error), isError: true });
     } finally {
       setBusy(false);
     }
@@ -169,8 +169,8 @@ function Undo({ sharing }: { sharing: ShareList }) {
           </button>
         </p>
       )}
-      {ended !== null && sharing.rest.value !== "" && <p class="notice warn">{sharing.rest.value}</p>}
-      {said !== null && <p class={said.wrong ? "field-error" : "field-note"}>{said.text}</p>}
+      {ended !== null && sharing.pendingRevocation.value !== "" && <p class="notice warn">{sharing.pendingRevocation.value}</p>}
+      {message !== null && <p class={message.isError ? "field-error" : "field-note"}>{message.text}</p>}
     </div>
   );
 }
@@ -179,14 +179,14 @@ function PersonRow({ share, sharing }: { share: Share; sharing: ShareList }) {
   const { name } = share.account;
   const [changing, setChanging] = useState(false);
   const [busy, setBusy] = useState(false);
-  const [said, setSaid] = useState({ text: "", wrong: false });
+  const [message, setMessage] = useState({ text: "", error: false });
   const opener = useReturnFocus(changing);
   const remove = async (): Promise<void> => {
     setBusy(true);
     try {
-      await sharing.end(share); // This row goes with it.
+      await sharing.revoke(share); // This removes the row.
     } catch (error) {
-      setSaid({ text: sentence(error), wrong: true });
+      setMessage({ text: sentence(error), error: true });
       setBusy(false);
     }
   };
@@ -229,12 +229,12 @@ function PersonRow({ share, sharing }: { share: Share; sharing: ShareList }) {
           sharing={sharing}
           onDone={(text) => {
             setChanging(false);
-            setSaid({ text, wrong: false });
+            setMessage({ text, error: false });
           }}
         />
       )}
-      <p class={said.wrong ? "field-error" : "field-note"} role="status" hidden={said.text === ""}>
-        {said.text}
+      <p class={message.error ? "field-error" : "field-note"} role="status" hidden={message.text === ""}>
+        {message.text}
       </p>
     </li>
   );
@@ -243,28 +243,28 @@ function PersonRow({ share, sharing }: { share: Share; sharing: ShareList }) {
 interface ChangeFormProps {
   share: Share;
   sharing: ShareList;
-  /** With what there is to say; empty: nothing was changed. */
+  /** `text`: the result message; empty without a change. */
   onDone: (text: string) => void;
 }
 
 function ChangeForm({ share, sharing, onDone }: ChangeFormProps) {
   const [role, setRole] = useState(share.role);
-  const [lasts, setLasts] = useState(UNCHANGED);
+  const [duration, setDuration] = useState(UNCHANGED);
   const [busy, setBusy] = useState(false);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
   const save = async (): Promise<void> => {
-    const forS = seconds(lasts, secondsLeft(share.expires_at));
+    const forS = seconds(duration, secondsLeft(share.expires_at));
     if (forS === undefined) {
-      setWrong(common.duration.past);
+      setError(common.duration.past);
       return;
     }
     setBusy(true);
-    setWrong("");
+    setError("");
     try {
-      const { account, role: now, expires_at: until } = await sharing.put(share.account.name, role, forS);
+      const { account, role: now, expires_at: until } = await sharing.share(share.account.name, role, forS);
       onDone(texts.access.changed(account.name, common.role[now], format.until(until)));
     } catch (error) {
-      setWrong(sentence(error));
+      setError(sentence(error));
       setBusy(false);
     }
   };
@@ -274,20 +274,20 @@ function ChangeForm({ share, sharing, onDone }: ChangeFormProps) {
       submitLabel={texts.access.save}
       busyLabel={texts.access.saving}
       busy={busy}
-      error={wrong}
+      error={error}
       onSubmit={save}
       onClose={() => onDone("")}
     >
       <div class="field">
         <span class="label">{texts.invite.role}</span>
-        <Choice label={texts.invite.role} value={role} options={MAY} onChange={setRole} />
+        <Choice label={texts.invite.role} value={role} options={SHARED_ROLES} onChange={setRole} />
       </div>
       <DurationPicker
         id={`lasts-${share.account.id}`}
-        label={texts.invite.lasts}
-        value={lasts}
-        choices={LASTS}
-        onChange={setLasts}
+        label={texts.invite.duration}
+        value={duration}
+        choices={DURATIONS}
+        onChange={setDuration}
       />
     </InlineForm>
   );
@@ -320,10 +320,10 @@ function OpenLink({ invitation, sharing }: { invitation: Invitation; sharing: Sh
       <ConfirmButton
         label={texts.access.withdraw}
         description={`${texts.access.withdraw}: ${texts.access.linkFor[role]}`}
-        question={texts.access.withdrawSure}
-        confirmLabel={texts.access.withdrawYes}
+        question={texts.access.withdrawQuestion}
+        confirmLabel={texts.access.withdrawConfirm}
         busyLabel={texts.access.withdrawing}
-        cancelLabel={texts.access.keep}
+        cancelLabel={texts.access.cancel}
         onConfirm={() => sharing.withdraw(invitation)}
       />
     </li>
@@ -333,18 +333,18 @@ function OpenLink({ invitation, sharing }: { invitation: Invitation; sharing: Sh
 /** Accounts with access to a device through its space. */
 function ThroughSpace({ api, space }: { api: Api; space: { id: string; name: string } }) {
   const [shares, setShares] = useState<readonly Share[]>([]);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
   useEffect(() => {
-    let wanted = true;
+    let mounted = true;
     api.shares({ kind: "space", id: space.id }).then(
-      (found) => wanted && setShares(found),
-      (error: unknown) => wanted && setWrong(sentence(error)),
+      (found) => mounted && setShares(found),
+      (error: unknown) => mounted && setError(sentence(error)),
     );
     return () => {
-      wanted = false;
+      mounted = false;
     };
   }, [api, space.id]);
-  if (wrong !== "") return <p class="field-error">{texts.access.failed(wrong)}</p>;
+  if (error !== "") return <p class="field-error">{texts.access.failed(error)}</p>;
   if (shares.length === 0) return null;
   return (
     <>

@@ -1,3 +1,3 @@
 export { AccessList, goToAccess } from "./access-list";
-export { MAY } from "./invite-form";
+export { SHARED_ROLES } from "./invite-form";
 export { JoinForm } from "./join-form";

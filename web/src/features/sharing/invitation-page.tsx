@@ -18,7 +18,7 @@ interface InvitationPageProps {
   followed: FollowedInvitation;
 }
 
-/** What an invitation offers, and taking it. */
+/** Shows an invitation, and accepts or declines it. */
 export function InvitationPage(props: InvitationPageProps) {
   const [accepted, setAccepted] = useState<Invitation | null>(null);
   const state = props.followed.state.value;
@@ -47,68 +47,68 @@ interface OfferProps extends InvitationPageProps {
 
 function Offer({ api, fleet, account, followed, secret, away, onAccepted }: OfferProps) {
   const [offer, setOffer] = useState<Invitation | null>(null);
-  const [own, setOwn] = useState<readonly Space[]>([]);
+  const [ownSpaces, setOwn] = useState<readonly Space[]>([]);
   const [space, setSpace] = useState<string | null>(null);
   const [busy, setBusy] = useState(false);
-  const [wrong, setWrong] = useState<{ text: string; final: boolean } | null>(null);
+  const [failure, setFailure] = useState<{ text: string; final: boolean } | null>(null);
 
-  const failed = (error: unknown): void => {
+  const handleError = (error: unknown): void => {
     const final = error instanceof ApiError && error.code === "invitation-unknown";
     // An account created at the provider has already redeemed it.
     if (final && away) followed.joined();
-    else setWrong({ text: sentence(error), final });
+    else setFailure({ text: sentence(error), final });
   };
-  const look = async (): Promise<void> => {
-    setWrong(null);
+  const load = async (): Promise<void> => {
+    setFailure(null);
     try {
-      const found = await api.previewInvitation(secret);
-      if (found.kind === "agent") setOwn((await api.spaces()).filter(({ role }) => role === "owner"));
-      setOffer(found);
+      const preview = await api.previewInvitation(secret);
+      if (preview.kind === "agent") setOwn((await api.spaces()).filter(({ role }) => role === "owner"));
+      setOffer(preview);
     } catch (error) {
-      failed(error);
+      handleError(error);
     }
   };
-  useEffect(() => void look(), [api, secret]);
+  useEffect(() => void load(), [api, secret]);
 
   const accept = async (): Promise<void> => {
     setBusy(true);
-    setWrong(null);
+    setFailure(null);
     try {
-      const taken = await api.redeemInvitation(secret, space);
+      const accepted = await api.redeemInvitation(secret, space);
       await fleet.refresh();
-      onAccepted(taken);
+      onAccepted(accepted);
       followed.drop();
     } catch (error) {
-      failed(error);
+      handleError(error);
       setBusy(false);
     }
   };
-  const refuse = (): void => {
+  const decline = (): void => {
     followed.drop();
     replaceWith(deviceListAddress);
   };
 
-  const hands = offer?.role === "owner";
+  const isTransfer = offer?.role === "owner";
   const title =
     offer === null
       ? texts.invitation.title
-      : hands
-        ? texts.invitation.hands(offer.created_by, offer.label)
+      : isTransfer
+        ? texts.invitation.offersOwnership(offer.created_by, offer.label)
         : texts.invitation.offers(offer.created_by, offer.label);
   return (
     <>
       <h1>{title}</h1>
-      {offer === null && wrong === null && (
+      {offer === null && failure === null && (
         <p class="quiet" role="status">
-          {texts.invitation.looking}
+          {texts.invitation.loading}
         </p>
       )}
       {offer !== null && <Terms offer={offer} />}
-      {offer?.kind === "agent" && own.length > 1 && (
+      {offer?.kind === "agent" && ownSpaces.length > 1 && (
         <div class="field">
-          <label for="into-space">{texts.invitation.into}</label>
+          <label for="into-space">{texts.invitation.space}</label>
           <select id="into-space" value={space ?? ""} onChange={(event) => setSpace(event.currentTarget.value)}>
-            {own.map(({ id, name }) => (
+            {ownSpaces.map(({ id, name }) => (
               <option key={id} value={id}>
                 {name}
               </option>
@@ -117,31 +117,31 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
         </div>
       )}
       <p class="quiet">{texts.invitation.as(account.name)}</p>
-      <div role="alert">{wrong !== null && <p class="notice bad">{wrong.text}</p>}</div>
+      <div role="alert">{failure !== null && <p class="notice bad">{failure.text}</p>}</div>
       <div class="row">
-        {offer !== null && hands && wrong?.final !== true && (
+        {offer !== null && isTransfer && failure?.final !== true && (
           <ConfirmButton
             label={texts.invitation.acceptTransfer}
-            question={texts.invitation.handsSure(offer.label)}
-            confirmLabel={texts.invitation.handsYes}
+            question={texts.invitation.transferQuestion(offer.label)}
+            confirmLabel={texts.invitation.transferConfirm}
             busyLabel={texts.invitation.accepting}
-            cancelLabel={texts.invitation.handsKeep}
+            cancelLabel={texts.invitation.transferCancel}
             onConfirm={accept}
             data-testid="accept"
           />
         )}
-        {offer !== null && !hands && wrong?.final !== true && (
+        {offer !== null && !isTransfer && failure?.final !== true && (
           <button type="button" class="primary" data-testid="accept" disabled={busy} onClick={() => void accept()}>
             {busy ? texts.invitation.accepting : texts.invitation.accept}
           </button>
         )}
-        {offer === null && wrong !== null && !wrong.final && (
-          <button type="button" onClick={() => void look()}>
+        {offer === null && failure !== null && !failure.final && (
+          <button type="button" onClick={() => void load()}>
             {texts.invitation.retry}
           </button>
         )}
-        <button type="button" disabled={busy} onClick={refuse}>
-          {wrong?.final === true ? texts.invitation.toDevices : texts.invitation.notNow}
+        <button type="button" disabled={busy} onClick={decline}>
+          {failure?.final === true ? texts.invitation.toDevices : texts.invitation.notNow}
         </button>
       </div>
     </>
@@ -152,7 +152,7 @@ function Terms({ offer: { role, kind, share_s: shareS } }: { offer: Invitation }
   if (role === "owner") {
     return (
       <ul class="terms" data-testid="terms">
-        {[...texts.invitation.handsNote, texts.invitation.declined].map((line) => (
+        {[...texts.invitation.transferNotes, texts.invitation.declined].map((line) => (
           <li key={line}>{line}</li>
         ))}
       </ul>
@@ -160,7 +160,7 @@ function Terms({ offer: { role, kind, share_s: shareS } }: { offer: Invitation }
   }
   return (
     <ul class="terms" data-testid="terms">
-      <li>{texts.invitation.may[role]}</li>
+      <li>{texts.invitation.permissions[role]}</li>
       {texts.invitation.kind[kind] !== "" && <li>{texts.invitation.kind[kind]}</li>}
       <li>{texts.invitation.lasts(shareS)}</li>
     </ul>
@@ -173,39 +173,39 @@ function Accepted({ invitation: { kind, target, label, role } }: { invitation: I
   useEffect(() => next.current?.focus(), []);
   return (
     <>
-      <h1>{role === "owner" ? texts.invitation.taken(label) : texts.invitation.accepted(label)}</h1>
+      <h1>{role === "owner" ? texts.invitation.transferred(label) : texts.invitation.accepted(label)}</h1>
       <p>
         <a class="elsewhere" ref={next} data-testid="open-it" href={address}>
-          {kind === "agent" ? texts.invitation.toDevices : texts.invitation.openIt(label)}
+          {kind === "agent" ? texts.invitation.toDevices : texts.invitation.open(label)}
         </a>
       </p>
     </>
   );
 }
 
-/** The page after an account was created with the invitation: everything that is shared with it. */
+/** The page after creating an account with the invitation: everything that is shared with it. */
 function Joined({ api, fleet, account }: InvitationPageProps) {
   const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
   useEffect(() => {
-    api.spaces().then(setSpaces, (error: unknown) => setWrong(sentence(error)));
+    api.spaces().then(setSpaces, (error: unknown) => setError(sentence(error)));
   }, [api]);
   const devices = fleet.devices.value;
-  const waiting = (spaces === null && wrong === "") || devices === null;
-  const rooms = spaces?.filter(({ role }) => role !== "owner") ?? [];
-  const things = [...(devices?.values() ?? [])].map(({ info }) => info.value).filter(({ role }) => role !== "owner");
-  const nothing = !waiting && wrong === "" && rooms.length + things.length === 0;
+  const waiting = (spaces === null && error === "") || devices === null;
+  const sharedSpaces = spaces?.filter(({ role }) => role !== "owner") ?? [];
+  const sharedDevices = [...(devices?.values() ?? [])].map(({ info }) => info.value).filter(({ role }) => role !== "owner");
+  const empty = !waiting && error === "" && sharedSpaces.length + sharedDevices.length === 0;
   return (
     <>
       <h1>{texts.invitation.signedInAs(account.name)}</h1>
       <p role="status">
-        {waiting ? common.loading : nothing ? texts.invitation.joinedNothing : texts.invitation.joined}
+        {waiting ? common.loading : empty ? texts.invitation.joinedNothing : texts.invitation.joined}
       </p>
-      {wrong !== "" && <p class="notice bad">{texts.invitation.spacesFailed(wrong)}</p>}
-      {rooms.length + things.length > 0 && (
+      {error !== "" && <p class="notice bad">{texts.invitation.spacesFailed(error)}</p>}
+      {sharedSpaces.length + sharedDevices.length > 0 && (
         <Card title={texts.invitation.devices}>
           <ul class="people" data-testid="shared-with-me">
-            {rooms.map(({ id, name, role }) => (
+            {sharedSpaces.map(({ id, name, role }) => (
               <li key={id}>
                 <a class="person" href={spaceAddress(id)}>
                   {name}
@@ -213,7 +213,7 @@ function Joined({ api, fleet, account }: InvitationPageProps) {
                 <span class={`chip role-${role}`}>{common.role[role]}</span>
               </li>
             ))}
-            {things.map(({ id, label, role }) => (
+            {sharedDevices.map(({ id, label, role }) => (
               <li key={id}>
                 <a class="person" href={deviceAddress(id)}>
                   {label}

@@ -12,22 +12,22 @@ interface JoinFormProps {
   secret: string;
 }
 
-/** Make an account with an invitation, and accept it in one. */
+/** Creates an account with an invitation, and accepts the invitation. */
 export function JoinForm({ session, followed, secret }: JoinFormProps) {
   const [name, setName] = useState("");
   const [password, setPassword] = useState("");
   const [busy, setBusy] = useState(false);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
 
   const join = async (): Promise<void> => {
     setBusy(true);
-    setWrong("");
+    setError("");
     try {
-      await session.join(secret, name.trim(), password);
+      await session.createAccount(secret, name.trim(), password);
       followed.joined();
       replaceWith(invitationAddress);
     } catch (error) {
-      setWrong(sentence(error)); // What was typed stays.
+      setError(sentence(error)); // The input stays.
       setBusy(false);
     }
   };
@@ -75,7 +75,7 @@ export function JoinForm({ session, followed, secret }: JoinFormProps) {
           </p>
         </div>
         <p id="join-answer" class="field-error" aria-live="polite">
-          {wrong}
+          {error}
         </p>
         <div class="row">
           <button type="submit" class="primary" data-testid="join" disabled={busy}>

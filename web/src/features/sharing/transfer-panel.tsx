@@ -1,4 +1,4 @@
-/** Handing something over for good: the offer, those that are out, and taking them back. For its owner. */
+/** Ownership transfer: creates, lists and withdraws offers. For the owner. */
 import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
 import { useEffect, useRef, useState } from "preact/hooks";
@@ -17,22 +17,22 @@ import { usePolling } from "../../shared/hooks/use-polling";
 import "./sharing.css";
 
 /** An open offer can be accepted at any time, so it is polled at this interval [ms]. */
-const LOOK_AGAIN_MS = 5_000;
+const REFRESH_MS = 5_000;
 const VALID = ["hour", "day", "week", "month"] as const;
-const TO = [
+const RECIPIENTS = [
   ["name", texts.transfer.toName],
   ["link", texts.transfer.toLink],
 ] as const;
 
 interface TransferProps {
   api: Api;
-  of: Transferable;
-  /** All that goes along, by name. */
-  goes: readonly string[];
+  unit: Transferable;
+  /** Names of the devices that are included. */
+  included: readonly string[];
 }
 
-export function TransferPanel({ api, of, goes }: TransferProps) {
-  const { value: offers, error, refresh } = usePolling(() => api.transfers.open(of), LOOK_AGAIN_MS, [api, of.kind, of.id]);
+export function TransferPanel({ api, unit, included }: TransferProps) {
+  const { value: offers, error, refresh } = usePolling(() => api.transfers.open(unit), REFRESH_MS, [api, unit.kind, unit.id]);
   const [step, setStep] = useState<"closed" | "asking" | CreatedInvitation>("closed");
   const opener = useReturnFocus(step !== "closed");
   const open = step !== "closed" ? null : (
@@ -46,10 +46,10 @@ export function TransferPanel({ api, of, goes }: TransferProps) {
         {step === "asking" && (
           <OfferForm
             api={api}
-            of={of}
-            goes={goes}
-            onMade={(made) => {
-              setStep(made);
+            unit={unit}
+            included={included}
+            onMade={(offer) => {
+              setStep(offer);
               refresh();
             }}
             onClose={() => setStep("closed")}
@@ -67,7 +67,7 @@ export function TransferPanel({ api, of, goes }: TransferProps) {
         {offers !== null && offers.length > 0 && (
           <ul class="people" data-testid="offers">
             {offers.map((offer) => (
-              <OpenOffer key={offer.id} offer={offer} withdraw={() => api.transfers.withdraw(of, offer.id)} onGone={refresh} />
+              <OpenOffer key={offer.id} offer={offer} withdraw={() => api.transfers.withdraw(unit, offer.id)} onWithdrawn={refresh} />
             ))}
           </ul>
         )}
@@ -79,27 +79,27 @@ export function TransferPanel({ api, of, goes }: TransferProps) {
 interface OpenOfferProps {
   offer: Invitation;
   withdraw: () => Promise<void>;
-  onGone: () => void;
+  onWithdrawn: () => void;
 }
 
-function OpenOffer({ offer: { account, expires_at: until }, withdraw, onGone }: OpenOfferProps) {
+function OpenOffer({ offer: { account, expires_at: until }, withdraw, onWithdrawn }: OpenOfferProps) {
   const name = texts.transfer.offered(account?.name ?? null);
   return (
     <li>
       <span class="person">
         {name}
-        <span class="quiet small">{texts.transfer.waits(format.until(until))}</span>
+        <span class="quiet small">{texts.transfer.pending(format.until(until))}</span>
       </span>
       <ConfirmButton
         label={texts.access.withdraw}
         description={`${texts.access.withdraw}: ${name}`}
-        question={texts.transfer.withdrawSure}
-        confirmLabel={texts.access.withdrawYes}
+        question={texts.transfer.withdrawQuestion}
+        confirmLabel={texts.access.withdrawConfirm}
         busyLabel={texts.access.withdrawing}
-        cancelLabel={texts.access.keep}
+        cancelLabel={texts.access.cancel}
         onConfirm={async () => {
           await withdraw();
-          onGone();
+          onWithdrawn();
         }}
       />
     </li>
@@ -111,38 +111,38 @@ interface OfferFormProps extends TransferProps {
   onClose: () => void;
 }
 
-/** What was typed stays until it has come to something. */
-function OfferForm({ api, of, goes, onMade, onClose }: OfferFormProps) {
-  const [to, setTo] = useState<"name" | "link">("name");
+/** The input stays until the offer succeeds. */
+function OfferForm({ api, unit, included, onMade, onClose }: OfferFormProps) {
+  const [recipient, setRecipient] = useState<"name" | "link">("name");
   const [name, setName] = useState("");
   const [valid, setValid] = useState(ONE_DAY);
   const [busy, setBusy] = useState(false);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
   const form = useRef<HTMLFormElement>(null);
   useEffect(() => form.current?.querySelector("input")?.focus(), []);
   const send = async (): Promise<void> => {
-    setWrong("");
+    setError("");
     setBusy(true);
     try {
-      onMade(await api.transfers.offer(of, to === "name" ? name.trim() : null, seconds(valid) ?? 0));
+      onMade(await api.transfers.offer(unit, recipient === "name" ? name.trim() : null, seconds(valid) ?? 0));
     } catch (error) {
-      setWrong(sentence(error));
+      setError(sentence(error));
       setBusy(false);
     }
   };
   const { todo, doing, title } = texts.transfer;
-  const props = { label: title, submitLabel: todo, busyLabel: doing, busy, error: wrong, form, messageId: "transfer-answer", submitTestId: "transfer-send" };
+  const formProps = { label: title, submitLabel: todo, busyLabel: doing, busy, error, form, messageId: "transfer-answer", submitTestId: "transfer-send" };
   return (
-    <InlineForm {...props} onSubmit={send} onClose={onClose}>
+    <InlineForm {...formProps} onSubmit={send} onClose={onClose}>
       <ul class="terms" data-testid="transfer-terms">
-        <li>{texts.transfer.goes[of.kind](goes)}</li>
+        <li>{texts.transfer.included[unit.kind](included)}</li>
         {texts.transfer.terms.map((line) => (
           <li key={line}>{line}</li>
         ))}
       </ul>
-      <Choice label={texts.transfer.to} value={to} options={TO} onChange={setTo} />
-      {to === "name" && (
-        <AccountNameField id="transfer-name" messageId="transfer-answer" value={name} invalid={wrong !== ""} onInput={setName} />
+      <Choice label={texts.transfer.to} value={recipient} options={RECIPIENTS} onChange={setRecipient} />
+      {recipient === "name" && (
+        <AccountNameField id="transfer-name" messageId="transfer-answer" value={name} invalid={error !== ""} onInput={setName} />
       )}
       <DurationPicker id="transfer-valid" label={texts.transfer.valid} value={valid} choices={VALID} onChange={setValid} />
     </InlineForm>

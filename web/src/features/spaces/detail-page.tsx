@@ -57,8 +57,8 @@ export function SpacePage({ api, fleet, account, id }: SpacePageProps) {
             api={api}
             account={account}
             target={{ kind: "space", id }}
-            whole={{ kind: "space", id }}
-            goes={inIt.map(({ info }) => info.value.label)}
+            unit={{ kind: "space", id }}
+            included={inIt.map(({ info }) => info.value.label)}
             owner={space.owner}
             role={space.role}
             onLeft={() => {

@@ -1,6 +1,6 @@
 import { describe, expect, it } from "vitest";
 import { entryText, type Names } from "../../../src/features/account/audit-entry-text";
-import { ALL_ENTRIES, AuditReader, accountIdsOf, subjectOf } from "../../../src/features/account/model/audit-log";
+import { ALL_ENTRIES, AuditReader, accountNamesOf, subjectOf } from "../../../src/features/account/model/audit-log";
 import type { AuditRecord } from "../../../src/shared/api/sharing";
 import { server } from "../../support/console";
 import { list, ok, problem } from "../../support/fake-server";
@@ -24,16 +24,16 @@ describe("the audit log", () => {
     const serve = (): void => server.on(AUDIT, ({ query }) => ok(pages.get(query.get("cursor"))));
     serve();
     const reader = new AuditReader(server.api);
-    await reader.ask({ ...ALL_ENTRIES, event: "signed-in" });
+    await reader.load({ ...ALL_ENTRIES, event: "signed-in" });
     expect(server.calls[0]?.query.get("event")).toBe("signed-in");
     expect(reader.records.value.map(({ seq }) => seq)).toEqual([90]);
     expect(reader.more.value).toBe(true);
     server.on(AUDIT, problem(503, "busy", "Try again in a moment."));
-    await reader.older();
-    expect(reader.trouble.value).toBe("Try again in a moment.");
+    await reader.loadOlder();
+    expect(reader.error.value).toBe("Try again in a moment.");
     expect(reader.records.value).toHaveLength(1);
     serve();
-    await reader.older();
+    await reader.loadOlder();
     expect(reader.records.value.map(({ seq }) => seq)).toEqual([90, 12]);
     expect(reader.more.value).toBe(false);
   });
@@ -41,13 +41,13 @@ describe("the audit log", () => {
   it("ignores the response to a previous filter", async () => {
     server.on(AUDIT, list(record({ seq: 1 })));
     const reader = new AuditReader(server.api);
-    await Promise.all([reader.ask(ALL_ENTRIES), reader.ask({ ...ALL_ENTRIES, event: "shared" })]);
+    await Promise.all([reader.load(ALL_ENTRIES), reader.load({ ...ALL_ENTRIES, event: "shared" })]);
     expect(reader.records.value).toHaveLength(1);
     expect(reader.busy.value).toBe(false);
   });
 
   it("offers the accounts that acted or received access as filters, but no API keys", () => {
-    const accounts = accountIdsOf([
+    const accounts = accountNamesOf([
       record({ account: "a1", actor: "Ann" }),
       record({ account: "a1", actor: "Ann (dashboard)", key: "k1" }),
       record({ account: "", actor: "", data: { with: "b2", name: "Bob" } }),
@@ -73,7 +73,7 @@ describe("the audit log", () => {
   ])("describes %s %o", (event, part, text) => {
     const names: Names = {
       accounts: new Map([["b2", "Bob"]]),
-      things: new Map([["abc-arm", "Arm"], ["lab", "Laboratory"]]),
+      targets: new Map([["abc-arm", "Arm"], ["lab", "Laboratory"]]),
       keys: new Map([["k1", "dashboard"]]),
     };
     expect(entryText(record({ event, ...part }), names).startsWith(text)).toBe(true);

@@ -23,22 +23,22 @@ describe("a session", () => {
     await session.start("good");
     expect(session.state.value).toMatchObject({ kind: "in", account: { name: "Demo" } });
     await session.signOut();
-    expect(session.state.value).toEqual({ kind: "out", why: "" });
+    expect(session.state.value).toEqual({ kind: "out", reason: "" });
   });
 
   it("signs in with a name and a password, or rejects them", async () => {
-    await expect(session.enter("demo", "wrong")).rejects.toMatchObject({ status: 401 });
+    await expect(session.signInWithPassword("demo", "wrong")).rejects.toMatchObject({ status: 401 });
     expect(session.state.value.kind).not.toBe("in");
-    await session.enter("demo", "right");
+    await session.signInWithPassword("demo", "right");
     expect(session.state.value).toMatchObject({ kind: "in", account: { name: "Demo" } });
   });
 
   it("starts with a new account of an invitation, or reports why there is none", async () => {
     server.on("POST /auth/accounts", problem(409, "name-taken", "This name is taken."));
-    await expect(session.join("secret", "Bob", "correct horse battery")).rejects.toMatchObject({ code: "name-taken" });
+    await expect(session.createAccount("secret", "Bob", "correct horse battery")).rejects.toMatchObject({ code: "name-taken" });
     expect(session.state.value.kind).not.toBe("in");
     server.on("POST /auth/accounts", ok({ account: { id: "bob", name: "Bob" }, session: "s1", csrf_token: CSRF }));
-    await session.join("secret", "Bob", "correct horse battery");
+    await session.createAccount("secret", "Bob", "correct horse battery");
     expect(session.state.value.kind).toBe("in");
     expect(server.callsTo("POST /auth/accounts")[1]?.body).toEqual({ invitation: "secret", name: "Bob", password: "correct horse battery" });
   });
@@ -48,15 +48,15 @@ describe("a session", () => {
     expect(session.state.value.kind).toBe("in");
     server.on("GET /accounts/me", problem(401, "unauthorized", "Sign in first."));
     await session.start(null, "Not there.");
-    expect(session.state.value).toEqual({ kind: "out", why: "Not there." });
+    expect(session.state.value).toEqual({ kind: "out", reason: "Not there." });
   });
 
   it("reports why a sign-in link failed, and shows no error on a first visit", async () => {
     await session.start("used");
-    expect(session.state.value).toEqual({ kind: "out", why: expect.stringContaining("used before") as string });
+    expect(session.state.value).toEqual({ kind: "out", reason: expect.stringContaining("used before") as string });
     server.on("GET /accounts/me", problem(401, "signed-out", "You are not signed in."));
     await session.start(null);
-    expect(session.state.value).toEqual({ kind: "out", why: "" });
+    expect(session.state.value).toEqual({ kind: "out", reason: "" });
   });
 });
 

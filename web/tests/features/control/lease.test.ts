@@ -58,7 +58,7 @@ describe("control of a device", () => {
     expect(renewals).toHaveLength(9);
   });
 
-  it("is lost at once when the server rejects the renewal, and the stream ends", async () => {
+  it("is lost immediately when the server rejects the renewal, and the stream ends", async () => {
     await control.take();
     await pass(LEASE_MS / 3 - 500);
     control.streamer.value?.setTarget("elbow", 1);
@@ -69,7 +69,7 @@ describe("control of a device", () => {
     expect(setpoints.published.length).toBeGreaterThan(10);
     renewal = () => problem(409, "lease-lost", "Ann has control.");
     await pass(110);
-    expect(control.state.value).toEqual({ kind: "lost", why: "Ann has control." });
+    expect(control.state.value).toEqual({ kind: "lost", reason: "Ann has control." });
     expect(control.streamer.value).toBeNull();
     expect(setpoints.status.value.state).toBe("closed");
     const sent = setpoints.published.length;
@@ -97,7 +97,7 @@ describe("control of a device", () => {
   it.each([
     ["telemetry", "tele/joints", () => telemetry({ epoch: 6 })],
     ["state", "state", () => state(6)],
-  ])("is lost at once when the robot's %s contains a newer epoch", async (_, kind, message) => {
+  ])("is lost immediately when the robot's %s contains a newer epoch", async (_, kind, message) => {
     await control.take();
     deliver(kind, message());
     await pass(1);
@@ -120,7 +120,7 @@ describe("control of a device", () => {
     server.on(`POST ${LEASE}`, problem(409, "lease-held", "Ann has control."));
     server.on(`GET ${LEASE}`, ok({ lease: { holder: "Ann", epoch: 4, expires_at: EXPIRES, mine: false } }));
     await control.take();
-    expect(control.state.value).toEqual({ kind: "refused", why: "Ann has control." });
+    expect(control.state.value).toEqual({ kind: "refused", reason: "Ann has control." });
     expect(control.epoch).toBeNull();
     await pass(1);
     expect(device.lease.value?.holder).toBe("Ann");
@@ -157,7 +157,7 @@ describe("control of a device", () => {
 
 describe("a request for control", () => {
   let answer: Answer | (() => never);
-  const asking = (): ControlRequestState => control.asking.state.value;
+  const asking = (): ControlRequestState => control.outgoingRequest.state.value;
 
   beforeEach(() => {
     device.setLease({ holder: "Ann", epoch: 5, expires_at: EXPIRES, mine: false });
@@ -168,65 +168,65 @@ describe("a request for control", () => {
   });
 
   it("gives control in the new epoch after it is accepted, without another click", async () => {
-    await control.asking.ask();
-    expect(asking()).toMatchObject({ kind: "open", id: "r1", shown: true, of: "Ann" });
+    await control.outgoingRequest.send();
+    expect(asking()).toMatchObject({ kind: "open", id: "r1", published: true, holder: "Ann" });
     await pass(2_000);
     expect(control.epoch).toBeNull();
     answer = ok(request("accepted"));
     await pass(1_000);
     expect(control.epoch).toBe(6);
     expect(renewals).toEqual([6]);
-    expect(asking()).toEqual({ kind: "over", how: "accepted", of: "Ann" });
+    expect(asking()).toEqual({ kind: "ended", outcome: "accepted", holder: "Ann" });
   });
 
-  it("is read at once when the robot reports the new epoch", async () => {
+  it("is read immediately when the robot reports the new epoch", async () => {
     deliver("state", state(5, "Ann", { lease: { holder: "Ann", epoch: 5, expires_in_ms: 30_000, request: { id: "r1", requester: "Bob", expires_in_ms: 30_000 } } }));
-    await control.asking.ask();
+    await control.outgoingRequest.send();
     answer = ok(request("accepted"));
     deliver("state", state(6, "Bob"));
     await pass(10);
     expect(control.epoch).toBe(6);
   });
 
-  it.each(["rejected", "expired", "ended"] as const)("reports that it was %s, and gives no control", async (how) => {
-    await control.asking.ask();
-    answer = ok(request(how));
+  it.each(["rejected", "expired", "ended"] as const)("reports that it was %s, and gives no control", async (outcome) => {
+    await control.outgoingRequest.send();
+    answer = ok(request(outcome));
     await pass(1_000);
-    expect(asking()).toEqual({ kind: "over", how, of: "Ann" });
+    expect(asking()).toEqual({ kind: "ended", outcome, holder: "Ann" });
     expect(control.state.value).toEqual({ kind: "none" });
-    control.read();
+    control.dismiss();
     expect(asking()).toEqual({ kind: "none" });
   });
 
   it("can be withdrawn, unless it was accepted at the same moment", async () => {
-    await control.asking.ask();
-    await control.asking.withdraw();
-    expect(asking()).toMatchObject({ kind: "over", how: "withdrawn" });
-    await control.asking.ask();
+    await control.outgoingRequest.send();
+    await control.outgoingRequest.withdraw();
+    expect(asking()).toMatchObject({ kind: "ended", outcome: "withdrawn" });
+    await control.outgoingRequest.send();
     server.on(`DELETE ${REQUEST}`, problem(409, "control-request-closed", "Accepted."));
     answer = ok(request("accepted"));
-    await control.asking.withdraw();
+    await control.outgoingRequest.withdraw();
     await pass(10);
     expect(control.epoch).toBe(6);
   });
 
   it("stays open during an outage of the server, until its deadline", async () => {
-    await control.asking.ask();
+    await control.outgoingRequest.send();
     answer = unreachable;
     await pass(29_000);
     expect(asking().kind).toBe("open");
     await pass(8_000);
-    expect(asking()).toMatchObject({ kind: "over", how: "expired" });
+    expect(asking()).toMatchObject({ kind: "ended", outcome: "expired" });
   });
 
   it("reports why it failed", async () => {
     server.on(`POST ${LEASE}/requests`, problem(409, "lease-requested", "Eve asks already."));
-    await control.asking.ask();
-    expect(asking()).toEqual({ kind: "failed", why: "Eve asks already." });
+    await control.outgoingRequest.send();
+    expect(asking()).toEqual({ kind: "failed", reason: "Eve asks already." });
   });
 
   it("is withdrawn when the page closes", async () => {
-    await control.asking.ask();
+    await control.outgoingRequest.send();
     control.dispose();
     await pass(5_000);
     expect(server.callsTo(`DELETE ${REQUEST}`)).toHaveLength(1);
@@ -245,20 +245,20 @@ describe("the holder's response to a request", () => {
   });
 
   it("is possible while the robot reports the request", () => {
-    expect(control.asked.value).toMatchObject({ id: "r1", by: "Bob" });
-    expect((control.asked.value?.until ?? 0) - performance.now()).toBeCloseTo(20_000, -2);
+    expect(control.incomingRequest.value).toMatchObject({ id: "r1", by: "Bob" });
+    expect((control.incomingRequest.value?.until ?? 0) - performance.now()).toBeCloseTo(20_000, -2);
     deliver("state", state(5, "Ann"));
-    expect(control.asked.value).toBeNull();
+    expect(control.incomingRequest.value).toBeNull();
   });
 
   it("is possible for a request that only the cloud reports", () => {
     deliver("state", state(4, "Ann"));
     device.setLease({ holder: "Ann", epoch: 5, expires_at: EXPIRES, mine: true, request: request() });
-    expect(control.asked.value).toMatchObject({ id: "r1", by: "Bob" });
+    expect(control.incomingRequest.value).toMatchObject({ id: "r1", by: "Bob" });
   });
 
   it("hands control over and ends the stream; the new operator's lease is not released", async () => {
-    const answered = control.answer(true);
+    const answered = control.respond(true);
     deliver("state", state(6, "Bob")); // The robot's report arrives before the server's response.
     await pass(0);
     expect(control.state.value).toEqual({ kind: "handed", to: "Bob" });
@@ -270,16 +270,16 @@ describe("the holder's response to a request", () => {
   });
 
   it("keeps control", async () => {
-    await control.answer(false);
+    await control.respond(false);
     expect(control.epoch).toBe(5);
-    expect(control.answered.value).toEqual({ kind: "kept", from: "Bob" });
+    expect(control.response.value).toEqual({ kind: "kept", from: "Bob" });
   });
 
   it("keeps control if it was too late", async () => {
     server.on(`POST ${REQUEST}/accept`, problem(409, "control-request-closed", "It was not answered in time."));
-    await control.answer(true);
+    await control.respond(true);
     expect(control.epoch).toBe(5);
-    expect(control.answered.value).toEqual({ kind: "failed", why: "It was not answered in time." });
+    expect(control.response.value).toEqual({ kind: "failed", reason: "It was not answered in time." });
   });
 });
 
@@ -290,15 +290,15 @@ describe("the other viewers", () => {
     server.on(`PUT ${viewers}`, ok({ ...(list(bob).body as object), refresh_ms: 10_000 }));
     server.on(`DELETE ${viewers}`, none);
     const watchers = new Watchers(server.api, DEVICE);
-    watchers.seen(true);
-    watchers.seen(true);
+    watchers.setVisible(true);
+    watchers.setVisible(true);
     await pass(25_000);
     expect(server.callsTo(`PUT ${viewers}`)).toHaveLength(3);
     expect(watchers.others.value).toEqual([bob]);
     server.on(`PUT ${viewers}`, unreachable);
     await pass(10_000);
     expect(watchers.others.value).toBeNull();
-    watchers.seen(false);
+    watchers.setVisible(false);
     await pass(60_000);
     expect(server.calls.map(({ route }) => route.split(" ")[0])).toEqual(["PUT", "PUT", "PUT", "PUT", "DELETE"]);
   });

@@ -38,11 +38,11 @@ describe("stop", () => {
 
   it("is sent over MQTT and HTTP, and republished with a warning until the robot confirms it", async () => {
     stop.press("test");
-    expect(stop.state.value).toEqual({ kind: "sending", doubtful: false });
+    expect(stop.state.value).toEqual({ kind: "sending", overdue: false });
     expect(stops()).toMatchObject([{ caller: "Demo", reason: "test" }]);
     expect(server.callsTo(`POST ${STOP}`)).toHaveLength(1);
     await pass(1_500);
-    expect(stop.state.value).toEqual({ kind: "sending", doubtful: true });
+    expect(stop.state.value).toEqual({ kind: "sending", overdue: true });
     expect(stops().length).toBeGreaterThan(4);
     latched();
     await pass(0);
@@ -69,14 +69,14 @@ describe("stop", () => {
     device.update(listed({ role: "viewer" }));
     stop.press("test");
     expect(stop.state.value.kind).toBe("clear");
-    expect(stop.problem.value).toContain("watch");
+    expect(stop.error.value).toContain("watch");
     expect([stops(), server.callsTo(`POST ${STOP}`)]).toEqual([[], []]);
   });
 
   it("stays latched until it is reset, and no motion resumes", async () => {
     await control.take();
     control.streamer.value?.setTarget("shoulder_pan", 3);
-    control.stopped();
+    control.onStop();
     stop.press();
     latched();
     await pass(300);
@@ -139,7 +139,7 @@ describe("an action", () => {
     const actions = runner();
     server.on(ACTIONS, problem(409, "device-busy", "The arm is running home."));
     await actions.start(WAVE, null);
-    expect(actions.run.value).toMatchObject({ status: "refused", why: "The arm is running home." });
+    expect(actions.run.value).toMatchObject({ status: "refused", reason: "The arm is running home." });
   });
 
   it("is sent again with the same key if the server was unreachable", async () => {
@@ -155,9 +155,9 @@ describe("an action", () => {
     const actions = runner();
     deliver("desc", { ...description, actions: ["move_joints", "take_posture", "say"] });
     deliver("tele/joints", telemetry({ position_rad: [0, 0, 1.5, 0, 0, 0] }));
-    const { back } = await actions.start({ kind: "take_posture", name: "Sit" }, null);
-    expect(back).toMatchObject({ kind: "move_joints", plan: true, position_rad: { elbow: 1.5 } });
-    expect((await actions.start({ kind: "say", text: "Yes." }, null)).back).toBeNull();
+    const { undo } = await actions.start({ kind: "take_posture", name: "Sit" }, null);
+    expect(undo).toMatchObject({ kind: "move_joints", plan: true, position_rad: { elbow: 1.5 } });
+    expect((await actions.start({ kind: "say", text: "Yes." }, null)).undo).toBeNull();
   });
 });
 
@@ -182,7 +182,7 @@ describe("a command trace", () => {
     }
     expect(trace.lines.value).toHaveLength(1);
     const [line] = trace.lines.value;
-    expect(line).toMatchObject({ request: { kind: "stream" }, why: "reached", seenBy: "motion" });
+    expect(line).toMatchObject({ request: { kind: "stream" }, reason: "reached", observedBy: "motion" });
     expect(line?.steps.map(({ status }) => status)).toEqual(["sent", "accepted", "started", "observed", "done"]);
     const times = line?.steps.map(({ afterMs }) => afterMs) ?? [];
     expect(times).toEqual(times.toSorted((a, b) => a - b));
@@ -192,20 +192,20 @@ describe("a command trace", () => {
     await actions.start({ kind: "say", text: "Good morning." }, 5);
     ack("accepted");
     deliver("tele/joints", telemetry({ mode: "action" }));
-    expect(trace.lines.value[0]).toMatchObject({ status: "started", seenBy: "state" });
+    expect(trace.lines.value[0]).toMatchObject({ status: "started", observedBy: "state" });
     ack("done");
     const [line] = trace.lines.value;
     expect(line?.status).toBe("done");
-    expect(line?.steps.map(({ heard }) => heard)).toEqual(["page", "device", "cloud", "device", "device"]);
+    expect(line?.steps.map(({ source }) => source)).toEqual(["page", "device", "cloud", "device", "device"]);
   });
 
   it("does not report motion that did not occur", async () => {
     await actions.start({ kind: "take_posture", name: "Sit" }, 5);
     deliver("tele/joints", telemetry({ mode: "action" }));
-    expect(trace.lines.value[0]?.seenBy).toBeNull();
+    expect(trace.lines.value[0]?.observedBy).toBeNull();
     ack("done");
     await pass(500);
     deliver("tele/joints", telemetry());
-    expect(trace.lines.value[0]?.seenBy).toBe("state");
+    expect(trace.lines.value[0]?.observedBy).toBe("state");
   });
 });

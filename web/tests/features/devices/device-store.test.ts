@@ -35,16 +35,16 @@ describe("a device", () => {
     deliver("state", state(2));
     const before = device.state.value;
     deliver("state", '{"mode":');
-    expect(device.trouble.value).not.toBeNull();
+    expect(device.parseError.value).not.toBeNull();
     expect(device.state.value).toBe(before);
     deliver("state", state(3));
-    expect(device.trouble.value).toBeNull();
+    expect(device.parseError.value).toBeNull();
     expect(device.state.value?.epoch).toBe(3);
   });
 
   it("rejects telemetry with a different number of joints", () => {
     deliver("tele/joints", telemetry({ position_rad: [7], velocity_rad_s: [0], effort_nm: [0], commanded_rad: [7] }));
-    expect(device.trouble.value).toContain("1 joints");
+    expect(device.parseError.value).toContain("1 joints");
     expect(device.telemetry.value?.message.position_rad).toHaveLength(6);
   });
 
@@ -59,7 +59,7 @@ describe("a device", () => {
 });
 
 describe("the lease holder", () => {
-  it("is reported by the robot, unless the cloud has a newer lease or the robot is silent", async () => {
+  it("is reported by the robot, unless the cloud has a newer lease or the robot sends nothing", async () => {
     const lease = (epoch: number, inMs: number): void =>
       device.setLease({ holder: "Cloud", epoch, expires_at: new Date(Date.now() + inMs).toISOString(), mine: false });
     deliver("state", state(3, "Ann"));
@@ -78,7 +78,7 @@ describe("the lease holder", () => {
 });
 
 describe("the fleet", () => {
-  it("names spaces, and is read again at once when the connection is cut", async () => {
+  it("names spaces, and is refreshed immediately when the connection is lost", async () => {
     server.on("GET /devices", list(listed()));
     server.on("GET /spaces", list({ id: "lab", name: "Laboratory" }));
     const fleet = new Fleet(server.api, link);

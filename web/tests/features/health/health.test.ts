@@ -1,5 +1,5 @@
 import { describe, expect, it } from "vitest";
-import { healthNow, intervalAround, openCount, standings, watchedQuantity, worstFirst } from "../../../src/features/health/model/health";
+import { healthNow, intervalAround, openCount, compareFaults, watchedQuantity, worstFirst } from "../../../src/features/health/model/health";
 import type { Fault, MonitoredField } from "../../../src/shared/api/health";
 
 const fault = (code: string, more: Partial<Fault> = {}): Fault => ({
@@ -16,9 +16,9 @@ describe("an open fault", () => {
     ["both report it", [driver], [reported("driver")], ["same"]],
     ["the cloud has not stored it yet", [detected], [reported("driver")], ["unstored", "same"]],
     ["it has ended at the device", [driver], [], ["ended"]],
-    ["the device is unreachable", [driver, fault("silent", { source: "cloud" })], null, ["unheard", "same"]],
+    ["the device is unreachable", [driver, fault("silent", { source: "cloud" })], null, ["unreachable", "same"]],
   ])("names its source when %s", (_, stored, told, agreement) => {
-    expect(standings(stored, told).map((standing) => standing.agreement)).toEqual(agreement);
+    expect(compareFaults(stored, told).map((standing) => standing.agreement)).toEqual(agreement);
   });
 
   it("counts once, by the device's report if it is reachable", () => {

@@ -1,5 +1,5 @@
 import { beforeEach, describe, expect, it } from "vitest";
-import { LatencyProbe, TIMES, probeKindsOf } from "../../../src/features/latency/model/probe";
+import { LatencyProbe, SAMPLES_PER_KIND, probeKindsOf } from "../../../src/features/latency/model/probe";
 import { PUBLISHED, UR5_TABLE_2, publishedFor } from "../../../src/features/latency/model/published-figures";
 import { csv, distribution, figuresOf, linesOf, type Line } from "../../../src/features/latency/model/latency-stats";
 import type { Sample, StoredLatency } from "../../../src/shared/api/latency";
@@ -81,12 +81,12 @@ describe("a latency probe", () => {
 
   it("measures each path twenty times and stores each result once", async () => {
     await run("cloud", "broker", "device");
-    expect([server.callsTo(HEALTH).length, link.pings, server.callsTo(SHOOT).length]).toEqual([TIMES, TIMES, TIMES]);
+    expect([server.callsTo(HEALTH).length, link.pings, server.callsTo(SHOOT).length]).toEqual([SAMPLES_PER_KIND, SAMPLES_PER_KIND, SAMPLES_PER_KIND]);
     const paths = server.callsTo(STORE).map(({ body }) => [body["path"], (body["samples"] as object[]).length]);
-    expect(paths).toEqual([["operator-cloud", TIMES], ["operator-cloud", TIMES], ["operator-device", TIMES]]);
+    expect(paths).toEqual([["operator-cloud", SAMPLES_PER_KIND], ["operator-cloud", SAMPLES_PER_KIND], ["operator-device", SAMPLES_PER_KIND]]);
     await probe.store();
     expect(server.callsTo(STORE)).toHaveLength(3);
-    expect(probe.lines.map((line) => line.samples.length)).toEqual([TIMES, TIMES, TIMES]);
+    expect(probe.lines.map((line) => line.samples.length)).toEqual([SAMPLES_PER_KIND, SAMPLES_PER_KIND, SAMPLES_PER_KIND]);
   });
 
   it("keeps the samples before a failure, and stores them later under the same key", async () => {
@@ -94,7 +94,7 @@ describe("a latency probe", () => {
     const ping = link.ping.bind(link);
     link.ping = () => (link.pings === 3 ? Promise.reject(new Error("gone")) : ping());
     await run("broker");
-    expect([probe.lines[0]?.samples.length, probe.unstored, probe.why.value]).toEqual([3, true, "Later, please."]);
+    expect([probe.lines[0]?.samples.length, probe.unstored, probe.error.value]).toEqual([3, true, "Later, please."]);
     server.on(STORE, none);
     await probe.store();
     expect(probe.unstored).toBe(false);
@@ -105,6 +105,6 @@ describe("a latency probe", () => {
     device.update(listed({ role: "viewer" }));
     expect(probeKindsOf(device)).toEqual(["cloud", "broker"]);
     await run("broker");
-    expect([probe.lines[0]?.samples.length, server.callsTo(STORE).length]).toEqual([TIMES, 0]);
+    expect([probe.lines[0]?.samples.length, server.callsTo(STORE).length]).toEqual([SAMPLES_PER_KIND, 0]);
   });
 });

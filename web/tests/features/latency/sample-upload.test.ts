@@ -13,8 +13,8 @@ it("uploads latency samples in one batch; a failed batch is sent again with the 
   ends.push(() => samples.dispose());
   await samples.send();
   expect(server.callsTo(route)).toEqual([]);
-  roundTrip.seen(1, 1000, 1012);
-  roundTrip.seen(2, 1020, 1035);
+  roundTrip.add(1, 1000, 1012);
+  roundTrip.add(2, 1020, 1035);
   await samples.send();
   server.on(route, none);
   await samples.send();

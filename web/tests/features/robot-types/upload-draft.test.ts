@@ -9,14 +9,14 @@ const bytes = (text: string): Uint8Array => new TextEncoder().encode(text);
 const folder = (...names: string[]): Map<string, Uint8Array> => new Map(names.map((name) => [name, bytes(name)]));
 
 describe("a folder", () => {
-  it("contains the files beside its manifest, at any depth", () => {
-    const { files, left } = selectFiles(
+  it("contains the files next to its manifest, at any depth", () => {
+    const { files, ignored } = selectFiles(
       folder("my/robots/lever/robot.toml", "my/robots/lever/lever.xml", "my/robots/lever/movements/up.py",
         "my/robots/lever/meshes/hand.stl", "my/robots/lever/README.md", "my/notes.txt", "__MACOSX/lever/robot.toml",
         "my/robots/lever/.DS_Store", "my/robots/lever/"),
     );
     expect([...files.keys()].sort()).toEqual(["lever.xml", "meshes/hand.stl", "movements/up.py", "robot.toml"]);
-    expect(left).toEqual(["my/robots/lever/README.md", "my/notes.txt"]);
+    expect(ignored).toEqual(["my/robots/lever/README.md", "my/notes.txt"]);
   });
 
   it("without a manifest contains all files, without their common parent folder", () => {
@@ -39,9 +39,9 @@ describe("a finding", () => {
   it.each([
     ["lever.xml: the range of joint 'shoulder' is -0.5000 to 0.5000 rad; the manifest's must lie within (…).", "range", null, "shoulder"],
     ["lever.xml: 'hand.stl' is not among the files (line 2).", "missing", 2, "hand.stl"],
-    ["scene.xml: mismatched tag: line 3, column 15.", "torn", 3, ""],
-    ["lever.xml: XML parse error 14: Error=XML_ERROR_MISMATCHED_ELEMENT ErrorID=14 (0xe) Line number=1: XMLElement name=body.", "torn", 1, ""],
-    ["lever.xml: XML Error: invalid keyword: 'boxx' Element 'geom', line 4.", "word", 4, "boxx"],
+    ["scene.xml: mismatched tag: line 3, column 15.", "malformed", 3, ""],
+    ["lever.xml: XML parse error 14: Error=XML_ERROR_MISMATCHED_ELEMENT ErrorID=14 (0xe) Line number=1: XMLElement name=body.", "malformed", 1, ""],
+    ["lever.xml: XML Error: invalid keyword: 'boxx' Element 'geom', line 4.", "keyword", 4, "boxx"],
     ["lever.xml: XML Error: Schema violation: unrecognized element Element 'sight', line 8.", "element", 8, "sight"],
     ["lever.xml: no joint 'shoulder'; the model has: hip.", "unnamed", null, "shoulder"],
     ["robot.toml: Expected '=' after a key in a key/value pair (at line 5, column 8).", "manifest", 5, "="],
@@ -51,7 +51,7 @@ describe("a finding", () => {
     ["something new", "other", null, ""],
   ])("is classified: %s", (error, kind, line, about) => {
     const found = readFinding(error);
-    expect([found.kind, found.line, found.about]).toEqual([kind, line, about]);
+    expect([found.kind, found.line, found.subject]).toEqual([kind, line, about]);
     expect(found.file === "" || error.startsWith(found.file)).toBe(true);
   });
 
@@ -117,23 +117,23 @@ describe("a draft", () => {
 
   it("is checked when files are added, previewed, and saved with its movements", async () => {
     await draft.add(whole);
-    expect(draft.step.value).toBe("good");
+    expect(draft.step.value).toBe("valid");
     expect(draft.model.value?.twin.device).toBe("lever");
     expect(Object.keys(checker.checked[0]?.movements ?? {})).toEqual(["up", "bad"]);
     await draft.save();
     expect(draft.step.value).toBe("saved");
-    expect(draft.movements.value).toEqual([{ name: "up", why: "" }, { name: "bad", why: "Line 1: no." }]);
+    expect(draft.movements.value).toEqual([{ name: "up", error: "" }, { name: "bad", error: "Line 1: no." }]);
     expect(checker.dropped).toEqual([]);
   });
 
   it("keeps its files when it is rejected, and is checked again after a file is replaced", async () => {
     checker.errors = ["lever.xml: mismatched tag: line 3, column 1."];
     await draft.add(whole);
-    expect([draft.step.value, draft.errors.value.length]).toEqual(["wrong", 1]);
+    expect([draft.step.value, draft.errors.value.length]).toEqual(["invalid", 1]);
     checker.errors = [];
     checker.open = 1;
     await draft.replace("lever.xml", bytes("<mujoco/>"));
-    expect([draft.step.value, draft.files.value.size]).toEqual(["good", 4]);
+    expect([draft.step.value, draft.files.value.size]).toEqual(["valid", 4]);
     expect(checker.checked[1]?.files["lever.xml"]).toBe("<mujoco/>");
     expect(checker.dropped).toEqual(["look1"]);
   });
@@ -141,23 +141,23 @@ describe("a draft", () => {
   it("distinguishes rejection from an unreachable server", async () => {
     checker.failure = new ApiError(422, "manifest-invalid", "no", { errors: ["robot.toml: a.", "lever.xml: b."] });
     await draft.add(whole);
-    expect([draft.step.value, draft.errors.value.map(({ file }) => file)]).toEqual(["wrong", ["lever.xml", "robot.toml"]]);
+    expect([draft.step.value, draft.errors.value.map(({ file }) => file)]).toEqual(["invalid", ["lever.xml", "robot.toml"]]);
     checker.failure = new ApiError(0, "unreachable", "The server cannot be reached.");
     await draft.check();
-    expect([draft.step.value, draft.trouble.value, draft.errors.value]).toEqual(["unsent", "The server cannot be reached.", []]);
+    expect([draft.step.value, draft.error.value, draft.errors.value]).toEqual(["unsent", "The server cannot be reached.", []]);
     checker.failure = new ApiError(409, "robot-type-built-in", "'ur5' comes with the installation.");
     await draft.check();
-    expect([draft.step.value, draft.errors.value[0]?.file]).toEqual(["wrong", "robot.toml"]);
+    expect([draft.step.value, draft.errors.value[0]?.file]).toEqual(["invalid", "robot.toml"]);
     expect(draft.files.value.size).toBe(4);
   });
 
   it("is not sent without a manifest or if it is too large", async () => {
     await draft.add(folder("lever.xml"));
-    expect([draft.step.value, draft.fault.value]).toEqual(["wrong", "no-manifest"]);
+    expect([draft.step.value, draft.localError.value]).toEqual(["invalid", "no-manifest"]);
     await draft.add(new Map([["robot.toml", bytes("x")], ["a.stl", new Uint8Array(7_000_000)]]));
-    expect(draft.fault.value).toBe("too-large");
+    expect(draft.localError.value).toBe("too-large");
     await draft.clear();
-    expect([draft.step.value, draft.fault.value, checker.checked.length]).toEqual(["empty", null, 0]);
+    expect([draft.step.value, draft.localError.value, checker.checked.length]).toEqual(["empty", null, 0]);
   });
 
   it("discards a running check when a file changes", async () => {
@@ -167,7 +167,7 @@ describe("a draft", () => {
     expect(draft.step.value).toBe("checking");
     checker.open = 1;
     await Promise.all([first, draft.remove("movements/bad.py")]);
-    expect([draft.step.value, draft.files.value.size, draft.look.value?.id]).toEqual(["good", 3, "look2"]);
+    expect([draft.step.value, draft.files.value.size, draft.preview.value?.id]).toEqual(["valid", 3, "look2"]);
     expect(checker.dropped).toEqual(["look1"]);
     draft.dispose();
     expect(checker.dropped).toEqual(["look1", "look2"]);

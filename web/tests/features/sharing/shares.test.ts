@@ -38,18 +38,18 @@ describe("shares", () => {
   it("report a revocation that the broker has not confirmed", async () => {
     const detail = "The share has ended. The broker did not answer.";
     server.on(END, { status: 202, body: { detail } });
-    await shares.end(bob());
-    expect(shares.rest.value).toBe(detail);
+    await shares.revoke(bob());
+    expect(shares.pendingRevocation.value).toBe(detail);
     server.on(END, none);
-    await shares.end(bob());
-    expect(shares.rest.value).toBe("");
+    await shares.revoke(bob());
+    expect(shares.pendingRevocation.value).toBe("");
   });
 
   it("end immediately; undo restores role and expiry", async () => {
     stored = [bob({ role: "viewer", expires_at: new Date(Date.now() + 3_600_000).toISOString() })];
     await shares.refresh();
     const [share = bob()] = stored;
-    await shares.end(share);
+    await shares.revoke(share);
     expect(shares.shares.value).toEqual([]);
     expect(shares.ended.value).toEqual(share);
     server.on(`POST ${SHARES}`, () => {
@@ -63,7 +63,7 @@ describe("shares", () => {
   });
 
   it("offer undo again if it was rejected", async () => {
-    await shares.end(bob());
+    await shares.revoke(bob());
     server.on(`POST ${SHARES}`, problem(409, "too-many-shares", "There are too many."));
     await expect(shares.undo()).rejects.toMatchObject({ code: "too-many-shares" });
     expect(shares.ended.value).toEqual(bob());
@@ -73,10 +73,10 @@ describe("shares", () => {
     server.on(INVITATIONS, problem(503, "busy", "Try again in a moment."));
     await shares.refresh();
     expect(shares.shares.value).toEqual([bob()]);
-    expect(shares.trouble.value).toBe("Try again in a moment.");
+    expect(shares.error.value).toBe("Try again in a moment.");
     server.on(INVITATIONS, list());
     await shares.refresh();
-    expect(shares.trouble.value).toBe("");
+    expect(shares.error.value).toBe("");
   });
 
   it("last for a duration, without end, as before, or until a future date", () => {
@@ -102,7 +102,7 @@ describe("a followed invitation", () => {
     new FollowedInvitation(tab).follow("secret");
     const reloaded = new FollowedInvitation(tab);
     expect(reloaded.state.value).toEqual({ kind: "open", secret: "secret", away: false });
-    reloaded.leave();
+    reloaded.markAway();
     expect(new FollowedInvitation(tab).state.value).toEqual({ kind: "open", secret: "secret", away: true });
     reloaded.drop();
     expect(tab.entries.size).toBe(0);

@@ -6,7 +6,7 @@ import type { AuditQuery, AuditRecord } from "../../../shared/api/sharing";
 
 const PAGE = 50;
 /** A strict filter can return empty pages: this many are read before the user must continue. */
-const PAGES_AT_ONCE = 5;
+const MAX_PAGES_PER_LOAD = 5;
 
 export const ALL_ENTRIES: AuditQuery = { event: "", target: "", sinceMs: null, untilMs: null };
 
@@ -14,16 +14,16 @@ export class AuditReader {
   readonly #api: Api;
   readonly #records = signal<readonly AuditRecord[]>([]);
   readonly #busy = signal(false);
-  readonly #trouble = signal("");
+  readonly #error = signal("");
   readonly #more = signal(true);
   #query = ALL_ENTRIES;
   #cursor: string | null = null;
-  #asked = 0;
+  #generation = 0;
 
   /** The newest first. */
   readonly records: ReadonlySignal<readonly AuditRecord[]> = this.#records;
   readonly busy: ReadonlySignal<boolean> = this.#busy;
-  readonly trouble: ReadonlySignal<string> = this.#trouble;
+  readonly error: ReadonlySignal<string> = this.#error;
   /** Whether older entries may exist. */
   readonly more: ReadonlySignal<boolean> = this.#more;
 
@@ -32,37 +32,37 @@ export class AuditReader {
   }
 
   /** Restarts with another filter. */
-  ask(query: AuditQuery): Promise<void> {
+  load(query: AuditQuery): Promise<void> {
     this.#query = query;
     this.#cursor = null;
     this.#records.value = [];
     this.#more.value = true;
-    return this.older();
+    return this.loadOlder();
   }
 
   /** Reads the next page. Entries already read stay after an error. */
-  async older(): Promise<void> {
-    const asked = ++this.#asked;
+  async loadOlder(): Promise<void> {
+    const generation = ++this.#generation;
     this.#busy.value = true;
-    this.#trouble.value = "";
+    this.#error.value = "";
     try {
-      for (let page = 0; page < PAGES_AT_ONCE; page += 1) {
+      for (let page = 0; page < MAX_PAGES_PER_LOAD; page += 1) {
         const { items, cursor } = await this.#api.audit(this.#query, this.#cursor, PAGE);
-        if (asked !== this.#asked) return; // Another filter was chosen meanwhile.
+        if (generation !== this.#generation) return; // Another filter was chosen meanwhile.
         this.#cursor = cursor;
         this.#records.value = [...this.#records.value, ...items];
         this.#more.value = cursor !== null;
         if (cursor === null || items.length > 0) break;
       }
     } catch (error) {
-      if (asked === this.#asked) this.#trouble.value = sentence(error);
+      if (generation === this.#generation) this.#error.value = sentence(error);
     }
-    if (asked === this.#asked) this.#busy.value = false;
+    if (generation === this.#generation) this.#busy.value = false;
   }
 }
 
 /** Account names that occur in these records. */
-export function accountIdsOf(records: readonly AuditRecord[]): ReadonlyMap<string, string> {
+export function accountNamesOf(records: readonly AuditRecord[]): ReadonlyMap<string, string> {
   const names = new Map<string, string>();
   for (const { account: id, actor, key, data } of records) {
     // For an API key, the name includes the key's name.
@@ -74,7 +74,7 @@ export function accountIdsOf(records: readonly AuditRecord[]): ReadonlyMap<strin
 }
 
 /** The subject of a record: `device:abc-arm` → `["device", "abc-arm"]`; the kind is empty if not given. */
-export function subjectOf(on: string): [kind: string, id: string] {
-  const found = /^(device|space|agent|key):(.+)$/.exec(on);
-  return found?.[1] === undefined || found[2] === undefined ? ["", on] : [found[1], found[2]];
+export function subjectOf(target: string): [kind: string, id: string] {
+  const match = /^(device|space|agent|key):(.+)$/.exec(target);
+  return match?.[1] === undefined || match[2] === undefined ? ["", target] : [match[1], match[2]];
 }

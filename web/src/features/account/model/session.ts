@@ -7,7 +7,7 @@ import { ApiError, sentence } from "../../../shared/api/http";
 type SessionState =
   | { kind: "checking" }
   /** `why`: the error of a sign-in link or the reason for the session's end; empty on a first visit. */
-  | { kind: "out"; why: string }
+  | { kind: "out"; reason: string }
   | { kind: "in"; account: Account };
 
 export class Session {
@@ -32,18 +32,18 @@ export class Session {
       this.#state.value = { kind: "in", account: await this.#api.me() };
     } catch (error) {
       const firstVisit = link === null && error instanceof ApiError && error.status === 401;
-      this.#state.value = { kind: "out", why: firstVisit ? failed : sentence(error) };
+      this.#state.value = { kind: "out", reason: firstVisit ? failed : sentence(error) };
     }
   }
 
   /** Signs in with name and password. Throws the server's error. */
-  async enter(name: string, password: string): Promise<void> {
+  async signInWithPassword(name: string, password: string): Promise<void> {
     await this.#api.signInByPassword(name, password);
     this.#state.value = { kind: "in", account: await this.#api.me() };
   }
 
   /** Creates an account with an invitation and signs in to it. Throws the server's error. */
-  async join(invitation: string, name: string, password: string): Promise<void> {
+  async createAccount(invitation: string, name: string, password: string): Promise<void> {
     await this.#api.createAccount(invitation, name, password);
     this.#state.value = { kind: "in", account: await this.#api.me() };
   }
@@ -52,22 +52,22 @@ export class Session {
     try {
       await this.#api.signOut();
     } finally {
-      this.#state.value = { kind: "out", why: "" };
+      this.#state.value = { kind: "out", reason: "" };
     }
   }
 
   /** The session has expired on the server. */
-  ended(why: string): void {
-    if (this.#state.value.kind === "in") this.#state.value = { kind: "out", why };
+  expire(reason: string): void {
+    if (this.#state.value.kind === "in") this.#state.value = { kind: "out", reason };
   }
 }
 
 /** The token in a URL fragment, `#sign-in=<token>`, or `null`. */
 export function signInToken(hash: string): string | null {
-  const found = /^#sign-in=([^&]+)$/.exec(hash);
-  if (found?.[1] === undefined) return null;
+  const match = /^#sign-in=([^&]+)$/.exec(hash);
+  if (match?.[1] === undefined) return null;
   try {
-    return decodeURIComponent(found[1]);
+    return decodeURIComponent(match[1]);
   } catch {
     return null;
   }

@@ -29,13 +29,13 @@ export type RunStatus =
   | "unanswered";
 
 /** Source of a step: this page, the device's ack, or the cloud's response. */
-export type Channel = "page" | "device" | "cloud";
+export type StepSource = "page" | "device" | "cloud";
 
 export interface Step<Status = RunStatus> {
   status: Status;
   /** Time since the click on the page's clock [ms]. */
   afterMs: number;
-  heard: Channel;
+  source: StepSource;
 }
 
 export interface Run {
@@ -48,19 +48,19 @@ export interface Run {
   status: RunStatus;
   /** The received steps, in order. */
   steps: readonly Step[];
-  why: string;
+  reason: string;
   output: string;
   progress: number | null;
   result: Readonly<Record<string, unknown>>;
   /** The request that undoes it, if any. */
-  back: AnyRequest | null;
+  undo: AnyRequest | null;
 }
 
 export interface ActionOptions extends ActionCallOptions {
   /** The request that undoes it; by default the result of `undoRequestOf`. */
-  back?: AnyRequest;
+  undo?: AnyRequest;
   /** The cloud's response, if one call started actions on several devices. */
-  asked?: Promise<Action>;
+  response?: Promise<Action>;
 }
 
 const RANK: Readonly<Record<RunStatus, number>> = {
@@ -74,15 +74,15 @@ const RANK: Readonly<Record<RunStatus, number>> = {
   refused: 3,
   unanswered: 3,
 };
-const KEPT = 20;
+const MAX_RUNS = 20;
 const POLL_MS = 10_000;
 const RETRY_MS = 2_000;
 /** A failed call is retried with the same key for at most this long, so that no motion starts unexpectedly [ms]. */
-const AGAIN_WITHIN_MS = 2_000;
+const RETRY_WITHIN_MS = 2_000;
 /** The cloud releases the lease of a run this long after the run ends; the page then reads the holder again [ms]. */
-const LEASE_AFTER_MS = 1_000;
+const LEASE_REFRESH_DELAY_MS = 1_000;
 
-function rank(status: ActionStatus): RunStatus {
+function runStatusOf(status: ActionStatus): RunStatus {
   if (status === "queued" || status === "created" || status === "published" || status === "received") return "sent";
   return status;
 }
@@ -94,10 +94,10 @@ export function ended({ status }: { status: RunStatus }): boolean {
 export class ActionRunner {
   readonly #api: Api;
   readonly #device: DeviceStore;
-  readonly #pursuits = signal<readonly Pursuit[]>([]);
+  readonly #tracked = signal<readonly TrackedRun[]>([]);
 
   /** The last twenty actions, newest first, including ended ones. */
-  readonly runs: ReadonlySignal<readonly Run[]> = computed(() => this.#pursuits.value.map(({ run }) => run.value));
+  readonly runs: ReadonlySignal<readonly Run[]> = computed(() => this.#tracked.value.map(({ run }) => run.value));
   /** The newest action of this page. */
   readonly run: ReadonlySignal<Run | null> = computed(() => this.runs.value[0] ?? null);
 
@@ -107,48 +107,48 @@ export class ActionRunner {
   }
 
   /** Starts an action under this page's lease, or under one that the cloud takes for this run. */
-  async start(request: AnyRequest, epoch: number | null, back?: AnyRequest): Promise<Run> {
-    return this.#begin(request, back === undefined ? { epoch } : { epoch, back }).begun;
+  async start(request: AnyRequest, epoch: number | null, undo?: AnyRequest): Promise<Run> {
+    return this.#track(request, undo === undefined ? { epoch } : { epoch, undo }).firstResponse;
   }
 
   /** Tracks an action that another call started; returns the run after that call's response. */
-  async follow(request: AnyRequest, asked: Promise<Action>): Promise<Run> {
-    return this.#begin(request, { epoch: null, asked }).begun;
+  async follow(request: AnyRequest, response: Promise<Action>): Promise<Run> {
+    return this.#track(request, { epoch: null, response }).firstResponse;
   }
 
   /** Starts an action and waits for the requested status or the end. */
-  async ask(request: AnyRequest, asking: ActionOptions): Promise<Run> {
-    return this.#begin(request, asking).reached(asking.waitFor ?? "done");
+  async startAndWait(request: AnyRequest, options: ActionOptions): Promise<Run> {
+    return this.#track(request, options).waitFor(options.waitFor ?? "done");
   }
 
   /** Cancels the newest run of this page, or action `other` of another caller. Returns the error, or "". */
-  async cancel(other: string | null): Promise<string> {
-    const newest = this.#pursuits.value[0];
-    const id = other ?? newest?.run.value.id;
+  async cancel(otherId: string | null): Promise<string> {
+    const newest = this.#tracked.value[0];
+    const id = otherId ?? newest?.run.value.id;
     if (id === undefined || id === null) return "";
     try {
       await this.#api.cancelAction(id);
       return "";
     } catch (error) {
-      if (other === null) newest?.note(sentence(error));
+      if (otherId === null) newest?.setReason(sentence(error));
       return sentence(error);
     }
   }
 
   dispose(): void {
-    for (const pursuit of this.#pursuits.value) pursuit.dispose();
+    for (const tracked of this.#tracked.value) tracked.dispose();
   }
 
-  #begin(request: AnyRequest, asking: ActionOptions): Pursuit {
-    const pursuit = new Pursuit(this.#api, this.#device, request, asking);
-    for (const old of this.#pursuits.value.slice(KEPT - 1)) old.dispose();
-    this.#pursuits.value = [pursuit, ...this.#pursuits.value].slice(0, KEPT);
-    return pursuit;
+  #track(request: AnyRequest, options: ActionOptions): TrackedRun {
+    const tracked = new TrackedRun(this.#api, this.#device, request, options);
+    for (const oldest of this.#tracked.value.slice(MAX_RUNS - 1)) oldest.dispose();
+    this.#tracked.value = [tracked, ...this.#tracked.value].slice(0, MAX_RUNS);
+    return tracked;
   }
 }
 
 /** One request in progress. */
-class Pursuit {
+class TrackedRun {
   readonly #api: Api;
   readonly #device: DeviceStore;
   readonly #run;
@@ -157,9 +157,9 @@ class Pursuit {
 
   readonly run: ReadonlySignal<Run>;
   /** The run after the cloud's first response. */
-  readonly begun: Promise<Run>;
+  readonly firstResponse: Promise<Run>;
 
-  constructor(api: Api, device: DeviceStore, request: AnyRequest, asking: ActionOptions) {
+  constructor(api: Api, device: DeviceStore, request: AnyRequest, options: ActionOptions) {
     this.#api = api;
     this.#device = device;
     this.#run = signal<Run>({
@@ -168,26 +168,26 @@ class Pursuit {
       clickedAt: now(),
       id: null,
       status: "sent",
-      steps: [{ status: "sent", afterMs: 0, heard: "page" }],
-      why: "",
+      steps: [{ status: "sent", afterMs: 0, source: "page" }],
+      reason: "",
       output: "",
       progress: null,
       result: {},
-      back: asking.back ?? undoRequestOf(device, request),
+      undo: options.undo ?? undoRequestOf(device, request),
     });
     this.run = this.#run;
-    this.begun = this.#begin(asking);
-    if (asking.epoch !== null) return;
-    void this.reached("done").then(() => setTimeout(() => void this.#refreshLease(), LEASE_AFTER_MS));
+    this.firstResponse = this.#start(options);
+    if (options.epoch !== null) return;
+    void this.waitFor("done").then(() => setTimeout(() => void this.#refreshLease(), LEASE_REFRESH_DELAY_MS));
   }
 
   /** The run when it reaches the status or ends. */
-  reached(status: "started" | "done"): Promise<Run> {
+  waitFor(status: "started" | "done"): Promise<Run> {
     return new Promise((resolve) => {
-      const forget = effect(() => {
+      const unsubscribe = effect(() => {
         const run = this.#run.value;
         if (RANK[run.status] < RANK[status] && !this.#disposed) return;
-        queueMicrotask(() => forget());
+        queueMicrotask(() => unsubscribe());
         resolve(run);
       });
     });
@@ -197,8 +197,8 @@ class Pursuit {
     if (!this.#disposed) await this.#device.refreshLease();
   }
 
-  note(why: string): void {
-    this.#run.value = { ...this.#run.value, why };
+  setReason(reason: string): void {
+    this.#run.value = { ...this.#run.value, reason };
   }
 
   dispose(): void {
@@ -208,31 +208,31 @@ class Pursuit {
     this.#run.value = { ...this.#run.value };
   }
 
-  async #begin(asking: ActionOptions): Promise<Run> {
+  async #start(options: ActionOptions): Promise<Run> {
     try {
-      const action = await this.#post(asking);
+      const action = await this.#post(options);
       if (this.#disposed) return this.#run.value;
       this.#run.value = { ...this.#run.value, id: action.id };
       // Apply the device's acks first: they arrived before this response.
-      this.#endAcks = this.#device.onAck(action.id, (ack, at) => this.#hearAck(ack, at));
-      this.#hear(action);
+      this.#endAcks = this.#device.onAck(action.id, (ack, at) => this.#applyAck(ack, at));
+      this.#applyResponse(action);
       void this.#poll(action.id);
     } catch (error) {
-      const silent = error instanceof ApiError && error.status === 0;
-      this.#advance(silent ? "unanswered" : "refused", { why: sentence(error) }, "cloud", now());
+      const unreachable = error instanceof ApiError && error.status === 0;
+      this.#advance(unreachable ? "unanswered" : "refused", { reason: sentence(error) }, "cloud", now());
     }
     return this.#run.value;
   }
 
-  async #post(asking: ActionOptions): Promise<Action> {
-    if (asking.asked !== undefined) return asking.asked;
+  async #post(options: ActionOptions): Promise<Action> {
+    if (options.response !== undefined) return options.response;
     const { request, key, clickedAt } = this.#run.value;
     try {
-      return await this.#api.startAction(this.#device.id, request, asking, key);
+      return await this.#api.startAction(this.#device.id, request, options, key);
     } catch (error) {
-      const again = error instanceof ApiError && error.status === 0 && now() - clickedAt < AGAIN_WITHIN_MS;
-      if (!again) throw error;
-      return this.#api.startAction(this.#device.id, request, asking, key);
+      const retry = error instanceof ApiError && error.status === 0 && now() - clickedAt < RETRY_WITHIN_MS;
+      if (!retry) throw error;
+      return this.#api.startAction(this.#device.id, request, options, key);
     }
   }
 
@@ -240,10 +240,10 @@ class Pursuit {
   async #poll(id: string): Promise<void> {
     while (!this.#disposed && !ended(this.#run.value)) {
       try {
-        this.#hear(await this.#api.action(id, POLL_MS));
+        this.#applyResponse(await this.#api.action(id, POLL_MS));
       } catch (error) {
         if (error instanceof ApiError && error.status === 404) {
-          this.#advance("unanswered", { why: sentence(error) }, "cloud", now());
+          this.#advance("unanswered", { reason: sentence(error) }, "cloud", now());
           return;
         }
         await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
@@ -251,25 +251,25 @@ class Pursuit {
     }
   }
 
-  #hear(action: Action): void {
+  #applyResponse(action: Action): void {
     const run = this.#run.value;
     const result = Object.keys(action.result).length > 0 ? action.result : run.result;
-    const told = { output: longer(action.output, run.output), progress: action.progress ?? run.progress, result };
-    this.#advance(rank(action.status), { why: action.reason?.message ?? "", ...told }, "cloud", now());
+    const update = { output: longer(action.output, run.output), progress: action.progress ?? run.progress, result };
+    this.#advance(runStatusOf(action.status), { reason: action.reason?.message ?? "", ...update }, "cloud", now());
   }
 
-  #hearAck(ack: KnownAck, at: number): void {
+  #applyAck(ack: KnownAck, at: number): void {
     const run = this.#run.value;
     const result = Object.keys(ack.result).length > 0 ? ack.result : run.result;
-    const told = { output: longer(ack.output, run.output), progress: ack.progress ?? run.progress, result };
-    this.#advance(rank(ack.status), { why: ack.reason?.message ?? run.why, ...told }, "device", at);
+    const update = { output: longer(ack.output, run.output), progress: ack.progress ?? run.progress, result };
+    this.#advance(runStatusOf(ack.status), { reason: ack.reason?.message ?? run.reason, ...update }, "device", at);
   }
 
   /** The status never moves backwards and the first terminal status stays; a late step is inserted in order. */
-  #advance(status: RunStatus, rest: Partial<Run>, heard: Channel, at: number): void {
+  #advance(status: RunStatus, rest: Partial<Run>, source: StepSource, at: number): void {
     const run = this.#run.value;
     const forward = RANK[status] > RANK[run.status];
-    const step = { status, afterMs: Math.max(0, at - run.clickedAt), heard };
+    const step = { status, afterMs: Math.max(0, at - run.clickedAt), source };
     this.#run.value = { ...run, ...rest, status: forward ? status : run.status, steps: withStep(run.steps, step) };
   }
 }

@@ -18,8 +18,8 @@ const JOINTS: ReadonlySet<AnyRequest["kind"]> = new Set([
 export function undoRequestOf(device: DeviceStore, request: AnyRequest): AnyRequest | null {
   if (request.kind === "set_stiffness") return stiffnessBefore(device, request.joints ?? []);
   const { telemetry, description } = { telemetry: device.telemetry.value, description: device.description.value };
-  const known = JOINTS.has(request.kind) && description?.actions.includes("move_joints") === true;
-  if (!known || telemetry === null || !device.live.value) return null;
+  const reversible = JOINTS.has(request.kind) && description?.actions.includes("move_joints") === true;
+  if (!reversible || telemetry === null || !device.live.value) return null;
   const positions = description.joints.flatMap((joint, index) => {
     const measured = telemetry.message.position_rad[index];
     // A servo may settle slightly outside its range: clamp, so that the undo request is accepted.

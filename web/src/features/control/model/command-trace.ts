@@ -14,7 +14,7 @@ import { moves, type AnyRequest } from "../../../shared/api/action-requests";
 export type TraceStatus = RunStatus | "observed";
 
 /** How the command was observed: measured motion, or the device's reported state. */
-export type SeenBy = "motion" | "state";
+export type ObservedBy = "motion" | "state";
 
 export interface TraceLine {
   key: string;
@@ -24,16 +24,16 @@ export interface TraceLine {
   status: RunStatus;
   steps: readonly Step<TraceStatus>[];
   /** `null` until an effect is observed. */
-  seenBy: SeenBy | null;
+  observedBy: ObservedBy | null;
   /** For an action, a sentence; for a stream, the streamer's end reason. */
-  why: string;
+  reason: string;
 }
 
-const KEPT = 20;
+const MAX_LINES = 20;
 /** Change since the click that counts as motion [rad; prismatic joints and bases: m]. */
-const MOVED = 0.005;
+const MOTION_THRESHOLD = 0.005;
 /** A joint faster than this at the click was already moving [rad/s]. */
-const UNDER_WAY_RAD_S = 0.02;
+const MOVING_RAD_S = 0.02;
 /** Telemetry up to this long after the end still counts as observation [ms]. */
 const GRACE_MS = 400;
 const ODOMETRY = "odometry";
@@ -41,10 +41,10 @@ const PLACE = ["x_m", "y_m", "yaw_rad"] as const;
 
 export class CommandTrace {
   readonly #device: DeviceStore;
-  readonly #watches = new Map<string, Watch>();
-  readonly #seen = signal<ReadonlyMap<string, Seen>>(new Map());
+  readonly #observers = new Map<string, CommandObserver>();
+  readonly #observations = signal<ReadonlyMap<string, Observation>>(new Map());
   readonly #streams = signal<readonly TraceLine[]>([]);
-  readonly #ends: (() => void)[];
+  readonly #unsubscribes: (() => void)[];
 
   /** The newest first. */
   readonly lines: ReadonlySignal<readonly TraceLine[]>;
@@ -52,47 +52,47 @@ export class CommandTrace {
   constructor(device: DeviceStore, control: Control, actions: ActionRunner) {
     this.#device = device;
     this.lines = computed(() => {
-      const seen = this.#seen.value;
-      const every = [...actions.runs.value.map(lineOf), ...this.#streams.value];
-      return every
+      const observations = this.#observations.value;
+      const all = [...actions.runs.value.map(lineOf), ...this.#streams.value];
+      return all
         .toSorted((a, b) => b.clickedAt - a.clickedAt)
-        .slice(0, KEPT)
-        .map((line) => withSeen(line, seen.get(line.key)));
+        .slice(0, MAX_LINES)
+        .map((line) => withObservation(line, observations.get(line.key)));
     });
-    this.#ends = [
+    this.#unsubscribes = [
       effect(() => {
-        for (const run of actions.runs.value) this.#attend(run);
+        for (const run of actions.runs.value) this.#track(run);
       }),
       effect(() => {
         const streamer = control.streamer.value;
         const state = streamer?.state.value ?? "idle";
-        untracked(() => this.#attendStream(streamer, state !== "idle"));
+        untracked(() => this.#trackStream(streamer, state !== "idle"));
       }),
       effect(() => {
         // Evaluate every device message on arrival.
-        const news = [device.telemetry.value, device.state.value, device.measured(ODOMETRY).value];
-        if (news.some((one) => one !== null)) untracked(() => this.#look());
+        const messages = [device.telemetry.value, device.state.value, device.measured(ODOMETRY).value];
+        if (messages.some((one) => one !== null)) untracked(() => this.#evaluate());
       }),
     ];
   }
 
   dispose(): void {
-    for (const end of this.#ends) end();
-    this.#watches.clear();
+    for (const end of this.#unsubscribes) end();
+    this.#observers.clear();
   }
 
-  #attend(run: Run): void {
-    const watch = this.#watches.get(run.key);
-    if (watch === undefined) {
-      const looked = ended(run) || this.#seen.peek().has(run.key);
-      if (!looked) this.#watches.set(run.key, untracked(() => new Watch(this.#device, run.clickedAt, moves(run.request), "action")));
+  #track(run: Run): void {
+    const observer = this.#observers.get(run.key);
+    if (observer === undefined) {
+      const done = ended(run) || this.#observations.peek().has(run.key);
+      if (!done) this.#observers.set(run.key, untracked(() => new CommandObserver(this.#device, run.clickedAt, moves(run.request), "action")));
       return;
     }
-    watch.action = run.id;
-    if (ended(run) && watch.endedAt === null) watch.endedAt = now();
+    observer.action = run.id;
+    if (ended(run) && observer.endedAt === null) observer.endedAt = now();
   }
 
-  #attendStream(streamer: SetpointStreamer | null, running: boolean): void {
+  #trackStream(streamer: SetpointStreamer | null, running: boolean): void {
     const [newest] = this.#streams.value;
     const open = newest?.status === "sent" || newest?.status === "accepted" || newest?.status === "started";
     if (running && !open) {
@@ -101,56 +101,56 @@ export class CommandTrace {
         request: { kind: "stream" },
         clickedAt: now(),
         status: "sent",
-        steps: [{ status: "sent", afterMs: 0, heard: "page" }],
-        seenBy: null,
-        why: "",
+        steps: [{ status: "sent", afterMs: 0, source: "page" }],
+        observedBy: null,
+        reason: "",
       };
-      this.#watches.set(line.key, new Watch(this.#device, line.clickedAt, true, "streaming"));
-      this.#streams.value = [line, ...this.#streams.value].slice(0, KEPT);
+      this.#observers.set(line.key, new CommandObserver(this.#device, line.clickedAt, true, "streaming"));
+      this.#streams.value = [line, ...this.#streams.value].slice(0, MAX_LINES);
     }
     if (!running && open) {
-      const why = streamer?.ended.peek() ?? "";
-      this.#stream(why === "reached" ? "done" : "cancelled", "page", why);
-      const watch = this.#watches.get(newest.key);
-      if (watch !== undefined) watch.endedAt = now();
+      const reason = streamer?.ended.peek() ?? "";
+      this.#addStreamStep(reason === "reached" ? "done" : "cancelled", "page", reason);
+      const observer = this.#observers.get(newest.key);
+      if (observer !== undefined) observer.endedAt = now();
     }
   }
 
   /** A step of the newest stream. */
-  #stream(status: RunStatus, heard: Step["heard"], why = ""): void {
+  #addStreamStep(status: RunStatus, source: Step["source"], reason = ""): void {
     const [newest, ...others] = this.#streams.value;
     if (newest === undefined || newest.steps.some((step) => step.status === status)) return;
-    const step = { status, afterMs: now() - newest.clickedAt, heard };
-    this.#streams.value = [{ ...newest, status, why, steps: [...newest.steps, step] }, ...others];
+    const step = { status, afterMs: now() - newest.clickedAt, source };
+    this.#streams.value = [{ ...newest, status, reason, steps: [...newest.steps, step] }, ...others];
   }
 
-  #look(): void {
-    this.#lookAtStream();
-    for (const [key, watch] of this.#watches) {
-      const seen = watch.look();
-      if (seen !== null) this.#seen.value = new Map([...this.#seen.value].slice(-2 * KEPT)).set(key, seen);
-      if (seen !== null || watch.over()) this.#watches.delete(key);
+  #evaluate(): void {
+    this.#evaluateStream();
+    for (const [key, observer] of this.#observers) {
+      const observation = observer.observe();
+      if (observation !== null) this.#observations.value = new Map([...this.#observations.value].slice(-2 * MAX_LINES)).set(key, observation);
+      if (observation !== null || observer.finished()) this.#observers.delete(key);
     }
   }
 
   /** Telemetry that acknowledges a setpoint of this stream shows acceptance, and then motion. */
-  #lookAtStream(): void {
+  #evaluateStream(): void {
     const [newest] = this.#streams.value;
     const message = this.#device.telemetry.value?.message;
     if (newest === undefined || message === undefined || newest.steps.some(({ status }) => status === "done" || status === "cancelled")) return;
     if (message.setpoint_sequence === 0 || message.setpoint_sent_ms < newest.clickedAt) return;
-    this.#stream("accepted", "device");
-    if (message.mode === "streaming") this.#stream("started", "device");
+    this.#addStreamStep("accepted", "device");
+    if (message.mode === "streaming") this.#addStreamStep("started", "device");
   }
 }
 
-interface Seen {
+interface Observation {
   afterMs: number;
-  by: SeenBy;
+  by: ObservedBy;
 }
 
-/** The device's pose at the click, and whether it has changed since. */
-class Watch {
+/** Observes the effect of one command: compares the device's pose and state with those at the click. */
+class CommandObserver {
   readonly #device: DeviceStore;
   readonly #since: number;
   readonly #motion: boolean;
@@ -158,7 +158,7 @@ class Watch {
   #joints: readonly number[] | null = null;
   #place: readonly number[] | null = null;
   #stiffness: string;
-  #changed: Seen | null = null;
+  #changed: Observation | null = null;
   readonly #wasBusy: boolean;
   action: string | null = null;
   endedAt: number | null = null;
@@ -172,46 +172,46 @@ class Watch {
     const message = device.telemetry.value?.message;
     this.#wasBusy = message?.mode === mode;
     this.#stiffness = JSON.stringify(device.state.value?.stiffness ?? {});
-    // A joint that already moves does so for another reason: compare with its position at the start.
-    if (message?.velocity_rad_s.every((velocity) => Math.abs(velocity) < UNDER_WAY_RAD_S) === true) this.#take();
+    // A joint that already moves has another cause: compare with its position when the command starts.
+    if (message?.velocity_rad_s.every((velocity) => Math.abs(velocity) < MOVING_RAD_S) === true) this.#readPose();
   }
 
   /** The first observation; `null` before. */
-  look(): Seen | null {
+  observe(): Observation | null {
     const telemetry = this.#device.telemetry.value;
     const state = this.#device.state.value;
     const at = now();
     const afterMs = at - this.#since;
-    const fresh = telemetry !== null && telemetry.receivedAt >= this.#since;
-    const doing = fresh && telemetry.message.mode === this.#mode;
+    const current = telemetry !== null && telemetry.receivedAt >= this.#since;
+    const inMode = current && telemetry.message.mode === this.#mode;
     if (this.#changed === null) {
-      const says = (doing && !this.#wasBusy) || (this.action !== null && state?.action?.id === this.action);
-      const stiff = state !== null && JSON.stringify(state.stiffness) !== this.#stiffness;
-      if (says || (stiff && !this.#motion)) this.#changed = { afterMs, by: "state" };
+      const reported = (inMode && !this.#wasBusy) || (this.action !== null && state?.action?.id === this.action);
+      const stiffnessChanged = state !== null && JSON.stringify(state.stiffness) !== this.#stiffness;
+      if (reported || (stiffnessChanged && !this.#motion)) this.#changed = { afterMs, by: "state" };
     }
-    if (fresh && (doing || this.endedAt !== null)) {
-      if (this.#joints === null) this.#take();
-      else if (this.#moved(telemetry.message.position_rad)) return { afterMs, by: "motion" };
+    if (current && (inMode || this.endedAt !== null)) {
+      if (this.#joints === null) this.#readPose();
+      else if (this.#hasMoved(telemetry.message.position_rad)) return { afterMs, by: "motion" };
     }
-    const wanted = !this.#motion || this.over();
-    return wanted ? this.#changed : null;
+    const sufficient = !this.#motion || this.finished();
+    return sufficient ? this.#changed : null;
   }
 
-  over(): boolean {
+  finished(): boolean {
     return this.endedAt !== null && now() - this.endedAt > GRACE_MS;
   }
 
-  #take(): void {
+  #readPose(): void {
     this.#joints = this.#device.telemetry.value?.message.position_rad ?? null;
     this.#place = placeOf(this.#device);
   }
 
-  #moved(position: readonly number[]): boolean {
+  #hasMoved(position: readonly number[]): boolean {
     const joints = this.#joints ?? [];
-    if (position.some((one, index) => Math.abs(one - (joints[index] ?? one)) > MOVED)) return true;
+    if (position.some((one, index) => Math.abs(one - (joints[index] ?? one)) > MOTION_THRESHOLD)) return true;
     const place = this.#place;
-    const here = placeOf(this.#device);
-    return here?.some((one, index) => Math.abs(one - (place?.[index] ?? one)) > MOVED) === true;
+    const current = placeOf(this.#device);
+    return current?.some((one, index) => Math.abs(one - (place?.[index] ?? one)) > MOTION_THRESHOLD) === true;
   }
 }
 
@@ -221,14 +221,14 @@ function placeOf(device: DeviceStore): readonly number[] | null {
   return PLACE.map((name) => Number(values[name] ?? 0));
 }
 
-function lineOf({ key, request, clickedAt, status, steps, why }: Run): TraceLine {
-  return { key, request, clickedAt, status, steps, why, seenBy: null };
+function lineOf({ key, request, clickedAt, status, steps, reason }: Run): TraceLine {
+  return { key, request, clickedAt, status, steps, reason, observedBy: null };
 }
 
-function withSeen(line: TraceLine, seen: Seen | undefined): TraceLine {
-  if (seen === undefined) return line;
+function withObservation(line: TraceLine, observation: Observation | undefined): TraceLine {
+  if (observation === undefined) return line;
   // Insert it before the end, independent of the order of arrival.
   const at = line.steps.findIndex(({ status }) => !["sent", "accepted", "started"].includes(status));
-  const step = { status: "observed", afterMs: seen.afterMs, heard: "device" } as const;
-  return { ...line, seenBy: seen.by, steps: at < 0 ? [...line.steps, step] : line.steps.toSpliced(at, 0, step) };
+  const step = { status: "observed", afterMs: observation.afterMs, source: "device" } as const;
+  return { ...line, observedBy: observation.by, steps: at < 0 ? [...line.steps, step] : line.steps.toSpliced(at, 0, step) };
 }

@@ -7,93 +7,93 @@ import { now, toPageClock } from "../../../shared/lib/clock";
 import { ApiError, sentence } from "../../../shared/api/http";
 
 /** Time for the holder to respond [ms]. */
-const ANSWER_WITHIN_MS = 30_000;
-const LOOK_MS = 1_000;
+const RESPONSE_TIMEOUT_MS = 30_000;
+const POLL_MS = 1_000;
 /** Grace time after the deadline before the request counts as expired [ms]. */
-const AFTER_MS = 5_000;
+const GRACE_MS = 5_000;
 
-export type Ended = Exclude<ControlRequestInfo["outcome"], "open">;
+export type RequestOutcome = Exclude<ControlRequestInfo["outcome"], "open">;
 
 export type ControlRequestState =
   | { kind: "none" }
   | { kind: "sending" }
-  /** `until`: on the page's clock. `shown`: the device publishes the request, so the holder sees it immediately. */
-  | { kind: "open"; id: string; epoch: number; until: number; shown: boolean; of: string }
-  | { kind: "over"; how: Ended; of: string }
-  | { kind: "failed"; why: string };
+  /** `until`: on the page's clock. `published`: the device publishes the request, so the holder sees it immediately. */
+  | { kind: "open"; id: string; epoch: number; until: number; published: boolean; holder: string }
+  | { kind: "ended"; outcome: RequestOutcome; holder: string }
+  | { kind: "failed"; reason: string };
 
 export class ControlRequest {
   readonly #api: Api;
   readonly #device: DeviceStore;
-  readonly #accepted: (epoch: number) => void;
+  readonly #onAccepted: (epoch: number) => void;
   readonly #state = signal<ControlRequestState>({ kind: "none" });
   #timer: ReturnType<typeof setTimeout> | undefined;
-  readonly #forget: () => void;
+  readonly #unsubscribe: () => void;
   #disposed = false;
 
   readonly state: ReadonlySignal<ControlRequestState> = this.#state;
 
   /** `accepted` is called with the epoch that was handed over to this session. */
-  constructor(api: Api, device: DeviceStore, accepted: (epoch: number) => void) {
+  constructor(api: Api, device: DeviceStore, onAccepted: (epoch: number) => void) {
     this.#api = api;
     this.#device = device;
-    this.#accepted = accepted;
+    this.#onAccepted = onAccepted;
     // The device reports a new epoch, or the end of the request, before the next poll.
-    this.#forget = effect(() => {
-      const told = device.state.value?.lease ?? null;
-      const asked = this.#state.peek();
-      if (asked.kind === "open" && asked.shown && told?.request?.id !== asked.id) this.#lookIn(0);
+    this.#unsubscribe = effect(() => {
+      const lease = device.state.value?.lease ?? null;
+      const current = this.#state.peek();
+      if (current.kind === "open" && current.published && lease?.request?.id !== current.id) this.#pollIn(0);
     });
   }
 
-  async ask(): Promise<void> {
+  async send(): Promise<void> {
     if (this.#state.value.kind === "sending" || this.#state.value.kind === "open") return;
-    const of = this.#device.holder.value?.name ?? "";
+    const holder = this.#device.holder.value?.name ?? "";
     this.#state.value = { kind: "sending" };
     try {
-      const { request, confirmed } = await this.#api.requestControl(this.#device.id, ANSWER_WITHIN_MS);
+      const { request, confirmed } = await this.#api.requestControl(this.#device.id, RESPONSE_TIMEOUT_MS);
       if (this.#disposed) {
-        this.#takeBack(request.id);
+        this.#withdrawAfterClose(request.id);
         return;
       }
       const until = toPageClock(Date.parse(request.expires_at));
-      this.#state.value = { kind: "open", id: request.id, epoch: request.epoch, until, shown: confirmed, of };
-      this.#lookIn(LOOK_MS);
+      this.#state.value = { kind: "open", id: request.id, epoch: request.epoch, until, published: confirmed, holder };
+      this.#pollIn(POLL_MS);
     } catch (error) {
-      this.#state.value = { kind: "failed", why: sentence(error) };
+      this.#state.value = { kind: "failed", reason: sentence(error) };
       void this.#device.refreshLease();
     }
   }
 
   /** Withdraws the request. If it was accepted at the same moment, this session keeps control until released. */
   async withdraw(): Promise<void> {
-    const asked = this.#state.value;
-    if (asked.kind !== "open") return;
+    const open = this.#state.value;
+    if (open.kind !== "open") return;
     clearTimeout(this.#timer);
     try {
-      await this.#api.withdrawRequest(this.#device.id, asked.id);
-      this.#end({ kind: "over", how: "withdrawn", of: asked.of });
+      await this.#api.withdrawRequest(this.#device.id, open.id);
+      this.#end({ kind: "ended", outcome: "withdrawn", holder: open.holder });
     } catch {
-      this.#lookIn(0);
+      this.#pollIn(0);
     }
   }
 
   /** Clears the outcome. */
   clear(): void {
     const { kind } = this.#state.value;
-    if (kind === "over" || kind === "failed") this.#state.value = { kind: "none" };
+    if (kind === "ended" || kind === "failed") this.#state.value = { kind: "none" };
   }
 
   dispose(): void {
     this.#disposed = true;
-    const asked = this.#state.value;
+    const open = this.#state.value;
     this.#end({ kind: "none" });
-    this.#forget();
-    if (asked.kind === "open") this.#takeBack(asked.id);
+    this.#unsubscribe();
+    if (open.kind === "open") this.#withdrawAfterClose(open.id);
   }
 
-  /** The page closes: the call completes after it. */
-  #takeBack(id: string): void {
+  /** Withdraws a request after `dispose`. The call completes even if the page closes. */
+  #withdrawAfterClose(id: string): void {
     void this.#api.withdrawRequest(this.#device.id, id, true).catch(() => undefined);
   }
 
@@ -102,29 +102,29 @@ export class ControlRequest {
     this.#state.value = state;
   }
 
-  #lookIn(inMs: number): void {
+  #pollIn(delayMs: number): void {
     clearTimeout(this.#timer);
-    this.#timer = setTimeout(() => void this.#look(), inMs);
+    this.#timer = setTimeout(() => void this.#poll(), delayMs);
   }
 
-  async #look(): Promise<void> {
-    const asked = this.#state.value;
-    if (asked.kind !== "open") return;
+  async #poll(): Promise<void> {
+    const open = this.#state.value;
+    if (open.kind !== "open") return;
     let outcome: ControlRequestInfo["outcome"];
     try {
-      outcome = (await this.#api.controlRequest(this.#device.id, asked.id)).outcome;
+      outcome = (await this.#api.controlRequest(this.#device.id, open.id)).outcome;
     } catch (error) {
       // A newer request replaced it: only the end of its lease is known.
-      const gone = error instanceof ApiError && error.status === 404;
-      outcome = gone ? "ended" : now() > asked.until + AFTER_MS ? "expired" : "open";
+      const replaced = error instanceof ApiError && error.status === 404;
+      outcome = replaced ? "ended" : now() > open.until + GRACE_MS ? "expired" : "open";
     }
-    if (this.#state.value !== asked) return;
+    if (this.#state.value !== open) return;
     if (outcome === "open") {
-      this.#lookIn(LOOK_MS);
+      this.#pollIn(POLL_MS);
       return;
     }
-    this.#end({ kind: "over", how: outcome, of: asked.of });
-    if (outcome === "accepted") this.#accepted(asked.epoch + 1);
+    this.#end({ kind: "ended", outcome, holder: open.holder });
+    if (outcome === "accepted") this.#onAccepted(open.epoch + 1);
     else void this.#device.refreshLease();
   }
 }

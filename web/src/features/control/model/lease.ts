@@ -1,6 +1,6 @@
 /** Control of one device: acquires, renews and loses the lease, and owns its setpoint stream. */
 import type { GrantedLease } from "../../../shared/api/types";
-import type { DeviceStore, OpenRequestHere } from "../../devices/model";
+import type { DeviceStore, OpenRequest } from "../../devices/model";
 import { RoundTrip } from "../../latency/model";
 import { SetpointStreamer } from "../../steering/model";
 import { batch, computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
@@ -17,17 +17,17 @@ type ControlState =
   | { kind: "none" }
   | { kind: "taking" }
   | { kind: "held"; epoch: number; confirmed: boolean }
-  | { kind: "lost"; why: string }
+  | { kind: "lost"; reason: string }
   /** Handed over to the requester. */
   | { kind: "handed"; to: string }
-  | { kind: "refused"; why: string };
+  | { kind: "refused"; reason: string };
 
 /** The holder's response to a control request. */
-type AnswerState =
+type ResponseState =
   | { kind: "none" }
   | { kind: "sending"; accept: boolean }
   | { kind: "kept"; from: string }
-  | { kind: "failed"; why: string };
+  | { kind: "failed"; reason: string };
 
 /** Creates the setpoint connection. */
 type OpenControlLink = (device: string, epoch: number) => Link;
@@ -44,15 +44,15 @@ export class Control {
   #timer: ReturnType<typeof setTimeout> | undefined;
   #expiry: ReturnType<typeof setTimeout> | undefined;
   #cleanups: (() => void)[] = [];
-  #obeyed = false;
+  #epochReported = false;
   /** The new operator during a handover, whose lease end is not a loss. */
   #handingTo: string | null = null;
-  readonly #answer = signal<AnswerState>({ kind: "none" });
+  readonly #response = signal<ResponseState>({ kind: "none" });
 
   /** This session's request for control from another operator. */
-  readonly asking: ControlRequest;
+  readonly outgoingRequest: ControlRequest;
   /** The response to another operator's request. */
-  readonly answered: ReadonlySignal<AnswerState> = this.#answer;
+  readonly response: ReadonlySignal<ResponseState> = this.#response;
   readonly state: ReadonlySignal<ControlState> = this.#state;
   /** Set while the lease is held. */
   readonly streamer: ReadonlySignal<SetpointStreamer | null> = this.#streamer;
@@ -64,14 +64,14 @@ export class Control {
     this.#device = device;
     this.#openLink =
       openLink ?? ((id, epoch) => new MqttLink(() => api.credentials({ purpose: "control", device: id, epoch })));
-    // The accepted lease already belongs to this session: only renew it.
-    this.asking = new ControlRequest(api, device, (epoch) => {
-      void this.#begin(() => api.renewLease(device.id, LEASE_MS, epoch));
+    // An accepted request transfers the lease to this session: only renew it.
+    this.outgoingRequest = new ControlRequest(api, device, (epoch) => {
+      void this.#acquire(() => api.renewLease(device.id, LEASE_MS, epoch));
     });
   }
 
   /** The open control request to this page. */
-  readonly asked = computed<OpenRequestHere | null>(() =>
+  readonly incomingRequest = computed<OpenRequest | null>(() =>
     this.#state.value.kind === "held" ? this.#device.request.value : null,
   );
 
@@ -80,50 +80,50 @@ export class Control {
   }
 
   async take(): Promise<void> {
-    this.asking.clear();
-    await this.#begin(() => this.#api.takeLease(this.#device.id, LEASE_MS));
+    this.outgoingRequest.clear();
+    await this.#acquire(() => this.#api.takeLease(this.#device.id, LEASE_MS));
   }
 
   /** Takes control from the current operator, who sees the reason. For owners. */
   async takeOver(reason: string): Promise<void> {
-    this.asking.clear();
-    await this.#begin(() => this.#api.takeOver(this.#device.id, LEASE_MS, reason));
+    this.outgoingRequest.clear();
+    await this.#acquire(() => this.#api.takeOver(this.#device.id, LEASE_MS, reason));
   }
 
   /** Clears the outcome of a response or request. */
-  read(): void {
-    this.asking.clear();
-    if (this.#answer.value.kind !== "sending") this.#answer.value = { kind: "none" };
+  dismiss(): void {
+    this.outgoingRequest.clear();
+    if (this.#response.value.kind !== "sending") this.#response.value = { kind: "none" };
     const { kind } = this.#state.value;
     if (kind === "handed" || kind === "lost" || kind === "refused") this.#state.value = { kind: "none" };
   }
 
   /** Hands control over to the requester, or rejects the request. */
-  async answer(accept: boolean): Promise<void> {
-    const asked = this.asked.value;
-    if (asked === null || this.#answer.value.kind === "sending") return;
-    this.#answer.value = { kind: "sending", accept };
-    if (accept) this.#handingTo = asked.by;
+  async respond(accept: boolean): Promise<void> {
+    const request = this.incomingRequest.value;
+    if (request === null || this.#response.value.kind === "sending") return;
+    this.#response.value = { kind: "sending", accept };
+    if (accept) this.#handingTo = request.by;
     try {
-      await this.#api.respondToRequest(this.#device.id, asked.id, accept);
-      this.#answer.value = accept ? { kind: "none" } : { kind: "kept", from: asked.by };
-      if (accept) this.#handed(asked.by);
+      await this.#api.respondToRequest(this.#device.id, request.id, accept);
+      this.#response.value = accept ? { kind: "none" } : { kind: "kept", from: request.by };
+      if (accept) this.#handedOver(request.by);
     } catch (error) {
-      this.#answer.value = { kind: "failed", why: sentence(error) };
+      this.#response.value = { kind: "failed", reason: sentence(error) };
       void this.#device.refreshLease();
     } finally {
       this.#handingTo = null;
     }
   }
 
-  async #begin(grant: () => Promise<GrantedLease>): Promise<void> {
+  async #acquire(grant: () => Promise<GrantedLease>): Promise<void> {
     if (this.#state.value.kind === "taking" || this.#state.value.kind === "held") return;
     this.#state.value = { kind: "taking" };
-    const askedAt = now();
+    const requestedAt = now();
     try {
-      this.#hold(await grant(), askedAt);
+      this.#acquired(await grant(), requestedAt);
     } catch (error) {
-      this.#state.value = { kind: "refused", why: sentence(error) };
+      this.#state.value = { kind: "refused", reason: sentence(error) };
       void this.#device.refreshLease();
     }
   }
@@ -132,38 +132,38 @@ export class Control {
   async release(leaving = false): Promise<void> {
     const { epoch } = this;
     if (epoch === null) return;
-    this.#letGo({ kind: "none" });
+    this.#end({ kind: "none" });
     try {
       await this.#api.releaseLease(this.#device.id, epoch, leaving);
       this.#device.setLease(null);
     } catch (error) {
       // The lease expires soon; the page already stopped streaming.
       if (!(error instanceof ApiError && error.code === "lease-lost")) {
-        this.#state.value = { kind: "lost", why: sentence(error) };
+        this.#state.value = { kind: "lost", reason: sentence(error) };
       }
     }
   }
 
-  /** The page is hidden: its streams must end. */
-  hidden(): void {
+  /** Ends the streams because the page is hidden. */
+  onHidden(): void {
     this.#streamer.value?.end("hidden");
   }
 
-  /** Stop was pressed: ends all streams. */
-  stopped(): void {
+  /** Ends the streams because Stop was pressed. */
+  onStop(): void {
     this.#streamer.value?.end("stopped");
   }
 
   dispose(): void {
-    this.asking.dispose();
+    this.outgoingRequest.dispose();
     void this.release(true);
-    this.#letGo({ kind: "none" });
+    this.#end({ kind: "none" });
   }
 
-  #hold(granted: GrantedLease, askedAt: number): void {
+  #acquired(granted: GrantedLease, requestedAt: number): void {
     const { epoch } = granted;
-    this.#obeyed = false;
-    this.#answer.value = { kind: "none" };
+    this.#epochReported = false;
+    this.#response.value = { kind: "none" };
     this.#device.setLease({ holder: granted.holder, epoch, expires_at: granted.expires_at, mine: true });
     this.roundTrip.restart();
     const link = this.#openLink(this.#device.id, epoch);
@@ -179,91 +179,91 @@ export class Control {
       this.#streamer.value = streamer;
       this.#state.value = { kind: "held", epoch, confirmed: granted.confirmed };
     });
-    this.#renewed(granted, askedAt);
+    this.#renewed(granted, requestedAt);
     this.#cleanups = [
       effect(() => {
         this.#linkStatus.value = link.status.value;
         if (link.status.value.state === "refused") this.#lose(link.status.value.reason);
       }),
-      effect(() => this.#hear(epoch)),
+      effect(() => this.#applyReports(epoch)),
     ];
   }
 
   /** Applies the robot's reported epoch: a higher epoch, or none after ours, ends the lease regardless of the local clock. */
-  #hear(epoch: number): void {
+  #applyReports(epoch: number): void {
     const latest = this.#device.telemetry.value;
     const state = this.#device.state.value;
-    const heard = Math.max(latest?.message.epoch ?? 0, state?.epoch ?? 0);
+    const reportedEpoch = Math.max(latest?.message.epoch ?? 0, state?.epoch ?? 0);
     queueMicrotask(() => {
       const current = this.#state.peek();
       if (current.kind !== "held" || current.epoch !== epoch) return;
       if (this.#handingTo !== null) {
-        if (heard > epoch) this.#handed(this.#handingTo);
+        if (reportedEpoch > epoch) this.#handedOver(this.#handingTo);
         return;
       }
-      if (heard > epoch) {
+      if (reportedEpoch > epoch) {
         this.#lose("Another operator has control now.");
         return;
       }
       if (latest?.message.epoch === epoch) {
-        this.#obeyed = true;
+        this.#epochReported = true;
         if (!current.confirmed) this.#state.value = { ...current, confirmed: true };
-      } else if (this.#obeyed && latest?.message.epoch === 0) {
-        this.#lose("The robot has ended it: it was stopped, or had to hold. Take control again to go on.");
+      } else if (this.#epochReported && latest?.message.epoch === 0) {
+        this.#lose("The robot ended it because it was stopped or had to hold its position. Take control again to continue.");
         // This lease is unusable: release it, so that other operators can take the next one.
         void this.#api.releaseLease(this.#device.id, epoch, false).catch(() => undefined).then(() => this.#device.refreshLease());
         return;
       }
       this.#streamer.peek()?.follow();
       if (latest?.message.epoch === epoch && latest.message.setpoint_sequence > 0) {
-        this.roundTrip.seen(latest.message.setpoint_sequence, latest.message.setpoint_sent_ms, latest.receivedAt);
+        this.roundTrip.add(latest.message.setpoint_sequence, latest.message.setpoint_sent_ms, latest.receivedAt);
       }
     });
   }
 
-  #renewed(granted: GrantedLease, askedAt: number): void {
+  #renewed(granted: GrantedLease, requestedAt: number): void {
     clearTimeout(this.#expiry);
     this.#expiry = setTimeout(
-      () => this.#lose("Control ran out: the server could not be reached in time to renew it."),
-      askedAt + granted.lease_ms - now(),
+      () => this.#lose("It expired because the server could not be reached in time to renew it."),
+      requestedAt + granted.lease_ms - now(),
     );
-    this.#plan(granted.epoch, granted.lease_ms / 3);
+    this.#scheduleRenewal(granted.epoch, granted.lease_ms / 3);
   }
 
-  #plan(epoch: number, inMs: number): void {
+  #scheduleRenewal(epoch: number, delayMs: number): void {
     clearTimeout(this.#timer);
-    this.#timer = setTimeout(() => void this.#renew(epoch), inMs);
+    this.#timer = setTimeout(() => void this.#renew(epoch), delayMs);
   }
 
   async #renew(epoch: number): Promise<void> {
     if (this.epoch !== epoch) return;
-    const askedAt = now();
+    const requestedAt = now();
     try {
       const granted = await this.#api.renewLease(this.#device.id, LEASE_MS, epoch);
-      if (this.epoch === epoch) this.#renewed(granted, askedAt);
+      if (this.epoch === epoch) this.#renewed(granted, requestedAt);
     } catch (error) {
       if (this.epoch !== epoch) return;
       if (error instanceof ApiError && error.status >= 400 && error.status < 500 && error.status !== 429) {
         this.#lose(sentence(error));
       } else {
-        this.#plan(epoch, RETRY_MS);
+        this.#scheduleRenewal(epoch, RETRY_MS);
       }
     }
   }
 
-  #handed(to: string): void {
+  #handedOver(to: string): void {
     if (this.epoch === null) return;
-    this.#letGo({ kind: "handed", to });
+    this.#end({ kind: "handed", to });
     void this.#device.refreshLease();
   }
 
-  #lose(why: string): void {
+  #lose(reason: string): void {
     if (this.epoch === null) return;
-    this.#letGo({ kind: "lost", why });
+    this.#end({ kind: "lost", reason });
     void this.#device.refreshLease();
   }
 
-  #letGo(next: ControlState): void {
+  #end(next: ControlState): void {
     clearTimeout(this.#timer);
     clearTimeout(this.#expiry);
     for (const cleanup of this.#cleanups) cleanup();
@@ -271,7 +271,7 @@ export class Control {
     this.#streamer.value?.dispose();
     this.#link?.close();
     this.#link = null;
-    this.asking.clear();
+    this.outgoingRequest.clear();
     batch(() => {
       this.#streamer.value = null;
       this.#linkStatus.value = null;

@@ -11,43 +11,43 @@ import type { Stop } from "../../../shared/mqtt/protocol.generated";
 
 const REPEAT_MS = 200;
 /** Without confirmation for this long, the page shows a prominent warning [ms]. */
-const DOUBT_MS = 1_000;
+const CONFIRM_TIMEOUT_MS = 1_000;
 /** Stop is republished for at most this long; after it, an operator must be at the robot [ms]. */
-const GIVE_UP_MS = 60_000;
+const REPEAT_FOR_MS = 60_000;
 
 type StopState =
   | { kind: "clear" }
-  /** Sent and not confirmed; `doubtful` after `DOUBT_MS`. */
-  | { kind: "sending"; doubtful: boolean }
+  /** Sent and not confirmed; `overdue` after `CONFIRM_TIMEOUT_MS`. */
+  | { kind: "sending"; overdue: boolean }
   | { kind: "latched" }
   | { kind: "unconfirmed" };
 
 type Pressed =
-  | { kind: "sending"; at: number; doubtful: boolean }
+  | { kind: "sending"; at: number; overdue: boolean }
   /** The robot confirmed to the cloud that it stopped; this page has not received the state yet. */
-  | { kind: "told"; at: number }
+  | { kind: "confirmed"; at: number }
   | { kind: "unconfirmed" };
 
 export class StopSwitch {
   readonly #api: Api;
   readonly #device: DeviceStore;
   readonly #link: Link;
-  readonly #by: string;
+  readonly #caller: string;
   readonly #pressed = signal<Pressed | null>(null);
   readonly #resetting = signal(false);
-  readonly #problem = signal<string | null>(null);
-  readonly #watch: () => void;
+  readonly #error = signal<string | null>(null);
+  readonly #disposeEffect: () => void;
   #timer: ReturnType<typeof setInterval> | undefined;
   #stateAtPress: KnownState | null = null;
 
   readonly resetting: ReadonlySignal<boolean> = this.#resetting;
   /** The error of the last stop or reset, or `null`. */
-  readonly problem: ReadonlySignal<string | null> = this.#problem;
+  readonly error: ReadonlySignal<string | null> = this.#error;
 
   readonly state = computed<StopState>(() => {
     const pressed = this.#pressed.value;
-    if (pressed?.kind === "sending") return { kind: "sending", doubtful: pressed.doubtful };
-    if (this.#device.stopped.value || pressed?.kind === "told") return { kind: "latched" };
+    if (pressed?.kind === "sending") return { kind: "sending", overdue: pressed.overdue };
+    if (this.#device.stopped.value || pressed?.kind === "confirmed") return { kind: "latched" };
     return pressed === null ? { kind: "clear" } : { kind: "unconfirmed" };
   });
 
@@ -55,19 +55,19 @@ export class StopSwitch {
     this.#api = api;
     this.#device = device;
     this.#link = link;
-    this.#by = by;
-    this.#watch = effect(() => {
+    this.#caller = by;
+    this.#disposeEffect = effect(() => {
       const latest = device.telemetry.value;
       const pressed = this.#pressed.value;
       // The robot's own state takes precedence once it arrives.
-      if (pressed?.kind === "told" && latest !== null && latest.receivedAt > pressed.at + DOUBT_MS) {
+      if (pressed?.kind === "confirmed" && latest !== null && latest.receivedAt > pressed.at + CONFIRM_TIMEOUT_MS) {
         queueMicrotask(() => this.#finish(null));
       }
       if (pressed?.kind !== "sending") return;
       // Only messages after the press confirm it. `state` has no arrival time: any change of it is new.
-      const seen = latest !== null && latest.receivedAt >= pressed.at && latest.message.mode === "stopped";
-      const told = device.state.value !== this.#stateAtPress && device.state.value?.mode === "stopped";
-      if (seen || told) {
+      const telemetryStopped = latest !== null && latest.receivedAt >= pressed.at && latest.message.mode === "stopped";
+      const stateStopped = device.state.value !== this.#stateAtPress && device.state.value?.mode === "stopped";
+      if (telemetryStopped || stateStopped) {
         queueMicrotask(() => this.#finish(null));
       }
     });
@@ -76,44 +76,44 @@ export class StopSwitch {
   /** Latches Stop. Can be repeated at any time. */
   press(reason = "Stop pressed on the console"): void {
     if (this.#device.info.value.role === "viewer") {
-      this.#problem.value = "You can watch this device, but not stop it. Ask its owner or an operator at the robot.";
+      this.#error.value = "You can watch this device, but not stop it. Ask its owner or an operator at the robot.";
       return;
     }
     this.#stateAtPress = this.#device.state.value;
     const at = now();
-    this.#problem.value = null;
-    this.#pressed.value = { kind: "sending", at, doubtful: false };
-    const message: Stop = { id: newId(), caller: this.#by.slice(0, 200), reason };
+    this.#error.value = null;
+    this.#pressed.value = { kind: "sending", at, overdue: false };
+    const message: Stop = { id: newId(), caller: this.#caller.slice(0, 200), reason };
     clearInterval(this.#timer);
     this.#timer = setInterval(() => {
       const age = now() - at;
-      if (age > GIVE_UP_MS) {
+      if (age > REPEAT_FOR_MS) {
         this.#finish({ kind: "unconfirmed" });
         return;
       }
-      if (age > DOUBT_MS) this.#pressed.value = { kind: "sending", at, doubtful: true };
+      if (age > CONFIRM_TIMEOUT_MS) this.#pressed.value = { kind: "sending", at, overdue: true };
       this.#publish(message);
     }, REPEAT_MS);
     this.#publish(message);
     this.#api.stop(this.#device.id, reason).then(
       ({ confirmed }) => {
         const pressed = this.#pressed.value;
-        if (confirmed && pressed?.kind === "sending" && pressed.at === at) this.#finish({ kind: "told", at: now() });
+        if (confirmed && pressed?.kind === "sending" && pressed.at === at) this.#finish({ kind: "confirmed", at: now() });
       },
-      (error: unknown) => (this.#problem.value = sentence(error)),
+      (error: unknown) => (this.#error.value = sentence(error)),
     );
   }
 
   /** Resets the latch. No motion resumes. */
   async reset(): Promise<void> {
     this.#resetting.value = true;
-    this.#problem.value = null;
+    this.#error.value = null;
     try {
       const { confirmed } = await this.#api.resetStop(this.#device.id);
-      if (!confirmed) this.#problem.value = "The robot has not confirmed the reset yet.";
+      if (!confirmed) this.#error.value = "The robot has not confirmed the reset yet.";
       this.#pressed.value = null;
     } catch (error) {
-      this.#problem.value = sentence(error);
+      this.#error.value = sentence(error);
     } finally {
       this.#resetting.value = false;
     }
@@ -121,11 +121,11 @@ export class StopSwitch {
 
   dispose(): void {
     clearInterval(this.#timer);
-    this.#watch();
+    this.#disposeEffect();
   }
 
   #publish(message: Stop): void {
-    // If the broker is unreachable, the HTTP call is the second channel; the banner names the failed one.
+    // If the broker is unreachable, the HTTP call is the second channel; its error is displayed.
     this.#link.publish(this.#device.topics.stop, message, 1).catch(() => undefined);
   }
 

@@ -3,7 +3,7 @@ import type { Watcher } from "../../../shared/api/types";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
 
-const AGAIN_MS = 10_000;
+const REFRESH_MS = 10_000;
 /** Bounds for the interval that the server requests [ms]. */
 const BOUNDS_MS = [2_000, 60_000] as const;
 
@@ -12,7 +12,7 @@ export class Watchers {
   readonly #id: string;
   readonly #others = signal<readonly Watcher[] | null>(null);
   #timer: ReturnType<typeof setTimeout> | undefined;
-  #on = false;
+  #visible = false;
 
   /** The other viewers; `null`: unknown. */
   readonly others: ReadonlySignal<readonly Watcher[] | null> = this.#others;
@@ -22,25 +22,25 @@ export class Watchers {
     this.#id = id;
   }
 
-  /** The page became visible or hidden. */
-  seen(visible: boolean): void {
-    if (visible === this.#on) return;
-    this.#on = visible;
+  /** Starts or ends the reports when the page becomes visible or hidden. */
+  setVisible(visible: boolean): void {
+    if (visible === this.#visible) return;
+    this.#visible = visible;
     clearTimeout(this.#timer);
-    if (visible) void this.#say();
-    else void this.#api.unwatch(this.#id).catch(() => undefined); // Its time runs out by itself.
+    if (visible) void this.#report();
+    else void this.#api.unwatch(this.#id).catch(() => undefined); // The server removes it after a timeout.
   }
 
-  async #say(): Promise<void> {
-    let inMs = AGAIN_MS;
+  async #report(): Promise<void> {
+    let delayMs = REFRESH_MS;
     try {
-      const { items, refresh_ms: wanted } = await this.#api.watch(this.#id);
-      if (!this.#on) return;
+      const { items, refresh_ms: refreshMs } = await this.#api.watch(this.#id);
+      if (!this.#visible) return;
       this.#others.value = items;
-      inMs = Math.min(BOUNDS_MS[1], Math.max(BOUNDS_MS[0], wanted));
+      delayMs = Math.min(BOUNDS_MS[1], Math.max(BOUNDS_MS[0], refreshMs));
     } catch {
       this.#others.value = null;
     }
-    if (this.#on) this.#timer = setTimeout(() => void this.#say(), inMs);
+    if (this.#visible) this.#timer = setTimeout(() => void this.#report(), delayMs);
   }
 }

@@ -14,10 +14,10 @@ export class Fleet {
   readonly #devices = signal<ReadonlyMap<string, DeviceStore> | null>(null);
   readonly #error = signal<string | null>(null);
   readonly #spaces = signal<ReadonlyMap<string, string>>(new Map());
-  readonly #ends = new Map<string, () => void>();
+  readonly #unsubscribes = new Map<string, () => void>();
   readonly #timer: ReturnType<typeof setInterval>;
-  readonly #forget: () => void;
-  #cut = false;
+  readonly #disposeEffect: () => void;
+  #disconnected = false;
 
   /** By id, in list order; `null` until the first response. */
   readonly devices: ReadonlySignal<ReadonlyMap<string, DeviceStore> | null> = this.#devices;
@@ -29,7 +29,7 @@ export class Fleet {
     this.link = link ?? new MqttLink(() => api.credentials({ purpose: "view" }));
     void this.refresh();
     this.#timer = setInterval(() => void this.refresh(), REFRESH_MS);
-    this.#forget = this.#askWhenCut();
+    this.#disposeEffect = this.#refreshOnConnectionChange();
   }
 
   /** The name of a space, or its id until the name is loaded. */
@@ -39,8 +39,8 @@ export class Fleet {
 
   async refresh(): Promise<void> {
     try {
-      this.#take(await this.#api.devices());
-      if (this.#unnamed()) this.#spaces.value = new Map((await this.#api.spaces()).map(({ id, name }) => [id, name]));
+      this.#apply(await this.#api.devices());
+      if (this.#hasUnnamedSpace()) this.#spaces.value = new Map((await this.#api.spaces()).map(({ id, name }) => [id, name]));
       this.#error.value = null;
     } catch (error) {
       this.#error.value = sentence(error);
@@ -56,52 +56,52 @@ export class Fleet {
 
   dispose(): void {
     clearInterval(this.#timer);
-    this.#forget();
-    for (const end of this.#ends.values()) end();
-    this.#ends.clear();
+    this.#disposeEffect();
+    for (const end of this.#unsubscribes.values()) end();
+    this.#unsubscribes.clear();
     this.link.close();
   }
 
   /** A share that ends or changes closes the connection: reload the list now and after the reconnect. */
-  #askWhenCut(): () => void {
-    let was = this.link.status.value.state;
+  #refreshOnConnectionChange(): () => void {
+    let previous = this.link.status.value.state;
     return effect(() => {
       const { state } = this.link.status.value;
-      const cut = was === "up" && state !== "up" && state !== "closed";
-      const back = was !== "up" && state === "up" && this.#cut;
-      was = state;
-      if (cut) this.#cut = true;
-      if (back) this.#cut = false;
-      if (cut || back) queueMicrotask(() => void this.refresh());
+      const lost = previous === "up" && state !== "up" && state !== "closed";
+      const restored = previous !== "up" && state === "up" && this.#disconnected;
+      previous = state;
+      if (lost) this.#disconnected = true;
+      if (restored) this.#disconnected = false;
+      if (lost || restored) queueMicrotask(() => void this.refresh());
     });
   }
 
-  #unnamed(): boolean {
+  #hasUnnamedSpace(): boolean {
     return [...(this.#devices.value?.values() ?? [])].some(({ info }) => !this.#spaces.value.has(info.value.space));
   }
 
-  #take(list: readonly Device[]): void {
-    const known = this.#devices.value ?? new Map<string, DeviceStore>();
+  #apply(list: readonly Device[]): void {
+    const stores = this.#devices.value ?? new Map<string, DeviceStore>();
     const next = new Map<string, DeviceStore>();
     for (const info of list) {
-      const store = known.get(info.id);
+      const store = stores.get(info.id);
       if (store === undefined) {
         const added = new DeviceStore(info, this.#api, this.link);
-        this.#ends.set(info.id, added.watch());
+        this.#unsubscribes.set(info.id, added.watch());
         next.set(info.id, added);
       } else {
         store.update(info);
         next.set(info.id, store);
       }
     }
-    const gone = [...known.keys()].filter((id) => !next.has(id));
-    for (const id of gone) {
-      this.#ends.get(id)?.();
-      this.#ends.delete(id);
+    const removed = [...stores.keys()].filter((id) => !next.has(id));
+    for (const id of removed) {
+      this.#unsubscribes.get(id)?.();
+      this.#unsubscribes.delete(id);
     }
-    const added = [...next.keys()].some((id) => !known.has(id));
+    const added = [...next.keys()].some((id) => !stores.has(id));
     // Replace the list only if it changed, to avoid needless rendering.
-    if (added || gone.length > 0 || this.#devices.value === null) {
+    if (added || removed.length > 0 || this.#devices.value === null) {
       const first = this.#devices.value === null;
       this.#devices.value = next;
       // The credentials fix the topics that this connection may subscribe to.

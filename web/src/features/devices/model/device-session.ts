@@ -19,7 +19,7 @@ export class DeviceSession {
   /** `by`: the name that is reported as the caller of Stop. */
   constructor(api: Api, link: Link, device: DeviceStore, by: string) {
     this.device = device;
-    this.#unwatch = device.watchClosely();
+    this.#unwatch = device.watchDetails();
     this.control = new Control(api, device);
     this.stop = new StopSwitch(api, device, link, by);
     this.actions = new ActionRunner(api, device);
@@ -30,7 +30,7 @@ export class DeviceSession {
 
   /** Stops the device and ends all streams. */
   stopNow(): void {
-    this.control.stopped();
+    this.control.onStop();
     this.stop.press();
   }
 
@@ -38,7 +38,7 @@ export class DeviceSession {
     this.commandTrace.dispose();
     this.#samples.dispose();
     this.control.dispose();
-    this.watchers.seen(false);
+    this.watchers.setVisible(false);
     this.stop.dispose();
     this.actions.dispose();
     this.#unwatch();

@@ -19,7 +19,7 @@ export type Reach = "online" | "stale" | "offline" | "unknown";
 const STALE_MS = 1_000;
 /** The list receives only `state`, every 30 s: two missed messages and a margin [ms]. */
 const LIST_STALE_MS = 65_000;
-const EVENTS_KEPT = 20;
+const MAX_EVENTS = 20;
 
 interface Timed<T> {
   message: T;
@@ -35,7 +35,7 @@ interface MeasuredValues extends Timed<Measurements> {
   everyMs: number | null;
 }
 
-export interface OpenRequestHere {
+export interface OpenRequest {
   id: string;
   by: string;
   until: number;
@@ -61,9 +61,9 @@ export class DeviceStore {
   readonly #measured = new Map<string, Signal<MeasuredValues | null>>();
   readonly #events = signal<readonly KnownEvent[]>([]);
   readonly #lease;
-  readonly #heardAt = signal<number | null>(null);
-  readonly #troubles = signal<ReadonlyMap<string, string>>(new Map());
-  readonly #close = signal(false);
+  readonly #lastMessageAt = signal<number | null>(null);
+  readonly #parseErrors = signal<ReadonlyMap<string, string>>(new Map());
+  readonly #detailed = signal(false);
   readonly #retained = new Map<string, Uint8Array>();
   readonly #ackReceivers = new Set<AckReceiver>();
   readonly #recentAcks = new Map<string, Timed<KnownAck>[]>();
@@ -78,14 +78,14 @@ export class DeviceStore {
   /** The lease holder according to the cloud. The device's own report is in `state`. */
   readonly lease: ReadonlySignal<Lease | null>;
   /** The parse error of a topic's newest message; `null`: none. */
-  readonly trouble = computed<string | null>(() => [...this.#troubles.value.values()].at(-1) ?? null);
+  readonly parseError = computed<string | null>(() => [...this.#parseErrors.value.values()].at(-1) ?? null);
 
   /** Time of the last message from the device, or from the cloud for it, on the page's clock [ms]. */
   readonly lastSeenAt = computed(() => {
     const at = this.#info.value.last_seen_at;
-    const told = at === null ? null : toPageClock(Date.parse(at));
-    const heard = this.#heardAt.value;
-    return told === null || (heard !== null && heard > told) ? heard : told;
+    const stored = at === null ? null : toPageClock(Date.parse(at));
+    const received = this.#lastMessageAt.value;
+    return stored === null || (received !== null && received > stored) ? received : stored;
   });
 
   /** Age of the newest telemetry [ms]; `null` before the first. */
@@ -99,12 +99,12 @@ export class DeviceStore {
   readonly reach = computed<Reach>(() => {
     if (!this.#link.up.value) return "unknown";
     if (!(this.#presence.value?.online ?? this.#info.value.online)) return "offline";
-    if (this.#close.value && (this.#description.value?.joints.length ?? 0) > 0) {
+    if (this.#detailed.value && (this.#description.value?.joints.length ?? 0) > 0) {
       const age = this.telemetryAgeMs.value;
       return age === null || age > STALE_MS ? "stale" : "online";
     }
-    const heardAt = this.lastSeenAt.value;
-    return heardAt === null || clock.value - heardAt > LIST_STALE_MS ? "stale" : "online";
+    const lastSeenAt = this.lastSeenAt.value;
+    return lastSeenAt === null || clock.value - lastSeenAt > LIST_STALE_MS ? "stale" : "online";
   });
 
   /** Whether the displayed state is current. */
@@ -130,10 +130,10 @@ export class DeviceStore {
    */
   readonly holder = computed<{ name: string; mine: boolean } | null>(() => {
     const lease = this.#lease.value;
-    const told = this.live.value ? this.#state.value : null;
+    const reported = this.live.value ? this.#state.value : null;
     const current = lease !== null && toPageClock(Date.parse(lease.expires_at)) > clock.value ? lease : null;
-    if (told !== null && (current === null || current.epoch < told.epoch)) {
-      return told.lease === null ? null : { name: told.lease.holder, mine: false };
+    if (reported !== null && (current === null || current.epoch < reported.epoch)) {
+      return reported.lease === null ? null : { name: reported.lease.holder, mine: false };
     }
     return current === null ? null : { name: current.holder, mine: current.mine };
   });
@@ -142,11 +142,11 @@ export class DeviceStore {
    * The open control request; `until`: on the page's clock. From the device if it reports the current lease, otherwise
    * from the cloud.
    */
-  readonly request = computed<OpenRequestHere | null>(() => {
-    const told = this.#state.value?.lease ?? null;
+  readonly request = computed<OpenRequest | null>(() => {
+    const reported = this.#state.value?.lease ?? null;
     const lease = this.#lease.value;
-    if (told !== null && told.epoch >= (lease?.epoch ?? 0)) {
-      const { request } = told;
+    if (reported !== null && reported.epoch >= (lease?.epoch ?? 0)) {
+      const { request } = reported;
       return request ? { id: request.id, by: request.requester, until: this.#stateAt + request.expires_in_ms } : null;
     }
     const request = lease?.request ?? null;
@@ -185,19 +185,19 @@ export class DeviceStore {
   /** Subscribes to presence and state, for a list. Returns a function that unsubscribes. */
   watch(): () => void {
     return this.#subscribe({
-      [this.topics.conn]: (payload, _, retained) => this.#hearPresence(readPresence(payload), retained),
+      [this.topics.conn]: (payload, _, retained) => this.#applyPresence(readPresence(payload), retained),
       [this.topics.state]: (payload, _, retained) => {
         const state = readState(payload);
         this.#stateAt = retained ? Math.min(now(), toPageClock(state.at_ms)) : now();
         this.#state.value = state;
-        this.#noteHeard(state.at_ms, retained);
+        this.#noteMessage(state.at_ms, retained);
       },
     });
   }
 
   /** Subscribes to all topics of the device's own page. Returns a function that unsubscribes. */
-  watchClosely(): () => void {
-    this.#close.value = true;
+  watchDetails(): () => void {
+    this.#detailed.value = true;
     const end = this.#subscribe({
       [this.topics.desc]: (payload, topic) => {
         if (this.#isNew(topic, payload)) this.#description.value = readDescription(payload);
@@ -206,15 +206,15 @@ export class DeviceStore {
         if (this.#isNew(topic, payload)) this.#twin.value = readTwin(payload);
       },
       [this.topics.tele]: (payload, topic) => {
-        if (topic === this.topics.joints) this.#hearTelemetry(readTelemetry(payload));
-        else this.#hearMeasurements(topic, readMeasurements(payload));
+        if (topic === this.topics.joints) this.#applyTelemetry(readTelemetry(payload));
+        else this.#applyMeasurements(topic, readMeasurements(payload));
       },
-      [this.topics.event]: (payload) => this.#hearEvent(readEvent(payload)),
-      [this.topics.ack]: (payload) => this.#hearAck(readAck(payload)),
+      [this.topics.event]: (payload) => this.#applyEvent(readEvent(payload)),
+      [this.topics.ack]: (payload) => this.#applyAck(readAck(payload)),
     });
     return () => {
       end();
-      this.#close.value = false;
+      this.#detailed.value = false;
       this.#telemetry.value = null;
     };
   }
@@ -249,7 +249,7 @@ export class DeviceStore {
         if (this.#isNew(topic, payload)) this.#description.value = readDescription(payload);
       },
       [this.topics.tele]: (payload, topic) => {
-        if (topic !== this.topics.joints) this.#hearMeasurements(topic, readMeasurements(payload));
+        if (topic !== this.topics.joints) this.#applyMeasurements(topic, readMeasurements(payload));
       },
     });
   }
@@ -259,7 +259,7 @@ export class DeviceStore {
     return this.#subscribe({
       [this.topics.cam(name)]: (payload) => {
         receiver(readFrame(payload));
-        this.#heardAt.value = now();
+        this.#lastMessageAt.value = now();
       },
     });
   }
@@ -279,10 +279,10 @@ export class DeviceStore {
       this.#link.subscribe(filter, (topic, payload, retained) => {
         try {
           reader(payload, topic, retained);
-          this.#noteTrouble(topic, null);
+          this.#setParseError(topic, null);
         } catch (error) {
           if (!(error instanceof MessageError)) throw error;
-          this.#noteTrouble(topic, error.message);
+          this.#setParseError(topic, error.message);
         }
       }),
     );
@@ -293,78 +293,78 @@ export class DeviceStore {
 
   /** A new connection delivers retained messages again: unchanged ones must not trigger a redraw. */
   #isNew(topic: string, payload: Uint8Array): boolean {
-    const known = this.#retained.get(topic);
-    if (known?.length === payload.length && known.every((byte, index) => byte === payload[index])) return false;
+    const previous = this.#retained.get(topic);
+    if (previous?.length === payload.length && previous.every((byte, index) => byte === payload[index])) return false;
     this.#retained.set(topic, payload);
     return true;
   }
 
-  #noteTrouble(topic: string, what: string | null): void {
-    const known = this.#troubles.value;
-    if ((known.get(topic) ?? null) === what) return;
-    const next = new Map(known);
-    if (what === null) next.delete(topic);
-    else next.set(topic, what);
-    this.#troubles.value = next;
+  #setParseError(topic: string, error: string | null): void {
+    const previous = this.#parseErrors.value;
+    if ((previous.get(topic) ?? null) === error) return;
+    const next = new Map(previous);
+    if (error === null) next.delete(topic);
+    else next.set(topic, error);
+    this.#parseErrors.value = next;
   }
 
-  #hearPresence(presence: Required<Presence>, retained: boolean): void {
-    const known = this.#presence.value;
+  #applyPresence(presence: Required<Presence>, retained: boolean): void {
+    const previous = this.#presence.value;
     // The will of an older connection may arrive after messages of a newer one.
-    if (known !== null && presence.session < known.session) return;
+    if (previous !== null && presence.session < previous.session) return;
     this.#presence.value = presence;
-    this.#noteHeard(presence.at_ms, retained);
+    this.#noteMessage(presence.at_ms, retained);
   }
 
-  #hearTelemetry(message: KnownTelemetry): void {
-    const known = this.#telemetry.value?.message;
-    const wanted = this.#description.value?.joints.length;
-    if (wanted !== undefined && message.position_rad.length !== wanted) {
-      throw new MessageError(`telemetry has ${message.position_rad.length} joints, the description ${wanted}`);
+  #applyTelemetry(message: KnownTelemetry): void {
+    const previous = this.#telemetry.value?.message;
+    const expected = this.#description.value?.joints.length;
+    if (expected !== undefined && message.position_rad.length !== expected) {
+      throw new MessageError(`telemetry has ${message.position_rad.length} joints, the description ${expected}`);
     }
     // Older than the displayed message, unless the agent restarted with a new clock.
-    if (known !== undefined && message.tick_ms <= known.tick_ms && message.at_ms <= known.at_ms) return;
+    if (previous !== undefined && message.tick_ms <= previous.tick_ms && message.at_ms <= previous.at_ms) return;
     const at = now();
     this.#telemetry.value = { message, receivedAt: at };
-    this.#heardAt.value = at;
+    this.#lastMessageAt.value = at;
     this.history.add(message, at);
   }
 
   #measuredOf(stream: string): Signal<MeasuredValues | null> {
-    let found = this.#measured.get(stream);
-    if (found === undefined) {
-      found = signal(null);
-      this.#measured.set(stream, found);
+    let values = this.#measured.get(stream);
+    if (values === undefined) {
+      values = signal(null);
+      this.#measured.set(stream, values);
     }
-    return found;
+    return values;
   }
 
-  #hearMeasurements(topic: string, message: Measurements): void {
+  #applyMeasurements(topic: string, message: Measurements): void {
     const newest = this.#measuredOf(topic.slice(topic.lastIndexOf("/") + 1));
-    const known = newest.value;
+    const previous = newest.value;
     // A duplicate or out of order, unless the agent restarted.
-    if (known !== null && message.tick_ms <= known.message.tick_ms && message.at_ms <= known.message.at_ms) return;
+    if (previous !== null && message.tick_ms <= previous.message.tick_ms && message.at_ms <= previous.message.at_ms) return;
     const at = now();
-    newest.value = { message, receivedAt: at, everyMs: known === null ? null : at - known.receivedAt };
-    this.#heardAt.value = at;
+    newest.value = { message, receivedAt: at, everyMs: previous === null ? null : at - previous.receivedAt };
+    this.#lastMessageAt.value = at;
   }
 
-  #hearEvent(event: KnownEvent): void {
-    if (this.#events.value.some((known) => known.id === event.id)) return;
-    this.#events.value = [event, ...this.#events.value].slice(0, EVENTS_KEPT);
+  #applyEvent(event: KnownEvent): void {
+    if (this.#events.value.some((previous) => previous.id === event.id)) return;
+    this.#events.value = [event, ...this.#events.value].slice(0, MAX_EVENTS);
   }
 
-  #hearAck(ack: KnownAck): void {
-    const known = this.#recentAcks.get(ack.id) ?? [];
+  #applyAck(ack: KnownAck): void {
+    const previous = this.#recentAcks.get(ack.id) ?? [];
     const receivedAt = now();
-    this.#recentAcks.set(ack.id, [...known, { message: ack, receivedAt }]);
-    for (const oldest of [...this.#recentAcks.keys()].slice(0, -EVENTS_KEPT)) this.#recentAcks.delete(oldest);
+    this.#recentAcks.set(ack.id, [...previous, { message: ack, receivedAt }]);
+    for (const oldest of [...this.#recentAcks.keys()].slice(0, -MAX_EVENTS)) this.#recentAcks.delete(oldest);
     for (const receiver of this.#ackReceivers) receiver(ack, receivedAt);
   }
 
   /** A retained message is older than its arrival: use its own time, but never a future one. */
-  #noteHeard(atMs: number, retained: boolean): void {
+  #noteMessage(atMs: number, retained: boolean): void {
     const at = retained ? Math.min(now(), toPageClock(atMs)) : now();
-    if (this.#heardAt.value === null || at > this.#heardAt.value) this.#heardAt.value = at;
+    if (this.#lastMessageAt.value === null || at > this.#lastMessageAt.value) this.#lastMessageAt.value = at;
   }
 }

@@ -9,8 +9,8 @@ export interface DeviceFilter {
   /** Words that must all occur in the label, name, type, kind or space. */
   search: string;
   kinds: KindFilter;
-  whose: OwnerFilter;
-  onlyTrouble: boolean;
+  owner: OwnerFilter;
+  needsAttention: boolean;
 }
 
 /** For a room device, type and kind are equal. */
@@ -19,16 +19,16 @@ export function isRoomDevice({ kind, robot_type: type }: Pick<Device, "kind" | "
 }
 
 /** `faults`: number of faults from the device or the cloud. */
-export function matchesFilter(device: DeviceStore, space: string, faults: number, wanted: DeviceFilter): boolean {
-  const { search, kinds, whose, onlyTrouble } = wanted;
+export function matchesFilter(device: DeviceStore, space: string, faults: number, filter: DeviceFilter): boolean {
+  const { search, kinds, owner, needsAttention } = filter;
   const info = device.info.value;
-  if (whose !== "all" && (info.role === "owner") !== (whose === "mine")) return false;
+  if (owner !== "all" && (info.role === "owner") !== (owner === "mine")) return false;
   if (kinds !== "all" && isRoomDevice(info) !== (kinds === "sensors")) return false;
-  if (onlyTrouble && faults === 0 && !needsALook(device)) return false;
+  if (needsAttention && faults === 0 && !needsAttentionNow(device)) return false;
   const text = [info.label, info.name, info.kind, info.robot_type, space].join(" ").toLowerCase().replaceAll("_", " ");
   return search.toLowerCase().split(/\s+/).every((word) => text.includes(word));
 }
 
-function needsALook(device: DeviceStore): boolean {
+function needsAttentionNow(device: DeviceStore): boolean {
   return device.reach.value !== "online" || device.stopped.value || device.state.value?.mode === "fault";
 }

@@ -1,3 +1,3 @@
 export { Fleet } from "./device-list";
 export { DeviceSession } from "./device-session";
-export { DeviceStore, type OpenRequestHere, type Reach } from "./device-store";
+export { DeviceStore, type OpenRequest, type Reach } from "./device-store";

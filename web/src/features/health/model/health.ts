@@ -6,26 +6,26 @@ import type { KnownDescription, KnownTelemetry } from "../../../shared/mqtt/pars
 import type { Fault as ReportedFault } from "../../../shared/mqtt/protocol.generated";
 
 /** A fault as stored in the cloud and as reported by the device; differences are shown. */
-export interface Standing {
+export interface FaultComparison {
   /** `null`: only the device reports it. */
   stored: Fault | null;
   /** `null`: not reported by the device, or not a fault that devices report. */
-  told: ReportedFault | null;
-  /** `unstored`, `ended`: only one of them knows it yet. `unheard`: the device is unreachable. */
-  agreement: "same" | "unstored" | "ended" | "unheard";
+  reported: ReportedFault | null;
+  /** `unstored`, `ended`: only one of them knows it yet. `unreachable`: the device is unreachable. */
+  agreement: "same" | "unstored" | "ended" | "unreachable";
 }
 
 /** Open faults of the cloud and the device, worst first. `told`: the device's faults; `null` if it is unreachable. */
-export function standings(open: readonly Fault[], told: readonly ReportedFault[] | null): Standing[] {
-  const left = new Map((told ?? []).map((fault) => [fault.code, fault]));
-  const found = open.map((stored): Standing => {
-    if (stored.source !== "device") return { stored, told: null, agreement: "same" };
-    if (told === null) return { stored, told: null, agreement: "unheard" };
-    const heard = left.get(stored.code) ?? null;
-    left.delete(stored.code);
-    return { stored, told: heard, agreement: heard === null ? "ended" : "same" };
+export function compareFaults(open: readonly Fault[], reported: readonly ReportedFault[] | null): FaultComparison[] {
+  const remaining = new Map((reported ?? []).map((fault) => [fault.code, fault]));
+  const stored = open.map((stored): FaultComparison => {
+    if (stored.source !== "device") return { stored, reported: null, agreement: "same" };
+    if (reported === null) return { stored, reported: null, agreement: "unreachable" };
+    const match = remaining.get(stored.code) ?? null;
+    remaining.delete(stored.code);
+    return { stored, reported: match, agreement: match === null ? "ended" : "same" };
   });
-  return [...[...left.values()].map((one): Standing => ({ stored: null, told: one, agreement: "unstored" })), ...found];
+  return [...[...remaining.values()].map((one): FaultComparison => ({ stored: null, reported: one, agreement: "unstored" })), ...stored];
 }
 
 /** The faults that the device reports now; `null` if it is unreachable. */
@@ -34,15 +34,15 @@ export function reportedFaults(device: DeviceStore): readonly ReportedFault[] | 
 }
 
 /** Number of open faults: those the device reports now and those the cloud has detected. */
-export function openCount(stored: readonly Pick<Fault, "source" | "code">[] | null, told: readonly ReportedFault[] | null): number {
-  if (stored === null) return told?.length ?? 0;
-  if (told === null) return stored.length;
-  return stored.filter(({ source }) => source !== "device").length + told.length;
+export function openCount(stored: readonly Pick<Fault, "source" | "code">[] | null, reported: readonly ReportedFault[] | null): number {
+  if (stored === null) return reported?.length ?? 0;
+  if (reported === null) return stored.length;
+  return stored.filter(({ source }) => source !== "device").length + reported.length;
 }
 
 /** The worse of the cloud's result and the page's own observation. */
-export function healthNow(stored: HealthState, told: readonly ReportedFault[] | null, reach: Reach): HealthState {
-  if ((told?.length ?? 0) > 0) return "fault";
+export function healthNow(stored: HealthState, reported: readonly ReportedFault[] | null, reach: Reach): HealthState {
+  if ((reported?.length ?? 0) > 0) return "fault";
   if (stored === "ok" && (reach === "offline" || reach === "stale")) return "unknown";
   return stored;
 }
@@ -54,17 +54,17 @@ export function watchedQuantity(watched: MonitoredField, description: KnownDescr
   const limited = [low, high, warning_low, warning_high].some((limit) => limit !== null);
   const listed = label !== name;
   const judged = { stream, fields: field, label, unit, advice, low, high, warning_low, warning_high, change: null, horizon_s: 0, checks: [] };
-  const known = { controls: description?.controls ?? [], diagnostics: limited || listed ? [judged] : [] };
-  const quantity = quantityOf(known, stream, field);
+  const described = { controls: description?.controls ?? [], diagnostics: limited || listed ? [judged] : [] };
+  const quantity = quantityOf(described, stream, field);
   if (!listed) return { ...quantity, judged: limited ? judged : null };
-  return { ...quantity, label: [label, ...part.map(plain)].join(" · ") };
+  return { ...quantity, label: [label, ...part.map(readable)].join(" · ") };
 }
 
-function plain(name: string): string {
+function readable(name: string): string {
   return name.replaceAll("_", " ");
 }
 
-interface Newest {
+interface TimedValue {
   /** On the agent's wall clock [ms since 1970]. */
   atMs: number;
   value: number | boolean;
@@ -75,14 +75,14 @@ const OF_JOINTS = ["position_rad", "velocity_rad_s", "effort_nm"] as const;
 const LOOP_AGE = "loop_age_ms";
 
 /** The newest value of a field from the device; `null` before the first. */
-export function newestOf(device: DeviceStore, stream: string, field: string): Newest | null {
+export function newestOf(device: DeviceStore, stream: string, field: string): TimedValue | null {
   const message = stream === JOINTS ? device.telemetry.value?.message : device.measured(stream).value?.message;
   if (message === undefined) return null;
-  const value = "values" in message ? message.values[field] : ofJoints(device, message, field);
+  const value = "values" in message ? message.values[field] : jointValue(device, message, field);
   return value === undefined ? null : { atMs: message.at_ms, value };
 }
 
-function ofJoints(device: DeviceStore, message: KnownTelemetry, field: string): number | undefined {
+function jointValue(device: DeviceStore, message: KnownTelemetry, field: string): number | undefined {
   if (field === LOOP_AGE) return message.mode === "streaming" ? message.loop_age_ms : undefined;
   const quantity = OF_JOINTS.find((one) => field.startsWith(`${one}.`));
   if (quantity === undefined) return undefined;

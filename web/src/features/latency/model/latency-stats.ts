@@ -27,25 +27,25 @@ export function lineKey({ device, transport, path }: Pick<Line, "device" | "tran
 }
 
 /** Joins stored samples and this page's unsaved ones (`fresh`); each sample counts once. */
-export function linesOf(stored: ReadonlyMap<string, readonly StoredLatency[]>, fresh: readonly Line[], wanted: LatencyQuery): Line[] {
-  const found = new Map<string, Line>();
+export function linesOf(stored: ReadonlyMap<string, readonly StoredLatency[]>, unsaved: readonly Line[], query: LatencyQuery): Line[] {
+  const lines = new Map<string, Line>();
   for (const [device, items] of stored) {
     for (const { transport, path, at_ms, ms, count } of items) {
       const samples = at_ms.map((atMs, index): Sample => ({ atMs, ms: ms[index] ?? 0 }));
-      found.set(lineKey({ device, transport, path }), { device, transport, path, samples, stored: count });
+      lines.set(lineKey({ device, transport, path }), { device, transport, path, samples, stored: count });
     }
   }
-  for (const line of fresh) {
-    const known = found.get(lineKey(line));
-    const seen = new Set(known?.samples.map(({ atMs, ms }) => `${atMs} ${ms}`));
+  for (const line of unsaved) {
+    const existing = lines.get(lineKey(line));
+    const seen = new Set(existing?.samples.map(({ atMs, ms }) => `${atMs} ${ms}`));
     const more = line.samples.filter(({ atMs, ms }) => !seen.has(`${atMs} ${ms}`));
-    const samples = [...(known?.samples ?? []), ...more].sort((one, other) => one.atMs - other.atMs);
-    found.set(lineKey(line), { ...line, samples, stored: known?.stored ?? 0 });
+    const samples = [...(existing?.samples ?? []), ...more].sort((one, other) => one.atMs - other.atMs);
+    lines.set(lineKey(line), { ...line, samples, stored: existing?.stored ?? 0 });
   }
-  return [...found.values()]
-    .filter((line) => [null, line.device].includes(wanted.device) && [null, line.transport].includes(wanted.transport))
-    .filter((line) => wanted.path === null || line.path === wanted.path)
-    .map((line) => ({ ...line, samples: line.samples.filter(({ atMs }) => atMs >= wanted.sinceMs) }))
+  return [...lines.values()]
+    .filter((line) => [null, line.device].includes(query.device) && [null, line.transport].includes(query.transport))
+    .filter((line) => query.path === null || line.path === query.path)
+    .map((line) => ({ ...line, samples: line.samples.filter(({ atMs }) => atMs >= query.sinceMs) }))
     .filter(({ samples }) => samples.length > 0)
     .sort((one, other) => lineKey(one).localeCompare(lineKey(other)));
 }

@@ -11,9 +11,9 @@ import type { Link } from "../../../shared/mqtt/mqtt-link";
 import type { Line } from "./latency-stats";
 
 /** As in the papers. */
-export const TIMES = 20;
+export const SAMPLES_PER_KIND = 20;
 /** Avoids queueing behind the previous request [ms]. */
-const BETWEEN_MS = 100;
+const PAUSE_MS = 100;
 /** Timeout of a single measurement of a room device [ms]. */
 const SHOT_TIMEOUT_MS = 10_000;
 
@@ -29,13 +29,13 @@ const KINDS: Readonly<Record<ProbeKind, Kind>> = {
 };
 
 interface Progress {
-  way: ProbeKind;
+  kind: ProbeKind;
   done: number;
-  of: number;
+  total: number;
 }
 
 interface Batch {
-  way: ProbeKind;
+  kind: ProbeKind;
   key: string;
   samples: readonly Sample[];
   stored: boolean;
@@ -54,28 +54,28 @@ export class LatencyProbe {
   readonly #link: Link;
   readonly #device: DeviceStore;
   readonly #epoch: () => number | null;
-  readonly #betweenMs: number;
+  readonly #pauseMs: number;
   readonly #progress = signal<Progress | null>(null);
   readonly #batches = signal<readonly Batch[]>([]);
-  readonly #why = signal("");
-  #ended = new AbortController();
+  readonly #error = signal("");
+  #abort = new AbortController();
 
   /** The running measurement; `null`: none. */
   readonly progress: ReadonlySignal<Progress | null> = this.#progress;
   /** Why it ended early or could not be stored; empty otherwise. */
-  readonly why: ReadonlySignal<string> = this.#why;
+  readonly error: ReadonlySignal<string> = this.#error;
 
   /** `epoch`: the epoch of this page's lease, if any. */
-  constructor(api: Api, link: Link, device: DeviceStore, epoch: () => number | null, betweenMs = BETWEEN_MS) {
+  constructor(api: Api, link: Link, device: DeviceStore, epoch: () => number | null, pauseMs = PAUSE_MS) {
     this.#api = api;
     this.#link = link;
     this.#device = device;
     this.#epoch = epoch;
-    this.#betweenMs = betweenMs;
+    this.#pauseMs = pauseMs;
   }
 
   get lines(): Line[] {
-    return this.#batches.value.map(({ way, samples }) => ({ ...KINDS[way], device: this.#device.id, samples, stored: 0 }));
+    return this.#batches.value.map(({ kind, samples }) => ({ ...KINDS[kind], device: this.#device.id, samples, stored: 0 }));
   }
 
   /** Whether samples are not stored yet. */
@@ -84,13 +84,13 @@ export class LatencyProbe {
   }
 
   /** Measures and stores each path in turn, until the end or `stop`. */
-  async run(ways: readonly ProbeKind[]): Promise<void> {
+  async run(kinds: readonly ProbeKind[]): Promise<void> {
     if (this.#progress.value !== null) return;
-    this.#ended = new AbortController();
-    const { signal: ended } = this.#ended;
-    this.#why.value = "";
-    for (const way of ways) {
-      if (!ended.aborted) await this.#measure(way, ended);
+    this.#abort = new AbortController();
+    const { signal: ended } = this.#abort;
+    this.#error.value = "";
+    for (const kind of kinds) {
+      if (!ended.aborted) await this.#measure(kind, ended);
     }
     this.#progress.value = null;
     await this.store();
@@ -98,7 +98,7 @@ export class LatencyProbe {
 
   /** Stops; the samples stay. */
   stop(): void {
-    this.#ended.abort();
+    this.#abort.abort();
   }
 
   /** Stores pending samples. Viewers cannot store any. */
@@ -106,47 +106,47 @@ export class LatencyProbe {
     if (this.#device.info.value.role === "viewer") return;
     for (const batch of this.#batches.value) {
       if (batch.stored || batch.samples.length === 0) continue;
-      const { transport, path } = KINDS[batch.way];
+      const { transport, path } = KINDS[batch.kind];
       try {
         const samples = batch.samples.map(({ atMs, ms }) => ({ at_ms: atMs, ms }));
         await this.#api.addLatency(this.#device.id, { transport, path, samples }, batch.key);
-        this.#note({ ...batch, stored: true });
+        this.#setBatch({ ...batch, stored: true });
       } catch (error) {
-        this.#why.value = sentence(error);
+        this.#error.value = sentence(error);
         return;
       }
     }
-    if (this.#batches.value.every(({ stored }) => stored) && !this.#ended.signal.aborted) this.#why.value = "";
+    if (this.#batches.value.every(({ stored }) => stored) && !this.#abort.signal.aborted) this.#error.value = "";
   }
 
-  async #measure(way: ProbeKind, ended: AbortSignal): Promise<void> {
-    let batch: Batch = { way, key: newId(), samples: [], stored: false };
-    for (let done = 0; done < TIMES; done += 1) {
+  async #measure(kind: ProbeKind, ended: AbortSignal): Promise<void> {
+    let batch: Batch = { kind, key: newId(), samples: [], stored: false };
+    for (let done = 0; done < SAMPLES_PER_KIND; done += 1) {
       if (ended.aborted) return;
-      this.#progress.value = { way, done, of: TIMES };
+      this.#progress.value = { kind, done, total: SAMPLES_PER_KIND };
       const atMs = Math.round(serverNow());
-      const begun = now();
+      const started = now();
       try {
-        await this.#once(way);
+        await this.#sample(kind);
       } catch (error) {
-        this.#why.value = sentence(error);
+        this.#error.value = sentence(error);
         return;
       }
-      batch = { ...batch, samples: [...batch.samples, { atMs, ms: Math.round((now() - begun) * 1000) / 1000 }] };
-      this.#note(batch);
-      await new Promise((resolve) => setTimeout(resolve, this.#betweenMs));
+      batch = { ...batch, samples: [...batch.samples, { atMs, ms: Math.round((now() - started) * 1000) / 1000 }] };
+      this.#setBatch(batch);
+      await new Promise((resolve) => setTimeout(resolve, this.#pauseMs));
     }
   }
 
-  async #once(way: ProbeKind): Promise<void> {
-    if (way === "cloud") return this.#api.latency.measureRoundTrip();
-    if (way === "broker") return this.#link.ping();
-    const asked = { epoch: this.#epoch(), waitFor: "done", timeoutMs: SHOT_TIMEOUT_MS } as const;
-    const action = await this.#api.startAction(this.#device.id, { kind: SHOOT, streams: [] }, asked, newId());
+  async #sample(kind: ProbeKind): Promise<void> {
+    if (kind === "cloud") return this.#api.latency.measureRoundTrip();
+    if (kind === "broker") return this.#link.ping();
+    const options = { epoch: this.#epoch(), waitFor: "done", timeoutMs: SHOT_TIMEOUT_MS } as const;
+    const action = await this.#api.startAction(this.#device.id, { kind: SHOOT, streams: [] }, options, newId());
     if (action.status !== "done") throw new Error(action.reason?.message ?? action.status);
   }
 
-  #note(batch: Batch): void {
+  #setBatch(batch: Batch): void {
     this.#batches.value = [...this.#batches.value.filter(({ key }) => key !== batch.key), batch];
   }
 }

@@ -30,7 +30,7 @@ export class RoundTrip {
   }
 
   /** Telemetry echoes a setpoint of this page. Each sequence number counts once. */
-  seen(sequence: number, sentMs: number, nowMs: number): void {
+  add(sequence: number, sentMs: number, nowMs: number): void {
     const tookMs = nowMs - sentMs;
     if (sequence <= this.#lastSequence || tookMs < 0) return;
     this.#lastSequence = sequence;

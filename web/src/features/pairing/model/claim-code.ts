@@ -1,9 +1,9 @@
-/** A claim code: how it is written, and one whose link was followed. It stays in this tab until it is used or dropped. */
-import type { Shelf } from "../../sharing/model";
+/** Parses claim codes, and stores the code of an opened pairing link in this tab until it is used or dropped. */
+import type { TabStorage } from "../../sharing/model";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 
 const KEY = "telescope.pair";
-/** The agent's alphabet has no vowels and nothing that looks like a digit. */
+/** The alphabet has no vowels, and no letters that resemble digits. */
 const CODE = /^[BCDFGHJKLMNPQRSTVWXZ]{8}$/;
 
 /** Normalizes a code to `BCDF-GHJK`; `null`: invalid. Accepts lower case, spaces and hyphens. */
@@ -12,31 +12,31 @@ export function readCode(typed: string): string | null {
   return CODE.test(code) ? `${code.slice(0, 4)}-${code.slice(4)}` : null;
 }
 
-/** The code in an address's fragment, `#pair=<code>`, or `null`: an invalid code is not shown. */
+/** The code in a URL fragment, `#pair=<code>`; `null` without a valid code. */
 export function pairingCode(hash: string): string | null {
-  const found = /^#pair=([A-Za-z-]{8,12})$/.exec(hash)?.[1];
-  return found === undefined ? null : readCode(found);
+  const match = /^#pair=([A-Za-z-]{8,12})$/.exec(hash)?.[1];
+  return match === undefined ? null : readCode(match);
 }
 
-/** Signing in may lead away and back: the tab's own storage keeps the code meanwhile. */
+/** The code of an opened pairing link. The tab's storage retains it during an external sign-in. */
 export class FollowedCode {
-  readonly #shelf: Shelf;
+  readonly #storage: TabStorage;
   readonly #code;
   readonly code: ReadonlySignal<string | null>;
 
-  constructor(shelf: Shelf) {
-    this.#shelf = shelf;
-    this.#code = signal(shelf.getItem(KEY));
+  constructor(storage: TabStorage) {
+    this.#storage = storage;
+    this.#code = signal(storage.getItem(KEY));
     this.code = this.#code;
   }
 
   follow(code: string): void {
-    this.#shelf.setItem(KEY, code);
+    this.#storage.setItem(KEY, code);
     this.#code.value = code;
   }
 
   drop(): void {
-    this.#shelf.removeItem(KEY);
+    this.#storage.removeItem(KEY);
     this.#code.value = null;
   }
 }

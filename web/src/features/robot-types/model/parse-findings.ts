@@ -3,8 +3,8 @@
 type FindingKind =
   | "range"
   | "missing"
-  | "torn"
-  | "word"
+  | "malformed"
+  | "keyword"
   | "element"
   | "unnamed"
   | "servo"
@@ -29,9 +29,9 @@ export interface Finding {
   line: number | null;
   kind: FindingKind;
   /** The message without file and line. */
-  said: string;
+  message: string;
   /** The affected name, such as a joint or file; may be empty. */
-  about: string;
+  subject: string;
   /** For a range error: the range that the model allows [rad]. */
   range_rad: readonly [number, number] | null;
 }
@@ -57,42 +57,42 @@ const KINDS: readonly (readonly [FindingKind, RegExp])[] = [
   ["mesh", /meshes are shown as boxes/],
   ["invisible", /nothing of it can be seen|too many parts/],
   ["element", /unrecognized element|Schema violation/i],
-  ["word", /invalid keyword|unrecognized attribute/i],
-  ["torn", /XML_ERROR|mismatched tag|not well-formed|unclosed token|no element found|undefined entity|XML parse error/i],
+  ["keyword", /invalid keyword|unrecognized attribute/i],
+  ["malformed", /XML_ERROR|mismatched tag|not well-formed|unclosed token|no element found|undefined entity|XML parse error/i],
 ];
 
 export function readFinding(error: string): Finding {
   const file = FILE.exec(error)?.[1] ?? "";
-  const said = error.slice(FILE.exec(error)?.[0].length ?? 0);
-  const line = LINES.map((each) => each.exec(said)?.[1]).find((found) => found !== undefined);
-  const range = RANGE.exec(said);
+  const message = error.slice(FILE.exec(error)?.[0].length ?? 0);
+  const line = LINES.map((each) => each.exec(message)?.[1]).find((found) => found !== undefined);
+  const range = RANGE.exec(message);
   return {
     file,
     line: line === undefined ? null : Number(line),
-    kind: kindOf(file, said),
-    said: tidy(said),
-    about: /'([^']*)'/.exec(said)?.[1] ?? "",
+    kind: kindOf(file, message),
+    message: withoutLine(message),
+    subject: /'([^']*)'/.exec(message)?.[1] ?? "",
     range_rad: range === null ? null : [Number(range[1]), Number(range[2])],
   };
 }
 
 /** All findings, sorted by file and line. Findings without a file come first. */
 export function readFindings(errors: readonly string[]): Finding[] {
-  const found = errors.map(readFinding);
-  return found.sort((one, other) => one.file.localeCompare(other.file) || (one.line ?? 0) - (other.line ?? 0));
+  const findings = errors.map(readFinding);
+  return findings.sort((one, other) => one.file.localeCompare(other.file) || (one.line ?? 0) - (other.line ?? 0));
 }
 
-function kindOf(file: string, said: string): FindingKind {
-  const found = KINDS.find(([, words]) => words.test(said))?.[0];
-  if (found !== undefined && !(file.endsWith(".py") || file === "robot.toml") ) return found;
+function kindOf(file: string, message: string): FindingKind {
+  const matched = KINDS.find(([, pattern]) => pattern.test(message))?.[0];
+  if (matched !== undefined && !(file.endsWith(".py") || file === "robot.toml") ) return matched;
   if (file.endsWith(".py")) return "script";
-  if (file === "robot.toml") return /at line \d+/.test(said) ? "manifest" : "field";
+  if (file === "robot.toml") return /at line \d+/.test(message) ? "manifest" : "field";
   return "other";
 }
 
 /** Removes the line number, which is shown separately. */
-function tidy(said: string): string {
-  return said
+function withoutLine(message: string): string {
+  return message
     .replace(/\s*\((?:at )?line \d+[^)]*\)/, "")
     .replace(/^Line \d+: /, "")
     .replace(/^(?:XML )?Error: /, "")

@@ -6,53 +6,53 @@ import { ApiError, sentence } from "../../../shared/api/http";
 import type { TypePreview, RobotType, RobotTypes, TypeModel } from "../../../shared/api/robot-types";
 import { selectFiles, MANIFEST, MAX_BYTES, packFiles, size, type Files } from "./upload-files";
 
-type DraftStep = "empty" | "sending" | "checking" | "good" | "wrong" | "unsent" | "saving" | "saved";
+type DraftStep = "empty" | "sending" | "checking" | "valid" | "invalid" | "unsent" | "saving" | "saved";
 
 /** The result of saving one of the type's movements. */
 interface SavedMovement {
   name: string;
   /** The error, or "". */
-  why: string;
+  error: string;
 }
 
 /** Errors that prevent sending. */
-type LocalFault = "no-manifest" | "too-large" | null;
+type LocalError = "no-manifest" | "too-large" | null;
 
-const ASK_EVERY_MS = 500;
+const POLL_MS = 500;
 
 /** Files can be replaced at any time; pending results for the previous files are discarded. */
 export class UploadDraft {
   readonly #types: RobotTypes;
   readonly #files = signal<Files>(new Map());
-  readonly #left = signal<readonly string[]>([]);
+  readonly #ignored = signal<readonly string[]>([]);
   readonly #step = signal<DraftStep>("empty");
-  readonly #look = signal<TypePreview | null>(null);
+  readonly #preview = signal<TypePreview | null>(null);
   readonly #model = signal<TypeModel | null>(null);
   readonly #errors = signal<readonly string[]>([]);
-  readonly #trouble = signal("");
+  readonly #error = signal("");
   readonly #saved = signal<RobotType | null>(null);
   readonly #movements = signal<readonly SavedMovement[]>([]);
   readonly #since = signal(0);
-  #round = 0;
+  #generation = 0;
   #disposed = false;
 
   readonly files: ReadonlySignal<Files> = this.#files;
   /** Chosen files that a robot type does not use. */
-  readonly left: ReadonlySignal<readonly string[]> = this.#left;
+  readonly ignored: ReadonlySignal<readonly string[]> = this.#ignored;
   readonly step: ReadonlySignal<DraftStep> = this.#step;
-  readonly look: ReadonlySignal<TypePreview | null> = this.#look;
+  readonly preview: ReadonlySignal<TypePreview | null> = this.#preview;
   readonly model: ReadonlySignal<TypeModel | null> = this.#model;
   /** The error of the last attempt, such as an unreachable server. */
-  readonly trouble: ReadonlySignal<string> = this.#trouble;
+  readonly error: ReadonlySignal<string> = this.#error;
   readonly saved: ReadonlySignal<RobotType | null> = this.#saved;
   readonly movements: ReadonlySignal<readonly SavedMovement[]> = this.#movements;
   /** Start of the current step on the page's clock [ms]. */
   readonly since: ReadonlySignal<number> = this.#since;
   readonly errors: ReadonlySignal<readonly Finding[]> = computed(() => readFindings(this.#errors.value));
   readonly warnings: ReadonlySignal<readonly Finding[]> = computed(() =>
-    readFindings(this.#look.value?.robot_type.upload?.warnings ?? []),
+    readFindings(this.#preview.value?.robot_type.upload?.warnings ?? []),
   );
-  readonly fault: ReadonlySignal<LocalFault> = computed(() => {
+  readonly localError: ReadonlySignal<LocalError> = computed(() => {
     const files = this.#files.value;
     if (files.size === 0) return null;
     if (!files.has(MANIFEST)) return "no-manifest";
@@ -66,15 +66,15 @@ export class UploadDraft {
 
   /** Adds files, replaces those with the same name, and validates all. */
   async add(entries: Files): Promise<void> {
-    const { files, left } = selectFiles(entries);
+    const { files, ignored } = selectFiles(entries);
     // A single file replaces the file with the same name in any folder.
     for (const [name, content] of [...files]) {
-      const known = [...this.#files.value.keys()].filter((each) => each.endsWith(`/${name}`));
-      if (name.includes("/") || this.#files.value.has(name) || known.length !== 1) continue;
+      const matches = [...this.#files.value.keys()].filter((each) => each.endsWith(`/${name}`));
+      if (name.includes("/") || this.#files.value.has(name) || matches.length !== 1) continue;
       files.delete(name);
-      files.set(known[0] ?? name, content);
+      files.set(matches[0] ?? name, content);
     }
-    await this.#change(new Map([...this.#files.value, ...files]), left);
+    await this.#change(new Map([...this.#files.value, ...files]), ignored);
   }
 
   /** Replaces file `name`. The replacement may have any local name. */
@@ -92,81 +92,81 @@ export class UploadDraft {
 
   /** Sends all files and waits for the result. */
   async check(): Promise<void> {
-    const round = this.#begin("sending");
+    const generation = this.#start("sending");
     const folder = packFiles(this.#files.value);
-    if (folder === null || this.fault.value !== null) {
-      this.#step.value = this.#files.value.size === 0 ? "empty" : "wrong";
+    if (folder === null || this.localError.value !== null) {
+      this.#step.value = this.#files.value.size === 0 ? "empty" : "invalid";
       return;
     }
     try {
-      let look = await this.#types.createPreview(folder);
-      if (this.#past(round)) {
-        void this.#forget(look);
+      let preview = await this.#types.createPreview(folder);
+      if (this.#outdated(generation)) {
+        void this.#deletePreview(preview);
         return;
       }
       batch(() => {
-        this.#look.value = look;
-        this.#to("checking");
+        this.#preview.value = preview;
+        this.#setStep("checking");
       });
-      while (look.robot_type.upload?.state === "checking") {
-        await new Promise((resolve) => setTimeout(resolve, ASK_EVERY_MS));
-        if (this.#past(round)) return;
-        look = await this.#types.preview(look.id);
-        if (this.#past(round)) return;
+      while (preview.robot_type.upload?.state === "checking") {
+        await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+        if (this.#outdated(generation)) return;
+        preview = await this.#types.preview(preview.id);
+        if (this.#outdated(generation)) return;
       }
-      const errors = look.robot_type.upload?.errors ?? [];
-      const model = errors.length === 0 ? await this.#modelOf(look) : null;
-      if (this.#past(round)) return;
+      const errors = preview.robot_type.upload?.errors ?? [];
+      const model = errors.length === 0 ? await this.#modelOf(preview) : null;
+      if (this.#outdated(generation)) return;
       batch(() => {
-        this.#look.value = look;
+        this.#preview.value = preview;
         this.#errors.value = errors;
         this.#model.value = model;
-        this.#to(errors.length === 0 ? "good" : "wrong");
+        this.#setStep(errors.length === 0 ? "valid" : "invalid");
       });
     } catch (error) {
-      if (!this.#past(round)) this.#refuse(error);
+      if (!this.#outdated(generation)) this.#fail(error);
     }
   }
 
   /** Saves the robot type and its movements. */
   async save(): Promise<void> {
-    const look = this.#look.value;
-    if (look === null || this.#step.value !== "good") return;
-    const round = this.#round;
-    this.#trouble.value = "";
-    this.#to("saving");
+    const preview = this.#preview.value;
+    if (preview === null || this.#step.value !== "valid") return;
+    const generation = this.#generation;
+    this.#error.value = "";
+    this.#setStep("saving");
     try {
-      let saved = await this.#types.savePreview(look.id);
+      let saved = await this.#types.savePreview(preview.id);
       while (saved.upload?.state === "checking") {
-        await new Promise((resolve) => setTimeout(resolve, ASK_EVERY_MS));
-        if (this.#past(round)) return;
+        await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+        if (this.#outdated(generation)) return;
         saved = await this.#types.get(saved.type);
       }
       const movements = await this.#saveMovements(saved.type);
-      if (this.#past(round)) return;
+      if (this.#outdated(generation)) return;
       batch(() => {
-        this.#look.value = null;
+        this.#preview.value = null;
         this.#saved.value = saved;
         this.#movements.value = movements;
-        this.#to("saved");
+        this.#setStep("saved");
       });
     } catch (error) {
-      if (this.#past(round)) return;
+      if (this.#outdated(generation)) return;
       batch(() => {
-        this.#trouble.value = sentence(error);
-        this.#to("good");
+        this.#error.value = sentence(error);
+        this.#setStep("valid");
       });
     }
   }
 
   dispose(): void {
     this.#disposed = true;
-    this.#dropLook();
+    this.#discardPreview();
   }
 
-  async #modelOf(look: TypePreview): Promise<TypeModel | null> {
+  async #modelOf(preview: TypePreview): Promise<TypeModel | null> {
     try {
-      return await this.#types.previewModel(look.id);
+      return await this.#types.previewModel(preview.id);
     } catch (error) {
       // A model that cannot be drawn can still be valid; a warning reports it.
       if (error instanceof ApiError && error.code === "model-unknown") return null;
@@ -179,66 +179,66 @@ export class UploadDraft {
     for (const [name, source] of Object.entries(packFiles(this.#files.value)?.movements ?? {})) {
       try {
         await this.#types.putMovement(type, name, source);
-        saved.push({ name, why: "" });
+        saved.push({ name, error: "" });
       } catch (error) {
-        saved.push({ name, why: sentence(error) });
+        saved.push({ name, error: sentence(error) });
       }
     }
     return saved;
   }
 
-  async #change(files: Files, left: readonly string[]): Promise<void> {
+  async #change(files: Files, ignored: readonly string[]): Promise<void> {
     batch(() => {
       this.#files.value = files;
-      this.#left.value = left;
+      this.#ignored.value = ignored;
     });
     await this.check();
   }
 
-  #begin(step: DraftStep): number {
-    this.#dropLook();
+  #start(step: DraftStep): number {
+    this.#discardPreview();
     batch(() => {
       this.#model.value = null;
       this.#errors.value = [];
-      this.#trouble.value = "";
+      this.#error.value = "";
       this.#saved.value = null;
       this.#movements.value = [];
-      this.#to(step);
+      this.#setStep(step);
     });
-    this.#round += 1;
-    return this.#round;
+    this.#generation += 1;
+    return this.#generation;
   }
 
-  #to(step: DraftStep): void {
+  #setStep(step: DraftStep): void {
     this.#step.value = step;
     this.#since.value = now();
   }
 
   /** The server rejected the files or was unreachable. */
-  #refuse(error: unknown): void {
-    const told = error instanceof ApiError ? error.extra["errors"] : undefined;
-    const errors = Array.isArray(told) ? told.filter((each): each is string => typeof each === "string") : [];
-    const refused = error instanceof ApiError && (error.status === 422 || error.code === "robot-type-built-in");
+  #fail(error: unknown): void {
+    const details = error instanceof ApiError ? error.extra["errors"] : undefined;
+    const errors = Array.isArray(details) ? details.filter((each): each is string => typeof each === "string") : [];
+    const rejected = error instanceof ApiError && (error.status === 422 || error.code === "robot-type-built-in");
     batch(() => {
-      this.#errors.value = errors.length > 0 || !refused ? errors : [`robot.toml: ${sentence(error)}`];
-      this.#trouble.value = refused ? "" : sentence(error);
-      this.#to(refused ? "wrong" : "unsent");
+      this.#errors.value = errors.length > 0 || !rejected ? errors : [`robot.toml: ${sentence(error)}`];
+      this.#error.value = rejected ? "" : sentence(error);
+      this.#setStep(rejected ? "invalid" : "unsent");
     });
   }
 
-  #past(round: number): boolean {
-    return this.#disposed || round !== this.#round;
+  #outdated(generation: number): boolean {
+    return this.#disposed || generation !== this.#generation;
   }
 
-  #dropLook(): void {
-    const look = this.#look.value;
-    this.#look.value = null;
-    if (look !== null) void this.#forget(look);
+  #discardPreview(): void {
+    const preview = this.#preview.value;
+    this.#preview.value = null;
+    if (preview !== null) void this.#deletePreview(preview);
   }
 
-  async #forget(look: TypePreview): Promise<void> {
+  async #deletePreview(preview: TypePreview): Promise<void> {
     try {
-      await this.#types.deletePreview(look.id);
+      await this.#types.deletePreview(preview.id);
     } catch {
       // The server deletes it later.
     }

@@ -12,23 +12,23 @@ export type Files = ReadonlyMap<string, Uint8Array>;
 
 interface SelectedUpload {
   files: Map<string, Uint8Array>;
-  left: string[];
+  ignored: string[];
 }
 
 /** The files in the folder of `robot.toml`, by relative path. Without a manifest: below the common parent folder. */
 export function selectFiles(entries: Files): SelectedUpload {
   const files = new Map<string, Uint8Array>();
-  const left: string[] = [];
+  const ignored: string[] = [];
   const names = [...entries.keys()].filter((name) => !name.endsWith("/") && !hidden(name));
   const root = rootOf(names);
   for (const name of names) {
-    const inside = name.slice(root.length);
+    const relative = name.slice(root.length);
     const content = entries.get(name);
     if (content === undefined) continue;
-    if (name.startsWith(root) && belongs(inside)) files.set(inside, content);
-    else left.push(name);
+    if (name.startsWith(root) && belongs(relative)) files.set(relative, content);
+    else ignored.push(name);
   }
-  return { files, left };
+  return { files, ignored };
 }
 
 /** The folder's content in the server's format; `null` without a manifest. */

@@ -153,10 +153,10 @@ export class RoomDeviceAction {
   async #ask(request: RoomRequest, waitFor: Required<ActionOptions>["waitFor"], timeoutMs: number): Promise<Run | null> {
     this.#busy.value = request.kind;
     this.#why.value = "";
-    const run = await this.#actions.ask(request, { epoch: this.#epoch(), waitFor, timeoutMs });
+    const run = await this.#actions.startAndWait(request, { epoch: this.#epoch(), waitFor, timeoutMs });
     this.#busy.value = null;
     if (run.status === "done" || (waitFor === "started" && run.status === "started")) return run;
-    this.#why.value = run.why === "" ? run.status : run.why;
+    this.#why.value = run.reason === "" ? run.status : run.reason;
     return null;
   }
 

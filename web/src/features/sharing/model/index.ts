@@ -1,1 +1,1 @@
-export { FollowedInvitation, type Shelf } from "./invitation-link";
+export { FollowedInvitation, type TabStorage } from "./invitation-link";

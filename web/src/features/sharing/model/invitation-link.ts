@@ -6,57 +6,57 @@ const AWAY = "telescope.invitation.away";
 
 type Followed =
   | { kind: "none" }
-  /** `away`: signing in has led to a provider, where an account that was made on the way has taken it already. */
+  /** `away`: an external sign-in was started. If it created an account, it has already redeemed the invitation. */
   | { kind: "open"; secret: string; away: boolean }
-  /** It was taken by making an account with it, so it may not be there to be looked at any more. */
+  /** Redeemed by creating an account with it, so it can no longer be previewed. */
   | { kind: "joined" };
 
-/** What is needed of the tab's own storage. */
-export type Shelf = Pick<Storage, "getItem" | "setItem" | "removeItem">;
+/** The required methods of the tab's storage. */
+export type TabStorage = Pick<Storage, "getItem" | "setItem" | "removeItem">;
 
 export class FollowedInvitation {
-  readonly #shelf: Shelf;
+  readonly #storage: TabStorage;
   readonly #state;
   readonly state: ReadonlySignal<Followed>;
 
-  constructor(shelf: Shelf) {
-    this.#shelf = shelf;
-    const secret = shelf.getItem(KEY);
+  constructor(storage: TabStorage) {
+    this.#storage = storage;
+    const secret = storage.getItem(KEY);
     this.#state = signal<Followed>(
-      secret === null ? { kind: "none" } : { kind: "open", secret, away: shelf.getItem(AWAY) !== null },
+      secret === null ? { kind: "none" } : { kind: "open", secret, away: storage.getItem(AWAY) !== null },
     );
     this.state = this.#state;
   }
 
   follow(secret: string): void {
-    this.#shelf.setItem(KEY, secret);
-    this.#shelf.removeItem(AWAY);
+    this.#storage.setItem(KEY, secret);
+    this.#storage.removeItem(AWAY);
     this.#state.value = { kind: "open", secret, away: false };
   }
 
-  /** The browser leaves for a provider with it. */
-  leave(): void {
-    this.#shelf.setItem(AWAY, "1");
+  /** Records that the browser leaves for an external sign-in with the invitation. */
+  markAway(): void {
+    this.#storage.setItem(AWAY, "1");
   }
 
-  /** It was redeemed, or is not wanted, or is worth nothing. */
+  /** The invitation was redeemed, declined or is invalid. */
   drop(): void {
-    this.#forget();
+    this.#clearStorage();
     this.#state.value = { kind: "none" };
   }
 
   joined(): void {
-    this.#forget();
+    this.#clearStorage();
     this.#state.value = { kind: "joined" };
   }
 
-  #forget(): void {
-    this.#shelf.removeItem(KEY);
-    this.#shelf.removeItem(AWAY);
+  #clearStorage(): void {
+    this.#storage.removeItem(KEY);
+    this.#storage.removeItem(AWAY);
   }
 }
 
-/** The secret in an address's fragment, `#invitation=<secret>`, or `null`. */
+/** The secret in a URL fragment, `#invitation=<secret>`, or `null`. */
 export function invitationSecret(hash: string): string | null {
   return /^#invitation=([A-Za-z0-9._~-]{1,200})$/.exec(hash)?.[1] ?? null;
 }
