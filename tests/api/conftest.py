@@ -16,7 +16,7 @@ def broker(brokers: Brokers) -> RunningBroker:
 
 @pytest.fixture
 def new_home(tmp_path: Path, keys: Path) -> Callable[[], Path]:
-    """Makes empty folders of functions that the broker knows."""
+    """Creates home folders with the keys that the broker accepts."""
     numbers = itertools.count()
 
     def make() -> Path:

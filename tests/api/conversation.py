@@ -1,6 +1,6 @@
-"""One long conversation with the API: people, a robot that polls, and everything they do, step by step.
+"""A fixed sequence of API requests by users and a polling robot.
 
-Nothing in it waits or runs beside it, so two runs say the same things in the same order.
+It is sequential and does not wait, so two runs send the same requests in the same order.
 """
 
 import hashlib
@@ -16,81 +16,81 @@ from tests.harness.cloud.polling import PollingRobot, Site
 from tests.harness.hosts import Host
 
 PUBLIC_URL = "http://telescope.test"
-"""What the functions believe to be their address."""
-ODD = "grüß 🤖 \u202e'\";--\\ \u0001 %2F"
+"""The configured public URL of the functions."""
+UNUSUAL = "grüß 🤖 \u202e'\";--\\ \u0001 %2F"
 MINE = "/robot-types/ur5/movements/mine"
 SOURCE = '"""Wäve 🤖."""\nrobot.home()\n'
 CAPTURE = b"\x00\xff raw" * 1000
 
 
 class Recorder(Site):
-    """Writes down all that is asked through it."""
+    """Records all requests and responses in a transcript."""
 
     def __init__(self, base: str) -> None:
         super().__init__(base)
         self.transcript = Transcript()
-        self.silent = False
+        self.paused = False
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
-        answer = super().request(method, path, **options)
-        if not self.silent:
-            self.transcript.write(method, path, answer)
-        return answer
+        response = super().request(method, path, **options)
+        if not self.paused:
+            self.transcript.write(method, path, response)
+        return response
 
 
 class Conversation:
-    """All of it, in order. What must be so is asserted by comparing transcripts, and here where it is a promise."""
+    """The request sequence. The test compares transcripts; the sequence asserts only essential results."""
 
     def __init__(self, host: Host, links: list[str]) -> None:
         self.host = host
         self.site = Recorder(host.url)
         self._links = links
         self.robot = PollingRobot(self.site, "arm", "leg")
-        self.site.transcript.know(self.robot.id, "robot")
-        self.site.transcript.know(self.robot.public, "robot's key")
+        self.site.transcript.add_name(self.robot.id, "robot")
+        self.site.transcript.add_name(self.robot.public, "robot's key")
 
-    def hold(self) -> list[str]:
-        """Gives what was said."""
+    def run(self) -> list[str]:
+        """Send all requests; returns the transcript."""
         try:
-            self._hold()
+            self._run()
         finally:
             self.site.close()
         return self.site.transcript.lines
 
-    def _hold(self) -> None:
-        self.knock()
+    def _run(self) -> None:
+        self.anonymous()
         self.anna, self.again, self.bert = (self.sign_in(link) for link in self._links)
         self.claim()
-        self.look()
+        self.read()
         self.movements()
         self.lease()
         self.handover()
         self.actions()
         self.queue()
-        self.fleet()
+        self.batch()
         self.measure()
         self.upload()
         self.accounts()
-        self.mistakes()
-        self.leave()
+        self.invalid_requests()
+        self.unpair()
 
-    def knock(self) -> None:
+    def anonymous(self) -> None:
         """Without credentials, and with invalid ones."""
-        ask = self.site.request
-        ask("GET", f"{API}/health")
-        ask("GET", f"{API}/devices")
-        ask("GET", f"{API}/devices", headers={"Authorization": "Bearer nonsense"})
-        ask("POST", f"{API}/auth/sign-in", json={"link": "wrong"})
-        ask("POST", f"{API}/auth/sign-in", content=b"{")
-        ask("POST", f"{API}/auth/sign-in", content=b"\xff\xfe")
-        ask("POST", f"{API}/auth/sign-in", json={"link": ODD, "more": 1})
-        ask("POST", f"{API}/auth/sign-in", content=b" " * 1_000_001)
+        request = self.site.request
+        request("GET", f"{API}/health")
+        request("GET", f"{API}/devices")
+        request("GET", f"{API}/devices", headers={"Authorization": "Bearer nonsense"})
+        request("POST", f"{API}/auth/sign-in", json={"link": "wrong"})
+        request("POST", f"{API}/auth/sign-in", content=b"{")
+        request("POST", f"{API}/auth/sign-in", content=b"\xff\xfe")
+        request("POST", f"{API}/auth/sign-in", json={"link": UNUSUAL, "more": 1})
+        request("POST", f"{API}/auth/sign-in", content=b" " * 1_000_001)
 
     def sign_in(self, link: str) -> Visitor:
-        answer = self.site.request("POST", f"{API}/auth/sign-in", json={"link": link})
-        assert answer.status_code == 200, answer.text
+        response = self.site.request("POST", f"{API}/auth/sign-in", json={"link": link})
+        assert response.status_code == 200, response.text
         assert self.site.request("POST", f"{API}/auth/sign-in", json={"link": link}).status_code == 401
-        person = Visitor(self.site, answer.json())
+        person = Visitor(self.site, response.json())
         person.get("/accounts/me")
         person.get("/spaces")
         return person
@@ -103,7 +103,7 @@ class Conversation:
         assert self.anna.post("/agents/claim", {"code": f" {code.lower()} "}).status_code == 200
         assert self.bert.post("/agents/claim", {"code": code}).status_code == 404
         self.robot.space = self.robot.enrollment()["space"]
-        self.robot.enroll(software="toy 2")
+        self.robot.enroll(software="test 2")
         self.robot._keys = self.keys()
         self.robot.open_link()
 
@@ -112,7 +112,7 @@ class Conversation:
 
         return {key["id"]: signing.public_key(key["public"]) for key in self.robot.enrollment()["keys"]}
 
-    def look(self) -> None:
+    def read(self) -> None:
         device = self.robot.device
         for person in (self.anna, self.again, self.bert):
             person.get("/agents")
@@ -128,11 +128,11 @@ class Conversation:
                 "/uploads",
                 "/diagnostics",
             ):
-                answer = person.get(f"/devices/{device}{path}")
-                assert answer.status_code == (404 if person is self.bert else 200), answer.text
-        for odd in ("%F0%9F%A4%96", "..", "a%20b", "%01", "x" * 200, "aaaaaaaaaa-arm", f"{device}%20"):
-            answer = self.anna.get(f"/devices/{odd}")
-            assert answer.status_code == 404, f"{odd}: {answer.status_code} {answer.text}"
+                response = person.get(f"/devices/{device}{path}")
+                assert response.status_code == (404 if person is self.bert else 200), response.text
+        for device_id in ("%F0%9F%A4%96", "..", "a%20b", "%01", "x" * 200, "aaaaaaaaaa-arm", f"{device}%20"):
+            response = self.anna.get(f"/devices/{device_id}")
+            assert response.status_code == 404, f"{device_id}: {response.status_code} {response.text}"
 
     def movements(self) -> None:
         self.anna.get("/robot-types")
@@ -140,7 +140,7 @@ class Conversation:
         self.anna.get("/robot-types/none")
         self.anna.get("/robot-types/ur5/movements", params={"limit": 1})
         assert self.anna.put(MINE, {"source": SOURCE}).status_code == 201
-        self.anna.put(MINE, {"source": SOURCE + "#", "description": ODD.replace("\u0001", "")})
+        self.anna.put(MINE, {"source": SOURCE + "#", "description": UNUSUAL.replace("\u0001", "")})
         self.anna.put(MINE, {"source": ""})
         self.anna.put("/robot-types/ur5/movements/a%20b", {"source": SOURCE})
         self.anna.get(MINE)
@@ -164,54 +164,54 @@ class Conversation:
         self.robot.step()
 
     def handover(self) -> None:
-        """From hand to hand: refused, withdrawn, accepted; then taken over, and given back."""
+        """Control requests are rejected, withdrawn and accepted; then the lease is taken over and released."""
         path = f"/devices/{self.robot.device}/lease"
         requests = f"{path}/requests"
         assert self.again.post(requests).status_code == 409
         self.anna.post(path, {"wait_ms": 0})
-        asked = {"wait_ms": 0, "within_ms": 60_000}
-        first = self.again.post(requests, asked).json()["request"]["id"]
-        assert self.again.post(requests, asked).status_code == 200
-        assert self.anna.post(requests, asked).status_code == 409
-        assert self.bert.post(requests, asked).status_code == 404
+        body = {"wait_ms": 0, "within_ms": 60_000}
+        first = self.again.post(requests, body).json()["request"]["id"]
+        assert self.again.post(requests, body).status_code == 200
+        assert self.anna.post(requests, body).status_code == 409
+        assert self.bert.post(requests, body).status_code == 404
         self.again.post(requests, {"within_ms": 1})
         self.robot.step()
         self.anna.get(path)
         assert self.again.post(f"{requests}/{first}/accept").status_code == 403
         assert self.anna.post(f"{requests}/{first}/reject").json()["outcome"] == "rejected"
         assert self.anna.post(f"{requests}/{first}/accept", {"wait_ms": 0}).status_code == 409
-        second = self.again.post(requests, asked).json()["request"]["id"]
+        second = self.again.post(requests, body).json()["request"]["id"]
         self.again.delete(f"{requests}/{second}")
         self.again.get(f"{requests}/{second}")
-        third = self.again.post(requests, asked).json()["request"]["id"]
-        given = self.anna.post(f"{requests}/{third}/accept", {"wait_ms": 0}).json()
+        third = self.again.post(requests, body).json()["request"]["id"]
+        accepted = self.anna.post(f"{requests}/{third}/accept", {"wait_ms": 0}).json()
         self.robot.step()
-        assert self.again.get(path).json()["lease"]["epoch"] == given["epoch"]
+        assert self.again.get(path).json()["lease"]["epoch"] == accepted["epoch"]
         assert self.again.delete(f"{requests}/{third}").status_code == 409
         assert self.anna.get(f"{requests}/{first}").status_code == 404
-        self.anna.post(path, {"wait_ms": 0, "epoch": given["epoch"] - 1})
+        self.anna.post(path, {"wait_ms": 0, "epoch": accepted["epoch"] - 1})
         self.anna.post(path, {"take_over": True})
-        taken = self.anna.post(path, {"wait_ms": 0, "take_over": True, "reason": ODD[:6]}).json()
+        taken = self.anna.post(path, {"wait_ms": 0, "take_over": True, "reason": UNUSUAL[:6]}).json()
         self.again.get(path)
         assert self.anna.request("DELETE", path, params={"epoch": taken["epoch"]}).status_code == 204
         self.robot.step()
 
     def actions(self) -> None:
-        device, asked = self.robot.device, {"request": MOVE}
+        device, body = self.robot.device, {"request": MOVE}
         action = self.start(idempotency_key="a/b#c? ü".encode().hex())
         assert self.start(idempotency_key="a/b#c? ü".encode().hex()) == action
         self.anna.start(device, idempotency_key="a/b#c? ü".encode().hex(), ttl_ms=5)
         assert self.anna.start(device).status_code == 409
         self.robot.step()
         assert self.anna.action(action)["status"] == "started"
-        assert self.again.post(f"/devices/{device}/actions", {**asked, "epoch": 1}).status_code == 409
+        assert self.again.post(f"/devices/{device}/actions", {**body, "epoch": 1}).status_code == 409
         assert self.bert.get(f"/actions/{action}").status_code == 404
         assert self.bert.post(f"/actions/{action}/cancel").status_code == 404
-        self.robot.report(action, AckStatus.DONE, result={"odd": ODD})
-        assert self.anna.action(action)["result"] == {"odd": ODD}
+        self.robot.report(action, AckStatus.DONE, result={"text": UNUSUAL})
+        assert self.anna.action(action)["result"] == {"text": UNUSUAL}
         self.robot.report(action, AckStatus.FAILED)
         assert self.anna.action(action)["status"] == "done"
-        request = {"kind": "run_movement", "name": "mine", "parameters": {"note": ODD, "deep": [[{"a": 1.5}]]}}
+        request = {"kind": "run_movement", "name": "mine", "parameters": {"note": UNUSUAL, "deep": [[{"a": 1.5}]]}}
         wave = self.start(request=request)
         self.robot.step()
         (command,) = self.robot.received(RunMovement)
@@ -221,16 +221,16 @@ class Conversation:
         self.robot.step()
         self.robot.report(wave, AckStatus.CANCELLED)
         self.anna.action(wave)
-        found = self.anna.get(f"/devices/{device}/actions", params={"limit": 1}).json()
-        rest = self.anna.get(f"/devices/{device}/actions", params={"cursor": found["cursor"]}).json()
-        assert [item["id"] for item in (*found["items"], *rest["items"])] == [wave, action]
-        for wrong in ({}, {"request": {"kind": "fly"}}, {**asked, "more": 1}, {**asked, "wait_ms": 30_001}):
-            assert self.anna.post(f"/devices/{device}/actions", wrong).status_code == 422
+        page = self.anna.get(f"/devices/{device}/actions", params={"limit": 1}).json()
+        rest = self.anna.get(f"/devices/{device}/actions", params={"cursor": page["cursor"]}).json()
+        assert [item["id"] for item in (*page["items"], *rest["items"])] == [wave, action]
+        for invalid in ({}, {"request": {"kind": "fly"}}, {**body, "more": 1}, {**body, "wait_ms": 30_001}):
+            assert self.anna.post(f"/devices/{device}/actions", invalid).status_code == 422
 
     def start(self, **options: Any) -> str:
-        answer = self.anna.start(self.robot.device, **options)
-        assert answer.status_code == 202, answer.text
-        action: str = answer.json()["id"]
+        response = self.anna.start(self.robot.device, **options)
+        assert response.status_code == 202, response.text
+        action: str = response.json()["id"]
         return action
 
     def queue(self) -> None:
@@ -249,20 +249,22 @@ class Conversation:
         assert self.anna.action(waiting)["status"] == "cancelled"
         self.robot.step()
 
-    def fleet(self) -> None:
+    def batch(self) -> None:
         body = {"devices": [*self.robot.devices, "aaaaaaaaaa-arm"], "request": MOVE}
-        answer = self.anna.post("/actions", body)
-        assert answer.status_code == 207, answer.text
-        self.site.silent = True  # the order of the devices is not specified
+        response = self.anna.post("/actions", body)
+        assert response.status_code == 207, response.text
+        self.site.paused = True  # the order of the devices is not specified
         self.robot.step()
-        self.site.silent = False
+        self.site.paused = False
         for device in self.robot.devices:
             (item,) = self.anna.get(f"/devices/{device}/actions", params={"limit": 1}).json()["items"]
             assert item["status"] == "started"
             name = device.partition("-")[2]
             self.robot.publish(self.robot.topic(topics.ACK, name), self.robot.ack(item["id"], AckStatus.DONE))
 
-        assert self.anna.post(f"/devices/{self.robot.device}/stop", {"reason": ODD[:6]}).json() == {"confirmed": False}
+        assert self.anna.post(f"/devices/{self.robot.device}/stop", {"reason": UNUSUAL[:6]}).json() == {
+            "confirmed": False
+        }
         self.robot.step()
         (space,) = self.bert.get("/spaces").json()["items"]
         assert self.anna.post(f"/spaces/{space['id']}/stop").status_code == 404
@@ -287,9 +289,9 @@ class Conversation:
         assert data["fields"]["temperature_c"]["mean"] == [40.5] * 5
         self.anna.get(f"/devices/{device}/data/none")
         self.anna.get(f"/devices/{device}/data/health", params={"from": "x"})
-        (found,) = self.anna.get(f"/devices/{device}/faults").json()["items"]
-        self.anna.post(f"/devices/{device}/faults/{found['id']}/acknowledge")
-        self.bert.post(f"/devices/{device}/faults/{found['id']}/acknowledge")
+        (fault_out,) = self.anna.get(f"/devices/{device}/faults").json()["items"]
+        self.anna.post(f"/devices/{device}/faults/{fault_out['id']}/acknowledge")
+        self.bert.post(f"/devices/{device}/faults/{fault_out['id']}/acknowledge")
         samples = [{"at_ms": now_ms, "ms": each} for each in (1.5, 2.5, 200.0)]
         body = {"transport": "http", "path": "device-cloud", "samples": samples}
         self.anna.post(f"/devices/{device}/latency", body)
@@ -299,63 +301,63 @@ class Conversation:
     def upload(self) -> None:
         path = f"/devices/{self.robot.device}/uploads"
         digest = hashlib.sha256(CAPTURE).hexdigest()
-        body = {"stream": "camera", "length": len(CAPTURE), "content_type": "image/png", "name": ODD[:6]}
-        begun = self.anna.post(path, {**body, "sha256": digest}).json()
+        body = {"stream": "camera", "length": len(CAPTURE), "content_type": "image/png", "name": UNUSUAL[:6]}
+        upload = self.anna.post(path, {**body, "sha256": digest}).json()
         sent = httpx.request(
-            begun["method"], self.reached(begun["url"]), content=CAPTURE, headers=begun["headers"], timeout=60
+            upload["method"], self.reachable(upload["url"]), content=CAPTURE, headers=upload["headers"], timeout=60
         )
         assert sent.status_code < 300, sent.text
-        stored = self.anna.post(f"{path}/{begun['id']}/complete").json()
+        stored = self.anna.post(f"{path}/{upload['id']}/complete").json()
         assert (stored["length"], stored["sha256"]) == (len(CAPTURE), digest)
-        found = self.anna.get(f"{path}/{begun['id']}").json()
-        assert httpx.get(self.reached(found["url"]), timeout=60).content == CAPTURE
+        capture = self.anna.get(f"{path}/{upload['id']}").json()
+        assert httpx.get(self.reachable(capture["url"]), timeout=60).content == CAPTURE
         self.anna.get(path)
-        assert self.bert.get(f"{path}/{begun['id']}").status_code == 404
-        self.anna.delete(f"{path}/{begun['id']}")
-        self.anna.get(f"{path}/{begun['id']}")
+        assert self.bert.get(f"{path}/{upload['id']}").status_code == 404
+        self.anna.delete(f"{path}/{upload['id']}")
+        self.anna.get(f"{path}/{upload['id']}")
 
-    def reached(self, url: str) -> str:
-        """Where the functions keep blobs themselves, they are asked where they are now."""
+    def reachable(self, url: str) -> str:
+        """The URL with the server's real address; the local blob store creates URLs with the public one."""
         return url.replace(PUBLIC_URL, self.host.url)
 
     def accounts(self) -> None:
         """A password, and an API key."""
-        ask, good = self.site.request, "grüß 🤖 correct horse"
-        ask("GET", f"{API}/auth/methods")
-        ask("GET", f"{API}/auth/oidc/start")
+        request, password = self.site.request, "grüß 🤖 correct horse"
+        request("GET", f"{API}/auth/methods")
+        request("GET", f"{API}/auth/oidc/start")
         self.bert.put("/accounts/me/password", {"password": "short"})
-        assert self.bert.put("/accounts/me/password", {"password": good}).status_code == 204
-        ask("POST", f"{API}/auth/password", json={"name": "bert", "password": good + "x"})
-        assert ask("POST", f"{API}/auth/password", json={"name": "bert", "password": good}).status_code == 200
-        made = self.anna.post("/api-keys", {"name": "Wäve 🤖", "role": "viewer", "only": [self.robot.device]})
-        assert made.status_code == 201, made.text
-        key = {"Authorization": f"Bearer {made.json()['token']}"}
-        ask("GET", f"{API}/devices", headers=key)
-        ask("POST", f"{API}/devices/{self.robot.device}/lease", json={}, headers=key)
-        ask("GET", f"{API}/agents", headers=key)
+        assert self.bert.put("/accounts/me/password", {"password": password}).status_code == 204
+        request("POST", f"{API}/auth/password", json={"name": "bert", "password": password + "x"})
+        assert request("POST", f"{API}/auth/password", json={"name": "bert", "password": password}).status_code == 200
+        created = self.anna.post("/api-keys", {"name": "Wäve 🤖", "role": "viewer", "only": [self.robot.device]})
+        assert created.status_code == 201, created.text
+        key = {"Authorization": f"Bearer {created.json()['token']}"}
+        request("GET", f"{API}/devices", headers=key)
+        request("POST", f"{API}/devices/{self.robot.device}/lease", json={}, headers=key)
+        request("GET", f"{API}/agents", headers=key)
         self.anna.get("/api-keys")
-        assert self.anna.delete(f"/api-keys/{made.json()['api_key']['id']}").status_code == 204
-        assert ask("GET", f"{API}/devices", headers=key).status_code == 401
+        assert self.anna.delete(f"/api-keys/{created.json()['api_key']['id']}").status_code == 204
+        assert request("GET", f"{API}/devices", headers=key).status_code == 401
 
-    def mistakes(self) -> None:
+    def invalid_requests(self) -> None:
         device = self.robot.device
         for method, path in (("PUT", f"/devices/{device}/lease"), ("PATCH", "/devices"), ("GET", "/nothing")):
             self.anna.request(method, path)
-        for query in ({"cursor": ODD}, {"cursor": "x" * 2001}, {"limit": "0"}, {"limit": "1001"}, {"limit": "ü"}):
+        for query in ({"cursor": UNUSUAL}, {"cursor": "x" * 2001}, {"limit": "0"}, {"limit": "1001"}, {"limit": "ü"}):
             self.anna.get("/devices", params=query)
         self.anna.post("/mqtt/credentials", {"purpose": "control", "device": device, "epoch": 1})
         self.robot.request("GET", "/devices")
         self.robot.request("GET", "/agents/aaaaaaaaaa/commands")
 
-    def leave(self) -> None:
+    def unpair(self) -> None:
         assert self.anna.delete(f"/agents/{self.robot.id}").status_code == 204
         assert self.anna.get(f"/devices/{self.robot.device}").status_code == 404
         self.anna.get("/devices")
         self.robot.request("GET", "/agents/enrollment")
         for number in range(6):
-            answer = self.bert.post("/agents/claim", {"code": f"BCDF-GHJ{'KLMNPQ'[number]}"})
-            assert answer.status_code in {404, 429}
-        assert answer.status_code == 429
+            response = self.bert.post("/agents/claim", {"code": f"BCDF-GHJ{'KLMNPQ'[number]}"})
+            assert response.status_code in {404, 429}
+        assert response.status_code == 429
         assert self.anna.post("/auth/sign-out").status_code == 204
         assert self.anna.get("/accounts/me").status_code == 401
         assert self.again.get("/accounts/me").status_code == 200

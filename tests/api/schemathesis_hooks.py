@@ -1,7 +1,7 @@
-"""What makes schemathesis get beyond 401 and 404: tokens of the caller that an operation asks for, ids that exist.
+"""Hooks that give schemathesis valid tokens and existing ids, so that requests pass 401 and 404.
 
-Loaded by the program ``schemathesis`` itself (``SCHEMATHESIS_HOOKS``). ``TELESCOPE_WORLD`` names a JSON file that the
-test wrote: what there is at the API under test.
+The program ``schemathesis`` loads this module (``SCHEMATHESIS_HOOKS``). ``TELESCOPE_WORLD`` names a JSON file with the
+resources at the tested API.
 """
 
 import functools
@@ -20,13 +20,13 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from device_agent.protocol.security import signing
 
 WORLD: dict[str, Any] = json.loads(Path(os.environ["TELESCOPE_WORLD"]).read_text(encoding="utf-8"))
-TURN_S = 600
-"""An access token lives for a quarter of an hour: a long run asks for the next one in time."""
-_BEGUN_S = time.monotonic()
+REFRESH_S = 600
+"""Renewal interval of access tokens, which expire after 15 min."""
+_START_S = time.monotonic()
 LONGEST_MS = 30_000
-"""What the API allows."""
-QUICK_MS = 50
-"""No wait is longer: an answer that is waited for is the same one as at the end of a longer wait."""
+"""Longest wait that the API allows."""
+MAX_WAIT_MS = 50
+"""Longest wait of a test request. Longer waits would return the same response."""
 
 
 class _Operation(Protocol):
@@ -42,7 +42,7 @@ class _Case(Protocol):
 
 
 def agent_token(name: str) -> str:
-    """A request token of the agent that the world calls ``name``."""
+    """A request token of the agent with the key ``name``."""
     key: Any = load_pem_private_key(WORLD[name].encode(), None)
     now_s = int(time.time())
     claims = {"iss": "agent", "aud": "telescope/api", "iat": now_s, "exp": now_s + 60, "jti": str(time.time_ns())}
@@ -50,21 +50,21 @@ def agent_token(name: str) -> str:
 
 
 @functools.cache
-def _token_of(whose: str, turn: int) -> str:
-    """The access token of a session; the next one at each turn."""
+def _token_of(prefix: str, turn: int) -> str:
+    """The access token of a session; another one for each turn."""
     if not turn:
-        return str(WORLD[f"{whose}token"])
-    page = WORLD[f"{whose}page"]
+        return str(WORLD[f"{prefix}token"])
+    page = WORLD[f"{prefix}page"]
     headers = {"Cookie": page["cookie"], "X-CSRF-Token": page["csrf_token"]}
-    answer = requests.post(f"{WORLD['url']}/api/v1/auth/token", headers=headers, timeout=30)
-    if answer.ok:
-        return str(answer.json()["access_token"])
-    return _token_of(whose, turn - 1)  # the session was ended by what is tried here
+    response = requests.post(f"{WORLD['url']}/api/v1/auth/token", headers=headers, timeout=30)
+    if response.ok:
+        return str(response.json()["access_token"])
+    return _token_of(prefix, turn - 1)  # a tested request has ended the session
 
 
-def _token(whose: str) -> str:
-    """Of a session; ``spare_``: of the one that is signed out."""
-    return _token_of(whose, int((time.monotonic() - _BEGUN_S) / TURN_S))
+def _token(prefix: str) -> str:
+    """The current access token. The prefix ``spare_`` selects the session that is signed out."""
+    return _token_of(prefix, int((time.monotonic() - _START_S) / REFRESH_S))
 
 
 @schemathesis.auth(refresh_interval=None)
@@ -74,8 +74,8 @@ class Caller:
     def get(self, case: _Case, _context: object) -> str:
         operation = case.operation.definition.raw
         schemes = {name for each in operation.get("security", []) for name in each}
-        asks_for_agent = isinstance(case.body, dict) and case.body.get("purpose") == "agent"
-        if "agentToken" in schemes and (asks_for_agent or "accessToken" not in schemes):
+        for_agent = isinstance(case.body, dict) and case.body.get("purpose") == "agent"
+        if "agentToken" in schemes and (for_agent or "accessToken" not in schemes):
             return agent_token("new_agent_key" if operation["operationId"] == "enroll_agent" else "agent_key")
         return _token("spare_" if operation["operationId"] == "sign_out" else "")
 
@@ -85,28 +85,28 @@ class Caller:
 
 @schemathesis.hook
 def map_case(_context: object, case: _Case) -> _Case:
-    """Put what exists in place of most of what was made up, and ask for no long waits."""
-    chance = zlib.crc32(repr((case.path_parameters, case.query, case.body)).encode())
+    """Replace most generated ids by existing ones, and long waits by short ones."""
+    selector = zlib.crc32(repr((case.path_parameters, case.query, case.body)).encode())
     operation = case.operation.definition.raw["operationId"]
     for name, value in dict(case.path_parameters or {}).items():
-        known = WORLD["spare_agents"] if operation == "unpair_agent" else WORLD["ids"].get(name, [])
-        if known and isinstance(value, str) and chance % 8:
-            case.path_parameters[name] = known[chance // 8 % len(known)]
+        existing = WORLD["spare_agents"] if operation == "unpair_agent" else WORLD["ids"].get(name, [])
+        if existing and isinstance(value, str) and selector % 8:
+            case.path_parameters[name] = existing[selector // 8 % len(existing)]
     for place in (case.query, case.body):
         if isinstance(place, dict):
-            _fit(place, operation, chance)
+            _replace(place, operation, selector)
     return case
 
 
-def _fit(fields: dict[str, Any], operation: str, chance: int) -> None:
+def _replace(fields: dict[str, Any], operation: str, selector: int) -> None:
     wait_ms = str(fields.get("wait_ms"))
-    if wait_ms.isdecimal() and QUICK_MS < int(wait_ms) <= LONGEST_MS:
-        fields["wait_ms"] = int(wait_ms) % QUICK_MS
-    if chance % 4:
+    if wait_ms.isdecimal() and MAX_WAIT_MS < int(wait_ms) <= LONGEST_MS:
+        fields["wait_ms"] = int(wait_ms) % MAX_WAIT_MS
+    if selector % 4:
         if isinstance(fields.get("device"), str):
             fields["device"] = WORLD["ids"]["name" if operation == "add_agent_latency" else "device"][0]
         if operation == "start_actions" and isinstance(fields.get("devices"), list):
-            fields["devices"] = WORLD["ids"]["device"][: 1 + chance % 3]
+            fields["devices"] = WORLD["ids"]["device"][: 1 + selector % 3]
         if operation == "enroll_agent" and isinstance(fields.get("public_key"), str):
             fields["public_key"] = WORLD["new_agent_public"]
         if operation in {"start_action", "start_actions"} and isinstance(fields.get("epoch"), int):

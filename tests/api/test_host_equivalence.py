@@ -1,4 +1,4 @@
-"""One conversation over each store and under each host gives the same responses."""
+"""All stores and hosts return the same responses to the same requests."""
 
 import difflib
 from collections.abc import Callable
@@ -14,14 +14,14 @@ from tests.harness.network.brokers import RunningBroker
 from tests.harness.stores.aws import use_credentials
 from tests.harness.stores.emulators import StoreKind, empty_store, make_places
 
-Talk = Callable[[StoreKind, HostKind, Path], list[str]]
+Run = Callable[[StoreKind, HostKind, Path], list[str]]
 
 
 @pytest.fixture
-def talk(broker: RunningBroker, emulators: Emulators, monkeypatch: pytest.MonkeyPatch) -> Talk:
-    """Holds the conversation with an empty store; returns its transcript."""
+def run(broker: RunningBroker, emulators: Emulators, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Sends all requests to a host with an empty store; returns the transcript."""
 
-    def held(store: StoreKind, kind: HostKind, home: Path) -> list[str]:
+    def transcript(store: StoreKind, kind: HostKind, home: Path) -> list[str]:
         if store == "aws":
             use_credentials(monkeypatch)
         environment = {
@@ -33,14 +33,14 @@ def talk(broker: RunningBroker, emulators: Emulators, monkeypatch: pytest.Monkey
         make_places(home, environment)
         links = sign_in_links(environment, "anna", "anna", "bert")
         with start_host(kind, environment) as host:
-            return Conversation(host, links).hold()
+            return Conversation(host, links).run()
 
-    return held
+    return transcript
 
 
 @pytest.fixture(scope="module")
 def first() -> list[str]:
-    """The transcript of the first store and host; filled by the first test that needs it."""
+    """The transcript of the reference store and host; filled by the first test."""
     return []
 
 
@@ -59,11 +59,11 @@ COMBINATIONS = [
 
 @pytest.mark.parametrize(("store", "kind"), COMBINATIONS)
 def test_the_responses_are_the_same(
-    talk: Talk, first: list[str], new_home: Callable[[], Path], store: StoreKind, kind: HostKind
+    run: Run, first: list[str], new_home: Callable[[], Path], store: StoreKind, kind: HostKind
 ) -> None:
     if not first:
-        first += talk("local", "uvicorn", new_home())
+        first += run("local", "uvicorn", new_home())
         assert len(first) > 150
-    transcript = talk(store, kind, new_home())
-    different = list(difflib.unified_diff(first, transcript, "local, uvicorn", f"{store}, {kind}", lineterm="", n=0))
-    assert not different, "\n".join(different[:40])
+    transcript = run(store, kind, new_home())
+    differences = list(difflib.unified_diff(first, transcript, "local, uvicorn", f"{store}, {kind}", lineterm="", n=0))
+    assert not differences, "\n".join(differences[:40])

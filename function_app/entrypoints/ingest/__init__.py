@@ -1,1 +1,1 @@
-"""Ingest."""
+"""Stores messages that agents send over any transport."""

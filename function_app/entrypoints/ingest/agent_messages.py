@@ -1,4 +1,4 @@
-"""Messages that an agent sends without MQTT: checked, stored, and published to the broker's subscribers."""
+"""Stores messages that an agent sends without MQTT, and publishes them to the broker's subscribers."""
 
 from collections.abc import Sequence
 
@@ -7,65 +7,65 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.topics import Topic
 from function_app.bootstrap import Functions
 from function_app.domain.devices.devices import Agent, Transport
-from function_app.entrypoints.ingest.router import take_in
+from function_app.entrypoints.ingest.router import store_message
 from function_app.services.devices.device_access import require_claimed
 from function_app.services.telemetry.ingest import InboundMessage
 
-SAID = frozenset({topics.CONN, topics.DESC, topics.STATE, topics.EVENT, topics.ACK}) | topics.MEASURED
-"""Classes of topics that agents speak on, and that are JSON."""
+PUBLISHABLE = frozenset({topics.CONN, topics.DESC, topics.STATE, topics.EVENT, topics.ACK}) | topics.MEASURED
+"""Topic classes with JSON payload on which agents publish."""
 
 
-async def tell(
+async def ingest_messages(
     functions: Functions, agent: Agent, messages: Sequence[tuple[str, bytes]], *, by: Transport
 ) -> list[str | None]:
-    """Take in messages of one agent, in order. Safe to repeat.
+    """Store and publish messages of one agent, in order. Safe to repeat.
 
     Args:
-        functions: Where to.
-        agent: Who tells them.
+        functions: Services of the cloud.
+        agent: The sender.
         messages: Topics and payloads.
-        by: How they came.
+        by: Transport of the messages.
 
     Returns:
-        For each message ``None``, or why it is refused: telling it again changes nothing.
+        For each message ``None``, or the reason for its rejection, which is permanent.
 
     Raises:
-        Problem, StoreError: Not all are stored; to be told again.
+        Problem, StoreError: At least one message is not stored; the agent must send all again.
     """
-    taken: dict[int, InboundMessage] = {}
-    refused: dict[int, str] = {}
-    for place, (topic, payload) in enumerate(messages):
+    accepted: dict[int, InboundMessage] = {}
+    rejected: dict[int, str] = {}
+    for index, (topic, payload) in enumerate(messages):
         try:
-            arrived = InboundMessage(own_topic(topic, agent), payload)
-            if arrived.topic.kind not in topics.MEASURED:
-                await take_in(functions, arrived.topic, arrived.payload, by=by)
-            taken[place] = arrived
+            message = InboundMessage(own_topic(topic, agent), payload)
+            if message.topic.kind not in topics.MEASURED:
+                await store_message(functions, message.topic, message.payload, by=by)
+            accepted[index] = message
         except ProtocolError as error:
-            refused[place] = str(error)
-    # All telemetry at once: that costs much less than one by one.
-    measured = [place for place, arrived in taken.items() if arrived.topic.kind in topics.MEASURED]
-    dropped = await functions.telemetry_ingest.ingest([taken[place] for place in measured])
-    refused |= {measured[number]: why for number, why in dropped.items()}
-    passed = [
-        (messages[place][0], *arrived)
-        for place, arrived in taken.items()
-        if place not in refused and arrived.topic.kind != topics.LATE  # late measurements have no live viewers
+            rejected[index] = str(error)
+    # One write for all telemetry is much cheaper than one for each message.
+    telemetry = [index for index, message in accepted.items() if message.topic.kind in topics.MEASURED]
+    dropped = await functions.telemetry_ingest.ingest([accepted[index] for index in telemetry])
+    rejected |= {telemetry[number]: reason for number, reason in dropped.items()}
+    published = [
+        (messages[index][0], *message)
+        for index, message in accepted.items()
+        if index not in rejected and message.topic.kind != topics.LATE  # late measurements have no live viewers
     ]
-    await functions.relay.publish(passed)
-    return [refused.get(place) for place in range(len(messages))]
+    await functions.relay.publish(published)
+    return [rejected.get(index) for index in range(len(messages))]
 
 
 def own_topic(text: str, agent: Agent) -> Topic:
-    """The topic, once it is seen that the agent may speak on it.
+    """The parsed topic, on which the agent may publish.
 
     Raises:
         Problem: ``agent-unclaimed``.
-        ProtocolError: It may not.
+        ProtocolError: The agent may not publish on this topic.
     """
     topic = topics.parse(text)
-    mine = (require_claimed(agent), agent.id)
-    if (topic.space, topic.agent) != mine or (topic.device and agent.device(topic.device) is None):
+    own = (require_claimed(agent), agent.id)
+    if (topic.space, topic.agent) != own or (topic.device and agent.device(topic.device) is None):
         raise ProtocolError(f"'{text[:200]}' is not a topic of this agent or of a device that it has enrolled")
-    if topic.kind not in SAID:
-        raise ProtocolError(f"'{topic.kind}' is not for an agent to say here")
+    if topic.kind not in PUBLISHABLE:
+        raise ProtocolError(f"an agent may not publish '{topic.kind}' with this transport")
     return topic

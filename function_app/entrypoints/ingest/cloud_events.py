@@ -1,7 +1,7 @@
-"""What devices say, as the clouds hand it over: Event Grid's events, Amazon's IoT rules, and queues behind those.
+"""Stores device messages from Event Grid events, AWS IoT rules, and SQS queues behind these rules.
 
-A message that cannot be stored raises, so that the cloud delivers it again. One that cannot be read never will be: it
-is logged and let go. All deliver at least once and in any order, which ``ingest`` bears.
+If a message cannot be stored, an exception makes the cloud deliver it again. An invalid message is logged and dropped.
+All sources deliver at least once and in any order; ``ingest`` is idempotent and independent of the order.
 """
 
 import base64
@@ -17,42 +17,42 @@ from function_app.entrypoints.ingest.router import ingest, ingest_telemetry, is_
 from function_app.ports.tables import StoreError
 
 RULE_SQL = "SELECT encode(*, 'base64') AS payload, topic() AS topic, timestamp() AS at_ms FROM 'ts/v1/#'"
-"""The SQL of the IoT rule whose events these are."""
+"""The SQL of the IoT rule that sends these events."""
 _MQTT = "MQTT.EventPublished"
-_SHOWN = 200
+_MAX_LOGGED = 200
 
 _log = logging.getLogger(__name__)
 
 
 async def from_event_grid(functions: Functions, events: Sequence[Mapping[str, Any]]) -> None:
-    """Take in MQTT messages that an Event Grid namespace has routed, as CloudEvents 1.0.
+    """Store MQTT messages that an Event Grid namespace routes as CloudEvents 1.0.
 
-    The topic is the event's ``subject``; the payload is in ``data_base64``, or in ``data`` where its publisher called
-    it JSON.
+    The topic is the event's ``subject``. The payload is in ``data_base64``, or in ``data`` if the publisher declared it
+    as JSON.
 
     Raises:
-        Problem, StoreError: At least one was not stored; all are to be delivered again.
+        Problem, StoreError: At least one message is not stored; all must be delivered again.
     """
     failed: Problem | StoreError | None = None
-    measured: list[tuple[str, bytes]] = []
+    telemetry: list[tuple[str, bytes]] = []
     for event in events:
         if event.get("type") != _MQTT:
-            _log.warning("an event of type '%s' is no MQTT message", str(event.get("type"))[:_SHOWN])
+            _log.warning("ignored an event of type '%s'", str(event.get("type"))[:_MAX_LOGGED])
             continue
         payload = _cloud_event_payload(event)
         if payload is None:
-            _log.warning("the event of '%s' has no payload that can be read", str(event.get("subject"))[:_SHOWN])
+            _log.warning("dropped an event on '%s' without a valid payload", str(event.get("subject"))[:_MAX_LOGGED])
             continue
         topic = str(event.get("subject"))
         if is_telemetry(topic):
-            measured.append((topic, payload))
+            telemetry.append((topic, payload))
             continue
         try:
             await ingest(functions, topic, payload)
         except (Problem, StoreError) as error:
             failed = error
     try:
-        await ingest_telemetry(functions, measured)
+        await ingest_telemetry(functions, telemetry)
     except (Problem, StoreError) as error:
         failed = error
     if failed is not None:
@@ -60,10 +60,10 @@ async def from_event_grid(functions: Functions, events: Sequence[Mapping[str, An
 
 
 async def from_iot_rule(functions: Functions, event: Mapping[str, Any]) -> None:
-    """Take in one MQTT message, as the rule with ``RULE_SQL`` gives it.
+    """Store one MQTT message from the IoT rule with ``RULE_SQL``.
 
     Raises:
-        Problem, StoreError: Not stored; to be delivered again.
+        Problem, StoreError: The message is not stored; it must be delivered again.
     """
     message = _rule_message(event)
     if message is not None:
@@ -71,19 +71,19 @@ async def from_iot_rule(functions: Functions, event: Mapping[str, Any]) -> None:
 
 
 async def from_queue(functions: Functions, event: Mapping[str, Any]) -> dict[str, list[dict[str, str]]]:
-    """Take in a batch of messages that the rule has put into a queue (SQS).
+    """Store a batch of messages that the rule has sent to an SQS queue.
 
     Returns:
-        The records that were not stored, in the form by which Lambda leaves only those in the queue.
+        The records that were not stored, as a partial batch response: Lambda keeps only these in the queue.
     """
     failed: list[str] = []
-    measured: dict[str, tuple[str, bytes]] = {}
+    telemetry: dict[str, tuple[str, bytes]] = {}
     for record in event.get("Records", ()):
         message = _rule_message(_body(record))
         if message is None:
             continue
         if is_telemetry(message[0]):
-            measured[str(record["messageId"])] = message
+            telemetry[str(record["messageId"])] = message
             continue
         try:
             await ingest(functions, *message)
@@ -91,17 +91,17 @@ async def from_queue(functions: Functions, event: Mapping[str, Any]) -> dict[str
             _log.warning("record %s was not stored: %s", record.get("messageId"), error)
             failed.append(str(record["messageId"]))
     try:
-        await ingest_telemetry(functions, list(measured.values()))
+        await ingest_telemetry(functions, list(telemetry.values()))
     except (Problem, StoreError) as error:
-        _log.warning("%d records of telemetry were not stored: %s", len(measured), error)
-        failed += measured
+        _log.warning("%d telemetry records were not stored: %s", len(telemetry), error)
+        failed += telemetry
     return {"batchItemFailures": [{"itemIdentifier": record} for record in failed]}
 
 
 def _rule_message(event: Mapping[str, Any]) -> tuple[str, bytes] | None:
     topic, payload = event.get("topic"), _base64(event.get("payload"))
     if not isinstance(topic, str) or payload is None:
-        _log.warning("an event with the fields %s is not what the rule gives", str(sorted(event))[:_SHOWN])
+        _log.warning("dropped an invalid event of the IoT rule with the fields %s", str(sorted(event))[:_MAX_LOGGED])
         return None
     return topic, payload
 

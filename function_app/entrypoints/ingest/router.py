@@ -1,4 +1,4 @@
-"""What devices say, into the tables: the one handler behind every way in."""
+"""Stores messages of agents and devices. All transports and hosts use these functions."""
 
 import logging
 from collections.abc import Sequence
@@ -10,29 +10,29 @@ from function_app.bootstrap import Functions
 from function_app.domain.devices.devices import Transport
 from function_app.services.telemetry.ingest import InboundMessage
 
-_SHOWN = 200
+_MAX_LOGGED = 200
 
 _log = logging.getLogger(__name__)
 
 
 async def ingest(functions: Functions, topic: str, payload: bytes) -> None:
-    """Store one message that came over MQTT. Safe to repeat; what cannot be read is logged and let go.
+    """Store one MQTT message. Safe to repeat. An invalid message is logged and dropped.
 
     Raises:
-        Problem, StoreError: Not stored; to be delivered again.
+        Problem, StoreError: The message is not stored; it must be delivered again.
     """
     try:
-        await take_in(functions, topics.parse(topic), payload)
+        await store_message(functions, topics.parse(topic), payload)
     except ProtocolError as error:
-        _log.warning("a message of %s was dropped: %s", topic[:_SHOWN], error)
+        _log.warning("dropped a message on %s: %s", topic[:_MAX_LOGGED], error)
 
 
-async def take_in(functions: Functions, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
+async def store_message(functions: Functions, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
     """Store one message of any transport. Safe to repeat.
 
     Raises:
-        ProtocolError: It is not what its topic says.
-        Problem, StoreError: Not stored; to be delivered again.
+        ProtocolError: The payload does not match its topic.
+        Problem, StoreError: The message is not stored; it must be delivered again.
     """
     if topic.kind == topics.ACK:
         await functions.action_acks.ingest(topic, payload, by=by)
@@ -43,17 +43,17 @@ async def take_in(functions: Functions, topic: Topic, payload: bytes, *, by: Tra
 
 
 def is_telemetry(topic: str) -> bool:
-    """Whether it looks like a measurement's: those are better taken in together."""
+    """Whether the topic is one of telemetry, which ``ingest_telemetry`` stores in batches."""
     return any(f"/{kind}/" in topic for kind in topics.MEASURED)
 
 
 async def ingest_telemetry(functions: Functions, messages: Sequence[tuple[str, bytes]]) -> None:
-    """Store many measurements at once, which costs much less than one by one. Safe to repeat.
+    """Store a batch of telemetry, which is much cheaper than single messages. Safe to repeat.
 
     Raises:
-        Problem, StoreError: Not all are stored; to be delivered again.
+        Problem, StoreError: At least one message is not stored; all must be delivered again.
     """
-    arrived = []
+    batch = []
     for topic, payload in messages:
         try:
             parsed = topics.parse(topic)
@@ -61,6 +61,6 @@ async def ingest_telemetry(functions: Functions, messages: Sequence[tuple[str, b
             _log.warning("%s", error)
             continue
         if parsed.kind in topics.MEASURED:
-            arrived.append(InboundMessage(parsed, payload))
-    if arrived:
-        await functions.telemetry_ingest.ingest(arrived)
+            batch.append(InboundMessage(parsed, payload))
+    if batch:
+        await functions.telemetry_ingest.ingest(batch)

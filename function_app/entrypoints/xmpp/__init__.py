@@ -1,4 +1,4 @@
-"""``python -m function_app xmpp``: the XMPP gateway of the cloud. Any number of instances may run."""
+"""The XMPP gateway (``python -m function_app xmpp``). Several gateways may run concurrently."""
 
 from function_app.entrypoints.xmpp.program import run_gateway
 

@@ -1,7 +1,7 @@
-"""Who speaks for the cloud over XMPP: knows who is there, and hands each stanza and order to whom it is about.
+"""The XMPP gateway: routes stanzas of agents to their sessions, and messages of the broker to agents.
 
-An agent is served once it has greeted with its presence message; its newest greeting counts. What an agent tells it
-publishes for itself: its name is that of its JID, which the XMPP server has verified.
+An agent starts a session with its presence message; the newest session number is valid. The sender of a message is the
+agent in the JID, which the XMPP server has authenticated.
 """
 
 import asyncio
@@ -24,33 +24,33 @@ from function_app.ports.xmpp_connection import XmppConnection
 from function_app.services.storage import records
 from function_app.services.telemetry.ingest import InboundMessage
 
-COLLECT_S = 2.0
-MAX_COLLECTED = 20_000
-"""Measurements that wait to be stored: a hundred robots at 20 Hz for ten seconds."""
-GREET_TRIES = 3
+STORE_INTERVAL_S = 2.0
+MAX_MEASUREMENTS = 20_000
+"""Limit of measurements that wait for storage: a hundred robots at 20 Hz for ten seconds."""
+MAX_ATTEMPTS = 3
 
 _log = logging.getLogger(__name__)
 
 
 class XmppGateway:
-    """Listener of an ``XmppConnection``; also passes on the commands of the broker."""
+    """Serves agents as the listener of an ``XmppConnection`` and of the broker's command feed."""
 
-    def __init__(self, functions: Functions, line: XmppConnection, orders: CommandFeed) -> None:
+    def __init__(self, functions: Functions, connection: XmppConnection, feed: CommandFeed) -> None:
         self._functions = functions
-        self._line = line
-        self._orders = orders
-        self._served: dict[str, AgentSession] = {}
-        self._people: dict[str, set[str]] = {}
+        self._connection = connection
+        self._feed = feed
+        self._sessions: dict[str, AgentSession] = {}
+        self._viewers: dict[str, set[str]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._collected: list[InboundMessage] = []
+        self._measurements: list[InboundMessage] = []
         self._dropped = 0
 
     async def run(self) -> None:
-        """Speak until cancelled; then what was told already is stored still."""
+        """Run until cancelled. Messages that were received before are stored first."""
         tasks = [
-            asyncio.create_task(self._line.run(self)),
-            asyncio.create_task(self._orders.run(self.order)),
-            asyncio.create_task(self._keep_measurements()),
+            asyncio.create_task(self._connection.run(self)),
+            asyncio.create_task(self._feed.run(self.deliver)),
+            asyncio.create_task(self._store_measurements()),
         ]
         try:
             await asyncio.gather(*tasks)
@@ -71,176 +71,178 @@ class XmppGateway:
         if user is None:
             return
         try:
-            told = stanzas.parse(stanza)
+            delivery = stanzas.parse(stanza)
         except ProtocolError as error:
-            _log.warning("a message of %s was refused: %s", user, error)
+            _log.warning("rejected a message of %s: %s", user, error)
             if stanza.get("id") and stanza.get("type") != "error":
-                self._line.send(stanzas.rejection(jid, stanza.get("id", ""), str(error)))
+                self._connection.send(stanzas.rejection(jid, stanza.get("id", ""), str(error)))
             return
-        if told is None:
+        if delivery is None:
             return
-        served = self._served.get(user)
-        greeting = _greeting(told, user)
-        if greeting is not None and (served is None or served.greeting.session != greeting.session):
-            self._start(self._greeted(user, jid, told, greeting, stanzas.requested_topics(stanza)))
-        elif served is not None and served.jid == jid:
-            served.say(told)
-        elif told.id:
+        session = self._sessions.get(user)
+        presence = _online_presence(delivery, user)
+        if presence is not None and (session is None or session.presence.session != presence.session):
+            self._start(self._start_session(user, jid, delivery, presence, stanzas.requested_topics(stanza)))
+        elif session is not None and session.jid == jid:
+            session.receive(delivery)
+        elif delivery.id:
             # An agent without a session gets "unavailable", and then starts a session.
-            self._line.send(stanzas.presence(to=jid, available=False))
+            self._connection.send(stanzas.presence(to=jid, available=False))
 
     def presence(self, stanza: Element) -> None:
         """See ``Listener``."""
         jid = stanza.get("from", "")
-        found = stanzas.user_at(jid, self._line.domain)
-        if found is None or found[0] == jids.CLOUD or stanza.get("type") not in {None, "unavailable"}:
+        identity = stanzas.user_at(jid, self._connection.domain)
+        if identity is None or identity[0] == jids.CLOUD or stanza.get("type") not in {None, "unavailable"}:
             return
-        user, there = found[0], stanza.get("type") is None
+        user, available = identity[0], stanza.get("type") is None
         if len(user) == AGENT_LENGTH:
-            served = self._served.get(user)
-            if not there and served is not None and served.jid == jid:
-                served.leave()
-        elif there and found[1]:
-            self._people.setdefault(user, set()).add(jid)
+            session = self._sessions.get(user)
+            if not available and session is not None and session.jid == jid:
+                session.close()
+        elif available and identity[1]:
+            self._viewers.setdefault(user, set()).add(jid)
         else:
-            self._people.get(user, set()).discard(jid)
-            if not self._people.get(user):
-                self._people.pop(user, None)
+            self._viewers.get(user, set()).discard(jid)
+            if not self._viewers.get(user):
+                self._viewers.pop(user, None)
 
     def lost(self) -> None:
         """See ``Listener``."""
-        self._people.clear()
-        for served in self._served.values():
-            served.leave()
+        self._viewers.clear()
+        for session in self._sessions.values():
+            session.close()
 
-    def order(self, topic: str, payload: bytes) -> None:
-        """Something came by the broker."""
+    def deliver(self, topic: str, payload: bytes) -> None:
+        """Pass a message of the broker to the sessions that receive its topic."""
         parts = topic.split("/")
         if len(parts) > 5 and parts[5] == topics.TELE:  # noqa: PLR2004 (ts/v1/space/agent/device/tele/…)
-            for listener in self._served.values():
-                if topic in listener.listen:
-                    listener.order(topic, payload)
+            for subscriber in self._sessions.values():
+                if topic in subscriber.subscriptions:
+                    subscriber.send(topic, payload)
             return
-        served = self._served.get(parts[3]) if len(parts) > 4 else None  # noqa: PLR2004 (ts/v1/space/agent/…)
-        if served is None or parts[2] != served.agent.space:
+        session = self._sessions.get(parts[3]) if len(parts) > 4 else None  # noqa: PLR2004 (ts/v1/space/agent/…)
+        if session is None or parts[2] != session.agent.space:
             return
         if parts[4] != topics.CONN:
-            served.order(topic, payload)
+            session.send(topic, payload)
         elif not payload:
-            served.doubt()  # what was kept of it was cleared: it is leaving
+            session.request_check()  # the cloud clears retained messages when an agent is unpaired or moved
         else:
-            self._contradict(served, payload)
+            self._restore_presence(session, payload)
 
     @staticmethod
-    def _contradict(served: AgentSession, payload: bytes) -> None:
-        """An older connection was declared gone after this one had come, and that is what the broker keeps now."""
+    def _restore_presence(session: AgentSession, payload: bytes) -> None:
+        """Publish the presence again if a late "offline" of an older session has replaced it at the broker."""
         try:
-            said = codec.decode(payload, Presence)
+            retained = codec.decode(payload, Presence)
         except ProtocolError:
             return
-        if not said.online and said.session < served.greeting.session:
-            served.say(served.greeted)
+        if not retained.online and retained.session < session.presence.session:
+            session.receive(session.delivery)
 
     # ------------------------------------------------------------ agents
 
     def _agent_at(self, jid: str) -> str | None:
-        found = stanzas.user_at(jid, self._line.domain)
-        return found[0] if found is not None and found[1] and len(found[0]) == AGENT_LENGTH else None
+        identity = stanzas.user_at(jid, self._connection.domain)
+        return identity[0] if identity is not None and identity[1] and len(identity[0]) == AGENT_LENGTH else None
 
-    async def _greeted(self, user: str, jid: str, told: Delivery, greeting: Presence, wanted: tuple[str, ...]) -> None:
+    async def _start_session(
+        self, user: str, jid: str, delivery: Delivery, presence: Presence, requested: tuple[str, ...]
+    ) -> None:
         try:
-            agent = await self._known(user)
+            agent = await self._find_agent(user)
         except (StoreError, Problem) as error:
-            _log.warning("%s cannot be served: %s", user, error)
-            self._line.send(stanzas.presence(to=jid, available=False))
+            _log.warning("no session for %s: %s", user, error)
+            self._connection.send(stanzas.presence(to=jid, available=False))
             return
-        why = _unfit(agent, told)
-        before = self._served.get(user)
-        if before is not None and before.greeting.session > greeting.session:
-            why = why or "A newer connection of this agent is there."
-        if agent is None or why is not None:
-            if told.id:
-                self._line.send(stanzas.rejection(jid, told.id, why or ""))
+        reason = _rejection_reason(agent, delivery)
+        previous = self._sessions.get(user)
+        if previous is not None and previous.presence.session > presence.session:
+            reason = reason or "A newer session of this agent exists."
+        if agent is None or reason is not None:
+            if delivery.id:
+                self._connection.send(stanzas.rejection(jid, delivery.id, reason or ""))
             return
-        if before is not None:
-            before.leave(replaced=True)
-        listen = [topic for topic in wanted if _may_hear(agent, topic)]
-        served = self._served[user] = AgentSession(
+        if previous is not None:
+            previous.close(replaced=True)
+        subscriptions = [topic for topic in requested if _may_subscribe(agent, topic)]
+        session = self._sessions[user] = AgentSession(
             self._functions,
-            self._line,
+            self._connection,
             agent=agent,
             jid=jid,
-            greeting=greeting,
-            greeted=told._replace(id=""),
-            listen=listen,
-            broker_up=lambda: self._orders.up,
-            measured=self._measured,
-            told=self._show,
+            presence=presence,
+            delivery=delivery._replace(id=""),
+            subscriptions=subscriptions,
+            broker_up=lambda: self._feed.up,
+            on_measurement=self._collect,
+            on_stored=self._notify_viewers,
         )
-        served.say(told)
-        await self._orders.add(agent.space or "", agent.id, listen)
-        self._start(self._serve(served))
+        session.receive(delivery)
+        await self._feed.add(agent.space or "", agent.id, subscriptions)
+        self._start(self._run_session(session))
 
-    async def _known(self, user: str) -> Agent | None:
-        for attempt in range(GREET_TRIES):
+    async def _find_agent(self, user: str) -> Agent | None:
+        for attempt in range(MAX_ATTEMPTS):
             try:
                 row = await self._functions.tables.get(records.AGENTS, user, "agent")
             except StoreError:
-                if attempt + 1 == GREET_TRIES:
+                if attempt + 1 == MAX_ATTEMPTS:
                     raise
                 await asyncio.sleep(0.2)
                 continue
             return None if row is None else records.read(row, Agent)
         return None
 
-    async def _serve(self, served: AgentSession) -> None:
-        agent = served.agent
-        _log.info("%s is there, session %d", agent.id, served.greeting.session)
+    async def _run_session(self, session: AgentSession) -> None:
+        agent = session.agent
+        _log.info("%s connected, session %d", agent.id, session.presence.session)
         try:
-            welcome = await served.run()
-        except Exception:  # noqa: BLE001 (the others go on; this one greets anew)
-            _log.exception("%s is served no longer", agent.id)
-            self._line.send(stanzas.presence(to=served.jid, available=False))
-            welcome = True
-        if self._served.get(agent.id) is served:
-            del self._served[agent.id]
-            self._orders.drop(agent.space or "", agent.id)
-        if not welcome:
-            self._line.send(stanzas.revoke_user(self._line.domain, agent.id))
-        _log.info("%s is gone, session %d", agent.id, served.greeting.session)
+            authorized = await session.run()
+        except Exception:  # noqa: BLE001 (other sessions continue; this agent starts a new one)
+            _log.exception("the session of %s failed", agent.id)
+            self._connection.send(stanzas.presence(to=session.jid, available=False))
+            authorized = True
+        if self._sessions.get(agent.id) is session:
+            del self._sessions[agent.id]
+            self._feed.drop(agent.space or "", agent.id)
+        if not authorized:
+            self._connection.send(stanzas.revoke_user(self._connection.domain, agent.id))
+        _log.info("%s disconnected, session %d", agent.id, session.presence.session)
 
     def _start(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    # ------------------------------------------------------------ people, and what is measured
+    # ------------------------------------------------------------ viewers and measurements
 
-    def _show(self, agent: Agent, told: Delivery) -> None:
-        """A person who is there with an XMPP client of their own hears how their devices are."""
-        places = self._people.get(agent.account or "")
-        if not places or not told.topic.endswith(f"/{topics.STATE}"):
+    def _notify_viewers(self, agent: Agent, delivery: Delivery) -> None:
+        """Send the state of a device to the owner's XMPP clients."""
+        clients = self._viewers.get(agent.account or "")
+        if not clients or not delivery.topic.endswith(f"/{topics.STATE}"):
             return
         try:
-            said = codec.decode(told.payload, State)
+            state = codec.decode(delivery.payload, State)
         except ProtocolError:
             return
-        body = f"{said.device}: {said.mode.value}" + (f", stopped by {said.stop.caller}" if said.stop else "")
-        for jid in places:
-            self._line.send(stanzas.message(jid, told.topic, told.payload, body=body))
+        body = f"{state.device}: {state.mode.value}" + (f", stopped by {state.stop.caller}" if state.stop else "")
+        for jid in clients:
+            self._connection.send(stanzas.message(jid, delivery.topic, delivery.payload, body=body))
 
-    def _measured(self, arrived: InboundMessage) -> None:
-        if len(self._collected) >= MAX_COLLECTED:
+    def _collect(self, measurement: InboundMessage) -> None:
+        if len(self._measurements) >= MAX_MEASUREMENTS:
             self._dropped += 1
         else:
-            self._collected.append(arrived)
+            self._measurements.append(measurement)
 
-    async def _keep_measurements(self) -> None:
+    async def _store_measurements(self) -> None:
         while True:
-            await asyncio.sleep(COLLECT_S)
-            batch, self._collected = self._collected, []
+            await asyncio.sleep(STORE_INTERVAL_S)
+            batch, self._measurements = self._measurements, []
             if self._dropped:
-                _log.warning("telemetry is behind: %d messages were dropped", self._dropped)
+                _log.warning("telemetry storage is too slow: dropped %d messages", self._dropped)
                 self._dropped = 0
             try:
                 await self._functions.telemetry_ingest.ingest(batch)
@@ -248,18 +250,18 @@ class XmppGateway:
                 _log.warning("%d measurements were not stored: %s", len(batch), error)
 
 
-def _greeting(told: Delivery, user: str) -> Presence | None:
-    if not told.topic.endswith(f"/{user}/{topics.CONN}"):
+def _online_presence(delivery: Delivery, user: str) -> Presence | None:
+    if not delivery.topic.endswith(f"/{user}/{topics.CONN}"):
         return None
     try:
-        said = codec.decode(told.payload, Presence)
+        presence = codec.decode(delivery.payload, Presence)
     except ProtocolError:
         return None
-    return said if said.online else None
+    return presence if presence.online else None
 
 
-def _may_hear(agent: Agent, topic: str) -> bool:
-    """What any agent may hear: what its space measures."""
+def _may_subscribe(agent: Agent, topic: str) -> bool:
+    """Whether the topic is telemetry of the agent's space."""
     try:
         parsed = topics.parse(topic)
     except ProtocolError:
@@ -267,12 +269,12 @@ def _may_hear(agent: Agent, topic: str) -> bool:
     return parsed.space == agent.space and parsed.kind == topics.TELE
 
 
-def _unfit(agent: Agent | None, told: Delivery) -> str | None:
-    """Why an agent cannot be served."""
+def _rejection_reason(agent: Agent | None, delivery: Delivery) -> str | None:
+    """Why an agent may not start a session; ``None``: it may."""
     if agent is None or not agent.claimed:
         return "This agent is not claimed. Claim it with its code first."
     if agent.transport != "xmpp":
-        return f"This agent said at its enrolment that it speaks {agent.transport}. Enroll it for xmpp."
-    if told.topic != topics.conn(agent.space or "", agent.id):
-        return "This agent belongs to another space now."
+        return f"This agent is enrolled with the transport {agent.transport}. Enroll it with xmpp."
+    if delivery.topic != topics.conn(agent.space or "", agent.id):
+        return "This agent belongs to another space."
     return None

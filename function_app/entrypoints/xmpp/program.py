@@ -1,4 +1,4 @@
-"""The program, from start to end."""
+"""Runs the XMPP gateway as a program."""
 
 import asyncio
 import signal
@@ -12,17 +12,17 @@ async def run_gateway(functions: Functions) -> None:
     """Run until SIGINT or SIGTERM.
 
     Raises:
-        StoreError: The tables cannot be used, at the start.
-        SettingsError: There is no XMPP server in the settings.
+        StoreError: The tables are not available at the start.
+        SettingsError: The settings name no XMPP server.
     """
-    ending = asyncio.Event()
+    stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ending.set)
+        loop.add_signal_handler(number, stopping.set)
     await functions.health.require_tables()
     gateway = XmppGateway(functions, xmpp_connection(functions), command_feed(functions))
     running = asyncio.create_task(gateway.run())
-    waiting = asyncio.create_task(ending.wait())
+    waiting = asyncio.create_task(stopping.wait())
     done, _ = await asyncio.wait((running, waiting), return_when=asyncio.FIRST_COMPLETED)
     for task in (running, waiting):
         task.cancel()

@@ -131,7 +131,7 @@ class Gateway:
         self.gateway, self._task = cloud.run(start())
 
     def serves(self, agent: str) -> bool:
-        return agent in self.gateway._served
+        return agent in self.gateway._sessions
 
     def end(self) -> None:
         async def stop() -> None:

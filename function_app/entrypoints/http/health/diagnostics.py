@@ -20,7 +20,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /devices/{device}/diagnostics", "Diagnose a device", schemas.DeviceDiagnostics, 404)
     async def get_diagnostics(request: Request, device: str) -> Response:
-        """Open faults, and each measurement with its usual range, limits and trend."""
+        """Returns open faults, and each measurement with its usual range, limits and trend."""
         caller = await auth.account(request)
         summary, fields = await functions.diagnostics.of_device(caller, device)
         body = schemas.DeviceDiagnostics(
@@ -37,10 +37,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /diagnostics", "Summarize the health of all devices", schemas.DeviceHealthList, 422)
     async def list_diagnostics(request: Request, cursor: Cursor = None, limit: Limit = 1000) -> Response:
-        """Worst first, with counts."""
+        """Returns the health of each device, worst first, with counts."""
         caller = await auth.account(request)
-        found, following = await functions.diagnostics.summaries(caller, space=None, cursor=cursor, limit=limit)
-        return json_response(_list(found, following))
+        summaries, next_cursor = await functions.diagnostics.summaries(caller, space=None, cursor=cursor, limit=limit)
+        return json_response(_list(summaries, next_cursor))
 
     @routes.add(
         "GET /spaces/{space}/diagnostics",
@@ -51,28 +51,28 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     async def list_space_diagnostics(
         request: Request, space: str, cursor: Cursor = None, limit: Limit = 1000
     ) -> Response:
-        """Worst first, with counts."""
+        """Returns the health of each device, worst first, with counts."""
         caller = await auth.account(request)
-        found, following = await functions.diagnostics.summaries(caller, space=space, cursor=cursor, limit=limit)
-        return json_response(_list(found, following))
+        summaries, next_cursor = await functions.diagnostics.summaries(caller, space=space, cursor=cursor, limit=limit)
+        return json_response(_list(summaries, next_cursor))
 
     return routes
 
 
-def _list(found: list[Summary], cursor: str | None) -> schemas.DeviceHealthList:
-    counted = {health.value: sum(one.health is health for one in found) for health in Health}
+def _list(summaries: list[Summary], cursor: str | None) -> schemas.DeviceHealthList:
+    counted = {health.value: sum(summary.health is health for summary in summaries) for health in Health}
     items = tuple(
         schemas.DeviceHealthOut(
-            device=one.view.device.id,
-            label=one.view.device.label,
-            space=one.view.device.space,
-            health=one.health.value,
-            online=one.view.online,
-            last_seen_at=_moment(one.view.last_seen_ms),
-            counts=_counts(one),
-            worst=fault_out(one.faults[0]) if one.faults else None,
+            device=summary.view.device.id,
+            label=summary.view.device.label,
+            space=summary.view.device.space,
+            health=summary.health.value,
+            online=summary.view.online,
+            last_seen_at=_moment(summary.view.last_seen_ms),
+            counts=_counts(summary),
+            worst=fault_out(summary.faults[0]) if summary.faults else None,
         )
-        for one in found
+        for summary in summaries
     )
     return schemas.DeviceHealthList(counts=schemas.DeviceHealthCounts(**counted), items=items, cursor=cursor)
 
@@ -81,15 +81,15 @@ def _counts(summary: Summary) -> schemas.FaultCounts:
     return schemas.FaultCounts(**{severity.value: summary.count(severity) for severity in Severity})
 
 
-def _field(known: FieldView) -> schemas.DiagnosticFieldOut:
-    limits, watch = known.rule.limits, known.watch
+def _field(view: FieldView) -> schemas.DiagnosticFieldOut:
+    limits, watch = view.rule.limits, view.watch
     usual = usual_range(watch, limits)
     return schemas.DiagnosticFieldOut(
-        stream=known.stream,
-        field=known.name,
-        label=known.rule.label,
-        unit=known.rule.unit,
-        advice=known.rule.advice,
+        stream=view.stream,
+        field=view.name,
+        label=view.rule.label,
+        unit=view.rule.unit,
+        advice=view.rule.advice,
         value=watch.value,
         baseline=watch.baseline.mean,
         usual_low=usual[0] if usual else None,

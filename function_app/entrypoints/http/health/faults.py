@@ -12,7 +12,7 @@ from function_app.entrypoints.http.health import schemas
 from function_app.entrypoints.http.health.serializers import fault_out
 from function_app.services.devices.device_access import require_operator
 
-Open = Annotated[bool | None, Query(alias="open", description="Only open ones, or only those that are over.")]
+Open = Annotated[bool | None, Query(alias="open", description="true: only open faults; false: only cleared faults.")]
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
@@ -23,23 +23,23 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     async def list_faults(
         request: Request, device: str, only: Open = None, cursor: Cursor = None, limit: Limit = 100
     ) -> Response:
-        """Since the device was paired. The first page holds all open faults, which do not count towards ``limit``."""
+        """Returns faults since the device was paired. The first page has all open faults in addition to ``limit``."""
         caller = await auth.account(request)
-        found = await functions.devices.get(caller, device)
+        target = await functions.devices.get(caller, device)
         with_open, with_past = only is not False and cursor is None, only is not True
-        current = await functions.faults.open(found) if with_open else []
-        past, following = await functions.faults.past(found, cursor=cursor, limit=limit) if with_past else ([], None)
+        current = await functions.faults.open(target) if with_open else []
+        past, next_cursor = await functions.faults.past(target, cursor=cursor, limit=limit) if with_past else ([], None)
         return json_response(
-            schemas.FaultList(items=tuple(fault_out(fault) for fault in (*current, *past)), cursor=following)
+            schemas.FaultList(items=tuple(fault_out(fault) for fault in (*current, *past)), cursor=next_cursor)
         )
 
     @routes.add(
         "POST /devices/{device}/faults/{fault}/acknowledge", "Acknowledge a fault", schemas.FaultOut, (404, 409)
     )
     async def acknowledge_fault(request: Request, device: str, fault: str) -> Response:
-        """It stays open until it is cleared. The first acknowledging account stays named."""
+        """The fault stays open until it is cleared. It records the first account that acknowledged it."""
         caller = await auth.account(request)
-        found = require_operator(await functions.devices.get(caller, device))
-        return json_response(fault_out(await functions.faults.acknowledge(found, fault, by=caller.name)))
+        target = require_operator(await functions.devices.get(caller, device))
+        return json_response(fault_out(await functions.faults.acknowledge(target, fault, by=caller.name)))
 
     return routes

@@ -16,15 +16,15 @@ def router(functions: Functions, _auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /health", "Check the server", schemas.HealthOut, caller="anonymous")
     async def health(_request: Request) -> Response:
-        """503 if the tables cannot be used. An unreachable broker is reported and recovers by itself."""
-        found = await functions.health.check()
-        if found.tables != "ok":
-            raise store_unavailable(found.tables)
+        """503: the tables are not available. ``degraded``: the broker is not reachable; the server reconnects."""
+        result = await functions.health.check()
+        if result.tables != "ok":
+            raise store_unavailable(result.tables)
         body = schemas.HealthOut(
-            status="ok" if found.broker == "ok" else "degraded",
+            status="ok" if result.broker == "ok" else "degraded",
             version=VERSION,
-            tables=found.tables,
-            broker=found.broker,
+            tables=result.tables,
+            broker=result.broker,
         )
         return json_response(body)
 

@@ -6,11 +6,12 @@ from function_app.entrypoints.http.framework.schemas import Moment, Response
 
 
 class FaultOut(Response, frozen=True, kw_only=True):
-    """Something that is or was wrong.
+    """A fault of a device, open or cleared.
 
-    ``kind``: ``reported`` by the device; ``silent``: nothing is heard of it; or what a detector found: ``level``, it is
-    beyond a limit; ``trend``, on its way to one; ``change``, settled elsewhere; ``outlier``, far from its past.
-    ``count``: first, second … of its code. ``worsened``: how often it got worse, each time to be acknowledged again.
+    ``kind``: ``reported`` by the device, ``silent`` (no messages from it), or the detector: ``level`` (beyond a limit),
+    ``trend`` (moving towards a limit), ``change`` (lasting shift), ``outlier`` (far from the baseline). ``count``:
+    number of this fault among those with the same code. ``worsened``: how often its severity increased, which each
+    time removes the acknowledgement.
     """
 
     id: str
@@ -34,7 +35,7 @@ class FaultOut(Response, frozen=True, kw_only=True):
 
 
 class FaultList(Response, frozen=True, kw_only=True):
-    """Open ones worst first; then the history, newest first."""
+    """Open faults, worst first; then cleared faults, newest first."""
 
     items: tuple[FaultOut, ...]
     cursor: str | None
@@ -44,12 +45,12 @@ Health = Literal["ok", "unknown", "warning", "fault"]
 
 
 class DiagnosticFieldOut(Response, frozen=True, kw_only=True):
-    """One watched field, by means over ten seconds.
+    """One monitored field, as mean of ten seconds.
 
-    ``baseline`` is what is usual; values are usually from ``usual_low`` to ``usual_high``, null until that is known.
-    ``slope_per_s`` is the trend of the last ten minutes; ``limit_in_s`` the time until it meets a limit, null: it
-    does not. ``findings``: what is wrong now, of ``level``, ``trend``, ``change``, ``outlier``. ``advice``: what to do
-    then, by the robot type or the room; empty for unlisted fields.
+    ``baseline`` is the usual value; ``usual_low`` and ``usual_high`` are the usual range, null until it is known.
+    ``slope_per_s`` is the trend of the last ten minutes. ``limit_in_s`` is the time until the trend reaches a limit;
+    null: it does not. ``findings``: triggered detectors (``level``, ``trend``, ``change``, ``outlier``). ``advice``:
+    instruction of the robot type or room; empty for unlisted fields.
     """
 
     stream: str
@@ -80,7 +81,7 @@ class FaultCounts(Response, frozen=True, kw_only=True):
 
 
 class DeviceDiagnostics(Response, frozen=True, kw_only=True):
-    """How a device is, and all that is watched of it. ``unknown``: nothing is heard of it."""
+    """Health of a device, with its faults and monitored fields. ``unknown``: the device is offline."""
 
     device: str
     label: str
@@ -93,7 +94,7 @@ class DeviceDiagnostics(Response, frozen=True, kw_only=True):
 
 
 class DeviceHealthOut(Response, frozen=True, kw_only=True):
-    """How a device is, in short. ``worst`` is its worst open fault."""
+    """Summary of a device's health. ``worst``: its most severe open fault."""
 
     device: str
     label: str
@@ -106,7 +107,7 @@ class DeviceHealthOut(Response, frozen=True, kw_only=True):
 
 
 class DeviceHealthCounts(Response, frozen=True, kw_only=True):
-    """Devices of this page by health."""
+    """Number of devices on this page by health."""
 
     fault: int
     warning: int
@@ -115,7 +116,7 @@ class DeviceHealthCounts(Response, frozen=True, kw_only=True):
 
 
 class DeviceHealthList(Response, frozen=True, kw_only=True):
-    """Devices, worst first. A page holds those of up to ``limit`` agents, by default all."""
+    """Devices, worst first. A page has the devices of up to ``limit`` agents."""
 
     counts: DeviceHealthCounts
     items: tuple[DeviceHealthOut, ...]
@@ -123,7 +124,7 @@ class DeviceHealthList(Response, frozen=True, kw_only=True):
 
 
 class HealthOut(Response, frozen=True, kw_only=True):
-    """``ok``, or a sentence, for each thing the functions need."""
+    """Health of the server. ``tables`` and ``broker``: ``ok``, or a description of the error."""
 
     status: Literal["ok", "degraded"]
     version: str

@@ -1,4 +1,4 @@
-"""Faults as the API shows them."""
+"""Converts faults to API responses."""
 
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.health.faults import Fault
@@ -7,7 +7,7 @@ from function_app.entrypoints.http.health.schemas import FaultOut
 
 
 def fault_out(fault: Fault) -> FaultOut:
-    """A fault with its state."""
+    """The response for a fault with its state."""
     return response_from(
         fault,
         FaultOut,

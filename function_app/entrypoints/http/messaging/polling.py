@@ -12,13 +12,15 @@ from function_app.entrypoints.http.framework.authentication import RequestAuthen
 from function_app.entrypoints.http.framework.responses import json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.messaging import schemas
-from function_app.entrypoints.ingest.agent_messages import tell
+from function_app.entrypoints.ingest.agent_messages import ingest_messages
 from function_app.services.devices.device_access import require_claimed
 
-Wait = Annotated[int, Query(ge=0, le=30_000, description="Wait at most this long for a command [ms]; 0: plain poll.")]
-Limit = Annotated[int, Query(ge=1, le=32, description="At most so many.")]
-Have = Annotated[
-    list[str], Query(max_length=32, description="Ids of commands that came already and are not answered yet.")
+Wait = Annotated[
+    int, Query(ge=0, le=30_000, description="Maximum time to wait for a command [ms]; 0: return immediately.")
+]
+Limit = Annotated[int, Query(ge=1, le=32, description="Maximum number of commands.")]
+Received = Annotated[
+    list[str], Query(max_length=32, description="Ids of received commands that are not acknowledged yet.")
 ]
 
 
@@ -32,19 +34,19 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         agent: str,
         wait_ms: Wait = 0,
         limit: Limit = 10,
-        have: Have = (),  # type: ignore[assignment]
+        have: Received = (),  # type: ignore[assignment]
     ) -> Response:
-        """For agents enrolled with transport ``http``. A command is returned until the agent posts an ack of it."""
-        asking = await _asking(request, agent)
-        found = await functions.polling.commands(asking, wait_ms=wait_ms, limit=limit, have=frozenset(have))
+        """For agents with transport ``http``. A command is returned until the agent acknowledges it."""
+        caller = await _caller(request, agent)
+        commands = await functions.polling.commands(caller, wait_ms=wait_ms, limit=limit, have=frozenset(have))
         items = tuple(
             schemas.CommandOut(
-                id=letter.command,
-                topic=letter.topic,
-                payload=letter.payload.decode(),
-                expires_at=rfc3339(letter.expires_ms),
+                id=command.command,
+                topic=command.topic,
+                payload=command.payload.decode(),
+                expires_at=rfc3339(command.expires_ms),
             )
-            for letter in found
+            for command in commands
         )
         return json_response(schemas.CommandList(items=items), headers={"Cache-Control": "no-store"})
 
@@ -57,26 +59,28 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="agent",
     )
     async def post_agent_messages(request: Request, agent: str) -> Response:
-        """Acks, state, description, events and telemetry as over MQTT. The broker's subscribers receive them too.
+        """Accepts acks, state, description, events and telemetry as over MQTT, and publishes them to the broker.
 
-        Each message has its own result. Messages may be sent again: stored ones change nothing.
+        Each message has its own result. Safe to repeat: messages that are already stored have no effect.
         """
-        asking = await _asking(request, agent)
-        require_claimed(asking)
+        caller = await _caller(request, agent)
+        require_claimed(caller)
         payload: schemas.MessagesRequest = await read(request, schemas.MessagesRequest)
-        await functions.polling.mark_online(asking)  # first: what it says of itself counts more
-        told = [(each.topic, bytes(each.payload)) for each in payload.messages]
+        await functions.polling.mark_online(caller)  # first: the posted presence takes precedence
+        messages = [(each.topic, bytes(each.payload)) for each in payload.messages]
         results = (
-            schemas.MessageResult(status="stored" if why is None else "rejected", detail=why and f"{why.rstrip('.')}.")
-            for why in await tell(functions, asking, told, by="http")
+            schemas.MessageResult(
+                status="stored" if error is None else "rejected", detail=error and f"{error.rstrip('.')}."
+            )
+            for error in await ingest_messages(functions, caller, messages, by="http")
         )
         return json_response(schemas.MessageResults(results=tuple(results)))
 
-    async def _asking(request: Request, agent: str) -> Agent:
-        """The agent that asks, once it is seen that the path names it."""
-        found = await auth.agent(request)
-        if found.id != agent:
+    async def _caller(request: Request, agent: str) -> Agent:
+        """The authenticated agent, which must be the agent of the path."""
+        caller = await auth.agent(request)
+        if caller.id != agent:
             raise not_found("agent", agent)
-        return found
+        return caller
 
     return routes

@@ -9,7 +9,7 @@ from function_app.entrypoints.http.framework.schemas import Moment, Request, Res
 
 
 class CommandOut(Response, frozen=True, kw_only=True):
-    """One command. ``payload`` is the text of the MQTT message on ``topic``, byte for byte: its signature holds."""
+    """One command. ``payload``: the exact text of the MQTT message on ``topic``, so that its signature is valid."""
 
     id: str
     topic: str
@@ -18,13 +18,13 @@ class CommandOut(Response, frozen=True, kw_only=True):
 
 
 class CommandList(Response, frozen=True, kw_only=True):
-    """Commands that wait for an answer: Stop first, then the oldest first."""
+    """Commands that are not acknowledged: Stop first, then oldest first."""
 
     items: tuple[CommandOut, ...]
 
 
 class AgentMessage(Request, frozen=True, kw_only=True):
-    """One message: topic and payload as on MQTT."""
+    """One message, with topic and payload as in MQTT."""
 
     topic: Annotated[str, Meta(min_length=1, max_length=400)]
     payload: Raw
@@ -37,7 +37,7 @@ class MessagesRequest(Request, frozen=True, kw_only=True):
 
 
 class MessageResult(Response, frozen=True, kw_only=True):
-    """``stored``, or ``rejected`` with a reason. Sending a rejected message again changes nothing."""
+    """The result for one message. A rejected message has a reason and must not be sent again."""
 
     status: Literal["stored", "rejected"]
     detail: str | None = None
@@ -53,9 +53,9 @@ XmppCredentialsRequest = ViewCredentialsRequest | AgentCredentialsRequest
 
 
 class XmppCredentialsOut(Response, frozen=True, kw_only=True):
-    """Where to connect, as whom, and with whom to speak.
+    """XMPP credentials and server address.
 
-    ``cloud`` is the bare JID of the XMPP gateway.
+    ``cloud``: bare JID of the XMPP gateway. For an agent also the statements that rotate the server's signing keys.
     """
 
     jid: str
@@ -79,7 +79,7 @@ class XmppVerifyRequest(Request, frozen=True, kw_only=True):
 
 
 class XmppContactOut(Response, frozen=True, kw_only=True):
-    """A contact of the user, in both directions."""
+    """A contact with a mutual subscription."""
 
     user: str
     name: str

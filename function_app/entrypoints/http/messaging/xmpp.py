@@ -1,4 +1,4 @@
-"""XMPP credentials, and logins of the XMPP server."""
+"""XMPP credentials, and verification of logins for the XMPP server."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from function_app.entrypoints.http.framework.responses import json_response, rea
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.messaging import schemas
 
-_NOT_KEPT = {"Cache-Control": "no-store"}
+_NO_STORE = {"Cache-Control": "no-store"}
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
@@ -30,31 +30,31 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="account or agent",
     )
     async def xmpp_credentials(request: Request) -> Response:
-        """For an agent that enrolled with transport ``xmpp``, or to view one's agents with an XMPP client."""
+        """Returns credentials for an agent with transport ``xmpp``, or for an XMPP client that views agents."""
         payload: Any = await read(request, schemas.XmppCredentialsRequest)
         space: str | None = None
         if isinstance(payload, AgentCredentialsRequest):
             agent = await auth.agent(request)
-            given = await functions.xmpp_credentials.agent(agent)
+            issued = await functions.xmpp_credentials.agent(agent)
             space = agent.space
         else:
-            given = await functions.xmpp_credentials.account(await auth.account(request))
+            issued = await functions.xmpp_credentials.account(await auth.account(request))
         settings = functions.settings
-        news = None if space is None else await functions.keys.announcement()
+        keys = None if space is None else await functions.keys.announcement()
         body = schemas.XmppCredentialsOut(
-            jid=f"{given.user}@{settings.xmpp.domain}",
-            password=given.password,
-            expires_at=rfc3339(given.expires_ms),
-            lifetime_s=given.lifetime_s,
+            jid=f"{issued.user}@{settings.xmpp.domain}",
+            password=issued.password,
+            expires_at=rfc3339(issued.expires_ms),
+            lifetime_s=issued.lifetime_s,
             space=space,
             cloud=f"{jids.CLOUD}@{settings.xmpp.domain}",
             host=settings.xmpp.host,
             port=settings.xmpp.port,
             server_time_ms=functions.clock.now_ms(),
-            key_statements=() if news is None else news.statements,
-            signing_key="" if news is None else news.signing,
+            key_statements=() if keys is None else keys.statements,
+            signing_key="" if keys is None else keys.signing,
         )
-        return json_response(body, headers=_NOT_KEPT)
+        return json_response(body, headers=_NO_STORE)
 
     @routes.add(
         "POST /xmpp/verify",
@@ -65,10 +65,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="anonymous",
     )
     async def xmpp_verify(request: Request) -> Response:
-        """Called by the XMPP server. A caller without a valid password learns nothing."""
+        """Called by the XMPP server to authenticate a user. Requires a valid password."""
         payload: schemas.XmppVerifyRequest = await read(request, schemas.XmppVerifyRequest)
-        found = await functions.xmpp_credentials.verify(payload.user, payload.password)
-        body = msgspec.convert(found, schemas.XmppIdentityOut, from_attributes=True)
-        return json_response(body, headers=_NOT_KEPT)
+        identity = await functions.xmpp_credentials.verify(payload.user, payload.password)
+        body = msgspec.convert(identity, schemas.XmppIdentityOut, from_attributes=True)
+        return json_response(body, headers=_NO_STORE)
 
     return routes

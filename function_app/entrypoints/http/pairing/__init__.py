@@ -1,1 +1,1 @@
-"""Routes of agents."""
+"""Routes of agents: enrolment, claim, unpairing."""

@@ -20,7 +20,7 @@ from function_app.entrypoints.http.framework.schemas import AccountRef
 from function_app.entrypoints.http.pairing import schemas
 from function_app.services.pairing.enroll import Enrollment
 
-Wait = Annotated[int, Query(ge=0, le=30_000, description="Wait at most this long for the claim [ms].")]
+Wait = Annotated[int, Query(ge=0, le=30_000, description="Maximum time to wait for the claim [ms].")]
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
@@ -36,17 +36,17 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="agent",
     )
     async def enroll_agent(request: Request) -> Response:
-        """Called by an agent with a token signed by the key in the body.
+        """Called by an agent. Returns a claim code until an account claims the agent.
 
-        Returns a claim code until the agent is claimed.
+        The bearer token must be signed by the key in the body.
         """
         payload: schemas.EnrollRequest = await read(request, schemas.EnrollRequest)
         if len({device.name for device in payload.devices}) != len(payload.devices):
             raise invalid("Two devices have the same name.")
         agent = await auth.enrolling(request, payload.public_key)
         specs = tuple(msgspec.convert(device, DeviceSpec, from_attributes=True) for device in payload.devices)
-        told = Enrollment(payload.name, payload.public_key, payload.software, specs, payload.transport)
-        done = await functions.enroll.enroll(agent, told)
+        enrollment = Enrollment(payload.name, payload.public_key, payload.software, specs, payload.transport)
+        done = await functions.enroll.enroll(agent, enrollment)
         if done.claimed:
             return json_response(schemas.EnrollmentOut(agent=done.id, claim_code=None, expires_at=None, expires_in_s=0))
         left_ms = max(0, done.claim_expires_ms - functions.clock.now_ms())
@@ -60,9 +60,9 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /agents/enrollment", "Get the enrolment state", schemas.EnrollmentState, 422, caller="agent")
     async def enrollment(request: Request, wait_ms: Wait = 0) -> Response:
-        """Called by an agent: its space, its owner, and the keys whose commands it must accept."""
+        """Called by an agent. Returns its space, its owner, and the keys whose commands it must accept."""
         agent = await functions.enroll.wait(await auth.agent(request), wait_ms)
-        news = await functions.keys.announcement()
+        keys = await functions.keys.announcement()
         body = schemas.EnrollmentState(
             agent=agent.id,
             state="claimed" if agent.claimed else "waiting",
@@ -72,10 +72,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
                 schemas.SigningKeyOut(
                     id=pin.id, public=signing.public_text(pin.key), serial=pin.serial, until_ms=pin.until_ms
                 )
-                for pin in news.pins
+                for pin in keys.pins
             ),
-            key_statements=news.statements,
-            signing_key=news.signing,
+            key_statements=keys.statements,
+            signing_key=keys.signing,
         )
         return json_response(body)
 
@@ -88,7 +88,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="agent",
     )
     async def certify(request: Request) -> Response:
-        """For brokers that require agent certificates. The certificate ends with the pairing."""
+        """Called by an agent whose broker requires certificates. Unpairing revokes the certificate."""
         agent = await auth.agent(request)
         payload: schemas.CertificateRequest = await read(request, schemas.CertificateRequest)
         issued = await functions.agent_certificates.certify(agent, payload.request)
@@ -98,23 +98,23 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         "POST /agents/claim", "Claim an agent by its code", schemas.ClaimOut, (404, 429), body=schemas.ClaimRequest
     )
     async def claim_agent(request: Request) -> Response:
-        """Wrong, used and expired codes get the same response."""
+        """Claims the agent for the account. Wrong, used and expired codes cause the same response."""
         caller = await auth.account(request)
         payload: schemas.ClaimRequest = await read(request, schemas.ClaimRequest)
         agent = await functions.claim.claim(
             caller, payload.code, payload.space, address=client_address(request, functions.settings.trusted_proxies)
         )
         views = await functions.devices.of_agent(caller, agent.id)
-        found = tuple(device_out(view, caller, functions.clock.now_ms()) for view in views)
-        return json_response(schemas.ClaimOut(agent=agent.id, space=agent.space or "", devices=found))
+        devices = tuple(device_out(view, caller, functions.clock.now_ms()) for view in views)
+        return json_response(schemas.ClaimOut(agent=agent.id, space=agent.space or "", devices=devices))
 
     @routes.add("GET /agents", "List agents", schemas.AgentList, 422)
     async def list_agents(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
-        """Agents that the account has claimed."""
+        """Returns agents that the account has claimed."""
         caller = await auth.account(request)
-        agents, following = await functions.devices.agents(caller, cursor=cursor, limit=limit)
-        items = tuple(_shown(agent) for agent in agents)
-        return json_response(schemas.AgentList(items=items, cursor=following))
+        agents, next_cursor = await functions.devices.agents(caller, cursor=cursor, limit=limit)
+        items = tuple(_agent_out(agent) for agent in agents)
+        return json_response(schemas.AgentList(items=items, cursor=next_cursor))
 
     @routes.add(
         "PUT /agents/{agent}/space",
@@ -124,10 +124,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.MoveAgentRequest,
     )
     async def move_agent(request: Request, agent: str) -> Response:
-        """Its history stays. Running actions end, leases are revoked, and its broker connection is closed."""
+        """Ends running actions, revokes leases and closes its broker connection. Its history stays available."""
         caller = await auth.account(request)
         payload: schemas.MoveAgentRequest = await read(request, schemas.MoveAgentRequest)
-        return json_response(_shown(await functions.unpair.move(caller, agent, payload.space)))
+        return json_response(_agent_out(await functions.unpair.move(caller, agent, payload.space)))
 
     @routes.add("DELETE /agents/{agent}", "Unpair an agent", None, 404)
     async def unpair_agent(request: Request, agent: str) -> Response:
@@ -138,7 +138,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     return routes
 
 
-def _shown(agent: Agent) -> schemas.AgentOut:
+def _agent_out(agent: Agent) -> schemas.AgentOut:
     return schemas.AgentOut(
         id=agent.id,
         name=agent.name,

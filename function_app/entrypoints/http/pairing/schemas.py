@@ -19,19 +19,20 @@ class DeviceIn(Request, frozen=True, kw_only=True):
 
 
 class EnrollRequest(Request, frozen=True, kw_only=True):
-    """An agent introduces itself; the request's token is signed by the key that it names."""
+    """An agent with its devices. ``public_key`` must verify the bearer token."""
 
     name: Name
     public_key: Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{43}$")]
     software: Label
     devices: Annotated[tuple[DeviceIn, ...], Meta(min_length=1, max_length=64)]
     transport: Annotated[
-        Literal["mqtt", "http", "xmpp"], Meta(description="How it hears commands: by the broker, or by asking")
+        Literal["mqtt", "http", "xmpp"],
+        Meta(description="How the agent receives commands: MQTT broker, HTTP polling or XMPP"),
     ] = "mqtt"
 
 
 class EnrollmentOut(Response, frozen=True, kw_only=True):
-    """``claim_code`` is null once the agent is claimed."""
+    """An enrolled agent. ``claim_code`` is null if the agent is claimed."""
 
     agent: str
     claim_code: str | None
@@ -40,7 +41,10 @@ class EnrollmentOut(Response, frozen=True, kw_only=True):
 
 
 class SigningKeyOut(Response, frozen=True, kw_only=True):
-    """A public key (Ed25519, base64url), its id and place in their order; it counts until ``until_ms`` (0: on)."""
+    """A public key (Ed25519, base64url).
+
+    ``serial`` increases with each rotation. ``until_ms``: expiry time [ms since 1970]; 0: does not expire.
+    """
 
     id: str
     public: str
@@ -49,9 +53,9 @@ class SigningKeyOut(Response, frozen=True, kw_only=True):
 
 
 class EnrollmentState(Response, frozen=True, kw_only=True):
-    """Whether an agent is claimed, and the keys whose commands it is to obey.
+    """Whether an agent is claimed, and the keys whose commands it must accept.
 
-    ``key_statements`` lead from a key that is pinned already to the newest; ``signing_key`` signs commands now.
+    ``key_statements`` is the chain of signed rotations up to the newest key. ``signing_key`` signs commands now.
     """
 
     agent: str
@@ -64,33 +68,33 @@ class EnrollmentState(Response, frozen=True, kw_only=True):
 
 
 class CertificateRequest(Request, frozen=True, kw_only=True):
-    """PKCS 10 in PEM, for a key on P-256 that has signed it."""
+    """A certificate signing request (PKCS #10 in PEM) for a P-256 key."""
 
     request: Annotated[str, Meta(min_length=1, max_length=4096)]
 
 
 class CertificateOut(Response, frozen=True, kw_only=True):
-    """What the agent is to show to the broker, in PEM."""
+    """The agent's certificate chain for the broker (PEM)."""
 
     chain: str
     expires_at: Moment
 
 
 class ClaimRequest(Request, frozen=True, kw_only=True):
-    """The code that an agent shows, and the space it shall be in (default: the first)."""
+    """The claim code that the agent displays. ``space``: where to put the agent; null: the account's first space."""
 
     code: Annotated[str, Meta(min_length=1, max_length=40)]
     space: Id | None = None
 
 
 class MoveAgentRequest(Request, frozen=True, kw_only=True):
-    """The space to move an agent to, one of the account's."""
+    """The new space, which the account must own."""
 
     space: Id
 
 
 class AgentOut(Response, frozen=True, kw_only=True):
-    """An agent of the account."""
+    """An agent of the account. ``devices``: names of its devices."""
 
     id: str
     name: str
@@ -102,14 +106,14 @@ class AgentOut(Response, frozen=True, kw_only=True):
 
 
 class AgentList(Response, frozen=True, kw_only=True):
-    """Agents."""
+    """Agents of the account."""
 
     items: tuple[AgentOut, ...]
     cursor: str | None
 
 
 class ClaimOut(Response, frozen=True, kw_only=True):
-    """What was claimed."""
+    """The claimed agent and its devices."""
 
     agent: str
     space: str

@@ -20,9 +20,9 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /devices/{device}/robot-type", "Get a device's robot type", RobotTypeOut, 404)
     async def get_device_robot_type(request: Request, device: str) -> Response:
-        """As its owner has it. The caller's own robot type of the same name may differ."""
-        found = await functions.devices.get(await auth.account(request), device)
-        return json_response(robot_type_out(await functions.robot_types.view(_owner(found.owner), found.robot_type)))
+        """Returns the robot type of the device's owner. The caller's own robot type with the same name may differ."""
+        target = await functions.devices.get(await auth.account(request), device)
+        return json_response(robot_type_out(await functions.robot_types.view(_owner(target.owner), target.robot_type)))
 
     @routes.add(
         "GET /devices/{device}/robot-type/files/{name:path}",
@@ -31,9 +31,9 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         (404, 409),
     )
     async def get_device_robot_type_file(request: Request, device: str, name: str) -> Response:
-        """Of the version in use. ``robot.toml`` is the manifest."""
-        found = await functions.devices.get(await auth.account(request), device)
-        body = await functions.robot_types.file(_owner(found.owner), found.robot_type, name)
+        """Returns a file of the active version. ``robot.toml`` is the manifest."""
+        target = await functions.devices.get(await auth.account(request), device)
+        body = await functions.robot_types.file(_owner(target.owner), target.robot_type, name)
         return content(body, "application/octet-stream", name.rpartition("/")[2])
 
     @routes.add(
@@ -42,12 +42,12 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     async def list_device_movements(
         request: Request, device: str, cursor: Cursor = None, limit: Limit = 100
     ) -> Response:
-        """Built-in movements and its owner's, by name. For accounts that may run them."""
-        found = require_operator(await functions.devices.get(await auth.account(request), device))
-        items, following = await functions.movements.list(
-            _owner(found.owner), found.robot_type, cursor=cursor, limit=limit
+        """Returns built-in movements and those of the device's owner, by name. Operators only."""
+        target = require_operator(await functions.devices.get(await auth.account(request), device))
+        items, next_cursor = await functions.movements.list(
+            _owner(target.owner), target.robot_type, cursor=cursor, limit=limit
         )
-        return json_response(schemas.MovementList(items=tuple(movement_out(each) for each in items), cursor=following))
+        return json_response(schemas.MovementList(items=tuple(map(movement_out, items)), cursor=next_cursor))
 
     @routes.add(
         "GET /devices/{device}/movements/{name}",
@@ -56,15 +56,15 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         (403, 404, 409),
     )
     async def get_device_movement(request: Request, device: str, name: str) -> Response:
-        """The newest version. For accounts that may run it."""
-        found = require_operator(await functions.devices.get(await auth.account(request), device))
-        movement, source = await functions.movements.get(_owner(found.owner), found.robot_type, name)
+        """Returns the newest version. Operators only."""
+        target = require_operator(await functions.devices.get(await auth.account(request), device))
+        movement, source = await functions.movements.get(_owner(target.owner), target.robot_type, name)
         public = signing.public_text((await functions.keys.public())[movement.key])
-        return json_response(movement_source_out(found.robot_type, movement, source, public))
+        return json_response(movement_source_out(target.robot_type, movement, source, public))
 
     return routes
 
 
 def _owner(account: str) -> Identity:
-    """The account whose library is used. The caller has checked the access."""
+    """The identity of the library's account. The caller of this function must have checked the access."""
     return Identity(account, "", "")

@@ -14,8 +14,7 @@ from function_app.entrypoints.http.robot_types.serializers import movement_out, 
 from function_app.services.robot_types import parameter_schema
 from function_app.services.robot_types.movements import Draft
 
-_MOVEMENTS = "/robot-types/{robot_type}/movements"
-Version = Annotated[int | None, Query(ge=1, le=2**31, description="Not the newest, but this one.")]
+Version = Annotated[int | None, Query(ge=1, le=2**31, description="Version number. Default: the newest version.")]
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
@@ -29,10 +28,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         (404, 409, 422),
     )
     async def list_movements(request: Request, robot_type: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
-        """Built-in movements and the account's own, by name."""
+        """Returns built-in movements and the account's own, by name."""
         caller = await auth.account(request)
-        found, following = await functions.movements.list(caller, robot_type, cursor=cursor, limit=limit)
-        return json_response(schemas.MovementList(items=tuple(movement_out(each) for each in found), cursor=following))
+        found, next_cursor = await functions.movements.list(caller, robot_type, cursor=cursor, limit=limit)
+        return json_response(schemas.MovementList(items=tuple(map(movement_out, found)), cursor=next_cursor))
 
     @routes.add(
         "GET /robot-types/{robot_type}/movements/{name}",
@@ -41,11 +40,11 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         (404, 409, 422),
     )
     async def get_movement(request: Request, robot_type: str, name: str, version: Version = None) -> Response:
-        """The newest version, or the requested one."""
+        """Returns the newest or the requested version."""
         caller = await auth.account(request)
-        found, source = await functions.movements.get(caller, robot_type, name, version)
-        public = signing.public_text((await functions.keys.archive())[found.key])
-        return json_response(movement_source_out(robot_type, found, source, public))
+        movement, source = await functions.movements.get(caller, robot_type, name, version)
+        public = signing.public_text((await functions.keys.archive())[movement.key])
+        return json_response(movement_source_out(robot_type, movement, source, public))
 
     @routes.add(
         "GET /robot-types/{robot_type}/movements/{name}/versions",
@@ -56,10 +55,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     async def list_movement_versions(
         request: Request, robot_type: str, name: str, cursor: Cursor = None, limit: Limit = 100
     ) -> Response:
-        """Newest first. A built-in movement of the same name comes last."""
+        """Returns versions, newest first. A built-in movement with the same name is last."""
         caller = await auth.account(request)
-        found, following = await functions.movements.versions(caller, robot_type, name, cursor=cursor, limit=limit)
-        return json_response(schemas.MovementList(items=tuple(movement_out(each) for each in found), cursor=following))
+        found, next_cursor = await functions.movements.versions(caller, robot_type, name, cursor=cursor, limit=limit)
+        return json_response(schemas.MovementList(items=tuple(map(movement_out, found)), cursor=next_cursor))
 
     @routes.add(
         "PUT /robot-types/{robot_type}/movements/{name}",
@@ -69,7 +68,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.MovementRequest,
     )
     async def put_movement(request: Request, robot_type: str, name: str) -> Response:
-        """Stores a new version of the account's own movement. It replaces a built-in movement of the same name."""
+        """Stores a new version of the account's own movement. It hides a built-in movement with the same name."""
         caller = await auth.account(request)
         payload: schemas.MovementRequest = await read(request, schemas.MovementRequest)
         schema = None
@@ -77,14 +76,14 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             parameter_schema.check_schema(payload.parameters_schema)
             schema = parameter_schema.plain(payload.parameters_schema)
         draft = Draft(payload.source, payload.description, schema, payload.based_on)
-        found, new = await functions.movements.put(caller, robot_type, name, draft)
-        return json_response(movement_out(found), 201 if new else 200)
+        movement, created = await functions.movements.put(caller, robot_type, name, draft)
+        return json_response(movement_out(movement), 201 if created else 200)
 
     @routes.add("DELETE /robot-types/{robot_type}/movements/{name}", "Delete a movement", None, (404, 409))
     async def delete_movement(request: Request, robot_type: str, name: str) -> Response:
-        """All versions of the account's own movement.
+        """Deletes all versions of the account's own movement. Running actions continue.
 
-        A built-in one of the same name becomes visible again. Running actions continue.
+        A built-in movement with the same name becomes visible again.
         """
         await functions.movements.delete(await auth.account(request), robot_type, name)
         return empty()

@@ -1,4 +1,4 @@
-"""Robot type previews: validated before they are saved."""
+"""Robot type previews: validated uploads that are not saved."""
 
 from fastapi import Request, Response
 
@@ -8,8 +8,6 @@ from function_app.entrypoints.http.framework.responses import empty, json_respon
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
 from function_app.entrypoints.http.robot_types import schemas
 from function_app.entrypoints.http.robot_types.serializers import preview_out, robot_type_out, twin_out
-
-_ONE = "/robot-type-previews/{preview}"
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
@@ -24,23 +22,23 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.RobotTypePreviewRequest,
     )
     async def add_robot_type_preview(request: Request) -> Response:
-        """Compiles the model and compares it with the manifest, like an upload. 201: validated; 202: poll it.
+        """Validates a robot type like an upload, without saving it. 201: validated; 202: not finished, poll it.
 
-        An account has at most four previews, each for 30 min.
+        An account can have four previews. Each expires after 30 min.
         """
         caller = await auth.account(request)
         payload: schemas.RobotTypePreviewRequest = await read(
             request, schemas.RobotTypePreviewRequest, limit=schemas.MAX_UPLOAD
         )
-        found = await functions.robot_type_preview.begin(
+        result = await functions.robot_type_preview.begin(
             caller, payload.manifest, payload.files, payload.movements, wait_ms=payload.wait_ms
         )
-        status = 202 if found.upload.open else 201
-        return json_response(preview_out(found), status, {"Location": f"{PREFIX}/robot-type-previews/{found.id}"})
+        status = 202 if result.upload.open else 201
+        return json_response(preview_out(result), status, {"Location": f"{PREFIX}/robot-type-previews/{result.id}"})
 
     @routes.add("GET /robot-type-previews/{preview}", "Get a preview", schemas.RobotTypePreviewOut, 404)
     async def get_robot_type_preview(request: Request, preview: str) -> Response:
-        """Only the account's own."""
+        """Returns a preview of the account."""
         return json_response(preview_out(await functions.robot_type_preview.get(await auth.account(request), preview)))
 
     @routes.add(
@@ -50,7 +48,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         (404, 409, 422),
     )
     async def get_robot_type_preview_twin(request: Request, preview: str) -> Response:
-        """As for a robot type."""
+        """Returns the same as for a robot type."""
         return json_response(twin_out(await functions.robot_type_preview.model(await auth.account(request), preview)))
 
     @routes.add(
@@ -61,18 +59,18 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         optional_body=schemas.SaveRobotTypePreviewRequest,
     )
     async def save_robot_type_preview(request: Request, preview: str) -> Response:
-        """Creates a robot type, or the next version of one, like an upload. The preview ends."""
+        """Creates a robot type, or its next version, like an upload. Deletes the preview."""
         caller = await auth.account(request)
         payload = await read_or(request, schemas.SaveRobotTypePreviewRequest, schemas.SaveRobotTypePreviewRequest())
-        found, new = await functions.robot_type_preview.save(caller, preview, wait_ms=payload.wait_ms)
-        status = 201 if new else 200
-        if found.upload is not None and found.upload.open:
+        view, created = await functions.robot_type_preview.save(caller, preview, wait_ms=payload.wait_ms)
+        status = 201 if created else 200
+        if view.upload is not None and view.upload.open:
             status = 202
-        return json_response(robot_type_out(found), status, {"Location": f"{PREFIX}/robot-types/{found.manifest.type}"})
+        return json_response(robot_type_out(view), status, {"Location": f"{PREFIX}/robot-types/{view.manifest.type}"})
 
     @routes.add("DELETE /robot-type-previews/{preview}", "Delete a preview", None, 404)
     async def delete_robot_type_preview(request: Request, preview: str) -> Response:
-        """With all stored files."""
+        """Deletes a preview and its files."""
         await functions.robot_type_preview.drop(await auth.account(request), preview)
         return empty()
 

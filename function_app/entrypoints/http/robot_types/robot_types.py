@@ -9,7 +9,6 @@ from function_app.entrypoints.http.framework.routing import PREFIX, Cursor, Limi
 from function_app.entrypoints.http.robot_types import schemas
 from function_app.entrypoints.http.robot_types.serializers import robot_type_out, twin_out
 
-_ONE = "/robot-types/{robot_type}"
 _BYTES = "application/octet-stream"
 _ZIP = "application/zip"
 
@@ -20,10 +19,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /robot-types", "List robot types", schemas.RobotTypeList, 422)
     async def list_robot_types(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
-        """Built-in robot types and the account's own."""
+        """Returns built-in robot types and the account's own."""
         caller = await auth.account(request)
-        found, following = await functions.robot_types.list(caller, cursor=cursor, limit=limit)
-        return json_response(schemas.RobotTypeList(items=tuple(map(robot_type_out, found)), cursor=following))
+        types, next_cursor = await functions.robot_types.list(caller, cursor=cursor, limit=limit)
+        return json_response(schemas.RobotTypeList(items=tuple(map(robot_type_out, types)), cursor=next_cursor))
 
     @routes.add(
         "POST /robot-types",
@@ -33,36 +32,37 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.RobotTypeRequest,
     )
     async def add_robot_type(request: Request) -> Response:
-        """MuJoCo compiles it and compares it with the manifest. 201: ready and new; 200: ready, the next version.
+        """Compiles the model with MuJoCo and compares it with the manifest.
 
-        202: not validated yet; poll it. 422 ``robot-type-rejected``: see ``errors``.
+        201: created; 200: a new version was created; 202: the validation has not finished, poll the robot type;
+        422 ``robot-type-rejected``: ``errors`` contains the reasons.
         """
         caller = await auth.account(request)
         payload: schemas.RobotTypeRequest = await read(request, schemas.RobotTypeRequest, limit=schemas.MAX_UPLOAD)
-        found, new = await functions.upload_robot_type.upload(
+        view, created = await functions.upload_robot_type.upload(
             caller, payload.manifest, payload.files, wait_ms=payload.wait_ms
         )
-        status = 201 if new else 200
-        if found.upload is not None and found.upload.open:
+        status = 201 if created else 200
+        if view.upload is not None and view.upload.open:
             status = 202
-        where = {"Location": f"{PREFIX}/robot-types/{found.manifest.type}"}
-        return json_response(robot_type_out(found), status, where)
+        headers = {"Location": f"{PREFIX}/robot-types/{view.manifest.type}"}
+        return json_response(robot_type_out(view), status, headers)
 
     @routes.add("GET /robot-types/{robot_type}", "Get a robot type", schemas.RobotTypeOut, 404)
     async def get_robot_type(request: Request, robot_type: str) -> Response:
-        """Joints, limits and capabilities, and the state of its newest upload."""
+        """Returns joints, limits and capabilities, and the state of the newest upload."""
         caller = await auth.account(request)
         return json_response(robot_type_out(await functions.robot_types.view(caller, robot_type)))
 
     @routes.add("GET /robot-types/{robot_type}/archive", "Get a robot type as a zip archive", _ZIP, (404, 409))
     async def get_robot_type_archive(request: Request, robot_type: str) -> Response:
-        """A folder as under ``robots/``, of the version in use."""
+        """Returns the folder of the active version, with the same structure as under ``robots/``."""
         caller = await auth.account(request)
         return content(await functions.robot_types.archive(caller, robot_type), _ZIP, f"{robot_type}.zip")
 
     @routes.add("GET /robot-types/{robot_type}/files/{name:path}", "Get a file of a robot type", _BYTES, (404, 409))
     async def get_robot_type_file(request: Request, robot_type: str, name: str) -> Response:
-        """Of the version in use. ``robot.toml`` is the manifest."""
+        """Returns a file of the active version. ``robot.toml`` is the manifest."""
         caller = await auth.account(request)
         body = await functions.robot_types.file(caller, robot_type, name)
         return content(body, _BYTES, name.rpartition("/")[2])
@@ -71,12 +71,12 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         "GET /robot-types/{robot_type}/twin", "Get the geometry of a robot type", schemas.RobotTypeTwin, (404, 409)
     )
     async def get_robot_type_twin(request: Request, robot_type: str) -> Response:
-        """What a page needs to draw and move the version in use without a robot."""
+        """Returns the geometry and joints of the active version, for 3D views without a robot."""
         return json_response(twin_out(await functions.robot_types.model(await auth.account(request), robot_type)))
 
     @routes.add("DELETE /robot-types/{robot_type}", "Delete a robot type", None, (404, 409))
     async def delete_robot_type(request: Request, robot_type: str) -> Response:
-        """All versions, unless a device or a movement of the account uses it."""
+        """Deletes all versions. 409: a device or movement of the account uses the robot type."""
         await functions.delete_robot_type.delete(await auth.account(request), robot_type)
         return empty()
 

@@ -13,12 +13,12 @@ from function_app.services.robot_types.parameter_schema import ObjectSchema
 from function_app.services.robot_types.script_metadata import MAX_SOURCE
 
 MAX_UPLOAD = 8_500_000
-"""Bytes of a request that uploads a robot type: the files' 6 MB as base64, and the rest."""
+"""Maximum size of an upload request [bytes]: 6 MB of files as base64, manifest and scripts."""
 State = Literal["checking", "ready", "rejected"]
 
 
 class RobotTypeUploadOut(Response, frozen=True, kw_only=True):
-    """The newest upload. ``errors`` are those of the manifest's check and MuJoCo's own; ``warnings`` refuse nothing."""
+    """The newest upload. ``errors``: results of the manifest check and of MuJoCo. ``warnings`` never reject."""
 
     version: int
     state: State
@@ -28,10 +28,10 @@ class RobotTypeUploadOut(Response, frozen=True, kw_only=True):
 
 
 class RobotTypeOut(Response, frozen=True, kw_only=True):
-    """What every robot of one type has in common, in the version in use: the newest one that was found good.
+    """The active version of a robot type: the newest valid one.
 
-    ``state`` is ``ready`` as soon as there is one; until then everything is of the newest upload. ``files``: name →
-    bytes. ``actions``: the kinds of action that such a robot may be asked for; each says itself which it takes.
+    ``state`` is ``ready`` if a valid version exists; otherwise all fields describe the newest upload. ``files``: name
+    → size [bytes]. ``actions``: action kinds that the type supports; a device may support other kinds.
     """
 
     type: str
@@ -58,16 +58,16 @@ class RobotTypeOut(Response, frozen=True, kw_only=True):
 
 
 class RobotTypeList(Response, frozen=True, kw_only=True):
-    """Robot types by id."""
+    """Robot types, by id."""
 
     items: tuple[RobotTypeOut, ...]
     cursor: str | None
 
 
 class RobotTypeRequest(Request, frozen=True, kw_only=True):
-    """``manifest`` is the text of a ``robot.toml``; ``files`` name → text of an ``.xml``, base64 of others.
+    """A robot type. ``manifest``: text of ``robot.toml``. ``files``: name → text of an ``.xml`` file, else base64.
 
-    Waits at most ``wait_ms`` for the validation.
+    The response waits for the validation, at most ``wait_ms``.
     """
 
     manifest: Annotated[str, Meta(min_length=1, max_length=MAX_MANIFEST)]
@@ -76,9 +76,9 @@ class RobotTypeRequest(Request, frozen=True, kw_only=True):
 
 
 class RobotTypeTwin(Response, frozen=True, kw_only=True):
-    """The model as a page can draw it: ``device`` and ``bodies`` as in ``desc/twin``, here for every robot of a type.
+    """The geometry of a robot type. ``device`` and ``bodies`` have the same form as in the message ``desc/twin``.
 
-    ``actuators`` are the model's, ``cameras`` those of its scene.
+    ``actuators``: names in the model. ``cameras``: names in its scene.
     """
 
     device: str
@@ -88,11 +88,11 @@ class RobotTypeTwin(Response, frozen=True, kw_only=True):
 
 
 MAX_SCRIPTS = 20
-"""Movements that can be looked at with a robot type."""
+"""Maximum number of movements in a preview."""
 
 
 class RobotTypePreviewRequest(Request, frozen=True, kw_only=True):
-    """An upload to preview. ``movements``: name → script; they are checked, not stored."""
+    """A robot type to preview. ``movements``: name → script; scripts are checked but not stored."""
 
     manifest: Annotated[str, Meta(min_length=1, max_length=MAX_MANIFEST)]
     files: Annotated[dict[str, str], Meta(min_length=1, max_length=MAX_FILES)]
@@ -101,9 +101,9 @@ class RobotTypePreviewRequest(Request, frozen=True, kw_only=True):
 
 
 class RobotTypePreviewOut(Response, frozen=True, kw_only=True):
-    """A validated upload that is not saved yet. Only its account sees it, and it expires.
+    """An upload that is not saved. Only its account can access it.
 
-    ``robot_type`` is the result of saving it; its ``upload`` contains the validation result.
+    ``robot_type``: the robot type that saving would create; its ``upload`` contains the validation result.
     """
 
     id: str
@@ -112,16 +112,16 @@ class RobotTypePreviewOut(Response, frozen=True, kw_only=True):
 
 
 class SaveRobotTypePreviewRequest(Request, frozen=True, kw_only=True):
-    """Waits at most ``wait_ms`` for the validation."""
+    """``wait_ms``: maximum time to wait for the validation."""
 
     wait_ms: WaitMs = 10_000
 
 
 class SignatureOut(Response, frozen=True, kw_only=True):
-    """Ed25519 over ``telescope/v1/movement``, a line feed, and ``signed`` (UTF-8).
+    """An Ed25519 signature of ``telescope/v1/movement``, a line feed, and ``signed`` (UTF-8).
 
-    ``signed`` is robot type, name, version and SHA-256, a line each. ``signature`` and ``public`` are base64url;
-    ``key`` is the id under which agents know the public key (``GET /agents/enrollment``).
+    ``signed``: robot type, name, version and SHA-256, one per line. ``signature`` and ``public``: base64url. ``key``:
+    id of the public key, as in ``GET /agents/enrollment``.
     """
 
     key: str
@@ -131,7 +131,7 @@ class SignatureOut(Response, frozen=True, kw_only=True):
 
 
 class MovementOut(Response, frozen=True, kw_only=True):
-    """One version of a movement. Without a ``parameters_schema`` a script accepts any parameters."""
+    """One version of a movement. ``parameters_schema`` null: the script accepts any parameters."""
 
     name: str
     description: str
@@ -150,18 +150,18 @@ class MovementSource(MovementOut, frozen=True, kw_only=True):
 
 
 class MovementList(Response, frozen=True, kw_only=True):
-    """Movements by name, or versions of one, newest first."""
+    """Movements by name, or versions of one movement, newest first."""
 
     items: tuple[MovementOut, ...]
     cursor: str | None
 
 
 class MovementRequest(Request, frozen=True, kw_only=True):
-    """A script.
+    """A movement script.
 
-    Without a description the first line of its docstring serves; without a schema its ``PARAMETERS = {…}``: a literal,
-    name → schema, where a parameter without a default must be given. ``based_on``: the version that it was made from, 0
-    for none; 409 ``movement-changed`` where another is the newest now.
+    ``description``: default: first line of the script's docstring. ``parameters_schema``: default: its literal
+    ``PARAMETERS = {…}``, name → schema; parameters without a default are required. ``based_on``: the edited version,
+    0 for none; 409 ``movement-changed`` if it is not the newest.
     """
 
     source: Annotated[str, Meta(min_length=1, max_length=MAX_SOURCE)]
@@ -171,22 +171,22 @@ class MovementRequest(Request, frozen=True, kw_only=True):
 
 
 class ScriptingOut(Response, frozen=True, kw_only=True):
-    """What a script finds, and ``names``: ``joints``, ``frames``, ``postures`` … → those of the robot type."""
+    """The script API. ``names``: ``joints``, ``frames``, ``postures`` … → names that the robot type defines."""
 
     api: ScriptApi
     names: dict[str, tuple[str, ...]]
 
 
 class ScriptCheckRequest(Request, frozen=True, kw_only=True):
-    """A script as it stands."""
+    """A script to check."""
 
     source: Annotated[str, Meta(max_length=200_000)]
 
 
 class ScriptDiagnosticOut(Response, frozen=True, kw_only=True):
-    """What is wrong, and where: lines from 1, columns from 0, in characters (not bytes, not UTF-16).
+    """A problem and its position: lines from 1, columns from 0, in Unicode characters.
 
-    With an ``error`` it cannot be saved; with a ``warning`` it can, and would most likely fail at the robot.
+    A script with an ``error`` cannot be saved. A script with a ``warning`` can be saved but probably fails.
     """
 
     severity: Literal["error", "warning"]
@@ -198,7 +198,7 @@ class ScriptDiagnosticOut(Response, frozen=True, kw_only=True):
 
 
 class ScriptCheckOut(Response, frozen=True, kw_only=True):
-    """``savable``: no error. What the script says about itself is known then."""
+    """The result of a check. ``savable``: no errors; only then description and schema are available."""
 
     diagnostics: tuple[ScriptDiagnosticOut, ...]
     savable: bool

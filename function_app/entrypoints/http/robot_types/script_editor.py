@@ -14,8 +14,6 @@ from function_app.entrypoints.http.robot_types import schemas
 from function_app.services.robot_types.parameter_schema import ObjectSchema
 from function_app.services.robot_types.script_linter import check_script, names_of
 
-_SCRIPTING = "/robot-types/{robot_type}/scripting"
-
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
@@ -28,9 +26,9 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         (404, 409),
     )
     async def get_scripting(request: Request, robot_type: str) -> Response:
-        """Calls with their signatures, importable modules, and the names that the robot type defines."""
-        found = await functions.robot_types.get(await auth.account(request), robot_type)
-        return json_response(schemas.ScriptingOut(api=script_api(), names=names_of(found)))
+        """Returns calls with their signatures, importable modules, and names that the robot type defines."""
+        manifest = await functions.robot_types.get(await auth.account(request), robot_type)
+        return json_response(schemas.ScriptingOut(api=script_api(), names=names_of(manifest)))
 
     @routes.add(
         "POST /robot-types/{robot_type}/scripting/check",
@@ -40,10 +38,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.ScriptCheckRequest,
     )
     async def check_movement(request: Request, robot_type: str) -> Response:
-        """Returns problems with their positions. Nothing is saved or run."""
-        found = await functions.robot_types.get(await auth.account(request), robot_type)
+        """Returns problems with their positions. The script is not saved or run."""
+        manifest = await functions.robot_types.get(await auth.account(request), robot_type)
         payload: schemas.ScriptCheckRequest = await read(request, schemas.ScriptCheckRequest)
-        checked = check_script(payload.source, found)
+        checked = check_script(payload.source, manifest)
         schema = checked.script.schema if checked.script else None
         return json_response(
             schemas.ScriptCheckOut(

@@ -1,4 +1,4 @@
-"""Robot types, previews and movements as the API shows them."""
+"""Converts robot types, previews and movements to API responses."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from function_app.services.robot_types.script_store import signed_text
 
 
 def robot_type_out(robot_type: KnownType) -> schemas.RobotTypeOut:
-    """A robot type in its newest usable version, with its newest upload."""
+    """The response for a robot type in its active version, with its newest upload."""
     manifest, upload = robot_type.manifest, robot_type.upload
     return response_from(
         manifest,
@@ -35,7 +35,7 @@ def robot_type_out(robot_type: KnownType) -> schemas.RobotTypeOut:
 
 
 def _actions(manifest: RobotType) -> tuple[str, ...]:
-    """Action kinds that the manifest alone shows. A driver or the room's floor may add or exclude kinds."""
+    """Action kinds that follow from the manifest. A driver or the floor map may add or exclude kinds."""
     has = {
         "move_joints": bool(manifest.joints),
         "say": "speech" in manifest.capabilities,
@@ -49,12 +49,12 @@ def _actions(manifest: RobotType) -> tuple[str, ...]:
 
 
 def twin_out(model: Model) -> schemas.RobotTypeTwin:
-    """The geometry of a robot type, for drawing."""
+    """The response for the geometry of a robot type."""
     return response_from(model, schemas.RobotTypeTwin, device=model.twin.device, bodies=model.twin.bodies)
 
 
 def preview_out(preview: Preview) -> schemas.RobotTypePreviewOut:
-    """A preview: an upload that is validated and not saved."""
+    """The response for a preview."""
     upload = preview.upload
     robot_type = KnownType(
         preview.manifest, upload.version, upload.files, usable=upload.state == "ready", upload=upload
@@ -79,12 +79,12 @@ def _upload_state(upload: TypeVersion) -> schemas.State:
 
 
 def movement_out(movement: Movement) -> schemas.MovementOut:
-    """A movement without its source."""
+    """The response for a movement without its source."""
     return _movement(movement, schemas.MovementOut)
 
 
 def movement_source_out(robot_type: str, movement: Movement, source: str, public: str) -> schemas.MovementSource:
-    """A movement with its source. ``public`` is the public key that verifies the signature."""
+    """The response for a movement with its source. ``public``: the public key that verifies the signature."""
     signature = schemas.SignatureOut(
         key=movement.key, public=public, signed=signed_text(robot_type, movement), signature=movement.signature
     )

@@ -17,8 +17,8 @@ from function_app.services.sharing.invitations import Known, Offer
 from function_app.services.sharing.shares import Target
 
 _INCOMPLETE: Final = (
-    "The share has ended, and control under it. The broker did not answer: live sessions are cut, and the device is "
-    "told, as soon as it does."
+    "The share is removed. The broker did not respond: the account's connections and its control of the device end as "
+    "soon as the broker is reachable."
 )
 
 
@@ -37,7 +37,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.InvitationLookupRequest,
     )
     async def look_up_invitation(request: Request) -> Response:
-        """Requires its secret. Wrong, used, expired and withdrawn invitations get the same response."""
+        """Requires its secret. Wrong, used, expired and withdrawn invitations cause the same response."""
         await auth.account(request)
         payload: schemas.InvitationLookupRequest = await read(request, schemas.InvitationLookupRequest)
         return json_response(schemas.InvitationOut(**_invitation(await functions.invitations.look(payload.secret))))
@@ -50,12 +50,15 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.RedeemRequest,
     )
     async def redeem_invitation(request: Request) -> Response:
-        """Of concurrent requests for the last use exactly one succeeds. Returns what it offered."""
+        """Gives the account the offered role. Returns the invitation.
+
+        If several requests compete for the last use, exactly one succeeds.
+        """
         caller = await auth.account(request)
         payload: schemas.RedeemRequest = await read(request, schemas.RedeemRequest)
-        known = await functions.invitations.look(payload.secret)
-        await functions.invitations.redeem(caller, known, space=payload.space)
-        return json_response(schemas.InvitationOut(**_invitation(known)))
+        view = await functions.invitations.look(payload.secret)
+        await functions.invitations.redeem(caller, view, space=payload.space)
+        return json_response(schemas.InvitationOut(**_invitation(view)))
 
     return routes
 
@@ -63,12 +66,12 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 def _shares(routes: Routes, sharing: "_Sharing") -> None:
     @routes.add("GET /devices/{device}/shares", "List shares of a device", schemas.ShareList, (403, 404))
     async def list_device_shares(request: Request, device: str) -> Response:
-        """Shares of the device itself; shares of its space are listed there. Owners only."""
+        """Returns shares of the device, without those of its space. Owners only."""
         return await sharing.list_shares(request, "device", device)
 
     @routes.add("GET /spaces/{space}/shares", "List shares of a space", schemas.ShareList, (403, 404))
     async def list_space_shares(request: Request, space: str) -> Response:
-        """Each includes every device in the space, also later ones. Owners only."""
+        """Returns shares of the space. Each applies to all current and future devices in it. Owners only."""
         return await sharing.list_shares(request, "space", space)
 
     @routes.add(
@@ -79,10 +82,9 @@ def _shares(routes: Routes, sharing: "_Sharing") -> None:
         body=schemas.ShareRequest,
     )
     async def share_device(request: Request, device: str) -> Response:
-        """With another account, until it is removed, it expires, or the agent is unpaired.
+        """Gives another account a role on the device, until the share is removed or expires, or the agent is unpaired.
 
-        202: the role was lowered, which ends sessions, and the broker has not confirmed yet; see the removal of a
-        share.
+        202: the role was lowered, but the broker has not confirmed that connections are closed.
         """
         return await sharing.put(request, "device", device)
 
@@ -94,7 +96,10 @@ def _shares(routes: Routes, sharing: "_Sharing") -> None:
         body=schemas.ShareRequest,
     )
     async def share_space(request: Request, space: str) -> Response:
-        """With another account: every device in the space, also later ones. 202: as for a device."""
+        """Gives another account a role on all current and future devices in the space.
+
+        202: see the share of a device.
+        """
         return await sharing.put(request, "space", space)
 
     @routes.add(
@@ -104,9 +109,9 @@ def _shares(routes: Routes, sharing: "_Sharing") -> None:
         (404, 409),
     )
     async def unshare_device(request: Request, device: str, account: str) -> Response:
-        """By its owner, or by the account itself. Ends that account's control and actions at once.
+        """By its owner or by the account of the share. Ends that account's control and actions immediately.
 
-        202: removed, and the broker has not confirmed yet; connections are closed as soon as it does.
+        202: removed, but the broker has not confirmed that connections are closed.
         """
         return await sharing.end(request, "device", device, account)
 
@@ -117,9 +122,9 @@ def _shares(routes: Routes, sharing: "_Sharing") -> None:
         (404, 409),
     )
     async def unshare_space(request: Request, space: str, account: str) -> Response:
-        """By its owner, or by the account itself.
+        """By its owner or by the account of the share.
 
-        Ends that account's control and actions at once. 202: as for a device.
+        Ends that account's control and actions immediately. 202: see the share of a device.
         """
         return await sharing.end(request, "space", space, account)
 
@@ -129,7 +134,7 @@ def _invitations(routes: Routes, sharing: "_Sharing") -> None:
         "GET /devices/{device}/invitations", "List open invitations to a device", schemas.InvitationList, (403, 404)
     )
     async def list_device_invitations(request: Request, device: str) -> Response:
-        """Without their secrets. Owners only."""
+        """Returns them without their secrets. Owners only."""
         return await sharing.list_invitations(request, "device", device)
 
     @routes.add(
@@ -145,14 +150,14 @@ def _invitations(routes: Routes, sharing: "_Sharing") -> None:
 
     @routes.add("DELETE /devices/{device}/invitations/{invitation}", "Withdraw an invitation", None, 404)
     async def withdraw_device_invitation(request: Request, device: str, invitation: str) -> Response:
-        """It can no longer be redeemed. Existing shares stay."""
+        """The invitation can no longer be redeemed. Existing shares stay valid."""
         return await sharing.withdraw(request, "device", device, invitation)
 
     @routes.add(
         "GET /spaces/{space}/invitations", "List open invitations to a space", schemas.InvitationList, (403, 404)
     )
     async def list_space_invitations(request: Request, space: str) -> Response:
-        """Without their secrets. Owners only."""
+        """Returns them without their secrets. Owners only."""
         return await sharing.list_invitations(request, "space", space)
 
     @routes.add(
@@ -168,14 +173,14 @@ def _invitations(routes: Routes, sharing: "_Sharing") -> None:
 
     @routes.add("DELETE /spaces/{space}/invitations/{invitation}", "Withdraw an invitation", None, 404)
     async def withdraw_space_invitation(request: Request, space: str, invitation: str) -> Response:
-        """It can no longer be redeemed. Existing shares stay."""
+        """The invitation can no longer be redeemed. Existing shares stay valid."""
         return await sharing.withdraw(request, "space", space, invitation)
 
 
 def _transfers(routes: Routes, sharing: "_Sharing") -> None:
     @routes.add("GET /spaces/{space}/transfers", "List open transfers of a space", schemas.InvitationList, (403, 404))
     async def list_space_transfers(request: Request, space: str) -> Response:
-        """Without their secrets. Owners only."""
+        """Returns them without their secrets. Owners only."""
         return await sharing.list_invitations(request, "space", space, transfers=True)
 
     @routes.add(
@@ -186,17 +191,17 @@ def _transfers(routes: Routes, sharing: "_Sharing") -> None:
         body=schemas.TransferRequest,
     )
     async def transfer_space(request: Request, space: str) -> Response:
-        """With all agents in it at that time. Nothing changes until it is accepted with ``invitations/redeem``."""
+        """Includes all agents that are in the space at acceptance. The account accepts with ``invitations/redeem``."""
         return await sharing.transfer(request, "space", space)
 
     @routes.add("DELETE /spaces/{space}/transfers/{invitation}", "Withdraw a transfer", None, 404)
     async def withdraw_space_transfer(request: Request, space: str, invitation: str) -> Response:
-        """It can no longer be accepted."""
+        """The transfer can no longer be accepted."""
         return await sharing.withdraw(request, "space", space, invitation)
 
     @routes.add("GET /agents/{agent}/transfers", "List open transfers of an agent", schemas.InvitationList, (403, 404))
     async def list_agent_transfers(request: Request, agent: str) -> Response:
-        """Without their secrets. Owners only."""
+        """Returns them without their secrets. Owners only."""
         return await sharing.list_invitations(request, "agent", agent, transfers=True)
 
     @routes.add(
@@ -207,17 +212,17 @@ def _transfers(routes: Routes, sharing: "_Sharing") -> None:
         body=schemas.TransferRequest,
     )
     async def transfer_agent(request: Request, agent: str) -> Response:
-        """With all its devices. Nothing changes until it is accepted with ``invitations/redeem``."""
+        """Includes all devices of the agent. The account accepts with ``invitations/redeem``."""
         return await sharing.transfer(request, "agent", agent)
 
     @routes.add("DELETE /agents/{agent}/transfers/{invitation}", "Withdraw a transfer", None, 404)
     async def withdraw_agent_transfer(request: Request, agent: str, invitation: str) -> Response:
-        """It can no longer be accepted."""
+        """The transfer can no longer be accepted."""
         return await sharing.withdraw(request, "agent", agent, invitation)
 
 
 class _Sharing:
-    """Requests for any kind of target."""
+    """Handlers for all kinds of targets."""
 
     def __init__(self, functions: Functions, auth: RequestAuthenticator) -> None:
         self._functions = functions
@@ -273,9 +278,9 @@ class _Sharing:
     async def list_invitations(self, request: Request, kind: Kind, name: str, *, transfers: bool = False) -> Response:
         _, target = await self._of(request, kind, name)
         items = [
-            schemas.InvitationOut(**_invitation(known), account=await self._only(known.invitation.account))
-            for known in await self._functions.invitations.open(target)
-            if (known.invitation.role is Role.OWNER) == transfers
+            schemas.InvitationOut(**_invitation(view), account=await self._only(view.invitation.account))
+            for view in await self._functions.invitations.open(target)
+            if (view.invitation.role is Role.OWNER) == transfers
         ]
         return json_response(schemas.InvitationList(items=tuple(items), cursor=None))
 
@@ -290,25 +295,25 @@ class _Sharing:
         return "" if name is None else (await self._functions.sharing.person(name)).id
 
     async def _make(self, caller: Identity, shared: Target, offer: Offer) -> Response:
-        secret, known = await self._functions.invitations.make(caller, shared, offer)
+        secret, view = await self._functions.invitations.make(caller, shared, offer)
         link = f"{self._functions.settings.public_url}/#invitation={secret}"
-        body = schemas.InvitationCreated(**_invitation(known), secret=secret, link=link)
+        body = schemas.InvitationCreated(**_invitation(view), secret=secret, link=link)
         return json_response(body, 201, headers={"Cache-Control": "no-store"})
 
 
-def _invitation(known: Known) -> dict[str, Any]:
-    offered = known.invitation
-    kind, target = split_target(offered.on)
+def _invitation(view: Known) -> dict[str, Any]:
+    invitation = view.invitation
+    kind, target = split_target(invitation.on)
     return {
-        "id": known.id,
+        "id": view.id,
         "kind": cast("Kind", kind),
         "target": target,
-        "label": offered.label,
-        "role": offered.role.value,
-        "created_by": offered.by,
-        "uses": offered.uses,
-        "share_s": offered.share_s or None,
-        "expires_at": rfc3339(offered.expires_ms),
+        "label": invitation.label,
+        "role": invitation.role.value,
+        "created_by": invitation.by,
+        "uses": invitation.uses,
+        "share_s": invitation.share_s or None,
+        "expires_at": rfc3339(invitation.expires_ms),
     }
 
 

@@ -8,7 +8,7 @@ from device_agent.protocol import Id
 from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, Name, Request, Response
 
 SharedRole = Literal["operator", "viewer"]
-ForS = Annotated[int, Meta(ge=10, le=10 * 366 * 86_400, description="How long it lasts [s]; null: until it is ended.")]
+ForS = Annotated[int, Meta(ge=10, le=10 * 366 * 86_400, description="Duration of the share [s]; null: unlimited.")]
 
 
 class ShareRequest(Request, frozen=True, kw_only=True):
@@ -20,7 +20,7 @@ class ShareRequest(Request, frozen=True, kw_only=True):
 
 
 class ShareOut(Response, frozen=True, kw_only=True):
-    """One account's share. ``created_by``: name of the sharing account."""
+    """A share of one account. ``created_by``: name of the sharing account."""
 
     account: AccountRef
     role: SharedRole
@@ -30,25 +30,25 @@ class ShareOut(Response, frozen=True, kw_only=True):
 
 
 class ShareRevocation(Response, frozen=True, kw_only=True):
-    """The share has ended and control with it; ``detail``: who could not be told yet, and what becomes of that."""
+    """The share is removed, but connections are not closed yet. ``detail``: the reason."""
 
     detail: str
 
 
 class ShareList(Response, frozen=True, kw_only=True):
-    """Shares, oldest first: all of them."""
+    """All shares, oldest first."""
 
     items: tuple[ShareOut, ...]
     cursor: str | None
 
 
 Secret = Annotated[str, Meta(min_length=1, max_length=200)]
-LinkS = Annotated[int, Meta(ge=60, le=30 * 86_400, description="How long it can be redeemed [s].")]
-Uses = Annotated[int, Meta(ge=1, le=50, description="How many accounts may redeem it; each once.")]
+LinkS = Annotated[int, Meta(ge=60, le=30 * 86_400, description="Validity of the invitation [s].")]
+Uses = Annotated[int, Meta(ge=1, le=50, description="Number of accounts that may redeem it, each once.")]
 
 
 class InvitationRequest(Request, frozen=True, kw_only=True):
-    """Role and duration of the share that an account gets with the secret.
+    """An invitation. ``role`` and ``share_s``: role and duration of the share that it offers.
 
     ``account``: name of the only account that may redeem it; null: any account with the secret.
     """
@@ -61,14 +61,14 @@ class InvitationRequest(Request, frozen=True, kw_only=True):
 
 
 class TransferRequest(Request, frozen=True, kw_only=True):
-    """Validity of the offer, and the only account that may accept it; null: any account with the secret."""
+    """A transfer. ``account``: name of the only account that may accept it; null: any account with the secret."""
 
     expires_in_s: LinkS = 86_400
     account: Name | None = None
 
 
 class InvitationOut(Response, frozen=True, kw_only=True):
-    """An open invitation. ``role`` ``owner``: a transfer. ``share_s``: how long the part will last; null: no end.
+    """An open invitation. ``role`` ``owner``: a transfer. ``share_s``: duration of the share; null: unlimited.
 
     ``account``: the only account that may redeem it, visible to the owner; null: any account with the secret.
     """
@@ -86,14 +86,14 @@ class InvitationOut(Response, frozen=True, kw_only=True):
 
 
 class InvitationCreated(InvitationOut, frozen=True, kw_only=True):
-    """An invitation with its secret, which is returned only once, and a console link that contains it."""
+    """A new invitation. ``secret`` is returned only once; ``link`` is a console link that contains it."""
 
     secret: str
     link: str
 
 
 class InvitationList(Response, frozen=True, kw_only=True):
-    """Open invitations, oldest first: all of them."""
+    """All open invitations, oldest first."""
 
     items: tuple[InvitationOut, ...]
     cursor: str | None
@@ -106,7 +106,10 @@ class InvitationLookupRequest(Request, frozen=True, kw_only=True):
 
 
 class RedeemRequest(Request, frozen=True, kw_only=True):
-    """The secret of an invitation; and for an agent that is handed over the space it shall be in (null: the first)."""
+    """The secret of an invitation or transfer.
+
+    ``space``: for the transfer of an agent, its new space; null: the account's first space.
+    """
 
     secret: Secret
     space: Id | None = None

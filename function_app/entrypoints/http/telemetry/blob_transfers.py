@@ -1,6 +1,6 @@
-"""Presigned addresses of blobs that lead to us: of a store that has no HTTP of its own.
+"""Presigned URLs of a blob store without an HTTP interface.
 
-They belong to no resource of the API and are not in its description, as S3's and Azure's addresses are not.
+The URLs are opaque, like those of S3 and Azure, so they are not part of the OpenAPI document.
 """
 
 from fastapi import APIRouter, Request, Response
@@ -11,12 +11,12 @@ from function_app.entrypoints.http.framework.routing import PREFIX
 from function_app.ports.blobs import TransferRefused, Transfers
 
 PATH = "/blobs"
-_SHOWN = frozenset({"image/jpeg", "image/png", "image/webp"})
+_DISPLAYABLE = frozenset({"image/jpeg", "image/png", "image/webp"})
 """Content types that a browser may display. All others are untrusted uploads from the server's own origin."""
 
 
 def router(transfers: Transfers | None) -> APIRouter:
-    """The routes; without ``transfers`` nothing is behind them."""
+    """The routes; without ``transfers`` they respond with 404."""
     routes = APIRouter(prefix=PREFIX, include_in_schema=False)
 
     @routes.put(PATH + "/{token}")
@@ -34,15 +34,15 @@ def router(transfers: Transfers | None) -> APIRouter:
         if transfers is None:
             raise not_found("address", token)
         try:
-            found = await transfers.send(token)
+            blob = await transfers.send(token)
         except TransferRefused as error:
             raise _problem(error) from error
-        kind = found.content_type if found.content_type in _SHOWN else "application/octet-stream"
-        headers = {"Content-Length": str(found.length), "Content-Disposition": "attachment"}
-        return StreamingResponse(found.content, media_type=kind, headers=headers)
+        kind = blob.content_type if blob.content_type in _DISPLAYABLE else "application/octet-stream"
+        headers = {"Content-Length": str(blob.length), "Content-Disposition": "attachment"}
+        return StreamingResponse(blob.content, media_type=kind, headers=headers)
 
     return routes
 
 
 def _problem(error: TransferRefused) -> Problem:
-    return Problem("transfer-rejected", error.status, "This address cannot be used so", str(error))
+    return Problem("transfer-rejected", error.status, "The URL is not valid for this request", str(error))

@@ -16,10 +16,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /devices/{device}/events", "List events", schemas.EventList, (404, 422))
     async def list_events(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
-        """Since the device was paired: control changes, rejected requests with reasons, faults, room events."""
+        """Returns control changes, rejected requests, faults and room events since the device was paired."""
         caller = await auth.account(request)
-        found = await functions.devices.get(caller, device)
-        events, following = await functions.events.read(found, cursor=cursor, limit=limit)
+        target = await functions.devices.get(caller, device)
+        events, next_cursor = await functions.events.read(target, cursor=cursor, limit=limit)
         items = tuple(
             schemas.EventOut(
                 id=event["id"],
@@ -32,6 +32,6 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             )
             for event in events
         )
-        return json_response(schemas.EventList(items=items, cursor=following))
+        return json_response(schemas.EventList(items=items, cursor=next_cursor))
 
     return routes

@@ -20,16 +20,17 @@ Key = Annotated[
         alias="Idempotency-Key",
         min_length=1,
         max_length=200,
-        description="The same key counts once. Without one the same samples of the same sender do.",
+        description="Samples with the same key are stored once. Default: a hash of sender and samples.",
     ),
 ]
 OfTransport = Annotated[Transport | None, Query(description="Only this transport.")]
 OfPath = Annotated[Path | None, Query(description="Only this path.")]
 Since = Annotated[
-    int | None, Query(alias="from", ge=0, le=2**48, description="From here [ms since 1970]; a day before `to`.")
+    int | None,
+    Query(alias="from", ge=0, le=2**48, description="First time [ms since 1970]. Default: one day before `to`."),
 ]
-Until = Annotated[int | None, Query(alias="to", ge=0, le=2**48, description="To here [ms since 1970]; now.")]
-Recent = Annotated[int, Query(ge=0, le=1000, description="At most so many of the newest samples of each.")]
+Until = Annotated[int | None, Query(alias="to", ge=0, le=2**48, description="Last time [ms since 1970]. Default: now.")]
+Recent = Annotated[int, Query(ge=0, le=1000, description="Maximum number of newest samples per item.")]
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
@@ -39,12 +40,13 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     @routes.add(
         "POST /devices/{device}/latency", "Add latency samples of an operator", None, 404, body=schemas.LatencyRequest
     )
-    async def add_latency(request: Request, device: str, once: Key = None) -> Response:
-        """Durations that the operator's side measured on its own clock. Viewers add none."""
+    async def add_latency(request: Request, device: str, idempotency_key: Key = None) -> Response:
+        """Stores durations that a client measured with its own clock. Viewers are rejected."""
         caller = await auth.account(request)
         payload: schemas.LatencyRequest = await read(request, schemas.LatencyRequest)
-        found = require_operator(await functions.devices.get(caller, device))
-        await functions.latencies.add(found, _samples(payload), caller=f"account:{caller.account}", once=once or "")
+        target = require_operator(await functions.devices.get(caller, device))
+        sender = f"account:{caller.account}"
+        await functions.latencies.add(target, _samples(payload), caller=sender, once=idempotency_key or "")
         return empty()
 
     @routes.add(
@@ -55,12 +57,13 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         body=schemas.AgentLatencyRequest,
         caller="agent",
     )
-    async def add_agent_latency(request: Request, agent: str, once: Key = None) -> Response:
-        """Called by an agent: durations that it measured for one of its devices on its own clock."""
-        known = await auth.agent(request)
+    async def add_agent_latency(request: Request, agent: str, idempotency_key: Key = None) -> Response:
+        """Called by an agent. Stores durations that it measured for one of its devices with its own clock."""
+        caller = await auth.agent(request)
         payload: schemas.AgentLatencyRequest = await read(request, schemas.AgentLatencyRequest)
-        device = own_device(known, agent, payload.device)
-        await functions.latencies.add(device, _samples(payload), caller=f"agent:{known.id}", once=once or "")
+        device = own_device(caller, agent, payload.device)
+        sender = f"agent:{caller.id}"
+        await functions.latencies.add(device, _samples(payload), caller=sender, once=idempotency_key or "")
         return empty()
 
     @routes.add("GET /devices/{device}/latency", "Get latency statistics", schemas.LatencyList, (404, 422))
@@ -73,15 +76,15 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         until: Until = None,
         samples: Recent = 1000,
     ) -> Response:
-        """Percentiles and histograms of each transport and path since the device was paired."""
+        """Returns percentiles and histograms for each transport and path since the device was paired."""
         caller = await auth.account(request)
-        found = await functions.devices.get(caller, device)
+        target = await functions.devices.get(caller, device)
         span = functions.latencies.span(since, until)
-        items = await functions.latencies.find(found, span, transport=transport, path=path)
+        items = await functions.latencies.find(target, span, transport=transport, path=path)
         body = schemas.LatencyList(
             since=rfc3339(span.first_ms),
             until=rfc3339(span.last_ms),
-            items=tuple(_show(item, samples) for item in items),
+            items=tuple(_latency_out(item, samples) for item in items),
         )
         return json_response(body)
 
@@ -92,20 +95,22 @@ def _samples(payload: schemas.LatencyRequest | schemas.AgentLatencyRequest) -> S
     return Samples(payload.transport, payload.path, tuple((sample.at_ms, sample.ms) for sample in payload.samples))
 
 
-def _show(found: LatencySeries, samples: int) -> schemas.LatencyOut:
-    known = found.histogram
-    recent = found.recent[len(found.recent) - min(samples, len(found.recent)) :]
+def _latency_out(series: LatencySeries, samples: int) -> schemas.LatencyOut:
+    histogram = series.histogram
+    recent = series.recent[len(series.recent) - min(samples, len(series.recent)) :]
     measures: dict[str, Any] = dict.fromkeys(
         ("mean_ms", "min_ms", "max_ms", "p50_ms", "p90_ms", "p95_ms", "p99_ms"), None
     )
-    if known.count:
-        measures = {"mean_ms": known.mean_ms, "min_ms": known.min_ms, "max_ms": known.max_ms}
-        measures |= {f"p{percent}_ms": known.quantile(percent / 100) for percent in (50, 90, 95, 99)}
+    if histogram.count:
+        measures = {"mean_ms": histogram.mean_ms, "min_ms": histogram.min_ms, "max_ms": histogram.max_ms}
+        measures |= {f"p{percent}_ms": histogram.quantile(percent / 100) for percent in (50, 90, 95, 99)}
     return schemas.LatencyOut(
-        transport=found.transport,
-        path=found.path,
-        count=known.count,
-        bins=tuple(schemas.LatencyBin(above_ms=low, up_to_ms=high, count=count) for low, high, count in known.bins()),
+        transport=series.transport,
+        path=series.path,
+        count=histogram.count,
+        bins=tuple(
+            schemas.LatencyBin(above_ms=low, up_to_ms=high, count=count) for low, high, count in histogram.bins()
+        ),
         at_ms=tuple(at_ms for at_ms, _ in recent),
         ms=tuple(ms for _, ms in recent),
         **measures,

@@ -13,7 +13,7 @@ Resolution = Literal["raw", "10s", "1min", "10min", "1h", "6h", "1d"]
 
 
 class StreamOut(Response, frozen=True, kw_only=True):
-    """A stream of measurements: how many samples it has had since the device was paired, and when."""
+    """A stream of measurements, with the number and times of its samples since the device was paired."""
 
     name: str
     samples: int
@@ -23,16 +23,16 @@ class StreamOut(Response, frozen=True, kw_only=True):
 
 
 class StreamList(Response, frozen=True, kw_only=True):
-    """The streams of a device, by name: all of them."""
+    """All streams of a device, by name."""
 
     items: tuple[StreamOut, ...]
     cursor: str | None
 
 
 class ColumnOut(Response, frozen=True, kw_only=True):
-    """One field, a value for each of ``at_ms``; null where it was not measured.
+    """One field, with one value for each time in ``at_ms``; null: not measured.
 
-    Of ``raw`` samples ``mean`` is the value itself, and the others are empty.
+    For ``raw`` samples, ``mean`` contains the values, and the other lists are empty.
     """
 
     mean: tuple[float | None, ...]
@@ -43,7 +43,7 @@ class ColumnOut(Response, frozen=True, kw_only=True):
 
 
 class DataOut(Response, frozen=True, kw_only=True):
-    """A page of a stream, in columns. ``at_ms``: times of samples, or the beginnings of stretches of ``span_ms``."""
+    """A page of a stream, by column. ``at_ms``: times of the samples, or starts of the time spans of ``span_ms``."""
 
     stream: str
     resolution: Resolution
@@ -56,7 +56,7 @@ class DataOut(Response, frozen=True, kw_only=True):
 
 
 class EventOut(Response, frozen=True, kw_only=True):
-    """An event. ``at`` is the time on its publisher's clock, ``received_at`` on the server's."""
+    """An event. ``at``: time of the publisher's clock. ``received_at``: time of the server's clock."""
 
     id: str
     kind: str
@@ -68,21 +68,21 @@ class EventOut(Response, frozen=True, kw_only=True):
 
 
 class EventList(Response, frozen=True, kw_only=True):
-    """Newest first."""
+    """Events, newest first."""
 
     items: tuple[EventOut, ...]
     cursor: str | None
 
 
-Sent = Annotated[int, Meta(ge=0, le=2**53, description="when, by the sender's clock [ms since 1970, UTC]")]
-Took = Annotated[float, Meta(ge=0, le=86_400_000, description="how long [ms]")]
+SampleTime = Annotated[int, Meta(ge=0, le=2**53, description="Time of the sender's clock [ms since 1970]")]
+Duration = Annotated[float, Meta(ge=0, le=86_400_000, description="Duration [ms]")]
 
 
 class LatencySample(Request, frozen=True, kw_only=True):
-    """One time."""
+    """One measured duration."""
 
-    at_ms: Sent
-    ms: Took
+    at_ms: SampleTime
+    ms: Duration
 
 
 Samples = Annotated[tuple[LatencySample, ...], Meta(min_length=1, max_length=1000)]
@@ -106,7 +106,7 @@ class AgentLatencyRequest(Request, frozen=True, kw_only=True):
 
 
 class LatencyBin(Response, frozen=True, kw_only=True):
-    """How many were longer than ``above_ms`` and not longer than ``up_to_ms``."""
+    """Number of samples above ``above_ms`` and up to ``up_to_ms``."""
 
     above_ms: float
     up_to_ms: float
@@ -114,9 +114,9 @@ class LatencyBin(Response, frozen=True, kw_only=True):
 
 
 class LatencyOut(Response, frozen=True, kw_only=True):
-    """One transport and path. Percentiles are within 1 % of the exact ones; null without samples in the span.
+    """Statistics of one transport and path. Percentiles have an error of at most 1 %; null without samples.
 
-    ``at_ms`` and ``ms`` are the newest raw samples, at most 1,000, oldest first. They may lie outside the span.
+    ``at_ms`` and ``ms``: the newest samples, at most 1,000, oldest first. They may be outside the time span.
     """
 
     transport: Transport
@@ -135,7 +135,7 @@ class LatencyOut(Response, frozen=True, kw_only=True):
 
 
 class LatencyList(Response, frozen=True, kw_only=True):
-    """By transport and path. ``since`` and ``until`` is the span asked for, widened to whole hours or days (UTC)."""
+    """Statistics by transport and path. ``since``, ``until``: the requested span, extended to whole hours or days."""
 
     since: Moment
     until: Moment
@@ -143,7 +143,7 @@ class LatencyList(Response, frozen=True, kw_only=True):
 
 
 _WORD = r"[A-Za-z0-9!#$&^_.+-]{1,60}"
-ContentType = Annotated[str, Meta(pattern=f"^{_WORD}/{_WORD}$(?!\\n)", description="such as image/png")]
+ContentType = Annotated[str, Meta(pattern=f"^{_WORD}/{_WORD}$(?!\\n)", description="Media type, such as image/png")]
 Length = Annotated[int, Meta(ge=0, le=MAX_UPLOAD_BYTES)]
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 FileName = Annotated[str, Meta(max_length=200)]
@@ -151,7 +151,7 @@ AtMs = Annotated[int, Meta(ge=0, le=9_999_999_999_999)]
 
 
 class UploadRequest(Request, frozen=True, kw_only=True):
-    """What shall be uploaded. ``at_ms``: when it was taken [ms since 1970]; now."""
+    """A file to upload. ``at_ms``: time of the capture [ms since 1970]; null: now."""
 
     stream: Id
     length: Length
@@ -162,13 +162,13 @@ class UploadRequest(Request, frozen=True, kw_only=True):
 
 
 class AgentUploadRequest(UploadRequest, frozen=True, kw_only=True):
-    """The same by an agent, of one of its devices."""
+    """A file to upload for one of the agent's devices."""
 
     device: DeviceName
 
 
 class AgentCompleteRequest(Request, frozen=True, kw_only=True):
-    """Of which device it is."""
+    """The agent's device."""
 
     device: DeviceName
 
@@ -184,7 +184,7 @@ class UploadStarted(Response, frozen=True, kw_only=True):
 
 
 class UploadOut(Response, frozen=True, kw_only=True):
-    """A completed capture. ``verified``: its content has the announced hash."""
+    """A completed capture. ``verified``: the content matches the hash in the request."""
 
     id: str
     stream: str
@@ -200,7 +200,7 @@ class UploadOut(Response, frozen=True, kw_only=True):
 
 
 class UploadWithUrl(UploadOut, frozen=True, kw_only=True):
-    """A capture, and where it can be read for an hour."""
+    """A capture, with a URL of its content that is valid for one hour."""
 
     url: str
 

@@ -12,11 +12,12 @@ from function_app.entrypoints.http.framework.routing import Routes, Since, Until
 from function_app.entrypoints.http.telemetry import schemas
 from function_app.services.telemetry.series_reader import MAX_POINTS, Part, Range
 
-Points = Annotated[int, Query(ge=1, le=MAX_POINTS, description="At most so many points in a page.")]
-Fields = Annotated[str | None, Query(max_length=4_000, description="Only these fields, with commas between.")]
-Cursor = Annotated[str | None, Query(max_length=40, description="Where the page before ended.")]
+Points = Annotated[int, Query(ge=1, le=MAX_POINTS, description="Maximum number of points on a page.")]
+Fields = Annotated[str | None, Query(max_length=4_000, description="Only these fields, separated by commas.")]
+Cursor = Annotated[str | None, Query(max_length=40, description="Cursor of the previous page.")]
 Resolution = Annotated[
-    schemas.Resolution | None, Query(description="How fine; without it, as fine as `points` allow on one page.")
+    schemas.Resolution | None,
+    Query(description="Time resolution. Default: the finest that fits on one page of `points`."),
 ]
 
 
@@ -26,7 +27,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /devices/{device}/data", "List measurement streams", schemas.StreamList, 404)
     async def list_streams(request: Request, device: str) -> Response:
-        """Since the device was paired."""
+        """Returns streams since the device was paired."""
         views = await functions.series.streams(await auth.account(request), device)
         items = tuple(
             schemas.StreamOut(
@@ -52,8 +53,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         resolution: Resolution = None,
         cursor: Cursor = None,
     ) -> Response:
-        """Raw samples if there are few; otherwise mean, minimum, maximum and last value of equal time spans."""
-        wanted = Range(
+        """Returns raw samples, or mean, minimum, maximum and last value of equal time spans."""
+        time_range = Range(
             first_ms=since,
             last_ms=until,
             points=points,
@@ -61,13 +62,13 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             fields=None if fields is None else fields.split(","),
             cursor=cursor,
         )
-        part = await functions.series.read(await auth.account(request), device, stream, wanted)
-        return json_response(_show(stream, part))
+        part = await functions.series.read(await auth.account(request), device, stream, time_range)
+        return json_response(_data_out(stream, part))
 
     return routes
 
 
-def _show(stream: str, part: Part) -> schemas.DataOut:
+def _data_out(stream: str, part: Part) -> schemas.DataOut:
     columns = {name: schemas.ColumnOut(mean=tuple(values)) for name, values in part.values.items()}
     for name, summaries in part.summaries.items():
         columns[name] = schemas.ColumnOut(

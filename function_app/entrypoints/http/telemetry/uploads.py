@@ -26,7 +26,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
 
 
 def _for_accounts(routes: Routes, functions: Functions, auth: RequestAuthenticator) -> None:
-    async def operated(request: Request, device: str) -> tuple[Device, str]:
+    async def operated_device(request: Request, device: str) -> tuple[Device, str]:
         caller = await auth.account(request)
         return require_operator(await functions.devices.get(caller, device)), caller.name
 
@@ -38,37 +38,39 @@ def _for_accounts(routes: Routes, functions: Functions, auth: RequestAuthenticat
         body=schemas.UploadRequest,
     )
     async def begin_upload(request: Request, device: str) -> Response:
-        """Returns a URL for the content, which bypasses this API. Complete the upload afterwards."""
-        found, name = await operated(request, device)
+        """Returns a URL to which the client sends the content. The client must then complete the upload."""
+        target, operator = await operated_device(request, device)
         payload: schemas.UploadRequest = await read(request, schemas.UploadRequest)
-        return await _begin(functions, found, payload, f"account:{name}")
+        return await _begin(functions, target, payload, f"account:{operator}")
 
     @routes.add("POST /devices/{device}/uploads/{upload}/complete", "Complete an upload", schemas.UploadOut, (404, 409))
     async def complete_upload(request: Request, device: str, upload: str) -> Response:
-        """Verifies that the content exists and is what was announced. Safe to repeat."""
-        found, _ = await operated(request, device)
-        return json_response(_show(await functions.uploads.complete(found, upload)))
+        """Verifies length and hash of the content. Safe to repeat."""
+        target, _ = await operated_device(request, device)
+        return json_response(_capture_out(await functions.uploads.complete(target, upload)))
 
     @routes.add("GET /devices/{device}/uploads", "List captures of a device", schemas.UploadList, (404, 422))
     async def list_uploads(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
-        """Completed ones, newest first."""
-        found = await functions.devices.get(await auth.account(request), device)
-        captures, following = await functions.uploads.list(found, cursor=cursor, limit=limit)
-        items: tuple[schemas.UploadOut, ...] = tuple(_show(capture) for capture in captures)
-        return json_response(schemas.UploadList(items=items, cursor=following))
+        """Returns completed captures, newest first."""
+        target = await functions.devices.get(await auth.account(request), device)
+        captures, next_cursor = await functions.uploads.list(target, cursor=cursor, limit=limit)
+        items: tuple[schemas.UploadOut, ...] = tuple(_capture_out(capture) for capture in captures)
+        return json_response(schemas.UploadList(items=items, cursor=next_cursor))
 
     @routes.add("GET /devices/{device}/uploads/{upload}", "Get a capture", schemas.UploadWithUrl, 404)
     async def get_upload(request: Request, device: str, upload: str) -> Response:
-        """With a URL for its content."""
-        found = await functions.devices.get(await auth.account(request), device)
-        capture, url = await functions.uploads.get(found, upload)
-        return json_response(_show(capture, schemas.UploadWithUrl, url=url), headers={"Cache-Control": "no-store"})
+        """Returns a capture with a URL of its content."""
+        target = await functions.devices.get(await auth.account(request), device)
+        capture, url = await functions.uploads.get(target, upload)
+        return json_response(
+            _capture_out(capture, schemas.UploadWithUrl, url=url), headers={"Cache-Control": "no-store"}
+        )
 
     @routes.add("DELETE /devices/{device}/uploads/{upload}", "Delete a capture", None, 404)
     async def delete_upload(request: Request, device: str, upload: str) -> Response:
-        """With its content. Owners only: an operator's captures stay until then."""
-        found = require_owner(await functions.devices.get(await auth.account(request), device))
-        await functions.uploads.delete(found, upload)
+        """Deletes a capture with its content. Owners only."""
+        target = require_owner(await functions.devices.get(await auth.account(request), device))
+        await functions.uploads.delete(target, upload)
         return empty()
 
 
@@ -82,10 +84,10 @@ def _for_agents(routes: Routes, functions: Functions, auth: RequestAuthenticator
         caller="agent",
     )
     async def begin_agent_upload(request: Request, agent: str) -> Response:
-        """Called by an agent, for one of its devices."""
-        known = await auth.agent(request)
+        """Called by an agent for one of its devices."""
+        caller = await auth.agent(request)
         payload: schemas.AgentUploadRequest = await read(request, schemas.AgentUploadRequest)
-        return await _begin(functions, own_device(known, agent, payload.device), payload, f"agent:{known.id}")
+        return await _begin(functions, own_device(caller, agent, payload.device), payload, f"agent:{caller.id}")
 
     @routes.add(
         "POST /agents/{agent}/uploads/{upload}/complete",
@@ -97,28 +99,28 @@ def _for_agents(routes: Routes, functions: Functions, auth: RequestAuthenticator
     )
     async def complete_agent_upload(request: Request, agent: str, upload: str) -> Response:
         """Called by an agent. Safe to repeat."""
-        known = await auth.agent(request)
+        caller = await auth.agent(request)
         payload: schemas.AgentCompleteRequest = await read(request, schemas.AgentCompleteRequest)
-        capture = await functions.uploads.complete(own_device(known, agent, payload.device), upload)
-        return json_response(_show(capture))
+        capture = await functions.uploads.complete(own_device(caller, agent, payload.device), upload)
+        return json_response(_capture_out(capture))
 
 
-def own_device(known: Agent, agent: str, name: str) -> Device:
-    """The device of this name of the agent that asks.
+def own_device(caller: Agent, agent: str, name: str) -> Device:
+    """The device with this name of the authenticated agent.
 
     Raises:
-        Problem: ``agent-unknown``, ``device-unknown``.
+        Problem: ``agent-uncaller``, ``device-uncaller``.
     """
-    if known.id != agent or not known.claimed:
+    if caller.id != agent or not caller.claimed:
         raise not_found("agent", agent)
-    device = next((found for found in devices_of(known) if found.name == name), None)
+    device = next((each for each in devices_of(caller) if each.name == name), None)
     if device is None:
         raise not_found("device", name)
     return device
 
 
 async def _begin(functions: Functions, device: Device, payload: schemas.UploadRequest, by: str) -> Response:
-    wanted = Announced(
+    announced = Announced(
         stream=payload.stream,
         length=payload.length,
         content_type=payload.content_type,
@@ -126,7 +128,7 @@ async def _begin(functions: Functions, device: Device, payload: schemas.UploadRe
         at_ms=payload.at_ms,
         sha256=payload.sha256 or "",
     )
-    capture, upload = await functions.uploads.begin(device, wanted, by=by)
+    capture, upload = await functions.uploads.begin(device, announced, by=by)
     body = schemas.UploadStarted(
         id=capture.id,
         method=upload.method,
@@ -137,7 +139,7 @@ async def _begin(functions: Functions, device: Device, payload: schemas.UploadRe
     return json_response(body, 201, headers={"Cache-Control": "no-store"})
 
 
-def _show(capture: Capture, kind: type[R] = schemas.UploadOut, **more: Any) -> R:  # type: ignore[assignment]
+def _capture_out(capture: Capture, kind: type[R] = schemas.UploadOut, **more: Any) -> R:  # type: ignore[assignment]
     return response_from(
         capture,
         kind,

@@ -63,7 +63,7 @@ def test_acks_in_order_record_every_time() -> None:
 @pytest.mark.parametrize("order", list(permutations(range(len(LIFE)))))
 def test_acks_in_any_order_have_the_same_result(order: tuple[int, ...]) -> None:
     reports = life(*LIFE)
-    action = applied(NEW, [reports[place] for place in order])
+    action = applied(NEW, [reports[index] for index in order])
     assert (action.status, action.output, action.progress) == (Status.DONE, "line 5", 0.5)
 
 
@@ -87,7 +87,7 @@ def test_no_acks_reverse_a_step_and_the_first_terminal_status_is_final(reports: 
         before, action = action, apply_report(action, report)
         assert action.status.rank >= before.status.rank
         assert action.sequence >= before.sequence
-        assert before.times.items() <= action.times.items(), "a time that is known stays"
+        assert before.times.items() <= action.times.items(), "recorded times do not change"
         if before.status.terminal:
             assert action is before
         if report.status.terminal and not before.status.terminal:
@@ -98,8 +98,8 @@ def test_no_acks_reverse_a_step_and_the_first_terminal_status_is_final(reports: 
 def test_duplicate_acks_change_nothing(reports: list[AckReport], data: st.DataObject) -> None:
     action = applied(NEW, reports)
     for report in data.draw(st.lists(st.sampled_from(reports), max_size=10)) if reports else []:
-        again = apply_report(action, report)
-        assert (again.status, again.sequence, again.output) == (action.status, action.sequence, action.output)
+        result = apply_report(action, report)
+        assert (result.status, result.sequence, result.output) == (action.status, action.sequence, action.output)
 
 
 def test_a_late_ack_of_an_earlier_step_adds_its_time_only() -> None:

@@ -62,12 +62,12 @@ def test_any_text_is_parsed_or_rejected(text: str) -> None:
     assert code is None or set(code) <= set(ids.CLAIM_ALPHABET)
 
 
-def test_claim_codes_are_accepted_as_people_type_them() -> None:
+def test_claim_codes_are_accepted_in_any_notation() -> None:
     for _ in range(100):
         code = ids.new_claim_code()
-        shown = ids.format_claim_code(code)
-        assert re.fullmatch("[BCDFGHJKLMNPQRSTVWXZ]{4}-[BCDFGHJKLMNPQRSTVWXZ]{4}", shown)
-        for typed in (shown, code, shown.lower(), f" {shown[:4]} - {shown[5:]} "):
+        displayed = ids.format_claim_code(code)
+        assert re.fullmatch("[BCDFGHJKLMNPQRSTVWXZ]{4}-[BCDFGHJKLMNPQRSTVWXZ]{4}", displayed)
+        for typed in (displayed, code, displayed.lower(), f" {displayed[:4]} - {displayed[5:]} "):
             assert ids.parse_claim_code(typed) == code
     for invalid in ("", "BCDF-GHJ", "BCDF-GHJKL", "ABCD-EFGH", "BCDF-GHJ1", "BCDF_GHJK", "\uff22CDF-GHJK"):
         assert ids.parse_claim_code(invalid) is None

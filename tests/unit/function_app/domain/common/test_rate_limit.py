@@ -47,38 +47,38 @@ def test_a_request_is_admitted_after_the_stated_wait() -> None:
 
 def test_the_number_of_counted_names_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rate_limiter, "KNOWN", 10)
-    known = RateLimiter(per_s={"address": 1, "account": 1, "key": 1, "agent": 1}, clock=MovingClock())
+    limiter = RateLimiter(per_s={"address": 1, "account": 1, "key": 1, "agent": 1}, clock=MovingClock())
     for number in range(1000):
-        known.admit("address", str(number))
-    assert len(known._arrivals) == 10
+        limiter.admit("address", str(number))
+    assert len(limiter._arrivals) == 10
     for _ in range(BURST_S - 1):
-        known.admit("address", "999")
+        limiter.admit("address", "999")
     with pytest.raises(Problem, match="this address"):
-        known.admit("address", "999")
+        limiter.admit("address", "999")
 
 
-def test_too_many_requests_of_an_account_wait_but_stop_never_does(open_cloud: OpenCloud) -> None:
+def test_rate_limits_of_an_account_do_not_apply_to_stop(open_cloud: OpenCloud) -> None:
     cloud = open_cloud(rate_limits=RateLimits(account=1, address=0, key=0, agent=0))
     anna, bert = cloud.sign_in("anna"), cloud.sign_in("bert")
     statuses = [anna.get("/accounts/me").status_code for _ in range(BURST_S)]
     assert statuses == [200] * BURST_S
-    refused = anna.get("/accounts/me")
-    problem(refused, 429, "too-many-requests")
-    assert 1 <= int(refused.headers["retry-after"]) <= 2
+    rejected = anna.get("/accounts/me")
+    problem(rejected, 429, "too-many-requests")
+    assert 1 <= int(rejected.headers["retry-after"]) <= 2
     assert bert.get("/accounts/me").status_code == 200
     assert anna.post("/stop").status_code in {200, 207}
     problem(anna.post("/devices/abcdefgh23-arm/stop"), 404, "device-unknown")
     problem(anna.post("/spaces/abcdefgh23/stop"), 404, "space-unknown")
     problem(anna.post("/devices/abcdefgh23-arm/stop/reset"), 429, "too-many-requests")
-    cloud.clock.advance(int(refused.headers["retry-after"]))
+    cloud.clock.advance(int(rejected.headers["retry-after"]))
     assert anna.get("/accounts/me").status_code == 200
 
 
 def test_addresses_are_counted_before_authentication(open_cloud: OpenCloud) -> None:
     cloud = open_cloud(rate_limits=RateLimits(address=1, agent=1, account=0, key=0))
-    here, there = cloud.client(address="192.0.2.1"), cloud.client(address="192.0.2.2")
+    first, second = cloud.client(address="192.0.2.1"), cloud.client(address="192.0.2.2")
     for _ in range(BURST_S):
-        assert cloud.run(here.get(f"{API}/health")).status_code == 200
-    problem(cloud.run(here.get(f"{API}/accounts/me")), 429, "too-many-requests")
-    problem(cloud.run(here.post(f"{API}/devices/abcdefgh23-arm/stop")), 401, "unauthorized")
-    assert cloud.run(there.get(f"{API}/health")).status_code == 200
+        assert cloud.run(first.get(f"{API}/health")).status_code == 200
+    problem(cloud.run(first.get(f"{API}/accounts/me")), 429, "too-many-requests")
+    problem(cloud.run(first.post(f"{API}/devices/abcdefgh23-arm/stop")), 401, "unauthorized")
+    assert cloud.run(second.get(f"{API}/health")).status_code == 200

@@ -46,7 +46,7 @@ def test_the_highest_share_counts(of_device: Role | None, of_space: Role | None)
 
 
 @pytest.mark.parametrize(
-    "dead",
+    "ignored",
     [
         share(DEVICE, Role.OPERATOR, expires_ms=NOW_MS),
         share(DEVICE, Role.OPERATOR, pairing="p0"),
@@ -59,14 +59,14 @@ def test_the_highest_share_counts(of_device: Role | None, of_space: Role | None)
         share("space:attic", Role.OPERATOR, pairing="p1"),
     ],
 )
-def test_expired_and_foreign_shares_are_ignored(dead: Share) -> None:
-    assert role(dead) is None
+def test_expired_and_foreign_shares_are_ignored(ignored: Share) -> None:
+    assert role(ignored) is None
 
 
 def test_a_share_is_valid_until_its_expiry() -> None:
-    lasting = share(DEVICE, Role.OPERATOR, expires_ms=NOW_MS)
-    assert role(lasting, now_ms=NOW_MS - 1) is Role.OPERATOR
-    assert role(lasting, share(SPACE, Role.VIEWER)) is Role.VIEWER
+    expiring = share(DEVICE, Role.OPERATOR, expires_ms=NOW_MS)
+    assert role(expiring, now_ms=NOW_MS - 1) is Role.OPERATOR
+    assert role(expiring, share(SPACE, Role.VIEWER)) is Role.VIEWER
     shares = [share(DEVICE, Role.OPERATOR, expires_ms=5_000), share(SPACE, Role.VIEWER, expires_ms=9_000)]
     assert access.permissions(BERT, AGENT, "arm", shares, NOW_MS) == Permissions(Role.OPERATOR, 5_000, Role.VIEWER)
     equal = [share(DEVICE, Role.VIEWER, expires_ms=5_000), share(SPACE, Role.VIEWER)]

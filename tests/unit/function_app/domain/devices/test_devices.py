@@ -23,20 +23,20 @@ links = st.builds(Link, online=st.booleans(), session=st.integers(min_value=0, m
 
 
 @given(st.lists(links))
-def test_reordered_presence_never_returns_to_an_earlier_session(news: list[Link]) -> None:
+def test_reordered_presence_never_returns_to_an_earlier_session(incoming: list[Link]) -> None:
     assert newer_link(Link(online=True, session=9, seen_ms=1), Link(online=True, session=1, seen_ms=0, pairing="q"))
-    known: Link | None = None
-    for link in news:
-        newer = newer_link(known, link)
-        if known is not None and newer is not None:
-            assert newer.session >= known.session
-            assert newer.session > known.session or known.online or not newer.online
-        known = newer or known
-    if news:
-        newest = max(link.session for link in news)
-        assert known is not None
-        assert known.session == newest
-        assert known.online is all(link.online for link in news if link.session == newest)
+    stored: Link | None = None
+    for link in incoming:
+        newer = newer_link(stored, link)
+        if stored is not None and newer is not None:
+            assert newer.session >= stored.session
+            assert newer.session > stored.session or stored.online or not newer.online
+        stored = newer or stored
+    if incoming:
+        newest = max(link.session for link in incoming)
+        assert stored is not None
+        assert stored.session == newest
+        assert stored.online is all(link.online for link in incoming if link.session == newest)
 
 
 @pytest.mark.parametrize(
@@ -82,9 +82,9 @@ CLAIMED = claim(Agent("a", "lab", "k", "1", (ARM, CAM), 0), account="anna", spac
 
 
 def test_departures_contain_the_former_owner_and_are_bounded() -> None:
-    (left,) = unpair(CLAIMED).leaving
-    assert (left.why, left.account, left.space, left.pairing) == ("unpaired", "anna", "home", "p")
-    assert left.devices == ("arm", "cam")
+    (departure,) = unpair(CLAIMED).leaving
+    assert (departure.why, departure.account, departure.space, departure.pairing) == ("unpaired", "anna", "home", "p")
+    assert departure.devices == ("arm", "cam")
     moved = move(CLAIMED, "attic")
     assert (moved.space, moved.pairing, moved.account) == ("attic", "p", "anna")
     assert [(each.why, each.space) for each in moved.leaving] == [("moved", "home")]

@@ -36,28 +36,28 @@ def test_quantiles_are_within_one_percent_of_the_exact_ones(values: list[float])
 
 
 def test_quantiles_of_ten_thousand_samples() -> None:
-    chance = random.Random(3)  # noqa: S311 (repeatable samples)
+    rng = random.Random(3)  # noqa: S311 (repeatable samples)
     for draw in (
-        lambda: chance.lognormvariate(3.0, 0.8),
-        lambda: chance.gauss(20, 1) if chance.random() < 0.9 else chance.gauss(900, 50),
+        lambda: rng.lognormvariate(3.0, 0.8),
+        lambda: rng.gauss(20, 1) if rng.random() < 0.9 else rng.gauss(900, 50),
         lambda: 12.5,
-        lambda: chance.expovariate(0.02),
+        lambda: rng.expovariate(0.02),
     ):
         check([draw() for _ in range(10_000)])
 
 
 @given(st.lists(samples, min_size=1, max_size=6), st.randoms())
-def test_merged_parts_are_the_whole_in_any_order(parts: list[list[float]], chance: random.Random) -> None:
+def test_merged_parts_are_the_whole_in_any_order(parts: list[list[float]], rng: random.Random) -> None:
     whole = asdict(of([value for part in parts for value in part]))
     histograms = [of(part) for part in parts]
-    chance.shuffle(histograms)
-    merged = merge(merge([one]) if chance.random() < 0.5 else one for one in histograms)
-    found = asdict(merged)
-    assert found.pop("sum_ms") == pytest.approx(whole.pop("sum_ms"))
-    assert found == whole
+    rng.shuffle(histograms)
+    merged = merge(merge([one]) if rng.random() < 0.5 else one for one in histograms)
+    result = asdict(merged)
+    assert result.pop("sum_ms") == pytest.approx(whole.pop("sum_ms"))
+    assert result == whole
 
 
-def test_bins_hold_every_sample_and_the_mean_has_no_error() -> None:
+def test_bins_contain_every_sample_and_the_mean_has_no_error() -> None:
     values = [0.5, 1.0, 1.0, 20.0, 3_000.0]
     histogram = of(values)
     assert sum(count for _, _, count in histogram.bins()) == len(values)

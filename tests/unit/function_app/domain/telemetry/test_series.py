@@ -31,11 +31,11 @@ Rows = list[tuple[int, dict[str, float]]]
 
 
 def rows_of(samples: Samples) -> dict[int, dict[str, float]]:
-    found: dict[int, dict[str, float]] = {}
+    result: dict[int, dict[str, float]] = {}
     for index, at_ms in enumerate(samples.at_ms):
         values = {name: column[index] for name, column in samples.columns.items()}
-        found[at_ms] = {name: value for name, value in values.items() if not math.isnan(value)}
-    return found
+        result[at_ms] = {name: value for name, value in values.items() if not math.isnan(value)}
+    return result
 
 
 def truth(rows: Rows) -> dict[int, dict[str, float]]:
@@ -61,21 +61,21 @@ def test_unpacking_reverses_packing(rows: Rows) -> None:
 
 @given(ROWS, ROWS)
 def test_samples_are_a_set_by_time(one: Rows, other: Rows) -> None:
-    there = series.from_rows(one)
-    fresh = series.new_samples(series.from_rows(other), there)
-    assert rows_of(series.merge(there, fresh)) == truth(one + other)
-    assert len(series.new_samples(series.from_rows(other), series.merge(there, fresh))) == 0
+    stored = series.from_rows(one)
+    new = series.new_samples(series.from_rows(other), stored)
+    assert rows_of(series.merge(stored, new)) == truth(one + other)
+    assert len(series.new_samples(series.from_rows(other), series.merge(stored, new))) == 0
 
 
 @given(ROWS)
-def test_windows_hold_every_sample_once(rows: Rows) -> None:
+def test_windows_contain_every_sample_once(rows: Rows) -> None:
     samples = series.from_rows(rows)
-    found: dict[int, dict[str, float]] = {}
+    result: dict[int, dict[str, float]] = {}
     for start_ms, window in samples.windows():
         assert start_ms % WINDOW_MS == 0
         assert all(start_ms <= at_ms < start_ms + WINDOW_MS for at_ms in window.at_ms)
-        found |= rows_of(window)
-    assert found == rows_of(samples)
+        result |= rows_of(window)
+    assert result == rows_of(samples)
 
 
 @given(ROWS, st.randoms(use_true_random=False))
@@ -145,7 +145,7 @@ def test_deleted_levels_are_not_chosen() -> None:
     )
 
 
-def test_keys_of_a_level_sort_by_time_and_say_their_start() -> None:
+def test_keys_of_a_level_sort_by_time_and_contain_their_start() -> None:
     starts = [0, 9_000, 10_000, NOW_MS]
     for level in LEVELS:
         keys = [series.key(level, start_ms) for start_ms in starts]

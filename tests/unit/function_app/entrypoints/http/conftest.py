@@ -8,7 +8,7 @@ from tests.harness.cloud.cloud import Cloud, settings
 
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cloud]:
-    """The functions with real tables and no broker anywhere."""
+    """Functions with real tables and without a broker."""
     folder = tmp_path_factory.mktemp("home")
     console = folder / "console"
     (console / "assets").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""The API's description: whole, consistent, and readable without any script."""
+"""The OpenAPI document is complete and consistent, and its HTML page needs no scripts."""
 
 import json
 import re
@@ -19,10 +19,10 @@ PROBLEM = "#/components/schemas/Problem"
 
 @pytest.fixture(scope="module")
 def document(cloud: Cloud) -> dict[str, Any]:
-    answer = cloud.request("GET", "/api/v1/openapi.json")
-    assert answer.status_code == 200
-    found: dict[str, Any] = answer.json()
-    return found
+    response = cloud.request("GET", "/api/v1/openapi.json")
+    assert response.status_code == 200
+    document: dict[str, Any] = response.json()
+    return document
 
 
 def operations(document: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -32,7 +32,7 @@ def operations(document: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, A
             yield method.upper(), path, operation
 
 
-def test_every_reference_leads_somewhere(document: dict[str, Any]) -> None:
+def test_every_reference_has_a_schema(document: dict[str, Any]) -> None:
     text = json.dumps(document)
     names = set(re.findall(r'"\$ref": "([^"]+)"', text))
     assert names
@@ -95,22 +95,22 @@ class _Page(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_for_people_names_every_route_and_links_only_to_itself(cloud: Cloud, document: dict[str, Any]) -> None:
-    answer = cloud.request("GET", "/api/docs")
-    assert answer.status_code == 200
-    assert answer.headers["content-type"] == "text/html; charset=utf-8"
+def test_the_html_page_contains_every_route_and_no_external_links(cloud: Cloud, document: dict[str, Any]) -> None:
+    response = cloud.request("GET", "/api/docs")
+    assert response.status_code == 200
+    assert response.headers["content-type"] == "text/html; charset=utf-8"
     page = _Page()
-    page.feed(answer.text)
+    page.feed(response.text)
     assert page.open == []
     assert not page.tags & {"script", "style", "link", "img", "iframe", "form"}
     for link in page.links:
         assert link == "/api/v1/openapi.json" or link.removeprefix("#") in page.ids, link
     for method, path, operation in operations(document):
-        assert f"{method} {path}" in answer.text
-        assert escape(operation["summary"]) in answer.text
+        assert f"{method} {path}" in response.text
+        assert escape(operation["summary"]) in response.text
 
 
-def test_the_page_shows_hostile_text_as_text() -> None:
+def test_the_html_page_escapes_text() -> None:
     evil = "<script>alert(1)</script>&'\""
     text = {"summary": evil, "description": evil}
     content = {"x": {"schema": {"$ref": f"#/components/schemas/{evil}"}}}

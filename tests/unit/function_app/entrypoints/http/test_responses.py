@@ -1,4 +1,4 @@
-"""Every answer of the API, also to what is wrong: problem details, security headers, and never a 500."""
+"""Responses of the API: problem details, security headers, and no 500 for invalid requests."""
 
 import asyncio
 import contextlib
@@ -55,29 +55,29 @@ def anna(cloud: Cloud) -> Person:
 
 @pytest.mark.parametrize("path", [*WITH_BODY, *OPTIONAL_BODY, "/robot-types/ur5/movements/mine"])
 @pytest.mark.parametrize("body", BODIES.values(), ids=BODIES.keys())
-def test_a_wrong_body_is_a_problem_and_never_a_fault(anna: Person, path: str, body: bytes) -> None:
-    answer = anna.request("PUT" if "/robot-types/" in path else "POST", path, content=body)
+def test_an_invalid_body_is_rejected_with_a_problem(anna: Person, path: str, body: bytes) -> None:
+    response = anna.request("PUT" if "/robot-types/" in path else "POST", path, content=body)
     if path in OPTIONAL_BODY and body == b"":
-        problem(answer, 404, "device-unknown")
+        problem(response, 404, "device-unknown")
     else:
-        problem(answer, 422, "invalid")
+        problem(response, 422, "invalid")
 
 
 class TestBodySize:
-    def test_a_body_of_a_million_bytes_is_read(self, cloud: Cloud) -> None:
+    def test_a_body_of_maximum_size_is_accepted(self, cloud: Cloud) -> None:
         body = b'{"link":"x"}'
         problem(cloud.request("POST", SIGN_IN, content=body.ljust(MAX_BODY)), 401, "unauthorized")
 
     @pytest.mark.parametrize("length", ["1" * 5000, "-5", "x", "", "٣", "1, 2"])
-    def test_a_declared_length_that_is_no_length_is_no_fault(self, cloud: Cloud, length: str) -> None:
+    def test_an_invalid_content_length_causes_no_server_error(self, cloud: Cloud, length: str) -> None:
         headers = {"content-length": length.encode()}
-        answer = cloud.request("POST", SIGN_IN, content=b'{"link":"x"}', headers=headers)
-        assert answer.status_code in {401, 413, 422}
+        response = cloud.request("POST", SIGN_IN, content=b'{"link":"x"}', headers=headers)
+        assert response.status_code in {401, 413, 422}
 
-    def test_a_caller_who_leaves_in_mid_body_is_no_fault(self, cloud: Cloud) -> None:
+    def test_a_client_that_disconnects_during_the_body_causes_no_server_error(self, cloud: Cloud) -> None:
         sent: list[Any] = []
 
-        async def leave() -> None:
+        async def disconnect() -> None:
             messages: list[dict[str, Any]] = [
                 {"type": "http.request", "body": b'{"li', "more_body": True},
                 {"type": "http.disconnect"},
@@ -92,7 +92,7 @@ class TestBodySize:
             scope = {"type": "http", "method": "POST", "path": SIGN_IN, "headers": [], "query_string": b""}
             await cloud.app(scope, receive, send)
 
-        cloud.run(leave())
+        cloud.run(disconnect())
         assert not sent or sent[0]["status"] < 500
 
 
@@ -100,7 +100,7 @@ class TestErrors:
     @pytest.mark.parametrize(
         "path", ["/api", "/api/", "/api/v1", "/api/v1/nothing", "/api/v2/health", "/api/v1/health/"]
     )
-    def test_what_is_not_there_is_a_problem(self, cloud: Cloud, path: str) -> None:
+    def test_an_unknown_path_is_a_problem(self, cloud: Cloud, path: str) -> None:
         for method in ("GET", "POST", "DELETE"):
             problem(cloud.request(method, path), 404, "http")
 
@@ -114,49 +114,49 @@ class TestErrors:
             ("PUT", f"/devices/{DEVICE}/lease", {"GET", "POST", "DELETE"}),
         ],
     )
-    def test_a_method_that_a_resource_has_not_is_405_and_says_which_it_has(
+    def test_an_unsupported_method_is_405_with_the_supported_ones(
         self, cloud: Cloud, method: str, path: str, allowed: set[str]
     ) -> None:
-        answer = cloud.request(method, API + path)
-        problem(answer, 405, "http")
-        assert set(answer.headers["allow"].split(", ")) == allowed
+        response = cloud.request(method, API + path)
+        problem(response, 405, "http")
+        assert set(response.headers["allow"].split(", ")) == allowed
 
-    def test_an_unhandled_error_is_a_problem_without_internals(
+    def test_an_unhandled_error_is_a_problem_without_details(
         self, cloud: Cloud, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         async def broken() -> None:
-            raise RuntimeError("the secret inside")
+            raise RuntimeError("a secret")
 
         monkeypatch.setattr(cloud.functions.health, "check", broken, raising=True)
-        answer = cloud.request("GET", f"{API}/health")
-        problem(answer, 500, "internal")
-        assert "secret" not in answer.text
-        assert answer.headers["x-content-type-options"] == "nosniff"
+        response = cloud.request("GET", f"{API}/health")
+        problem(response, 500, "internal")
+        assert "secret" not in response.text
+        assert response.headers["x-content-type-options"] == "nosniff"
 
-    def test_tables_that_cannot_be_used_are_503_and_said_in_health(self, tmp_path: Path) -> None:
+    def test_unavailable_tables_are_503_and_reported_by_the_health_check(self, tmp_path: Path) -> None:
         with Cloud(cloud_settings(tmp_path)) as cloud:
             anna = cloud.sign_in("anna")
             cloud.run(cloud.functions.tables.close())
             (tmp_path / "tables.sqlite").write_bytes(b"no database " * 100)
             for name in ("tables.sqlite-wal", "tables.sqlite-shm"):
                 (tmp_path / name).unlink(missing_ok=True)
-            answer = anna.get("/devices")
-            problem(answer, 503, "store-unavailable")
-            assert answer.headers["retry-after"]
-            assert str(tmp_path) not in answer.text
+            response = anna.get("/devices")
+            problem(response, 503, "store-unavailable")
+            assert response.headers["retry-after"]
+            assert str(tmp_path) not in response.text
             assert "damaged" in problem(cloud.request("GET", f"{API}/health"), 503, "store-unavailable")["detail"]
 
-    def test_a_refusal_carries_what_programs_need(self) -> None:
-        answer = problem_response(Problem("x", 429, "T", "D.", retry_after_s=7, extras={"holder": "anna"}))
-        assert answer.headers["retry-after"] == "7"
-        assert bytes(answer.body) == b'{"type":"/problems/x","title":"T","status":429,"detail":"D.","holder":"anna"}'
+    def test_a_problem_has_its_extra_members_and_retry_after(self) -> None:
+        response = problem_response(Problem("x", 429, "T", "D.", retry_after_s=7, extras={"holder": "anna"}))
+        assert response.headers["retry-after"] == "7"
+        assert bytes(response.body) == b'{"type":"/problems/x","title":"T","status":429,"detail":"D.","holder":"anna"}'
 
 
 class TestHeaders:
     @pytest.mark.parametrize(
         "path", ["/", "/assets/app-0123abcd.js", "/api/docs", "/api/v1/health", "/api/v1/devices", "/api/v1/nothing"]
     )
-    def test_every_answer_has_them(self, cloud: Cloud, path: str) -> None:
+    def test_every_response_has_security_headers(self, cloud: Cloud, path: str) -> None:
         headers = cloud.request("GET", path).headers
         policy = dict(part.strip().split(" ", 1) for part in headers["content-security-policy"].split(";"))
         assert policy == {
@@ -169,35 +169,35 @@ class TestHeaders:
         assert headers["x-frame-options"] == "DENY"
         assert headers["cross-origin-opener-policy"] == "same-origin"
 
-    def test_every_answer_tells_the_time(self, tmp_path: Path) -> None:
+    def test_every_response_has_the_server_time(self, tmp_path: Path) -> None:
         clock = MovingClock()
         with Cloud(cloud_settings(tmp_path), clock=clock) as cloud:
             clock.advance(1_000_000)
             for path in ("/api/v1/health", "/api/v1/devices", "/nothing"):
-                told = int(cloud.request("GET", path).headers["x-telescope-time-ms"])
-                assert abs(clock.now_ms() - told) < 20_000
+                server_ms = int(cloud.request("GET", path).headers["x-telescope-time-ms"])
+                assert abs(clock.now_ms() - server_ms) < 20_000
 
-    def test_no_other_origin_is_let_in(self, cloud: Cloud) -> None:
-        answer = cloud.request("OPTIONS", f"{API}/devices", headers={"Origin": "https://evil.example"})
-        assert answer.status_code == 405
-        assert not [name for name in answer.headers if name.startswith("access-control-")]
+    def test_other_origins_are_rejected(self, cloud: Cloud) -> None:
+        response = cloud.request("OPTIONS", f"{API}/devices", headers={"Origin": "https://evil.example"})
+        assert response.status_code == 405
+        assert not [name for name in response.headers if name.startswith("access-control-")]
 
 
 class TestConsole:
-    def test_the_page_is_asked_for_anew_and_its_assets_are_kept(self, cloud: Cloud) -> None:
+    def test_pages_are_revalidated_and_assets_are_cached(self, cloud: Cloud) -> None:
         page = cloud.request("GET", "/")
         assert (page.status_code, page.headers["cache-control"]) == (200, "no-cache")
-        again = cloud.request("GET", "/", headers={"If-None-Match": page.headers["etag"]})
-        assert again.status_code == 304
+        unchanged = cloud.request("GET", "/", headers={"If-None-Match": page.headers["etag"]})
+        assert unchanged.status_code == 304
         asset = cloud.request("GET", "/assets/app-0123abcd.js")
         assert asset.headers["cache-control"] == "public, max-age=31536000, immutable"
         assert cloud.request("HEAD", "/").status_code == 200
         problem(cloud.request("POST", "/"), 405, "http")
 
-    def test_a_browser_finds_the_icon_where_no_page_names_it(self, cloud: Cloud) -> None:
+    def test_the_default_icon_path_returns_the_icon(self, cloud: Cloud) -> None:
         icon = cloud.request("GET", "/favicon.ico")
         assert (icon.status_code, icon.headers["content-type"]) == (200, "image/svg+xml")
-        assert icon.headers["cache-control"] == "no-cache", "its address stays when it changes"
+        assert icon.headers["cache-control"] == "no-cache", "the path stays the same when the icon changes"
 
     @pytest.mark.parametrize(
         "path",
@@ -210,15 +210,15 @@ class TestConsole:
             "/assets",
         ],
     )
-    def test_nothing_outside_its_folder_is_served(self, cloud: Cloud, path: str) -> None:
-        answer = cloud.run(cloud.client().send(httpx.Request("GET", f"http://x{path}")))
-        problem(answer, 404, "http")
+    def test_files_outside_its_folder_are_not_served(self, cloud: Cloud, path: str) -> None:
+        response = cloud.run(cloud.client().send(httpx.Request("GET", f"http://x{path}")))
+        problem(response, 404, "http")
 
-    def test_a_console_that_was_not_built_says_so(self, tmp_path: Path) -> None:
-        with Cloud(cloud_settings(tmp_path, console=tmp_path / "nothing")) as cloud:
+    def test_a_missing_console_is_404_with_a_hint(self, tmp_path: Path) -> None:
+        with Cloud(cloud_settings(tmp_path, console=tmp_path / "missing")) as cloud:
             assert "make console" in problem(cloud.request("GET", "/"), 404, "http")["detail"]
 
-    def test_a_websocket_is_refused_without_a_fault(self, cloud: Cloud) -> None:
+    def test_a_websocket_is_closed_without_an_error(self, cloud: Cloud) -> None:
         sent: list[Any] = []
 
         async def connect() -> None:

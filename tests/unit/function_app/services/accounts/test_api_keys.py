@@ -26,8 +26,8 @@ class Program(Person):
         self.token = token
         self._client = cloud.client(headers={"Authorization": f"Bearer {token}"})
 
-    def _stay(self) -> None:
-        """A key is not renewed."""
+    def _renew_token(self) -> None:
+        """An API key is not renewed."""
 
 
 def make(person: Person, role: str = "operator", *only: str, **more: Any) -> tuple[str, Program]:
