@@ -164,8 +164,8 @@ def create_room_device(
         options.setdefault("faults", str(faults / f"{entry.name}.toml"))
     manifest = msgspec.structs.replace(device, label=entry.label or device.label, driver=driver, options=options)
     try:
-        made = sensors.load(driver)(manifest, ROOMS.folder(entry.room), _surroundings(entry.room, neighbours))
-        return RoomDevice(made, manifest, uploads)
+        sensor = sensors.load(driver)(manifest, ROOMS.folder(entry.room), _surroundings(entry.room, neighbours))
+        return RoomDevice(sensor, manifest, uploads)
     except SensorError as error:
         raise ConfigError(str(error)) from error
 

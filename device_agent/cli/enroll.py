@@ -102,7 +102,7 @@ def _enroll(options: argparse.Namespace) -> int:
 
 
 def _config(options: argparse.Namespace, store: IdentityStore) -> AgentConfig:
-    """The saved configuration, updated by the given options."""
+    """The saved configuration, updated by the options."""
     try:
         saved = AgentConfig.load(store.folder)
     except ConfigError:
@@ -126,8 +126,8 @@ def _config(options: argparse.Namespace, store: IdentityStore) -> AgentConfig:
 
 
 def _polling(options: argparse.Namespace, saved: HttpPolling) -> HttpPolling:
-    given = {"poll": options.poll, "poll_ms": options.poll_ms}
-    changed = {name: value for name, value in given.items() if value is not None}
+    arguments = {"poll": options.poll, "poll_ms": options.poll_ms}
+    changed = {name: value for name, value in arguments.items() if value is not None}
     try:
         return msgspec.convert(msgspec.to_builtins(saved) | changed, HttpPolling)
     except msgspec.ValidationError as error:

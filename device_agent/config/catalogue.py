@@ -23,12 +23,12 @@ class Catalogue(Generic[Manifest]):
     """Folders of one kind, each with a manifest, in all search paths.
 
     Attributes:
-        what: What a folder describes, for messages.
+        label: Content of a folder, for messages.
         pattern: Path of the manifest relative to a search path; ``*`` is the folder's name.
         read: Reads the manifest of a folder; raises ``ProtocolError``.
     """
 
-    what: str
+    label: str
     pattern: str
     read: Callable[[Path], Manifest]
 
@@ -49,7 +49,7 @@ class Catalogue(Generic[Manifest]):
         known = self.folders()
         if name not in known:
             raise ConfigError(
-                f"no {self.what} '{name}'; known: {', '.join(known)}. To add your own, set {ROBOTS_PATH} to the "
+                f"no {self.label} '{name}'; known: {', '.join(known)}. To add your own, set {ROBOTS_PATH} to the "
                 f"folder that contains {self.pattern.replace('*', name)}"
             )
         return known[name]
@@ -74,14 +74,14 @@ class Catalogue(Generic[Manifest]):
             raise ConfigError(str(error)) from error
 
 
-TYPES = Catalogue(what="robot type", pattern=f"*/{robot_type.MANIFEST}", read=robot_type.load)
-ROOMS = Catalogue(what="room", pattern=f"rooms/*/{room.MANIFEST}", read=room.load)
+TYPES = Catalogue(label="robot type", pattern=f"*/{robot_type.MANIFEST}", read=robot_type.load)
+ROOMS = Catalogue(label="room", pattern=f"rooms/*/{room.MANIFEST}", read=room.load)
 
 
 def search_paths() -> tuple[Path, ...]:
     """Search paths: the shipped folder, then those of ``TELESCOPE_ROBOTS_PATH``."""
-    more = os.environ.get(ROBOTS_PATH, "").split(os.pathsep)
-    return (ROBOTS, *(Path(place).expanduser().resolve() for place in more if place))
+    extra = os.environ.get(ROBOTS_PATH, "").split(os.pathsep)
+    return (ROBOTS, *(Path(path).expanduser().resolve() for path in extra if path))
 
 
 def type_of(entry: DeviceEntry) -> robot_type.RobotType:

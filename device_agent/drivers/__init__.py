@@ -50,4 +50,4 @@ def load(name: str) -> Factory:
     return _PLUG_INS.load(name)
 
 
-_PLUG_INS: PlugIns[Factory] = PlugIns(what="driver", group=GROUP, built_in=_BUILT_IN, error=DriverError)
+_PLUG_INS: PlugIns[Factory] = PlugIns(label="driver", group=GROUP, built_in=_BUILT_IN, error=DriverError)

@@ -69,12 +69,12 @@ class CollisionPairs:
         self._base = base
         lever_arms = LeverArms(model, joints, equality_joints)
         scenery_m = None if robot_type.base is not None else robot_type.margin_m + _BEYOND_M
-        found = _pairs(model, base, lever_arms, scenery_m=scenery_m)
-        self._a = np.array([a for a, _ in found], dtype=np.intp)
-        self._b = np.array([b for _, b in found], dtype=np.intp)
-        self._lever = np.array([lever_arms.between(a, b) for a, b in found]).reshape(len(found), len(joints))
-        self._margin = np.array([robot_type.margin_m] * len(found))
-        self._names = [(_name(model, a), _name(model, b)) for a, b in found]
+        pairs = _pairs(model, base, lever_arms, scenery_m=scenery_m)
+        self._a = np.array([a for a, _ in pairs], dtype=np.intp)
+        self._b = np.array([b for _, b in pairs], dtype=np.intp)
+        self._lever = np.array([lever_arms.between(a, b) for a, b in pairs]).reshape(len(pairs), len(joints))
+        self._margin = np.array([robot_type.margin_m] * len(pairs))
+        self._names = [(_name(model, a), _name(model, b)) for a, b in pairs]
         self._centre = model.geom_aabb[:, :3].copy()
         self._half = model.geom_aabb[:, 3:].copy()
         planes = model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)
@@ -142,9 +142,9 @@ class CollisionPairs:
         for pair in np.argsort(bound).tolist():
             if bound[pair] >= excess:
                 break
-            found = self._measure(data, pair, _FAR_M) - self._margin[pair]
-            if found < excess:
-                excess, between = float(found), self._names[pair]
+            pair_excess = self._measure(data, pair, _FAR_M) - self._margin[pair]
+            if pair_excess < excess:
+                excess, between = float(pair_excess), self._names[pair]
         for index, excesses in enumerate(self._face_excess(data)):
             face = int(np.argmin(excesses))
             if excesses[face] < excess:
@@ -314,15 +314,15 @@ class ApproachingPairs:
 
     def tightest(self) -> Clearance:
         """The worst clearance relative to the start."""
-        worst, found = math.inf, Clearance(math.inf, ("", ""))
+        worst, result = math.inf, Clearance(math.inf, ("", ""))
         for pair, excess in self._excess.items():
             if excess - self._least[pair] < worst:
-                worst, found = excess - self._least[pair], self._pairs.named(pair, excess)
+                worst, result = excess - self._least[pair], self._pairs.named(pair, excess)
         change = self._frame_excess - self._frame_least
         if len(change) and float(np.min(change)) < worst:
             index = int(np.argmin(change))
-            found = self._pairs.face(index, float(self._frame_excess[index]))
-        return found
+            result = self._pairs.face(index, float(self._frame_excess[index]))
+        return result
 
 
 def _left(closing: Floats) -> Floats:
@@ -342,7 +342,7 @@ def _pairs(model: Any, base: int, lever_arms: LeverArms, *, scenery_m: float | N
     candidates = [*static, *own]
     reach_m = {geom: lever_arms.reach_m(geom, base) for geom in own}
     away_m = _away(model, static, base)
-    found = []
+    pairs = []
     for index, a in enumerate(candidates):
         for b in candidates[index + 1 :]:
             if a in away_m and away_m[a] > reach_m.get(b, 0.0) + (scenery_m or 0.0):
@@ -350,8 +350,8 @@ def _pairs(model: Any, base: int, lever_arms: LeverArms, *, scenery_m: float | N
             bodies = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
             if bodies in excluded or bodies[::-1] in excluded or not _meet(model, a, b):
                 continue
-            found.append((a, b))
-    return found
+            pairs.append((a, b))
+    return pairs
 
 
 def _away(model: Any, static: Sequence[int], base: int) -> dict[int, float]:

@@ -38,8 +38,8 @@ class _Narrowed:
         distance = end[self.by] - start[self.by]
         shares = np.empty(0) if distance == 0 else (self.table[0] - start[self.by]) / distance
         inside = shares[(shares > 0) & (shares < 1)]
-        found: Floats = start + np.concatenate(([0.0, 1.0], inside))[:, np.newaxis] * (end - start)
-        return found
+        positions: Floats = start + np.concatenate(([0.0, 1.0], inside))[:, np.newaxis] * (end - start)
+        return positions
 
 
 class JointBounds:

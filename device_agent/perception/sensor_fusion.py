@@ -130,10 +130,10 @@ class SensorFusion:
             self._map(sensor, projection.points(image, depth_m[within], lines[within]), np.asarray(image.position_m))
         foreground = self.background.foreground(sensor, image)
         if foreground is not None:
-            seen = projection.points(image, depth_m[foreground], lines[foreground])
-            seen = self._within(seen[(seen[:, 2] > FLOOR_M) & (seen[:, 2] < self._max_height_m)])
+            points_m = projection.points(image, depth_m[foreground], lines[foreground])
+            points_m = self._within(points_m[(points_m[:, 2] > FLOOR_M) & (points_m[:, 2] < self._max_height_m)])
             with self._lock:
-                self._share(sensor, seen, np.asarray(image.position_m[:2], dtype=np.float64), image.taken_s)
+                self._share(sensor, points_m, np.asarray(image.position_m[:2], dtype=np.float64), image.taken_s)
 
     def _within(self, points_m: Floats) -> Floats:
         low_x, low_y, high_x, high_y = self.inside
@@ -204,10 +204,10 @@ class SensorFusion:
     def brightness(self) -> Mapping[str, float]:
         """Brightness of each zone's floor in the camera images, 0…1: ``brightness.{zone}``."""
         with self._lock:
-            seen = list(self._brightness.values())
+            by_sensor = list(self._brightness.values())
         result = {}
         for zone in self.zones:
-            values = [one[zone.name] for one in seen if zone.name in one]
+            values = [brightness[zone.name] for brightness in by_sensor if zone.name in brightness]
             if values:
                 result[f"brightness.{zone.name}"] = sum(values) / len(values)
         return result

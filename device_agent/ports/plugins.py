@@ -17,13 +17,13 @@ class PlugIns(Generic[Factory]):
     """Factories of one kind, by name.
 
     Attributes:
-        what: What they create, for messages.
+        label: Created objects, for messages.
         group: Entry point group; an entry point is a factory.
         built_in: Name → module with the factory ``create``.
         error: Exception for unknown names.
     """
 
-    what: str
+    label: str
     group: str
     built_in: Mapping[str, str]
     error: type[Exception]
@@ -46,6 +46,6 @@ class PlugIns(Generic[Factory]):
                     return cast("Factory", point.load())
         except (ImportError, AttributeError) as error:
             raise self.error(
-                f"{self.what} '{name}' cannot be loaded: {error}; check that its package is installed"
+                f"{self.label} '{name}' cannot be loaded: {error}; check that its package is installed"
             ) from error
-        raise self.error(f"no {self.what} '{name}'; there are: {', '.join(self.names())}")
+        raise self.error(f"no {self.label} '{name}'; there are: {', '.join(self.names())}")

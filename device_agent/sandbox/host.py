@@ -135,14 +135,14 @@ class SandboxHost:
                 zygote.ready = task, self._fork(zygote, task)
 
     def _fork(self, zygote: "_Zygote", task: "_Task") -> "_HostedProcess":
-        ours, theirs = socket.socketpair()
+        own_end, child_end = socket.socketpair()
         try:
-            with theirs:
-                response, descriptor = zygote.request(task, theirs)
+            with child_end:
+                response, descriptor = zygote.request(task, child_end)
         except SandboxError:
-            ours.close()
+            own_end.close()
             raise
-        return _HostedProcess(zygote, self._lock, ours, response["pid"], descriptor)
+        return _HostedProcess(zygote, self._lock, own_end, response["pid"], descriptor)
 
     def _task(self, zygote: "_Zygote", limits: Limits) -> "_Task":
         return {"layers": self._layers_at(zygote), "cpu_s": limits.cpu_s, "memory_bytes": limits.memory_bytes}
@@ -189,13 +189,13 @@ class _Zygote:
         if self.runs:
             return
         self.close()
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.settimeout(_START_S)
-        with theirs:
+        own_end, child_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        own_end.settimeout(_START_S)
+        with child_end:
             try:
                 self._process = subprocess.Popen(  # noqa: S603 (a file of this package, run by this interpreter)
-                    [*self._wrapper(), sys.executable, "-I", "-B", str(_MAIN), str(theirs.fileno())],
-                    pass_fds=(theirs.fileno(),),
+                    [*self._wrapper(), sys.executable, "-I", "-B", str(_MAIN), str(child_end.fileno())],
+                    pass_fds=(child_end.fileno(),),
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
@@ -204,14 +204,14 @@ class _Zygote:
                     start_new_session=True,
                 )
             except OSError as error:
-                ours.close()
+                own_end.close()
                 raise SandboxError(
                     f"the script sandbox does not start ({error}); check the Python installation"
                 ) from error
-        self._control = ours
-        report, self._pidfd = self._receive(ours)
+        self._control = own_end
+        report, self._pidfd = self._receive(own_end)
         self.missing = report["missing"]
-        ours.settimeout(_RESPONSE_S)
+        own_end.settimeout(_RESPONSE_S)
 
     def take_ready(self, task: "_Task") -> "_HostedProcess | None":
         """The prepared process, if it matches the task and is alive."""

@@ -52,4 +52,4 @@ def load(name: str) -> Factory:
     return _PLUG_INS.load(name)
 
 
-_PLUG_INS: PlugIns[Factory] = PlugIns(what="sensor driver", group=GROUP, built_in=_BUILT_IN, error=SensorError)
+_PLUG_INS: PlugIns[Factory] = PlugIns(label="sensor driver", group=GROUP, built_in=_BUILT_IN, error=SensorError)

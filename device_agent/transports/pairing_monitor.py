@@ -80,7 +80,7 @@ class PairingMonitor:
         try:
             self._announce(api)
             response = call()
-            self._update_keys(responses.read(response, responses.News))
+            self._update_keys(responses.read(response, responses.KeyUpdate))
         except CloudError as error:
             if error.code == "agent-unclaimed":
                 raise self._mark_outdated("this agent was unpaired") from error
@@ -89,13 +89,13 @@ class PairingMonitor:
             raise
         return response
 
-    def _update_keys(self, news: responses.News) -> None:
+    def _update_keys(self, update: responses.KeyUpdate) -> None:
         """Follow key rotations. On failure the link stays useful for Stop and telemetry."""
         try:
-            self._keys.follow(news.key_statements)
+            self._keys.follow(update.key_statements)
         except Refused as refused:
             _log.error("the cloud's new key is not trusted: %s", refused.message)
-        self._keys.check(news.signing_key)
+        self._keys.check(update.signing_key)
 
     def _announce(self, api: CloudClient) -> None:
         if self._announced:

@@ -66,10 +66,10 @@ class Revocations:
             OSError: It could not be written; it stays in effect until the process ends.
         """
         fields = [(field, getattr(revoke, field)) for field in ("client_id", "principal", "token_id")]
-        given = [(field, value) for field, value in fields if value]
-        if len(given) != 1:
+        selectors = [(field, value) for field, value in fields if value]
+        if len(selectors) != 1:
             raise ValueError("a revocation must name exactly one of client_id, principal and token_id")
-        field, value = given[0]
+        field, value = selectors[0]
         by_time = field != "token_id" and revoke.before_s is not None
         entry = _Entry(field, value, revoke.before_s if by_time and revoke.before_s is not None else time.time())
         self._store(entry)

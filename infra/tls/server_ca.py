@@ -154,12 +154,12 @@ def describe(folder: Path, *, now: dt.datetime) -> str:
         alternatives = current.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound as error:
         raise TlsError(f"{folder / CERTIFICATE} has no subjectAltName") from error
-    shown = ", ".join(str(each.value) for each in alternatives)
+    subjects = ", ".join(str(name.value) for name in alternatives)
     remaining = current.not_valid_after_utc - now
     if remaining <= dt.timedelta():
         raise TlsError(f"{folder / CERTIFICATE} expired on {current.not_valid_after_utc:%Y-%m-%d}; renew it")
     warning = "; it expires soon, renew it" if remaining <= dt.timedelta(days=RENEW_DAYS) else ""
-    return f"for {shown}, until {current.not_valid_after_utc:%Y-%m-%d}{warning}"
+    return f"for {subjects}, until {current.not_valid_after_utc:%Y-%m-%d}{warning}"
 
 
 def load(path: Path) -> x509.Certificate:

@@ -123,7 +123,7 @@ def _server(
 def _keys(enrollment: dict[str, Any], pairing: Pairing, clock: CloudClock) -> Finding:
     """Check that this agent trusts the key with which the cloud signs now."""
     try:
-        keys = responses.read(enrollment, responses.News)
+        keys = responses.read(enrollment, responses.KeyUpdate)
         pins = PinnedKeys(pairing, save=lambda _: None, now_ms=clock.now_ms)
         pins.follow(keys.key_statements)
     except (CloudError, Refused) as error:

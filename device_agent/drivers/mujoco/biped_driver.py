@@ -205,8 +205,8 @@ class BipedDriver(MujocoDriver):
     the legs move slowly to the agent's newest command.
     """
 
-    def __init__(self, *, robot_type: RobotType, world: World, device: str, prefix: str = "", **more: Any) -> None:
-        super().__init__(robot_type=robot_type, world=world, device=device, prefix=prefix, **more)
+    def __init__(self, *, robot_type: RobotType, world: World, device: str, prefix: str = "", **options: Any) -> None:
+        super().__init__(robot_type=robot_type, world=world, device=device, prefix=prefix, **options)
         if robot_type.base is None or robot_type.simulation is None or robot_type.simulation.walk is None:
             raise DriverError(f"robot type '{robot_type.type}' has no [base] or no [simulation.walk]; it cannot walk")
         self._limits: Base = robot_type.base

@@ -116,8 +116,8 @@ class WheeledDriver(MujocoDriver):
     sensor, which measures along the site's x axis.
     """
 
-    def __init__(self, *, robot_type: RobotType, world: World, device: str, prefix: str = "", **more: Any) -> None:
-        super().__init__(robot_type=robot_type, world=world, device=device, prefix=prefix, **more)
+    def __init__(self, *, robot_type: RobotType, world: World, device: str, prefix: str = "", **options: Any) -> None:
+        super().__init__(robot_type=robot_type, world=world, device=device, prefix=prefix, **options)
         if robot_type.simulation is None or robot_type.simulation.wheels is None:
             raise DriverError(
                 f"robot type '{robot_type.type}' has no [simulation.wheels]; it cannot be driven on wheels"

@@ -166,8 +166,8 @@ def check_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
         ProtocolError: The limits are not. The message names the fields.
     """
     for diagnostic in diagnostics:
-        given = (diagnostic.low, diagnostic.warning_low, diagnostic.warning_high, diagnostic.high)
-        limits = [limit for limit in given if limit is not None]
+        values = (diagnostic.low, diagnostic.warning_low, diagnostic.warning_high, diagnostic.high)
+        limits = [limit for limit in values if limit is not None]
         if not all(math.isfinite(limit) for limit in limits) or limits != sorted(limits):
             raise ProtocolError(f"diagnostics of '{diagnostic.fields}': low, warning_low, warning_high, high must rise")
 

@@ -295,9 +295,9 @@ def _check_supervision(device: RoomDeviceManifest, where: str) -> None:
     sources = [*streams, *(camera.name for camera in device.cameras)]
     references = [("diagnostics", diagnostic.stream, streams) for diagnostic in device.diagnostics]
     references += [("watch", watch.source, sources) for watch in device.watch]
-    for what, name, known in references:
+    for label, name, known in references:
         if name not in known:
-            raise ProtocolError(f"{what} of {where}: there is no '{name}'; known: {', '.join(known) or 'none'}")
+            raise ProtocolError(f"{label} of {where}: there is no '{name}'; known: {', '.join(known) or 'none'}")
 
 
 def _check_person(person: Person, plan: Plan) -> None:
@@ -327,10 +327,10 @@ def _check_inside(where: str, position_m: Sequence[float], plan: Plan) -> None:
             raise ProtocolError(f"{where} is outside of the plan: {tuple(position_m[:2])}")
 
 
-def _check_names(what: str, names: Sequence[str]) -> None:
+def _check_names(label: str, names: Sequence[str]) -> None:
     duplicates = sorted({name for name in names if list(names).count(name) > 1})
     if duplicates:
-        raise ProtocolError(f"{what}: the name '{duplicates[0]}' is used twice")
+        raise ProtocolError(f"{label}: the name '{duplicates[0]}' is used twice")
 
 
 def _check_finite(where: str, values: Iterable[float]) -> None:

@@ -42,14 +42,14 @@ def convert(text: str, kind: type[Manifest]) -> Manifest:
         raise ProtocolError(str(error)) from error
 
 
-def check_positive(what: str, value: float) -> None:
+def check_positive(label: str, value: float) -> None:
     """Require a finite number above 0.
 
     Raises:
         ProtocolError: The number is not.
     """
     if not 0 < value < math.inf:
-        raise ProtocolError(f"{what} is {value}; it must be above 0 and finite")
+        raise ProtocolError(f"{label} is {value}; it must be above 0 and finite")
 
 
 def check_box(where: str, lower_m: Sequence[float], upper_m: Sequence[float]) -> None:
@@ -63,7 +63,7 @@ def check_box(where: str, lower_m: Sequence[float], upper_m: Sequence[float]) ->
             raise ProtocolError(f"{where}: lower_m must be below upper_m everywhere, and all of them finite")
 
 
-def check_known(where: str, what: str, named: Sequence[str], known: Collection[str]) -> None:
+def check_known(where: str, label: str, named: Sequence[str], known: Collection[str]) -> None:
     """Require known names.
 
     Raises:
@@ -71,4 +71,4 @@ def check_known(where: str, what: str, named: Sequence[str], known: Collection[s
     """
     for name in named:
         if name not in known:
-            raise ProtocolError(f"{where}: no {what} '{name}'; there are: {', '.join(known)}")
+            raise ProtocolError(f"{where}: no {label} '{name}'; there are: {', '.join(known)}")

@@ -70,9 +70,9 @@ def covering(principal: str) -> tuple[str, ...]:
     """
     parts = principal.split(":")
     whole = [parts[:length] for length in range(1, len(parts) + 1)]
-    found = [":".join(some) for some in whole]
-    found += [":".join((*some[:place], "+", *some[place + 1 :])) for some in whole for place in range(len(some))]
-    return tuple(found)
+    names = [":".join(some) for some in whole]
+    names += [":".join((*some[:index], "+", *some[index + 1 :])) for some in whole for index in range(len(some))]
+    return tuple(names)
 
 
 def issue(grant: Grant, key: Ed25519PrivateKey) -> str:

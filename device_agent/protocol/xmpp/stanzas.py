@@ -166,8 +166,8 @@ def requested_topics(stanza: Element) -> tuple[str, ...]:
 
 def receipt_id(stanza: Element) -> str | None:
     """Id of the message that this receipt confirms, or ``None``."""
-    found = stanza.find(f"{{{RECEIPTS}}}received")
-    return None if found is None or stanza.get("type") == "error" else found.get("id", "")
+    element = stanza.find(f"{{{RECEIPTS}}}received")
+    return None if element is None or stanza.get("type") == "error" else element.get("id", "")
 
 
 def parse_rejection(stanza: Element) -> Rejection | None:

@@ -38,13 +38,13 @@ class PoseEstimator:
             Refused: There is no recent position.
         """
         wheels = _position(odometry, "")
-        seen = _position(room, f".{self._name}")
+        observed = _position(room, f".{self._name}")
         if wheels is None:
-            if seen is None or "yaw_rad" not in seen:
+            if observed is None or "yaw_rad" not in observed:
                 raise Refused("no_position", "the position of the robot is unknown; the robot does not move")
-            return Pose2D(seen["x_m"], seen["y_m"], seen["yaw_rad"])
-        if seen is not None:
-            x, y = seen["x_m"] - wheels["x_m"], seen["y_m"] - wheels["y_m"]
+            return Pose2D(observed["x_m"], observed["y_m"], observed["yaw_rad"])
+        if observed is not None:
+            x, y = observed["x_m"] - wheels["x_m"], observed["y_m"] - wheels["y_m"]
             before = self._offset or (x, y)
             self._offset = before[0] + _ROOM_WEIGHT * (x - before[0]), before[1] + _ROOM_WEIGHT * (y - before[1])
         x, y = self._offset or (0.0, 0.0)

@@ -25,7 +25,7 @@ _SOUNDS = {
     "nn": "n l",
     "RR": "r",
 }
-_BY_LETTERS = {letters: shape for shape, listed in _SOUNDS.items() for letters in listed.split()}
+_BY_LETTERS = {letters: shape for shape, sounds in _SOUNDS.items() for letters in sounds.split()}
 _NEAREST = {
     "E": ("ih", "aa"),
     "ih": ("E", "aa"),

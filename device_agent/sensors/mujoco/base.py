@@ -142,7 +142,7 @@ class SimulatedSensor:
         """
 
     def on_close(self) -> None:
-        """Release what ``on_connect`` acquired."""
+        """Release the resources of ``on_connect``."""
 
     def require(self) -> None:
         """Check the connection.
@@ -175,9 +175,9 @@ class SimulatedSensor:
         lower, upper = model.actuator_ctrlrange[index].tolist()
         return _Servo(name, control, (lower, upper), int(model.jnt_qposadr[model.actuator_trnid[index, 0]]))
 
-    def _reject_unknown(self, what: str, name: str, known: Any) -> NoReturn:
+    def _reject_unknown(self, label: str, name: str, known: Any) -> NoReturn:
         available = ", ".join(known) or "none"
-        raise SensorError(f"'{self._device.name}' has no {what} '{name[:80]}'; it has: {available}")
+        raise SensorError(f"'{self._device.name}' has no {label} '{name[:80]}'; it has: {available}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -343,9 +343,9 @@ class PerceptionDriver:
             if isinstance(raw, Image) and raw.depth_m is None:
                 self._next_s[name] = self._sampled_s + COLOURS_EVERY_S
 
-    def _reject_unknown(self, what: str, name: str, known: tuple[str, ...]) -> NoReturn:
+    def _reject_unknown(self, label: str, name: str, known: tuple[str, ...]) -> NoReturn:
         available = ", ".join(known) or "none"
-        raise SensorError(f"'{self._device.name}' has no {what} '{name[:80]}'; it has: {available}")
+        raise SensorError(f"'{self._device.name}' has no {label} '{name[:80]}'; it has: {available}")
 
 
 def _flat(positions: Mapping[str, ObjectPosition]) -> dict[str, float]:

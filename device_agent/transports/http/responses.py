@@ -82,7 +82,7 @@ class Certificate(Struct, frozen=True, kw_only=True):
     chain: str
 
 
-class News(Struct, frozen=True, kw_only=True):
+class KeyUpdate(Struct, frozen=True, kw_only=True):
     """Key rotations: statements that lead to the newest key, and the key that signs commands now."""
 
     key_statements: tuple[Statement, ...] = ()

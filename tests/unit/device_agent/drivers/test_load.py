@@ -19,8 +19,8 @@ CREATE: object = mujoco_driver.create
 
 def third_party(monkeypatch: pytest.MonkeyPatch, **points: str) -> None:
     """Simulate installed packages with these entry points."""
-    offered = EntryPoints(EntryPoint(name, value, drivers.GROUP) for name, value in points.items())
-    monkeypatch.setattr(plugins, "entry_points", lambda *, group: offered.select(group=group))
+    entry_points_ = EntryPoints(EntryPoint(name, value, drivers.GROUP) for name, value in points.items())
+    monkeypatch.setattr(plugins, "entry_points", lambda *, group: entry_points_.select(group=group))
 
 
 def test_unknown_driver_error_lists_the_valid_names(monkeypatch: pytest.MonkeyPatch):

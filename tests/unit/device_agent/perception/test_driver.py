@@ -90,10 +90,10 @@ def neighbours():
 
 @pytest.fixture
 def driver(folder, neighbours):
-    made = create(device(survey="survey.npz", light="light"), folder, Surroundings(neighbours=neighbours))
-    made.connect()
-    yield made
-    made.close()
+    driver = create(device(survey="survey.npz", light="light"), folder, Surroundings(neighbours=neighbours))
+    driver.connect()
+    yield driver
+    driver.close()
 
 
 def until(read, accepted, timeout_s=60):

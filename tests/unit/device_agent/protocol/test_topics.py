@@ -19,12 +19,12 @@ def mqtt_match(pattern: list[str], topic: list[str]) -> bool:
     if topic and topic[0].startswith("$") and pattern and pattern[0] in {"+", "#"}:
         return False
 
-    def walk(wanted: list[str], given: list[str]) -> bool:
-        if not wanted:
-            return not given
-        if wanted[0] == "#":
+    def walk(pattern: list[str], levels: list[str]) -> bool:
+        if not pattern:
+            return not levels
+        if pattern[0] == "#":
             return True
-        return bool(given) and wanted[0] in {"+", given[0]} and walk(wanted[1:], given[1:])
+        return bool(levels) and pattern[0] in {"+", levels[0]} and walk(pattern[1:], levels[1:])
 
     return walk(pattern, topic)
 

@@ -28,15 +28,15 @@ def short_periods(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def make_device(tmp_path: Path) -> Iterator[MakeDevice]:
     """Starts and connects devices; another call restarts the device."""
-    made: list[DeviceHarness] = []
+    harnesses: list[DeviceHarness] = []
 
     def make(**parts: Any) -> DeviceHarness:
-        made.append(DeviceHarness(tmp_path, **parts))
-        made[-1].start()
-        return made[-1]
+        harnesses.append(DeviceHarness(tmp_path, **parts))
+        harnesses[-1].start()
+        return harnesses[-1]
 
     yield make
-    for harness in made:
+    for harness in harnesses:
         harness.stop()
 
 

@@ -63,10 +63,10 @@ def place_driver(world: World, name: str) -> driver.MujocoDriver:
     robot = MANIFEST.robot(name)
     assert robot is not None
     kind = robot_type.load(ROBOTS / robot.type)
-    made = driver._driver_class(kind)(robot_type=kind, world=world, device=name, prefix=world_registry.prefix(name))
-    made._resolve(world.model)
-    made._connected = True
-    return made
+    placed = driver._driver_class(kind)(robot_type=kind, world=world, device=name, prefix=world_registry.prefix(name))
+    placed._resolve(world.model)
+    placed._connected = True
+    return placed
 
 
 def test_robots_start_at_their_manifest_poses():

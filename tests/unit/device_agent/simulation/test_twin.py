@@ -182,5 +182,5 @@ def test_the_web_fixture_is_up_to_date() -> None:
         return bool(one == (pytest.approx(other, rel=1e-9, abs=1e-9) if isinstance(one, float) else other))
 
     fixtures = ROBOTS.parent / "web" / "tests" / "fixtures"
-    made = runpy.run_path(str(fixtures / "make.py"))["content"]()
-    assert equal(made, json.loads((fixtures / "ur5.json").read_text(encoding="utf-8")))
+    content = runpy.run_path(str(fixtures / "make.py"))["content"]()
+    assert equal(content, json.loads((fixtures / "ur5.json").read_text(encoding="utf-8")))

@@ -50,12 +50,12 @@ class FakeProcess:
     """A process with preset messages."""
 
     def __init__(self, *, exits: bool = True) -> None:
-        self.link, self.theirs = socket.socketpair()
+        self.link, self.script_end = socket.socketpair()
         self.exits = exits
         self.killed = False
 
     def send(self, *lines: bytes) -> None:
-        self.theirs.sendall(b"".join(line + b"\n" for line in lines))
+        self.script_end.sendall(b"".join(line + b"\n" for line in lines))
 
     def kill(self) -> None:
         self.killed = True
@@ -69,7 +69,7 @@ class FakeProcess:
 
     def close(self) -> None:
         self.link.close()
-        self.theirs.close()
+        self.script_end.close()
 
 
 class FakeSandbox:

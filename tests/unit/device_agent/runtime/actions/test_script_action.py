@@ -66,11 +66,11 @@ def test_play_is_split_at_keyframes_with_other_calls() -> None:
         "robot.play([{'time_s': 0, 'say': 'end'}])\n"
         "robot.play([])\n"
     )
-    there = script_calls.PlayKeyframe(time_s=1, position_rad={"elbow": 0.2})
+    keyframe = script_calls.PlayKeyframe(time_s=1, position_rad={"elbow": 0.2})
     assert api.received == [
         ({"elbow": 0.1}, 0.25),
         protocol.Say(text="off", language=""),
-        script_calls.Play(keyframes=(there, script_calls.PlayKeyframe(time_s=2)), first=2, speed=0.5),
+        script_calls.Play(keyframes=(keyframe, script_calls.PlayKeyframe(time_s=2)), first=2, speed=0.5),
         protocol.TakePosture(name="Sit", speed=0.5),
         protocol.Express(name="smile", strength=1),
         protocol.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0, duration_s=2),

@@ -97,7 +97,7 @@ def test_an_endless_line_ends_the_script() -> None:
 
     def flood() -> None:
         with contextlib.suppress(OSError):
-            process.theirs.sendall(b" " * (4 * script_calls.MAX_LINE))
+            process.script_end.sendall(b" " * (4 * script_calls.MAX_LINE))
 
     thread = threading.Thread(target=flood)
     thread.start()
@@ -123,7 +123,7 @@ def test_repeated_and_invalid_messages_are_answered_with_errors() -> None:
         b'{"kind": "output", "text": "x"}',
         b'{"kind": "ended", "error": ""}',
     )
-    answers = process.theirs.dup()
+    answers = process.script_end.dup()
     output = run_fake(process)
     assert (output.printed, output.progress) == ("x", [])
     script, repeated, invalid = (json.loads(line) for line in answers.makefile("rb").read().splitlines())
@@ -134,13 +134,13 @@ def test_repeated_and_invalid_messages_are_answered_with_errors() -> None:
 
 
 def test_a_flooding_script_is_throttled(monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
+    agent_end, script_end = socket.socketpair()
+    with agent_end, script_end:
         killed = threading.Event()
         waited: list[float] = []
         monkeypatch.setattr(killed, "wait", waited.append)
-        lines = script_action._LineReader(ours, killed)
-        theirs.sendall(b"{}\n" * 700)
+        lines = script_action._LineReader(agent_end, killed)
+        script_end.sendall(b"{}\n" * 700)
         for _ in range(700):
             assert lines.read() == b"{}"
     assert len(waited) > 100

@@ -62,16 +62,16 @@ MakeLoop = Callable[..., LoopFixture]
 @pytest.fixture
 def make_loop() -> Iterator[MakeLoop]:
     """Starts control loops, and waits for their first period."""
-    made: list[LoopFixture] = []
+    fixtures: list[LoopFixture] = []
 
     def make(*args: Any, **options: Any) -> LoopFixture:
-        made.append(LoopFixture(*args, **options))
-        made[-1].loop.start()
-        wait_until(lambda: made[-1].loop._next_s > time.monotonic(), "the first period")
-        return made[-1]
+        fixtures.append(LoopFixture(*args, **options))
+        fixtures[-1].loop.start()
+        wait_until(lambda: fixtures[-1].loop._next_s > time.monotonic(), "the first period")
+        return fixtures[-1]
 
     yield make
-    for setup in made:
+    for setup in fixtures:
         setup.loop.stop()
 
 

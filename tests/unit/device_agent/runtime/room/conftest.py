@@ -13,15 +13,15 @@ MakeRoomDevice = Callable[..., RoomDeviceHarness]
 
 @pytest.fixture
 def make_room_device(tmp_path: Path) -> Iterator[MakeRoomDevice]:
-    made: list[RoomDeviceHarness] = []
+    harnesses: list[RoomDeviceHarness] = []
 
     def make(**parts: Any) -> RoomDeviceHarness:
-        made.append(RoomDeviceHarness(tmp_path, **parts))
-        made[-1].start()
-        return made[-1]
+        harnesses.append(RoomDeviceHarness(tmp_path, **parts))
+        harnesses[-1].start()
+        return harnesses[-1]
 
     yield make
-    for harness in made:
+    for harness in harnesses:
         harness.stop()
 
 
