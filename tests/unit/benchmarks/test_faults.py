@@ -17,7 +17,7 @@ def requested(number: int, status: str) -> RequestedAction:
     return RequestedAction(number, "none", 0.0, f"a{number}" if status else "", status)
 
 
-def test_accepted_actions_without_an_end_are_lost_and_actions_with_two_starts_are_duplicated() -> None:
+def test_unfinished_accepted_actions_are_lost_and_actions_with_two_starts_are_duplicated() -> None:
     actions = [requested(1, "done"), requested(2, "started"), requested(3, ""), requested(4, "expired")]
     assert lost(actions) == [actions[1]]
     assert duplicated(actions, {"a1": 1, "a4": 2}) == [actions[3]]
@@ -31,7 +31,7 @@ def test_accepted_actions_without_an_end_are_lost_and_actions_with_two_starts_ar
         ((5, 6, 0, 7), 0),  # a restarted simulation begins at zero
     ],
 )
-def test_a_repeated_earlier_move_is_found_in_the_record(steps: tuple[float, ...], count: int) -> None:
+def test_a_return_to_an_earlier_target_is_counted(steps: tuple[float, ...], count: int) -> None:
     assert count_returns([number * STEP_RAD for number in steps for _ in range(5)]) == count
     assert count_returns([each * 1e-4 for each in range(100)]) == 0, "positions on the method are not targets"
 

@@ -51,7 +51,7 @@ def test_a_rate_is_carried_if_nothing_is_lost_or_late(
     assert (lost.holds, late.holds) == (received == 10, p99_ms < 50)
 
 
-def test_a_client_sends_the_next_request_after_a_complete_response_and_counts_last_errors() -> None:
+def test_a_client_sends_the_next_request_after_a_complete_response_and_counts_rejections() -> None:
     async def run() -> RawHttpConnection:
         connection, transport = RawHttpConnection([b"second", b"first"]), Mock(spec=asyncio.Transport)
         connection.connection_made(transport)
