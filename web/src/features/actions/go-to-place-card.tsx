@@ -46,7 +46,7 @@ export function GoToPlaceCard({ session, disabledReason, fleet }: ActionCardProp
       {plan.extent === null ? (
         <p class="quiet">{plan.perception === null ? texts.planMissing : texts.planWaiting}</p>
       ) : (
-        <Drawing {...plan} extent={plan.extent} hung={[]} trails={null} target={target} onPick={pick} />
+        <Drawing {...plan} extent={plan.extent} mounted={[]} trails={null} target={target} onPick={pick} />
       )}
       <p class="quiet small">{texts.placeNote}</p>
       <div class="act-numbers">

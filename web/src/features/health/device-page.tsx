@@ -1,6 +1,6 @@
 /** Health of one device: monitored fields with trends, and faults from the first report to the end. */
 import type { DeviceStore } from "../devices/model";
-import { shown } from "../sensors";
+import { valueText } from "../sensors";
 import { type Quantity, quantityOf } from "../sensors/model";
 import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
@@ -223,7 +223,7 @@ function Field({ device, watched, quantity, chosen, show }: FieldProps) {
   const newest = newestOf(device, stream, field);
   const value = newest === null ? watched.value : Number(newest.value);
   const old = newest === null || isLate(device, stream);
-  const text = (one: number): string => `${shown(quantity, one)} ${quantity.unit}`.trim();
+  const text = (one: number): string => `${valueText(quantity, one)} ${quantity.unit}`.trim();
   const span = (low: number | null, high: number | null): string => texts.health.span(low === null ? null : text(low), high === null ? null : text(high));
   return (
     <tr data-testid="watched-row" data-field={`${stream}.${field}`}>

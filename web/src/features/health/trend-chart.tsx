@@ -1,6 +1,6 @@
 /** One measured field over hours to weeks: the stored series with minimum and maximum, continued live. */
 import type { DeviceStore } from "../devices/model";
-import { Figure, HistoryCard, Limits, shown, useRecording } from "../sensors";
+import { Figure, HistoryCard, Limits, valueText, useRecording } from "../sensors";
 import type { Quantity, Recording } from "../sensors/model";
 import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
@@ -32,7 +32,7 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
   const [span, setSpan] = useState<Span>("hour");
   const [view, setView] = useState<"chart" | "table">("chart");
   const spanMs = SPAN_MS[span];
-  const { recording, trouble } = useRecording(api, device, quantity, spanMs);
+  const { recording, error } = useRecording(api, device, quantity, spanMs);
   const newest = newestOf(device, quantity.stream, quantity.field);
   const late = isLate(device, quantity.stream);
   const low = watched?.usual_low ?? null;
@@ -41,7 +41,7 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
   const since = serverNow() - spanMs;
   const inSpan = fieldFaults.filter(({ cleared_at: end }) => end === null || Date.parse(end) >= since);
   const marks = {
-    usual: low === null || high === null ? null : ([quantity.shown(low), quantity.shown(high)] as const),
+    usual: low === null || high === null ? null : ([quantity.toDisplay(low), quantity.toDisplay(high)] as const),
     faults: inSpan.map(({ raised_at, cleared_at, severity }) => ({
       from: Date.parse(raised_at) / 1000,
       to: cleared_at === null ? null : Date.parse(cleared_at) / 1000,
@@ -71,7 +71,7 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
       ) : (
         <Rows recording={recording} quantity={quantity} spanMs={spanMs} />
       )}
-      {quantity.judged !== null && <Limits quantity={quantity} />}
+      {quantity.limits !== null && <Limits quantity={quantity} />}
       {watched !== null && <p class="quiet small">{usual(watched, quantity)}</p>}
       {inSpan.length > 0 && (
         <ul class="trend-faults" aria-label={texts.trend.faults}>
@@ -86,16 +86,16 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
           ))}
         </ul>
       )}
-      {trouble !== "" && <p class="quiet small">{texts.trend.noHistory(trouble)}</p>}
+      {error !== "" && <p class="quiet small">{texts.trend.noHistory(error)}</p>}
     </Card>
   );
 }
 
 /** The learned range and trend as text. */
 function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_in_s: limitInS }: MonitoredField, quantity: Quantity): string {
-  const text = (value: number): string => `${shown(quantity, value)} ${quantity.unit}`.trim();
+  const text = (value: number): string => `${valueText(quantity, value)} ${quantity.unit}`.trim();
   const sentences = [low === null || high === null ? texts.trend.learning : texts.trend.usual(text(low), text(high))];
-  const perMinute = slope === null ? 0 : (quantity.shown(slope) - quantity.shown(0)) * 60;
+  const perMinute = slope === null ? 0 : (quantity.toDisplay(slope) - quantity.toDisplay(0)) * 60;
   if (Math.abs(perMinute) >= 0.0005) sentences.push(texts.trend.slope(perMinute > 0, `${Math.abs(perMinute).toPrecision(2)} ${quantity.unit}`));
   if (limitInS !== null) sentences.push(texts.trend.limitIn(format.duration(limitInS)));
   return sentences.join(" ");
@@ -125,7 +125,7 @@ function Rows({ recording, quantity, spanMs }: { recording: Recording; quantity:
               <tr key={one.at}>
                 <th scope="row">{format.recentTime(one.at)}</th>
                 {[one.mean, one.low, one.high].map((value, index) => (
-                  <td key={index}>{`${shown(quantity, value)} ${quantity.unit}`}</td>
+                  <td key={index}>{`${valueText(quantity, value)} ${quantity.unit}`}</td>
                 ))}
               </tr>
             ))}

@@ -41,23 +41,23 @@ export function CameraCard({ device, name, roomAction, title, aside }: CameraCar
   const [running, setRunning] = useState(false);
   const [shown, setShown] = useState<Shown | null>(null);
   const [rate, setRate] = useState(0);
-  const [trouble, setTrouble] = useState("");
+  const [error, setError] = useState("");
 
   useEffect(() => {
     if (!running) return;
     const painter = new Painter(canvas, (frame, arrivals) => {
       setShown({ kind: "live", width: frame.width, height: frame.height, at: arrivals.at(-1) ?? now() });
       setRate(arrivals.length / Math.max(0.5, Math.min(RATE_OVER_MS, now() - (arrivals[0] ?? 0)) / 1000));
-      setTrouble("");
-    }, () => setTrouble(texts.camera.undecodable));
-    const end = device.watchCamera(name, (frame) => painter.take(frame));
+      setError("");
+    }, () => setError(texts.camera.undecodable));
+    const end = device.watchCamera(name, (frame) => painter.push(frame));
     return () => {
       end();
       painter.dispose();
     };
   }, [device, name, running]);
 
-  const once = async (): Promise<void> => {
+  const takeImage = async (): Promise<void> => {
     const taken = await roomAction?.capture("image");
     if (taken === null || taken === undefined || canvas.current === null) return;
     try {
@@ -66,9 +66,9 @@ export function CameraCard({ device, name, roomAction, title, aside }: CameraCar
       setRunning(false);
       setShown({ kind: "still", width: image.width, height: image.height, at: now() });
       image.close();
-      setTrouble("");
+      setError("");
     } catch (error) {
-      setTrouble(sentence(error));
+      setError(sentence(error));
     }
   };
 
@@ -76,7 +76,7 @@ export function CameraCard({ device, name, roomAction, title, aside }: CameraCar
   const silentMs = shown === null ? 0 : clock.value - shown.at;
   const stalled = running && shown?.kind === "live" && silentMs > Math.max(STALLED_MS, 3000 / rateHz);
   const old = stalled || (shown?.kind === "live" && !running) || !device.live.value;
-  const no = unavailableReason(device);
+  const unavailable = unavailableReason(device);
   return (
     <Card title={title ?? texts.camera.title(name)} class="picture" aside={aside}>
       <div class="canvas-box image-box">
@@ -110,17 +110,17 @@ export function CameraCard({ device, name, roomAction, title, aside }: CameraCar
           <button
             type="button"
             data-testid="camera-shot"
-            disabled={no !== "" || roomAction.busy.value !== null}
-            title={no}
-            onClick={() => void once()}
+            disabled={unavailable !== "" || roomAction.busy.value !== null}
+            title={unavailable}
+            onClick={() => void takeImage()}
           >
             {roomAction.busy.value === "capture" ? texts.camera.taking : texts.camera.shot}
           </button>
         )}
         <span class="quiet small">{shown !== null && <Caption shown={shown} running={running} rate={rate} />}</span>
       </div>
-      {roomAction !== null && roomAction.why.value !== "" && <p class="notice bad">{roomAction.why.value}</p>}
-      {trouble !== "" && <p class="notice bad">{trouble}</p>}
+      {roomAction !== null && roomAction.error.value !== "" && <p class="notice bad">{roomAction.error.value}</p>}
+      {error !== "" && <p class="notice bad">{error}</p>}
     </Card>
   );
 }
@@ -152,7 +152,7 @@ class Painter {
     this.#failed = failed;
   }
 
-  take(frame: CameraFrame): void {
+  push(frame: CameraFrame): void {
     const at = now();
     this.#arrivals = [...this.#arrivals.filter((one) => one > at - RATE_OVER_MS), at];
     this.#next = frame;

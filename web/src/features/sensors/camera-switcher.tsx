@@ -10,7 +10,7 @@ interface View {
   camera: string;
 }
 
-interface WatchingProps {
+interface CameraSwitcherProps {
   device: DeviceStore;
   views: readonly View[];
 }
@@ -22,17 +22,17 @@ export function useCameraSources(fleet: Fleet, device: DeviceStore): readonly Vi
   const others = [...(all?.values() ?? [])].filter(({ id, info }) => id !== device.id && info.value.space === space);
   const ids = others.map(({ id }) => id).join();
   useEffect(() => {
-    const ends = others.map((one) => one.watchDescription());
-    return () => ends.forEach((end) => end());
+    const unsubscribers = others.map((one) => one.watchDescription());
+    return () => unsubscribers.forEach((end) => end());
   }, [ids]);
   return [device, ...others].flatMap((one) =>
     (one.description.value?.cameras ?? []).map(({ name }) => ({ key: `${one.id}/${name}`, device: one, camera: name })),
   );
 }
 
-export function CameraSwitcher({ device, views }: WatchingProps) {
-  const [chosen, setChosen] = useState("");
-  const view = views.find(({ key }) => key === chosen) ?? views[0];
+export function CameraSwitcher({ device, views }: CameraSwitcherProps) {
+  const [selected, setSelected] = useState("");
+  const view = views.find(({ key }) => key === selected) ?? views[0];
   if (view === undefined) return null;
   const name = ({ device: of, camera }: View): string =>
     of === device ? texts.cameraSource.own(camera) : texts.cameraSource.from(of.info.value.label, camera);
@@ -41,7 +41,7 @@ export function CameraSwitcher({ device, views }: WatchingProps) {
       aria-label={texts.cameraSource.choose}
       data-testid="watch-from"
       value={view.key}
-      onChange={(event) => setChosen(event.currentTarget.value)}
+      onChange={(event) => setSelected(event.currentTarget.value)}
     >
       {views.map((one) => (
         <option key={one.key} value={one.key}>

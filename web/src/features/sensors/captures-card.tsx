@@ -10,8 +10,8 @@ import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 
-/** Captures with a card of their own. */
-const SHOWN_ELSEWHERE = ["image", "depth", "scan"];
+/** Captures that have their own card. */
+const WITH_OWN_CARD = ["image", "depth", "scan"];
 
 interface FilesProps {
   device: DeviceStore;
@@ -21,28 +21,28 @@ interface FilesProps {
 /** Captured files, with download links. */
 export function CapturesCard({ device, roomAction }: FilesProps) {
   const uploads = roomAction.uploads.value;
-  const more = (device.description.value?.captures ?? []).filter((name) => !SHOWN_ELSEWHERE.includes(name));
-  const no = unavailableReason(device);
-  const [taking, setTaking] = useState("");
-  const take = async (name: string): Promise<void> => {
-    setTaking(name);
+  const otherCaptures = (device.description.value?.captures ?? []).filter((name) => !WITH_OWN_CARD.includes(name));
+  const unavailable = unavailableReason(device);
+  const [capturing, setCapturing] = useState("");
+  const capture = async (name: string): Promise<void> => {
+    setCapturing(name);
     await roomAction.capture(name);
-    setTaking("");
+    setCapturing("");
   };
   return (
     <Card title={texts.files.title}>
-      {more.length > 0 && (
+      {otherCaptures.length > 0 && (
         <div class="row">
-          {more.map((name) => (
+          {otherCaptures.map((name) => (
             <button
               key={name}
               type="button"
               data-testid={`capture-${name}`}
-              disabled={no !== "" || roomAction.busy.value !== null}
-              title={no}
-              onClick={() => void take(name)}
+              disabled={unavailable !== "" || roomAction.busy.value !== null}
+              title={unavailable}
+              onClick={() => void capture(name)}
             >
-              {taking === name ? texts.files.taking : texts.files.take(name)}
+              {capturing === name ? texts.files.capturing : texts.files.capture(name)}
             </button>
           ))}
         </div>
@@ -64,7 +64,7 @@ function File({ upload, roomAction }: { upload: Upload; roomAction: RoomDeviceAc
   const name = upload.name === "" ? upload.stream : upload.name;
   const download = async (): Promise<void> => {
     // The address is valid for one hour, so request it on demand.
-    const found = await roomAction.find(upload.id);
+    const found = await roomAction.file(upload.id);
     if (found === null) return;
     const link = document.createElement("a");
     link.href = found.url;

@@ -29,19 +29,19 @@ export function DepthCard({ device, roomAction }: { device: DeviceStore; roomAct
   const scale = useRef<HTMLCanvasElement>(null);
   const [drawn, setDrawn] = useState<Drawn | null>(null);
   const [point, setPoint] = useState<Point | null>(null);
-  const [trouble, setTrouble] = useState("");
+  const [error, setError] = useState("");
 
-  const take = async (): Promise<void> => {
-    const taken = await roomAction.capture("depth");
-    if (taken === null) return;
+  const capture = async (): Promise<void> => {
+    const file = await roomAction.capture("depth");
+    if (file === null) return;
     try {
-      const picture = await readDepth(await contentOf(taken));
-      const seen = picture.depthM.filter((m) => m > 0).sort();
-      const [nearM, farM] = [seen[0] ?? 0, seen.at(-1) ?? 1];
-      setDrawn({ ...picture, nearM: Math.floor(nearM * 10) / 10, farM: Math.ceil(farM * 10) / 10, at: now() });
-      setTrouble("");
+      const image = await readDepth(await contentOf(file));
+      const distances = image.depthM.filter((m) => m > 0).sort();
+      const [nearM, farM] = [distances[0] ?? 0, distances.at(-1) ?? 1];
+      setDrawn({ ...image, nearM: Math.floor(nearM * 10) / 10, farM: Math.ceil(farM * 10) / 10, at: now() });
+      setError("");
     } catch (error) {
-      setTrouble(sentence(error));
+      setError(sentence(error));
     }
   };
 
@@ -72,7 +72,7 @@ export function DepthCard({ device, roomAction }: { device: DeviceStore; roomAct
     });
   };
 
-  const no = unavailableReason(device);
+  const unavailable = unavailableReason(device);
   const busy = roomAction.busy.value !== null;
   return (
     <Card title={texts.depth.title} class="picture">
@@ -112,15 +112,15 @@ export function DepthCard({ device, roomAction }: { device: DeviceStore; roomAct
         </p>
       )}
       <div class="row">
-        <button type="button" class="primary" data-testid="depth-shot" disabled={no !== "" || busy} title={no} onClick={() => void take()}>
+        <button type="button" class="primary" data-testid="depth-shot" disabled={unavailable !== "" || busy} title={unavailable} onClick={() => void capture()}>
           {busy ? texts.camera.taking : drawn === null ? texts.depth.shot : texts.depth.again}
         </button>
         <span class="quiet small">
-          {drawn !== null && <Age at={drawn.at} as={(age) => texts.depth.taken(drawn.width, drawn.height, age)} />}
+          {drawn !== null && <Age at={drawn.at} as={(age) => texts.depth.captured(drawn.width, drawn.height, age)} />}
         </span>
       </div>
-      {roomAction.why.value !== "" && <p class="notice bad">{roomAction.why.value}</p>}
-      {trouble !== "" && <p class="notice bad">{trouble}</p>}
+      {roomAction.error.value !== "" && <p class="notice bad">{roomAction.error.value}</p>}
+      {error !== "" && <p class="notice bad">{error}</p>}
     </Card>
   );
 }
@@ -131,7 +131,7 @@ function percent(value: number, of: number): string {
 
 function reading({ depthM, width }: Drawn, { x, y }: Point): string {
   const m = depthM[y * width + x] ?? 0;
-  return m > 0 ? texts.depth.read(m.toFixed(2)) : texts.depth.readNothing;
+  return m > 0 ? texts.depth.read(m.toFixed(2)) : texts.depth.outOfRange;
 }
 
 function paint(canvas: HTMLCanvasElement, { width, height, depthM, nearM, farM }: Drawn): void {

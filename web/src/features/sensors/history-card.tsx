@@ -17,13 +17,13 @@ import { colour, onColourChange } from "../../shared/ui/canvas-theme";
 const DRAW_EVERY_MS = 500;
 const POINTS = 400;
 /** The cloud stores measurements with a delay: reloading after this time closes the gap to the live data [ms]. */
-const AGAIN_MS = 30_000;
-const FAR = 10;
+const RELOAD_MS = 30_000;
+const PAGE_STEP = 10;
 
 /** Stored and live samples of a time span. `loads` increases with each response. */
 export function useRecording(api: Api, device: DeviceStore, { stream, field }: Quantity, spanMs: number) {
   const recording = useMemo(() => new Recording(), [device, stream, field]);
-  const [trouble, setTrouble] = useState("");
+  const [error, setError] = useState("");
   const [loads, setLoads] = useState(0);
   useEffect(
     () =>
@@ -34,30 +34,30 @@ export function useRecording(api: Api, device: DeviceStore, { stream, field }: Q
     [recording, device, stream, field],
   );
   useEffect(() => {
-    let wanted = true;
+    let active = true;
     const load = (): void => {
       api.series(device.id, stream, serverNow() - spanMs, POINTS, field).then(
         (series) => {
-          if (!wanted) return;
+          if (!active) return;
           recording.load(series, field);
-          setTrouble("");
+          setError("");
           setLoads((count) => count + 1);
         },
         (error: unknown) => {
-          // Nothing is stored yet.
+          // No measurements are stored yet.
           const unknown = error instanceof ApiError && error.status === 404;
-          if (wanted && !unknown) setTrouble(sentence(error));
+          if (active && !unknown) setError(sentence(error));
         },
       );
     };
     load();
-    const timer = setInterval(load, AGAIN_MS);
+    const timer = setInterval(load, RELOAD_MS);
     return () => {
-      wanted = false;
+      active = false;
       clearInterval(timer);
     };
   }, [api, device, recording, stream, field, spanMs]);
-  return { recording, trouble, loads };
+  return { recording, error, loads };
 }
 
 interface HistoryProps {
@@ -90,25 +90,25 @@ export function HistoryCard({ recording, quantity, spanMs, binary, old, marks }:
   useEffect(() => {
     if (box.current === null) return;
     const element = box.current;
-    let alive = true;
+    let active = true;
     const draw = (): void => {
       const until = Math.max(serverNow(), recording.samples(0).at(-1)?.at ?? 0);
       const [times, ...values] = recording.columns(until - spanMs);
-      const inUnit = values.map((column) => column.map((one) => (one === null ? null : quantity.shown(one))));
+      const inUnit = values.map((column) => column.map((one) => (one === null ? null : quantity.toDisplay(one))));
       const columns = [times, ...inUnit] as Columns;
       drawn.current.columns = columns;
-      const given = shown.current;
-      const extra = given === undefined ? undefined : { ...given, cursor: cursor.current };
+      const currentMarks = shown.current;
+      const extra = currentMarks === undefined ? undefined : { ...currentMarks, cursor: cursor.current };
       drawn.current.chart?.draw((until - spanMs) / 1000, until / 1000, times, inUnit, extra);
-      const seen = columns[1].filter((one) => one !== null);
-      element.setAttribute("data-points", String(seen.length));
-      element.setAttribute("aria-label", described(quantity, seen));
-      if (given !== undefined) tellPlace(element, columns, cursor.current, quantity);
+      const measured = columns[1].filter((one) => one !== null);
+      element.setAttribute("data-points", String(measured.length));
+      element.setAttribute("aria-label", chartLabel(quantity, measured));
+      if (currentMarks !== undefined) updateSliderAttributes(element, columns, cursor.current, quantity);
     };
     drawn.current.draw = draw;
     import("./series-chart").then(
       ({ createSeriesChart }) => {
-        if (!alive) return;
+        if (!active) return;
         drawn.current.chart = createSeriesChart(element, { quantity, binary, colour: colour("--series-1") });
         draw();
       },
@@ -116,7 +116,7 @@ export function HistoryCard({ recording, quantity, spanMs, binary, old, marks }:
     );
     const timer = setInterval(draw, DRAW_EVERY_MS);
     return () => {
-      alive = false;
+      active = false;
       clearInterval(timer);
       drawn.current.chart?.dispose();
       drawn.current.chart = null;
@@ -127,11 +127,11 @@ export function HistoryCard({ recording, quantity, spanMs, binary, old, marks }:
     cursor.current = time;
     drawn.current.draw();
     const { columns } = drawn.current;
-    setReading(time === null ? "" : said(columns, nearest(columns, time), quantity));
+    setReading(time === null ? "" : describePoint(columns, nearest(columns, time), quantity));
   };
-  const press = (event: KeyboardEvent): void => {
+  const onKeyDown = (event: KeyboardEvent): void => {
     const { columns } = drawn.current;
-    const to = steps(event.key, columns, cursor.current);
+    const to = indexForKey(event.key, columns, cursor.current);
     if (to === null) return;
     event.preventDefault();
     goTo(columns[0][to] ?? null);
@@ -155,7 +155,7 @@ export function HistoryCard({ recording, quantity, spanMs, binary, old, marks }:
         aria-label={quantity.label}
         aria-valuenow={0}
         tabIndex={0}
-        onKeyDown={press}
+        onKeyDown={onKeyDown}
         onPointerMove={point}
         onPointerLeave={() => goTo(null)}
         onBlur={() => goTo(null)}
@@ -168,48 +168,48 @@ export function HistoryCard({ recording, quantity, spanMs, binary, old, marks }:
 }
 
 /** Updates the cursor's description for screen readers. */
-function tellPlace(element: HTMLElement, columns: Columns, cursor: number | null, quantity: Quantity): void {
+function updateSliderAttributes(element: HTMLElement, columns: Columns, cursor: number | null, quantity: Quantity): void {
   const at = nearest(columns, cursor ?? Infinity);
   element.setAttribute("aria-valuemin", "0");
   element.setAttribute("aria-valuemax", String(Math.max(0, columns[0].length - 1)));
   element.setAttribute("aria-valuenow", String(Math.max(0, at)));
-  element.setAttribute("aria-valuetext", said(columns, at, quantity));
+  element.setAttribute("aria-valuetext", describePoint(columns, at, quantity));
 }
 
 /** The index of the measured point nearest to a time; -1: none. */
 function nearest([times, means]: Columns, time: number): number {
   let found = -1;
   times.forEach((one, index) => {
-    const away = time === Infinity ? -one : Math.abs(one - time);
-    const best = time === Infinity ? -(times[found] ?? -Infinity) : Math.abs((times[found] ?? -Infinity) - time);
-    if (means[index] !== null && away < best) found = index;
+    const distance = time === Infinity ? -one : Math.abs(one - time);
+    const bestDistance = time === Infinity ? -(times[found] ?? -Infinity) : Math.abs((times[found] ?? -Infinity) - time);
+    if (means[index] !== null && distance < bestDistance) found = index;
   });
   return found;
 }
 
 /** The index of the point that a key selects, or `null` for other keys. */
-function steps(key: string, columns: Columns, cursor: number | null): number | null {
-  const by = { ArrowLeft: -1, ArrowRight: 1, PageUp: -FAR, PageDown: FAR, Home: -Infinity, End: Infinity }[key];
+function indexForKey(key: string, columns: Columns, cursor: number | null): number | null {
+  const by = { ArrowLeft: -1, ArrowRight: 1, PageUp: -PAGE_STEP, PageDown: PAGE_STEP, Home: -Infinity, End: Infinity }[key];
   const measured = columns[1].flatMap((mean, index) => (mean === null ? [] : [index]));
   if (by === undefined || measured.length === 0) return null;
-  const here = measured.indexOf(nearest(columns, cursor ?? Infinity));
-  const to = Math.min(measured.length - 1, Math.max(0, here + by));
+  const position = measured.indexOf(nearest(columns, cursor ?? Infinity));
+  const to = Math.min(measured.length - 1, Math.max(0, position + by));
   return measured[to] ?? null;
 }
 
-function said([times, means, lows, highs]: Columns, index: number, { unit }: Quantity): string {
+function describePoint([times, means, lows, highs]: Columns, index: number, { unit }: Quantity): string {
   const [at, mean, low, high] = [times[index], means[index], lows[index], highs[index]];
-  if (at === undefined || mean === undefined || mean === null) return texts.trend.nothing;
+  if (at === undefined || mean === undefined || mean === null) return texts.trend.noData;
   const places = digits(Math.max(Math.abs(mean) / 100, 0.01));
   const text = (value: number): string => `${value.toFixed(places)} ${unit}`.trim();
   const band = low === high || low === null || high === null || low === undefined || high === undefined ? null : [text(low), text(high)] as const;
   return texts.trend.at(format.recentTime(at * 1000), text(mean), band);
 }
 
-function described({ label, unit }: Quantity, seen: readonly number[]): string {
-  if (seen.length === 0) return texts.room.chartEmpty(label);
+function chartLabel({ label, unit }: Quantity, measured: readonly number[]): string {
+  if (measured.length === 0) return texts.room.chartEmpty(label);
   let [low, high] = [Infinity, -Infinity];
-  for (const one of seen) [low, high] = [Math.min(low, one), Math.max(high, one)];
+  for (const one of measured) [low, high] = [Math.min(low, one), Math.max(high, one)];
   const places = digits(high - low);
   return texts.room.chart(label, low.toFixed(places), high.toFixed(places), unit);
 }

@@ -16,7 +16,7 @@ import { colour, onColourChange } from "../../shared/ui/canvas-theme";
 const RANGE = "range";
 const LABEL_PX = 12;
 
-interface Taken {
+interface CapturedScan {
   scan: LidarScan;
   at: number;
 }
@@ -24,8 +24,8 @@ interface Taken {
 /** Lidar view to scale: live nearest distances per sector, and all beams of a captured scan. */
 export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAction: RoomDeviceAction | null }) {
   const canvas = useRef<HTMLCanvasElement>(null);
-  const [taken, setTaken] = useState<Taken | null>(null);
-  const [trouble, setTrouble] = useState("");
+  const [captured, setCaptured] = useState<CapturedScan | null>(null);
+  const [error, setError] = useState("");
   const [repaint, setRepaint] = useState(0);
   const newest = device.measured(RANGE).value;
   const sectors = sectorsOf(newest?.message.values ?? {});
@@ -34,23 +34,23 @@ export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAct
   useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
   useEffect(() => {
     if (canvas.current === null) return;
-    return canvasBox(canvas.current, (context, width, height) => draw(context, width, height, sectors, taken?.scan ?? null));
-  }, [newest, taken, repaint]);
+    return canvasBox(canvas.current, (context, width, height) => draw(context, width, height, sectors, captured?.scan ?? null));
+  }, [newest, captured, repaint]);
 
-  const take = async (): Promise<void> => {
+  const capture = async (): Promise<void> => {
     const found = await roomAction?.capture("scan");
     if (found === null || found === undefined) return;
     try {
       const scan = readScan(new TextDecoder().decode(await contentOf(found)));
-      setTaken({ scan, at: now() });
-      setTrouble("");
+      setCaptured({ scan, at: now() });
+      setError("");
     } catch (error) {
-      setTrouble(sentence(error));
+      setError(sentence(error));
     }
   };
 
   const nearest = sectors.length === 0 ? null : Math.min(...sectors);
-  const no = unavailableReason(device);
+  const unavailable = unavailableReason(device);
   return (
     <Card
       title={texts.scan.title}
@@ -68,16 +68,16 @@ export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAct
           ref={canvas}
           role="img"
           data-testid="scan"
-          data-beams={taken?.scan.range_m.length ?? 0}
+          data-beams={captured?.scan.range_m.length ?? 0}
           aria-label={nearest === null ? texts.scan.labelEmpty : texts.scan.label(nearest.toFixed(2))}
         />
       </div>
       <p class="quiet small">
         {sectors.length > 0 && `${texts.scan.live} `}
-        {taken === null ? (
+        {captured === null ? (
           roomAction !== null && texts.scan.noPoints
         ) : (
-          <Age at={taken.at} as={(age) => texts.scan.points(taken.scan.range_m.length, age)} />
+          <Age at={captured.at} as={(age) => texts.scan.points(captured.scan.range_m.length, age)} />
         )}
         {late && newest !== null && <Age at={newest.receivedAt} as={(age) => ` ${texts.room.late(age)}`} />}
       </p>
@@ -87,16 +87,16 @@ export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAct
             type="button"
             class="primary"
             data-testid="scan-shot"
-            disabled={no !== "" || roomAction.busy.value !== null}
-            title={no}
-            onClick={() => void take()}
+            disabled={unavailable !== "" || roomAction.busy.value !== null}
+            title={unavailable}
+            onClick={() => void capture()}
           >
             {roomAction.busy.value === "capture" ? texts.camera.taking : texts.scan.shot}
           </button>
         </div>
       )}
-      {roomAction !== null && roomAction.why.value !== "" && <p class="notice bad">{roomAction.why.value}</p>}
-      {trouble !== "" && <p class="notice bad">{trouble}</p>}
+      {roomAction !== null && roomAction.error.value !== "" && <p class="notice bad">{roomAction.error.value}</p>}
+      {error !== "" && <p class="notice bad">{error}</p>}
     </Card>
   );
 }
@@ -111,10 +111,10 @@ function sectorsOf(values: Values): number[] {
 /** Top view: x axis up, counter-clockwise to the left. Scaled to the largest distance. */
 function draw(context: CanvasRenderingContext2D, width: number, height: number, sectors: number[], scan: LidarScan | null): void {
   const wide = (2 * Math.PI) / sectors.length;
-  const beams = (scan?.range_m ?? []).flatMap((m, index) => (m === null ? [] : [spot(scan?.angle_rad[index] ?? 0, m)]));
-  const arcs = sectors.flatMap((m, index) => [0, 0.5, 1].map((share) => spot((index + share) * wide, m)));
-  const seen = [[-0.5, -0.5], [0.5, 0.5], ...arcs, ...beams] as const;
-  const [xs, ys] = [seen.map(([right]) => right), seen.map(([, up]) => up)];
+  const beams = (scan?.range_m ?? []).flatMap((m, index) => (m === null ? [] : [pointAt(scan?.angle_rad[index] ?? 0, m)]));
+  const arcs = sectors.flatMap((m, index) => [0, 0.5, 1].map((share) => pointAt((index + share) * wide, m)));
+  const points = [[-0.5, -0.5], [0.5, 0.5], ...arcs, ...beams] as const;
+  const [xs, ys] = [points.map(([right]) => right), points.map(([, up]) => up)];
   const [left, right, low, high] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
   const scale = Math.min((width - 4 * LABEL_PX) / (right - left), (height - 4 * LABEL_PX) / (high - low));
   const [x, y] = [width / 2 - ((left + right) / 2) * scale, height / 2 + ((low + high) / 2) * scale];
@@ -146,7 +146,7 @@ function draw(context: CanvasRenderingContext2D, width: number, height: number, 
 }
 
 /** A point right of and above the lidar [m]. */
-function spot(angle: number, m: number): readonly [number, number] {
+function pointAt(angle: number, m: number): readonly [number, number] {
   return [-Math.sin(angle) * m, Math.cos(angle) * m];
 }
 

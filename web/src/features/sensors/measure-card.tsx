@@ -9,36 +9,36 @@ import { quantityOf } from "./model/quantities";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
-import { shown } from "./readings-card";
+import { valueText } from "./readings-card";
 
-const LEAST_HZ = 0.001;
-const MOST_HZ = 50;
+const MIN_HZ = 0.001;
+const MAX_HZ = 50;
 /** Maximum number of values per measurement here; the rest is in its own card. */
-const MOST_SHOWN = 12;
+const MAX_SHOWN = 12;
 
-type Time = keyof typeof texts.collect.times;
+type DurationOption = keyof typeof texts.collect.times;
 
-interface GatherProps {
+interface CollectDataProps {
   device: DeviceStore;
   roomAction: RoomDeviceAction;
 }
 
 /** Collects data at a chosen rate, or measures once. */
-export function CollectDataCard({ device, roomAction }: GatherProps) {
-  const own = Math.max(...(device.description.value?.streams ?? []).map(({ rate_hz: rate }) => rate), LEAST_HZ);
-  const [rate, setRate] = useState(String(Math.min(MOST_HZ, Math.max(1, own * 2))));
-  const [time, setTime] = useState<Time>("60");
+export function CollectDataCard({ device, roomAction }: CollectDataProps) {
+  const defaultRate = Math.max(...(device.description.value?.streams ?? []).map(({ rate_hz: rate }) => rate), MIN_HZ);
+  const [rate, setRate] = useState(String(Math.min(MAX_HZ, Math.max(1, defaultRate * 2))));
+  const [duration, setDuration] = useState<DurationOption>("60");
   const action = device.state.value?.action ?? null;
   const running = action?.kind === "gather";
   const rateHz = Number(rate);
-  const valid = rate.trim() !== "" && rateHz >= LEAST_HZ && rateHz <= MOST_HZ;
-  const no = unavailableReason(device);
+  const valid = rate.trim() !== "" && rateHz >= MIN_HZ && rateHz <= MAX_HZ;
+  const unavailable = unavailableReason(device);
   const busy = roomAction.busy.value;
 
   const submit = (event: SubmitEvent): void => {
     event.preventDefault();
-    if (running) void roomAction.stopGathering();
-    else if (valid && no === "" && busy === null) void roomAction.gather([], rateHz, Number(time));
+    if (running) void roomAction.cancelCollection();
+    else if (valid && unavailable === "" && busy === null) void roomAction.collect([], rateHz, Number(duration));
   };
 
   return (
@@ -58,10 +58,10 @@ export function CollectDataCard({ device, roomAction }: GatherProps) {
           />
         </label>
         <Choice
-          label={texts.collect.time}
-          value={time}
-          onChange={setTime}
-          options={Object.entries(texts.collect.times) as [Time, string][]}
+          label={texts.collect.duration}
+          value={duration}
+          onChange={setDuration}
+          options={Object.entries(texts.collect.times) as [DurationOption, string][]}
         />
         <div class="row">
         <button
@@ -69,23 +69,23 @@ export function CollectDataCard({ device, roomAction }: GatherProps) {
           class="primary"
           data-testid="gather"
           aria-pressed={running}
-          disabled={!running && (!valid || no !== "" || busy !== null)}
-          title={no}
+          disabled={!running && (!valid || unavailable !== "" || busy !== null)}
+          title={unavailable}
         >
           {running ? texts.collect.stop : texts.collect.start}
         </button>
         <button
           type="button"
           data-testid="shoot"
-          disabled={no !== "" || busy !== null || action !== null}
-          title={no}
-          onClick={() => void roomAction.shoot()}
+          disabled={unavailable !== "" || busy !== null || action !== null}
+          title={unavailable}
+          onClick={() => void roomAction.measureOnce()}
         >
-          {texts.collect.once}
+          {texts.collect.measureOnce}
         </button>
         </div>
       </form>
-      {!valid && <p class="field-error">{texts.collect.badRate}</p>}
+      {!valid && <p class="field-error">{texts.collect.invalidRate}</p>}
       <div role="status" data-testid="gather-state" data-running={String(running)}>
         {running ? (
           <>
@@ -93,31 +93,31 @@ export function CollectDataCard({ device, roomAction }: GatherProps) {
             <progress value={action.progress ?? 0} max={1} />
           </>
         ) : (
-          <span class="quiet">{action === null ? texts.collect.rest : texts.collect.busy}</span>
+          <span class="quiet">{action === null ? texts.collect.idle : texts.collect.busy}</span>
         )}
       </div>
-      <Paces device={device} />
-      {roomAction.why.value !== "" && <p class="notice bad">{roomAction.why.value}</p>}
-      <Once device={device} roomAction={roomAction} />
+      <StreamRates device={device} />
+      {roomAction.error.value !== "" && <p class="notice bad">{roomAction.error.value}</p>}
+      <MeasurementList device={device} roomAction={roomAction} />
     </Card>
   );
 }
 
 /** The actual rate of each stream. */
-function Paces({ device }: { device: DeviceStore }) {
-  const paces = (device.description.value?.streams ?? []).flatMap(({ name }) => {
+function StreamRates({ device }: { device: DeviceStore }) {
+  const rates = (device.description.value?.streams ?? []).flatMap(({ name }) => {
     const everyMs = device.measured(name).value?.everyMs ?? null;
-    return everyMs === null || everyMs <= 0 || device.late(name) ? [] : [texts.collect.pace(name, pace(1000 / everyMs))];
+    return everyMs === null || everyMs <= 0 || device.late(name) ? [] : [texts.collect.rateText(name, rateText(1000 / everyMs))];
   });
-  return paces.length === 0 ? null : <p class="quiet small">{paces.join(" · ")}</p>;
+  return rates.length === 0 ? null : <p class="quiet small">{rates.join(" · ")}</p>;
 }
 
-function pace(hz: number): string {
+function rateText(hz: number): string {
   return hz < 1 ? hz.toFixed(2) : format.oneDigit(hz);
 }
 
-function Once({ device, roomAction }: GatherProps) {
-  const shot = roomAction.shot.value;
+function MeasurementList({ device, roomAction }: CollectDataProps) {
+  const shot = roomAction.measurement.value;
   const description = device.description.value;
   if (shot === null || description === null) return null;
   const rows = Object.entries(shot.streams).flatMap(([stream, values]) =>
@@ -126,16 +126,16 @@ function Once({ device, roomAction }: GatherProps) {
   return (
     <div data-testid="shot">
       <p class="quiet small">
-        <Age at={shot.at} as={texts.collect.onceTaken} />
+        <Age at={shot.at} as={texts.collect.measuredOnce} />
       </p>
       <dl class="figures">
-        {rows.slice(0, MOST_SHOWN).map(({ quantity, value }) => (
+        {rows.slice(0, MAX_SHOWN).map(({ quantity, value }) => (
           <div key={`${quantity.stream} ${quantity.field}`}>
             <dt>{quantity.label}</dt>
             <dd>
               {typeof value === "boolean"
                 ? (common.booleanState[quantity.field] ?? common.yesNo)[value ? 0 : 1]
-                : `${shown(quantity, value)} ${quantity.unit}`}
+                : `${valueText(quantity, value)} ${quantity.unit}`}
             </dd>
           </div>
         ))}

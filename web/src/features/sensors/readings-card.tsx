@@ -6,7 +6,7 @@ import { Choice } from "../../shared/ui/choice";
 import { useMemo, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { toPageClock } from "../../shared/lib/clock";
-import { digits, judge, quantityOf, type Quantity } from "./model/quantities";
+import { digits, assess, quantityOf, type Quantity } from "./model/quantities";
 import type { Recording } from "./model/stored-series";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
@@ -15,7 +15,7 @@ import { HistoryCard, useRecording } from "./history-card";
 import "./sensors.css";
 
 /** More values are shown as a table. */
-const MOST_CARDS = 4;
+const MAX_CARDS = 4;
 /** The stream with the values of the controls. */
 const SETTINGS = "settings";
 
@@ -32,19 +32,19 @@ export function ReadingsCard({ api, device, stream }: ReadingsProps) {
   const values = device.measured(stream).value?.message.values ?? {};
   const description = device.description.value;
   const fields = Object.keys(values);
-  const known = fields.join(" ");
+  const fieldNames = fields.join(" ");
   const quantities = useMemo(
-    () => (description === null ? [] : named(fields.map((field) => quantityOf(description, stream, field)))),
-    [description, stream, known],
+    () => (description === null ? [] : withStreamLabel(fields.map((field) => quantityOf(description, stream, field)))),
+    [description, stream, fieldNames],
   );
   if (fields.length === 0) {
     return (
       <Card title={capital(stream)}>
-        <p class="quiet">{texts.room.nothingYet}</p>
+        <p class="quiet">{texts.room.noDataYet}</p>
       </Card>
     );
   }
-  if (fields.length > MOST_CARDS) return <Table device={device} stream={stream} quantities={quantities} />;
+  if (fields.length > MAX_CARDS) return <Table device={device} stream={stream} quantities={quantities} />;
   return (
     <>
       {quantities.map((quantity) => (
@@ -55,10 +55,10 @@ export function ReadingsCard({ api, device, stream }: ReadingsProps) {
 }
 
 /** A stream's only value has the stream's label. */
-function named(quantities: Quantity[]): Quantity[] {
+function withStreamLabel(quantities: Quantity[]): Quantity[] {
   const [only] = quantities;
-  if (quantities.length !== 1 || only === undefined || only.judged === null || only.stream === SETTINGS) return quantities;
-  return [{ ...only, label: only.judged.label }];
+  if (quantities.length !== 1 || only === undefined || only.limits === null || only.stream === SETTINGS) return quantities;
+  return [{ ...only, label: only.limits.label }];
 }
 
 interface ReadingProps {
@@ -72,7 +72,7 @@ function Reading({ api, device, quantity }: ReadingProps) {
   const newest = device.measured(quantity.stream).value;
   const value = newest?.message.values[quantity.field];
   const late = device.late(quantity.stream);
-  const { recording, trouble, loads } = useRecording(api, device, quantity, SPAN_MS[span]);
+  const { recording, error, loads } = useRecording(api, device, quantity, SPAN_MS[span]);
   const binary = typeof value === "boolean";
   return (
     <Card
@@ -100,20 +100,20 @@ function Reading({ api, device, quantity }: ReadingProps) {
         )}
       </p>
       <HistoryCard recording={recording} quantity={quantity} spanMs={SPAN_MS[span]} binary={binary} old={late} />
-      {quantity.judged !== null && !binary && <Limits quantity={quantity} />}
-      {trouble !== "" && <p class="quiet small">{texts.room.noHistory(trouble)}</p>}
+      {quantity.limits !== null && !binary && <Limits quantity={quantity} />}
+      {error !== "" && <p class="quiet small">{texts.room.noHistory(error)}</p>}
     </Card>
   );
 }
 
 export function Figure({ quantity, value }: { quantity: Quantity; value: number }) {
-  const judgement = judge(value, quantity.judged);
+  const assessment = assess(value, quantity.limits);
   return (
     <>
-      <strong>{shown(quantity, value)}</strong> <span class="unit">{quantity.unit}</span>
-      {quantity.judged !== null && judgement !== "well" && (
-        <span class={`chip ${judgement === "bad" ? "bad" : "reach-stale"}`} title={quantity.judged.advice}>
-          {texts.room.judged[judgement]}
+      <strong>{valueText(quantity, value)}</strong> <span class="unit">{quantity.unit}</span>
+      {quantity.limits !== null && assessment !== "normal" && (
+        <span class={`chip ${assessment === "outside" ? "bad" : "reach-stale"}`} title={quantity.limits.advice}>
+          {texts.room.assessment[assessment]}
         </span>
       )}
     </>
@@ -140,11 +140,11 @@ function Status({ recording, field, value, loads }: { recording: Recording; fiel
 }
 
 export function Limits({ quantity }: { quantity: Quantity }) {
-  const { judged, unit, shown: inUnit } = quantity;
-  if (judged === null) return null;
+  const { limits, unit, toDisplay: inUnit } = quantity;
+  if (limits === null) return null;
   const text = (limit: number | null): string | null => (limit === null ? null : String(Number(inUnit(limit).toFixed(2))));
-  const said = texts.room.limits(text(judged.warning_low ?? judged.low), text(judged.warning_high ?? judged.high), unit);
-  return said === "" ? null : <p class="quiet small">{said}</p>;
+  const limitsText = texts.room.limits(text(limits.warning_low ?? limits.low), text(limits.warning_high ?? limits.high), unit);
+  return limitsText === "" ? null : <p class="quiet small">{limitsText}</p>;
 }
 
 function Table({ device, stream, quantities }: { device: DeviceStore; stream: string; quantities: readonly Quantity[] }) {
@@ -189,12 +189,12 @@ function Table({ device, stream, quantities }: { device: DeviceStore; stream: st
 
 function cell(quantity: Quantity, value: number | boolean): string {
   if (typeof value === "boolean") return common.yesNo[value ? 0 : 1];
-  return `${shown(quantity, value)} ${quantity.unit}`.trim();
+  return `${valueText(quantity, value)} ${quantity.unit}`.trim();
 }
 
 /** Three significant digits; integers unchanged. */
-export function shown(quantity: Quantity, value: number): string {
-  const converted = quantity.shown(value);
+export function valueText(quantity: Quantity, value: number): string {
+  const converted = quantity.toDisplay(value);
   if (Number.isInteger(converted)) return String(converted);
   return converted.toFixed(digits(Math.max(Math.abs(converted), 0.01)));
 }

@@ -26,7 +26,7 @@ const SETTINGS = "settings";
 const POSITIONS = "positions";
 const OCCUPANCY = "occupancy";
 
-interface RoomDeskProps {
+interface RoomDevicePageProps {
   api: Api;
   fleet: Fleet;
   session: DeviceSession;
@@ -34,7 +34,7 @@ interface RoomDeskProps {
   access: ComponentChildren;
 }
 
-export function RoomDevicePage({ api, fleet, session, access }: RoomDeskProps) {
+export function RoomDevicePage({ api, fleet, session, access }: RoomDevicePageProps) {
   const { device, control, actions } = session;
   const roomAction = useMemo(() => new RoomDeviceAction(api, device, actions, () => control.epoch), [api, device, actions, control]);
   useEffect(() => void roomAction.list(), [roomAction]);
@@ -45,7 +45,7 @@ export function RoomDevicePage({ api, fleet, session, access }: RoomDeskProps) {
   });
   const description = device.description.value;
   if (description === null) return null;
-  const pictured = description.cameras.length > 0;
+  const hasCamera = description.cameras.length > 0;
   const settings = description.controls.length > 0 && <SettingsCard device={device} roomAction={roomAction} />;
   const has = (name: string): boolean => description.captures.includes(name);
   return (
@@ -54,21 +54,21 @@ export function RoomDevicePage({ api, fleet, session, access }: RoomDeskProps) {
         {description.cameras.map(({ name }) => (
           <CameraCard key={name} device={device} name={name} roomAction={has(IMAGE) ? roomAction : null} />
         ))}
-        {/* Beside the camera image; without one, settings are the main content. */}
-        {!pictured && settings}
+        {/* Without a camera, settings are the main content; otherwise they are in the second column. */}
+        {!hasCamera && settings}
         {has(DEPTH) && <DepthCard device={device} roomAction={roomAction} />}
         {(has(SCAN) || measures(description, RANGE)) && (
           <LidarCard device={device} roomAction={has(SCAN) ? roomAction : null} />
         )}
         {measures(description, POSITIONS) && <FloorPlan fleet={fleet} space={device.info.value.space} agent={device.info.value.agent} />}
         {description.streams
-          .filter(({ name }) => !drawnElsewhere(description, name))
+          .filter(({ name }) => !hasOwnCard(description, name))
           .map(({ name }) => (
             <ReadingsCard key={name} api={api} device={device} stream={name} />
           ))}
       </div>
       <div class="column">
-        {pictured && settings}
+        {hasCamera && settings}
         {description.actions.includes("gather") && <CollectDataCard device={device} roomAction={roomAction} />}
         {description.captures.length > 0 && <CapturesCard device={device} roomAction={roomAction} />}
         <EventLog device={device} />
@@ -82,7 +82,7 @@ function measures(description: KnownDescription, stream: string): boolean {
   return description.streams.some(({ name }) => name === stream);
 }
 
-function drawnElsewhere(description: KnownDescription, stream: string): boolean {
+function hasOwnCard(description: KnownDescription, stream: string): boolean {
   if (stream === SETTINGS) return description.cameras.length > 0;
   return [RANGE, POSITIONS, OCCUPANCY].includes(stream);
 }

@@ -42,7 +42,7 @@ const STRIP_PX = 6;
 export function createSeriesChart(box: HTMLElement, { quantity, binary, colour: line }: Options): SeriesChart {
   const axis = { stroke: colour("--quiet"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line"), width: 1 } };
   const stepped = uPlot.paths.stepped?.({ align: 1 });
-  let between: [number, number] = [0, 1];
+  let timeRange: [number, number] = [0, 1];
   let marks = UNMARKED;
   const chart = new uPlot(
     {
@@ -51,14 +51,14 @@ export function createSeriesChart(box: HTMLElement, { quantity, binary, colour: 
       legend: { show: false },
       cursor: { show: false },
       scales: {
-        x: { time: true, range: () => between },
+        x: { time: true, range: () => timeRange },
         y: { range: (_, low, high) => (binary ? [-0.15, 1.15] : range(quantity, marks.usual, low, high)) },
       },
       axes: [
-        { ...axis, space: 70, values: (_, ticks) => ticks.map((tick) => shortTime(tick, between)) },
+        { ...axis, space: 70, values: (_, ticks) => ticks.map((tick) => shortTime(tick, timeRange)) },
         binary
-          ? { ...axis, grid: { show: false }, size: 124, splits: () => [0, 1], values: () => words(quantity.field) }
-          : { ...axis, size: (_, values) => widest(values), values: (_, ticks) => ticks.map((tick) => label(tick, ticks, quantity.unit)) },
+          ? { ...axis, grid: { show: false }, size: 124, splits: () => [0, 1], values: () => stateLabels(quantity.field) }
+          : { ...axis, size: (_, values) => axisWidth(values), values: (_, ticks) => ticks.map((tick) => label(tick, ticks, quantity.unit)) },
       ],
       series: [
         {},
@@ -82,10 +82,10 @@ export function createSeriesChart(box: HTMLElement, { quantity, binary, colour: 
   });
   observer.observe(box);
   return {
-    draw(from, to, times, columns, given = UNMARKED) {
-      between = [from, to];
-      marks = given;
-      const extended = binary && times.length > 0 ? holding(to, times, columns) : { times, columns };
+    draw(from, to, times, columns, newMarks = UNMARKED) {
+      timeRange = [from, to];
+      marks = newMarks;
+      const extended = binary && times.length > 0 ? extendToNow(to, times, columns) : { times, columns };
       chart.setData([extended.times, ...extended.columns] as uPlot.AlignedData);
     },
     timeAt: (clientX) => chart.posToVal(clientX - chart.over.getBoundingClientRect().left, "x"),
@@ -97,30 +97,30 @@ export function createSeriesChart(box: HTMLElement, { quantity, binary, colour: 
 }
 
 /** Extends the last state to now. */
-function holding(to: number, times: number[], columns: (number | null)[][]): { times: number[]; columns: (number | null)[][] } {
+function extendToNow(to: number, times: number[], columns: (number | null)[][]): { times: number[]; columns: (number | null)[][] } {
   return { times: [...times, to], columns: columns.map((column) => [...column, column.at(-1) ?? null]) };
 }
 
-function words(field: string): string[] {
+function stateLabels(field: string): string[] {
   const [yes, no] = common.booleanState[field] ?? common.yesNo;
   return [no, yes];
 }
 
-function range({ judged, shown }: Quantity, usual: Marks["usual"], low: number | null, high: number | null): [number, number] {
+function range({ limits, toDisplay }: Quantity, usual: Marks["usual"], low: number | null, high: number | null): [number, number] {
   const middle = ((low ?? 0) + (high ?? 0)) / 2;
   const room = Math.max((high ?? 0) - (low ?? 0), SMALLEST_SHARE * Math.abs(middle), 0.1);
   let [from, to] = [Math.min(low ?? 0, middle - room / 2), Math.max(high ?? 1, middle + room / 2)];
   const reach = LIMIT_WITHIN * Math.max(room, 0.15 * Math.abs(middle));
-  const limits = [judged?.warning_low, judged?.warning_high].flatMap((limit) => (limit === null || limit === undefined ? [] : [shown(limit)]));
-  for (const limit of [...limits, ...(usual ?? [])]) {
+  const warningLimits = [limits?.warning_low, limits?.warning_high].flatMap((limit) => (limit === null || limit === undefined ? [] : [toDisplay(limit)]));
+  for (const limit of [...warningLimits, ...(usual ?? [])]) {
     if (Math.abs(limit - middle) <= reach) [from, to] = [Math.min(from, limit), Math.max(to, limit)];
   }
   const pad = (to - from) * 0.08;
   return [low !== null && low >= 0 ? Math.max(0, from - pad) : from - pad, to + pad];
 }
 
-function paintLimits(plot: uPlot, { judged, shown }: Quantity): void {
-  if (judged === null) return;
+function paintLimits(plot: uPlot, { limits, toDisplay }: Quantity): void {
+  if (limits === null) return;
   const { ctx, bbox } = plot;
   const { min = NaN, max = NaN } = plot.scales["y"] ?? {};
   if (!(max > min)) return;
@@ -130,16 +130,16 @@ function paintLimits(plot: uPlot, { judged, shown }: Quantity): void {
     ctx.fillStyle = colour(name);
     ctx.fillRect(bbox.left, y(to), bbox.width, y(from) - y(to));
   };
-  const or = (value: number | null, otherwise: number): number => (value === null ? otherwise : shown(value));
-  const low = or(judged.low, min);
-  const high = or(judged.high, max);
-  const wellLow = or(judged.warning_low, low);
-  const wellHigh = or(judged.warning_high, high);
-  if ([judged.low, judged.high, judged.warning_low, judged.warning_high].every((one) => one === null)) return;
+  const limitOr = (value: number | null, otherwise: number): number => (value === null ? otherwise : toDisplay(value));
+  const low = limitOr(limits.low, min);
+  const high = limitOr(limits.high, max);
+  const normalLow = limitOr(limits.warning_low, low);
+  const normalHigh = limitOr(limits.warning_high, high);
+  if ([limits.low, limits.high, limits.warning_low, limits.warning_high].every((one) => one === null)) return;
   ctx.save();
-  fill(Math.max(min, wellLow), Math.min(max, wellHigh), "--good-ground");
-  fill(Math.max(min, low), Math.min(max, wellLow), "--warn-ground");
-  fill(Math.max(min, wellHigh), Math.min(max, high), "--warn-ground");
+  fill(Math.max(min, normalLow), Math.min(max, normalHigh), "--good-ground");
+  fill(Math.max(min, low), Math.min(max, normalLow), "--warn-ground");
+  fill(Math.max(min, normalHigh), Math.min(max, high), "--warn-ground");
   fill(min, Math.min(max, low), "--bad-ground");
   fill(Math.max(min, high), max, "--bad-ground");
   ctx.restore();
@@ -179,7 +179,7 @@ function paintMarks(plot: uPlot, { usual, faults, cursor }: Marks): void {
 const SEVERITY_COLOUR = { info: "--accent", warning: "--warn", error: "--bad" } as const;
 
 /** Width of an axis [px]: its longest label, and at least three digits. */
-function widest(values: readonly string[] | null): number {
+function axisWidth(values: readonly string[] | null): number {
   const longest = Math.max(0, ...(values ?? []).map((text) => text.length));
   return Math.max(66, 16 + longest * 7.5);
 }

@@ -20,10 +20,10 @@ interface SettingsProps {
 /** Settings of a device within the limits of its description, with the current values. */
 export function SettingsCard({ device, roomAction }: SettingsProps) {
   const description = device.description.value;
-  const no = unavailableReason(device);
+  const unavailable = unavailableReason(device);
   if (description === null) return null;
   return (
-    <Card title={texts.settings.title} aside={no !== "" && <span class="quiet">{no}</span>}>
+    <Card title={texts.settings.title} aside={unavailable !== "" && <span class="quiet">{unavailable}</span>}>
       {description.controls.map((control) => (
         <Setting
           key={control.name}
@@ -31,7 +31,7 @@ export function SettingsCard({ device, roomAction }: SettingsProps) {
           roomAction={roomAction}
           control={control}
           text={textOf(control, quantityOf(description, STREAM, control.name))}
-          disabled={no !== ""}
+          disabled={unavailable !== ""}
         />
       ))}
     </Card>
@@ -39,11 +39,11 @@ export function SettingsCard({ device, roomAction }: SettingsProps) {
 }
 
 /** A control's value: shares in per cent, angles in degrees, with the digits of a step. */
-function textOf({ lower, upper }: Control, { unit, shown }: Quantity): (value: number) => string {
-  const spread = shown(upper) - shown(lower);
+function textOf({ lower, upper }: Control, { unit, toDisplay }: Quantity): (value: number) => string {
+  const spread = toDisplay(upper) - toDisplay(lower);
   const places = spread > 50 ? 0 : spread > 5 ? 1 : 2;
   // No negative zero.
-  return (value) => `${(Number(shown(value).toFixed(places)) + 0).toFixed(places)} ${unit}`.trim();
+  return (value) => `${(Number(toDisplay(value).toFixed(places)) + 0).toFixed(places)} ${unit}`.trim();
 }
 
 interface SettingProps extends SettingsProps {
@@ -54,14 +54,14 @@ interface SettingProps extends SettingsProps {
 
 function Setting({ device, roomAction, control, text, disabled }: SettingProps) {
   /** While the slider is dragged. */
-  const [held, setHeld] = useState<number | null>(null);
+  const [dragged, setDragged] = useState<number | null>(null);
   const measured = device.measured(STREAM).value?.message.values[control.name];
   const late = device.late(STREAM);
   const setting = roomAction.settings.value.get(control.name);
   const now = typeof measured === "number" ? measured : null;
-  const asked = held ?? setting?.asked ?? now ?? control.lower;
+  const target = dragged ?? setting?.requested ?? now ?? control.lower;
   const send = (value: number): void => {
-    setHeld(null);
+    setDragged(null);
     void roomAction.set(control.name, clamp(value, control.lower, control.upper));
   };
   const ends = texts.settings.ends[control.name];
@@ -82,12 +82,12 @@ function Setting({ device, roomAction, control, text, disabled }: SettingProps) 
             min={control.lower}
             max={control.upper}
             step={(control.upper - control.lower) / STEPS}
-            value={asked}
+            value={target}
             disabled={disabled}
             aria-label={texts.settings.slider(control.label)}
-            aria-valuetext={text(asked)}
+            aria-valuetext={text(target)}
             data-testid={`set-${control.name}`}
-            onInput={(event) => setHeld(event.currentTarget.valueAsNumber)}
+            onInput={(event) => setDragged(event.currentTarget.valueAsNumber)}
             onChange={(event) => send(event.currentTarget.valueAsNumber)}
           />
           {share !== null && <span class={`marker ${late ? "old" : ""}`} aria-hidden="true" style={{ "--at": String(clamp(share, 0, 1)) }} />}
@@ -101,7 +101,7 @@ function Setting({ device, roomAction, control, text, disabled }: SettingProps) 
               key={value}
               type="button"
               disabled={disabled}
-              aria-pressed={setting !== undefined ? setting.asked === value : now === value}
+              aria-pressed={setting !== undefined ? setting.requested === value : now === value}
               data-testid={`${control.name}-${index === 0 ? "least" : "most"}`}
               onClick={() => send(value)}
             >
@@ -109,12 +109,12 @@ function Setting({ device, roomAction, control, text, disabled }: SettingProps) 
             </button>
           ))}
         <span class="small" role="status" data-testid={`applied-${control.name}`} data-value={setting?.applied ?? ""}>
-          {held !== null ? (
-            text(held)
+          {dragged !== null ? (
+            text(dragged)
           ) : setting === undefined ? (
             ""
-          ) : setting.why !== "" ? (
-            <span class="stream-limited">{texts.settings.refused(setting.why)}</span>
+          ) : setting.error !== "" ? (
+            <span class="stream-limited">{texts.settings.refused(setting.error)}</span>
           ) : setting.applied === null ? (
             texts.settings.applying
           ) : (

@@ -20,30 +20,30 @@ interface SpacePageProps {
 /** One space: its devices and its access list. */
 export function SpacePage({ api, fleet, account, id }: SpacePageProps) {
   const [space, setSpace] = useState<Space | null | undefined>(undefined);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
   const devices = fleet.devices.value;
   useEffect(() => {
-    let wanted = true;
+    let active = true;
     api.spaces().then(
       (found) => {
-        if (!wanted) return;
+        if (!active) return;
         setSpace(found.find((each) => each.id === id) ?? null);
-        setWrong("");
+        setError("");
       },
-      (error: unknown) => wanted && setWrong(texts.spaces.failed(sentence(error))),
+      (error: unknown) => active && setError(texts.spaces.failed(sentence(error))),
     );
     return () => {
-      wanted = false;
+      active = false;
     };
     // Reload when devices change: the space may have been shared or unshared.
   }, [api, id, devices]);
 
-  const inIt = [...(devices?.values() ?? [])].filter(({ info }) => info.value.space === id);
+  const members = [...(devices?.values() ?? [])].filter(({ info }) => info.value.space === id);
   return (
     <main class="page space" id="content">
       <a href={deviceListAddress}>← {common.allDevices}</a>
-      {wrong !== "" && <p class="notice bad">{wrong}</p>}
-      {space === undefined && wrong === "" && <p class="quiet">{common.loading}</p>}
+      {error !== "" && <p class="notice bad">{error}</p>}
+      {space === undefined && error === "" && <p class="quiet">{common.loading}</p>}
       {space === null && <p role="status">{texts.spaces.missing}</p>}
       {space !== undefined && space !== null && (
         <>
@@ -51,14 +51,14 @@ export function SpacePage({ api, fleet, account, id }: SpacePageProps) {
           <p>
             <a href={healthAddressOf("space", id)}>{texts.spaces.healthOf(space.name)}</a>
           </p>
-          {inIt.length === 0 ? <p class="quiet">{texts.spaces.empty}</p> : <RoomView fleet={fleet} id={id} />}
+          {members.length === 0 ? <p class="quiet">{texts.spaces.empty}</p> : <RoomView fleet={fleet} id={id} />}
           <PageExplainer page="space" />
           <AccessList
             api={api}
             account={account}
             target={{ kind: "space", id }}
             unit={{ kind: "space", id }}
-            included={inIt.map(({ info }) => info.value.label)}
+            included={members.map(({ info }) => info.value.label)}
             owner={space.owner}
             role={space.role}
             onLeft={() => {

@@ -6,7 +6,7 @@ import { type Box, placeLabels, type Placed } from "./model/label-placement";
 /** Size of a mark and of a pin [px]. */
 const MARK_PX = 24;
 
-/** `marks` and `pins`: centres in pixels of the box; the marks' elements have the class `who`, in the same order. */
+/** `marks` and `pins`: centres in pixels of the box; the marks' elements have the class `occupant`, in the same order. */
 export function useFloorPlanLabels(
   box: RefObject<HTMLElement | null>,
   marks: readonly (readonly [number, number])[],
@@ -15,8 +15,8 @@ export function useFloorPlanLabels(
   const before = useRef(new Map<string, number>());
   useLayoutEffect(() => {
     if (box.current === null) return;
-    const found = [...box.current.querySelectorAll<HTMLElement>(".who")].slice(0, marks.length);
-    const names = found.map((mark) => mark.querySelector<HTMLElement>(".who-label"));
+    const found = [...box.current.querySelectorAll<HTMLElement>(".occupant")].slice(0, marks.length);
+    const names = found.map((mark) => mark.querySelector<HTMLElement>(".occupant-label"));
     const ids = found.map((mark) => mark.dataset["testid"] ?? "");
     const measured = marks.map(([x, y], index) => {
       const { offsetWidth: width = 0, offsetHeight: height = 0 } = names[index] ?? {};
@@ -40,8 +40,8 @@ function around([x, y]: readonly [number, number]): Box {
 }
 
 function show(mark: HTMLElement, [x, y]: readonly [number, number], placed: Placed | null): void {
-  const name = mark.querySelector<HTMLElement>(".who-label");
-  const line = mark.querySelector<HTMLElement>(".who-leader");
+  const name = mark.querySelector<HTMLElement>(".occupant-label");
+  const line = mark.querySelector<HTMLElement>(".occupant-leader");
   mark.classList.toggle("unnamed", placed === null);
   if (name === null || line === null) return;
   name.style.left = placed === null ? "0" : `${placed.left - x + MARK_PX / 2}px`;

@@ -1,5 +1,5 @@
 import type { DeviceStore } from "../devices/model";
-import { shown } from "../sensors";
+import { valueText } from "../sensors";
 import { quantityOf } from "../sensors/model";
 import { Age } from "../../shared/ui/age";
 import { degrees } from "../../shared/lib/angles";
@@ -9,7 +9,7 @@ import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { deviceAddress } from "../../shared/routing/routes";
-import { RANGE, type Hung, deviceOf, nameOf } from "./floor-plan";
+import { RANGE, type MountedDevice, deviceOf, nameOf } from "./floor-plan";
 
 export function Legend() {
   return (
@@ -21,19 +21,19 @@ export function Legend() {
   );
 }
 
-interface WhoProps {
+interface OccupantTableProps {
   places: readonly Place[];
   devices: readonly DeviceStore[];
   receivedAt: number;
   old: boolean;
 }
 
-export function Who({ places, devices, receivedAt, old }: WhoProps) {
+export function OccupantTable({ places, devices, receivedAt, old }: OccupantTableProps) {
   const metres = (m: number): string => m.toFixed(2);
   const since = Math.max(0, clock.value - receivedAt);
   const { column } = texts.plan;
   return (
-    <div class="scroll" tabIndex={0} role="region" aria-label={texts.plan.who}>
+    <div class="scroll" tabIndex={0} role="region" aria-label={texts.plan.occupants}>
       <table class={old ? "old" : ""}>
         <thead>
           <tr>
@@ -69,18 +69,18 @@ export function Who({ places, devices, receivedAt, old }: WhoProps) {
 }
 
 /** The numbered devices of the plan with their current values. */
-export function HungList({ hung }: { hung: readonly Hung[] }) {
+export function MountedDeviceList({ mounted }: { mounted: readonly MountedDevice[] }) {
   return (
     <>
       <h3>{texts.plan.sensors}</h3>
-      <ol class="hung">
-        {hung.map(({ device, number }) => (
+      <ol class="mounted-devices">
+        {mounted.map(({ device, number }) => (
           <li key={device.id}>
             <span class="pin-number" aria-hidden="true">
               {number}
             </span>
             <a href={deviceAddress(device.id)}>{device.info.value.label}</a>
-            <Says device={device} />
+            <CurrentValues device={device} />
           </li>
         ))}
       </ol>
@@ -89,7 +89,7 @@ export function HungList({ hung }: { hung: readonly Hung[] }) {
 }
 
 /** Current values: of a lidar the nearest distance, of others the first two. */
-function Says({ device }: { device: DeviceStore }) {
+function CurrentValues({ device }: { device: DeviceStore }) {
   const description = device.description.value;
   const stream = description?.streams[0]?.name;
   if (description === null || stream === undefined) return null;
@@ -97,15 +97,15 @@ function Says({ device }: { device: DeviceStore }) {
   const values = Object.entries(newest?.message.values ?? {});
   if (newest === null || values.length === 0) return <span class="quiet">{format.unknown}</span>;
   const late = device.late(stream);
-  const said = (field: string, value: number | boolean): string => {
+  const valueOf = (field: string, value: number | boolean): string => {
     if (typeof value === "boolean") return (common.booleanState[field] ?? common.yesNo)[value ? 0 : 1];
     const quantity = quantityOf(description, stream, field);
-    return `${shown(quantity, value)} ${quantity.unit}`;
+    return `${valueText(quantity, value)} ${quantity.unit}`;
   };
   const [first, second] = stream === RANGE ? [[...values].sort(([, a], [, b]) => Number(a) - Number(b))[0]] : values;
   return (
     <span class={late ? "old" : "value"}>
-      {[first, second].flatMap((one) => (one === undefined ? [] : [said(...one)])).join(", ")}
+      {[first, second].flatMap((one) => (one === undefined ? [] : [valueOf(...one)])).join(", ")}
       {late && (
         <span class="small">
           {" "}

@@ -5,14 +5,14 @@ import { Card } from "../../shared/ui/card";
 import { effect } from "@preact/signals";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { clock, now } from "../../shared/lib/clock";
-import { apart, extent, readFloor, readPlaces, type Extent, type Floor, type Place } from "./model/room-perception";
+import { separatePins, extent, readFloor, readPlaces, type Extent, type Floor, type Place } from "./model/room-perception";
 import { texts } from "./texts";
 import { canvasBox } from "../../shared/ui/hidpi-canvas";
 import { useFloorPlanLabels } from "./floor-plan-labels";
 import { deviceAddress } from "../../shared/routing/routes";
 import { onColourChange } from "../../shared/ui/canvas-theme";
 import "./floor-plan.css";
-import { Legend, Who, HungList } from "./floor-plan-tables";
+import { Legend, OccupantTable, MountedDeviceList } from "./floor-plan-tables";
 import { paint } from "./floor-plan-canvas";
 
 const POSITIONS = "positions";
@@ -23,7 +23,7 @@ export const RANGE = "range";
 
 const TRAIL_MS = 30_000;
 
-/** A position that no sensor has seen for this long is shown as old [s]. */
+/** A position without an observation for this long is shown as old [s]. */
 const UNSEEN_S = 2;
 
 const PIN_PX = 24;
@@ -31,21 +31,21 @@ const PIN_PX = 24;
 interface PlanProps {
   fleet: Fleet;
   space: string;
-  /** The agent whose frame it uses: all devices of one agent share it. */
+  /** The agent whose coordinate frame the plan uses: all devices of one agent share it. */
   agent: string;
 }
 
-export interface Hung {
+export interface MountedDevice {
   device: DeviceStore;
   position: readonly [number, number, number];
   number: number;
 }
 
 /** The current perception of one agent. */
-interface Known {
+interface FloorPlanState {
   devices: readonly DeviceStore[];
   perception: DeviceStore | null;
-  hung: readonly Hung[];
+  mounted: readonly MountedDevice[];
   places: readonly Place[];
   floor: Floor | null;
   /** `null` before the first data. */
@@ -54,29 +54,29 @@ interface Known {
   receivedAt: number | null;
 }
 
-export function useFloorPlan(fleet: Fleet, space: string, agent: string): Known {
+export function useFloorPlan(fleet: Fleet, space: string, agent: string): FloorPlanState {
   const all = fleet.devices.value;
   const devices = useMemo(
     () => [...(all?.values() ?? [])].filter(({ info }) => info.value.space === space && info.value.agent === agent),
     [all, space, agent],
   );
   const perception = devices.find((one) => one.description.value?.streams.some(({ name }) => name === POSITIONS)) ?? null;
-  const hung = hungOf(devices);
+  const mounted = mountedDevices(devices);
   const newest = perception?.measured(POSITIONS).value ?? null;
   const grid = perception?.measured(OCCUPANCY).value ?? null;
   const floor = useMemo(() => (grid === null ? null : readFloor(grid.message.values)), [grid]);
   const places = useMemo(() => (newest === null ? [] : readPlaces(newest.message.values)), [newest]);
-  const key = hung.map(({ position }) => position.join()).join(" ");
+  const key = mounted.map(({ position }) => position.join()).join(" ");
   const shownExtent = useMemo(
-    () => extent(floor === null ? [] : [floor], [...hung.map(({ position: [x, y] }) => [x, y] as const)]),
+    () => extent(floor === null ? [] : [floor], [...mounted.map(({ position: [x, y] }) => [x, y] as const)]),
     [floor, key],
   );
   const old = perception?.late(POSITIONS) === true || perception?.live.value === false;
-  return { devices, perception, hung, places, floor, extent: shownExtent, old, receivedAt: newest?.receivedAt ?? null };
+  return { devices, perception, mounted, places, floor, extent: shownExtent, old, receivedAt: newest?.receivedAt ?? null };
 }
 
 export function FloorPlan({ fleet, space, agent }: PlanProps) {
-  const { devices, perception, hung, places, floor, extent: shownExtent, old, receivedAt } = useFloorPlan(fleet, space, agent);
+  const { devices, perception, mounted, places, floor, extent: shownExtent, old, receivedAt } = useFloorPlan(fleet, space, agent);
   const late = perception?.late(POSITIONS) === true;
   const waiting = receivedAt === null && floor === null;
   return (
@@ -90,7 +90,7 @@ export function FloorPlan({ fleet, space, agent }: PlanProps) {
           extent={shownExtent}
           floor={floor}
           places={places}
-          hung={hung}
+          mounted={mounted}
           devices={devices}
           trails={perception}
           old={old}
@@ -105,8 +105,8 @@ export function FloorPlan({ fleet, space, agent }: PlanProps) {
       {waiting && shownExtent !== null && <p class="quiet">{perception === null ? texts.plan.empty : texts.plan.waiting}</p>}
         </div>
         <div class="plan-part">
-      {places.length > 0 && <Who places={places} devices={devices} receivedAt={receivedAt ?? 0} old={late} />}
-      {hung.length > 0 && <HungList hung={hung} />}
+      {places.length > 0 && <OccupantTable places={places} devices={devices} receivedAt={receivedAt ?? 0} old={late} />}
+      {mounted.length > 0 && <MountedDeviceList mounted={mounted} />}
         </div>
       </div>
     </Card>
@@ -114,7 +114,7 @@ export function FloorPlan({ fleet, space, agent }: PlanProps) {
 }
 
 /** Devices with a position, in list order. */
-function hungOf(devices: readonly DeviceStore[]): Hung[] {
+function mountedDevices(devices: readonly DeviceStore[]): MountedDevice[] {
   return devices
     .flatMap((device) => {
       const position = device.description.value?.position_m ?? null;
@@ -135,7 +135,7 @@ interface DrawingProps {
   extent: Extent;
   floor: Floor | null;
   places: readonly Place[];
-  hung: readonly Hung[];
+  mounted: readonly MountedDevice[];
   devices: readonly DeviceStore[];
   /** The device whose positions have trails. */
   trails: DeviceStore | null;
@@ -148,15 +148,15 @@ interface DrawingProps {
 
 export type Trail = { at: number; x: number; y: number }[];
 
-export function Drawing({ extent: room, floor, places, hung, devices, trails, old, receivedAt, target, onPick }: DrawingProps) {
+export function Drawing({ extent: room, floor, places, mounted, devices, trails, old, receivedAt, target, onPick }: DrawingProps) {
   const canvas = useRef<HTMLCanvasElement>(null);
   const box = useRef<HTMLDivElement>(null);
   const [width, setWidth] = useState(0);
   const [repaint, setRepaint] = useState(0);
   const trail = useTrails(trails);
-  const [wide, high] = [room.highX - room.lowX, room.highY - room.lowY];
-  const x = (m: number): string => `${(100 * (m - room.lowX)) / wide}%`;
-  const y = (m: number): string => `${(100 * (room.highY - m)) / high}%`;
+  const [widthM, heightM] = [room.highX - room.lowX, room.highY - room.lowY];
+  const x = (m: number): string => `${(100 * (m - room.lowX)) / widthM}%`;
+  const y = (m: number): string => `${(100 * (room.highY - m)) / heightM}%`;
 
   useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
   useEffect(() => {
@@ -168,32 +168,32 @@ export function Drawing({ extent: room, floor, places, hung, devices, trails, ol
   }, []);
   useEffect(() => {
     if (canvas.current === null) return;
-    return canvasBox(canvas.current, (context, wideIs, highIs) => paint(context, wideIs, highIs, room, floor, trail.current));
+    return canvasBox(canvas.current, (context, widthPx, heightPx) => paint(context, widthPx, heightPx, room, floor, trail.current));
   }, [room, floor, places, repaint]);
 
   const pins = useMemo(() => {
     if (width === 0) return [];
-    const scale = width / wide;
-    const at = hung.map(({ position: [atX, atY] }) => [(atX - room.lowX) * scale, (room.highY - atY) * scale] as const);
+    const scale = width / widthM;
+    const at = mounted.map(({ position: [atX, atY] }) => [(atX - room.lowX) * scale, (room.highY - atY) * scale] as const);
     const edge = PIN_PX / 2;
     const within = at.map(
-      ([atX, atY]) => [Math.min(width - edge, Math.max(edge, atX)), Math.min(high * scale - edge, Math.max(edge, atY))] as const,
+      ([atX, atY]) => [Math.min(width - edge, Math.max(edge, atX)), Math.min(heightM * scale - edge, Math.max(edge, atY))] as const,
     );
     // Relative to the box, so that positions stay correct after a resize.
-    return apart(within, PIN_PX + 1, [width, high * scale]).map(([atX, atY]) => [atX / width, atY / (high * scale)] as const);
-  }, [room, width, hung.map(({ device }) => device.id).join()]);
-  const px = (share: number, of: number): number => (share * of * width) / wide;
+    return separatePins(within, PIN_PX + 1, [width, heightM * scale]).map(([atX, atY]) => [atX / width, atY / (heightM * scale)] as const);
+  }, [room, width, mounted.map(({ device }) => device.id).join()]);
+  const px = (share: number, of: number): number => (share * of * width) / widthM;
   useFloorPlanLabels(
     box,
-    places.map(({ xM, yM }) => [px((xM - room.lowX) / wide, wide), px((room.highY - yM) / high, high)]),
-    pins.map(([left, top]) => [px(left, wide), px(top, high)]),
+    places.map(({ xM, yM }) => [px((xM - room.lowX) / widthM, widthM), px((room.highY - yM) / heightM, heightM)]),
+    pins.map(([left, top]) => [px(left, widthM), px(top, heightM)]),
   );
 
   return (
     <div
       ref={box}
       class={`plan-box ${old ? "old" : ""}`}
-      style={{ aspectRatio: `${wide} / ${high}` }}
+      style={{ aspectRatio: `${widthM} / ${heightM}` }}
       role="group"
       aria-label={texts.plan.label(places.length)}
       data-testid="plan"
@@ -201,7 +201,7 @@ export function Drawing({ extent: room, floor, places, hung, devices, trails, ol
       data-floor={floor === null ? "" : `${floor.columns}x${floor.rows}`}
     >
       <canvas ref={canvas} aria-hidden="true" />
-      {hung.map((one, index) => {
+      {mounted.map((one, index) => {
         const [left, top] = (pins[index] ?? [0.5, 0.5]).map((share) => `${100 * share}%`);
         return (
           <a
@@ -242,8 +242,8 @@ export function Drawing({ extent: room, floor, places, hung, devices, trails, ol
           onClick={(event) => {
             const at = event.currentTarget.getBoundingClientRect();
             onPick(
-              room.lowX + ((event.clientX - at.left) / at.width) * wide,
-              room.highY - ((event.clientY - at.top) / at.height) * high,
+              room.lowX + ((event.clientX - at.left) / at.width) * widthM,
+              room.highY - ((event.clientY - at.top) / at.height) * heightM,
             );
           }}
         />
@@ -269,18 +269,18 @@ function Mark({ place, device, label, left, top, receivedAt, index }: MarkProps)
   const content = (
     <>
       {place.yawRad !== null && <span class="arrow" style={{ transform: `rotate(${-place.yawRad}rad)` }} aria-hidden="true" />}
-      <span class="who-leader" aria-hidden="true" />
+      <span class="occupant-leader" aria-hidden="true" />
       <span class="disc" aria-hidden="true">
         {texts.plan.letter(index)}
       </span>
-      <span class="who-label">
+      <span class="occupant-label">
         {label}
         {unseen && <span class="small"> · {texts.plan.unseen(ageS)}</span>}
       </span>
     </>
   );
   const common = {
-    class: `who ${device === null ? "human" : "robot"} series-${(index % 8) + 1} ${unseen ? "old" : ""}`,
+    class: `occupant ${device === null ? "human" : "robot"} series-${(index % 8) + 1} ${unseen ? "old" : ""}`,
     style: { left, top },
     "data-testid": `place-${place.name}`,
     "data-x": place.xM,

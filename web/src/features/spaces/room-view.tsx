@@ -10,23 +10,23 @@ export function RoomView({ fleet, id }: { fleet: Fleet; id: string }) {
   const devices = [...(all?.values() ?? [])].filter(({ info }) => info.value.space === id);
   const ids = devices.map((device) => device.id).join();
   useEffect(() => {
-    const ends = devices.map((device) => device.watchMeasurements());
-    return () => ends.forEach((end) => end());
-    // By id: a new list of the same devices must not reload everything.
+    const unsubscribers = devices.map((device) => device.watchMeasurements());
+    return () => unsubscribers.forEach((end) => end());
+    // Depends on the ids: a new list of the same devices must not subscribe again.
   }, [ids]);
   const agents = [...new Set(devices.map(({ info }) => info.value.agent))];
   // Only agents with a device position or a `positions` stream have a plan.
-  const drawn = agents.filter((agent) =>
+  const withPlan = agents.filter((agent) =>
     devices.some(({ info, description }) => {
-      const told = description.value;
-      if (info.value.agent !== agent || told === null) return false;
-      return told.position_m !== null || told.streams.some(({ name }) => name === "positions");
+      const received = description.value;
+      if (info.value.agent !== agent || received === null) return false;
+      return received.position_m !== null || received.streams.some(({ name }) => name === "positions");
     }),
   );
   return (
     <>
-      {drawn.length === 0 && <p class="quiet">{texts.plan.empty}</p>}
-      {drawn.map((agent) => (
+      {withPlan.length === 0 && <p class="quiet">{texts.plan.empty}</p>}
+      {withPlan.map((agent) => (
         <FloorPlan key={agent} fleet={fleet} space={id} agent={agent} />
       ))}
       <DeviceLists devices={devices} fleet={fleet} />

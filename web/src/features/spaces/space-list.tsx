@@ -11,23 +11,23 @@ import { spaceAddress } from "../../shared/routing/routes";
 /** The accessible spaces, and a form to create one. */
 export function SpaceList({ api, fleet }: { api: Api; fleet: Fleet }) {
   const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
-  const [wrong, setWrong] = useState("");
+  const [error, setError] = useState("");
   const devices = fleet.devices.value;
-  const read = async (): Promise<void> => {
+  const load = async (): Promise<void> => {
     try {
       setSpaces(await api.spaces());
-      setWrong("");
+      setError("");
     } catch (error) {
-      setWrong(texts.spaces.failed(sentence(error)));
+      setError(texts.spaces.failed(sentence(error)));
     }
   };
   // Reload when devices change: a space may have been added or removed.
-  useEffect(() => void read(), [api, devices]);
+  useEffect(() => void load(), [api, devices]);
   const count = (id: string): number =>
     [...(devices?.values() ?? [])].filter(({ info }) => info.value.space === id).length;
   return (
     <Card title={texts.spaces.title} class="spaces">
-      {spaces === null && wrong === "" && <p class="quiet">{common.loading}</p>}
+      {spaces === null && error === "" && <p class="quiet">{common.loading}</p>}
       {spaces?.length === 0 && <p class="quiet">{texts.spaces.none}</p>}
       <ul class="people">
         {spaces?.map(({ id, name, role, owner }) => (
@@ -43,28 +43,28 @@ export function SpaceList({ api, fleet }: { api: Api; fleet: Fleet }) {
           </li>
         ))}
       </ul>
-      <p class="field-error" aria-live="polite" hidden={wrong === ""}>
-        {wrong}
+      <p class="field-error" aria-live="polite" hidden={error === ""}>
+        {error}
       </p>
-      <MakeSpace api={api} onMade={() => void read()} />
+      <CreateSpaceForm api={api} onCreated={() => void load()} />
     </Card>
   );
 }
 
-function MakeSpace({ api, onMade }: { api: Api; onMade: () => void }) {
+function CreateSpaceForm({ api, onCreated }: { api: Api; onCreated: () => void }) {
   const [name, setName] = useState("");
   const [busy, setBusy] = useState(false);
-  const [said, setSaid] = useState({ text: "", wrong: false });
-  const make = async (): Promise<void> => {
+  const [message, setMessage] = useState({ text: "", error: false });
+  const create = async (): Promise<void> => {
     setBusy(true);
-    setSaid({ text: "", wrong: false });
+    setMessage({ text: "", error: false });
     try {
-      const made = await api.createSpace(name.trim());
+      const created = await api.createSpace(name.trim());
       setName("");
-      setSaid({ text: texts.spaces.made(made.name), wrong: false });
-      onMade();
+      setMessage({ text: texts.spaces.created(created.name), error: false });
+      onCreated();
     } catch (error) {
-      setSaid({ text: sentence(error), wrong: true });
+      setMessage({ text: sentence(error), error: true });
     } finally {
       setBusy(false);
     }
@@ -74,7 +74,7 @@ function MakeSpace({ api, onMade }: { api: Api; onMade: () => void }) {
       class="row-form"
       onSubmit={(event) => {
         event.preventDefault();
-        void make();
+        void create();
       }}
     >
       <label for="space-name">{texts.spaces.name}</label>
@@ -90,11 +90,11 @@ function MakeSpace({ api, onMade }: { api: Api; onMade: () => void }) {
           onInput={(event) => setName(event.currentTarget.value)}
         />
         <button type="submit" disabled={busy}>
-          {busy ? texts.spaces.making : texts.spaces.make}
+          {busy ? texts.spaces.creating : texts.spaces.create}
         </button>
       </div>
-      <p id="space-answer" class={said.wrong ? "field-error" : "field-note"} aria-live="polite">
-        {said.text}
+      <p id="space-answer" class={message.error ? "field-error" : "field-note"} aria-live="polite">
+        {message.text}
       </p>
     </form>
   );

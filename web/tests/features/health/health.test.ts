@@ -49,13 +49,13 @@ const watched = (more: Partial<MonitoredField>): MonitoredField => ({
 
 describe("a watched field", () => {
   it.each([
-    [{}, { label: "Joint temperature · elbow", unit: "°C", judged: { warning_high: 70, high: 80, advice: "Let it rest." } }, 1],
+    [{}, { label: "Joint temperature · elbow", unit: "°C", limits: { warning_high: 70, high: 80, advice: "Let it rest." } }, 1],
     [{ field: "following_error_rad.wrist_1", label: "Following error", unit: "rad" }, { label: "Following error · wrist 1", unit: "°" }, 180 / Math.PI],
-    [{ field: "battery_v", label: "battery_v", unit: "", advice: "", high: null, warning_high: null }, { label: "Battery", unit: "V", judged: null }, 1],
+    [{ field: "battery_v", label: "battery_v", unit: "", advice: "", high: null, warning_high: null }, { label: "Battery", unit: "V", limits: null }, 1],
   ])("has a label, a unit and limits: %o", (more, expected, factor) => {
     const quantity = watchedQuantity(watched(more), null);
     expect(quantity).toMatchObject(expected);
-    expect(quantity.shown(2)).toBeCloseTo(2 * factor);
+    expect(quantity.toDisplay(2)).toBeCloseTo(2 * factor);
   });
 
   it("with a finding comes first", () => {

@@ -1,9 +1,9 @@
 import { readFileSync } from "node:fs";
 import { deflateSync } from "node:zlib";
 import { describe, expect, it } from "vitest";
-import { judge, quantityOf } from "../../../src/features/sensors/model/quantities";
+import { assess, quantityOf } from "../../../src/features/sensors/model/quantities";
 import { Recording } from "../../../src/features/sensors/model/stored-series";
-import { apart, extent, readFloor, readPlaces } from "../../../src/features/spaces/model/room-perception";
+import { separatePins, extent, readFloor, readPlaces } from "../../../src/features/spaces/model/room-perception";
 import { readDepth } from "../../../src/shared/lib/png";
 import { readFrame } from "../../../src/shared/mqtt/camera-frame";
 import { MessageError } from "../../../src/shared/mqtt/checks";
@@ -25,7 +25,7 @@ const thermometer = readDescription(
 );
 
 describe("messages of a room device", () => {
-  it("contain its position and limits, or none", () => {
+  it("contain its position and limits, if it has any", () => {
     expect(thermometer.position_m).toEqual([0.15, -2.47, 1.4]);
     expect(thermometer.diagnostics[0]).toMatchObject({ warning_high: 26, advice: "" });
     const bare = readDescription(bytes({ device: "a", kind: "a", robot_type: "a", label: "A" }));
@@ -102,7 +102,7 @@ function png(rows: number[][], bits = 16): Uint8Array {
 }
 
 describe("a depth image", () => {
-  it("keeps all sixteen bits with every filter", async () => {
+  it("is decoded with all sixteen bits and every filter", async () => {
     const rows = Array.from({ length: 7 }, (_, y) => Array.from({ length: 5 }, (__, x) => (y * 4001 + x * 977) % 65_536));
     const image = await readDepth(png(rows));
     expect([image.width, image.height]).toEqual([5, 7]);
@@ -124,7 +124,7 @@ describe("a floor plan", () => {
     expect(places.map(({ name, yawRad }) => [name, yawRad])).toEqual([["nao", 3], ["ur5", null]]);
   });
 
-  it("shows occupied and unseen cells, also beyond 32 columns", () => {
+  it("shows occupied and unobserved cells, also beyond 32 columns", () => {
     const grid = { lower_x_m: -3, lower_y_m: -2, side_m: 0.2, columns: 48, rows: 2 };
     const floor = readFloor({ ...grid, "taken_bits.0": 2 ** 47 + 1, "unknown_bits.0": 2, "taken_bits.1": 0, "unknown_bits.1": 0 });
     expect([0, 1, 2, 46, 47].map((column) => floor?.cell(column, 0))).toEqual(["taken", "unknown", "free", "free", "taken"]);
@@ -141,12 +141,12 @@ describe("a floor plan", () => {
   });
 
   it("moves overlapping pins apart, but not out of the plan", () => {
-    const pins = apart(Array.from({ length: 12 }, () => [100, 100] as const), 25);
+    const pins = separatePins(Array.from({ length: 12 }, () => [100, 100] as const), 25);
     expect(pins[0]).toEqual([100, 100]);
     pins.forEach(([x, y], index) => {
       for (const [otherX, otherY] of pins.slice(0, index)) expect(Math.hypot(x - otherX, y - otherY)).toBeGreaterThan(24);
     });
-    for (const [x, y] of apart(Array.from({ length: 12 }, () => [12, 290] as const), 25, [360, 302])) {
+    for (const [x, y] of separatePins(Array.from({ length: 12 }, () => [12, 290] as const), 25, [360, 302])) {
       expect(x >= 11.5 && y >= 11.5 && x <= 348.5 && y <= 290.5).toBe(true);
     }
   });
@@ -157,18 +157,18 @@ describe("a measured value", () => {
     const [described, plain, part, pan] = [["temperature", "temperature_c"], ["light", "light_lux"], ["presence", "people.door"], ["settings", "pan"]].map(
       ([stream = "", field = ""]) => quantityOf(thermometer, stream, field),
     );
-    expect(described).toMatchObject({ label: "Room temperature", unit: "°C", judged: LIMITS });
-    expect(plain).toMatchObject({ label: "Light", unit: "lx", judged: null });
+    expect(described).toMatchObject({ label: "Room temperature", unit: "°C", limits: LIMITS });
+    expect(plain).toMatchObject({ label: "Light", unit: "lx", limits: null });
     expect(part?.label).toBe("People · door");
     expect(pan).toMatchObject({ label: "Pan", unit: "°" });
-    expect(pan?.shown(Math.PI)).toBeCloseTo(180);
+    expect(pan?.toDisplay(Math.PI)).toBeCloseTo(180);
   });
 
   it("is compared with its limits, if there are any", () => {
-    const { judged } = quantityOf(thermometer, "temperature", "temperature_c");
-    expect([20, 17, 27, 4, 36].map((value) => judge(value, judged))).toEqual(["well", "warning", "warning", "bad", "bad"]);
-    expect(judge(1e6, null)).toBe("well");
-    expect(judge(-40, judged === null ? null : { ...judged, low: null, warning_low: null })).toBe("well");
+    const { limits } = quantityOf(thermometer, "temperature", "temperature_c");
+    expect([20, 17, 27, 4, 36].map((value) => assess(value, limits))).toEqual(["normal", "warning", "warning", "outside", "outside"]);
+    expect(assess(1e6, null)).toBe("normal");
+    expect(assess(-40, limits === null ? null : { ...limits, low: null, warning_low: null })).toBe("normal");
   });
 });
 
@@ -195,7 +195,7 @@ describe("a recording", () => {
     expect(recording.columns(0)[1].filter((value) => value === null)).toHaveLength(1);
   });
 
-  it("knows since when a state lasts, at least", () => {
+  it("reports the start of the current state, or its lower bound", () => {
     const recording = new Recording();
     expect(recording.since()).toBeNull();
     recording.load(series([1000, 2000, 3000], [0, 1, 1]), "open");

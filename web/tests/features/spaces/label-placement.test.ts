@@ -1,8 +1,8 @@
 import { describe, expect, it } from "vitest";
-import { type Box, type Named, placeLabels } from "../../../src/features/spaces/model/label-placement";
+import { type Box, type LabelledMark, placeLabels } from "../../../src/features/spaces/model/label-placement";
 
 const ROOM = { width: 360, height: 300 };
-const named = (x: number, y: number, width = 90): Named => ({ x, y, width, height: 18 });
+const named = (x: number, y: number, width = 90): LabelledMark => ({ x, y, width, height: 18 });
 const pin = (x: number, y: number): Box => ({ left: x - 12, top: y - 12, width: 24, height: 24 });
 
 function apart(boxes: readonly Box[]): boolean {
@@ -19,7 +19,7 @@ function apart(boxes: readonly Box[]): boolean {
   );
 }
 
-function boxes(marks: readonly Named[], taken: readonly Box[], before?: readonly (number | undefined)[]): Box[] {
+function boxes(marks: readonly LabelledMark[], taken: readonly Box[], before?: readonly (number | undefined)[]): Box[] {
   return placeLabels(marks, taken, ROOM, before).flatMap((placed, index) => {
     const { width, height } = marks[index] ?? named(0, 0);
     return placed === null ? [] : [{ left: placed.left, top: placed.top, width, height }];
@@ -27,7 +27,7 @@ function boxes(marks: readonly Named[], taken: readonly Box[], before?: readonly
 }
 
 describe("labels on a plan", () => {
-  it("are below their marks if that is free", () => {
+  it("are below their marks if that place is free", () => {
     const [placed] = placeLabels([named(180, 100)], [], ROOM);
     expect(placed).toMatchObject({ left: 135, top: 115, leader: null });
   });
@@ -44,7 +44,7 @@ describe("labels on a plan", () => {
     expect(apart(found)).toBe(true);
   });
 
-  it("have a leader line that ends at the label, if they are not beside their mark", () => {
+  it("have a leader line that ends at the label, if they are not adjacent to their mark", () => {
     const wall = [-12, 12, 36].flatMap((y) => [140, 165, 190, 215].map((x) => pin(x, 100 + y)));
     const [placed] = placeLabels([named(180, 110)], wall, ROOM);
     const { left = NaN, top = NaN, leader = null } = placed ?? {};
@@ -58,7 +58,7 @@ describe("labels on a plan", () => {
     expect(placeLabels([named(180, 100, 400)], [], ROOM)).toEqual([null]);
   });
 
-  it("stay in place while that is free", () => {
+  it("stay in place while the place is free", () => {
     const above = placeLabels([named(180, 100)], [pin(180, 125)], ROOM)[0]?.place;
     expect(above).toBe(1);
     expect(placeLabels([named(180, 100)], [], ROOM, [above])[0]?.place).toBe(above);

@@ -56,7 +56,7 @@ export function watchedQuantity(watched: MonitoredField, description: KnownDescr
   const judged = { stream, fields: field, label, unit, advice, low, high, warning_low, warning_high, change: null, horizon_s: 0, checks: [] };
   const described = { controls: description?.controls ?? [], diagnostics: limited || listed ? [judged] : [] };
   const quantity = quantityOf(described, stream, field);
-  if (!listed) return { ...quantity, judged: limited ? judged : null };
+  if (!listed) return { ...quantity, limits: limited ? judged : null };
   return { ...quantity, label: [label, ...part.map(readable)].join(" · ") };
 }
 

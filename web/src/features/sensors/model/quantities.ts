@@ -9,50 +9,50 @@ export interface Quantity {
   /** The displayed unit: degrees for angles. */
   unit: string;
   /** Converts from the message's unit to the displayed unit. */
-  shown: (value: number) => number;
-  /** The room's limits; `null`: none. */
-  judged: KnownDiagnostic | null;
+  toDisplay: (value: number) => number;
+  /** The limits from the description; `null`: none. */
+  limits: KnownDiagnostic | null;
 }
 
-const same = (value: number): number => value;
+const identity = (value: number): number => value;
 
 /** Units by name suffix; the longest match applies. */
 const UNITS: readonly (readonly [string, string, (value: number) => number])[] = [
   ["rad_s", "°/s", degrees],
-  ["percent", "%", same],
-  ["m_s", "m/s", same],
+  ["percent", "%", identity],
+  ["m_s", "m/s", identity],
   ["rad", "°", degrees],
-  ["ppm", "ppm", same],
-  ["lux", "lx", same],
-  ["nm", "N m", same],
-  ["db", "dB", same],
-  ["ms", "ms", same],
-  ["hz", "Hz", same],
-  ["m", "m", same],
-  ["s", "s", same],
-  ["c", "°C", same],
-  ["v", "V", same],
-  ["a", "A", same],
-  ["w", "W", same],
+  ["ppm", "ppm", identity],
+  ["lux", "lx", identity],
+  ["nm", "N m", identity],
+  ["db", "dB", identity],
+  ["ms", "ms", identity],
+  ["hz", "Hz", identity],
+  ["m", "m", identity],
+  ["s", "s", identity],
+  ["c", "°C", identity],
+  ["v", "V", identity],
+  ["a", "A", identity],
+  ["w", "W", identity],
 ];
 
 /** Label, unit and limits of one field. */
 export function quantityOf(description: Pick<KnownDescription, "controls" | "diagnostics">, stream: string, field: string): Quantity {
   const [name = field, ...part] = field.split(".");
-  const judged = description.diagnostics.find((one) => (one.stream === "" || one.stream === stream) && fits(one.fields, field)) ?? null;
+  const limits = description.diagnostics.find((one) => (one.stream === "" || one.stream === stream) && fits(one.fields, field)) ?? null;
   const control = description.controls.find((one) => one.name === field);
   const found = UNITS.find(([end]) => name === end || name.endsWith(`_${end}`));
   const share = control !== undefined && (control.unit ?? "") === "" && control.lower === 0 && control.upper === 1;
-  if (share) return { stream, field, label: control.label, unit: "%", shown: (value) => value * 100, judged };
-  const told = control?.unit ?? (judged?.unit === "" ? undefined : judged?.unit);
-  const unit = told === "rad" || told === undefined ? (found?.[1] ?? (told === "rad" ? "°" : "")) : told;
-  const shown = told === "rad" ? degrees : told === undefined ? (found?.[2] ?? same) : same;
-  const bare = found === undefined ? name : name.slice(0, -found[0].length);
-  const words = bare.replaceAll("_", " ").trim();
-  const plain = control?.label ?? (words === "" ? name : words.charAt(0).toUpperCase() + words.slice(1));
-  // A label for all fields of a stream does not name one of them.
-  const label = judged !== null && judged.fields !== "*" && part.length === 0 ? judged.label : [plain, ...part].join(" · ");
-  return { stream, field, label, unit, shown, judged };
+  if (share) return { stream, field, label: control.label, unit: "%", toDisplay: (value) => value * 100, limits };
+  const declaredUnit = control?.unit ?? (limits?.unit === "" ? undefined : limits?.unit);
+  const unit = declaredUnit === "rad" || declaredUnit === undefined ? (found?.[1] ?? (declaredUnit === "rad" ? "°" : "")) : declaredUnit;
+  const toDisplay = declaredUnit === "rad" ? degrees : declaredUnit === undefined ? (found?.[2] ?? identity) : identity;
+  const nameWithoutUnit = found === undefined ? name : name.slice(0, -found[0].length);
+  const words = nameWithoutUnit.replaceAll("_", " ").trim();
+  const ownLabel = control?.label ?? (words === "" ? name : words.charAt(0).toUpperCase() + words.slice(1));
+  // A label for all fields of a stream does not identify a single field.
+  const label = limits !== null && limits.fields !== "*" && part.length === 0 ? limits.label : [ownLabel, ...part].join(" · ");
+  return { stream, field, label, unit, toDisplay, limits };
 }
 
 /** Whether a pattern, in which `*` matches any text, matches a field. */
@@ -61,15 +61,15 @@ function fits(pattern: string, field: string): boolean {
   return new RegExp(`^${parts.join(".*")}$`).test(field);
 }
 
-type Judgement = "well" | "warning" | "bad";
+type Assessment = "normal" | "warning" | "outside";
 
-/** Compares a value with the room's limits. */
-export function judge(value: number, judged: KnownDiagnostic | null): Judgement {
-  if (judged === null) return "well";
-  const { low, high, warning_low: warningLow, warning_high: warningHigh } = judged;
-  if ((low !== null && value < low) || (high !== null && value > high)) return "bad";
+/** Compares a value with its limits. */
+export function assess(value: number, limits: KnownDiagnostic | null): Assessment {
+  if (limits === null) return "normal";
+  const { low, high, warning_low: warningLow, warning_high: warningHigh } = limits;
+  if ((low !== null && value < low) || (high !== null && value > high)) return "outside";
   if ((warningLow !== null && value < warningLow) || (warningHigh !== null && value > warningHigh)) return "warning";
-  return "well";
+  return "normal";
 }
 
 /** Decimal places for a range, so that its limits differ in the third digit. */

@@ -16,23 +16,23 @@ const TIMEOUT_MS = 30_000;
 const CAPTURE_TIMEOUT_MS = 120_000;
 const MARGIN_MS = 15_000;
 
-interface Shot {
+interface SingleMeasurement {
   /** Arrival time on the page's clock [ms]. */
   at: number;
   streams: Readonly<Record<string, Values>>;
 }
 
-export interface Taken {
+export interface CapturedFile {
   upload: Upload;
   url: string;
 }
 
 /** The requested and the applied value of a control. */
 interface Setting {
-  asked: number;
+  requested: number;
   /** `null` until the response, or without one. */
   applied: number | null;
-  why: string;
+  error: string;
 }
 
 export class RoomDeviceAction {
@@ -41,19 +41,19 @@ export class RoomDeviceAction {
   readonly #actions: ActionRunner;
   readonly #epoch: () => number | null;
   readonly #busy = signal<RoomRequest["kind"] | null>(null);
-  readonly #why = signal("");
-  readonly #shot = signal<Shot | null>(null);
+  readonly #error = signal("");
+  readonly #measurement = signal<SingleMeasurement | null>(null);
   readonly #settings = signal<ReadonlyMap<string, Setting>>(new Map());
   readonly #uploads = signal<readonly Upload[] | null>(null);
-  readonly #wanted = new Map<string, number>();
+  readonly #pending = new Map<string, number>();
   #setting = false;
 
   /** The running request. */
   readonly busy: ReadonlySignal<RoomRequest["kind"] | null> = this.#busy;
   /** The error of the last request, or "". */
-  readonly why: ReadonlySignal<string> = this.#why;
+  readonly error: ReadonlySignal<string> = this.#error;
   /** The last single measurement. */
-  readonly shot: ReadonlySignal<Shot | null> = this.#shot;
+  readonly measurement: ReadonlySignal<SingleMeasurement | null> = this.#measurement;
   readonly settings: ReadonlySignal<ReadonlyMap<string, Setting>> = this.#settings;
   /** Captured files, newest first; `null` until loaded. */
   readonly uploads: ReadonlySignal<readonly Upload[] | null> = this.#uploads;
@@ -66,41 +66,41 @@ export class RoomDeviceAction {
     this.#epoch = epoch;
   }
 
-  /** Measures streams at this rate; all subscribers receive them. Does not wait for the end. */
-  async gather(streams: string[], rateHz: number, durationS: number): Promise<void> {
+  /** Starts measuring streams at this rate; all subscribers receive the data. Returns when it has started. */
+  async collect(streams: string[], rateHz: number, durationS: number): Promise<void> {
     const request = { kind: "gather", streams, rate_hz: rateHz, duration_s: durationS } as const;
-    await this.#ask(request, "started", durationS * 1000 + MARGIN_MS);
+    await this.#runAction(request, "started", durationS * 1000 + MARGIN_MS);
   }
 
   /** Cancels the device's current action, including one that another caller started. */
-  async stopGathering(): Promise<void> {
+  async cancelCollection(): Promise<void> {
     const running = this.#device.state.value?.action ?? null;
     if (running === null) return;
-    this.#why.value = await this.#actions.cancel(running.id);
+    this.#error.value = await this.#actions.cancel(running.id);
   }
 
-  async shoot(): Promise<void> {
-    const done = await this.#ask({ kind: "shoot", streams: [] }, "done", TIMEOUT_MS);
-    if (done === null) return;
-    this.#try(() => (this.#shot.value = { at: now(), streams: readShot(done.result) }));
+  async measureOnce(): Promise<void> {
+    const run = await this.#runAction({ kind: "shoot", streams: [] }, "done", TIMEOUT_MS);
+    if (run === null) return;
+    this.#reportErrors(() => (this.#measurement.value = { at: now(), streams: readShot(run.result) }));
   }
 
-  /** Captures raw data; returns its location, or `null` on an error in `why`. */
-  async capture(name: string): Promise<Taken | null> {
-    const done = await this.#ask({ kind: "capture", name }, "done", CAPTURE_TIMEOUT_MS);
-    const id = done?.result["upload"];
+  /** Captures raw data; returns its location, or `null` on an error. */
+  async capture(name: string): Promise<CapturedFile | null> {
+    const run = await this.#runAction({ kind: "capture", name }, "done", CAPTURE_TIMEOUT_MS);
+    const id = run?.result["upload"];
     if (typeof id !== "string") return null;
     void this.list();
-    return this.find(id);
+    return this.file(id);
   }
 
   /** A captured file with its address. */
-  async find(id: string): Promise<Taken | null> {
+  async file(id: string): Promise<CapturedFile | null> {
     try {
       const { url, ...upload } = await this.#api.upload(this.#device.id, id);
       return { upload, url };
     } catch (error) {
-      this.#why.value = sentence(error);
+      this.#error.value = sentence(error);
       return null;
     }
   }
@@ -109,14 +109,14 @@ export class RoomDeviceAction {
     try {
       this.#uploads.value = await this.#api.uploads(this.#device.id, 50);
     } catch (error) {
-      this.#why.value = sentence(error);
+      this.#error.value = sentence(error);
     }
   }
 
   /** Sets a control. During a request, only the newest of the following values is sent. */
   async set(control: string, value: number): Promise<void> {
-    this.#wanted.set(control, value);
-    this.#note(control, { asked: value, applied: null, why: "" });
+    this.#pending.set(control, value);
+    this.#storeSetting(control, { requested: value, applied: null, error: "" });
     if (this.#setting) return;
     this.#setting = true;
     try {
@@ -127,44 +127,44 @@ export class RoomDeviceAction {
   }
 
   #next(): [string, number] | null {
-    const [first] = this.#wanted;
+    const [first] = this.#pending;
     if (first === undefined) return null;
-    this.#wanted.delete(first[0]);
+    this.#pending.delete(first[0]);
     return first;
   }
 
   async #setOne(control: string, value: number): Promise<void> {
-    const done = await this.#ask({ kind: "set_control", control, value }, "done", TIMEOUT_MS);
-    const why = this.#why.value;
-    this.#why.value = "";
-    let setting: Setting = { asked: value, applied: null, why };
-    if (done !== null) {
-      this.#try(() => (setting = { asked: value, applied: readApplied(done.result)[control] ?? null, why: "" }));
+    const run = await this.#runAction({ kind: "set_control", control, value }, "done", TIMEOUT_MS);
+    const error = this.#error.value;
+    this.#error.value = "";
+    let setting: Setting = { requested: value, applied: null, error };
+    if (run !== null) {
+      this.#reportErrors(() => (setting = { requested: value, applied: readApplied(run.result)[control] ?? null, error: "" }));
     }
     // A newer request is pending: its response applies.
-    if (!this.#wanted.has(control)) this.#note(control, setting);
+    if (!this.#pending.has(control)) this.#storeSetting(control, setting);
   }
 
-  #note(control: string, setting: Setting): void {
+  #storeSetting(control: string, setting: Setting): void {
     this.#settings.value = new Map(this.#settings.value).set(control, setting);
   }
 
-  /** The run at the requested status; `null` on an error in `why`. */
-  async #ask(request: RoomRequest, waitFor: Required<ActionOptions>["waitFor"], timeoutMs: number): Promise<Run | null> {
+  /** The run at the requested status; `null` on an error. */
+  async #runAction(request: RoomRequest, waitFor: Required<ActionOptions>["waitFor"], timeoutMs: number): Promise<Run | null> {
     this.#busy.value = request.kind;
-    this.#why.value = "";
+    this.#error.value = "";
     const run = await this.#actions.startAndWait(request, { epoch: this.#epoch(), waitFor, timeoutMs });
     this.#busy.value = null;
     if (run.status === "done" || (waitFor === "started" && run.status === "started")) return run;
-    this.#why.value = run.reason === "" ? run.status : run.reason;
+    this.#error.value = run.reason === "" ? run.status : run.reason;
     return null;
   }
 
-  #try(read: () => void): void {
+  #reportErrors(read: () => void): void {
     try {
       read();
     } catch (error) {
-      this.#why.value = sentence(error);
+      this.#error.value = sentence(error);
     }
   }
 }

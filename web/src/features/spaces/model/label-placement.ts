@@ -8,7 +8,7 @@ export interface Box {
 }
 
 /** The centre of a mark and the size of its label. */
-export interface Named {
+export interface LabelledMark {
   x: number;
   y: number;
   width: number;
@@ -25,10 +25,10 @@ export interface Placed {
 }
 
 /** Half a mark plus a margin. */
-const BESIDE = 15;
+const MARK_DISTANCE = 15;
 /** Distances from the mark. */
 const STEPS = [0, 20, 40, 60, 85];
-const AIR = 2;
+const MIN_GAP = 2;
 /** Below first. */
 const SIDES = [
   [0, 1],
@@ -46,19 +46,19 @@ const SIDES = [
  * tried first, so that labels stay in place.
  */
 export function placeLabels(
-  marks: readonly Named[],
+  marks: readonly LabelledMark[],
   taken: readonly Box[],
   within: { width: number; height: number },
   before: readonly (number | undefined)[] = [],
 ): (Placed | null)[] {
-  const full = [...taken];
+  const occupied = [...taken];
   return marks.map((mark, index) => {
     const last = before[index];
     const around = STEPS.flatMap((_, step) => SIDES.map((_, side) => step * SIDES.length + side));
     for (const place of last === undefined ? around : [last, ...around]) {
       const box = boxAt(mark, place);
-      if (!inside(box, within) || full.some((other) => overlap(box, other))) continue;
-      full.push(box);
+      if (!inside(box, within) || occupied.some((other) => overlap(box, other))) continue;
+      occupied.push(box);
       const leader = place < SIDES.length ? null : leaderTo(mark, box);
       return { left: box.left, top: box.top, place, leader };
     }
@@ -66,9 +66,9 @@ export function placeLabels(
   });
 }
 
-function boxAt({ x, y, width, height }: Named, place: number): Box {
+function boxAt({ x, y, width, height }: LabelledMark, place: number): Box {
   const [sideX, sideY] = SIDES[place % SIDES.length] ?? SIDES[0];
-  const off = BESIDE + (STEPS[Math.floor(place / SIDES.length)] ?? 0);
+  const off = MARK_DISTANCE + (STEPS[Math.floor(place / SIDES.length)] ?? 0);
   return {
     left: x - width / 2 + sideX * (width / 2 + off),
     top: y - height / 2 + sideY * (height / 2 + off),
@@ -83,14 +83,14 @@ function inside({ left, top, width, height }: Box, within: { width: number; heig
 
 function overlap(one: Box, other: Box): boolean {
   return (
-    one.left < other.left + other.width + AIR &&
-    other.left < one.left + one.width + AIR &&
-    one.top < other.top + other.height + AIR &&
-    other.top < one.top + one.height + AIR
+    one.left < other.left + other.width + MIN_GAP &&
+    other.left < one.left + one.width + MIN_GAP &&
+    one.top < other.top + other.height + MIN_GAP &&
+    other.top < one.top + one.height + MIN_GAP
   );
 }
 
-function leaderTo({ x, y }: Named, { left, top, width, height }: Box): { length: number; angleRad: number } {
+function leaderTo({ x, y }: LabelledMark, { left, top, width, height }: Box): { length: number; angleRad: number } {
   const [toX, toY] = [Math.min(left + width, Math.max(left, x)) - x, Math.min(top + height, Math.max(top, y)) - y];
   return { length: Math.hypot(toX, toY), angleRad: Math.atan2(toY, toX) };
 }

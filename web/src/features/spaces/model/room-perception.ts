@@ -27,9 +27,9 @@ export interface Floor {
   cell: (column: number, row: number) => Cell;
 }
 
-const MOST_PLACES = 128;
+const MAX_ROWS = 128;
 /** A number represents this many bits exactly. */
-const MOST_COLUMNS = 53;
+const MAX_COLUMNS = 53;
 
 /** The stream `positions`, by name. Entries without a coordinate are omitted. */
 export function readPlaces(values: Values): Place[] {
@@ -48,7 +48,7 @@ export function readFloor(values: Values): Floor | null {
   const [lowerXM, lowerYM] = [numeric(values["lower_x_m"]), numeric(values["lower_y_m"])];
   const [sideM, columns, rows] = [numeric(values["side_m"]), numeric(values["columns"]), numeric(values["rows"])];
   if (lowerXM === null || lowerYM === null || sideM === null || columns === null || rows === null) return null;
-  if (!(sideM > 0) || !isCount(columns, MOST_COLUMNS) || !isCount(rows, MOST_PLACES)) return null;
+  if (!(sideM > 0) || !isCount(columns, MAX_COLUMNS) || !isCount(rows, MAX_ROWS)) return null;
   const taken = bits(values, "taken_bits", rows);
   const unknown = bits(values, "unknown_bits", rows);
   const cell = (column: number, row: number): Cell => {
@@ -67,8 +67,8 @@ function isSet(row: number | null | undefined, column: number): boolean {
   return typeof row === "number" && Math.floor(row / 2 ** column) % 2 === 1;
 }
 
-function isCount(value: number, most: number): boolean {
-  return Number.isInteger(value) && value >= 1 && value <= most;
+function isCount(value: number, max: number): boolean {
+  return Number.isInteger(value) && value >= 1 && value <= max;
 }
 
 function numeric(value: number | boolean | undefined): number | null {
@@ -99,7 +99,7 @@ export function extent(floors: readonly Floor[], points: readonly (readonly [num
 }
 
 /** Moves overlapping pins apart [px]. Each stays as near to its position as possible and inside the plan. */
-export function apart(
+export function separatePins(
   points: readonly (readonly [number, number])[],
   gap: number,
   [wide, high]: readonly [number, number] = [Infinity, Infinity],
@@ -107,11 +107,11 @@ export function apart(
   const inside = ([x, y]: [number, number]): boolean =>
     x >= gap / 2 - 1 && y >= gap / 2 - 1 && x <= wide - gap / 2 + 1 && y <= high - gap / 2 + 1;
   const placed: [number, number][] = [];
-  for (const [x, y] of points) placed.push(free(x, y, placed, gap, inside));
+  for (const [x, y] of points) placed.push(freePosition(x, y, placed, gap, inside));
   return placed;
 }
 
-function free(
+function freePosition(
   x: number,
   y: number,
   placed: readonly [number, number][],
