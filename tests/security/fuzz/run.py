@@ -102,7 +102,7 @@ def _fuzz(folder: Path, name: str, options: tuple[str, ...], *, with_examples: b
     longest = max(4096, *(2 * len(seed) for seed in target.seeds))
     arguments = [name, str(corpus), f"-max_len={longest}", "-timeout=20", "-rss_limit_mb=2048"]
     arguments += ["-artifact_prefix=/tmp/", *(options if with_examples else ("-runs=1",))]
-    atheris.Setup(arguments, target.try_out, custom_mutator=mutate)
+    atheris.Setup(arguments, target.run, custom_mutator=mutate)
     atheris.Fuzz()
 
 

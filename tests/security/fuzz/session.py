@@ -16,7 +16,7 @@ _REACHED = re.compile(r"^#[0-9]+\s+(INITED|DONE)\s+cov: ([0-9]+)", re.MULTILINE)
 _DONE = re.compile(r"^Done ([0-9]+) runs", re.MULTILINE)
 
 
-class Crashed(Exception):  # noqa: N818 (what a fuzzer is for)
+class Crashed(Exception):  # noqa: N818 (an outcome that the fuzzer expects)
     """A parser raised an undocumented exception; the text is the fuzzer's output with the input."""
 
 

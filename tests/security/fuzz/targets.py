@@ -43,7 +43,7 @@ _KEY = signing.generate()
 _KEYS = {signing.key_id(_KEY.public_key()): _KEY.public_key()}
 
 
-class Found(Exception):  # noqa: N818 (what a fuzzer is for)
+class Found(Exception):  # noqa: N818 (an outcome that the fuzzer expects)
     """The parser accepted invalid input."""
 
 
@@ -52,11 +52,11 @@ class Target:
     """One fuzzed parser.
 
     Attributes:
-        try_out: Parses bytes; raises only if the parser is wrong.
+        run: Parses bytes; raises only if the parser has an error.
         seeds: Valid examples.
     """
 
-    try_out: Callable[[bytes], None]
+    run: Callable[[bytes], None]
     seeds: tuple[bytes, ...]
 
 
@@ -90,7 +90,7 @@ def _message(data: bytes) -> None:
         raise Found(str(error)) from error
     again = codec.decode(encoded, kind)
     if again != message or codec.encode(again) != encoded:
-        raise Found(f"{kind.__name__} changes when it is written and read again")
+        raise Found(f"{kind.__name__} changes when it is serialized and parsed again")
 
 
 def _signed(data: bytes) -> None:
@@ -109,7 +109,7 @@ def _topic(data: bytes) -> None:
             else topics.device(parsed.space, parsed.agent, parsed.device, parsed.kind, parsed.name)
         )
         if again != topic or not topics.matches(topic, topic):
-            raise Found(f"{topic!r} was read as {parsed}")
+            raise Found(f"{topic!r} was parsed as {parsed}")
     covered = topics.matches(pattern, topic)
     if covered and "#" not in pattern and len(pattern.split("/")) != len(topic.split("/")):
         raise Found(f"{pattern!r} covers {topic!r}")
@@ -173,7 +173,7 @@ def _stanza(data: bytes) -> None:
         text = stanzas.message("a@site", delivery.topic, delivery.payload, receipt=delivery.id)
         again = stanzas.parse(fromstring(text))  # noqa: S314
         if again != delivery:
-            raise Found(f"{delivery} changes when it is written and read again: {again}")
+            raise Found(f"{delivery} changes when it is serialized and parsed again: {again}")
 
 
 _FOLDER = Path(tempfile.mkdtemp(prefix="ts-fuzz-"))
@@ -190,7 +190,7 @@ def _home(data: bytes) -> None:
     if config is not None:
         config.save(store.folder)
         if AgentConfig.load(store.folder) != config:
-            raise Found("the configuration changes when it is written and read again")
+            raise Found("the configuration changes when it is serialized and parsed again")
 
 
 class _Request:
@@ -244,7 +244,7 @@ def _check_finite(value: Any) -> None:
     match value:
         case float():
             if not math.isfinite(value):
-                raise Found(f"{value} came out")
+                raise Found(f"{value} was accepted")
         case dict():
             _check_finite([*value, *value.values()])
         case list() | tuple():

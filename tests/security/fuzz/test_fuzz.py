@@ -11,14 +11,14 @@ from tests.security.fuzz.targets import TARGETS, Found, _check_finite
 SLOW = ("home", "robot_type")
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="atheris, the fuzzer, is installed on Linux alone")
+@pytest.mark.skipif(sys.platform != "linux", reason="the fuzzer atheris is installed on Linux only")
 @pytest.mark.parametrize(("slow", "runs"), [(False, 2000), (True, 300)], ids=["quick", "slow"])
 def test_parsers_raise_only_documented_errors(slow: bool, runs: int) -> None:
     assert set(TARGETS) == set(instrumented.MODULES)
     sessions = list(fuzz([name for name in TARGETS if (name in SLOW) == slow], f"-runs={runs}", "-seed=1"))
     print(*(session.row for session in sessions), sep="\n")
     assert all(session.runs >= runs for session in sessions)
-    assert all(session.end > session.empty for session in sessions), "the fuzzer is blind"
+    assert all(session.end > session.empty for session in sessions), "the fuzzer measures no coverage"
 
 
 @pytest.mark.parametrize(
@@ -31,13 +31,13 @@ def test_parsers_raise_only_documented_errors(slow: bool, runs: int) -> None:
     ],
 )
 def test_earlier_findings_stay_fixed(name: str, found: bytes) -> None:
-    TARGETS[name].try_out(found)
+    TARGETS[name].run(found)
 
 
 def test_every_example_passes() -> None:
     for target in TARGETS.values():
         for seed in target.seeds:
-            target.try_out(seed)
+            target.run(seed)
 
 
 def test_a_non_finite_number_is_found_at_any_depth() -> None:

@@ -46,7 +46,7 @@ class Result(msgspec.Struct):
         breaches: Successes that the attack reports or that are observed from outside.
         message: The error of the script, as the operator reads it.
         moves: Calls that reached the robot.
-        killed: Whether the process was killed, so that it did not end by itself.
+        killed: Whether the process was killed, so that it did not end without a kill.
         messages: Number of processed messages.
         cpu_s: Processor time of the host during the attack [s].
         wall_s: Duration [s].

@@ -70,7 +70,7 @@ REQUIREMENTS: dict[str, Callable[[Result], None]] = {
     "moves_without_the_api": require_finite_moves,
     "moves_after_it_has_ended": require_no_move,
 }
-"""Requirements beside those of every attack."""
+"""Requirements in addition to those of every attack."""
 
 
 @pytest.fixture(scope="module", params=USERS)

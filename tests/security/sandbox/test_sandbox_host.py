@@ -1,4 +1,4 @@
-"""The zygote starts clean, is replaced when it dies, dies with its agent, and reports missing layers."""
+"""The zygote starts clean, is replaced after a kill, ends with its agent, and reports missing layers."""
 
 import contextlib
 import json
@@ -27,7 +27,7 @@ def sandbox() -> Iterator[SandboxHost]:
     sandbox.close()
 
 
-def play(process: SandboxProcess, source: str) -> str:
+def run_script(process: SandboxProcess, source: str) -> str:
     """Runs a script and returns its messages and why it ended."""
     with contextlib.closing(process), process.link.makefile("rwb") as lines:
         assert json.loads(lines.readline()) == {"kind": "ready"}
@@ -48,7 +48,7 @@ def zygote_of(sandbox: SandboxHost) -> int:
     return process.pid
 
 
-def dead(pid: int) -> bool:
+def has_ended(pid: int) -> bool:
     with contextlib.suppress(OSError):
         return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()[0] in "ZX"
     return True
@@ -74,10 +74,10 @@ def test_the_zygote_inherits_nothing_of_the_agent(monkeypatch: pytest.MonkeyPatc
 def test_a_killed_zygote_is_replaced(sandbox: SandboxHost) -> None:
     running = sandbox.open(Limits(), untrusted=False)
     os.kill(zygote_of(sandbox), signal.SIGKILL)
-    assert running.wait(PATIENCE_S), "children die with the zygote"
+    assert running.wait(PATIENCE_S), "the processes must end with the zygote"
     assert running.ending() in {"", "the script sandbox has ended"}
     running.close()
-    assert "7" in play(sandbox.open(Limits(), untrusted=False), "print(3 + 4)")
+    assert "7" in run_script(sandbox.open(Limits(), untrusted=False), "print(3 + 4)")
 
 
 def test_an_unresponsive_zygote_is_killed_and_replaced(sandbox: SandboxHost, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,9 +91,9 @@ def test_an_unresponsive_zygote_is_killed_and_replaced(sandbox: SandboxHost, mon
     os.kill(stuck, signal.SIGSTOP)
     with pytest.raises(SandboxError, match="does not respond"):
         sandbox.open(Limits(), untrusted=False)
-    assert dead(stuck)
+    assert has_ended(stuck)
     monkeypatch.setattr(host, "_RESPONSE_S", 20.0)
-    assert "7" in play(sandbox.open(Limits(), untrusted=False), "print(3 + 4)")
+    assert "7" in run_script(sandbox.open(Limits(), untrusted=False), "print(3 + 4)")
 
 
 def ready(sandbox: SandboxHost) -> host._HostedProcess:
@@ -109,8 +109,8 @@ def test_a_process_is_prepared_for_each_script(sandbox: SandboxHost) -> None:
         pids.add(prepared.pid)
         process = sandbox.open(Limits(), untrusted=False)
         assert process is prepared
-        assert str(number) in play(process, f"print({number})")
-    assert len(pids) == 3, "each script has a process of its own"
+        assert str(number) in run_script(process, f"print({number})")
+    assert len(pids) == 3, "each script must have a separate process"
 
 
 def test_a_process_prepared_for_other_limits_is_not_used(sandbox: SandboxHost) -> None:
@@ -120,22 +120,24 @@ def test_a_process_prepared_for_other_limits_is_not_used(sandbox: SandboxHost) -
         assert process.pid != prepared.pid
         assert b"ready" in process.link.recv(100)
         assert f"Max cpu time              {7} " in Path(f"/proc/{process.pid}/limits").read_text(encoding="ascii")
-    assert dead(prepared.pid)
+    assert has_ended(prepared.pid)
 
 
 def test_a_dead_prepared_process_is_replaced_and_close_kills_it(sandbox: SandboxHost) -> None:
     prepared = ready(sandbox)
     os.kill(prepared.pid, signal.SIGKILL)
     assert prepared.wait(PATIENCE_S)
-    assert "7" in play(sandbox.open(Limits(), untrusted=False), "print(3 + 4)")
+    assert "7" in run_script(sandbox.open(Limits(), untrusted=False), "print(3 + 4)")
     prepared = ready(sandbox)
     sandbox.close()
-    assert dead(prepared.pid)
+    assert has_ended(prepared.pid)
     sandbox.close()
-    assert "1" in play(sandbox.open(Limits(), untrusted=False), "print(1)"), "it starts again on demand"
+    assert "1" in run_script(sandbox.open(Limits(), untrusted=False), "print(1)"), (
+        "the sandbox must start again on demand"
+    )
 
 
-def test_all_processes_die_with_a_killed_agent() -> None:
+def test_all_processes_end_with_a_killed_agent() -> None:
     program = (
         "import os, sys\n"
         "from device_agent.sandbox.host import SandboxHost\n"
@@ -151,11 +153,11 @@ def test_all_processes_die_with_a_killed_agent() -> None:
         pids = [int(pid) for pid in agent.stdout.readline().split()]
         assert len(pids) == 3
         agent.kill()
-        wait_until(lambda: all(dead(pid) for pid in pids), "the end of all processes")
+        wait_until(lambda: all(has_ended(pid) for pid in pids), "the end of all processes")
 
 
 def test_processor_time_is_limited(sandbox: SandboxHost) -> None:
-    ending = play(sandbox.open(Limits(cpu_s=1), untrusted=False), "while True: pass")
+    ending = run_script(sandbox.open(Limits(cpu_s=1), untrusted=False), "while True: pass")
     assert ending.endswith("it used up its processor time, or the machine's memory")
 
 
@@ -192,10 +194,10 @@ blocked.add_rule(pyseccomp.ERRNO(errno.ENOSYS), "{blocked}")
 blocked.load()
 from device_agent.sandbox.host import SandboxHost
 from device_agent.ports.sandbox import Limits
-from tests.security.sandbox.test_sandbox_host import play
+from tests.security.sandbox.test_sandbox_host import run_script
 strict, lenient = SandboxHost(), SandboxHost(allow_unconfined=True)
 print(json.dumps([strict.refusal(untrusted=False), lenient.refusal(untrusted=False)]), flush=True)
-print(play(lenient.open(Limits(), untrusted=False), "print(3 + 4)"), flush=True)
+print(run_script(lenient.open(Limits(), untrusted=False), "print(3 + 4)"), flush=True)
 try:
     strict.open(Limits(), untrusted=False)
 except Exception as error:

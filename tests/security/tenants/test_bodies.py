@@ -8,7 +8,7 @@ import httpx
 from function_app.entrypoints.http.framework.responses import MAX_BODY
 from function_app.entrypoints.http.robot_types.schemas import MAX_UPLOAD
 from tests.harness.cloud.cloud import API, problem
-from tests.security.tenants.test_routes import ask
+from tests.security.tenants.test_routes import send_request
 from tests.security.tenants.world import World
 
 PART = 65_536
@@ -26,7 +26,7 @@ class Endless:
     async def parts(self) -> AsyncIterator[bytes]:
         while True:
             self.taken += PART
-            assert self.taken < self._most + 10 * PART, "the body is taken in whole"
+            assert self.taken < self._most + 10 * PART, "the server read the complete body"
             yield b" " * PART
 
 
@@ -46,20 +46,20 @@ def caller(operation: dict[str, Any]) -> str:
     return "owner" if "accessToken" in names else "agent"
 
 
-def asked(world: World, name: str, method: str, path: str, who: str, **body: Any) -> Any:
+def send_body(world: World, name: str, method: str, path: str, role: str, **body: Any) -> Any:
     """Response to this body instead of the default one."""
     robot: Any = getattr(world.callers["agent"], "__self__", None)
-    if who == "agent":
+    if role == "agent":
         body["headers"] = {"Authorization": f"Bearer {robot.token()}", **body.get("headers", {})}
 
     def send(method: str, path: str, **_: Any) -> httpx.Response:
         return (
             world.cloud.request(method, API + path, **body)
-            if who == "agent"
-            else world.callers[who](method, path, **body)
+            if role == "agent"
+            else world.callers[role](method, path, **body)
         )
 
-    return ask(World(world.cloud, {who: send}, world.ids, {}), who, name, method, path)[1]
+    return send_request(World(world.cloud, {role: send}, world.ids, {}), role, name, method, path)[1]
 
 
 def test_every_route_rejects_a_body_that_is_too_large_without_reading_it(world: World) -> None:
@@ -68,17 +68,17 @@ def test_every_route_rejects_a_body_that_is_too_large_without_reading_it(world: 
         if "requestBody" not in operation:
             continue
         assert "413" in operation["responses"], name
-        limit, who = LARGER.get(name, MAX_BODY), caller(operation)
+        limit, role = LARGER.get(name, MAX_BODY), caller(operation)
         body = Endless(limit)
-        problem(asked(world, name, method, path, who, content=body.parts()), 413, "too-large")
+        problem(send_body(world, name, method, path, role, content=body.parts()), 413, "too-large")
         assert limit < body.taken <= limit + 2 * PART, f"{name} took {body.taken} bytes"
         body = Endless(limit)
         declared = {"headers": {"Content-Length": str(limit + 1)}}
-        problem(asked(world, name, method, path, who, content=body.parts(), **declared), 413, "too-large")
-        assert body.taken == 0, f"{name} took {body.taken} bytes of what it was told is too many"
-        world.put_back()
+        problem(send_body(world, name, method, path, role, content=body.parts(), **declared), 413, "too-large")
+        assert body.taken == 0, f"{name} took {body.taken} bytes although Content-Length was too large"
+        world.restore()
         seen += 1
-    print(f"{seen} routes that take a body")  # noqa: T201
+    print(f"{seen} routes with a body")  # noqa: T201
     assert seen > 30
 
 
@@ -87,6 +87,6 @@ def test_routes_without_a_body_read_none(world: World) -> None:
         if "requestBody" in operation:
             continue
         body = Endless(0)
-        asked(world, name, method, path, caller(operation), content=body.parts())
+        send_body(world, name, method, path, caller(operation), content=body.parts())
         assert body.taken == 0, f"{name} took {body.taken} bytes"
-        world.put_back()
+        world.restore()

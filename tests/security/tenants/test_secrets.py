@@ -53,7 +53,7 @@ class Run:
         self.machine = machine
         self.folder = folder
         self.secrets: dict[str, str] = {}
-        self.said: dict[str, str] = {}
+        self.logs: dict[str, str] = {}
         self._open = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
@@ -72,7 +72,7 @@ class Run:
             text=True,
             check=True,
         )
-        self.said[name] = done.stderr
+        self.logs[name] = done.stderr
         return done.stdout
 
     def sign_in(self, name: str) -> httpx.Client:
@@ -195,17 +195,17 @@ def pairing(run: Run, demo: httpx.Client) -> None:
     assert demo.post("/agents/claim", json={"code": "BCDF-GHJK"}).status_code == 404
     agent = ok(demo.post("/agents/claim", json={"code": code}))["agent"]
     assert demo.post("/agents/claim", json={"code": code}).status_code == 404
-    run.said["paired"] = run.program("pairing", "device_agent", "enroll", "--home", home, "--no-wait")
-    run.said["pinned"] = run.program("repin", "device_agent", "repin", "--home", home)
+    run.logs["paired"] = run.program("pairing", "device_agent", "enroll", "--home", home, "--no-wait")
+    run.logs["pinned"] = run.program("repin", "device_agent", "repin", "--home", home)
     ok(demo.delete(f"/agents/{agent}"))
     run.secrets |= {"claim code": code, "claim code without its hyphen": code.replace("-", "")}
 
 
 def rotation(run: Run) -> None:
-    run.said["rotated"] = run.program("rotation", "function_app", "rotate-keys")
+    run.logs["rotated"] = run.program("rotation", "function_app", "rotate-keys")
 
 
-def kept(run: Run) -> dict[str, str]:
+def stored_secrets(run: Run) -> dict[str, str]:
     """Secrets in files of mode 0600: private keys in each encoding, and passwords of programs."""
     found = {}
     for path in [*run.machine.home.rglob("*"), *run.folder.rglob("*")]:
@@ -230,14 +230,14 @@ def use(run: Run) -> None:
     control(run, demo, bert, device)
     pairing(run, demo)
     rotation(run)
-    run.said["programs"] = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
+    run.logs["programs"] = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
     for page in (demo, bert):
         ok(page.post("/auth/sign-out"))
         assert page.get("/accounts/me").status_code == 401
 
 
 def whole_run(broker: str, folder: Path) -> Run:
-    """Run all operations and stop the product; ``said`` then contains all logs."""
+    """Run all operations and stop the product; ``logs`` then contains all logs."""
     quiet = folder / "loud"
     quiet.mkdir()
     (quiet / "sitecustomize.py").write_text(LOUD)
@@ -255,18 +255,18 @@ def whole_run(broker: str, folder: Path) -> Run:
             assert machine.process.poll() is None, "".join(machine.lines)
             with Run(machine, folder) as run:
                 use(run)
-            run.secrets |= kept(run)
+            run.secrets |= stored_secrets(run)
     for path in [*(machine.home / "logs").glob("*"), *(machine.home / "trace").glob("*")]:
-        run.said[path.name] = path.read_text(errors="replace")
+        run.logs[path.name] = path.read_text(errors="replace")
     shown = re.search(r"#sign-in=(\S+)", machine.ready)
     assert shown
     run.secrets["link of the ready line"] = shown[1]
-    run.said["terminal"] = "".join(line for line in machine.lines if line != machine.ready)
+    run.logs["terminal"] = "".join(line for line in machine.lines if line != machine.ready)
     return run
 
 
 def leaks(run: Run) -> Iterator[str]:
-    for place, text in run.said.items():
+    for place, text in run.logs.items():
         for name, secret in run.secrets.items():
             assert len(secret) > 7, name
             raw = secret.encode()
@@ -283,10 +283,10 @@ def leaks(run: Run) -> Iterator[str]:
 @pytest.mark.parametrize("broker", ["amqtt", pytest.param("mosquitto", marks=pytest.mark.long)])
 def test_no_secret_is_in_any_log(broker: str, tmp_path: Path) -> None:
     run = whole_run(broker, tmp_path)
-    assert {"functions.log", "worker.log", "broker.log", "agent.log", "ur5.ndjson"} <= set(run.said)
-    assert "DEBUG" in run.said["functions.log"] + run.said["worker.log"], "the functions could have said more"
-    assert "DEBUG" in run.said["agent.log"], "the agent could have said more"
+    assert {"functions.log", "worker.log", "broker.log", "agent.log", "ur5.ndjson"} <= set(run.logs)
+    assert "DEBUG" in run.logs["functions.log"] + run.logs["worker.log"], "the functions did not log at DEBUG"
+    assert "DEBUG" in run.logs["agent.log"], "the agent did not log at DEBUG"
     assert len(run.secrets) > 35, sorted(run.secrets)
-    size = sum(map(len, run.said.values()))
-    print(f"{len(run.secrets)} secrets, {len(run.said)} logs of {size} characters")  # noqa: T201
+    size = sum(map(len, run.logs.values()))
+    print(f"{len(run.secrets)} secrets, {len(run.logs)} logs of {size} characters")  # noqa: T201
     assert not list(leaks(run))

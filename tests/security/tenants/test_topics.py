@@ -31,7 +31,7 @@ class Stage(NamedTuple):
     roles: dict[str, dict[str, Any]]
     topics: dict[str, str]
     wildcards: tuple[str, ...]
-    ear: Client
+    observer: Client
 
 
 def expected() -> dict[str, dict[str, str]]:
@@ -56,20 +56,20 @@ def stage(
     home = tmp_path_factory.mktemp(f"{kind}-home")
     if kind == "eventgrid":
         with event_grid_cloud(home) as (cloud, broker, grid):
-            grid.everything = "ear"
-            with broker.connect("ear", None) as ear:
-                yield _stage(broker, cloud, ear)
+            grid.everything = "observer"
+            with broker.connect("observer", None) as observer:
+                yield _stage(broker, cloud, observer)
         return
     shutil.copytree(keys, home / "keys")
     broker = brokers(kind)
     if kind == "mosquitto":
         (home / "mosquitto").mkdir()
         shutil.copy(broker.home / "service.password", home / "mosquitto")
-    with Cloud(settings(home, broker)) as cloud, _ear(cloud, broker) as ear:
-        yield _stage(broker, cloud, ear)
+    with Cloud(settings(home, broker)) as cloud, _observer(cloud, broker) as observer:
+        yield _stage(broker, cloud, observer)
 
 
-def _stage(broker: RunningBroker, cloud: Cloud, ear: Client) -> Stage:
+def _stage(broker: RunningBroker, cloud: Cloud, observer: Client) -> Stage:
     robot, roles = _people(cloud)
     topics = {name: address.format(**_names(robot)) for name, address in channels().items()}
     wide = (
@@ -82,7 +82,7 @@ def _stage(broker: RunningBroker, cloud: Cloud, ear: Client) -> Stage:
         *(f"ts/v1/+/+/+/{kind}" for kind in ("state", "desc", "event", "ack", "cmd", "stop")),
         *(f"ts/v1/+/+/+/{kind}/+" for kind in ("tele", "cam", "ctl", "late", "desc")),
     )
-    return Stage(broker, roles, topics, wide, ear)
+    return Stage(broker, roles, topics, wide, observer)
 
 
 def _names(robot: Robot) -> dict[str, str]:
@@ -111,21 +111,21 @@ def _people(cloud: Cloud) -> tuple[Robot, dict[str, dict[str, Any]]]:
     return robot, roles
 
 
-def _ear(cloud: Cloud, broker: RunningBroker) -> Client:
+def _observer(cloud: Cloud, broker: RunningBroker) -> Client:
     now_s = cloud.clock.now_ms() // 1000
     topics = tuple(address.format_map(_Any()) for address in channels().values())
     grant = Grant(
-        principal="service:ear",
-        client_id="ear",
+        principal="service:observer",
+        client_id="observer",
         publish=topics,
         subscribe=topics,
-        token_id="ear",
+        token_id="observer",
         expires_at=now_s + 600,
     )
     credentials = cloud.run(cloud.functions.access.issue(grant))
-    ear = broker.connect("ear", credentials)
-    assert ear.connected.is_set(), ear.answer
-    return ear
+    observer = broker.connect("observer", credentials)
+    assert observer.connected.is_set(), observer.answer
+    return observer
 
 
 class _Any(dict[str, str]):
@@ -153,46 +153,46 @@ def test_every_channel_has_a_row_and_every_row_a_channel(stage: Stage) -> None:
 
 
 def test_no_role_receives_forbidden_topics_by_any_filter(stage: Stage) -> None:
-    table, leaks, heard_all = expected(), [], 0
+    table, leaks, count = expected(), [], 0
     for name in RETAINED:
-        stage.ear.publish_acknowledged(stage.topics[name], f"{name} kept", retain=True)
+        stage.observer.publish_acknowledged(stage.topics[name], f"{name} retained", retain=True)
     for role in stage.roles:
         with join(stage, role) as client:
             assert client.connected.is_set(), f"{role}: {client.answer}"
             for pattern in (*stage.topics.values(), *stage.wildcards):
                 client.subscribe(pattern)
             for name, topic in stage.topics.items():
-                stage.ear.publish_acknowledged(topic, name)
+                stage.observer.publish_acknowledged(topic, name)
             client.subscribe(stage.topics["state"])
-            heard = {message.topic for message in client.pending()}
+            received = {message.topic for message in client.pending()}
         for name, topic in stage.topics.items():
-            if (topic in heard) != ("s" in table[name][role]):
-                leaks.append(f"{role} {'hears' if topic in heard else 'does not hear'} {name}")
-            heard_all += 1
-        leaks += [f"{role} hears {topic}" for topic in heard - set(stage.topics.values())]
+            if (topic in received) != ("s" in table[name][role]):
+                leaks.append(f"{role} {'receives' if topic in received else 'does not receive'} {name}")
+            count += 1
+        leaks += [f"{role} receives {topic}" for topic in received - set(stage.topics.values())]
     filters = len(stage.topics) + len(stage.wildcards)
-    print(f"{stage.broker.kind}: {heard_all} cells of hearing, {filters} filters each; {len(leaks)} leaks")  # noqa: T201
+    print(f"{stage.broker.kind}: {count} subscriptions checked, {filters} filters each; {len(leaks)} leaks")  # noqa: T201
     assert not leaks, "\n".join(leaks)
 
 
 def test_no_role_publishes_to_forbidden_topics(stage: Stage) -> None:
-    table, leaks, said = expected(), [], 0
+    table, leaks, count = expected(), [], 0
     for topic in stage.topics.values():
-        stage.ear.subscribe(topic)
-    stage.ear.pending()
+        stage.observer.subscribe(topic)
+    stage.observer.pending()
     for role in stage.roles:
         for name, topic in stage.topics.items():
             with join(stage, role) as client:
                 mid = client.publish(topic, role)
-                wait_until(lambda: client.acknowledged(mid) or client.disconnected.is_set(), "an end of it")  # noqa: B023
-            stage.ear.publish_acknowledged(stage.topics["ack"], "mark")
+                wait_until(lambda: client.acknowledged(mid) or client.disconnected.is_set(), "a response")  # noqa: B023
+            stage.observer.publish_acknowledged(stage.topics["ack"], "mark")
             through = False
-            while (message := stage.ear.receive()).payload != b"mark":
+            while (message := stage.observer.receive()).payload != b"mark":
                 through = through or (message.topic == topic and message.payload == role.encode())
             if through != ("p" in table[name][role]):
-                leaks.append(f"{role} {'says' if through else 'cannot say'} {name}")
-            said += 1
-    print(f"{stage.broker.kind}: {said} cells of saying; {len(leaks)} leaks")  # noqa: T201
+                leaks.append(f"{role} {'publishes' if through else 'cannot publish'} {name}")
+            count += 1
+    print(f"{stage.broker.kind}: {count} publications checked; {len(leaks)} leaks")  # noqa: T201
     assert not leaks, "\n".join(leaks)
 
 
@@ -204,8 +204,8 @@ def test_no_will_is_published_to_forbidden_topics(stage: Stage) -> None:
         ("command", stage.topics["command"]),
     ]
     for _, topic in wills:
-        stage.ear.subscribe(topic)
-    stage.ear.pending()
+        stage.observer.subscribe(topic)
+    stage.observer.pending()
     for role in stage.roles:
         for name, topic in wills:
             if "p" in table[name][role]:
@@ -218,8 +218,8 @@ def test_no_will_is_published_to_forbidden_topics(stage: Stage) -> None:
     # A message published later arrives after their wills.
     last = join(stage, "agent", will=Message(stage.topics["presence"], b"last", 1, retain=False))
     last.vanish()
-    said = []
-    while (message := stage.ear.receive()).payload != b"last":
-        said.append(message)
+    messages = []
+    while (message := stage.observer.receive()).payload != b"last":
+        messages.append(message)
     last.close()
-    assert not [message for message in said if message.payload == b"evil"]
+    assert not [message for message in messages if message.payload == b"evil"]

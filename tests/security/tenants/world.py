@@ -23,7 +23,7 @@ OWNER = "Anneliese Musterfrau"
 LABEL = "Kronjuwel"
 MOVEMENT = "secretdance"
 SOURCE = "'only for permitted accounts'"
-TYPE_TOLD_OF_REFUSALS = {records.ATTEMPTS, records.AUDIT, records.FORGET, records.EVENTS}
+TABLES_OF_REJECTIONS = {records.ATTEMPTS, records.AUDIT, records.FORGET, records.EVENTS}
 """Tables that record a rejected request. No other table may change."""
 
 Ask = Callable[..., httpx.Response]
@@ -49,10 +49,10 @@ class World:
         partitions = self._partitions.items()
         return {(*where, key): row[0] for where, found in partitions for key, row in found.rows.items()}
 
-    def keep(self) -> None:
+    def save(self) -> None:
         self._kept = copy.deepcopy(self._partitions)
 
-    def put_back(self) -> None:
+    def restore(self) -> None:
         """Restore the saved tables."""
         self._partitions.clear()
         self._partitions.update(copy.deepcopy(self._kept))
@@ -91,7 +91,7 @@ def make(memory: Memory) -> World:
     epoch = anna.take_lease(device, lease_ms=600_000, wait_ms=0).json()["epoch"]
     action = anna.start(device, epoch=epoch).json()["id"]
     request = _made(other.post(f"/devices/{device}/lease/requests", {"wait_ms": 0}))["request"]["id"]
-    _say(cloud, robot, epoch)
+    _publish_data(cloud, robot, epoch)
     upload = _upload(cloud, anna, device)
     fault = anna.get(f"/devices/{device}/faults").json()["items"][0]["id"]
     ids = {
@@ -140,9 +140,9 @@ def make(memory: Memory) -> World:
     }
     for caller in ("viewer key", "operator key"):
         assert world.callers[caller]("GET", "/accounts/me").status_code == 200, (
-            "that a key is used is noted once an hour"
+            "the use of a key must be recorded once an hour"
         )
-    world.keep()
+    world.save()
     return world
 
 
@@ -171,19 +171,19 @@ def _paired(cloud: Cloud, owner: Person) -> Robot:
     return robot
 
 
-def _say(cloud: Cloud, robot: Robot, epoch: int) -> None:
+def _publish_data(cloud: Cloud, robot: Robot, epoch: int) -> None:
     """Set the device online, with a fault and a measurement."""
     at_ms = cloud.clock.now_ms()
     short = Fault(code="short", message="Kurzschluss", since_ms=1)
     state = State(device="arm", at_ms=at_ms, tick_ms=1, mode=Mode.FAULT, epoch=epoch, faults=(short,))
     measured = Measurements(at_ms=at_ms, tick_ms=1, sequence=1, values={"geheim": 1.0})
     top = f"ts/v1/{robot.space}/{robot.id}"
-    told = {
+    published = {
         f"{top}/conn": Presence(online=True, session=1, at_ms=at_ms),
         f"{top}/arm/state": state,
         f"{top}/arm/tele/hidden": measured,
     }
-    messages = [{"topic": topic, "payload": json.loads(codec.encode(message))} for topic, message in told.items()]
+    messages = [{"topic": topic, "payload": json.loads(codec.encode(message))} for topic, message in published.items()]
     answer = robot.request("POST", f"/agents/{robot.id}/messages", json={"messages": messages})
     assert answer.status_code == 200, answer.text
     assert '"rejected"' not in answer.text, answer.text
