@@ -149,14 +149,14 @@ function PasswordForm({ session }: { session: Session }) {
           required
           value={password}
           aria-invalid={error !== ""}
-          aria-describedby="password-wrong"
+          aria-describedby="password-error"
           onInput={(event) => setPassword(event.currentTarget.value)}
         />
         <button type="submit" class="primary" data-testid="sign-in" disabled={busy}>
           {texts.session.signIn}
         </button>
       </div>
-      <p id="password-wrong" class="field-error" aria-live="polite">
+      <p id="password-error" class="field-error" aria-live="polite">
         {error}
       </p>
     </form>
@@ -185,12 +185,12 @@ function LinkForm({ onToken }: { onToken: (token: string) => void }) {
           spellcheck={false}
           value={pasted}
           aria-invalid={invalid}
-          aria-describedby="sign-in-wrong"
+          aria-describedby="sign-in-error"
           onInput={(event) => setPasted(event.currentTarget.value)}
         />
         <button type="submit">{texts.session.use}</button>
       </div>
-      <p id="sign-in-wrong" class="field-error" aria-live="polite">
+      <p id="sign-in-error" class="field-error" aria-live="polite">
         {invalid ? texts.session.notALink : ""}
       </p>
     </form>

@@ -1,4 +1,4 @@
-/** Control bar rows: request control, respond to a request, take over. They extend the bar and cover nothing. */
+/** Control bar rows: request control, respond to a request, take over. They extend the bar and do not cover other content. */
 import type { DeviceStore } from "../devices/model";
 import { useComputed } from "@preact/signals";
 import { useEffect, useId, useRef, useState } from "preact/hooks";

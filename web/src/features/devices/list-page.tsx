@@ -78,7 +78,7 @@ function bySpace(devices: readonly DeviceStore[], fleet: Fleet): [string, Device
 
 interface SearchProps {
   filter: DeviceFilter;
-  change: (wanted: DeviceFilter) => void;
+  change: (filter: DeviceFilter) => void;
   /** Whether some devices belong to other accounts. */
   shared: boolean;
   shown: number;

@@ -43,7 +43,7 @@ export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStor
   return (
     <div class="desk health-columns">
       <div class="column">
-        <HealthSummary device={device} value={value} trouble={error} />
+        <HealthSummary device={device} value={value} error={error} />
         <Faults api={api} device={device} open={value?.faults ?? null} past={past} again={refresh} show={show} />
       </div>
       <div class="column">
@@ -63,19 +63,19 @@ export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStor
   );
 }
 
-function HealthSummary({ device, value, trouble }: { device: DeviceStore; value: DeviceHealth | null; trouble: string }) {
+function HealthSummary({ device, value, error }: { device: DeviceStore; value: DeviceHealth | null; error: string }) {
   const reported = reportedFaults(device);
   const count = openCount(value?.faults ?? null, reported);
   return (
     <div class="row health-summary">
       {value !== null && <HealthLabel health={healthNow(value.health, reported, device.reach.value)} />}
       <p role="status" data-testid="open-faults" data-count={count}>
-        {value === null && trouble === "" ? common.loading : texts.health.open(count)}
+        {value === null && error === "" ? common.loading : texts.health.open(count)}
       </p>
       <button type="button" class="plain no-print" onClick={() => print()}>
         {texts.health.print}
       </button>
-      {trouble !== "" && <p class="notice bad">{texts.health.failed(trouble)}</p>}
+      {error !== "" && <p class="notice bad">{texts.health.failed(error)}</p>}
     </div>
   );
 }

@@ -73,17 +73,17 @@ function Progress({ draft }: { draft: UploadDraft }) {
 
 function Outcome({ draft }: { draft: UploadDraft }) {
   const words = texts.adding;
-  const look = draft.preview.value;
+  const preview = draft.preview.value;
   const model = draft.model.value;
   const step = draft.step.value;
-  const valid = look !== null && (step === "valid" || step === "saving");
+  const valid = preview !== null && (step === "valid" || step === "saving");
   return (
     <>
       <FindingsList findings={draft.errors.value} level="error" />
       <FindingsList findings={draft.warnings.value} level="warning" />
       {valid && (
         <>
-          <Card title={words.valid(look.robot_type.label)} class="save-type">
+          <Card title={words.valid(preview.robot_type.label)} class="save-type">
             <p>{words.previewNote}</p>
             <div class="row">
               <button
@@ -93,18 +93,18 @@ function Outcome({ draft }: { draft: UploadDraft }) {
                 disabled={step === "saving"}
                 onClick={() => void draft.save()}
               >
-                {words.save(look.robot_type.type)}
+                {words.save(preview.robot_type.type)}
               </button>
-              <span class="quiet small">{words.expires(format.dateTime(look.expires_at))}</span>
+              <span class="quiet small">{words.expires(format.dateTime(preview.expires_at))}</span>
             </div>
           </Card>
           <div class="two">
             {model === null ? (
               <p class="quiet">{texts.model.none}</p>
             ) : (
-              <ModelViewer twin={model.twin} joints={look.robot_type.joints} />
+              <ModelViewer twin={model.twin} joints={preview.robot_type.joints} />
             )}
-            <UploadSummary type={look.robot_type} model={model} files={draft.files.value} />
+            <UploadSummary type={preview.robot_type} model={model} files={draft.files.value} />
           </div>
         </>
       )}

@@ -157,7 +157,7 @@ describe("control of a device", () => {
 
 describe("a request for control", () => {
   let answer: Answer | (() => never);
-  const asking = (): ControlRequestState => control.outgoingRequest.state.value;
+  const requestState = (): ControlRequestState => control.outgoingRequest.state.value;
 
   beforeEach(() => {
     device.setLease({ holder: "Ann", epoch: 5, expires_at: EXPIRES, mine: false });
@@ -169,14 +169,14 @@ describe("a request for control", () => {
 
   it("gives control in the new epoch after it is accepted, without another click", async () => {
     await control.outgoingRequest.send();
-    expect(asking()).toMatchObject({ kind: "open", id: "r1", published: true, holder: "Ann" });
+    expect(requestState()).toMatchObject({ kind: "open", id: "r1", published: true, holder: "Ann" });
     await pass(2_000);
     expect(control.epoch).toBeNull();
     answer = ok(request("accepted"));
     await pass(1_000);
     expect(control.epoch).toBe(6);
     expect(renewals).toEqual([6]);
-    expect(asking()).toEqual({ kind: "ended", outcome: "accepted", holder: "Ann" });
+    expect(requestState()).toEqual({ kind: "ended", outcome: "accepted", holder: "Ann" });
   });
 
   it("is read immediately when the robot reports the new epoch", async () => {
@@ -192,16 +192,16 @@ describe("a request for control", () => {
     await control.outgoingRequest.send();
     answer = ok(request(outcome));
     await pass(1_000);
-    expect(asking()).toEqual({ kind: "ended", outcome, holder: "Ann" });
+    expect(requestState()).toEqual({ kind: "ended", outcome, holder: "Ann" });
     expect(control.state.value).toEqual({ kind: "none" });
     control.dismiss();
-    expect(asking()).toEqual({ kind: "none" });
+    expect(requestState()).toEqual({ kind: "none" });
   });
 
   it("can be withdrawn, unless it was accepted at the same moment", async () => {
     await control.outgoingRequest.send();
     await control.outgoingRequest.withdraw();
-    expect(asking()).toMatchObject({ kind: "ended", outcome: "withdrawn" });
+    expect(requestState()).toMatchObject({ kind: "ended", outcome: "withdrawn" });
     await control.outgoingRequest.send();
     server.on(`DELETE ${REQUEST}`, problem(409, "control-request-closed", "Accepted."));
     answer = ok(request("accepted"));
@@ -214,15 +214,15 @@ describe("a request for control", () => {
     await control.outgoingRequest.send();
     answer = unreachable;
     await pass(29_000);
-    expect(asking().kind).toBe("open");
+    expect(requestState().kind).toBe("open");
     await pass(8_000);
-    expect(asking()).toMatchObject({ kind: "ended", outcome: "expired" });
+    expect(requestState()).toMatchObject({ kind: "ended", outcome: "expired" });
   });
 
   it("reports why it failed", async () => {
-    server.on(`POST ${LEASE}/requests`, problem(409, "lease-requested", "Eve asks already."));
+    server.on(`POST ${LEASE}/requests`, problem(409, "lease-requested", "Eve has already requested control."));
     await control.outgoingRequest.send();
-    expect(asking()).toEqual({ kind: "failed", reason: "Eve asks already." });
+    expect(requestState()).toEqual({ kind: "failed", reason: "Eve has already requested control." });
   });
 
   it("is withdrawn when the page closes", async () => {

@@ -17,17 +17,17 @@ describe("an open fault", () => {
     ["the cloud has not stored it yet", [detected], [reported("driver")], ["unstored", "same"]],
     ["it has ended at the device", [driver], [], ["ended"]],
     ["the device is unreachable", [driver, fault("silent", { source: "cloud" })], null, ["unreachable", "same"]],
-  ])("names its source when %s", (_, stored, told, agreement) => {
-    expect(compareFaults(stored, told).map((standing) => standing.agreement)).toEqual(agreement);
+  ])("names its source when %s", (_, stored, reported, agreement) => {
+    expect(compareFaults(stored, reported).map(({ agreement: actual }) => actual)).toEqual(agreement);
   });
 
   it("counts once, by the device's report if it is reachable", () => {
     const stored = [driver, detected];
     const counts = [[stored, [reported("driver")]], [stored, []], [stored, null], [null, [reported("a")]], [null, null]] as const;
-    expect(counts.map(([open, told]) => openCount(open, told))).toEqual([2, 1, 2, 1, 0]);
+    expect(counts.map(([open, reported]) => openCount(open, reported))).toEqual([2, 1, 2, 1, 0]);
   });
 
-  it("is shown at once, and an unreachable device is not shown as healthy", () => {
+  it("is shown immediately, and an unreachable device is not shown as healthy", () => {
     expect(healthNow("ok", [reported("driver")], "online")).toBe("fault");
     expect(healthNow("ok", [], "online")).toBe("ok");
     expect(healthNow("ok", null, "stale")).toBe("unknown");

@@ -31,8 +31,8 @@ describe("latency plots", () => {
 
   it("contain a sample of this page once, even after the cloud has returned it", () => {
     const measured = [{ atMs: 3000, ms: 2 }, { atMs: 2500, ms: 9 }];
-    const fresh: Line[] = [{ device: "a", transport: "mqtt", path: "command-started", samples: measured, stored: 0 }];
-    const [line] = linesOf(new Map([["a", [stored()]]]), fresh, ALL);
+    const unsaved: Line[] = [{ device: "a", transport: "mqtt", path: "command-started", samples: measured, stored: 0 }];
+    const [line] = linesOf(new Map([["a", [stored()]]]), unsaved, ALL);
     expect(line?.samples.map(({ atMs }) => atMs)).toEqual([1000, 2000, 2500, 3000]);
   });
 
@@ -48,7 +48,7 @@ describe("latency plots", () => {
     expect(rows[1]).toBe('a,"\'=1+1, ""x""",mqtt,command-started,1970-01-01T00:00:01.000Z,3');
   });
 
-  it("show the papers' averages beside comparable paths", () => {
+  it("show the papers' averages with comparable paths", () => {
     const mean = (all: readonly number[]): number => all.reduce((sum, each) => sum + each, 0) / all.length;
     for (const kind of ["http", "xmpp"] as const) {
       expect(mean(UR5_TABLE_2[kind])).toBeCloseTo(PUBLISHED.find(({ id }) => id === `ur5-${kind}`)?.ms ?? NaN, 6);
@@ -92,7 +92,7 @@ describe("a latency probe", () => {
   it("keeps the samples before a failure, and stores them later under the same key", async () => {
     server.on(STORE, problem(503, "busy", "Later, please."));
     const ping = link.ping.bind(link);
-    link.ping = () => (link.pings === 3 ? Promise.reject(new Error("gone")) : ping());
+    link.ping = () => (link.pings === 3 ? Promise.reject(new Error("disconnected")) : ping());
     await run("broker");
     expect([probe.lines[0]?.samples.length, probe.unstored, probe.error.value]).toEqual([3, true, "Later, please."]);
     server.on(STORE, none);

@@ -3,15 +3,15 @@ import { FollowedCode, pairingCode, readCode } from "../../../src/features/pairi
 import { FakeStorage } from "../../support/fake-storage";
 
 describe("a claim code", () => {
-  it.each(["BCDF-GHJK", "bcdfghjk", " bcdf ghjk ", "BCDF–GHJK"])("is read as it is typed: %s", (typed) => {
+  it.each(["BCDF-GHJK", "bcdfghjk", " bcdf ghjk ", "BCDF–GHJK"])("is accepted in different spellings: %s", (typed) => {
     expect(readCode(typed)).toBe("BCDF-GHJK");
   });
 
-  it.each(["", "BCDF-GHJ", "BCDF-GHJKL", "ABCD-EFGH", "BCDF-GH1K"])("is none: %s", (typed) => {
+  it.each(["", "BCDF-GHJ", "BCDF-GHJKL", "ABCD-EFGH", "BCDF-GH1K"])("is invalid: %s", (typed) => {
     expect(readCode(typed)).toBeNull();
   });
 
-  it("is taken from a link's fragment, and from nothing that only begins so", () => {
+  it("is read from the fragment of a link, but not from similar fragments", () => {
     expect(pairingCode("#pair=BCDF-GHJK")).toBe("BCDF-GHJK");
     expect(pairingCode("#pair=bcdfghjk")).toBe("BCDF-GHJK");
     for (const hash of ["", "#/", "#pair=", "#pair=BCDF-GHJK&x=1", "#pair=<b>BCDFGHJK", "#x#pair=BCDF-GHJK"]) {

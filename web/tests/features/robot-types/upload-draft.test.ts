@@ -71,19 +71,19 @@ class FakeChecker {
   open = 1;
   failure: Error | null = null;
 
-  #look(id: string, state: "checking" | "ready" | "rejected"): TypePreview {
+  #preview(id: string, state: "checking" | "ready" | "rejected"): TypePreview {
     const errors = state === "rejected" ? this.errors : [];
     return { id, expires_at: "", robot_type: { type: "lever", upload: { version: 1, state, errors, warnings: [], uploaded_at: "" } } as unknown as RobotType };
   }
 
   createPreview(files: TypeFolder): Promise<TypePreview> {
     if (this.failure !== null) return Promise.reject(this.failure);
-    return Promise.resolve(this.#look(`look${this.checked.push(files)}`, "checking"));
+    return Promise.resolve(this.#preview(`preview${this.checked.push(files)}`, "checking"));
   }
 
   preview(id: string): Promise<TypePreview> {
     this.open -= 1;
-    return Promise.resolve(this.#look(id, this.open > 0 ? "checking" : this.errors.length > 0 ? "rejected" : "ready"));
+    return Promise.resolve(this.#preview(id, this.open > 0 ? "checking" : this.errors.length > 0 ? "rejected" : "ready"));
   }
 
   previewModel(): Promise<TypeModel> {
@@ -91,7 +91,7 @@ class FakeChecker {
   }
 
   savePreview(): Promise<RobotType> {
-    return Promise.resolve(this.#look("", "ready").robot_type);
+    return Promise.resolve(this.#preview("", "ready").robot_type);
   }
 
   putMovement(_: string, name: string): Promise<unknown> {
@@ -135,7 +135,7 @@ describe("a draft", () => {
     await draft.replace("lever.xml", bytes("<mujoco/>"));
     expect([draft.step.value, draft.files.value.size]).toEqual(["valid", 4]);
     expect(checker.checked[1]?.files["lever.xml"]).toBe("<mujoco/>");
-    expect(checker.dropped).toEqual(["look1"]);
+    expect(checker.dropped).toEqual(["preview1"]);
   });
 
   it("distinguishes rejection from an unreachable server", async () => {
@@ -167,9 +167,9 @@ describe("a draft", () => {
     expect(draft.step.value).toBe("checking");
     checker.open = 1;
     await Promise.all([first, draft.remove("movements/bad.py")]);
-    expect([draft.step.value, draft.files.value.size, draft.preview.value?.id]).toEqual(["valid", 3, "look2"]);
-    expect(checker.dropped).toEqual(["look1"]);
+    expect([draft.step.value, draft.files.value.size, draft.preview.value?.id]).toEqual(["valid", 3, "preview2"]);
+    expect(checker.dropped).toEqual(["preview1"]);
     draft.dispose();
-    expect(checker.dropped).toEqual(["look1", "look2"]);
+    expect(checker.dropped).toEqual(["preview1", "preview2"]);
   });
 });

@@ -45,7 +45,7 @@ export class Control {
   #expiry: ReturnType<typeof setTimeout> | undefined;
   #cleanups: (() => void)[] = [];
   #epochReported = false;
-  /** The new operator during a handover, whose lease end is not a loss. */
+  /** The new operator during a handover. The end of this lease then does not count as a loss. */
   #handingTo: string | null = null;
   readonly #response = signal<ResponseState>({ kind: "none" });
 

@@ -125,7 +125,7 @@ export class DeviceStore {
   });
 
   /**
-   * The lease holder; `null`: none. The device enforces the lease it knows, so its report takes precedence over the
+   * The lease holder; `null`: none. The device enforces the lease that it has received, so its report takes precedence over the
    * cloud's, unless the cloud has a newer epoch.
    */
   readonly holder = computed<{ name: string; mine: boolean } | null>(() => {

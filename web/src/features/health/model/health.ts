@@ -11,11 +11,11 @@ export interface FaultComparison {
   stored: Fault | null;
   /** `null`: not reported by the device, or not a fault that devices report. */
   reported: ReportedFault | null;
-  /** `unstored`, `ended`: only one of them knows it yet. `unreachable`: the device is unreachable. */
+  /** `unstored`: not stored yet. `ended`: no longer reported. `unreachable`: the device is unreachable. */
   agreement: "same" | "unstored" | "ended" | "unreachable";
 }
 
-/** Open faults of the cloud and the device, worst first. `told`: the device's faults; `null` if it is unreachable. */
+/** Open faults of the cloud and the device, worst first. `reported`: the device's faults; `null` if it is unreachable. */
 export function compareFaults(open: readonly Fault[], reported: readonly ReportedFault[] | null): FaultComparison[] {
   const remaining = new Map((reported ?? []).map((fault) => [fault.code, fault]));
   const stored = open.map((stored): FaultComparison => {

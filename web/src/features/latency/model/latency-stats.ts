@@ -26,7 +26,7 @@ export function lineKey({ device, transport, path }: Pick<Line, "device" | "tran
   return `${device} ${transport} ${path}`;
 }
 
-/** Joins stored samples and this page's unsaved ones (`fresh`); each sample counts once. */
+/** Joins stored samples and this page's unsaved ones (`unsaved`); each sample counts once. */
 export function linesOf(stored: ReadonlyMap<string, readonly StoredLatency[]>, unsaved: readonly Line[], query: LatencyQuery): Line[] {
   const lines = new Map<string, Line>();
   for (const [device, items] of stored) {

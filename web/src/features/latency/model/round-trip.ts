@@ -45,7 +45,7 @@ export class RoundTrip {
     };
   }
 
-  /** Starts a new lease, whose sequence numbers start again. */
+  /** Starts a new lease, which restarts the sequence numbers. */
   restart(): void {
     this.#lastSequence = 0;
     this.#samples.length = 0;
