@@ -1,1 +1,1 @@
-"""Model compiler."""
+"""The model compiler: MuJoCo in a sandboxed child process."""

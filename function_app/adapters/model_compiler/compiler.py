@@ -1,4 +1,4 @@
-"""Compiles models with MuJoCo in a child process that cannot harm this one."""
+"""Compiles models with MuJoCo in a sandboxed child process."""
 
 import asyncio
 import contextlib
@@ -21,7 +21,7 @@ CPU_S = 15
 WALL_S = 30
 MEMORY_MB = 1024
 _NO_MUJOCO = 3
-"""The child's exit code; importing it for this would cost a cold start."""
+"""Exit code of the worker. Not imported from there, because the import would slow down a cold start."""
 _CHILD = Path(__file__).with_name("worker.py")
 _MISSING = "MuJoCo is not installed here; install the packages of requirements/local.txt, or run the checker elsewhere"
 _TOO_LONG = f"The model takes MuJoCo more than {CPU_S} s. Simplify it."
@@ -29,11 +29,11 @@ _CRASHED = f"MuJoCo ended while it read the model, or needed more than {MEMORY_M
 
 
 class MujocoCompiler:
-    """``ModelCompiler``: one child process and one folder for each model.
+    """``ModelCompiler`` with one child process and one temporary folder per model.
 
     Args:
-        cpu_s: Processor time a model may take [s].
-        wall_s: Time a model may take, however busy the machine is [s].
+        cpu_s: Maximum processor time per model [s].
+        wall_s: Maximum elapsed time per model [s].
     """
 
     def __init__(self, *, cpu_s: int = CPU_S, wall_s: int = WALL_S) -> None:
@@ -50,7 +50,7 @@ class MujocoCompiler:
         self.require()
         folder = await asyncio.to_thread(_write, files)
         try:
-            code, answer = await self._run(folder, self._task(robot_type, missing))
+            code, output = await self._run(folder, self._task(robot_type, missing))
         finally:
             await asyncio.shield(asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True))
         if code == _NO_MUJOCO:
@@ -58,18 +58,18 @@ class MujocoCompiler:
         if code in {-signal.SIGKILL, -signal.SIGXCPU, -signal.SIGALRM}:
             return ModelReport((_TOO_LONG,))
         try:
-            return msgspec.json.decode(answer, type=ModelReport) if code == 0 else ModelReport((_CRASHED,))
+            return msgspec.json.decode(output, type=ModelReport) if code == 0 else ModelReport((_CRASHED,))
         except msgspec.DecodeError:
             return ModelReport((_CRASHED,))
 
     def _task(self, robot_type: RobotType, missing: Sequence[str]) -> bytes:
-        told = msgspec.to_builtins(robot_type)
+        manifest = msgspec.to_builtins(robot_type)
         names = ("type", "model", "scene", "joints", "frames", "home_rad")
-        wheels = (told["simulation"] or {}).get("wheels") or {}
+        wheels = (manifest["simulation"] or {}).get("wheels") or {}
         limits = {"cpu_s": self._cpu_s, "wall_s": self._wall_s + 5, "memory_mb": MEMORY_MB}
         sides = [wheels[side] for side in ("left", "right") if side in wheels]
         return json.dumps(
-            {**{name: told[name] for name in names}, "wheels": sides, "missing": missing, **limits}
+            {**{name: manifest[name] for name in names}, "wheels": sides, "missing": missing, **limits}
         ).encode()
 
     async def _run(self, folder: Path, task: bytes) -> tuple[int, bytes]:
@@ -87,18 +87,18 @@ class MujocoCompiler:
         )
         try:
             async with asyncio.timeout(self._wall_s):
-                answer, _ = await process.communicate(task)
+                output, _ = await process.communicate(task)
         except TimeoutError:
             return -signal.SIGKILL, b""
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             await process.wait()
-        return process.returncode or 0, answer
+        return process.returncode or 0, output
 
 
 def _write(files: Mapping[str, bytes]) -> Path:
-    """A folder with these files; their names have been looked at, and are still not believed."""
+    """A temporary folder with these files. Checks the names again, although the caller has validated them."""
     folder = Path(tempfile.mkdtemp(prefix="telescope-model-")).resolve()
     for name, content in files.items():
         path = (folder / name).resolve()

@@ -1,8 +1,7 @@
-"""The other side of ``model_compiler``: compiles one robot type with MuJoCo in a process of its own.
+"""The child process of ``compiler``: compiles one robot type with MuJoCo.
 
-Started as ``python -I -B model_compiler_child.py`` in a folder that holds the uploaded files alone. Reads the task from
-standard input, limits itself before it looks at any file, and writes what it has found as JSON: ``Looked`` of
-``model_compiler``.
+Runs as ``python -I -B worker.py`` in a folder that contains only the uploaded files. Reads the task from standard
+input, sets its resource limits before it opens a file, and writes a ``ModelReport`` as JSON.
 """
 
 import ctypes
@@ -21,8 +20,8 @@ _STEPS = 100
 _TIMESTEP_S = 0.002
 _SLACK_RAD = 1e-3
 _LAST_VISIBLE_GROUP = 2
-_OF_ATTACHING = "Attach conflict"
-"""What a robot has in its options besides: the room has the say there."""
+_ATTACH_WARNING = "Attach conflict"
+"""Warning about options of a robot that the room's options override."""
 _MAX_BODIES = 500
 _MAX_SHAPES = 2000
 _MAX_NAMES = 200
@@ -34,30 +33,30 @@ _READ_RIGHTS = 2**2 | 2**3
 
 
 def limit(cpu_s: int, wall_s: int, memory_mb: int) -> None:
-    """Take from this process what a hostile model could use."""
-    for kind, most in (
+    """Limit the resources of this process."""
+    for kind, maximum in (
         (resource.RLIMIT_CPU, cpu_s),
         (resource.RLIMIT_AS, memory_mb * _MEGABYTE),
         (resource.RLIMIT_CORE, 0),
         (resource.RLIMIT_FSIZE, _MEGABYTE),
         (resource.RLIMIT_NOFILE, 64),
     ):
-        resource.setrlimit(kind, (most, most))
+        resource.setrlimit(kind, (maximum, maximum))
     signal.alarm(wall_s)  # also if the parent process has ended
 
 
 def confine(folder: str) -> None:
-    """From here on read this folder and nothing else, where the kernel has Landlock.
+    """Restrict file access to this folder with Landlock.
 
-    Elsewhere the references in the XML have been looked at before, and that must do.
+    On kernels without Landlock, only the earlier validation of references in the XML protects other files.
     """
     calls = ctypes.CDLL(None)
     rights = ctypes.c_uint64(_ALL_FILE_RIGHTS)
     rules = calls.syscall(_LANDLOCK_CREATE, ctypes.byref(rights), ctypes.sizeof(rights), 0)
     if rules < 0:
         return
-    place = os.open(folder, os.O_PATH | os.O_DIRECTORY)
-    rule = _READ_RIGHTS.to_bytes(8, sys.byteorder) + place.to_bytes(4, sys.byteorder, signed=True)
+    descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY)
+    rule = _READ_RIGHTS.to_bytes(8, sys.byteorder) + descriptor.to_bytes(4, sys.byteorder, signed=True)
     calls.syscall(_LANDLOCK_ADD, rules, 1, rule, 0)
     calls.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
     calls.syscall(_LANDLOCK_RESTRICT, rules, 0)
@@ -65,18 +64,18 @@ def confine(folder: str) -> None:
 
 
 class Check:
-    """One robot type against its manifest, as the agent's ``mujoco`` driver will use it."""
+    """Checks a robot type against its manifest, with the settings of the agent's ``mujoco`` driver."""
 
     def __init__(self, mujoco: Any, draw: Callable[..., Any], task: dict[str, Any]) -> None:
         self._mujoco = mujoco
         self._draw = draw
         self._task = task
         self.warnings: list[str] = []
-        self.drawn: dict[str, Any] = {}
-        """With what else a page may want to know of the model; empty where there are errors."""
+        self.description: dict[str, Any] = {}
+        """Twin, actuators and cameras of the model; empty if there are errors."""
 
     def errors(self) -> list[str]:
-        """Everything that is wrong; what cannot be compiled is not looked at any further."""
+        """All errors of the type, or the first compiler error."""
         model_file, scene_file = self._task["model"], self._task["scene"]
         robot = None
         for name, placed in ((model_file, False), (model_file, True), (scene_file, False)):
@@ -89,16 +88,16 @@ class Check:
                 found = [f"{name}: {error}" for error in self._compare(model)]
                 if found or self._task["missing"]:
                     return found
-        found = [f"{scene_file}: {error}" for error in self._play(model)]
+        found = [f"{scene_file}: {error}" for error in self._simulate(model)]
         if not found:
-            self._look(robot, model)
+            self._describe(robot, model)
         return found
 
     def _compile(self, name: str, *, placed: bool) -> Any:
-        """A file alone, or put into an empty world, as robots in one room are."""
+        """Compile a file, either alone or attached to an empty world like a robot in a room."""
         mujoco = self._mujoco
         spec = mujoco.MjSpec.from_file(name)
-        self._do_without(spec)
+        self._remove_missing(spec)
         if placed:
             robot, spec = spec, mujoco.MjSpec()
             spec.attach(robot, prefix="robot/", frame=spec.worldbody.add_frame())
@@ -107,26 +106,26 @@ class Check:
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         return spec.compile()
 
-    def _do_without(self, spec: Any) -> None:
-        """Remove elements whose files are missing. They are reported, and compilation finds further errors."""
+    def _remove_missing(self, spec: Any) -> None:
+        """Remove elements whose files are missing, so that compilation finds further errors."""
         missing = set(self._task["missing"])
         if not missing:
             return
-        gone = {mesh.name for mesh in spec.meshes if Path(mesh.file).name in missing}
-        for geom in [geom for geom in spec.geoms if geom.meshname in gone]:
+        names = {mesh.name for mesh in spec.meshes if Path(mesh.file).name in missing}
+        for geom in [geom for geom in spec.geoms if geom.meshname in names]:
             spec.delete(geom)
-        for mesh in [mesh for mesh in spec.meshes if mesh.name in gone]:
+        for mesh in [mesh for mesh in spec.meshes if mesh.name in names]:
             spec.delete(mesh)
         spec.compiler.boundmass = max(spec.compiler.boundmass, _LEAST_MASS_KG)
         spec.compiler.boundinertia = max(spec.compiler.boundinertia, _LEAST_INERTIA_KG_M2)
 
-    def _look(self, model: Any, scene: Any) -> None:
-        """Draw the robot as a page will, and say what is well to know."""
+    def _describe(self, model: Any, scene: Any) -> None:
+        """Create the description and the warnings."""
         kinds, file = self._mujoco.mjtObj, self._task["model"]
-        joints = [self._find(model, kinds.mjOBJ_JOINT, name) for name in self._known()]
+        joints = [self._find(model, kinds.mjOBJ_JOINT, name) for name in self._joint_names()]
         base = int(model.body_rootid[model.jnt_bodyid[joints[0]]]) if joints else 1
         shapes = [geom for geom in range(model.ngeom) if model.geom_group[geom] <= _LAST_VISIBLE_GROUP]
-        self.drawn = {
+        self.description = {
             "actuators": self._named(model, kinds.mjOBJ_ACTUATOR, model.nu),
             "cameras": self._named(scene, kinds.mjOBJ_CAMERA, scene.ncam),
             "twin": None,
@@ -136,18 +135,18 @@ class Check:
                 f"{file}: it has too many parts to be drawn ({model.nbody} bodies, {len(shapes)} shapes)"
             )
         else:
-            self.drawn["twin"] = self._draw(model, base=base, device=self._task["type"])
+            self.description["twin"] = self._draw(model, base=base, device=self._task["type"])
         if not shapes:
             self.warnings.append(f"{file}: nothing of it can be seen: all shapes are in groups 3 and up")
         if any(model.geom_dataid[geom] >= 0 for geom in shapes):
             self.warnings.append(f"{file}: meshes are shown as boxes")
         for name in self._named(model, kinds.mjOBJ_ACTUATOR, model.nu):
-            if name not in {*self._known(), *self._task["wheels"]}:
+            if name not in {*self._joint_names(), *self._task["wheels"]}:
                 self.warnings.append(f"{file}: actuator '{name}' is not in robot.toml, so it cannot be moved")
         if not scene.ncam:
             self.warnings.append(f"{self._task['scene']}: there is no camera")
 
-    def _known(self) -> list[str]:
+    def _joint_names(self) -> list[str]:
         return [joint["name"] for joint in self._task["joints"]]
 
     def _compare(self, model: Any) -> Iterator[str]:
@@ -170,9 +169,9 @@ class Check:
             yield from self._compare_wheel(model, name)
         for frame in self._task["frames"]:
             if max(self._find(model, kind, frame) for kind in (kinds.mjOBJ_SITE, kinds.mjOBJ_BODY)) < 0:
-                known = self._names(model, kinds.mjOBJ_SITE, model.nsite)
+                sites = self._names(model, kinds.mjOBJ_SITE, model.nsite)
                 bodies = self._names(model, kinds.mjOBJ_BODY, model.nbody)
-                yield f"no site or body '{frame}'; the model has sites {known} and bodies {bodies}"
+                yield f"no site or body '{frame}'; the model has sites {sites} and bodies {bodies}"
         if joints:
             yield from self._compare_tree(model, int(model.body_rootid[model.jnt_bodyid[joints[0]]]))
 
@@ -217,15 +216,15 @@ class Check:
             yield f"actuator '{name}' is not a velocity servo on a hinge, with a control range"
 
     def _compare_tree(self, model: Any, base: int) -> Iterator[str]:
-        """Below its base a robot turns and slides only: nothing else can be drawn."""
+        """All joints below the base must be hinges or slides, which the console can display."""
         for joint in range(model.njnt):
             body = int(model.jnt_bodyid[joint])
             if body != base and int(model.body_rootid[body]) == base and not self._scalar(model, joint):
                 name = self._mujoco.mj_id2name(model, self._mujoco.mjtObj.mjOBJ_JOINT, joint) or f"number {joint}"
                 yield f"joint '{name}' is neither a hinge nor a slide, below the robot's base"
 
-    def _play(self, model: Any) -> Iterator[str]:
-        """Hold home for a moment."""
+    def _simulate(self, model: Any) -> Iterator[str]:
+        """Check that the simulation is stable at the home position."""
         mujoco = self._mujoco
         data = mujoco.MjData(model)
         for name, position in self._task["home_rad"].items():
@@ -254,19 +253,19 @@ class Check:
         return [name[:_MAX_NAMES] for name in names if name][:_MAX_NAMES]
 
 
-def _inside(what: str, known: Any, joint: dict[str, Any]) -> Iterator[str]:
-    lower, upper = float(known[0]), float(known[1])
+def _inside(what: str, limits: Any, joint: dict[str, Any]) -> Iterator[str]:
+    lower, upper = float(limits[0]), float(limits[1])
     if joint["lower_rad"] < lower - _SLACK_RAD or joint["upper_rad"] > upper + _SLACK_RAD:
         hint = "joint ranges in MJCF are degrees unless it says <compiler angle='radian'/>"
         yield f"{what} is {lower:.4f} to {upper:.4f} rad; the manifest's must lie within ({hint})"
 
 
 def main() -> int:
-    """Check the task on standard input; the exit code says whether there is an answer."""
+    """Check the task on standard input; returns 0 if a report was written."""
     task = json.load(sys.stdin)
     limit(task["cpu_s"], task["wall_s"], task["memory_mb"])
-    answers = os.dup(1)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nothing of MuJoCo's own may mix into the answer
+    output = os.dup(1)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # MuJoCo may print to standard output
     sys.path.append(str(Path(__file__).resolve().parents[3]))
     try:
         import msgspec  # noqa: PLC0415
@@ -275,11 +274,11 @@ def main() -> int:
         from device_agent.simulation.mjcf.twin import build_twin  # noqa: PLC0415 (needs MuJoCo)
     except ImportError:
         return NO_MUJOCO
-    warned: list[str] = []
+    mujoco_warnings: list[str] = []
 
-    def warn(text: object) -> None:  # else it writes a file
-        if _OF_ATTACHING not in str(text):
-            warned.append(str(text))
+    def warn(text: object) -> None:  # without a handler, MuJoCo writes a log file
+        if _ATTACH_WARNING not in str(text):
+            mujoco_warnings.append(str(text))
 
     mujoco.set_mju_user_warning(warn)
     confine(".")
@@ -288,13 +287,13 @@ def main() -> int:
         errors = check.errors()
     except MemoryError:
         errors = [f"The model needs more than {task['memory_mb']} MB of memory."]
-    found = {
+    report = {
         "errors": [error[:2000] for error in errors[:50]],
-        "warnings": [text[:2000] for text in (*check.warnings, *warned)[:50]],
-        **check.drawn,
+        "warnings": [text[:2000] for text in (*check.warnings, *mujoco_warnings)[:50]],
+        **check.description,
     }
-    with os.fdopen(answers, "wb") as answer:
-        answer.write(msgspec.json.encode(found))
+    with os.fdopen(output, "wb") as file:
+        file.write(msgspec.json.encode(report))
     return 0
 
 

@@ -153,7 +153,7 @@ def test_an_unknown_key_id_reloads_the_keys_at_a_limited_rate(
     assert redeem(oidc_client).id == "anna", "a key must be cached for an hour"
     clock.advance(3_600)
     provider.token = signed(claims(provider, exp=int(time.time()) + 7_200), key)
-    with pytest.raises(OidcError, match="does not show"):
+    with pytest.raises(OidcError, match="does not publish"):
         redeem(oidc_client)
 
 
@@ -187,7 +187,7 @@ def test_a_client_without_a_secret_sends_its_id(provider: FakeProvider, key: Sig
 def test_an_error_status_and_a_response_that_is_too_long_are_rejected(provider: FakeProvider, key: SigningKey) -> None:
     provider.token = signed(claims(provider), key)
     provider.status = 400
-    with pytest.raises(OidcError, match="answered 400"):
+    with pytest.raises(OidcError, match="returned 400"):
         redeem(client(provider))
     provider.status, provider.token = 200, "x" * 300_000
     with pytest.raises(OidcError, match="more than"):
