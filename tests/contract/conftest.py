@@ -1,4 +1,4 @@
-"""What the suites of several ports share."""
+"""Fixtures that several suites share."""
 
 import contextlib
 from collections.abc import AsyncIterator, Callable, Iterator

@@ -1,4 +1,4 @@
-"""What every adapter of ``Blobs`` promises. An adapter's test inherits the class and brings its fixtures.
+"""Contract of ``Blobs``. The test of an adapter inherits the class and supplies the fixtures.
 
 ``blobs``: an empty store. ``again``: opens another instance over the same store, as another process would.
 ``direct``: the store as a client of its presigned URLs sees it.
@@ -24,7 +24,7 @@ NAMES = (
     "~", "~a", "%7E",
 )  # fmt: skip
 LENGTHS = (1, 2, 119, 120, 121, 122, 239, 240, 241, 242, 255, 256, 304, 305, 359, 360, 361, 480, 481, 511, 512)
-"""Around those at which adapters cut names."""
+"""Lengths around the limits at which adapters truncate names."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Direct:
     """A store and a plain HTTP client.
 
     Attributes:
-        renamed: Puts another word of a name into a URL, and nothing else.
-        binds_length: Whether the store itself refuses another length.
+        renamed: Replaces a word of the name in a URL.
+        binds_length: Whether the store rejects another length.
     """
 
     blobs: Blobs
@@ -45,7 +45,7 @@ class Direct:
         return await self.blobs.presign_upload(name, length=length, content_type=PNG, lifetime_s=lifetime_s)
 
     async def send(self, upload: Upload, content: bytes) -> httpx.Response:
-        """Use ``upload`` with its own headers, but with the content's length."""
+        """Use ``upload`` with its headers, but with the length of the content."""
         headers = {**upload.headers, "Content-Length": str(len(content))}
         return await self.http.request(upload.method, upload.url, headers=headers, content=content)
 
@@ -58,7 +58,7 @@ class BlobsSuite:
 
     pytestmark = pytest.mark.anyio
 
-    async def test_put_replaces_the_content_and_delete_is_safe_to_repeat(self, blobs: Blobs) -> None:
+    async def test_put_replaces_the_content_and_delete_is_idempotent(self, blobs: Blobs) -> None:
         assert await blobs.get("a") is None
         await blobs.put("ab", b"2")
         for content in (bytes(range(256)) * 1000, b"\x00", b"", b"short"):
@@ -99,7 +99,7 @@ class BlobsSuite:
             assert await other.get("a") in contents
         await writing
 
-    async def test_another_instance_sees_every_write_at_once(self, blobs: Blobs, again: Again) -> None:
+    async def test_another_instance_sees_every_write_immediately(self, blobs: Blobs, again: Again) -> None:
         other = again()
         for number in range(5):
             await blobs.put("a", b"%d" % number)
@@ -135,7 +135,7 @@ class BlobsSuite:
         assert await blobs.list("", limit=3) == ("a/1", "b", "b/1")
         assert await blobs.list("zz") == ()
 
-    async def test_an_invalid_name_is_refused(self, blobs: Blobs) -> None:
+    async def test_an_invalid_name_is_rejected(self, blobs: Blobs) -> None:
         for name in ("", "x" * (MAX_NAME_LENGTH + 1), "\ud800"):
             calls: tuple[Awaitable[object], ...] = (
                 blobs.put(name, b""), blobs.append(name, b""), blobs.get(name), blobs.delete(name),
@@ -147,7 +147,7 @@ class BlobsSuite:
 
     # ------------------------------------------------------------ size
 
-    async def test_a_blob_has_64_mb_and_no_more(self, blobs: Blobs) -> None:
+    async def test_a_blob_has_64_mb_at_most(self, blobs: Blobs) -> None:
         content = bytes(MAX_BYTES + 1)
         for call in (blobs.put("a", content), blobs.append("a", content)):
             with pytest.raises(ValueError, match=str(MAX_BYTES)):
@@ -166,7 +166,7 @@ class BlobsSuite:
 
     # ------------------------------------------------------------ presigned URLs
 
-    async def test_an_upload_goes_straight_to_the_store(self, direct: Direct) -> None:
+    async def test_an_upload_goes_directly_to_the_store(self, direct: Direct) -> None:
         content = bytes(range(256)) * 20_000
         assert await direct.blobs.size(UPLOADED) is None
         response = await direct.send(await direct.offer(UPLOADED, length=len(content)), content)
@@ -196,7 +196,7 @@ class BlobsSuite:
         (winner,) = [content for success, content in zip(accepted, contents, strict=True) if success]
         assert await direct.blobs.get(UPLOADED) == winner
 
-    async def test_another_length_is_refused_or_visible(self, direct: Direct) -> None:
+    async def test_another_length_is_rejected_or_visible(self, direct: Direct) -> None:
         for content in (b"", b"12", b"1234", bytes(100_000)):
             name = f"{UPLOADED}{len(content)}"
             accepted = await direct.accepts(await direct.offer(name), content)
@@ -217,14 +217,14 @@ class BlobsSuite:
         assert await direct.blobs.list("") == ("up/gamma",)
         assert await direct.blobs.get("up/gamma") == b"two"
 
-    async def test_an_expired_url_is_refused(self, direct: Direct) -> None:
+    async def test_an_expired_url_is_rejected(self, direct: Direct) -> None:
         await direct.blobs.put("up/gamma", b"two")
         assert not await direct.accepts(await direct.offer("up/alpha", lifetime_s=-1), b"123")
         download = await direct.blobs.presign_download("up/gamma", content_type=PNG, lifetime_s=-1)
         assert not (await direct.http.get(download)).is_success
         assert await direct.blobs.size("up/alpha") is None
 
-    async def test_an_invalid_length_is_refused(self, blobs: Blobs) -> None:
+    async def test_an_invalid_length_is_rejected(self, blobs: Blobs) -> None:
         for length in (-1, MAX_UPLOAD_BYTES + 1):
             with pytest.raises(ValueError, match=str(length)):
                 await blobs.presign_upload("a", length=length, content_type=PNG, lifetime_s=60)

@@ -1,4 +1,4 @@
-"""``S3Blobs`` keeps the port's promises over moto."""
+"""``S3Blobs`` fulfils the contract of its port on moto."""
 
 import asyncio
 import hashlib
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.anyio
 
 @pytest.fixture(scope="module")
 def warm(moto: str) -> Iterator[S3Blobs]:
-    """One for all tests: the SDK takes long to make a client."""
+    """Shared by all tests: creating a client of the SDK is slow."""
     blobs = S3Blobs(bucket=NAME, region=REGION, endpoint=moto)
     yield blobs
     asyncio.run(blobs.close())
@@ -47,7 +47,7 @@ async def blobs(warm: S3Blobs, moto: str) -> Blobs:
 
 @pytest.fixture
 def open_at(closing: Closing) -> Open:
-    """Opens the bucket at an address."""
+    """Opens the bucket at an endpoint."""
     return lambda address: closing(S3Blobs(bucket=NAME, region=REGION, endpoint=address))
 
 
@@ -72,14 +72,14 @@ async def over_wire(blobs: Blobs, open_at: Open, proxy: FaultProxy) -> Blobs:
 
 @pytest.fixture
 async def direct(over_wire: Blobs, proxy: FaultProxy) -> AsyncIterator[Direct]:
-    """Over a proxy that checks signatures as Amazon documents them, which moto does not."""
+    """A proxy that verifies signatures by the documented rules of AWS, which moto does not."""
     proxy.guard = check_signature
     async with httpx.AsyncClient() as client:
         yield Direct(over_wire, client)
 
 
 def check_signature(method: str, path: str, headers: Mapping[str, str]) -> Refusal | None:
-    """Refuses a presigned request that is not what was signed (Signature Version 4, query parameters)."""
+    """Rejects a presigned request that differs from the signed one (Signature Version 4, query parameters)."""
     given = {name.lower(): value.strip() for name, value in headers.items()}
     address, _, text = path.partition("?")
     query = dict(part.partition("=")[::2] for part in text.split("&") if part)
@@ -107,7 +107,7 @@ class TestS3Blobs(BlobsSuite):
 
 
 async def test_presigned_urls_name_the_buckets_region(monkeypatch: pytest.MonkeyPatch, closing: Closing) -> None:
-    """S3 redirects requests at its general address, and a signature is valid for one host only."""
+    """S3 redirects requests at its global endpoint, and a signature is valid for one host."""
     use_credentials(monkeypatch)
     for bucket, host in ((NAME, f"{NAME}.s3.eu-west-1.amazonaws.com"), ("a.b", "s3.eu-west-1.amazonaws.com/a.b")):
         blobs = closing(S3Blobs(bucket=bucket, region="eu-west-1"))
@@ -148,7 +148,7 @@ SPECIAL = st.lists(st.sampled_from(["/", ".", "..", "!", "a", " ", "\x00", "0", 
 
 @given(one=TEXT | SPECIAL, other=TEXT | SPECIAL)
 @settings(max_examples=200, deadline=None)
-def test_keys_sort_and_begin_as_names_do_and_are_reversible(one: str, other: str) -> None:
+def test_keys_are_reversible_and_preserve_order_and_prefixes(one: str, other: str) -> None:
     keys = encode(one), encode(other)
     assert (decode(keys[0]), decode(keys[1])) == (one, other)
     assert (keys[0].encode() < keys[1].encode()) == (one.encode() < other.encode())
@@ -161,7 +161,9 @@ def test_keys_sort_and_begin_as_names_do_and_are_reversible(one: str, other: str
 # ---------------------------------------------------------------- lost requests and responses
 
 
-async def test_an_append_is_done_once_if_the_wire_fails(blobs: Blobs, over_wire: Blobs, proxy: FaultProxy) -> None:
+async def test_an_append_is_applied_once_despite_connection_errors(
+    blobs: Blobs, over_wire: Blobs, proxy: FaultProxy
+) -> None:
     for number in range(2):
         proxy.inject("pass", "lose response")
         await over_wire.append("log", b"%d" % number)
@@ -178,9 +180,7 @@ def meanwhile(write: Coroutine[Any, Any, None]) -> Callable[[], None]:
     return lambda: asyncio.run_coroutine_threadsafe(write, loop).result()
 
 
-async def test_an_append_keeps_what_other_clients_write_at_the_same_time(
-    blobs: Blobs, over_wire: Blobs, proxy: FaultProxy
-) -> None:
+async def test_an_append_preserves_concurrent_writes(blobs: Blobs, over_wire: Blobs, proxy: FaultProxy) -> None:
     proxy.inject("pass", meanwhile(blobs.append("log", b"0")), "pass", meanwhile(blobs.append("log", b"1")))
     await over_wire.append("log", b"2")
     assert await blobs.get("log") == b"012"
@@ -192,7 +192,7 @@ async def test_an_append_keeps_what_other_clients_write_at_the_same_time(
     assert await blobs.get("log") == b"5"
 
 
-async def test_an_append_starts_again_after_a_conflict(blobs: Blobs, over_wire: Blobs, proxy: FaultProxy) -> None:
+async def test_an_append_is_retried_after_a_conflict(blobs: Blobs, over_wire: Blobs, proxy: FaultProxy) -> None:
     await blobs.append("log", b"0")
     proxy.inject("pass", CONFLICT, "pass", Refusal(409, "ConditionalRequestConflict", {}))
     await over_wire.append("log", b"1")
@@ -200,7 +200,7 @@ async def test_an_append_starts_again_after_a_conflict(blobs: Blobs, over_wire: 
     assert await blobs.get("log") == b"01"
 
 
-async def test_an_append_that_is_always_in_conflict_is_an_error(
+async def test_an_append_that_always_conflicts_is_an_error(
     over_wire: Blobs, proxy: FaultProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(appending, "_LONGEST_PAUSE_S", 0.001)
@@ -211,10 +211,10 @@ async def test_an_append_that_is_always_in_conflict_is_an_error(
     assert await over_wire.get("log") is None
 
 
-# ---------------------------------------------------------------- preparing
+# ---------------------------------------------------------------- prepare
 
 
-async def test_preparing_and_closing_are_safe_to_repeat(blobs: Blobs, open_at: Open, moto: str) -> None:
+async def test_prepare_and_close_are_idempotent(blobs: Blobs, open_at: Open, moto: str) -> None:
     await blobs.put("a", b"1")
     await asyncio.gather(*(open_at(moto).prepare() for _ in range(4)))
     for _ in range(2):
@@ -222,7 +222,7 @@ async def test_preparing_and_closing_are_safe_to_repeat(blobs: Blobs, open_at: O
     assert await blobs.get("a") == b"1"
 
 
-async def test_a_bucket_in_amazons_first_region_can_be_made(moto: str, closing: Closing) -> None:
+async def test_a_bucket_can_be_created_in_us_east_1(moto: str, closing: Closing) -> None:
     reset(moto)
     blobs = closing(S3Blobs(bucket="first", region="us-east-1", endpoint=moto))
     await blobs.prepare()

@@ -1,4 +1,4 @@
-"""``AzureBlobs`` keeps the port's promises over Azurite."""
+"""``AzureBlobs`` fulfils the contract of its port on Azurite."""
 
 import asyncio
 import itertools
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.anyio
 
 @pytest.fixture
 def container() -> str:
-    """A container of each test's own."""
+    """A separate container per test."""
     return f"test{secrets.token_hex(8)}"
 
 
@@ -84,7 +84,7 @@ async def test_long_names_with_the_same_start_are_listed_in_order(blobs: Blobs) 
     assert await blobs.list("") == ()
 
 
-async def test_a_list_continues_over_azures_pages(blobs: Blobs, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_list_continues_over_several_responses(blobs: Blobs, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adapter, "_PAGE", 3)
     names = tuple(f"n{number:02d}" for number in range(10))
     for name in names:
@@ -126,10 +126,10 @@ async def test_nothing_exists_before_the_first_write(blobs: Blobs) -> None:
 
 @pytest.mark.parametrize("fault", ["lose response", "lose request"])
 @pytest.mark.parametrize("exists", [False, True])
-async def test_an_append_is_done_once_if_the_wire_fails(
+async def test_an_append_is_applied_once_despite_connection_errors(
     over_wire: Blobs, blobs: Blobs, proxy: FaultProxy, exists: bool, fault: Fault
 ) -> None:
-    for number in range(7):  # more than an append has requests
+    for number in range(7):  # more than the requests of an append
         await (blobs.put if exists else blobs.append)(f"log{number}", b"old,")
         faults: list[Fault] = ["pass"] * number
         proxy.inject(*faults, fault)
@@ -162,9 +162,7 @@ def meanwhile(write: Coroutine[Any, Any, None]) -> Callable[[], None]:
     return lambda: asyncio.run_coroutine_threadsafe(write, loop).result(20)
 
 
-async def test_an_append_keeps_what_other_clients_write_at_the_same_time(
-    over_wire: Blobs, blobs: Blobs, proxy: FaultProxy
-) -> None:
+async def test_an_append_preserves_concurrent_writes(over_wire: Blobs, blobs: Blobs, proxy: FaultProxy) -> None:
     for number in range(4):
         passed: list[Fault] = ["pass"] * number
         proxy.inject(*passed, meanwhile(blobs.append("log", b"a%d," % number)))

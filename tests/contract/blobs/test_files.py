@@ -1,4 +1,4 @@
-"""``FileBlobs`` keeps the port's promises and never leaves its folder."""
+"""``FileBlobs`` fulfils the contract of its port and writes only in its folder."""
 
 import asyncio
 import base64

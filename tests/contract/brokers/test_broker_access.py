@@ -51,7 +51,7 @@ def test_revoke_requires_exactly_one_name_which_may_be_unknown(broker: RunningBr
         broker.revoke(principal=f"account:{space}")
 
 
-def test_many_calls_at_once_all_succeed(broker: RunningBroker, space: str) -> None:
+def test_concurrent_calls_all_succeed(broker: RunningBroker, space: str) -> None:
     async def issue_many() -> list[Credentials]:
         wanted = (broker.grant(f"{space}-{number}", subscribe=(f"ts/v1/{space}/+/conn",)) for number in range(30))
         return list(await asyncio.gather(*(broker.access.issue(grant) for grant in wanted)))

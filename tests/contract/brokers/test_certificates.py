@@ -55,10 +55,12 @@ class Agent:
         self.credentials = broker.run(broker.access.issue(grant))
 
     def certificate(self, after_ms: float = 0) -> tuple[Path, Path]:
-        def ask(request: str) -> str:
+        def issue_chain(request: str) -> str:
             return asyncio.run(self.authority.issue(self.name, request)).chain
 
-        return self.own.ready(after_ms=after_ms, now_ms=dt.datetime.now(dt.UTC).timestamp() * 1000, request_chain=ask)
+        return self.own.ready(
+            after_ms=after_ms, now_ms=dt.datetime.now(dt.UTC).timestamp() * 1000, request_chain=issue_chain
+        )
 
     def connect(self, **changes: Any) -> Client:
         """Connects; ``certificate`` (its file and its key's, or ``None``) and ``credentials`` may be changed."""
@@ -137,17 +139,17 @@ def test_certificates_only_contain_the_agents_identity(site: Path) -> None:
         .sign(ec.generate_private_key(ec.SECP256R1()), hashes.SHA256())
     )
     issued = asyncio.run(FileCertificates(site).issue("agentddddd", pem(request)))
-    made = x509.load_pem_x509_certificate(issued.chain.encode())
-    assert made.subject.rfc4514_string() == "CN=agentddddd"
-    assert made.extensions.get_extension_for_class(x509.BasicConstraints).value.ca is False
+    certificate = x509.load_pem_x509_certificate(issued.chain.encode())
+    assert certificate.subject.rfc4514_string() == "CN=agentddddd"
+    assert certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca is False
 
 
 def invalid_requests() -> Iterator[tuple[str, str]]:
-    """Requests, and what their refusal says."""
+    """Invalid requests and the expected error texts."""
     valid = BUILDER.sign(ec.generate_private_key(ec.SECP256R1()), hashes.SHA256())
     forged = bytearray(valid.public_bytes(serialization.Encoding.DER))
     forged[-1] ^= 1
-    yield pem(x509.load_der_x509_csr(bytes(forged))), "not signed by the key"
+    yield pem(x509.load_der_x509_csr(bytes(forged))), "not signed by its own key"
     yield pem(BUILDER.sign(ec.generate_private_key(ec.SECP384R1()), hashes.SHA256())), "P-256"
     yield pem(BUILDER.sign(ed25519.Ed25519PrivateKey.generate(), None)), "P-256"
     for text in ("", "no request", "-----BEGIN CERTIFICATE REQUEST-----\nAAAA\n"):
@@ -155,7 +157,7 @@ def invalid_requests() -> Iterator[tuple[str, str]]:
     yield "x" * 5000, "at most"
 
 
-def test_an_invalid_request_is_refused(site: Path) -> None:
+def test_an_invalid_request_is_rejected(site: Path) -> None:
     for request, message in invalid_requests():
         with pytest.raises(CertificateRefused, match=message):
             asyncio.run(FileCertificates(site).issue("agentddddd", request))

@@ -13,7 +13,7 @@ from tests.harness.network import raw_mqtt
 from tests.harness.network.brokers import SILENCE_S, Client, Message, RunningBroker, Transport, wait_until
 
 NAGLE_S = 0.040
-"""Linux's least delay of an acknowledgement [s]."""
+"""Minimum delay of an acknowledgement in Linux [s]."""
 CONVERSATION = 6
 """Exchanges after which Linux considers a connection interactive; each delayed acknowledgement resets it."""
 
@@ -149,7 +149,7 @@ def test_the_largest_message_passes_and_a_larger_one_is_rejected_without_side_ef
             with broker.client(f"{space}-huge", publish=(topic,), transport=transport) as huge:
                 huge.publish(topic, largest + bytes(1_024), qos=qos)
                 after = huge.publish(topic, b"after")
-                wait_until(lambda: huge.disconnected.is_set() or huge.acknowledged(after), "the broker's answer")  # noqa: B023 (called here)
+                wait_until(lambda: huge.disconnected.is_set() or huge.acknowledged(after), "the response of the broker")  # noqa: B023 (called here)
                 # Over WebSocket mosquitto 2.0 drops the message and continues.
                 assert huge.disconnected.is_set() or (broker.kind, transport) == ("mosquitto", "websockets")
             arm.publish_acknowledged(topic, b"small")
@@ -185,7 +185,7 @@ def test_small_messages_are_sent_without_delay(
                 time.sleep(0.003)  # so that the broker does not send both together
                 began = time.perf_counter()
                 arm.publish(topic, b"second", qos=0)
-                # Not read before: reading would acknowledge the first, and Nagle's algorithm let the second go.
+                # Do not read earlier: that would acknowledge the first message and release the second one.
                 assert listener.read() == (raw_mqtt.PUBLISH, 0, raw_mqtt.text(topic) + b"first")
                 assert listener.read() == (raw_mqtt.PUBLISH, 0, raw_mqtt.text(topic) + b"second")
                 gaps.append(time.perf_counter() - began)

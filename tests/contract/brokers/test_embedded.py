@@ -111,9 +111,9 @@ def test_a_publish_beyond_the_contract_closes_the_connection(
 
 def test_a_denied_filter_does_not_affect_others(broker: RunningBroker, space: str) -> None:
     mine = f"ts/v1/{space}/arm/+"
-    refused = ("#", "ts/v1/+/arm/conn", f"{mine}/#", "$SYS/#", "", "ts/v1/#/conn", f"ts/v1/{space}/arm/a+", "x" * 600)
+    rejected = ("#", "ts/v1/+/arm/conn", f"{mine}/#", "$SYS/#", "", "ts/v1/#/conn", f"ts/v1/{space}/arm/a+", "x" * 600)
     with raw_mqtt.open_session(broker, space, broker.issue(broker.grant(space, subscribe=(mine,)))) as raw:
-        raw.send(raw_mqtt.subscribe_packet(*refused[:4], mine, *refused[4:]))
+        raw.send(raw_mqtt.subscribe_packet(*rejected[:4], mine, *rejected[4:]))
         assert raw.read() == (raw_mqtt.SUBACK, 0, b"\0\1" + b"\x80" * 4 + b"\0" + b"\x80" * 4)
 
 

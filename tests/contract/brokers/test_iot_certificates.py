@@ -26,14 +26,14 @@ def request() -> str:
 
 
 def statuses(iot: Any) -> list[str]:
-    """Of the agent's certificates, each of which has a policy."""
+    """Statuses of the agent's certificates, each with a policy."""
     principals = iot.list_thing_principals(thingName=AGENT)["principals"]
     assert all(iot.list_attached_policies(target=arn)["policies"] for arn in principals)
     ids = [arn.rpartition("/")[2] for arn in principals]
     return [iot.describe_certificate(certificateId=each)["certificateDescription"]["status"] for each in ids]
 
 
-async def test_certificates_belong_to_the_agents_thing_and_end_with_the_pairing(moto: str, closing: Closing) -> None:
+async def test_certificates_are_attached_to_the_thing_and_revoked(moto: str, closing: Closing) -> None:
     iot = Session().create_client("iot", region_name=REGION, endpoint_url=moto)
     authority = closing(IotCertificates(region=REGION, policy=POLICY, endpoint=moto))
     for _ in range(2):

@@ -70,18 +70,18 @@ def test_only_the_right_credentials_and_client_id_connect(
 # ---------------------------------------------------------------- topics and filters
 
 
-def test_a_client_without_rights_receives_and_publishes_nothing(broker: RunningBroker, space: str) -> None:
+def test_a_client_without_permissions_receives_and_publishes_nothing(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/conn"
     with (
         broker.client(f"{space}-arm", publish=(topic,)) as arm,
-        broker.client(f"{space}-deaf") as deaf,
+        broker.client(f"{space}-subscriber") as subscriber,
         listen(broker, space, topic) as listener,
     ):
         arm.publish_acknowledged(topic, b"retained", retain=True)
-        deaf.subscribe(topic, "ts/v1/#", "#", "+/+/+/+/+")
+        subscriber.subscribe(topic, "ts/v1/#", "#", "+/+/+/+/+")
         arm.publish_acknowledged(topic, b"live")
         assert listener.received() == [b"retained", b"live"]
-        assert deaf.pending() == []
+        assert subscriber.pending() == []
         arm.publish_acknowledged(topic, b"", retain=True)
         assert listener.received() == [b""]
         for qos in (0, 1):

@@ -43,13 +43,13 @@ class TestIot(BusContract):
                     newest = request.body
             return newest
 
-        bus, away = (
+        bus, unreachable = (
             closing(IotCommandBus(region=REGION, endpoint=endpoint))
             for endpoint in (proxy.endpoint, "http://127.0.0.1:1")
         )
-        return Stage(bus, space, sent, retained, away)
+        return Stage(bus, space, sent, retained, unreachable)
 
-    async def test_qos_is_passed_on(self, stage: Stage, proxy: FaultProxy) -> None:
+    async def test_qos_is_forwarded(self, stage: Stage, proxy: FaultProxy) -> None:
         for qos in (0, 1):
             await stage.bus.publish(stage.topic, b"x", qos=qos)
         assert [parse_qs(urlsplit(request.path).query)["qos"] for request in proxy.requests] == [["0"], ["1"]]
@@ -69,7 +69,7 @@ class TestIot(BusContract):
         ],
         ids=["rights", "throttled", "invalid"],
     )
-    async def test_a_refusal_is_reported_in_one_sentence(
+    async def test_a_rejection_is_reported_in_one_sentence(
         self, stage: Stage, proxy: FaultProxy, refusal: Refusal, words: str
     ) -> None:
         proxy.inject(*[refusal] * 3)

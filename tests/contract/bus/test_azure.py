@@ -1,7 +1,7 @@
 """The command bus over Event Grid. A local server checks the HTTP publish against the documentation of Microsoft.
 
 These tests show that requests are as documented, over TLS, with a token of the host's identity for the documented
-audience, and that every documented response is understood.
+audience, and that every documented response is handled.
 """
 
 import ssl
@@ -29,20 +29,20 @@ from tests.harness.network.http_server import QuietHandler, running
 AUDIENCE = "https://eventgrid.azure.net"
 
 Fault = int | str | Callable[[], object]
-"""A status; ``lost``: the request is taken and the connection cut; or a function to call before the response."""
+"""A status; ``lost``: the request is processed and the connection closed; or a function to call before the response."""
 
 
 class Namespace(ThreadingHTTPServer):
-    """Takes messages as the namespace does. ``wrong`` lists deviations from the documentation."""
+    """Receives messages like the namespace. ``deviations`` lists deviations from the documentation."""
 
     def __init__(self, certificate: Path) -> None:
         super().__init__((HOST, 0), _Publish)
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.load_cert_chain(certificate, certificate.with_name("key.pem"))
         self.socket = context.wrap_socket(self.socket, server_side=True)
-        self.taken: list[tuple[Sent, int, bool]] = []
-        self.wrong: list[str] = []
-        self.asked = 0
+        self.received: list[tuple[Sent, int, bool]] = []
+        self.deviations: list[str] = []
+        self.request_count = 0
         self.faults: deque[Fault] = deque()
         self.guard = threading.Lock()
 
@@ -58,7 +58,7 @@ class _Publish(QuietHandler):
     def handle_any(self) -> None:
         body = self.rfile.read(int(self.headers["Content-Length"]))
         with self.server.guard:
-            self.server.asked += 1
+            self.server.request_count += 1
             fault = self.server.faults.popleft() if self.server.faults else 204
         if callable(fault):
             fault()
@@ -66,14 +66,14 @@ class _Publish(QuietHandler):
         if isinstance(fault, int) and fault >= 400:
             self.respond(fault, [], b'{"error": {"code": "No",\n "message": "not now"}}')
             return
-        status = self._take(body)
+        status = self._receive(body)
         if fault == "lost":
             self.close_connection = True
             return
         self.respond(fault if status is None and isinstance(fault, int) else status or 204, [], b"")
 
-    def _take(self, body: bytes) -> int | None:
-        """Check the request; the status that refuses it."""
+    def _receive(self, body: bytes) -> int | None:
+        """Check the request; returns the status of a rejection."""
         url = urlsplit(self.path)
         query = parse_qs(url.query, strict_parsing=True)
         scheme, _, token = self.headers.get("Authorization", "").partition(" ")
@@ -89,11 +89,11 @@ class _Publish(QuietHandler):
             (bool(self.headers.get("Content-Type")), "content-type"),
         ):
             if not valid:
-                self.server.wrong.append(deviation)
+                self.server.deviations.append(deviation)
                 return 400
         message = Sent(query["topic"][0], body)
         with self.server.guard:
-            self.server.taken.append((message, int(self.headers["mqtt-qos"]), self.headers["mqtt-retain"] == "1"))
+            self.server.received.append((message, int(self.headers["mqtt-qos"]), self.headers["mqtt-retain"] == "1"))
         return None
 
 
@@ -113,7 +113,7 @@ def namespace(certificate: Path) -> Iterator[Namespace]:
     namespace = Namespace(certificate)
     with running(namespace):
         yield namespace
-    assert namespace.wrong == []
+    assert namespace.deviations == []
 
 
 class TestEventGrid(BusContract):
@@ -130,18 +130,18 @@ class TestEventGrid(BusContract):
         monkeypatch.setattr(publishing_bus, "GIVE_UP_S", PATIENCE_S)
 
         def retained(topic: str) -> bytes | None:
-            payloads = [sent.payload for sent, _, retain in namespace.taken if retain and sent.topic == topic]
+            payloads = [sent.payload for sent, _, retain in namespace.received if retain and sent.topic == topic]
             return payloads[-1] if payloads else None
 
-        bus, away = (
+        bus, unreachable = (
             closing(EventGridCommandBus(endpoint=endpoint)) for endpoint in (namespace.address, "https://127.0.0.1:1")
         )
-        return Stage(bus, space, lambda: [sent for sent, _, _ in namespace.taken], retained, away)
+        return Stage(bus, space, lambda: [sent for sent, _, _ in namespace.received], retained, unreachable)
 
-    async def test_qos_is_passed_on(self, stage: Stage, namespace: Namespace) -> None:
+    async def test_qos_is_forwarded(self, stage: Stage, namespace: Namespace) -> None:
         for qos in (0, 1):
             await stage.bus.publish(stage.topic, b"x", qos=qos)
-        assert [qos for _, qos, _ in namespace.taken] == [0, 1]
+        assert [qos for _, qos, _ in namespace.received] == [0, 1]
 
     async def test_one_token_serves_many_messages(self, stage: Stage, host: IdentityEndpoint) -> None:
         for _ in range(5):
@@ -169,7 +169,7 @@ class TestEventGrid(BusContract):
             (500, "rejected a message: 500 .*not now"),
         ],
     )
-    async def test_a_refusal_is_reported_in_one_sentence(
+    async def test_a_rejection_is_reported_in_one_sentence(
         self, stage: Stage, namespace: Namespace, status: int, words: str
     ) -> None:
         namespace.faults.extend([status] * 3)
@@ -177,7 +177,7 @@ class TestEventGrid(BusContract):
             await stage.bus.publish(stage.topic, b"x")
         assert "\n" not in str(caught.value)
         assert await stage.bus.status() == str(caught.value)
-        assert namespace.asked <= adapter.TRIES
+        assert namespace.request_count <= adapter.TRIES
         namespace.faults.clear()
         await stage.bus.publish(stage.topic, b"x")
         assert await stage.bus.status() == "ok"

@@ -23,8 +23,8 @@ pytestmark = pytest.mark.anyio
 class TestMemoryBus(BusContract):
     @pytest.fixture
     def stage(self) -> Stage:
-        broker, away = MemoryBroker(), MemoryBroker()
-        away.reachable = False
+        broker, unreachable = MemoryBroker(), MemoryBroker()
+        unreachable.reachable = False
         received: list[Sent] = []
 
         class Listener:
@@ -39,7 +39,7 @@ class TestMemoryBus(BusContract):
         def retained(topic: str) -> bytes | None:
             return next((message.payload for message in broker.retained(topic)), None)
 
-        return Stage(MemoryCommandBus(broker), "space", lambda: received, retained, MemoryCommandBus(away))
+        return Stage(MemoryCommandBus(broker), "space", lambda: received, retained, MemoryCommandBus(unreachable))
 
 
 async def connect(broker: MemoryBroker, client_id: str = "viewer") -> MemoryConnection:
@@ -51,7 +51,7 @@ def accepts(broker: MemoryBroker, client_id: str, credentials: Credentials | Non
     return MemoryConnection(broker, client_id, credentials).open().connected.is_set()
 
 
-async def test_a_connection_has_the_rights_of_its_grant_only() -> None:
+async def test_a_connection_has_only_the_permissions_of_its_grant() -> None:
     broker = MemoryBroker()
     viewer, other = await connect(broker), await connect(broker, "other")
     for payload in (b"old", b"new"):
@@ -63,8 +63,8 @@ async def test_a_connection_has_the_rights_of_its_grant_only() -> None:
     viewer.publish(f"{SPACE}/agent/arm/cmd", b"forbidden")
     assert [message.payload for message in other.pending()] == [b"setpoint"]
     credentials = viewer._credentials
-    for client_id, given in (("x", credentials), ("viewer", None), ("viewer", Credentials("account:viewer", "?"))):
-        assert not accepts(broker, client_id, given)
+    for client_id, presented in (("x", credentials), ("viewer", None), ("viewer", Credentials("account:viewer", "?"))):
+        assert not accepts(broker, client_id, presented)
     second = await connect(broker)
     assert (viewer.disconnected.is_set(), second.disconnected.is_set()) == (True, False)
 
@@ -73,11 +73,11 @@ async def test_a_connection_has_the_rights_of_its_grant_only() -> None:
 async def test_a_revocation_ends_connections_and_credentials(names: dict[str, str]) -> None:
     broker = MemoryBroker()
     viewer = await connect(broker)
-    viewer.will = Message(f"{SPACE}/agent/conn", b"gone", 1, retain=True)
+    viewer.will = Message(f"{SPACE}/agent/conn", b"offline", 1, retain=True)
     await MemoryBrokerAccess(broker).revoke(**names)
     assert viewer.disconnected.is_set()
     assert not accepts(broker, "viewer", viewer._credentials)
-    assert [message.payload for message in broker.retained(f"{SPACE}/agent/conn")] == [b"gone"]
+    assert [message.payload for message in broker.retained(f"{SPACE}/agent/conn")] == [b"offline"]
     assert (await connect(broker)).connected.is_set()
 
 
@@ -90,7 +90,7 @@ async def test_credentials_expire_by_the_clock_of_the_broker() -> None:
         assert viewer.disconnected.is_set() == ended
 
 
-async def test_an_unreachable_broker_and_a_wrong_number_of_names_are_errors() -> None:
+async def test_an_unreachable_broker_and_an_invalid_revocation_are_errors() -> None:
     broker = MemoryBroker()
     for names in ({}, {"client_id": "a", "principal": "b"}):
         with pytest.raises(ValueError, match="exactly one"):
@@ -128,13 +128,13 @@ class TestMemoryFeeds:
             if payload == b"fails":
                 raise ZeroDivisionError
             if payload == b"busy" or tried.count(payload) < 3:
-                raise Problem("busy", 503, "Busy", "Try again.") if payload == b"busy" else StoreError("away")
+                raise Problem("busy", 503, "Busy", "Try again.") if payload == b"busy" else StoreError("unreachable")
 
         async with running(MemoryFeed(broker).run(handle)):
-            for payload in (b"busy", b"fails", b"good"):
+            for payload in (b"busy", b"fails", b"valid"):
                 broker.publish(STATE, payload)
             await broker.idle()
-        assert tried == [*[b"busy"] * 6, b"fails", *[b"good"] * 3]
+        assert tried == [*[b"busy"] * 6, b"fails", *[b"valid"] * 3]
 
     @pytest.mark.parametrize(("late", "kind"), [(False, "tele"), (True, "late")])
     async def test_measurements_arrive_in_batches(self, late: bool, kind: str) -> None:

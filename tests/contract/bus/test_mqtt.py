@@ -1,4 +1,4 @@
-"""The command bus over one warm connection, to the embedded broker and to mosquitto."""
+"""The command bus over one persistent connection, to the embedded broker and to mosquitto."""
 
 import asyncio
 import queue
@@ -34,9 +34,9 @@ class TestMqtt(BusContract):
                     return None
 
         credentials = broker.access.service_credentials
-        bus, away = (
+        bus, unreachable = (
             closing(MqttCommandBus(Broker(host=HOST, port=port, credentials=credentials)))
             for port in (broker.tcp_port, 1)
         )
-        yield Stage(bus, space, sent, retained, away)
+        yield Stage(bus, space, sent, retained, unreachable)
         await asyncio.to_thread(subscriber.close)

@@ -1,4 +1,4 @@
-"""Connections that store messages read in rounds: all arrive in order, and the process seldom wakes up."""
+"""Periodic reads: all messages arrive in order, with few wake-ups of the process."""
 
 import asyncio
 import time
@@ -18,8 +18,8 @@ COUNT = 300
 
 
 @pytest.fixture
-def rounds_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The start of each round [s]."""
+def reads_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Start times of the reads [s]."""
     starts: list[float] = []
     start_reading = event_loop._PeriodicReader._start_reading
 
@@ -32,7 +32,7 @@ def rounds_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 @pytest.mark.anyio
-async def test_all_messages_arrive_in_order_and_in_few_rounds(broker: RunningBroker, rounds_s: list[float]) -> None:
+async def test_all_messages_arrive_in_order_and_in_few_reads(broker: RunningBroker, reads_s: list[float]) -> None:
     received: list[int] = []
     at = Broker(host=HOST, port=broker.tcp_port, credentials=broker.access.service_credentials)
     link = MqttConnection(
@@ -40,7 +40,7 @@ async def test_all_messages_arrive_in_order_and_in_few_rounds(broker: RunningBro
     )
     try:
         assert await link.ready(PATIENCE_S), link.problem
-        began_s, before = time.monotonic(), len(rounds_s)
+        began_s, before = time.monotonic(), len(reads_s)
         with await asyncio.to_thread(broker.client, "rounds", publish=(TOPIC,)) as robot:
             for number in range(COUNT):
                 robot.publish(TOPIC, str(number).encode(), qos=1)
@@ -48,10 +48,10 @@ async def test_all_messages_arrive_in_order_and_in_few_rounds(broker: RunningBro
             async with asyncio.timeout(PATIENCE_S):
                 while len(received) < COUNT:  # noqa: ASYNC110 (any may be the last)
                     await asyncio.sleep(EVERY_S / 10)
-        rounds, took_s = len(rounds_s) - before, time.monotonic() - began_s
+        rounds, took_s = len(reads_s) - before, time.monotonic() - began_s
         assert received == list(range(COUNT))
         assert 1 <= rounds <= took_s / EVERY_S + 2
-        assert min(later - earlier for earlier, later in pairwise(rounds_s)) >= 0.9 * EVERY_S
+        assert min(later - earlier for earlier, later in pairwise(reads_s)) >= 0.9 * EVERY_S
     finally:
         await link.close()
 
@@ -64,19 +64,19 @@ def stoppable(tmp_path: Path) -> Iterator[RunningBroker]:
 
 @pytest.mark.anyio
 async def test_it_sleeps_between_messages_and_detects_a_lost_broker(
-    stoppable: RunningBroker, rounds_s: list[float]
+    stoppable: RunningBroker, reads_s: list[float]
 ) -> None:
     at = Broker(host=HOST, port=stoppable.tcp_port, credentials=stoppable.access.service_credentials)
     link = MqttConnection(at, subscriptions=(TOPIC,), every_s=EVERY_S)
     try:
         assert await link.ready(PATIENCE_S), link.problem
         await asyncio.sleep(3 * EVERY_S)
-        before = len(rounds_s)
+        before = len(reads_s)
         await asyncio.sleep(5 * EVERY_S)
-        assert len(rounds_s) == before
+        assert len(reads_s) == before
         await asyncio.to_thread(stoppable.stop)
         async with asyncio.timeout(PATIENCE_S):
-            while not link.problem:  # noqa: ASYNC110 (there is no event for it)
+            while not link.problem:  # noqa: ASYNC110 (no event exists for it)
                 await asyncio.sleep(EVERY_S / 10)
     finally:
         await link.close()

@@ -1,4 +1,4 @@
-"""Errors of DynamoDB and S3 as the tables and the blobs report them."""
+"""Errors of DynamoDB and S3 as reported by tables and blobs."""
 
 import socket
 from collections.abc import Awaitable, Callable
@@ -77,7 +77,7 @@ async def test_a_missing_table_or_bucket_is_named(service: str, open_store: Open
         ("ValidationException", "cannot be used: .*ValidationException"),
     ],
 )
-async def test_a_refusal_is_reported_in_one_line_and_not_retried(
+async def test_an_error_is_reported_in_one_line_and_not_retried(
     open_store: OpenStore, moto: str, code: str, expected: str
 ) -> None:
     with start_fault_proxy(moto) as proxy:
@@ -89,7 +89,7 @@ async def test_a_refusal_is_reported_in_one_line_and_not_retried(
             assert len(proxy.requests) == 1
 
 
-async def test_a_throttled_call_is_tried_a_few_times(open_store: OpenStore, moto: str) -> None:
+async def test_a_throttled_call_is_retried_a_few_times(open_store: OpenStore, moto: str) -> None:
     with start_fault_proxy(moto) as proxy:
         get, *_ = open_store(proxy.endpoint)
         proxy.inject(*[Refusal(400, "ThrottlingException", {})] * ATTEMPTS)

@@ -1,4 +1,4 @@
-"""Errors of an Azure storage account and of the functions' identity, as the tables and the blobs report them."""
+"""Errors of an Azure storage account and of the functions' identity, as reported by tables and blobs."""
 
 import itertools
 import secrets
@@ -31,7 +31,7 @@ from tests.harness.stores.azure import KEY, endpoint, start_azurite, through
 CLIENT_ID = "11059fcc-5514-4800-b5f8-49808b9cfab6"
 WRONG_KEY = "d3Jvbmc="
 NONSENSE = {"Table": "invalid response", "Blob": "cannot be used"}
-"""What an unreadable response is reported as."""
+"""Expected error text for an unreadable response."""
 Calls = tuple[Callable[[], Awaitable[object]], ...]
 OpenStore = Callable[[Endpoint], Calls]
 

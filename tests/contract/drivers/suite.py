@@ -21,7 +21,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 class DriverContract:
-    """The suite. ``driver`` gives one that is not connected; the fixture closes it afterwards."""
+    """The suite. ``driver`` supplies an unconnected driver and closes it afterwards."""
 
     @pytest.fixture
     def robot_type(self) -> RobotType:
@@ -73,10 +73,10 @@ class DriverContract:
             assert all(type(value) is float for value in pose)
             assert math.isclose(math.hypot(*pose[3:]), 1.0, abs_tol=1e-6)
 
-    def test_it_holds_still_after_connect(self, connected: Driver) -> None:
+    def test_it_does_not_move_after_connect(self, connected: Driver) -> None:
         before = connected.observe().position_rad
         time.sleep(0.1)
-        # What stands on wheels or feet comes down on them by a millimetre, and its head nods by as little.
+        # Robots on wheels or feet settle by about a millimetre, and their heads move equally.
         assert connected.observe().position_rad == pytest.approx(before, abs=5e-3)
 
     def test_send_clamps_and_returns_the_applied_values(self, connected: Driver, robot_type: RobotType) -> None:

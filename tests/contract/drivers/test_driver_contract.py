@@ -1,4 +1,4 @@
-"""Every driver of the project keeps the promises of its port."""
+"""The drivers of the project fulfil the contract of their port."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The driver of ``examples/minimal_driver.py`` keeps the driver contract."""
+"""The driver of ``examples/minimal_driver.py`` fulfils the driver contract."""
 
 import runpy
 from collections.abc import Iterator

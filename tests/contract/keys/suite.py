@@ -1,4 +1,4 @@
-"""What every store of signing keys promises. A store's test inherits the class and gives the fixtures.
+"""Contract of ``SigningKeys``. The test of an adapter inherits the class and supplies the fixtures.
 
 ``keys``: opened over an empty place. ``again``: opens the same place as another process does.
 """
@@ -19,7 +19,7 @@ LEARN_MS, OVERLAP_MS = 1000, 5000
 
 
 class Time:
-    """A wall clock that stands until it is moved."""
+    """A manually advanced wall clock."""
 
     def __init__(self) -> None:
         self.ms = 1_800_000_000_000
@@ -40,7 +40,7 @@ async def rotate(keys: SigningKeys) -> str:
 
 
 class KeysSuite:
-    """Inherited by each."""
+    """Contract of ``SigningKeys``."""
 
     pytestmark = pytest.mark.anyio
 
@@ -49,7 +49,7 @@ class KeysSuite:
         assert [await key_ids(again()) for _ in range(3)] == [first] * 3
         assert set(await keys.public()) == {first[0]}
 
-    async def test_a_new_key_signs_tokens_at_once_and_commands_once_devices_had_time_to_learn_it(
+    async def test_a_new_key_signs_tokens_immediately_and_commands_after_the_learning_time(
         self, keys: SigningKeys, time: Time
     ) -> None:
         old, _ = await key_ids(keys)
@@ -66,7 +66,7 @@ class KeysSuite:
         assert (await keys.announcement()).statements == ()
         assert set(await keys.archive()) == {old, new}
 
-    async def test_statements_lead_from_an_old_key_over_each_rotation_to_the_newest(
+    async def test_statements_link_an_old_key_to_the_newest_across_rotations(
         self, keys: SigningKeys, time: Time
     ) -> None:
         old, _ = await key_ids(keys)
@@ -134,4 +134,4 @@ class KeysSuite:
         assert [bool(key.private) for key in ring.keys] == [False, False, True, True]
 
     def wait_for_followers(self, time: Time) -> None:
-        """Let the time pass after which another process reads the keys again."""
+        """Advance the clock until other processes read the keys again."""

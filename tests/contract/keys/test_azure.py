@@ -1,4 +1,4 @@
-"""Signing keys in Azure's Key Vault. There is no emulator: a fake answers as the API's documents say.
+"""Signing keys in Azure Key Vault. No emulator exists; a fake implements the documented API.
 
 The SDK, its challenges, TLS and the managed identity are real.
 """
@@ -26,7 +26,7 @@ class FakeVault(ThreadingHTTPServer):
     """Secrets by name, each a list of versions."""
 
     def __init__(self, certificate: Path) -> None:
-        super().__init__((HOST, 0), _Answer)
+        super().__init__((HOST, 0), _Secrets)
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         context.load_cert_chain(certificate, certificate.with_name("key.pem"))
         self.socket = context.wrap_socket(self.socket, server_side=True)
@@ -37,7 +37,7 @@ class FakeVault(ThreadingHTTPServer):
         return f"https://{HOST}:{self.server_port}"
 
 
-class _Answer(QuietHandler):
+class _Secrets(QuietHandler):
     protocol_version = "HTTP/1.1"
     server: FakeVault
 
@@ -45,7 +45,7 @@ class _Answer(QuietHandler):
         content = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         name = urlsplit(self.path).path.split("/")[2]
         if not self.headers.get("Authorization"):
-            # The SDK sends no token to a vault whose address does not end with the name that its challenge gives.
+            # The SDK sends no token if the vault's address does not end with the domain in the challenge.
             resource = f"https://{HOST.partition('.')[2]}:{self.server.server_port}"
             challenge = f'Bearer authorization="https://login.example/tenant", resource="{resource}"'
             self.respond(401, [("WWW-Authenticate", challenge)], b"")

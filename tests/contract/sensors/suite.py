@@ -29,7 +29,7 @@ def all_calls(driver: RoomDriver, entry: RoomDeviceManifest) -> list[Callable[[]
 
 
 class RoomDriverContract:
-    """The suite. ``driver`` gives one that is not connected, and closes it afterwards."""
+    """The suite. ``driver`` supplies an unconnected driver and closes it afterwards."""
 
     @pytest.fixture
     def entry(self) -> RoomDeviceManifest:

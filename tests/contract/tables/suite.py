@@ -1,4 +1,4 @@
-"""What every adapter of ``Tables`` promises. An adapter's test inherits the class and brings its fixtures.
+"""Contract of ``Tables``. The test of an adapter inherits the class and supplies the fixtures.
 
 ``tables``: an empty store. ``again``: opens another instance over the same store, as another process would.
 """
@@ -51,7 +51,7 @@ class TablesSuite:
 
     pytestmark = pytest.mark.anyio
 
-    async def test_a_created_row_is_read_back_with_its_etag_from_its_own_place_only(self, tables: Tables) -> None:
+    async def test_a_created_row_is_read_back_with_its_etag_only_from_its_own_key(self, tables: Tables) -> None:
         row = await tables.create("T", Row("p", "k", DATA))
         assert (row.partition, row.key, row.data) == ("p", "k", DATA)
         assert row.etag
@@ -107,7 +107,7 @@ class TablesSuite:
             await tables.delete("T", row)
             assert (await tables.query("T", key)).rows == ()
 
-    async def test_similar_keys_differ_and_sort_as_their_utf_8_bytes(self, tables: Tables) -> None:
+    async def test_similar_keys_differ_and_sort_by_their_utf_8_bytes(self, tables: Tables) -> None:
         rows = {key: await tables.create("T", Row("p", key, {"key": key})) for key in KEYS}
         for key, row in rows.items():
             assert await tables.get("T", "p", key) == row
@@ -129,7 +129,7 @@ class TablesSuite:
                 await tables.replace("T", Row("p", "one", {}, text))
         assert len((await tables.query("T", "p")).rows) == 2
 
-    async def test_an_invalid_key_is_refused_and_nothing_is_written(self, tables: Tables) -> None:
+    async def test_an_invalid_key_is_rejected_and_nothing_is_written(self, tables: Tables) -> None:
         for text in INVALID_KEYS:
             for row in (Row(text, "k"), Row("p", text)):
                 for call in (tables.create("T", row), tables.batch("T", [Write("create", row)])):
@@ -139,7 +139,7 @@ class TablesSuite:
 
     # ------------------------------------------------------------ size
 
-    async def test_a_row_holds_256_kb_and_no_more(self, tables: Tables) -> None:
+    async def test_a_row_holds_256_kb_at_most(self, tables: Tables) -> None:
         room = MAX_DATA_BYTES - len('{"text":""}')
         row = await tables.create("T", Row("p", "k", {"text": "x" * room}))
         assert await tables.get("T", "p", "k") == row
@@ -206,7 +206,7 @@ class TablesSuite:
         assert [row.key for row in (await tables.query("T", "p", first="b", cursor=early)).rows] == ["b1", "b2"]
         assert (await tables.query("T", "p", last="b", cursor=late)).rows == ()
 
-    async def test_an_invalid_cursor_or_limit_is_refused(self, tables: Tables) -> None:
+    async def test_an_invalid_cursor_or_limit_is_rejected(self, tables: Tables) -> None:
         for cursor in ("§", "a b", "=", "_w", "🤖", "'"):
             with pytest.raises(ValueError, match="cursor"):
                 await tables.query("T", "p", cursor=cursor)
@@ -255,7 +255,7 @@ class TablesSuite:
         assert (await tables.query("T", "p")).rows == ()
         assert len(await tables.batch("T", writes[:MAX_BATCH])) == MAX_BATCH
 
-    async def test_a_batch_holds_1_mb_of_data_and_no_more(self, tables: Tables) -> None:
+    async def test_a_batch_holds_1_mb_of_data_at_most(self, tables: Tables) -> None:
         text = "x" * (MAX_BATCH_BYTES // 5 - len('{"text":""}'))
         rows = [Row("p", str(number), {"text": text}) for number in range(5)]
         written = await tables.batch("T", [Write("create", row) for row in rows])
@@ -271,7 +271,7 @@ class TablesSuite:
 
     # ------------------------------------------------------------ instances
 
-    async def test_another_instance_sees_every_write_at_once(self, tables: Tables, again: Again) -> None:
+    async def test_another_instance_sees_every_write_immediately(self, tables: Tables, again: Again) -> None:
         other = again()
         for number in range(ROUNDS):
             row = await tables.create("T", Row("p", str(number), {"n": number}))
@@ -304,7 +304,7 @@ class TablesSuite:
                 with contextlib.suppress(Conflict):
                     created.append((await instance.create("T", Row("p", f"row{number}"))).key)
                 with contextlib.suppress(Conflict):
-                    writes = [Write("create", Row("q", f"{name}{number}")) for name in ("batch", "beside")]
+                    writes = [Write("create", Row("q", f"{name}{number}")) for name in ("batch", "single")]
                     created.append((await instance.batch("T", writes))[0].key)
                 await count_up(instance)
             return created

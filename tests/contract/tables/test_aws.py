@@ -1,4 +1,4 @@
-"""``DynamoTables`` keeps the port's promises over moto."""
+"""``DynamoTables`` fulfils the contract of its port on moto."""
 
 import asyncio
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.anyio
 
 @pytest.fixture(scope="module")
 def warm(moto: str) -> Iterator[DynamoTables]:
-    """One for all tests: the SDK takes long to make a client."""
+    """Shared by all tests: creating a client of the SDK is slow."""
     tables = DynamoTables(table=NAME, region=REGION, endpoint=moto)
     yield tables
     asyncio.run(tables.close())
@@ -83,12 +83,12 @@ async def test_long_keys_with_the_same_start_are_paged_in_order(tables: Tables) 
             assert [row.key async for row in all_rows(tables, limit=5, first=lower, last=upper)] == expected
 
 
-async def test_long_partitions_with_the_same_start_are_apart(tables: Tables) -> None:
+async def test_long_partitions_with_the_same_start_are_separate(tables: Tables) -> None:
     rows = [await tables.create("T", Row(partition, "k", {"partition": partition})) for partition in LONG]
     assert [(await tables.query("T", partition)).rows for partition in LONG] == [(row,) for row in rows]
 
 
-async def test_reading_with_an_invalid_key_is_refused(tables: Tables) -> None:
+async def test_reading_with_an_invalid_key_is_rejected(tables: Tables) -> None:
     for call in (
         tables.get("T", "\ud800", "k"),
         tables.get("T", "p", "\ud800"),
@@ -105,9 +105,7 @@ async def test_reading_with_an_invalid_key_is_refused(tables: Tables) -> None:
 # ---------------------------------------------------------------- requests
 
 
-async def test_a_page_is_one_request_for_few_more_than_its_rows(
-    tables: Tables, over_wire: Tables, proxy: FaultProxy
-) -> None:
+async def test_a_page_is_one_request_with_few_extra_rows(tables: Tables, over_wire: Tables, proxy: FaultProxy) -> None:
     keys = [f"{number:03d}" for number in range(100)]
     await create_rows(tables, *keys)
     page = await over_wire.query("T", "p", first="020", last="090", limit=10)
@@ -120,7 +118,7 @@ async def test_a_page_is_one_request_for_few_more_than_its_rows(
     assert [request.json["ConsistentRead"] for request in proxy.requests] == [True] * 3
 
 
-async def test_a_page_may_need_several_of_amazons_pages(tables: Tables, over_wire: Tables, proxy: FaultProxy) -> None:
+async def test_a_page_may_need_several_requests(tables: Tables, over_wire: Tables, proxy: FaultProxy) -> None:
     keys = [f"{number:02d}" for number in range(12)]
     for key in keys:
         await tables.create("T", Row("p", key, {"text": "x" * 200_000}))
@@ -133,7 +131,9 @@ async def test_a_page_may_need_several_of_amazons_pages(tables: Tables, over_wir
 # ---------------------------------------------------------------- lost requests and responses
 
 
-async def test_a_write_without_response_is_no_conflict(tables: Tables, over_wire: Tables, proxy: FaultProxy) -> None:
+async def test_a_write_with_a_lost_response_is_not_a_conflict(
+    tables: Tables, over_wire: Tables, proxy: FaultProxy
+) -> None:
     proxy.inject("lose response")
     row = await over_wire.create("T", Row("p", "k", {"n": 1}))
     assert await tables.get("T", "p", "k") == row
@@ -185,7 +185,7 @@ async def test_a_write_waits_for_another_transaction(over_wire: Tables, proxy: F
     assert proxy.operations == ["PutItem", "PutItem"]
 
 
-async def test_a_write_that_is_always_in_conflict_with_another_transaction_is_an_error(
+async def test_a_write_that_always_conflicts_with_transactions_is_an_error(
     over_wire: Tables, proxy: FaultProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(adapter, "_PAUSE_S", 0.001)
@@ -202,7 +202,7 @@ async def test_a_conflict_is_not_retried_and_names_the_row(over_wire: Tables, pr
     assert len(proxy.requests) == 1
 
 
-async def test_preparing_is_safe_to_repeat_and_keeps_rows(tables: Tables, open_at: Open, moto: str) -> None:
+async def test_prepare_is_idempotent_and_preserves_rows(tables: Tables, open_at: Open, moto: str) -> None:
     row = await tables.create("T", Row("p", "k"))
     await asyncio.gather(*(open_at(moto).prepare() for _ in range(4)))
     assert await tables.get("T", "p", "k") == row

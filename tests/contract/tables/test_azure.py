@@ -1,4 +1,4 @@
-"""``AzureTables`` keeps the port's promises over Azurite."""
+"""``AzureTables`` fulfils the contract of its port on Azurite."""
 
 import secrets
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.anyio
 
 @pytest.fixture
 def prefix() -> str:
-    """Tables of each test's own."""
+    """Separate tables per test."""
     return f"test{secrets.token_hex(8)}"
 
 
@@ -82,7 +82,7 @@ async def test_long_keys_with_the_same_start_are_paged_in_order(tables: Tables) 
         assert row.data == {"key": key}
 
 
-async def test_the_largest_page_needs_two_of_azures(tables: Tables) -> None:
+async def test_the_largest_page_needs_two_requests(tables: Tables) -> None:
     keys = [f"k{number:05d}" for number in range(1_050)]
     for start in range(0, len(keys), MAX_BATCH):
         await create_rows(tables, *keys[start : start + MAX_BATCH])
@@ -91,13 +91,13 @@ async def test_the_largest_page_needs_two_of_azures(tables: Tables) -> None:
     assert [row.key async for row in all_rows(tables, limit=1000, cursor=page.cursor)] == keys[1000:]
 
 
-async def test_long_partitions_with_the_same_start_are_apart(tables: Tables) -> None:
+async def test_long_partitions_with_the_same_start_are_separate(tables: Tables) -> None:
     partitions = ["n" * 469, "n" * 469 + "a", "n" * 469 + "b", "🤖" * 512, "🤖" * 511 + "🦾"]
     rows = [await tables.create("T", Row(partition, "k", {"p": partition})) for partition in partitions]
     assert [(await tables.query("T", partition)).rows for partition in partitions] == [(row,) for row in rows]
 
 
-async def test_any_data_fills_a_row_and_smaller_data_leaves_nothing_behind(tables: Tables) -> None:
+async def test_any_data_fills_a_row_and_smaller_data_replaces_all_of_it(tables: Tables) -> None:
     row = await tables.create("T", Row("p", "k"))
     for letter in ("x", "ü", "🤖", "\\", '"', "\x00", "\u2028", "\uffff"):
         for start in ("", "a"):  # even and odd positions
@@ -112,9 +112,9 @@ async def test_any_data_fills_a_row_and_smaller_data_leaves_nothing_behind(table
     assert (await tables.query("T", "p")).rows == (row,)
 
 
-async def test_the_largest_batch_is_written_and_a_larger_one_is_refused(tables: Tables) -> None:
+async def test_the_largest_batch_is_written_and_a_larger_one_is_rejected(tables: Tables) -> None:
     key = "🤖" * (MAX_KEY_LENGTH - 1)
-    text = "ü" * ((MAX_BATCH_BYTES // MAX_BATCH - len('{"text":""}')) // 2)  # which the SDK escapes with six bytes
+    text = "ü" * ((MAX_BATCH_BYTES // MAX_BATCH - len('{"text":""}')) // 2)  # the SDK escapes it with six bytes
     writes = [Write("create", Row(key + "p", key + chr(33 + n), {"text": text})) for n in range(MAX_BATCH)]
     written = await tables.batch("T", writes)
     assert (await tables.query("T", key + "p")).rows == written
@@ -128,7 +128,7 @@ async def test_the_largest_batch_is_written_and_a_larger_one_is_refused(tables: 
 
 
 @pytest.mark.parametrize("fault", ["lose response", "lose request", Refusal(500, "InternalError", {})], ids=str)
-async def test_a_write_is_done_once_if_the_wire_fails(
+async def test_a_write_is_applied_once_despite_connection_errors(
     over_wire: Tables, tables: Tables, proxy: FaultProxy, fault: Fault
 ) -> None:
     proxy.inject(fault)
@@ -153,7 +153,7 @@ async def test_a_write_is_done_once_if_the_wire_fails(
     assert len((await over_wire.query("T", "p")).rows) == 3
 
 
-async def test_the_row_of_another_writer_is_never_taken_for_the_own(
+async def test_the_row_of_another_writer_is_never_mistaken_for_the_own_one(
     over_wire: Tables, tables: Tables, proxy: FaultProxy
 ) -> None:
     row = await tables.create("T", Row("p", "k", {"n": 1}))
@@ -177,7 +177,7 @@ async def test_a_delete_without_response_is_an_error(over_wire: Tables, tables: 
         await over_wire.delete("T", row)
 
 
-async def test_a_missing_right_to_make_a_table_is_reported(
+async def test_a_missing_permission_to_create_a_table_is_reported(
     azurite: str, proxy: FaultProxy, prefix: str, closing: Closing
 ) -> None:
     tables = closing(AzureTables(endpoint=Endpoint(through(azurite, proxy.endpoint, "Table")), prefix=prefix))

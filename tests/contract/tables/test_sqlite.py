@@ -1,4 +1,4 @@
-"""``SqliteTables`` keeps the port's promises, and says clearly what is wrong with its file."""
+"""``SqliteTables`` fulfils the contract of its port, and reports problems with its file."""
 
 import asyncio
 import multiprocessing
@@ -41,7 +41,7 @@ class TestSqliteTables(TablesSuite):
     pass
 
 
-async def test_the_first_call_makes_a_file_for_its_owner_only(tables: Tables, path: Path) -> None:
+async def test_the_first_call_creates_a_file_for_its_owner_only(tables: Tables, path: Path) -> None:
     assert not path.parent.exists()
     assert await tables.get("T", "p", "k") is None
     assert path.stat().st_mode & 0o077 == 0
@@ -122,7 +122,7 @@ def test_a_folder_without_write_permission_is_reported(read_only_folder: Path, w
 
 
 def _write_unprivileged(path: Path, sender: "multiprocessing.connection.Connection") -> None:
-    if os.getuid() == 0:  # who may write everywhere
+    if os.getuid() == 0:  # root may write everywhere
         os.setgroups([])
         os.setgid(_UNPRIVILEGED_UID)
         os.setuid(_UNPRIVILEGED_UID)
@@ -133,7 +133,7 @@ def _write_unprivileged(path: Path, sender: "multiprocessing.connection.Connecti
         sender.send(f"StoreError: {error}")
 
 
-def test_many_processes_make_one_file_together(tmp_path: Path) -> None:
+def test_many_processes_create_one_file_concurrently(tmp_path: Path) -> None:
     with _FORK.Pool(4) as pool:
         for round_ in range(5):
             path = tmp_path / str(round_) / "tables.sqlite"

@@ -31,7 +31,7 @@ HELD_WITHIN_MS = 350
 
 
 class PairedAgent:
-    """An agent of Anna's in this process.
+    """An agent in this process, owned by the account ``anna``.
 
     Attributes:
         commanded: Time [s] and position [rad] of each command to the driver.
@@ -179,11 +179,11 @@ class AgentSuite:
         wait_until(lambda: AckStatus.DONE in agent.acks(order.command), "its end")
         acks, ticks = agent.acks(order.command), len(agent.commanded)
         processes.deliver(agent.agent, order)
-        new_epoch = agent.take()  # an agent that still has this command is asked for others
+        new_epoch = agent.take()  # the agent now requests other commands
         wait_until(lambda: len(agent.acks(order.command)) > len(acks), "the last acknowledgement again")
         statuses = list(dict.fromkeys(agent.acks(order.command)))
         assert statuses[-3:] == [AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE]
-        assert len({position for _, position in agent.commanded[ticks:]}) <= 1, "it moved again"
+        assert len({position for _, position in agent.commanded[ticks:]}) <= 1, "the robot moved again"
         return new_epoch
 
     @staticmethod

@@ -139,7 +139,7 @@ class TransportSuite:
         assert not link.publish(topics.ACK, codec.encode(_ack(link, 1)))
         processes.endpoints[spoken.endpoint].revive()
         link.up(2)
-        assert link.sessions >= 2, "each connection has a number of its own"
+        assert link.sessions >= 2, "each connection has a unique number"
         processes.send(link.robot, ODD)
         wait_until(lambda: (link.topic(topics.CMD), ODD) in link.received, "a command over the new link")
         assert link.changes == [True, False, True]
