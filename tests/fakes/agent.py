@@ -1,4 +1,4 @@
-"""A toy robot: an agent as the protocol says, of which a test decides what it answers."""
+"""A simulated agent whose acknowledgements the test defines."""
 
 import json
 import time
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from tests.harness.cloud.cloud import Cloud, Person
 
 T = TypeVar("T")
-Answers = Iterable[AckStatus | Ack]
+Acks = Iterable[AckStatus | Ack]
 
 
 class Robot:
-    """An agent as the protocol says: own key, broker credentials from the API, acks for each signed command.
+    """Enrolls with its own key, connects with credentials from the API, and acknowledges signed commands.
 
-    A command that comes a second time is answered with the last ack, and not obeyed.
+    A duplicate command is not executed again; the last ack is repeated.
 
     Attributes:
-        reports: What it answers to a new action; a test may put another function here.
-        silent: Answers nothing at all.
+        reports: Returns the acks of a new action. Tests may replace it.
+        silent: Send no acks.
     """
 
     def __init__(self, cloud: "Cloud", names: tuple[str, ...]) -> None:
@@ -53,18 +53,14 @@ class Robot:
         self.space = ""
         self.session = 0
         self.silent = False
-        self.reports: Callable[[Command], Answers] = lambda _: (
-            AckStatus.RECEIVED,
-            AckStatus.ACCEPTED,
-            AckStatus.STARTED,
-        )
+        self.reports: Callable[[Command], Acks] = lambda _: (AckStatus.RECEIVED, AckStatus.ACCEPTED, AckStatus.STARTED)
         self.commands: list[Command] = []
         self.payloads: dict[str, list[bytes]] = {}
         self.stops: list[Stop] = []
         self.link: Client | None = None
         self._keys: dict[str, Any] = {}
         self._sequences: dict[str, int] = {}
-        self._said: dict[str, bytes] = {}
+        self._last_acks: dict[str, bytes] = {}
 
     @property
     def device(self) -> str:
@@ -73,7 +69,7 @@ class Robot:
     # ------------------------------------------------------------ HTTP
 
     def token(self, **changes: Any) -> str:
-        """A request token, signed by the agent's own key."""
+        """A request token, signed with the agent's key."""
         key = changes.pop("key", self.key)
         now_s = self.cloud.clock.now_ms() // 1000
         claims = {"iss": "agent", "aud": "telescope/api", "iat": now_s, "exp": now_s + 60, "jti": str(time.time_ns())}
@@ -90,7 +86,7 @@ class Robot:
 
     def introduction(self, **changes: Any) -> dict[str, Any]:
         devices = [{"name": name, "kind": "arm", "robot_type": "ur5", "label": name.title()} for name in self.names]
-        return {"name": "lab", "public_key": self.public, "software": "toy 1", "devices": devices, **changes}
+        return {"name": "lab", "public_key": self.public, "software": "simulated 1", "devices": devices, **changes}
 
     def enroll(self, **changes: Any) -> httpx.Response:
         return self.request("POST", "/agents/enroll", json=self.introduction(**changes))
@@ -104,11 +100,11 @@ class Robot:
     def enrollment(self, wait_ms: int = 0) -> dict[str, Any]:
         answer = self.request("GET", "/agents/enrollment", params={"wait_ms": wait_ms})
         assert answer.status_code == 200, answer.text
-        found: dict[str, Any] = answer.json()
-        return found
+        state: dict[str, Any] = answer.json()
+        return state
 
     def pair(self, owner: "Person") -> str:
-        """Enroll and be claimed; gives the first device's id."""
+        """Enroll, and claim for ``owner``; return the id of the first device."""
         answer = owner.post("/agents/claim", {"code": self.code()})
         assert answer.status_code == 200, answer.text
         state = self.enrollment()
@@ -119,7 +115,7 @@ class Robot:
     # ------------------------------------------------------------ MQTT
 
     def connect(self) -> Self:
-        """Connect with credentials from the API, hear what is addressed to it, and say that it is there."""
+        """Connect with credentials from the API, subscribe, and publish the presence."""
         issued = self.request("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
         self.session += 1
         self.link = self.cloud.connect(issued, on_message=lambda message: self.handle(message))  # noqa: PLW0108 (tests replace it)
@@ -149,7 +145,7 @@ class Robot:
         return replace_ack(Ack(id=command, status=status, sequence=sequence, at_ms=at_ms, tick_ms=at_ms), more)
 
     def report(self, command: str, status: AckStatus, **more: Any) -> Ack:
-        """Report about an action, when the test wants it."""
+        """Publish an ack of an action."""
         ack = self.ack(command, status, **more)
         self.publish(self.topic(topics.ACK), ack)
         return ack
@@ -158,11 +154,11 @@ class Robot:
         self.report(command, AckStatus.FAILED, reason=Reason(code=code, message=message))
 
     def received(self, kind: type[T]) -> list[Command]:
-        """Signed commands of this kind, in order."""
+        """Received commands of this kind, in order."""
         return [command for command in self.commands if isinstance(command.request, kind)]
 
     def handle(self, message: Message) -> None:
-        """Called on the connection's own thread."""
+        """Process a received message; runs in the thread of the connection."""
         topic = topics.parse(message.topic)
         if topic.kind == topics.STOP:
             self.stops.append(codec.decode(message.payload, Stop))
@@ -173,8 +169,8 @@ class Robot:
         seen.append(message.payload)
         topic_of_acks = topics.device(topic.space, topic.agent, topic.device, topics.ACK)
         if len(seen) > 1:
-            if command.id in self._said and not self.silent and self.link is not None:
-                self.link.publish(topic_of_acks, self._said[command.id])
+            if command.id in self._last_acks and not self.silent and self.link is not None:
+                self.link.publish(topic_of_acks, self._last_acks[command.id])
             return
         self.commands.append(command)
         if self.silent or self.link is None:
@@ -182,8 +178,8 @@ class Robot:
         action = isinstance(command.request, Task | RunMovement)
         for each in self.reports(command) if action else (AckStatus.RECEIVED, AckStatus.DONE):
             ack = each if isinstance(each, Ack) else self.ack(command.id, each)
-            self._said[command.id] = codec.encode(ack)
-            self.link.publish(topic_of_acks, self._said[command.id])
+            self._last_acks[command.id] = codec.encode(ack)
+            self.link.publish(topic_of_acks, self._last_acks[command.id])
 
     def __enter__(self) -> Self:
         return self

@@ -19,7 +19,7 @@ SUBACK_FAILURE = 128
 
 
 class Subscriber(Protocol):
-    """A connection to the broker, as the broker sees it."""
+    """A connection, as used by the broker."""
 
     def matches(self, topic: str) -> bool: ...
 
@@ -39,8 +39,8 @@ class MemoryBroker:
     """Publish and subscribe with retained messages, wildcards and grants.
 
     Attributes:
-        settle: Waits until everything that was published is stored.
-        reachable: A test sets it to ``False`` to let every publication and every change of rights fail.
+        settle: Waits until all published messages are stored.
+        reachable: ``False``: publications and changes of permissions fail.
     """
 
     def __init__(self, *, now_s: Callable[[], float] = time.time) -> None:
@@ -56,7 +56,7 @@ class MemoryBroker:
         self._feeds: list[Feed] = []
 
     def publish(self, topic: str, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
-        """Deliver to every subscriber; a publication from within a delivery follows after it."""
+        """Deliver to every subscriber. Messages published during a delivery are queued."""
         if retain and payload:
             self._retained[topic] = payload
         elif retain:
@@ -86,7 +86,7 @@ class MemoryBroker:
         )
 
     def connect(self, client_id: str, credentials: Credentials | None, **options: Any) -> "MemoryConnection":
-        """A client that has tried to connect."""
+        """A client after its connection attempt."""
         return MemoryConnection(self, client_id, credentials, settle=self.settle, **options).open()
 
     def retained(self, pattern: str) -> list[Message]:
@@ -115,12 +115,12 @@ class MemoryBroker:
         self.detach(feed)
 
     async def idle(self) -> None:
-        """Wait until every message that has been published is stored."""
+        """Wait until all published messages are stored."""
         for feed in tuple(self._feeds):
             await feed.stored()
 
     def revoke(self, covered: Callable[[Grant], bool]) -> None:
-        """Drop the grants that match, and end the connections made with them."""
+        """Delete matching grants, and close their connections."""
         for username in [username for username, grant in self.grants.items() if covered(grant)]:
             del self.grants[username]
         for connection in [each for each in self.connections.values() if each.grant and covered(each.grant)]:
@@ -128,7 +128,7 @@ class MemoryBroker:
 
 
 class MemoryConnection:
-    """One client's connection. The same surface as ``tests.harness.network.brokers.Client``."""
+    """A client connection with the interface of ``tests.harness.network.brokers.Client``."""
 
     def __init__(
         self,
@@ -172,7 +172,7 @@ class MemoryConnection:
         return self
 
     def subscribe(self, *filters: str, qos: int = 1) -> list[int]:
-        """The SUBACK's codes."""
+        """Subscribe; return the SUBACK codes."""
         codes = []
         for pattern in filters:
             allowed = self.grant is not None and self.grant.may_subscribe(pattern)
@@ -194,7 +194,7 @@ class MemoryConnection:
         return self.is_open
 
     def publish_acknowledged(self, topic: str, payload: bytes | str = b"", *, retain: bool = False) -> None:
-        """Publish, and return once the ingest has stored the message and all that followed from it."""
+        """Publish, and return after the ingest has stored the message and all resulting messages."""
         self.publish(topic, payload, retain=retain)
         self._settle()
 
@@ -204,7 +204,7 @@ class MemoryConnection:
         return self.messages.get_nowait()
 
     def pending(self) -> list[Message]:
-        """The messages that were not received yet."""
+        """Received messages that were not read yet."""
         return [self.messages.get_nowait() for _ in range(self.messages.qsize())]
 
     @property
@@ -212,7 +212,7 @@ class MemoryConnection:
         return self._broker.connections.get(self.client_id) is self
 
     def vanish(self) -> None:
-        """End without DISCONNECT, so that the broker publishes the will."""
+        """Close without DISCONNECT, so that the broker publishes the will."""
         will = self.will if self.is_open else None
         self.close()
         if will is not None:

@@ -1,4 +1,4 @@
-"""Broker ports of the services over ``MemoryBroker``."""
+"""Broker ports of the services, implemented with ``MemoryBroker``."""
 
 import asyncio
 import contextlib
@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 
 class MemoryBrokerAccess:
-    """``BrokerAccess`` of a ``MemoryBroker``: credentials are a name and a token that the broker looks up."""
+    """``BrokerAccess`` of a ``MemoryBroker``. Credentials are a name and a random token."""
 
     def __init__(self, broker: MemoryBroker) -> None:
         self._broker = broker
@@ -72,7 +72,7 @@ class MemoryCommandBus:
     """``CommandBus`` of a ``MemoryBroker``."""
 
     broker: MemoryBroker
-    _waiting: dict[tuple[str, str], list[asyncio.Queue[Ack]]] = field(default_factory=dict)
+    _queues: dict[tuple[str, str], list[asyncio.Queue[Ack]]] = field(default_factory=dict)
 
     async def start(self) -> None:
         if self not in self.broker._subscribers:
@@ -90,13 +90,13 @@ class MemoryCommandBus:
         if not self.broker.reachable:
             yield None
             return
-        waiting: asyncio.Queue[Ack] = asyncio.Queue()
-        queues = self._waiting.setdefault((f"{device_topic}/{topics.ACK}", command), [])
-        queues.append(waiting)
+        received: asyncio.Queue[Ack] = asyncio.Queue()
+        queues = self._queues.setdefault((f"{device_topic}/{topics.ACK}", command), [])
+        queues.append(received)
         try:
-            yield _Acks(waiting)
+            yield _Acks(received)
         finally:
-            queues.remove(waiting)
+            queues.remove(received)
 
     async def status(self) -> str:
         return "ok" if self.broker.reachable else "the broker at 127.0.0.1:1 cannot be reached"
@@ -110,20 +110,20 @@ class MemoryCommandBus:
     def deliver(self, message: Message) -> None:
         with contextlib.suppress(ProtocolError):
             ack = codec.decode(message.payload, Ack)
-            for waiting in self._waiting.get((message.topic, ack.id), ()):
-                waiting.put_nowait(ack)
+            for queue in self._queues.get((message.topic, ack.id), ()):
+                queue.put_nowait(ack)
 
 
 class _Acks(AsyncIterator[Ack]):
-    def __init__(self, waiting: asyncio.Queue[Ack]) -> None:
-        self._waiting = waiting
+    def __init__(self, queue: asyncio.Queue[Ack]) -> None:
+        self._queue = queue
 
     async def __anext__(self) -> Ack:
-        return await self._waiting.get()
+        return await self._queue.get()
 
 
 class _MemorySubscription:
-    """A queue of topics and payloads that are stored one after another."""
+    """Queues received messages and stores them sequentially."""
 
     filters: tuple[str, ...]
 
@@ -166,7 +166,7 @@ class MemoryFeed(_MemorySubscription):
 
 
 class MemoryTelemetry(_MemorySubscription):
-    """``TelemetryFeed`` of a ``MemoryBroker``: by default measurements, with ``late`` those of an interrupted link."""
+    """``TelemetryFeed`` of a ``MemoryBroker``; ``late``: only backfilled measurements."""
 
     def __init__(self, broker: MemoryBroker, *, late: bool = False) -> None:
         super().__init__(broker)
@@ -189,7 +189,7 @@ async def _store(handle: Callable[[], Awaitable[None]], name: str) -> None:
         except (StoreError, Problem) as error:
             _log.warning("ingest of %s: %s", name, error)
             await asyncio.sleep(RETRY_S)
-        except Exception:  # noqa: BLE001 (the next message goes on)
+        except Exception:  # noqa: BLE001 (continue with the next message)
             _log.exception("ingest of %s failed", name)
             return None
     return None

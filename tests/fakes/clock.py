@@ -1,10 +1,10 @@
-"""Wall clocks that a test can advance."""
+"""Wall clocks that tests can advance."""
 
 import time
 
 
 class MovingClock:
-    """The machine's clock, plus what a test has advanced it by."""
+    """The system clock plus an offset that tests increase."""
 
     def __init__(self) -> None:
         self.ahead_ms = 0.0
@@ -17,7 +17,7 @@ class MovingClock:
 
 
 class MemoryClock(MovingClock):
-    """Moves when a test advances it, by 1 ms with each call of a ``Cloud``, and by waits on a ``VirtualTimeLoop``."""
+    """Advanced by tests, by 1 ms with each call of a ``Cloud``, and by waits on a ``VirtualTimeLoop``."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -20,7 +20,7 @@ BASE = Base(
 
 
 def joint(name: str, **figures: float) -> Joint:
-    toy = {
+    defaults = {
         "lower_rad": -3.0,
         "upper_rad": 3.0,
         "max_velocity_rad_s": 3.0,
@@ -28,15 +28,15 @@ def joint(name: str, **figures: float) -> Joint:
         "max_jerk_rad_s3": 80.0,
         "max_effort_nm": 100.0,
     }
-    return Joint(name=name, label=name, **(toy | figures))
+    return Joint(name=name, label=name, **(defaults | figures))
 
 
 def robot_type(base: Base | None = None, joints: Sequence[Joint] | None = None, **more: Any) -> RobotType:
-    """An arm of two joints, unless others are given."""
+    """A robot type with two arm joints by default."""
     joints = tuple(joints or (joint("shoulder"), joint("elbow")))
-    toy: dict[str, Any] = {
-        "type": "toy",
-        "label": "Toy",
+    defaults: dict[str, Any] = {
+        "type": "test",
+        "label": "Test",
         "kind": "robot",
         "version": 1,
         "description": "",
@@ -48,7 +48,7 @@ def robot_type(base: Base | None = None, joints: Sequence[Joint] | None = None, 
         "home_rad": {each.name: 0.0 for each in joints},
         "braking_rad_s2": 20.0,
     }
-    return RobotType(**(toy | {"base": base, "joints": joints} | more))
+    return RobotType(**(defaults | {"base": base, "joints": joints} | more))
 
 
 class FakeDriver:

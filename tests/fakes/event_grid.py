@@ -1,11 +1,10 @@
-"""A fake of an Event Grid namespace: its authorisation, by the pages that Microsoft has written about it.
+"""A fake Event Grid namespace that implements the documented authorization on the embedded MQTT broker.
 
-Read from the ARM template that ``python -m infra.azure`` prints, by rules of its own: a client is in a group by the
-group's query over its attributes; a binding lets a group publish, or subscribe, to a topic space; the variables of a
-template stand for the client's attributes, and a client without one has no right by it; a topic is allowed that one
-template matches, a filter that one template covers whole. MQTT itself is the embedded broker's, so that real clients
-connect, and a session is taken over by the same authentication name and by no other. Connections do not end at their
-``expiration``: it is not written that they do.
+It reads the ARM template of ``python -m infra.azure``. A group contains the clients whose attributes match its query. A
+binding allows a group to publish or subscribe to a topic space. Variables of topic templates are replaced with client
+attributes; a template with a missing attribute grants nothing. A template must match the whole topic, or cover the
+whole filter. Only a client with the same authentication name can take over a session. Connections do not end at their
+``expiration``, because the documentation does not specify this.
 """
 
 import asyncio
@@ -40,31 +39,30 @@ from tests.harness.network.brokers import RunningBroker
 
 HOST = "127.0.0.1"
 Webhook = Callable[[dict[str, Any]], dict[str, Any]]
-"""What the namespace asks, and what it is answered."""
 _QUERY = re.compile(r'attributes\.(\w+) = "([^"]*)"')
 _VARIABLE = re.compile(r"\$\{client\.(authenticationName|attributes\.(\w+))\}")
 
 
-def covers(template: str, wanted: str) -> bool:
-    """Whether every topic that ``wanted`` (a topic or a filter) matches is matched by ``template``."""
-    levels, asked = template.split("/"), wanted.split("/")
-    while levels and levels[0] != "#":
-        if not asked or asked[0] == "#" or (levels[0] != "+" and levels[0] != asked[0]):
+def covers(template: str, pattern: str) -> bool:
+    """Whether ``template`` matches every topic that ``pattern`` (a topic or a filter) matches."""
+    allowed, requested = template.split("/"), pattern.split("/")
+    while allowed and allowed[0] != "#":
+        if not requested or requested[0] == "#" or (allowed[0] != "+" and allowed[0] != requested[0]):
             return False
-        levels, asked = levels[1:], asked[1:]
-    return bool(levels) or not asked
+        allowed, requested = allowed[1:], requested[1:]
+    return bool(allowed) or not requested
 
 
 @dataclass(frozen=True)
 class Client:
-    """A client that the webhook has admitted."""
+    """A client that the webhook has accepted."""
 
     name: str
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Namespace:
-    """Client groups, topic spaces and permission bindings, as the template says."""
+    """Client groups, topic spaces and permission bindings of a template."""
 
     def __init__(self, template: Mapping[str, Any]) -> None:
         self.groups: dict[str, str] = {}
@@ -72,45 +70,45 @@ class Namespace:
         self.bindings: list[dict[str, str]] = []
         for resource in template["resources"]:
             kind = resource["type"].rpartition("/")[2]
-            named = re.search(r"\{0\}/([A-Za-z0-9-]{3,50})'", resource["name"])
-            said = resource["properties"]
-            if kind == "clientGroups" and named:
-                self.groups[named[1]] = said["query"]
-            elif kind == "topicSpaces" and named:
-                self.spaces[named[1]] = said["topicTemplates"]
-            elif kind == "permissionBindings" and named:
-                self.bindings.append(said)
+            name = re.search(r"\{0\}/([A-Za-z0-9-]{3,50})'", resource["name"])
+            properties = resource["properties"]
+            if kind == "clientGroups" and name:
+                self.groups[name[1]] = properties["query"]
+            elif kind == "topicSpaces" and name:
+                self.spaces[name[1]] = properties["topicTemplates"]
+            elif kind == "permissionBindings" and name:
+                self.bindings.append(properties)
 
-    def may(self, client: Client, permission: str, wanted: str) -> bool:
-        """Whether a client has this permission for a topic, or for all of a filter."""
-        if wanted.startswith("$"):
+    def may(self, client: Client, permission: str, pattern: str) -> bool:
+        """Whether a client has this permission for a topic, or for a whole filter."""
+        if pattern.startswith("$"):
             return False
         return any(
-            covers(pattern, wanted)
-            for bound in self.bindings
-            if bound["permission"] == permission and self._in(client, bound["clientGroupName"])
-            for template in self.spaces[bound["topicSpaceName"]]
-            if (pattern := self._put_in(template, client)) is not None
+            covers(allowed, pattern)
+            for binding in self.bindings
+            if binding["permission"] == permission and self._in_group(client, binding["clientGroupName"])
+            for template in self.spaces[binding["topicSpaceName"]]
+            if (allowed := self._substitute(template, client)) is not None
         )
 
-    def _in(self, client: Client, group: str) -> bool:
-        found = _QUERY.fullmatch(self.groups[group])
-        assert found, f"the fake cannot read the query {self.groups[group]}"
-        return bool(client.attributes.get(found[1]) == found[2])
+    def _in_group(self, client: Client, group: str) -> bool:
+        query = _QUERY.fullmatch(self.groups[group])
+        assert query, f"unsupported query: {self.groups[group]}"
+        return bool(client.attributes.get(query[1]) == query[2])
 
     @staticmethod
-    def _put_in(template: str, client: Client) -> str | None:
-        known = {"authenticationName": client.name} | {
+    def _substitute(template: str, client: Client) -> str | None:
+        values = {"authenticationName": client.name} | {
             f"attributes.{name}": value for name, value in client.attributes.items()
         }
-        if any(not isinstance(known.get(found[1]), str) for found in _VARIABLE.finditer(template)):
+        if any(not isinstance(values.get(variable[1]), str) for variable in _VARIABLE.finditer(template)):
             return None
-        return _VARIABLE.sub(lambda found: str(known[found[1]]), template)
+        return _VARIABLE.sub(lambda variable: str(values[variable[1]]), template)
 
 
 @dataclass(frozen=True)
 class Rights:
-    """Of one connection; where the embedded broker has a grant."""
+    """Permissions of one connection, instead of the grant of the embedded broker."""
 
     namespace: Namespace | None
     client: Client
@@ -124,67 +122,66 @@ class Rights:
     def may_subscribe(self, pattern: str) -> bool:
         return self._may("Subscriber", pattern)
 
-    def _may(self, permission: str, wanted: str) -> bool:
-        return self.namespace is None or self.namespace.may(self.client, permission, wanted)
+    def _may(self, permission: str, pattern: str) -> bool:
+        return self.namespace is None or self.namespace.may(self.client, permission, pattern)
 
 
-class _Nothing:
+class _NoKeys:
     def refresh(self) -> bool:
         return False
 
     def close(self) -> None:
-        """Nothing."""
+        pass
 
 
 class EventGrid(TelescopeBroker):
     """The namespace's MQTT broker. Set ``webhook`` before the first connection."""
 
     def __init__(self, namespace: Namespace, sockets: Mapping[str, socket.socket]) -> None:
-        nothing: Any = _Nothing()
-        super().__init__(sockets=sockets, keys=nothing, revocations=nothing)
+        unused: Any = _NoKeys()
+        super().__init__(sockets=sockets, keys=unused, revocations=unused)
         self.namespace = namespace
         self.webhook: Webhook | None = None
-        self.asked = 0
-        self.said: list[str] = []
-        """What was published over HTTPS; it goes no further."""
-        self.everything: str = ""
-        """Grant all rights to this client id, for tests."""
+        self.http_topics: list[str] = []
+        """Topics of messages that were published over HTTPS; these are not delivered."""
+        self.unrestricted_client: str = ""
+        """Id of a client with all permissions, for tests."""
 
     def authenticate(self, connect: Connect) -> Admission:
-        if self.everything and connect.client_id == self.everything:
-            rights: Any = Rights(None, Client(connect.client_id), connect.client_id)
+        rights: Any
+        if self.unrestricted_client and connect.client_id == self.unrestricted_client:
+            rights = Rights(None, Client(connect.client_id), connect.client_id)
             return Admission(rights, "", 0)
         assert self.webhook is not None
-        self.asked += 1
-        answer = self.webhook(
+        response = self.webhook(
             {
                 "clientId": connect.client_id,
                 "userName": connect.username,
                 "password": base64.b64encode(connect.password.encode()).decode(),
             }
         )
-        if answer.get("decision") != "allow":
-            raise Refused(packets.NOT_AUTHORISED, str(answer.get("errorReason")))
-        client = Client(answer["clientAuthenticationName"], answer["attributes"])
-        assert len(json.dumps(answer["attributes"])) < 4096
+        if response.get("decision") != "allow":
+            raise Refused(packets.NOT_AUTHORISED, str(response.get("errorReason")))
+        client = Client(response["clientAuthenticationName"], response["attributes"])
+        assert len(json.dumps(response["attributes"])) < 4096
         assert all(re.fullmatch(r"\w+", name) for name in client.attributes)
-        before = self._clients.get(connect.client_id)
-        if before is not None and before.admission is not None:
-            held: Any = before.admission.grant
-            if held.client.name.lower() != client.name.lower():
-                raise Refused(packets.NOT_AUTHORISED, "the session is another's")
+        existing = self._clients.get(connect.client_id)
+        if existing is not None and existing.admission is not None:
+            rights = existing.admission.grant
+            if rights.client.name.lower() != client.name.lower():
+                raise Refused(packets.NOT_AUTHORISED, "the session belongs to another authentication name")
         rights = Rights(self.namespace, client, connect.client_id)
         return Admission(rights, "", 0)
 
 
 ENTRA_ID = "11059fcc-5514-4800-b5f8-49808b9cfab6"
 CALLER = "of the namespace"
-"""Stands for its identity's token."""
+"""Represents the token of the namespace's identity."""
 
 
 @contextlib.contextmanager
 def start_event_grid(namespace: Namespace | None = None) -> Iterator[tuple[EventGrid, dict[str, int]]]:
-    """The namespace's broker on free loopback ports, for the time of a ``with``; and the ports."""
+    """The namespace's broker and its loopback ports, until the context ends."""
     sockets = {}
     for name in (TCP, WEBSOCKET):
         sockets[name] = socket.create_server((HOST, 0))
@@ -195,9 +192,9 @@ def start_event_grid(namespace: Namespace | None = None) -> Iterator[tuple[Event
     thread.start()
 
     async def start() -> EventGrid:
-        made = EventGrid(namespace or Namespace(template()), sockets)
-        await made.start()
-        return made
+        grid = EventGrid(namespace or Namespace(template()), sockets)
+        await grid.start()
+        return grid
 
     try:
         grid = asyncio.run_coroutine_threadsafe(start(), loop).result(10)
@@ -214,7 +211,7 @@ def start_event_grid(namespace: Namespace | None = None) -> Iterator[tuple[Event
 
 @contextlib.contextmanager
 def event_grid_cloud(home: Path) -> Iterator[tuple[Cloud, RunningBroker, EventGrid]]:
-    """The functions with a namespace as their broker and bus."""
+    """The functions with a fake namespace as broker and command bus."""
     with start_event_grid() as (grid, ports), pytest.MonkeyPatch.context() as patch:
         patch.setattr(EventGridCommandBus, "publish", _publisher(grid))
         webhook = EventGridWebhook(tenant=ENTRA_ID, audience=f"api://{ENTRA_ID}", caller=ENTRA_ID)
@@ -225,7 +222,7 @@ def event_grid_cloud(home: Path) -> Iterator[tuple[Cloud, RunningBroker, EventGr
             assert isinstance(access, EventGridBrokerAccess)
             access._take_over = SessionTakeover(host=HOST, port=ports[TCP], tls=None)
             access.verify_caller = _verify_caller
-            grid.webhook = lambda asked: _ask(cloud, asked)
+            grid.webhook = lambda request: _call_webhook(cloud, request)
             process: Any = None
             kind: Any = "eventgrid"
             broker = RunningBroker(kind, home, process, ports[TCP], ports[WEBSOCKET], cloud.loop, access=access)
@@ -236,20 +233,20 @@ async def _verify_caller(token: str) -> bool:
     return token == CALLER
 
 
-def _ask(cloud: Cloud, asked: dict[str, Any]) -> dict[str, Any]:
+def _call_webhook(cloud: Cloud, request: dict[str, Any]) -> dict[str, Any]:
     try:
-        status, answer = cloud.run(admit(cloud.functions, f"Bearer {CALLER}", json.dumps(asked).encode()))
+        status, response = cloud.run(admit(cloud.functions, f"Bearer {CALLER}", json.dumps(request).encode()))
     except Exception:  # noqa: BLE001 (like the namespace: every failure rejects the client)
         return {}
-    return answer if status == 200 else {}
+    return response if status == 200 else {}
 
 
 def _publisher(grid: EventGrid) -> Callable[..., Any]:
-    """What publishing over HTTPS does, with the functions' role on their one topic space."""
+    """A replacement for publishing over HTTPS, limited to the topic space of the functions."""
 
     async def publish(_: Any, topic: str, *__: Any, **___: Any) -> None:
         if not any(covers(each, topic) for each in grid.namespace.spaces[FUNCTIONS_SPACE]):
-            raise BusUnavailable(f"Event Grid does not let the functions publish to {topic}")
-        grid.said.append(topic)
+            raise BusUnavailable(f"the functions may not publish to {topic}")
+        grid.http_topics.append(topic)
 
     return publish

@@ -1,4 +1,4 @@
-"""An event loop in which waiting costs no real time."""
+"""An event loop with virtual time."""
 
 import asyncio
 import selectors
@@ -11,9 +11,9 @@ T = TypeVar("T")
 
 
 class VirtualTimeLoop(asyncio.SelectorEventLoop):
-    """Runs in the caller's thread. When every task waits for a timer, time moves on to the first timer at once.
+    """Runs in the caller's thread. When all tasks wait for timers, the time advances to the first timer.
 
-    Work for the executor runs inline, so that no thread can finish at an unforeseen moment.
+    Executor calls run inline, so that the order of execution is deterministic.
     """
 
     def __init__(self, clock: MemoryClock) -> None:
@@ -38,14 +38,14 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         return self.run_until_complete(call)
 
     def settle(self) -> None:
-        """Run everything that is ready; timers do not fire early."""
+        """Run all ready callbacks without advancing the time."""
         ready: Any = self._ready  # type: ignore[attr-defined]
         while ready:
             self.call_soon(self.stop)
             self.run_forever()
 
     def end(self) -> None:
-        """Cancel what still runs, and close."""
+        """Cancel the remaining tasks, and close the loop."""
         tasks = asyncio.all_tasks(self)
         for task in tasks:
             task.cancel()
@@ -59,18 +59,18 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 
 
 class _Selector(selectors.DefaultSelector):
-    """Never blocks while a timer is pending: moves the time on instead."""
+    """Advances the time instead of blocking while a timer is pending."""
 
     def __init__(self, skip: Callable[[float], None]) -> None:
         super().__init__()
         self._skip = skip
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        assert timeout is not None, "every task waits, and nothing in this process will end the wait"
-        found = super().select(0)
-        if not found and timeout > 0:
+        assert timeout is not None, "deadlock: all tasks wait, and no timer is pending"
+        events = super().select(0)
+        if not events and timeout > 0:
             self._skip(timeout)
-        return found
+        return events
 
 
 async def _gather(tasks: set[asyncio.Task[Any]]) -> None:

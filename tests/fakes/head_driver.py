@@ -1,4 +1,4 @@
-"""A toy head: two joints of a neck, one of which narrows the other, and two ears, one of which mirrors the other."""
+"""A simulated head: pitch limits depend on yaw, and the right ear mirrors the left ear."""
 
 from device_agent.protocol.manifests.capabilities import MimicJoint, PositionDependentLimit
 from device_agent.protocol.manifests.robot_type import RobotType
@@ -11,7 +11,7 @@ SPEED = 4.0
 FACTOR = -0.5
 WIDE = ((-2.0, -0.4, 0.1), (-0.5, -0.7, 0.5), (0.5, -0.7, 0.5), (2.0, -0.4, 0.1))
 BENT = ((-2.0, -0.7, -0.3), (-0.4, -0.5, 0.1), (0.4, -0.2, 0.3), (2.0, 0.2, 0.5))
-"""No one pitch does for all yaws."""
+"""No pitch is valid for every yaw."""
 
 
 def head(table: tuple[tuple[float, float, float], ...] = WIDE) -> RobotType:

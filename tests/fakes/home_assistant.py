@@ -1,4 +1,4 @@
-"""Prints what Home Assistant's own package takes as MQTT discovery, as JSON. Runs in an environment that has it."""
+"""Prints the MQTT discovery schema of Home Assistant as JSON. Requires the package ``homeassistant``."""
 
 import json
 import sys
@@ -12,12 +12,12 @@ from homeassistant.const import __version__
 
 
 def keys(schema: Any) -> dict[str, bool]:
-    """Key → required."""
+    """The keys of a schema: name → whether it is required."""
     if isinstance(schema, vol.All):
-        found: dict[str, bool] = {}
+        result: dict[str, bool] = {}
         for part in schema.validators:
-            found |= keys(part)
-        return found
+            result |= keys(part)
+        return result
     if isinstance(schema, vol.Schema) and isinstance(schema.schema, dict):
         return {str(key): isinstance(key, vol.Required) for key in schema.schema}
     return {}
@@ -29,11 +29,11 @@ if __name__ == "__main__":
         for kind in SensorDeviceClass
     }
     modules = {"sensor": sensor, "binary_sensor": binary_sensor, "number": number, "camera": camera}
-    found = {
+    result = {
         "version": __version__,
         "keys": {name: keys(module.DISCOVERY_SCHEMA) for name, module in modules.items()},
         "sensor_units": units,
         "binary_sensor_classes": sorted(kind.value for kind in BinarySensorDeviceClass),
     }
-    json.dump(found, sys.stdout, indent=1, ensure_ascii=False, sort_keys=True)
+    json.dump(result, sys.stdout, indent=1, ensure_ascii=False, sort_keys=True)
     sys.stdout.write("\n")

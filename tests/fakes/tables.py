@@ -24,8 +24,8 @@ class MemoryTables:
 
     async def get(self, table: str, partition: str, key: str) -> Row | None:
         await asyncio.sleep(0)
-        found = self.partition(table, partition).rows.get(key)
-        return None if found is None else Row(partition, key, row_codec.decode(found[1]), found[0])
+        row = self.partition(table, partition).rows.get(key)
+        return None if row is None else Row(partition, key, row_codec.decode(row[1]), row[0])
 
     async def create(self, table: str, row: Row) -> Row:
         return (await self._apply(table, [Write("create", row)]))[0]
@@ -48,14 +48,14 @@ class MemoryTables:
     ) -> Page:
         row_codec.check_limit(limit)
         await asyncio.sleep(0)
-        found = self.partition(table, partition)
+        existing = self.partition(table, partition)
         start = first if cursor is None else max(first, row_codec.read_cursor(cursor))
-        begin = bisect.bisect_left(found.keys, start)
-        end = len(found.keys) if last is None else bisect.bisect_left(found.keys, last)
-        keys = found.keys[begin : min(end, begin + limit)]
-        rows = tuple(Row(partition, key, row_codec.decode(found.rows[key][1]), found.rows[key][0]) for key in keys)
+        begin = bisect.bisect_left(existing.keys, start)
+        end = len(existing.keys) if last is None else bisect.bisect_left(existing.keys, last)
+        stored = [(key, *existing.rows[key]) for key in existing.keys[begin : min(end, begin + limit)]]
+        rows = tuple(Row(partition, key, row_codec.decode(text), etag) for key, etag, text in stored)
         following = begin + limit
-        return Page(rows, row_codec.write_cursor(found.keys[following]) if following < end else None)
+        return Page(rows, row_codec.write_cursor(existing.keys[following]) if following < end else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
         return await self._apply(table, writes)
@@ -69,7 +69,7 @@ class MemoryTables:
             if write.kind == "create" and current is not None:
                 raise Conflict(f"{table}: '{write.row.key}' exists")
             if write.kind != "create" and (current is None or current[0] != write.row.etag):
-                raise Conflict(f"{table}: '{write.row.key}' has changed or is gone")
+                raise Conflict(f"{table}: '{write.row.key}' was changed or deleted")
         return tuple(self._write(partition, write, text) for write, text in zip(writes, texts, strict=True))
 
     def rows(self, *tables: str) -> list[tuple[str, Row]]:
@@ -90,7 +90,7 @@ class MemoryTables:
         """Nothing is open."""
 
     def partition(self, table: str, partition: str) -> _Partition:
-        """The rows of one partition, which a test may change."""
+        """The rows of one partition; tests may change them."""
         return self._partitions.setdefault((table, partition), _Partition())
 
     def _write(self, partition: _Partition, write: Write, text: bytes) -> Row:

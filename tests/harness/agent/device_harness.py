@@ -195,7 +195,7 @@ class DeviceHarness:
 
 
 def signed_movement(
-    source: str, key: Ed25519PrivateKey, *, version: int = 1, author: str = SHIPPED, robot_type: str = "toy"
+    source: str, key: Ed25519PrivateKey, *, version: int = 1, author: str = SHIPPED, robot_type: str = "test"
 ) -> RunMovement:
     """A command to run this movement, signed as by the cloud."""
     digest = hashlib.sha256(source.encode()).hexdigest()

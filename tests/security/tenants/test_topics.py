@@ -56,7 +56,7 @@ def stage(
     home = tmp_path_factory.mktemp(f"{kind}-home")
     if kind == "eventgrid":
         with event_grid_cloud(home) as (cloud, broker, grid):
-            grid.everything = "observer"
+            grid.unrestricted_client = "observer"
             with broker.connect("observer", None) as observer:
                 yield _stage(broker, cloud, observer)
         return

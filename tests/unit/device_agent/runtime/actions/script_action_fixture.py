@@ -100,7 +100,7 @@ class Run:
         self.api, self.output = RecordingApi(), RecordedOutput()
         digest = hashlib.sha256(source.encode()).hexdigest()
         request = RunMovement(
-            robot_type="arm", name="wave", version=1, sha256=digest, source=source, parameters=parameters or {}
+            robot_type="test", name="wave", version=1, sha256=digest, source=source, parameters=parameters or {}
         )
         self.script = ScriptAction(
             request,

@@ -29,7 +29,7 @@ def journal(tmp_path: Path) -> Iterator[Journal]:
 
 def policy_of(journal: Journal, *, device: str = "arm", owner: str = OWNER) -> ScriptPolicy:
     keys = {signing.key_id(KEY.public_key()): KEY.public_key()}
-    return ScriptPolicy(device=device, robot_type="toy", owner=owner, keys=keys, journal=journal)
+    return ScriptPolicy(device=device, robot_type="test", owner=owner, keys=keys, journal=journal)
 
 
 def movement(version: int = 1, author: str = OWNER) -> RunMovement:
