@@ -31,7 +31,7 @@ class Program(Person):
 
 
 def make(person: Person, role: str = "operator", *only: str, **more: Any) -> tuple[str, Program]:
-    """A new key's id, and a program that has it."""
+    """Create a key; return its id and a program that uses it."""
     answer = person.post(KEYS, {"name": "Home Assistant", "role": role, "only": list(only), **more})
     assert answer.status_code == 201, answer.text
     body = answer.json()

@@ -1,4 +1,4 @@
-"""Local accounts' passwords, and the sessions that they begin and end."""
+"""Passwords of local accounts and their sign-in sessions."""
 
 import asyncio
 from typing import Any
@@ -26,7 +26,7 @@ def sign_in(cloud: Cloud, name: str, password: str, *, address: str = "127.0.0.1
 
 @pytest.fixture
 def anna(cloud: Cloud) -> Person:
-    """A person who has just signed in by a link and set a password."""
+    """A person who has signed in by a link and set a password."""
     anna = cloud.sign_in("anna")
     assert anna.put(PASSWORD, {"password": GOOD}).status_code == 204
     return anna
@@ -112,8 +112,8 @@ class TestNames:
         assert answer.status_code == 201, answer.text
         assert bert.get(f"/devices/{robot.device}").status_code == 200
 
-    def test_an_account_from_before_is_found_by_its_own_spelling(self, cloud: Cloud) -> None:
-        """Names were once case-sensitive: accounts from that time keep their names and data."""
+    def test_an_account_with_a_legacy_name_is_found(self, cloud: Cloud) -> None:
+        """Legacy rows are stored under the case-sensitive name."""
         old = {"account": "o" * 20, "space": "s" * 20}
         cloud.run(cloud.functions.tables.create(records.ACCOUNTS, Row("name:Dora", "account", old)))
         assert cloud.sign_in("Dora").account == old["account"]
@@ -169,7 +169,7 @@ class TestChanging:
             problem(other.get("/accounts/me"), 401, "unauthorized")
         assert anna.get("/accounts/me").status_code == stranger.get("/accounts/me").status_code == 200
 
-    def test_what_is_guessed_first_is_refused(self, anna: Person) -> None:
+    def test_common_passwords_are_refused(self, anna: Person) -> None:
         for weak in (
             "", "eleven char", "aaaaaaaaaaaaaaaa", "123456789012", "qwertyuiopas", "Password1234!", "annaanna2026",
             "t3l3sc0pe-t3l3sc0pe", "x" * 257,
@@ -178,7 +178,7 @@ class TestChanging:
 
 
 class TestSessions:
-    def test_they_are_listed_with_whence_they_came(self, cloud: Cloud, anna: Person) -> None:
+    def test_they_are_listed_with_method_and_address(self, cloud: Cloud, anna: Person) -> None:
         client = cloud.client(address="192.0.2.9", headers={"User-Agent": "Phone"})
         body = {"name": "anna", "password": GOOD}
         phone = cloud.run(client.post(f"{API}/auth/password", json=body)).json()["session"]
@@ -201,7 +201,7 @@ class TestSessions:
         assert [each["mine"] for each in anna.get(SESSIONS).json()["items"]] == [True]
         assert anna.delete(SESSIONS).json() == {"ended": 0}
 
-    def test_they_are_gone_after_twelve_hours(self, cloud: Cloud, anna: Person) -> None:
+    def test_they_expire_after_twelve_hours(self, cloud: Cloud, anna: Person) -> None:
         cloud.clock.advance(12 * 3600)
         newest = cloud.sign_in("anna")
         assert [each["id"] for each in newest.get(SESSIONS).json()["items"]] == [newest.session]
@@ -218,7 +218,7 @@ def test_signing_out_releases_control(cloud: Cloud, anna: Person, robot: Robot) 
     assert anna.take_lease(robot.device).json()["epoch"] == 2
 
 
-def test_concurrent_registrations_of_a_name_make_one_account(cloud: Cloud) -> None:
+def test_concurrent_registrations_of_a_name_create_one_account(cloud: Cloud) -> None:
     async def all_at_once() -> list[Any]:
         passwords = cloud.functions.passwords
         calls = (passwords.register("dora", f"{GOOD} {number}") for number in range(10))
@@ -232,7 +232,7 @@ def test_concurrent_registrations_of_a_name_make_one_account(cloud: Cloud) -> No
     assert Person(cloud, answer.json()).get("/spaces").json()["items"]
 
 
-def test_an_invitation_makes_an_account_with_the_shared_device(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
+def test_an_invitation_creates_an_account_with_the_shared_device(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
     owner, robot = pair
     invitation = owner.post(f"/devices/{robot.device}/invitations", {"role": "viewer"}).json()["secret"]
 

@@ -52,7 +52,7 @@ class TestWaiting:
         call = anna.begin("GET", f"/actions/{action}", params={"wait_ms": 20_000, "wait_for": "started"})
         robot.report(action, AckStatus.STARTED)
         assert call().json()["status"] == "started"
-        assert anna.start(robot.device, idempotency_key="k").status_code == 409, "refused until this one has ended"
+        assert anna.start(robot.device, idempotency_key="k").status_code == 409, "rejected until this action has ended"
 
     def test_a_call_returns_202_when_its_time_is_over(self, anna: Person, robot: Robot) -> None:
         answer = anna.start(robot.device, wait_ms=500, wait_for="done")
@@ -67,8 +67,8 @@ class TestWaiting:
         assert (answer.status_code, answer.json()["status"]) == (202, "published")
         assert anna.action(answer.json()["id"], wait_ms=200)["status"] == "published"
 
-    def test_an_end_before_the_call_was_listening_ends_its_waiting(self, anna: Person, robot: Robot) -> None:
-        """The ingest buffers acks briefly: neither the bus nor the tables have this one when the call begins."""
+    def test_an_action_that_ended_before_the_wait_returns_at_once(self, anna: Person, robot: Robot) -> None:
+        """The ingest buffers acks: neither the bus nor the tables contain this ack when the call starts."""
         action = anna.start(robot.device, wait_ms=10_000).json()["id"]
         robot.report(action, AckStatus.DONE)
         begun_ms = anna.cloud.clock.now_ms()
@@ -116,7 +116,7 @@ def test_a_device_runs_one_action_at_a_time(cloud: Cloud) -> None:
         assert anna.start(left).status_code == 202
 
 
-def test_an_action_without_a_lease_holds_one_until_it_ends(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_an_action_without_a_lease_gets_one_until_it_ends(cloud: Cloud, anna: Person, robot: Robot) -> None:
     other = cloud.sign_in("anna")
     action = anna.start(robot.device, wait_ms=10_000).json()
     refusal = problem(other.take_lease(robot.device), 409, "lease-held")

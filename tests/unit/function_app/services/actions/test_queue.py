@@ -1,4 +1,4 @@
-"""Queued actions start in order; after a failure or a stop nothing starts by itself."""
+"""Queued actions start in order; a failure or Stop cancels the queue."""
 
 from device_agent.protocol import AckStatus, CancelAction, MoveJoints, ResetStop, codec, topics
 from function_app.domain.actions.action import GRACE_MS
@@ -113,7 +113,7 @@ class TestLeases:
         robot.report(action, AckStatus.DONE)
         assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
 
-    def test_a_lease_acquired_meanwhile_is_not_taken_away(self, anna: Person, robot: Robot, running: str) -> None:
+    def test_a_lease_acquired_meanwhile_is_kept(self, anna: Person, robot: Robot, running: str) -> None:
         action = queued(anna.cloud.sign_in("anna"), robot.device)
         assert anna.take_lease(robot.device).status_code == 200
         robot.report(running, AckStatus.DONE)
@@ -131,7 +131,7 @@ class TestEnds:
         assert robot.received(CancelAction) == []
         anna.post(f"/actions/{running}/cancel")
         robot.report(running, AckStatus.CANCELLED)
-        assert started(anna, first), "after a cancelled one too"
+        assert started(anna, first), "after a cancelled action too"
         robot.report(first, AckStatus.DONE)
         assert started(anna, third)
         assert sent(robot) == [running, first, third]
@@ -145,7 +145,7 @@ class TestEnds:
         assert anna.action(first)["queue_position"] == 1
         anna.cloud.clock.advance(10)
         robot.report(running, AckStatus.DONE)
-        assert reason(anna, first) == ("expired", "queue-timeout"), "its turn came too late"
+        assert reason(anna, first) == ("expired", "queue-timeout"), "it expired in the queue"
         assert sent(robot) == [running]
 
     def test_a_failure_cancels_the_queue(self, anna: Person, robot: Robot, running: str) -> None:
@@ -156,7 +156,7 @@ class TestEnds:
         assert len(sent(robot)) == 2
         action = queued(anna, robot.device)
         pass_time(anna.cloud, 6)
-        assert reason(anna, action) == ("cancelled", "earlier-failed"), "a lost action is a failure too"
+        assert reason(anna, action) == ("cancelled", "earlier-failed"), "a lost action also counts as a failure"
 
     def test_a_stop_cancels_the_queue_and_nothing_resumes(self, anna: Person, robot: Robot, running: str) -> None:
         waiting = [queued(anna, robot.device) for _ in range(3)]

@@ -103,7 +103,7 @@ def test_an_unresponsive_device_delays_no_other_and_is_named(two_rooms: TwoRooms
     answer = call()
     assert answer.status_code == 207
     assert confirmed(answer) == {here.devices[0]: True, here.devices[1]: True, there.device: False}
-    assert len(there.stops) >= 3, "repeated until its time is over"
+    assert len(there.stops) >= 3, "repeated until the time limit"
     assert [anna.action(action)["status"] for action in waiting[1:]] == ["cancelled"] * 2
     events = anna.get(f"/devices/{there.device}/events").json()["items"]
     assert [item["kind"] for item in events if item["kind"].startswith("stop")] == ["stop-ordered"]

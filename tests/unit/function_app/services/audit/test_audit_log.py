@@ -66,7 +66,7 @@ class TestWhatIsRecorded:
         assert kinds(anna) == ["signed-out", "signed-in", *["sign-in-rejected"] * 2, "password-set", "signed-in"]
         after = cloud.run(cloud.functions.audit_reader.head(CLOUD))
         assert after is not None
-        assert after.seq == before.seq + 2, "one for the unknown name, one for the link"
+        assert after.seq == before.seq + 2, "a record for the unknown name and one for the link"
         text = anna.get("/accounts/me/audit").text
         assert not [secret for secret in ("horse", "wrong wrong", anna.token) if secret in text]
 
@@ -128,7 +128,7 @@ class TestWhatIsRecorded:
 
 
 def test_a_repeated_write_is_recorded_once(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A store's client repeats a request by itself; not every store recognizes the repetition."""
+    """Client libraries of stores retry requests, and not every store detects the duplicate."""
     functions = cloud.functions
     batch = functions.tables.batch
     lost: list[str] = []
@@ -138,7 +138,7 @@ def test_a_repeated_write_is_recorded_once(cloud: Cloud, monkeypatch: pytest.Mon
         if table == store.AUDIT:
             lost.append(table)
             if len(lost) % 2:
-                raise Conflict("it is not as the writer believed")
+                raise Conflict("the batch was already written")
         return done
 
     monkeypatch.setattr(functions.tables, "batch", losing)

@@ -71,8 +71,8 @@ def test_an_accepted_request_gives_the_requester_the_next_epoch(
         assert lease(anna, robot)["request"] == shown | {"mine": False}
         accepted = anna.post(f"{request}/accept").json()
         assert (accepted["epoch"], accepted["confirmed"], accepted["request"]["outcome"]) == (2, True, "accepted")
-        assert client.disconnected.is_set(), "the former holder's setpoints are cut off"
-    assert anna.post(f"{request}/accept").json()["epoch"] == 2, "accepting twice is accepting once"
+        assert client.disconnected.is_set(), "the setpoint connection of the former holder is closed"
+    assert anna.post(f"{request}/accept").json()["epoch"] == 2, "accepting is idempotent"
     grants = robot.received(GrantLease)
     assert [grant.epoch for grant in grants] == [1, 2]
     assert grants[1].request == GrantLease(holder="anna", lease_ms=45_000)
@@ -194,7 +194,7 @@ def test_an_owner_takes_over_with_a_reason(anna: Person, other: Person, robot: R
     assert "control-taken-over" in events(anna, robot)
     other.delete(f"/devices/{robot.device}/lease?epoch=2")
     assert anna.take_lease(robot.device, take_over=True, reason="now").json()["epoch"] == 3
-    assert lease(anna, robot)["reason"] == "", "a free lease is not taken over"
+    assert lease(anna, robot)["reason"] == "", "a free lease cannot be taken over"
 
 
 @pytest.mark.parametrize("role", [Role.OPERATOR, Role.VIEWER])

@@ -1,4 +1,4 @@
-"""What the API shows of devices: the newest messages of their agents, and only to their accounts."""
+"""The API returns the newest messages of devices, to authorized accounts only."""
 
 from typing import Any
 
@@ -135,7 +135,7 @@ class TestAcks:
             hear(cloud, robot.topic(topics.ACK), robot.ack(name, AckStatus.DONE))
         assert anna.action(action)["status"] == "started"
 
-    def test_a_result_that_is_too_deep_does_not_prevent_the_end(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
+    def test_a_deeply_nested_result_does_not_prevent_the_end(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
         action = anna.start(robot.device, wait_ms=10_000).json()["id"]
         ack = codec.encode(robot.ack(action, AckStatus.DONE))
         deep = b'"result":{"a":' + b"[" * 600 + b"]" * 600 + b"}"

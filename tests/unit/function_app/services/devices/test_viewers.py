@@ -1,4 +1,4 @@
-"""Present viewers of a device, and its label."""
+"""Current viewers of a device, and its label."""
 
 import pytest
 
@@ -48,9 +48,9 @@ class TestViewing:
         cloud.clock.advance(20)
         assert view(bert, robot) == [("anna", "owner", False), ("anna", "owner", False)]
         cloud.clock.advance(8)
-        assert view(anna, robot) == [("bert", "viewer", False)], "a silent viewer is gone"
+        assert view(anna, robot) == [("bert", "viewer", False)], "a viewer without reports is removed"
         assert bert.delete(path).status_code == 204
-        assert view(anna, robot) == [], "a viewer that leaves is gone at once"
+        assert view(anna, robot) == [], "a viewer that leaves is removed immediately"
 
     def test_the_start_is_that_of_the_uninterrupted_view(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
         again = cloud.sign_in("anna")

@@ -17,7 +17,7 @@ MINUTE = 6
 """Windows."""
 
 
-class Life:
+class MeasuringRobot:
     """A robot that measures every ten seconds of simulated time."""
 
     def __init__(self, cloud: Cloud, robot: Robot, *, stream: str = "health", seed: int = 0) -> None:
@@ -29,7 +29,7 @@ class Life:
         self._chance = random.Random(seed)  # noqa: S311 (repeatable noise)
 
     def messages(self, windows: int, **truth: Temperature) -> Iterable[tuple[str, bytes]]:
-        """The measurements of so many windows; each truth maps the window's number to a value."""
+        """The measurements of ``windows`` windows; each function maps the window number to a value."""
         for number in range(windows):
             self.cloud.clock.advance(10)
             self.now_ms += 10_000
@@ -41,7 +41,7 @@ class Life:
             yield self.topic, codec.encode(message)
 
     def live(self, windows: int, **truth: Temperature) -> None:
-        """Ingest the measurements of so many windows."""
+        """Ingest the measurements of ``windows`` windows."""
         batch = list(self.messages(windows, **truth))
         self.cloud.run(ingest_telemetry(self.cloud.functions, batch))
 
@@ -55,7 +55,7 @@ def warming(level: float, per_minute: float) -> Temperature:
 
 
 def health(cloud: Cloud, who: Person, robot: Robot) -> str:
-    """Health of the robot, which has just published its state."""
+    """Publish a state; return the health of the robot."""
     now_ms = cloud.clock.now_ms()
     state = State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0)
     cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), codec.encode(state)))
@@ -85,7 +85,7 @@ def open_faults(who: Person, robot: Robot) -> list[dict[str, Any]]:
 
 def test_a_warming_joint_is_reported_before_its_limit(cloud: Cloud, anna: Person, robot: Robot) -> None:
     cloud.start_telemetry()
-    life = Life(cloud, robot)
+    life = MeasuringRobot(cloud, robot)
 
     def publish(windows: int, elbow: Temperature) -> None:
         assert robot.link is not None
@@ -98,7 +98,7 @@ def test_a_warming_joint_is_reported_before_its_limit(cloud: Cloud, anna: Person
     while not open_faults(anna, robot):
         publish(5 * MINUTE, warming(at_c, 0.5))
         at_c += 2.5
-        assert at_c < 65, "half an hour before the limit at the latest"
+        assert at_c < 65, "at least half an hour before the limit"
     (fault,) = open_faults(anna, robot)
     expected = {"code": "health.temperature_c.elbow", "kind": "trend", "severity": "warning", "limit": 80.0}
     assert fault.items() >= expected.items()
@@ -128,7 +128,7 @@ def test_measurements_over_http_are_monitored(cloud: Cloud) -> None:
         code = robot.enroll(transport="http").json()["claim_code"]
         anna.post("/agents/claim", {"code": code})
         robot.space = robot.enrollment()["space"]
-        life = Life(cloud, robot)
+        life = MeasuringRobot(cloud, robot)
         for _ in range(2):
             measured = life.messages(5, temperature_c__elbow=still(84))
             messages = [{"topic": topic, "payload": codec.decode(payload, dict)} for topic, payload in measured]
@@ -140,7 +140,7 @@ def test_measurements_over_http_are_monitored(cloud: Cloud) -> None:
 
 
 def test_a_warning_becomes_an_error_beyond_the_limit_within_a_minute(cloud: Cloud, anna: Person, robot: Robot) -> None:
-    life = Life(cloud, robot)
+    life = MeasuringRobot(cloud, robot)
     life.now_ms = life.now_ms // 60_000 * 60_000 - 10_000
     life.live(3, temperature_c__elbow=still(74))
     (warning,) = open_faults(anna, robot)
@@ -154,7 +154,7 @@ def test_a_warning_becomes_an_error_beyond_the_limit_within_a_minute(cloud: Clou
 
 
 def test_a_change_of_a_value_without_limits_is_an_info(cloud: Cloud, anna: Person, robot: Robot) -> None:
-    life = Life(cloud, robot)
+    life = MeasuringRobot(cloud, robot)
     life.live(20 * MINUTE, fan_hz=still(50), door=still(0))
     assert open_faults(anna, robot) == []
     life.live(2 * MINUTE, fan_hz=still(20), door=still(0))
@@ -193,7 +193,7 @@ def test_effort_is_monitored_and_positions_are_not(cloud: Cloud, anna: Person, r
 
 def test_devices_are_listed_worst_first_with_counts(cloud: Cloud) -> None:
     with paired(cloud, "anna", "arm", "leg") as (anna, robot):
-        life = Life(cloud, robot)
+        life = MeasuringRobot(cloud, robot)
         life.live(4, temperature_c__elbow=still(90))
         other = cloud.robot("hand")
         other.pair(anna)
@@ -215,7 +215,9 @@ def test_devices_are_listed_worst_first_with_counts(cloud: Cloud) -> None:
 
 def test_concurrent_workers_lose_no_window(open_cloud: Any, cloud: Cloud, anna: Person, robot: Robot) -> None:
     clouds = [cloud, open_cloud(clock=cloud.clock), open_cloud(clock=cloud.clock)]
-    batch = list(Life(cloud, robot).messages(12, temperature_c__elbow=still(90), temperature_c__wrist_1=still(30)))
+    batch = list(
+        MeasuringRobot(cloud, robot).messages(12, temperature_c__elbow=still(90), temperature_c__wrist_1=still(30))
+    )
     calls = [one.begin(ingest_telemetry(one.functions, batch)) for one in clouds for _ in "ab"]
     for finish in calls:
         finish()
@@ -226,7 +228,7 @@ def test_concurrent_workers_lose_no_window(open_cloud: Any, cloud: Cloud, anna: 
 def test_a_state_lost_by_a_killed_worker_is_corrected(
     cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    life = Life(cloud, robot)
+    life = MeasuringRobot(cloud, robot)
     life.live(2, temperature_c__elbow=still(40))
     real = cloud.functions.tables.replace
 
@@ -237,7 +239,7 @@ def test_a_state_lost_by_a_killed_worker_is_corrected(
 
     monkeypatch.setattr(cloud.functions.tables, "replace", dying)
     life.live(4, temperature_c__elbow=still(90))
-    assert len(open_faults(anna, robot)) == 1, "the fault was stored, the state of its detector was not"
+    assert len(open_faults(anna, robot)) == 1, "the fault is stored, but the state of its detector is not"
     monkeypatch.undo()
     life.live(8, temperature_c__elbow=still(40))
     assert open_faults(anna, robot) == []
@@ -251,7 +253,7 @@ def test_an_unknown_robot_type_with_a_hundred_fields_is_monitored_without_limits
         anna.post("/agents/claim", {"code": code})
         robot.space = robot.enrollment()["space"]
         many: dict[str, Temperature] = {f"value_{number:03d}": still(float(number)) for number in range(120)}
-        life = Life(cloud, robot)
+        life = MeasuringRobot(cloud, robot)
         life.live(130, **many)
         fields = diagnostics(anna, robot)["fields"]
         assert [item["field"] for item in fields] == sorted(many)[:100]
@@ -261,7 +263,7 @@ def test_an_unknown_robot_type_with_a_hundred_fields_is_monitored_without_limits
 
 
 def test_data_of_an_earlier_pairing_are_hidden_and_deleted(cloud: Cloud, anna: Person, robot: Robot) -> None:
-    Life(cloud, robot).live(4, temperature_c__elbow=still(90))
+    MeasuringRobot(cloud, robot).live(4, temperature_c__elbow=still(90))
     sample = {"at_ms": cloud.clock.now_ms(), "ms": 5.0}
     latency = {"transport": "mqtt", "path": "operator-device", "samples": [sample]}
     assert anna.post(f"/devices/{robot.device}/latency", latency).status_code == 204

@@ -1,4 +1,4 @@
-"""Lifecycle of a fault that one or several sources report."""
+"""Lifecycle of faults from one or several sources."""
 
 import contextlib
 import itertools
@@ -23,7 +23,7 @@ def state(cloud: Cloud, *codes: str) -> State:
 
 
 def say(cloud: Cloud, robot: Robot, *codes: str) -> None:
-    """A state with these faults, a moment after the one before."""
+    """Ingest a later state with these faults."""
     cloud.clock.advance(0.01)
     robot.publish_state(state(cloud, *codes))
 
@@ -56,7 +56,7 @@ def test_a_reported_fault_is_raised_acknowledged_and_cleared(cloud: Cloud, anna:
     assert answer.status_code == 200, answer.text
     assert (answer.json()["state"], answer.json()["acknowledged_by"]) == ("acknowledged", "anna")
     say(cloud, robot, "encoder")
-    assert faults(anna, robot, open=True)[0]["state"] == "acknowledged", "there until it is cleared"
+    assert faults(anna, robot, open=True)[0]["state"] == "acknowledged", "it stays open until it is cleared"
     cloud.clock.advance(1)
     say(cloud, robot)
     assert faults(anna, robot, open=True) == []
@@ -147,7 +147,7 @@ class TestSilence:
         assert self.open(anna, robot) == []
         cloud.clock.advance(SILENT_MS / 1000 + 5)
         cloud.sweep()
-        assert self.open(anna, robot) == ["silent"], "it is watched again"
+        assert self.open(anna, robot) == ["silent"], "it is monitored again"
         robot.publish_presence(online=True, session=robot.session + 1)
         assert self.open(anna, robot) == []
 
@@ -192,7 +192,7 @@ def test_faults_are_private_to_their_owner(cloud: Cloud, anna: Person, robot: Ro
     problem(anna.get(f"/devices/{robot.device}/faults", params={"cursor": "x"}), 422, "cursor-invalid")
     anna.delete(f"/agents/{robot.id}")
     robot.pair(bert)
-    assert faults(bert, robot) == [], "an earlier owner's faults are not his"
+    assert faults(bert, robot) == [], "a new owner does not see earlier faults"
 
 
 def test_the_history_pages_and_expires(cloud: Cloud, anna: Person, robot: Robot) -> None:

@@ -1,4 +1,4 @@
-"""Faults put into a simulated robot reach telediagnostics as those of a real one: by what it measures and says."""
+"""Faults injected into a simulated robot appear in its diagnostics through measurements and states."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -26,25 +26,25 @@ Pair = tuple[Person, Robot]
 UR5 = robot_type.load(ROBOTS / "ur5")
 NAMES = [joint.name for joint in UR5.joints]
 WORK = np.array([10.0, 45.0, 40.0, 5.0, 4.0, 1.0])
-"""Torque of an arm at work, in the mean [N m]."""
+"""Mean joint torques of an arm at work [N m]."""
 
 
-class Ageing:
-    """The model of an arm's health in its own, faster time, told to the cloud every ten seconds of it."""
+class SimulatedWear:
+    """Ingests the measurements of an arm's motor model every ten seconds of simulated time."""
 
     def __init__(self, cloud: Cloud, robot: Robot, faults: Path) -> None:
         self.cloud = cloud
         self.health = MotorModel(UR5.joints, None, seed="arm")
-        self.bed = FaultInjector(faults, NAMES)
+        self.injector = FaultInjector(faults, NAMES)
         self.topic = topics.device(robot.space, robot.id, robot.names[0], topics.TELE, "health")
         self.now_ms = cloud.clock.now_ms()
         self.windows = 0
 
     def messages(self, windows: int) -> Iterable[tuple[str, bytes]]:
         for _ in range(windows):
-            news = self.bed.poll()
-            if news is not None:
-                self.health.inject(news)
+            faults = self.injector.poll()
+            if faults is not None:
+                self.health.inject(faults)
             for second in range(10):
                 self.health.observe(self.windows * 10.0 + second, WORK, np.zeros(6))
             self.cloud.clock.advance(10)
@@ -58,11 +58,11 @@ class Ageing:
         self.cloud.run(ingest_telemetry(self.cloud.functions, list(self.messages(minutes * MINUTE))))
 
 
-def test_a_joint_made_to_overheat_is_told_as_a_trend_before_its_limit(cloud: Cloud, pair: Pair, tmp_path: Path) -> None:
+def test_an_overheating_joint_raises_a_trend_fault_before_its_limit(cloud: Cloud, pair: Pair, tmp_path: Path) -> None:
     anna, robot = pair
     faults = tmp_path / "arm.toml"
-    arm = Ageing(cloud, robot, faults)
-    arm.live(60)  # it comes in cold, and warms at its work
+    arm = SimulatedWear(cloud, robot, faults)
+    arm.live(60)  # warm up
     anna = cloud.sign_in("anna")
     assert open_faults(anna, robot) == []
     faults.write_text("overheating = { elbow = 0.2 }")
@@ -73,7 +73,7 @@ def test_a_joint_made_to_overheat_is_told_as_a_trend_before_its_limit(cloud: Clo
             break
     (fault,) = open_faults(anna, robot)
     assert (fault["code"], fault["kind"], fault["limit"]) == ("health.temperature_c.elbow", "trend", 80.0)
-    assert fault["value"] < 70, "in time: neither at its limit nor at the warning before"
+    assert fault["value"] < 70, "the trend is reported before the warning limit"
     shown = field(anna, robot, "temperature_c.elbow")
     assert 300 < shown["limit_in_s"] < 2_700
     faults.unlink()
@@ -86,14 +86,14 @@ def test_a_joint_made_to_overheat_is_told_as_a_trend_before_its_limit(cloud: Clo
 def arm(tmp_path: Path) -> Iterator[DeviceHarness]:
     driver = load("mujoco")(UR5, ROBOTS / "ur5", {"faults": str(tmp_path / "arm.toml")}, "arm")
     assert isinstance(driver, MujocoDriver)
-    harness = DeviceHarness(tmp_path, kind=UR5, driver=driver)  # type: ignore[arg-type]  # a driver, if no toy
+    harness = DeviceHarness(tmp_path, kind=UR5, driver=driver)  # type: ignore[arg-type]  # not a fake driver
     harness.device.start()
     harness.device.link_changed(True)
     yield harness
     harness.stop()
 
 
-def test_a_joint_that_is_stuck_raises_a_fault_in_the_state_and_in_the_cloud(
+def test_a_stuck_joint_raises_a_fault_in_state_and_cloud(
     cloud: Cloud, pair: Pair, arm: DeviceHarness, tmp_path: Path
 ) -> None:
     anna, robot = pair
@@ -110,7 +110,7 @@ def test_a_joint_that_is_stuck_raises_a_fault_in_the_state_and_in_the_cloud(
     cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), codec.encode(state)))
     (fault,) = open_faults(anna, robot)
     assert fault["message"].startswith("elbow does not move")
-    # It holds where it is, and may be moved again: the fault is not for ever.
+    # It holds its position and can move again after the fault is removed.
     eventually(lambda: arm.published(topics.STATE, State)[-1].mode is not Mode.FAULT)
     (tmp_path / "arm.toml").unlink()
     eventually(lambda: arm.driver._fault_injector.version == (0, 0))  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""A room's sensors are watched as robots are: by limits that their room names, and for being silent or stuck."""
+"""Sensors of a room are monitored: limits of the room manifest, silent and stuck sensors."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,42 +23,42 @@ from tests.unit.function_app.services.health.test_diagnostics import MINUTE, dia
 pytestmark = pytest.mark.slow
 
 WINDOW_S = 10.0
-HURRY = 20.0
-"""How much faster the air is than the room: a window passes in half a second of it."""
+SPEEDUP = 20.0
+"""Speed of the climate model relative to the room: one window takes 0.5 s of room time."""
 
 
-class Air:
-    """The laboratory's air with people in it, read by its own meter and told to the cloud, in a faster time."""
+class SimulatedAir:
+    """Ingests the CO₂ measurements of a simulated laboratory with people, in accelerated time."""
 
     def __init__(self, cloud: Cloud, who: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
         self.cloud, self.now_s = cloud, 0.0
         manifest = msgspec.structs.replace(room.load(LAB), robots=())
         self.world = ManualWorld(manifest=manifest)
         self.people: list[Pedestrian] = []
-        self.world.add(Climate(manifest, self.world.world, self.people, speedup=HURRY))
+        self.world.add(Climate(manifest, self.world.world, self.people, speedup=SPEEDUP))
         monkeypatch.setattr(scalar_sensors, "time", self)
         self.meter = self.world.driver("co2")
         self.meter.connect()
         entry = self.world.entry("co2")
         claim(who, robot, entry)
-        described(cloud, robot, entry)
+        ingest_description(cloud, robot, entry)
         self._topic = topics.device(robot.space, robot.id, "co2", topics.TELE, "co2")
         self._at_ms = cloud.clock.now_ms()
 
     def monotonic(self) -> float:
-        """The meter's clock."""
+        """The clock of the meter."""
         return self.now_s
 
     def live(self, minutes: int) -> None:
         messages = []
         for number in range(minutes * MINUTE):
-            self.world.advance(WINDOW_S / HURRY)
+            self.world.advance(WINDOW_S / SPEEDUP)
             self.cloud.clock.advance(WINDOW_S)
             self.now_s += WINDOW_S
             self._at_ms += round(WINDOW_S * 1000)
             values = dict(self.meter.read("co2"))
-            told = Measurements(tick_ms=self._at_ms, at_ms=self._at_ms, sequence=number + 1, values=values)
-            messages.append((self._topic, codec.encode(told)))
+            message = Measurements(tick_ms=self._at_ms, at_ms=self._at_ms, sequence=number + 1, values=values)
+            messages.append((self._topic, codec.encode(message)))
         self.cloud.run(ingest_telemetry(self.cloud.functions, messages))
 
 
@@ -68,20 +68,20 @@ def claim(who: Person, robot: Robot, entry: RoomDeviceManifest) -> None:
     robot.space = robot.enrollment()["space"]
 
 
-def described(cloud: Cloud, robot: Robot, entry: RoomDeviceManifest) -> None:
-    said = Description(
+def ingest_description(cloud: Cloud, robot: Robot, entry: RoomDeviceManifest) -> None:
+    description = Description(
         device=entry.name, kind=entry.kind, robot_type=entry.kind, label=entry.label, diagnostics=entry.diagnostics
     )
     topic = topics.device(robot.space, robot.id, entry.name, topics.DESC)
-    cloud.run(ingest(cloud.functions, topic, codec.encode(said)))
+    cloud.run(ingest(cloud.functions, topic, codec.encode(description)))
 
 
-def test_people_behind_a_closed_door_raise_a_fault_of_the_air_and_the_open_door_clears_it(
+def test_people_in_a_closed_room_raise_a_co2_fault_that_an_open_door_clears(
     cloud: Cloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     anna = cloud.sign_in("anna")
     with cloud.robot("co2") as robot:
-        air = Air(cloud, anna, robot, monkeypatch)
+        air = SimulatedAir(cloud, anna, robot, monkeypatch)
         air.live(30)
         assert open_faults(anna, robot) == [], "the room is empty"
         air.people += [Pedestrian(air.world.manifest.people[0]) for _ in range(12)]
@@ -112,7 +112,7 @@ def test_people_behind_a_closed_door_raise_a_fault_of_the_air_and_the_open_door_
 
 @pytest.fixture
 def meter(tmp_path: Path) -> Iterator[DeviceHarness]:
-    """The laboratory's carbon dioxide meter at work, read and watched faster than there."""
+    """The CO₂ meter of the laboratory, with a higher rate and shorter time limits."""
     world = ManualWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
     entry = world.entry("co2")
     (stream,) = entry.streams
@@ -123,35 +123,35 @@ def meter(tmp_path: Path) -> Iterator[DeviceHarness]:
         options={"faults": str(tmp_path / "co2.toml")},
     )
     instrument = RoomDevice(world.driver(entry), entry, None)
-    harness = DeviceHarness(tmp_path, driver=instrument, kind=entry.robot_type())  # type: ignore[arg-type]  # no toy
+    harness = DeviceHarness(tmp_path, driver=instrument, kind=entry.robot_type())  # type: ignore[arg-type]  # not a fake driver
     harness.device.start()
     harness.device.link_changed(True)
     yield harness
     harness.stop()
 
 
-@pytest.mark.parametrize("ailment", ["silent", "stuck"])
-def test_a_sensor_made_silent_or_stuck_raises_a_fault_in_the_state_and_in_the_cloud(
-    cloud: Cloud, meter: DeviceHarness, tmp_path: Path, ailment: str
+@pytest.mark.parametrize("fault_kind", ["silent", "stuck"])
+def test_a_silent_or_stuck_sensor_raises_a_fault_in_state_and_cloud(
+    cloud: Cloud, meter: DeviceHarness, tmp_path: Path, fault_kind: str
 ) -> None:
     anna = cloud.sign_in("anna")
     with cloud.robot("arm") as robot:
         claim(anna, robot, msgspec.structs.replace(room.load(LAB).devices[0], name="arm"))
 
-        def tell() -> State:
-            """The harness's newest state, which it tells once a second at most, also to the cloud."""
+        def ingest_state() -> State:
+            """Ingest the newest state of the harness, which publishes at most one per second."""
             state: State = meter.published(topics.STATE, State)[-1]
             cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), codec.encode(state)))
             return state
 
         eventually(lambda: meter.published(topics.TELE, Measurements, "co2") and meter.published(topics.STATE, State))
-        assert tell().faults == ()
+        assert ingest_state().faults == ()
         assert meter.published(topics.DESC, Description)[0].diagnostics[0].high == 2000.0
-        (tmp_path / "co2.toml").write_text(f'{ailment} = ["co2"]')
-        eventually(lambda: tell().faults)
-        assert tell().mode is Mode.IDLE, "it may still be used"
+        (tmp_path / "co2.toml").write_text(f'{fault_kind} = ["co2"]')
+        eventually(lambda: ingest_state().faults)
+        assert ingest_state().mode is Mode.IDLE, "it remains usable"
         (fault,) = open_faults(anna, robot)
-        assert (fault["code"], fault["severity"]) == (f"{ailment}.co2", "error")
+        assert (fault["code"], fault["severity"]) == (f"{fault_kind}.co2", "error")
         (tmp_path / "co2.toml").unlink()
-        eventually(lambda: not tell().faults)
+        eventually(lambda: not ingest_state().faults)
         assert open_faults(anna, robot) == []

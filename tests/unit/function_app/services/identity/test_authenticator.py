@@ -1,4 +1,4 @@
-"""The token cache is bounded: expired checks are removed."""
+"""Tokens that are due for a check are not cached."""
 
 import pytest
 

@@ -28,7 +28,7 @@ def test_a_command_is_resent_unchanged_until_it_is_acknowledged(cloud: Cloud, an
     robot.silent = True
     action = anna.start(robot.device).json()["id"]
     cloud.sweep()
-    assert len(robot.payloads[action]) == 1, "not before its time"
+    assert len(robot.payloads[action]) == 1, "not before it is due"
     for copies in (2, 3):
         pass_time(cloud, 1.1)
         assert len(robot.payloads[action]) == copies
@@ -59,7 +59,7 @@ def test_a_script_is_resent_as_it_was_at_the_start(cloud: Cloud, anna: Person, r
 
 def test_an_unacknowledged_action_expires(cloud: Cloud, anna: Person, robot: Robot, unanswered: str) -> None:
     pass_time(cloud, 4.5, step_s=0.5)
-    assert anna.action(unanswered)["status"] == "published", "an ack may still come"
+    assert anna.action(unanswered)["status"] == "published", "an ack may still arrive"
     pass_time(cloud, 1, step_s=0.5)
     shown = anna.action(unanswered)
     assert (shown["status"], shown["reason"]["code"]) == ("expired", "no-answer")
@@ -68,7 +68,7 @@ def test_an_unacknowledged_action_expires(cloud: Cloud, anna: Person, robot: Rob
     robot.silent = False
     assert anna.start(robot.device, wait_ms=10_000).status_code == 200
     robot.report(unanswered, AckStatus.DONE)
-    assert anna.action(unanswered)["status"] == "expired", "the first end stays"
+    assert anna.action(unanswered)["status"] == "expired", "the first terminal status remains"
 
 
 def test_an_action_beyond_its_timeout_is_lost_and_cancelled(cloud: Cloud, anna: Person, robot: Robot) -> None:
@@ -85,7 +85,7 @@ def test_an_action_beyond_its_timeout_is_lost_and_cancelled(cloud: Cloud, anna: 
 def test_a_cancelled_action_is_not_resent(cloud: Cloud, anna: Person, robot: Robot, unanswered: str) -> None:
     assert anna.post(f"/actions/{unanswered}/cancel").status_code == 202
     pass_time(cloud, 1.1)
-    assert len(robot.received(CancelAction)) == 2, "the cancel is"
+    assert len(robot.received(CancelAction)) == 2, "the cancel command is resent"
     assert len(robot.payloads[unanswered]) == 1
     pass_time(cloud, 5)
     assert anna.action(unanswered)["status"] == "cancelled"

@@ -23,7 +23,7 @@ def anna(cloud: Cloud) -> Person:
 
 @pytest.fixture
 def robot(cloud: Cloud, anna: Person) -> Iterator[PollingRobot]:
-    """Paired, and not yet asking."""
+    """A paired agent that has not polled yet."""
     with PollingRobot(cloud) as robot:
         robot.pair(anna)
         yield robot
@@ -33,7 +33,7 @@ def state(tick_ms: int = 1) -> bytes:
     return codec.encode(State(device="arm", at_ms=1, tick_ms=tick_ms, mode=Mode.IDLE, epoch=0))
 
 
-class TestTelling:
+class TestMessages:
     def test_each_message_has_its_own_result(self, anna: Person, robot: PollingRobot, cloud: Cloud) -> None:
         other = cloud.robot()
         other.pair(cloud.sign_in("bert"))
@@ -68,7 +68,7 @@ class TestTelling:
         assert all(result["detail"].endswith(".") for result in results[2:])
         assert anna.get(f"/devices/{robot.device}").json()["state"]["tick_ms"] == 7
 
-    def test_told_twice_is_told_once(self, anna: Person, robot: PollingRobot) -> None:
+    def test_duplicate_messages_are_stored_once(self, anna: Person, robot: PollingRobot) -> None:
         robot.fetch()
         action = anna.start(robot.device).json()["id"]
         acks = [
@@ -76,13 +76,13 @@ class TestTelling:
             for status in (AckStatus.RECEIVED, AckStatus.STARTED, AckStatus.DONE)
         ]
         event = Event(id="e1", device="arm", at_ms=1, kind="bump", severity="info", message="")
-        said = [*acks, (robot.topic(topics.EVENT), codec.encode(event)), (robot.topic(topics.STATE), state())]
+        messages = [*acks, (robot.topic(topics.EVENT), codec.encode(event)), (robot.topic(topics.STATE), state())]
         for _ in range(2):
-            assert {result["status"] for result in robot.post_raw(*said).json()["results"]} == {"stored"}
+            assert {result["status"] for result in robot.post_raw(*messages).json()["results"]} == {"stored"}
             assert anna.action(action)["status"] == "done"
         assert len(anna.get(f"/devices/{robot.device}/events").json()["items"]) == 1
 
-    def test_the_brokers_subscribers_hear_it_too_and_its_echo_changes_nothing(
+    def test_messages_are_relayed_to_the_broker_and_its_echo_is_ignored(
         self, cloud: Cloud, broker: MemoryBroker, anna: Person, robot: PollingRobot
     ) -> None:
         def page() -> MemoryConnection:
@@ -93,21 +93,21 @@ class TestTelling:
 
         event = codec.encode(Event(id="e1", device="arm", at_ms=1, kind="bump", severity="info", message=""))
         heat = codec.encode(Measurements(tick_ms=1, at_ms=cloud.clock.now_ms(), sequence=1, values={"t_c": 20.0}))
-        said = [(robot.topic(topics.STATE), state(n)) for n in (1, 2, 3)]
-        said += [(robot.topic(topics.TELE) + "/heat", heat), (robot.topic(topics.EVENT), event)]
-        with page() as ear:
-            robot.post_raw(*said, (f"ts/v1/{robot.space}/{robot.id}/arm/cmd", b"{}"))
-            heard = [ear.receive() for _ in said]
-            assert sorted((message.topic, message.payload) for message in heard) == sorted(said)
-            ticks = [message.payload for message in heard if message.topic.endswith("/state")]
-            assert ticks == [state(1), state(2), state(3)]
+        messages = [(robot.topic(topics.STATE), state(n)) for n in (1, 2, 3)]
+        messages += [(robot.topic(topics.TELE) + "/heat", heat), (robot.topic(topics.EVENT), event)]
+        with page() as subscriber:
+            robot.post_raw(*messages, (f"ts/v1/{robot.space}/{robot.id}/arm/cmd", b"{}"))
+            received = [subscriber.receive() for _ in messages]
+            assert sorted((message.topic, message.payload) for message in received) == sorted(messages)
+            states = [message.payload for message in received if message.topic.endswith("/state")]
+            assert states == [state(1), state(2), state(3)]
         with page() as late:
-            kept = late.receive()
-            assert (kept.payload, kept.retain) == (state(3), True)
+            retained = late.receive()
+            assert (retained.payload, retained.retain) == (state(3), True)
         cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), state(2)))
         assert anna.get(f"/devices/{robot.device}").json()["state"]["tick_ms"] == 3
 
-    def test_an_unreachable_broker_is_tried_once_in_a_while(
+    def test_relaying_pauses_while_the_broker_is_unreachable(
         self, broker: MemoryBroker, robot: PollingRobot, caplog: pytest.LogCaptureFixture
     ) -> None:
         broker.reachable = False
@@ -116,14 +116,14 @@ class TestTelling:
         assert caplog.text.count("relayed messages are not published") == 1
 
 
-class TestWhoMayAsk:
+class TestRefusals:
     def test_messages_before_the_claim_are_refused(self, cloud: Cloud) -> None:
         robot = PollingRobot(cloud)
         robot.enroll()
         problem(robot.poll(), 409, "agent-unclaimed")
         problem(robot.post(("t", {})), 409, "agent-unclaimed")
 
-    def test_requests_have_limits(self, robot: PollingRobot) -> None:
+    def test_requests_beyond_the_limits_are_refused(self, robot: PollingRobot) -> None:
         for query in ({"wait_ms": -1}, {"wait_ms": 30_001}, {"limit": 0}, {"limit": 33}, {"have": ["x"] * 33}):
             problem(robot.poll(**query), 422, "invalid")
         problem(robot.post(), 422, "invalid")
@@ -133,7 +133,7 @@ class TestWhoMayAsk:
         (result,) = robot.post_raw((robot.topic(topics.STATE), b'"' + b"x" * 140_000 + b'"')).json()["results"]
         assert result["status"] == "rejected"
 
-    def test_a_new_owner_gets_nothing_of_the_old_ones(self, cloud: Cloud, anna: Person, robot: PollingRobot) -> None:
+    def test_a_new_owner_gets_no_earlier_commands(self, cloud: Cloud, anna: Person, robot: PollingRobot) -> None:
         robot.fetch()
         anna.start(robot.device, ttl_ms=600_000, timeout_ms=600_000)
         anna.post(f"/devices/{robot.device}/stop")
@@ -146,7 +146,7 @@ class TestWhoMayAsk:
             assert owner.delete(f"/agents/{robot.id}").status_code == 204
 
 
-ODD = st.recursive(
+INVALID_VALUES = st.recursive(
     st.none()
     | st.booleans()
     | st.integers(min_value=-(10**40), max_value=10**40)
@@ -155,7 +155,7 @@ ODD = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=4),
     max_leaves=8,
 )
-SAID: list[dict[str, Any]] = [
+MESSAGES: list[dict[str, Any]] = [
     {"online": True, "session": 1, "at_ms": 1, "software": ""},
     {"device": "arm", "at_ms": 1, "tick_ms": 1, "mode": "idle", "epoch": 0, "faults": []},
     {"id": "e", "device": "arm", "at_ms": 1, "kind": "k", "severity": "info", "message": "", "data": {}},
@@ -163,7 +163,7 @@ SAID: list[dict[str, Any]] = [
     {"id": "", "status": "done", "sequence": 1, "at_ms": 1, "tick_ms": 1, "output": "", "result": {}},
     {"tick_ms": 1, "at_ms": 1, "sequence": 1, "values": {"t_c": 1.0}},
 ]
-"""One message of each class, of which a part is replaced by something odd."""
+"""One message of each class; the test replaces some fields with random values."""
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -175,13 +175,13 @@ def test_every_message_is_stored_or_refused(
     kinds = ["conn", *(f"arm/{kind}" for kind in arm)]
     messages = []
     for _ in range(data.draw(st.integers(1, 4))):
-        said = dict(data.draw(st.sampled_from(SAID)))
-        for name in data.draw(st.lists(st.sampled_from(sorted(said)), max_size=2, unique=True)):
-            said[name] = data.draw(ODD)
-        if said.get("id") == "":
-            said["id"] = f"{robot.device}-{'0' * 20}"
+        message = dict(data.draw(st.sampled_from(MESSAGES)))
+        for name in data.draw(st.lists(st.sampled_from(sorted(message)), max_size=2, unique=True)):
+            message[name] = data.draw(INVALID_VALUES)
+        if message.get("id") == "":
+            message["id"] = f"{robot.device}-{'0' * 20}"
         topic = f"ts/v1/{robot.space}/{robot.id}/{data.draw(st.sampled_from(kinds))}"
-        messages.append((topic, json.dumps(said).encode()))
+        messages.append((topic, json.dumps(message).encode()))
     answer = robot.post_raw(*messages)
     assert answer.status_code in {200, 422}, answer.text
     if answer.status_code == 200:

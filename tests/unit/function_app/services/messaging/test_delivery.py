@@ -19,8 +19,8 @@ ARM = Device(
 )  # fmt: skip
 
 
-class Busy(Mailbox):
-    """Something happens in it just after each look."""
+class BusyMailbox(Mailbox):
+    """A mailbox that changes after each read."""
 
     async def stored_answer(self, agent: str, command: str) -> None:
         asyncio.get_running_loop().call_soon(self._ring, agent)
@@ -30,7 +30,7 @@ class Busy(Mailbox):
 async def confirmed(wait_ms: int) -> bool:
     tables, clock = MemoryTables(), SystemClock()
     retention = Retention(tables=tables, blobs=MemoryBlobs(now_s=time.time))
-    mailbox = Busy(tables=tables, retention=retention, clock=clock)
+    mailbox = BusyMailbox(tables=tables, retention=retention, clock=clock)
     unused: Any = None  # the agent polls
     delivery = Delivery(bus=unused, mailbox=mailbox, relay=unused)
     signed = SignedCommand("aaaaaaaaaa-arm-00000000000000000000", b"{}", clock.now_ms() + 5_000)

@@ -20,7 +20,7 @@ WAIT_MS = 20_000
 
 
 def rotate(cloud: Cloud, **options: Any) -> str:
-    """The new key's id."""
+    """Rotate the signing key; return the id of the new key."""
     options = options or {"learn_ms": LEARN_S * 1000, "overlap_ms": OVERLAP_S * 1000}
     return cloud.run(cloud.functions.keys.rotate(**options)).pins[-1].id
 
@@ -30,12 +30,12 @@ def old_key(cloud: Cloud) -> Ed25519PrivateKey:
 
 
 def follow(robot: Robot) -> None:
-    """Learn as an agent does, from the key announcement it receives with its credentials."""
-    given = robot.request("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
-    for statement in given["key_statements"]:
-        news = codec.decode(signing.verify(statement.encode(), robot._keys, context=KEYS_CONTEXT), NewKey)
-        half = signing.public_key(news.key)
-        robot._keys[signing.key_id(half)] = half
+    """Store new keys from the announcements in the response with MQTT credentials."""
+    response = robot.request("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
+    for statement in response["key_statements"]:
+        announcement = codec.decode(signing.verify(statement.encode(), robot._keys, context=KEYS_CONTEXT), NewKey)
+        key = signing.public_key(announcement.key)
+        robot._keys[signing.key_id(key)] = key
 
 
 def run(person: Person, robot: Robot) -> None:
@@ -58,11 +58,11 @@ def test_a_session_continues_through_a_rotation(pair: Pair, cloud: Cloud, open_c
         assert anna.get("/devices").status_code == 200
         assert anna.take_lease(robot.device, take_over=True, reason="on").json()["confirmed"]
         run(anna, robot)
-        ran = robot.received(RunMovement)[-1].request
-        assert isinstance(ran, RunMovement)
-        assert ran.key == signer
-        text = signing.movement_text(ran.robot_type, ran.name, ran.version, ran.sha256)
-        signing.verify_text(text, ran.signature, robot._keys[signer], context=signing.MOVEMENT_CONTEXT)
+        order = robot.received(RunMovement)[-1].request
+        assert isinstance(order, RunMovement)
+        assert order.key == signer
+        text = signing.movement_text(order.robot_type, order.name, order.version, order.sha256)
+        signing.verify_text(text, order.signature, robot._keys[signer], context=signing.MOVEMENT_CONTEXT)
     assert robot.link is not None
     robot.link.close()
     robot.connect()
@@ -70,7 +70,7 @@ def test_a_session_continues_through_a_rotation(pair: Pair, cloud: Cloud, open_c
     later = open_cloud(clock=cloud.clock)
     later.start_ingest()
     again = later.sign_in("anna")
-    assert again.get(MINE).status_code == 200, "what was saved with an old key is still there"
+    assert again.get(MINE).status_code == 200, "movements signed with an old key remain readable"
     assert again.take_lease(robot.device, take_over=True, reason="on").json()["confirmed"]
     run(again, robot)
 
@@ -79,7 +79,7 @@ def get_devices(cloud: Cloud, token: str) -> int:
     return cloud.request("GET", "/api/v1/devices", headers={"Authorization": f"Bearer {token}"}).status_code
 
 
-def test_a_token_of_an_old_key_counts_until_the_end_of_the_overlap(cloud: Cloud, open_cloud: OpenCloud) -> None:
+def test_a_token_of_an_old_key_is_valid_until_the_end_of_the_overlap(cloud: Cloud, open_cloud: OpenCloud) -> None:
     token, key = cloud.sign_in("anna").token, old_key(cloud)
     rotate(cloud)
     other = open_cloud()
@@ -92,7 +92,7 @@ def test_a_token_of_an_old_key_counts_until_the_end_of_the_overlap(cloud: Cloud,
     assert cloud.sign_in("anna").get("/devices").status_code == 200
 
 
-def test_a_leaked_key_ends_tokens_at_once_in_all_instances(cloud: Cloud, open_cloud: OpenCloud) -> None:
+def test_tokens_of_a_leaked_key_are_rejected_in_all_instances(cloud: Cloud, open_cloud: OpenCloud) -> None:
     token, other = cloud.sign_in("anna").token, open_cloud()
     assert get_devices(cloud, token) == get_devices(other, token) == 200
     rotate(cloud, leaked=True)
@@ -100,7 +100,7 @@ def test_a_leaked_key_ends_tokens_at_once_in_all_instances(cloud: Cloud, open_cl
     assert get_devices(cloud, token) == get_devices(other, token) == 401
 
 
-def test_an_agent_gets_the_new_key_in_a_command_that_the_old_key_signed(pair: Pair, cloud: Cloud) -> None:
+def test_a_new_key_is_announced_in_a_command_signed_with_the_old_key(pair: Pair, cloud: Cloud) -> None:
     _, robot = pair
     new = rotate(cloud)
     for tick in range(3):
@@ -109,11 +109,11 @@ def test_an_agent_gets_the_new_key_in_a_command_that_the_old_key_signed(pair: Pa
     order = robot.received(RotateKey)[0].request
     assert isinstance(order, RotateKey)
     (statement,) = order.statements
-    news = codec.decode(signing.verify(statement.encode(), robot._keys, context=KEYS_CONTEXT), NewKey)
-    assert signing.key_id(signing.public_key(news.key)) == new
+    announcement = codec.decode(signing.verify(statement.encode(), robot._keys, context=KEYS_CONTEXT), NewKey)
+    assert signing.key_id(signing.public_key(announcement.key)) == new
 
 
-def test_an_agent_that_is_claimed_during_an_overlap_pins_both_keys(cloud: Cloud) -> None:
+def test_an_agent_claimed_during_an_overlap_pins_both_keys(cloud: Cloud) -> None:
     rotate(cloud)
     robot = cloud.robot("arm")
     robot.pair(cloud.sign_in("anna"))
@@ -123,7 +123,7 @@ def test_an_agent_that_is_claimed_during_an_overlap_pins_both_keys(cloud: Cloud)
     assert second["until_ms"] == 0
 
 
-def test_an_agent_that_was_away_for_the_whole_overlap_gets_no_statement(pair: Pair, cloud: Cloud) -> None:
+def test_an_agent_offline_during_the_whole_overlap_gets_no_statement(pair: Pair, cloud: Cloud) -> None:
     _, robot = pair
     new = rotate(cloud)
     cloud.clock.advance(OVERLAP_S)

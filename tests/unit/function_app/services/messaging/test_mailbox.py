@@ -1,4 +1,4 @@
-"""Commands to an agent that polls over HTTP wait in a mailbox until it has answered them."""
+"""Commands for polling agents stay in the mailbox until they are acknowledged."""
 
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, suppress
@@ -40,7 +40,7 @@ def anna(cloud: Cloud) -> Person:
 
 @pytest.fixture
 def robot(cloud: Cloud, anna: Person) -> Iterator[PollingRobot]:
-    """Paired, and not yet polling."""
+    """A paired agent that has not polled yet."""
     with PollingRobot(cloud) as robot:
         robot.pair(anna)
         yield robot
@@ -95,14 +95,14 @@ def test_lease_action_stop_and_reset_need_no_broker(open_cloud: OpenCloud) -> No
         assert all(len(payloads) == 1 for payloads in robot.payloads.values())
 
 
-def test_a_device_that_refuses_confirms_nothing(anna: Person, cloud: Cloud, robot: PollingRobot) -> None:
+def test_a_rejected_command_is_not_confirmed(anna: Person, cloud: Cloud, robot: PollingRobot) -> None:
     result = anna.begin("POST", f"/devices/{robot.device}/lease", json={"wait_ms": 20_000})
     (item,) = robot.fetch()
     start_ms = cloud.clock.now_ms()
     robot.post_ack(item["id"], AckStatus.RECEIVED)
     robot.post_ack(item["id"], AckStatus.FAILED)
     assert result().json()["confirmed"] is False
-    assert cloud.clock.now_ms() - start_ms < 10_000, "a refusal ends the wait"
+    assert cloud.clock.now_ms() - start_ms < 10_000, "a rejection ends the wait"
 
 
 def test_an_agent_that_returns_to_mqtt_gets_commands_there(anna: Person, robot: PollingRobot) -> None:
@@ -123,7 +123,7 @@ def test_a_command_is_delivered_again_with_the_same_bytes_until_it_is_acknowledg
     assert (first["id"], first["topic"]) == (action, robot.topic(topics.CMD))
     cloud.clock.advance(1.1)
     cloud.sweep()
-    assert robot.fetch() == [first], "the timer sends it again, but the mailbox contains it once"
+    assert robot.fetch() == [first], "the timer resends it, but the mailbox contains it once"
     assert robot.fetch(have=[action]) == []
     assert robot.fetch(have=["another"]) == [first]
     assert robot.post_ack(action, AckStatus.RECEIVED) == {"status": "stored", "detail": None}
@@ -169,7 +169,7 @@ def test_an_action_that_is_cancelled_before_the_first_poll_is_not_delivered(
 def test_entries_expire_when_the_agent_does_not_poll(cloud: Cloud, anna: Person, robot: PollingRobot) -> None:
     anna.take_lease(robot.device, wait_ms=100)
     anna.post(f"/devices/{robot.device}/stop")
-    assert len(mailbox(cloud, robot)) == 4, "two commands, and an entry for the answer to each"
+    assert len(mailbox(cloud, robot)) == 4, "two commands, and an entry for each ack"
     cloud.clock.advance(3600)
     for _ in range(3):
         cloud.sweep()
@@ -217,7 +217,7 @@ def test_a_long_poll_without_commands_ends_in_time(cloud: Cloud, robot: PollingR
     assert cloud.clock.now_ms() - start_ms >= 300
 
 
-def test_a_polling_agent_is_online_and_its_mark_is_seldom_written(
+def test_a_polling_agent_is_online_and_its_last_poll_is_written_at_intervals(
     cloud: Cloud, anna: Person, robot: PollingRobot
 ) -> None:
     def mark() -> object:
@@ -334,7 +334,7 @@ def test_a_start_killed_after_any_write_reaches_the_robot_or_ends(
     pytest.fail(f"a start writes more than {MOST_WRITES} times")
 
 
-def test_an_ack_killed_after_any_write_is_sent_again_and_counts_once(
+def test_an_ack_killed_after_any_write_is_repeated_and_applied_once(
     cloud: Cloud, anna: Person, robot: PollingRobot, crashing: Crashing
 ) -> None:
     robot.fetch()

@@ -1,4 +1,4 @@
-"""Claim codes that are guessed at and redeemed by many."""
+"""Guessed claim codes, and concurrent claims with one code."""
 
 import asyncio
 import random
@@ -13,14 +13,14 @@ from tests.harness.cloud.cloud import Cloud
 from tests.harness.processes import show_code
 
 LIVE = 20
-"""Codes that are shown at the same time."""
+"""Number of valid codes."""
 
 
 @pytest.mark.parametrize(
     "guesses", [1_000, pytest.param(100_000, marks=[pytest.mark.long, pytest.mark.timeout(3_600)])]
 )
 def test_guessed_claim_codes_claim_nothing(cloud: Cloud, guesses: int) -> None:
-    """As many accounts as one likes, each with its five tries: what protects is that there are 2.56·10¹⁰ codes."""
+    """Unlimited accounts with five attempts each: the number of codes (2.56·10¹⁰) protects."""
     chance = random.Random(1)  # noqa: S311 (chance with a seed)
     functions = cloud.functions
 
@@ -50,7 +50,7 @@ def test_guessed_claim_codes_claim_nothing(cloud: Cloud, guesses: int) -> None:
     assert cloud.run(work()) == 0
 
 
-def test_of_a_hundred_who_redeem_one_code_at_once_one_wins(cloud: Cloud) -> None:
+def test_one_of_a_hundred_concurrent_claims_succeeds(cloud: Cloud) -> None:
     functions = cloud.functions
 
     async def work() -> list[str]:

@@ -1,4 +1,4 @@
-"""Enrolment by the agent's own key, claim codes, un-pairing."""
+"""Enrolment with the agent's key, claim codes and unpairing."""
 
 import datetime as dt
 from pathlib import Path
@@ -67,9 +67,7 @@ class TestEnroll:
         ],
         ids=str,
     )  # fmt: skip
-    def test_a_token_that_its_key_did_not_sign_for_this_now_is_refused(
-        self, alone: Cloud, claims: dict[str, Any]
-    ) -> None:
+    def test_invalid_agent_tokens_are_refused(self, alone: Cloud, claims: dict[str, Any]) -> None:
         robot = alone.robot()
         robot.enroll()
         answer = robot.request("GET", "/agents/enrollment", token=robot.token(**claims))
@@ -94,24 +92,22 @@ class TestEnroll:
         ],
         ids=lambda changes: str(changes)[:50],
     )  # fmt: skip
-    def test_an_introduction_that_is_wrong_is_refused(self, alone: Cloud, changes: dict[str, Any]) -> None:
+    def test_invalid_enrollments_are_refused(self, alone: Cloud, changes: dict[str, Any]) -> None:
         problem(alone.robot().enroll(**changes), 422, "invalid")
 
-    def test_waiting_for_the_claim_ends_with_it(self, alone: Cloud) -> None:
+    def test_waiting_for_the_claim_ends_when_the_agent_is_claimed(self, alone: Cloud) -> None:
         robot, anna = alone.robot(), alone.sign_in("anna")
         code = robot.code()
         headers = {"Authorization": f"Bearer {robot.token()}"}
         answer = anna.begin("GET", "/agents/enrollment", params={"wait_ms": 30_000}, headers=headers)
         assert robot.enrollment(wait_ms=250)["state"] == "waiting"
         claimed = anna.post("/agents/claim", {"code": code}).json()
-        found = answer().json()
-        assert (found["state"], found["space"]) == ("claimed", claimed["space"])
-        assert found["account"] == {"id": anna.account, "name": "anna"}
-        assert [signing.key_id(signing.public_key(key["public"])) for key in found["keys"]] == [
-            key["id"] for key in found["keys"]
-        ]
+        state = answer().json()
+        assert (state["state"], state["space"]) == ("claimed", claimed["space"])
+        assert state["account"] == {"id": anna.account, "name": "anna"}
+        assert all(signing.key_id(signing.public_key(key["public"])) == key["id"] for key in state["keys"])
 
-    def test_a_claimed_agent_that_enrolls_again_keeps_its_owner_and_tells_its_devices(self, alone: Cloud) -> None:
+    def test_enrolling_again_updates_the_devices_and_keeps_the_owner(self, alone: Cloud) -> None:
         robot, anna = alone.robot(), alone.sign_in("anna")
         robot.pair(anna)
         devices = robot.introduction()["devices"] + [{"name": "cam", "kind": "camera", "robot_type": "c", "label": "C"}]
@@ -121,7 +117,7 @@ class TestEnroll:
 
 
 class TestClaim:
-    def test_it_makes_the_devices_the_accounts(self, alone: Cloud) -> None:
+    def test_it_adds_the_devices_to_the_account(self, alone: Cloud) -> None:
         robot, anna = alone.robot("left", "right"), alone.sign_in("anna")
         body = anna.post("/agents/claim", {"code": robot.code().lower().replace("-", " ")}).json()
         assert [device["id"] for device in body["devices"]] == robot.devices
@@ -131,7 +127,7 @@ class TestClaim:
         (agent,) = anna.get("/agents").json()["items"]
         assert (agent["id"], agent["devices"]) == (robot.id, ["left", "right"])
 
-    def test_a_wrong_a_used_and_an_expired_code_are_answered_alike(self, alone: Cloud, clock: MovingClock) -> None:
+    def test_wrong_used_and_expired_codes_get_the_same_response(self, alone: Cloud, clock: MovingClock) -> None:
         bert = alone.sign_in("bert")
         used, last = alone.robot().code(), alone.robot().code()
         assert bert.post("/agents/claim", {"code": used}).status_code == 200
@@ -144,7 +140,7 @@ class TestClaim:
         bodies = [problem(answer, 404, "claim-code-unknown") for answer in answers]
         assert all(body == bodies[0] for body in bodies)
 
-    def test_after_five_wrong_tries_even_the_right_code_waits(self, alone: Cloud, clock: MovingClock) -> None:
+    def test_five_wrong_codes_block_the_account_for_five_minutes(self, alone: Cloud, clock: MovingClock) -> None:
         anna, bert = alone.sign_in("anna"), alone.sign_in("bert", address="10.0.0.2")
         robot = alone.robot()
         for _ in range(5):
@@ -158,7 +154,7 @@ class TestClaim:
         clock.advance(300)
         assert alone.sign_in("anna").post("/agents/claim", {"code": robot.code()}).status_code == 200
 
-    def test_an_address_has_five_wrong_tries_over_all_callers(self, alone: Cloud, clock: MovingClock) -> None:
+    def test_five_wrong_codes_block_the_address_for_all_accounts(self, alone: Cloud, clock: MovingClock) -> None:
         for number in range(5):
             guesser = alone.sign_in(f"guesser{number}", address="10.0.0.9")
             problem(guesser.post("/agents/claim", {"code": "BCDF-GHJK"}), 404, "claim-code-unknown")
@@ -167,12 +163,14 @@ class TestClaim:
             answer = late.post("/agents/claim", {"code": alone.robot().code()})
             problem(answer, 429, "too-many-tries")
         moved = alone.sign_in("late", address="10.0.0.10")
-        assert moved.post("/agents/claim", {"code": alone.robot().code()}).status_code == 200, "none of those counted"
+        assert moved.post("/agents/claim", {"code": alone.robot().code()}).status_code == 200, (
+            "attempts while blocked are not counted"
+        )
         clock.advance(300)
         assert late.post("/agents/claim", {"code": alone.robot().code()}).status_code == 200
 
     @pytest.mark.parametrize("accounts", [1, 10])
-    def test_parallel_guesses_are_no_way_around(self, alone: Cloud, accounts: int) -> None:
+    def test_concurrent_guesses_are_limited_too(self, alone: Cloud, accounts: int) -> None:
         guessers = [alone.sign_in(f"guesser{number}", address="10.0.0.9") for number in range(accounts)]
         answers = [
             guesser.begin("POST", "/agents/claim", json={"code": "BCDF-GHJK"})
@@ -195,12 +193,14 @@ class TestClaim:
             ("10.0.0.1", 2, ["6.6.6.6, 1.1.1.1", "2.2.2.2"], "1.1.1.1"), (None, 0, ["6.6.6.6, 1.1.1.1:1"], "1.1.1.1"),
         ],
     )  # fmt: skip
-    def test_whose_address_it_is(self, client: str | None, proxies: int, forwarded: list[str], found: str) -> None:
+    def test_client_address_behind_proxies(
+        self, client: str | None, proxies: int, forwarded: list[str], found: str
+    ) -> None:
         headers = [(b"x-forwarded-for", line.encode()) for line in forwarded]
         scope = {"type": "http", "client": client and (client, 1), "headers": headers}
         assert client_address(Request(scope), proxies) == found
 
-    def test_a_space_of_ones_own_may_be_chosen_and_no_other(self, alone: Cloud) -> None:
+    def test_only_an_own_space_can_be_chosen(self, alone: Cloud) -> None:
         anna, bert = alone.sign_in("anna"), alone.sign_in("bert")
         code = alone.robot().code()
         (foreign,) = bert.get("/spaces").json()["items"]
@@ -210,10 +210,10 @@ class TestClaim:
         assert answer.json()["space"] == own["id"]
 
 
-def test_the_lists_page_agent_by_agent(alone: Cloud) -> None:
+def test_lists_are_paged_by_agent(alone: Cloud) -> None:
     anna = alone.sign_in("anna")
     for _ in range(7):
-        alone.robot("a", "b").pair(anna)  # right codes are not counted as tries
+        alone.robot("a", "b").pair(anna)  # correct codes are not counted as attempts
     for path, each in (("/agents", 1), ("/devices", 2)):
         pages = anna.each_page(path, limit=2)
         assert [len(page) for page in pages] == [2 * each] * 3 + [each]
@@ -221,7 +221,7 @@ def test_the_lists_page_agent_by_agent(alone: Cloud) -> None:
         problem(anna.get(path, params={"cursor": "§"}), 422, "cursor-invalid")
 
 
-def test_unpairing_cuts_the_agent_and_leaves_nothing_of_it(
+def test_unpairing_disconnects_the_agent_and_hides_its_data(
     cloud: Cloud, anna: Person, robot: Robot, broker: MemoryBroker
 ) -> None:
     epoch = anna.take_lease(robot.device).json()["epoch"]
@@ -245,12 +245,12 @@ def test_unpairing_cuts_the_agent_and_leaves_nothing_of_it(
     robot.pair(bert)
     robot.connect()
     started = bert.start(robot.device, wait_ms=10_000)
-    assert started.status_code == 200, "an earlier owner's action does not hold the slot"
+    assert started.status_code == 200, "the action of an earlier owner does not occupy the slot"
     assert started.json()["epoch"] > epoch
     problem(bert.get(f"/actions/{action}"), 404, "action-unknown")
 
 
-def test_an_idempotency_key_of_an_earlier_pairing_starts_anew(anna: Person, robot: Robot) -> None:
+def test_an_idempotency_key_of_an_earlier_pairing_starts_a_new_action(anna: Person, robot: Robot) -> None:
     first = anna.start(robot.device, idempotency_key="k", wait_ms=10_000).json()["id"]
     anna.delete(f"/agents/{robot.id}")
     robot.pair(anna)
@@ -262,13 +262,13 @@ def test_an_idempotency_key_of_an_earlier_pairing_starts_anew(anna: Person, robo
 
 
 class TestCertificates:
-    def test_where_the_broker_wants_none_none_is_made(self, alone: Cloud) -> None:
+    def test_none_is_issued_for_a_broker_without_certificates(self, alone: Cloud) -> None:
         robot = alone.robot()
         robot.pair(alone.sign_in("anna"))
         answer = robot.request("POST", "/agents/certificate", json={"request": "x"})
         problem(answer, 409, "certificates-unused")
 
-    def test_an_agent_that_is_claimed_gets_one_and_loses_it_with_its_pairing(
+    def test_a_claimed_agent_gets_one_that_unpairing_revokes(
         self, alone: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         devices.create(tmp_path / "tls", now=dt.datetime.now(dt.UTC))
@@ -278,11 +278,11 @@ class TestCertificates:
         robot.enroll()
         key = ec.generate_private_key(ec.SECP256R1())
         request = x509.CertificateSigningRequestBuilder().subject_name(x509.Name([])).sign(key, hashes.SHA256())
-        asked = {"request": request.public_bytes(serialization.Encoding.PEM).decode()}
-        problem(robot.request("POST", "/agents/certificate", json=asked), 409, "agent-unclaimed")
+        body = {"request": request.public_bytes(serialization.Encoding.PEM).decode()}
+        problem(robot.request("POST", "/agents/certificate", json=body), 409, "agent-unclaimed")
         robot.pair(anna)
         problem(robot.request("POST", "/agents/certificate", json={"request": "x"}), 422, "invalid")
-        made = robot.request("POST", "/agents/certificate", json=asked)
+        made = robot.request("POST", "/agents/certificate", json=body)
         assert made.status_code == 200, made.text
         certificate = x509.load_pem_x509_certificate(made.json()["chain"].encode())
         assert certificate.subject.rfc4514_string() == f"CN={robot.id}"

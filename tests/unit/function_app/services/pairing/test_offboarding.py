@@ -1,4 +1,4 @@
-"""What is left when an agent is un-paired or moved, or loses a device: nothing that runs, shows or holds."""
+"""Cleanup after an agent is unpaired or moved, or a device is removed."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ Pair = tuple[Person, Robot]
 
 
 def furnish(anna: Person, robot: Robot, name: str = "arm") -> tuple[str, str]:
-    """Have a device run an action, with another one behind it, and say all that is retained."""
+    """Publish retained messages of a device, start an action and queue another one."""
     device = f"{robot.id}-{name}"
     state = State(device=name, at_ms=1, tick_ms=1, mode=Mode.IDLE, epoch=0)
     robot.publish(robot.topic(topics.STATE, name), state, retain=True)
@@ -33,7 +33,7 @@ def furnish(anna: Person, robot: Robot, name: str = "arm") -> tuple[str, str]:
 
 
 def retained(cloud: Cloud, broker: MemoryBroker, space: str, agent: str, name: str) -> set[str]:
-    """Topics of a device and its agent on which the broker retains a message."""
+    """Topics of a device and its agent with a retained message."""
     wanted = [f"{topics.ROOT}/{space}/{agent}/{name}/{kind}" for kind in ("state", "desc", "desc/twin")]
     wanted.append(topics.conn(space, agent))
     grant = broker.grant("look", publish=("look/x",), subscribe=tuple(wanted))
@@ -43,13 +43,13 @@ def retained(cloud: Cloud, broker: MemoryBroker, space: str, agent: str, name: s
 
 
 def ends(cloud: Cloud, *actions: str) -> set[tuple[str, str]]:
-    """How each of them ended, independent of the current owner."""
+    """Status and reason of each action, independent of the current owner."""
     found = [cloud.run(cloud.functions.start_action._action_store.get(action)) for action in actions]
     return {(each.action.status.value, (each.action.reason or {}).get("code", "")) for each in found if each}
 
 
 def rest(cloud: Cloud, robot: Robot) -> dict[str, Any]:
-    """What the tables still mean to do about an agent."""
+    """Departures and reminders of an agent that remain in the tables."""
     row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
     pages = [cloud.run(cloud.functions.tables.query(records.PENDING, str(shard))) for shard in range(SHARDS)]
     notes = [note.key for page in pages for note in page.rows if ":leave:" in note.key or ":queue:" in note.key]
@@ -63,7 +63,7 @@ def pass_time(cloud: Cloud) -> None:
         cloud.sweep()
 
 
-def test_unpairing_ends_what_runs_and_waits_and_clears_what_the_broker_keeps(
+def test_unpairing_ends_actions_and_clears_retained_messages(
     cloud: Cloud, anna: Person, robot: Robot, broker: MemoryBroker
 ) -> None:
     running, waiting = furnish(anna, robot)
@@ -79,14 +79,12 @@ def test_unpairing_ends_what_runs_and_waits_and_clears_what_the_broker_keeps(
         assert cloud.run(cloud.functions.tables.query(table, partition)).rows == ()
 
 
-def test_nothing_of_what_an_agent_said_under_one_owner_shows_to_the_next(
-    cloud: Cloud, anna: Person, robot: Robot
-) -> None:
+def test_a_new_owner_does_not_see_earlier_states(cloud: Cloud, anna: Person, robot: Robot) -> None:
     furnish(anna, robot)
     row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, f"state:{robot.names[0]}"))
     assert anna.delete(f"/agents/{robot.id}").status_code == 204
     assert row is not None
-    cloud.run(cloud.functions.tables.create(records.AGENTS, row))  # as if it had come late
+    cloud.run(cloud.functions.tables.create(records.AGENTS, row))  # a late write
     bert = cloud.sign_in("bert")
     robot.pair(bert)
     found = bert.get(f"/devices/{robot.device}").json()
@@ -105,7 +103,7 @@ def test_an_unpairing_killed_after_any_write_is_completed_by_the_timer(
     crash.left = after
     there.delete(f"/agents/{robot.id}")
     if anna.get(f"/devices/{robot.device}").status_code == 200:
-        assert after == 1, "only before the write that decides"
+        assert after == 1, "only before the deciding write"
         assert anna.delete(f"/agents/{robot.id}").status_code == 204
     bert = cloud.sign_in("bert")
     robot.pair(bert)
@@ -123,7 +121,7 @@ def test_an_unpairing_killed_after_any_write_is_completed_by_the_timer(
     assert anna.get("/agents").json()["items"] == []
 
 
-def test_what_the_broker_could_not_be_told_it_is_told_when_it_is_back(
+def test_broker_cleanup_is_completed_after_an_outage(
     cloud: Cloud, anna: Person, robot: Robot, broker: MemoryBroker
 ) -> None:
     running, waiting = furnish(anna, robot)
@@ -141,7 +139,7 @@ def test_what_the_broker_could_not_be_told_it_is_told_when_it_is_back(
 
 
 class TestMoving:
-    def test_it_keeps_the_history_and_ends_what_runs(
+    def test_it_keeps_the_history_and_ends_running_actions(
         self, cloud: Cloud, anna: Person, robot: Robot, broker: MemoryBroker
     ) -> None:
         running, waiting = furnish(anna, robot)
@@ -165,18 +163,16 @@ class TestMoving:
         pass_time(cloud)
         assert rest(cloud, robot) == {"leaving": [], "notes": []}
 
-    def test_only_into_a_space_of_ones_own_and_only_ones_own_agent(
-        self, cloud: Cloud, anna: Person, robot: Robot
-    ) -> None:
+    def test_only_own_agents_move_and_only_to_own_spaces(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
         action = anna.start(robot.device, wait_ms=10_000).json()["id"]
         bert = cloud.sign_in("bert")
         (foreign,) = bert.get("/spaces").json()["items"]
         problem(anna.put(f"/agents/{robot.id}/space", {"space": foreign["id"]}), 404, "space-unknown")
         problem(bert.put(f"/agents/{robot.id}/space", {"space": foreign["id"]}), 404, "agent-unknown")
         assert anna.put(f"/agents/{robot.id}/space", {"space": robot.space}).status_code == 200
-        assert anna.action(action)["status"] == "started", "moving it to where it is changes nothing"
+        assert anna.action(action)["status"] == "started", "moving it to its current space has no effect"
 
-    def test_the_first_space_stays_the_one_that_is_taken_where_none_is_named(self, cloud: Cloud) -> None:
+    def test_the_first_space_remains_the_default(self, cloud: Cloud) -> None:
         anna = cloud.sign_in("anna")
         (first,) = anna.get("/spaces").json()["items"]
         made = [anna.post("/spaces", {"name": f"s{number}"}).json() for number in range(8)]
@@ -188,13 +184,13 @@ class TestMoving:
         assert robot.space == first["id"]
         problem(anna.post("/spaces", {"name": ""}), 422, "invalid")
 
-    def test_an_account_has_a_hundred_spaces_at_most(self, cloud: Cloud) -> None:
+    def test_an_account_has_at_most_100_spaces(self, cloud: Cloud) -> None:
         anna = cloud.sign_in("anna")
         assert [anna.post("/spaces", {"name": "s"}).status_code for _ in range(99)] == [201] * 99
         problem(anna.post("/spaces", {"name": "s"}), 409, "too-many-spaces")
 
 
-def test_a_device_that_is_no_longer_named_ends_and_the_others_go_on(cloud: Cloud, broker: MemoryBroker) -> None:
+def test_removing_a_device_ends_its_actions_only(cloud: Cloud, broker: MemoryBroker) -> None:
     with paired(cloud, "anna", "left", "right") as (anna, robot):
         running, waiting = furnish(anna, robot, "left")
         other, _ = furnish(anna, robot, "right")

@@ -21,7 +21,7 @@ class TestParameters:
         "additionalProperties": False,
     }
 
-    def test_a_schema_is_the_callers_else_the_scripts_else_none(self, anna: Person) -> None:
+    def test_the_callers_schema_precedes_the_scripts(self, anna: Person) -> None:
         literal = 'PARAMETERS = {"who": {"type": "string"}, "times": {"type": "integer", "default": 1}}'
         read = anna.put(MINE, {"source": literal}).json()["parameters_schema"]
         assert (sorted(read["properties"]), read["required"]) == (["times", "who"], ["who"])
@@ -31,7 +31,7 @@ class TestParameters:
         assert anna.put(MINE, {"source": "1"}).json()["parameters_schema"] is None
         assert anna.get(MINE, params={"version": 2}).json()["parameters_schema"] == said
 
-    def test_a_wrong_schema_is_refused(self, anna: Person) -> None:
+    def test_invalid_schemas_are_refused(self, anna: Person) -> None:
         for unknown in ({"type": "object", "properties": {"a": {"$ref": "#"}}}, {"type": "array", "items": {}}):
             problem(anna.put(MINE, {"source": "1", "parameters_schema": unknown}), 422, "invalid")
         schema = {"type": "object", "properties": {"a": {"type": "integer", "default": "x"}}}
@@ -40,7 +40,7 @@ class TestParameters:
         problem(anna.put(MINE, {"source": 'PARAMETERS = {"a": 1}'}), 422, "schema-invalid")
         problem(anna.put(MINE, {"source": "PARAMETERS = f()"}), 422, "movement-invalid")
 
-    def test_an_action_gets_the_defaults_and_keeps_them(self, anna: Person, robot: Robot) -> None:
+    def test_an_action_stores_the_defaults(self, anna: Person, robot: Robot) -> None:
         anna.put(MINE, {"source": "1", "parameters_schema": self.SCHEMA})
         asked = {"kind": "run_movement", "name": "mine", "parameters": {"who": "bert"}}
         started = anna.start(robot.device, request=asked, wait_ms=10_000, idempotency_key="x").json()
@@ -59,7 +59,7 @@ class TestParameters:
             ({"who": "anna", "times": 0}, "$.times"), ({"who": "anna", "times": True}, "$.times"),
         ],
     )  # fmt: skip
-    def test_what_does_not_fit_is_refused_with_its_place_and_takes_no_slot(
+    def test_invalid_parameters_are_refused_with_their_place_and_take_no_slot(
         self, anna: Person, given: dict[str, Any], place: str
     ) -> None:
         device = anna.cloud.robot().pair(anna)

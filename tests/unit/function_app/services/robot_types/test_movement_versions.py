@@ -16,7 +16,7 @@ from tests.unit.function_app.services.robot_types.movements import MINE, SOURCE,
 
 
 class TestVersions:
-    def test_every_version_is_listed_and_can_be_had(self, anna: Person) -> None:
+    def test_every_version_is_listed_and_readable(self, anna: Person) -> None:
         sources = [f"robot.home()  # {number}" for number in range(5)]
         for source in sources:
             anna.put(WAVE, {"source": source})
@@ -36,14 +36,14 @@ class TestVersions:
         for wrong in ("0", "-1", "x", "1.5"):
             problem(anna.get(WAVE, params={"version": wrong}), 422, "invalid")
 
-    def test_versions_of_a_built_in_one_are_that_one(self, anna: Person) -> None:
+    def test_a_built_in_movement_has_one_version(self, anna: Person) -> None:
         (only,) = anna.get(f"{WAVE}/versions").json()["items"]
         assert (only["built_in"], only["version"]) == (True, 1)
         assert anna.get(WAVE, params={"version": 1}).status_code == 200
         problem(anna.get(WAVE, params={"version": 2}), 404, "movement-version-unknown")
         problem(anna.get(f"{MINE}/versions"), 404, "movement-unknown")
 
-    def test_versions_of_before_a_deletion_are_gone_and_their_scripts_after_some_days(
+    def test_deleted_versions_disappear_and_their_scripts_some_days_later(
         self, memory: Memory, alone: Cloud, anna: Person
     ) -> None:
         for number in range(3):
@@ -68,7 +68,7 @@ class TestVersions:
         page = alone.run(alone.functions.tables.query(records.MOVEMENTS, f"{anna.account}/ur5"))
         assert [row.key for row in page.rows] == ["mine"], "its name stays, so that no version is used twice"
 
-    def test_many_who_save_at_once_get_a_version_each_and_leave_no_other_script(
+    def test_concurrent_saves_get_one_version_each_and_leave_no_orphan_script(
         self, memory: Memory, anna: Person
     ) -> None:
         waiting = [anna.begin("PUT", MINE, json={"source": f"# {number}"}) for number in range(8)]
@@ -80,7 +80,7 @@ class TestVersions:
             anna.get(MINE, params={"version": version}).json()["source"] for version in range(1, 9)
         )
 
-    def test_lists_page_by_name_over_built_in_ones_and_ones_own(self, anna: Person) -> None:
+    def test_lists_of_built_in_and_own_movements_are_paged_by_name(self, anna: Person) -> None:
         for name in ("aaa", "home", "zzz", "wave-2", "gone"):
             anna.put(f"{UR5}/movements/{name}", {"source": SOURCE})
         anna.delete(f"{UR5}/movements/gone")
@@ -99,7 +99,7 @@ class TestVersions:
 
 class TestSignatures:
     @pytest.mark.parametrize("own", [True, False])
-    def test_one_verifies_with_the_keys_that_agents_know(self, alone: Cloud, anna: Person, own: bool) -> None:
+    def test_signatures_verify_with_the_keys_of_agents(self, alone: Cloud, anna: Person, own: bool) -> None:
         if own:
             anna.put(WAVE, {"source": SOURCE})
         robot = alone.robot()
@@ -117,7 +117,7 @@ class TestSignatures:
             key.verify(raw, b"telescope/v1/command\n" + text.encode())
 
     @pytest.mark.parametrize("change", ["sha256", "version", "signature", "key"])
-    def test_a_row_that_was_changed_in_the_store_is_not_run(self, alone: Cloud, anna: Person, change: str) -> None:
+    def test_a_row_modified_in_the_store_is_not_run(self, alone: Cloud, anna: Person, change: str) -> None:
         anna.put(MINE, {"source": SOURCE})
         tables = alone.functions.tables
         row = alone.run(tables.get(records.MOVEMENTS, f"{anna.account}/ur5", "mine"))

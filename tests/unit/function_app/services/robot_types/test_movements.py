@@ -18,7 +18,7 @@ from tests.harness.cloud.memory import Memory
 from tests.unit.function_app.services.robot_types.movements import MINE, SOURCE, UR5, WAVE
 
 
-def test_robot_types_say_their_joints(anna: Person) -> None:
+def test_robot_types_list_their_joints(anna: Person) -> None:
     (shown,) = [item for item in anna.get("/robot-types").json()["items"] if item["type"] == "ur5"]
     assert shown == anna.get(UR5).json()
     assert len(shown["joints"]) == 6
@@ -28,7 +28,7 @@ def test_robot_types_say_their_joints(anna: Person) -> None:
         assert anna.get(f"/robot-types/{name}/movements").status_code == 404
 
 
-def test_built_in_ones_are_listed_by_name_with_their_first_line(anna: Person) -> None:
+def test_built_in_movements_are_listed_by_name_with_description(anna: Person) -> None:
     items = anna.get(f"{UR5}/movements").json()["items"]
     names = [item["name"] for item in items]
     assert names == sorted(names)
@@ -38,7 +38,7 @@ def test_built_in_ones_are_listed_by_name_with_their_first_line(anna: Person) ->
     assert hashlib.sha256(one["source"].encode()).hexdigest() == one["sha256"]
 
 
-def test_ones_own_is_made_changed_and_deleted(anna: Person) -> None:
+def test_an_own_movement_is_created_changed_and_deleted(anna: Person) -> None:
     made = anna.put(MINE, {"source": SOURCE})
     assert (made.status_code, made.json()["version"], made.json()["description"]) == (201, 1, "Wave twice.")
     changed = anna.put(MINE, {"source": SOURCE + "#", "description": "Mine"})
@@ -53,7 +53,7 @@ def test_ones_own_is_made_changed_and_deleted(anna: Person) -> None:
     assert (again.status_code, again.json()["version"]) == (201, 3), "a version is never used twice"
 
 
-def test_ones_own_shadows_a_built_in_one_for_oneself_only(alone: Cloud, anna: Person) -> None:
+def test_an_own_movement_shadows_the_built_in_one_for_its_account_only(alone: Cloud, anna: Person) -> None:
     built_in = anna.get(WAVE).json()
     own = anna.put(WAVE, {"source": SOURCE})
     assert (own.status_code, own.json()["version"]) == (201, built_in["version"] + 1)
@@ -69,7 +69,7 @@ def test_ones_own_shadows_a_built_in_one_for_oneself_only(alone: Cloud, anna: Pe
     problem(anna.delete(WAVE), 409, "movement-built-in")
 
 
-def test_a_version_is_not_saved_over_one_that_its_author_has_not_seen(anna: Person) -> None:
+def test_saving_over_a_newer_version_is_refused(anna: Person) -> None:
     assert anna.put(MINE, {"source": SOURCE, "based_on": 0}).status_code == 201
     refused = problem(anna.put(MINE, {"source": SOURCE + "#", "based_on": 0}), 409, "movement-changed")
     assert refused["version"] == 1
@@ -83,7 +83,7 @@ def test_a_version_is_not_saved_over_one_that_its_author_has_not_seen(anna: Pers
     assert anna.put(WAVE, {"source": SOURCE, "based_on": built_in}).status_code == 201
 
 
-def test_a_script_is_checked_without_being_saved_and_an_editor_learns_what_there_is(anna: Person) -> None:
+def test_a_check_does_not_save_and_lists_available_names(anna: Person) -> None:
     checked = anna.post(f"{UR5}/scripting/check", {"source": '"""Wave."""\nrobot.home(\n'}).json()
     mark = checked["diagnostics"][0]
     assert (checked["savable"], mark["line"], mark["severity"]) == (False, 2, "error")
@@ -102,7 +102,7 @@ def test_a_script_is_checked_without_being_saved_and_an_editor_learns_what_there
     ("source", "line"),
     [("x = (", 1), ("a = 1\nb = = 2\n", 2), ("  x", 1), ("print 'x'", 1), ("x\x00", None), ("\n\nif x:\n", 3)],
 )
-def test_what_is_not_python_is_refused_with_the_line(anna: Person, source: str, line: int | None) -> None:
+def test_syntax_errors_are_refused_with_the_line(anna: Person, source: str, line: int | None) -> None:
     refused = problem(anna.put(MINE, {"source": source}), 422, "movement-invalid")
     assert refused.get("line") == line
     problem(anna.get(MINE), 404, "movement-unknown")
@@ -116,12 +116,12 @@ def test_what_is_not_python_is_refused_with_the_line(anna: Person, source: str, 
     ],
     ids=["parentheses", "minus", "plus", "dots", "lists", "long", "empty"],
 )  # fmt: skip
-def test_a_script_that_is_too_much_is_refused_or_kept_and_never_a_fault(anna: Person, source: str) -> None:
+def test_extreme_scripts_are_refused_or_stored(anna: Person, source: str) -> None:
     assert anna.put(MINE, {"source": source}).status_code in {201, 422}
     assert anna.get(f"{UR5}/movements").status_code == 200
 
 
-def test_a_script_that_is_taken_can_be_sent_with_all_the_parameters_it_may_have(alone: Cloud, anna: Person) -> None:
+def test_an_accepted_script_fits_into_a_command_with_parameters(alone: Cloud, anna: Person) -> None:
     text = "x" * (MAX_PARAMETERS_BYTES - len('{"text":""}'))
     for source in ("# ".ljust(MAX_SOURCE), "# ".ljust(48_000, "ü"), "\n" * 48_000, '#"' * 24_000):
         assert anna.put(MINE, {"source": source}).status_code in {200, 201}
@@ -131,18 +131,18 @@ def test_a_script_that_is_taken_can_be_sent_with_all_the_parameters_it_may_have(
 
 
 @pytest.mark.parametrize("letter", ["🤖", "ü", "\x01", '"'])
-def test_a_script_that_a_message_cannot_carry_is_refused(anna: Person, letter: str) -> None:
+def test_a_script_larger_than_a_message_is_refused(anna: Person, letter: str) -> None:
     refused = problem(anna.put(MINE, {"source": "#".ljust(MAX_SOURCE, letter)}), 422, "movement-invalid")
     assert "bytes" in refused["detail"]
 
 
 @pytest.mark.parametrize("name", ["a b", "x" * 65, "ä", "a.py", "%2e%2e", "a%2Fb", "-;"])
-def test_a_name_is_an_id(anna: Person, name: str) -> None:
+def test_invalid_names_are_refused(anna: Person, name: str) -> None:
     assert anna.put(f"{UR5}/movements/{name}", {"source": "1"}).status_code in {404, 422}
     assert anna.get(f"{UR5}/movements/{name}").status_code == 404
 
 
-def test_a_script_that_was_changed_in_the_store_is_not_run(alone: Cloud, memory: Memory) -> None:
+def test_a_script_modified_in_the_store_is_not_run(alone: Cloud, memory: Memory) -> None:
     anna = alone.sign_in("anna")
     anna.put(MINE, {"source": SOURCE})
     (stored,) = [name for name, content in memory.blobs.contents.items() if content.decode() == SOURCE]
@@ -155,9 +155,7 @@ def test_a_script_that_was_changed_in_the_store_is_not_run(alone: Cloud, memory:
     problem(anna.get(MINE), 409, "movement-damaged")
 
 
-def test_no_version_that_may_run_is_older_for_the_device_than_one_that_ran(
-    anna: Person, robot: Robot, tmp_path: Path
-) -> None:
+def test_version_numbers_increase_over_built_in_and_own_movements(anna: Person, robot: Robot, tmp_path: Path) -> None:
     robot.reports = lambda _: (AckStatus.DONE,)
     asked = {"kind": "run_movement", "name": "wave"}
 

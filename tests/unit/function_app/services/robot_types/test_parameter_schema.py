@@ -111,7 +111,7 @@ def test_a_deep_schema_is_refused() -> None:
         parameter_schema.schema_of({"type": "object", "properties": {"a": schema}})
 
 
-def test_defaults_reach_into_objects_and_lists_that_are_there() -> None:
+def test_defaults_apply_inside_present_objects_and_lists() -> None:
     point = {
         "type": "object",
         "properties": {"x": {"type": "number", "default": 0}, "y": {"type": "number", "default": 1}},
@@ -126,7 +126,7 @@ def test_defaults_reach_into_objects_and_lists_that_are_there() -> None:
     assert found == {"to": {"x": 5, "y": 1}, "path": [{"x": 0, "y": 1}]}
 
 
-def test_the_defaults_of_two_actions_are_not_one_list() -> None:
+def test_default_lists_are_copied() -> None:
     schema = parameter_schema.plain(
         parameter_schema.of_properties({"a": {"type": "array", "items": {"type": "integer"}, "default": []}})
     )
@@ -135,7 +135,7 @@ def test_the_defaults_of_two_actions_are_not_one_list() -> None:
 
 
 @pytest.mark.parametrize(("schema", "spare"), [(None, 0), ("default", 40)])
-def test_parameters_have_a_size_defaults_included(schema: str | None, spare: int) -> None:
+def test_the_size_of_parameters_includes_defaults(schema: str | None, spare: int) -> None:
     known = None
     if schema:
         properties = {
@@ -171,7 +171,7 @@ def test_computed_schemas_are_rejected(value: str) -> None:
     assert refused.value.extras["line"] == 2
 
 
-def test_a_scripts_literal_is_read_wherever_it_stands_at_the_top_level() -> None:
+def test_a_literal_schema_is_read_anywhere_at_the_top_level() -> None:
     literal = {"a": {"type": "integer", "default": 1}}
     for form in ("PARAMETERS = {}", "PARAMETERS: dict = {}", "x = 1\nPARAMETERS = {}\nrobot.home()"):
         schema = read_script(form.replace("{}", json.dumps(literal))).schema

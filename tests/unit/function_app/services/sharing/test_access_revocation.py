@@ -1,4 +1,4 @@
-"""What was given or asked for by a key, a share or a session ends with it: in the queue, at the broker, everywhere."""
+"""Actions, credentials and leases end with the API key, share or session that permits them."""
 
 from dataclasses import replace
 from typing import Any
@@ -21,15 +21,15 @@ DAY_S = 86_400
 
 
 def edit(cloud: Cloud, table: str, place: tuple[str, str], kind: type[Any], **changes: Any) -> None:
-    """Change a stored record directly, as no request can."""
+    """Change a stored record directly."""
     tables = cloud.functions.tables
     row = cloud.run(tables.get(table, *place))
     assert row is not None
     cloud.run(tables.replace(table, replace(row, data=records.to_data(replace(records.read(row, kind), **changes)))))
 
 
-class TestItsTurn:
-    """An action waits; what its starter may do changes; then its turn comes."""
+class TestQueuedActions:
+    """Permissions change while an action is queued."""
 
     @pytest.mark.parametrize(
         ("how", "why"),
@@ -39,7 +39,7 @@ class TestItsTurn:
             ("signed out", "signed-out"),
         ],
     )  # fmt: skip
-    def test_an_action_whose_starter_may_no_longer_do_it_never_begins(
+    def test_a_queued_action_fails_after_its_caller_lost_permission(
         self, cloud: Cloud, anna: Person, bert: Person, robot: Robot, how: str, *, why: str
     ) -> None:
         now_ms = cloud.clock.now_ms()
@@ -47,7 +47,7 @@ class TestItsTurn:
         other = cloud.sign_in("anna")
         anna.post(f"/devices/{robot.device}/shares", {"account": "bert", "role": "operator", "expires_in_s": 600})
         share = f"device:{robot.device}", f"account:{bert.account}"
-        # Stored records are changed directly: as before the timer runs, and after a killed request.
+        # Changed in the tables: the state before the timer runs, or after a killed request.
         changes: dict[str, tuple[Person, Any]] = {
             "key revoked": (program, lambda: anna.delete(f"{KEYS}/{key}")),
             "key expired": (program, lambda: edit(cloud, records.API_KEYS, (key, "key"), ApiKey, expires_ms=now_ms)),
@@ -70,9 +70,7 @@ class TestItsTurn:
         assert anna.action(behind, wait_ms=20_000, wait_for="started")["status"] == "started"
         assert [command.id for command in robot.received(MoveJoints)] == [running, behind]
 
-    def test_a_command_that_was_sent_is_not_sent_again_for_a_key_that_was_revoked(
-        self, cloud: Cloud, anna: Person, robot: Robot
-    ) -> None:
+    def test_a_command_of_a_revoked_key_is_not_resent(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
         _, program = make(anna)
         robot.silent = True
         action = program.start(robot.device).json()["id"]
@@ -85,17 +83,15 @@ class TestItsTurn:
         assert len(robot.payloads[action]) == 1
 
 
-class TestGiven:
-    """Credentials, tokens and control."""
+class TestGrants:
+    """Credentials, tokens and leases."""
 
-    def test_nothing_that_a_key_is_given_lasts_longer_than_the_key(
-        self, cloud: Cloud, anna: Person, robot: Robot
-    ) -> None:
+    def test_they_expire_with_the_api_key(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
         _, program = make(anna, days=1)
         cloud.clock.advance(DAY_S - 45)
-        self.expect_short(program, robot)
+        self.check_lifetimes(program, robot)
 
-    def test_nor_longer_than_the_session(self, cloud: Cloud, robot: Robot) -> None:
+    def test_they_expire_with_the_session(self, cloud: Cloud, robot: Robot) -> None:
         page = cloud.client()
         signed_in = cloud.run(page.post(f"{API}/auth/sign-in", json={"link": cloud.link("anna")})).json()
         csrf = {"X-CSRF-Token": cloud.run(page.get(f"{API}/accounts/me")).json()["csrf_token"]}
@@ -103,17 +99,17 @@ class TestGiven:
         token = cloud.run(page.post(f"{API}/auth/token", headers=csrf)).json()
         assert 0 < token["expires_in_s"] <= 45
         late = Program(cloud, token["access_token"])
-        self.expect_short(late, robot)
+        self.check_lifetimes(late, robot)
         assert signed_in["account"]["name"] == "anna"
         cloud.clock.advance(45)
         problem(late.get("/devices"), 401, "unauthorized")
 
-    def test_nor_longer_than_the_share(self, cloud: Cloud, anna: Person, bert: Person, robot: Robot) -> None:
+    def test_they_expire_with_the_share(self, cloud: Cloud, anna: Person, bert: Person, robot: Robot) -> None:
         anna.post(f"/devices/{robot.device}/shares", {"account": "bert", "role": "operator", "expires_in_s": 60})
         cloud.clock.advance(15)
-        self.expect_short(bert, robot)
+        self.check_lifetimes(bert, robot)
 
-    def expect_short(self, person: Person, robot: Robot) -> None:
+    def check_lifetimes(self, person: Person, robot: Robot) -> None:
         taken = person.take_lease(robot.device, lease_ms=600_000).json()
         granted: Any = robot.received(GrantLease)[-1].request
         assert max(taken["lease_ms"], granted.lease_ms) <= 45_000
@@ -121,7 +117,7 @@ class TestGiven:
         for purpose in ({"purpose": "view"}, control):
             assert 0 < person.post("/mqtt/credentials", purpose).json()["lifetime_s"] <= 45, purpose
 
-    def test_a_key_that_runs_out_loses_its_live_sessions_and_its_control(
+    def test_an_expired_key_loses_connections_and_lease(
         self, cloud: Cloud, anna: Person, robot: Robot, broker: MemoryBroker
     ) -> None:
         _, program = make(anna, days=1)
@@ -138,7 +134,7 @@ class TestGiven:
         assert [each.disconnected.is_set() for each in connections] == [False, True, True]
         assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
 
-    def test_an_action_that_a_key_has_begun_ends_with_the_key(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
+    def test_an_action_of_a_key_ends_when_the_key_expires(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
         _, program = make(anna, days=1)
         cloud.clock.advance(DAY_S - 60)
         anna = cloud.sign_in("anna")
@@ -151,7 +147,7 @@ class TestGiven:
 
 
 @pytest.mark.parametrize("what", ["credentials", "control", "action"])
-def test_what_a_key_asks_for_while_it_is_revoked_comes_to_nothing(
+def test_requests_of_a_key_that_is_revoked_concurrently_are_refused(
     cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     key, program = make(anna)
@@ -160,7 +156,7 @@ def test_what_a_key_asks_for_while_it_is_revoked_comes_to_nothing(
     real = getattr(devices, name)
 
     async def meanwhile(*given: Any) -> Any:
-        # All of a revocation but what looks for what is there to be ended: that was a moment ago.
+        # A revocation whose search for active permissions was completed before this request.
         row = await tables.get(records.API_KEYS, key, "key")
         if row is not None:
             await tables.delete(records.API_KEYS, row)

@@ -29,7 +29,7 @@ def redeem(person: Person, made: dict[str, Any], **more: Any) -> Any:
     return person.post("/invitations/redeem", {"secret": made["secret"], **more})
 
 
-def test_a_link_gives_what_it_says_to_the_first_who_brings_it(
+def test_a_link_grants_the_share_to_the_first_account(
     cloud: Cloud, memory: Memory, anna: Person, bert: Person, robot: Robot
 ) -> None:
     at = f"/devices/{robot.device}/invitations"
@@ -49,7 +49,7 @@ def test_a_link_gives_what_it_says_to_the_first_who_brings_it(
     assert made["secret"] not in str(memory.tables.rows())
 
 
-def test_a_link_to_a_space_for_several_serves_each_account_once(
+def test_a_link_with_several_uses_grants_each_account_one_share(
     cloud: Cloud, anna: Person, bert: Person, robot: Robot
 ) -> None:
     made = invite(anna, f"/spaces/{robot.space}/invitations", role="viewer", uses=2)
@@ -61,10 +61,10 @@ def test_a_link_to_a_space_for_several_serves_each_account_once(
     assert redeem(bert, again).status_code == 200
     assert anna.delete(f"/spaces/{robot.space}/shares/{bert.account}").status_code == 204
     problem(redeem(bert, again), 404, "invitation-unknown")
-    assert devices(bert) == {}, "who was un-shared does not come back by the same link"
+    assert devices(bert) == {}, "a removed account cannot use the same link again"
 
 
-def test_a_link_takes_nothing_away_from_who_has_more(anna: Person, bert: Person, robot: Robot) -> None:
+def test_a_link_does_not_reduce_an_existing_share(anna: Person, bert: Person, robot: Robot) -> None:
     assert anna.post(f"/devices/{robot.device}/shares", {"account": "bert", "role": "operator"}).status_code == 201
     made = invite(anna, f"/devices/{robot.device}/invitations", role="viewer", share_s=60)
     assert redeem(bert, made).status_code == 200
@@ -72,7 +72,7 @@ def test_a_link_takes_nothing_away_from_who_has_more(anna: Person, bert: Person,
     assert (share["role"], share["expires_at"]) == ("operator", None)
 
 
-def test_a_link_is_no_good_once_it_is_late_withdrawn_for_another_or_void(
+def test_expired_withdrawn_foreign_and_void_links_are_refused(
     cloud: Cloud, memory: Memory, anna: Person, bert: Person, robot: Robot
 ) -> None:
     at = f"/devices/{robot.device}/invitations"
@@ -94,11 +94,13 @@ def test_a_link_is_no_good_once_it_is_late_withdrawn_for_another_or_void(
     cloud.clock.advance(DAY_S)
     for _ in range(3):
         cloud.sweep()
-    assert memory.tables.rows("Invitations") == [], "what is over is forgotten"
+    assert memory.tables.rows("Invitations") == [], "expired invitations are deleted"
 
 
 @pytest.mark.parametrize("transfer", [False, True])
-def test_of_many_who_redeem_at_once_one_wins(cloud: Cloud, anna: Person, robot: Robot, *, transfer: bool) -> None:
+def test_one_of_several_concurrent_redemptions_succeeds(
+    cloud: Cloud, anna: Person, robot: Robot, *, transfer: bool
+) -> None:
     path = f"/agents/{robot.id}/transfers" if transfer else f"/devices/{robot.device}/invitations"
     made = invite(anna, path, **({} if transfer else {"role": "operator"}))
     people = [cloud.sign_in(f"guest {n}") for n in range(8)]
@@ -108,7 +110,7 @@ def test_of_many_who_redeem_at_once_one_wins(cloud: Cloud, anna: Person, robot: 
     assert len(devices(anna)) == (not transfer)
 
 
-def test_an_agent_that_is_handed_over_is_the_new_owners_and_nothing_of_the_former_goes_with_it(
+def test_a_transferred_agent_ends_shares_leases_and_actions_of_the_former_owner(
     cloud: Cloud, anna: Person, bert: Person, robot: Robot
 ) -> None:
     clara = cloud.sign_in("clara")
@@ -118,7 +120,7 @@ def test_an_agent_that_is_handed_over_is_the_new_owners_and_nothing_of_the_forme
     made = invite(anna, f"/agents/{robot.id}/transfers", account="bert")
     assert (made["kind"], made["role"]) == ("agent", "owner")
     assert len(anna.get(f"/agents/{robot.id}/transfers").json()["items"]) == 1
-    assert devices(bert) == {}, "nothing changes before it is accepted"
+    assert devices(bert) == {}, "a transfer has no effect before it is accepted"
     problem(redeem(clara, made), 403, "forbidden")
     link = robot.link
     assert link is not None
@@ -140,9 +142,7 @@ def test_an_agent_that_is_handed_over_is_the_new_owners_and_nothing_of_the_forme
     assert anna.get("/agents").json()["items"] == []
 
 
-def test_a_space_that_is_handed_over_takes_all_its_agents_along(
-    cloud: Cloud, anna: Person, bert: Person, robot: Robot
-) -> None:
+def test_a_transferred_space_contains_all_its_agents(cloud: Cloud, anna: Person, bert: Person, robot: Robot) -> None:
     clara = cloud.sign_in("clara")
     attic = anna.post("/spaces", {"name": "Attic"}).json()["id"]
     with paired(cloud, "anna", "left", "right") as (_, second):
@@ -161,7 +161,7 @@ def test_a_space_that_is_handed_over_takes_all_its_agents_along(
         assert [item["name"] for item in clara.get("/spaces").json()["items"]] == ["Home"]
 
 
-def test_offers_of_a_space_have_a_list_of_their_own_that_says_for_whom_they_are(
+def test_transfers_of_a_space_are_listed_separately_with_the_invited_account(
     anna: Person, bert: Person, robot: Robot
 ) -> None:
     anna.post("/spaces", {"name": "Attic"})
@@ -196,7 +196,7 @@ def test_an_acceptance_killed_after_any_write_is_completed_by_the_timer(
     cloud.clock.advance(LOOK_MS / 1000 + 61)
     cloud.sweep()
     if devices(anna):
-        assert after <= 5, "only before the write that accepts it"
+        assert after <= 5, "only before the accepting write"
         assert redeem(bert, made).status_code == 200
     assert (devices(anna), devices(bert)) == ({}, {robot.device: "owner"})
     assert [item["name"] for item in bert.get("/spaces").json()["items"]] == ["Home", "Attic"]

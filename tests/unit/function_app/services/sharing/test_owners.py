@@ -1,4 +1,4 @@
-"""Operations of an owner: one that would leave no owner is refused, and the error names the alternative."""
+"""Operations that would leave no owner are refused; the error names the alternative."""
 
 import pytest
 
@@ -14,7 +14,7 @@ def shared(anna: Person, bert: Person, robot: Robot) -> None:
 
 
 def stands(anna: Person, bert: Person, robot: Robot) -> None:
-    """All is as it was."""
+    """Check that roles, shares and lease are unchanged."""
     assert anna.get(f"/devices/{robot.device}").json()["role"] == "owner"
     assert bert.get(f"/devices/{robot.device}").json()["role"] == "operator"
     assert [each["account"]["name"] for each in anna.get(f"/devices/{robot.device}/shares").json()["items"]] == ["bert"]
@@ -22,20 +22,17 @@ def stands(anna: Person, bert: Person, robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("kind", ["devices", "spaces"])
-def test_an_owner_cannot_leave_or_lower_themselves_and_is_told_how_to_give_it_away(
-    anna: Person, bert: Person, robot: Robot, kind: str
-) -> None:
+def test_an_owner_cannot_leave_or_get_a_lower_role(anna: Person, bert: Person, robot: Robot, kind: str) -> None:
     at = f"/{kind}/{robot.device if kind == 'devices' else robot.space}/shares"
     left = problem(anna.delete(f"{at}/{anna.account}"), 409, "already-owner")
     lowered = problem(anna.post(at, {"account": "anna", "role": "viewer"}), 422, "invalid")
     for told in (left, lowered):
         assert "transfer" in told["detail"].lower()
-    # Nor has anybody else a way to put the owner out.
     assert bert.delete(f"{at}/{anna.account}").status_code in {403, 404}
     stands(anna, bert, robot)
 
 
-def test_nothing_is_handed_to_an_account_that_there_is_not(anna: Person, bert: Person, robot: Robot) -> None:
+def test_unknown_accounts_are_refused(anna: Person, bert: Person, robot: Robot) -> None:
     anna.post("/spaces", {"name": "second"})
     for path, body in (
         (f"/agents/{robot.id}/transfers", {}),
@@ -45,13 +42,13 @@ def test_nothing_is_handed_to_an_account_that_there_is_not(anna: Person, bert: P
     ):
         told = problem(anna.post(path, {"account": "unknown", **body}), 404, "account-unknown")
         assert "'unknown'" in told["detail"]
-        assert "invitation" in told["detail"], "who has no account gets one by a link"
+        assert "invitation" in told["detail"], "the error names the alternative"
     assert anna.get(f"/agents/{robot.id}/transfers").json()["items"] == []
     stands(anna, bert, robot)
 
 
 @pytest.mark.parametrize("role", ["viewer", "owner"])
-def test_an_invitation_that_its_maker_tries_is_not_used_up(
+def test_the_owner_cannot_use_up_an_own_invitation(
     cloud: Cloud, anna: Person, bert: Person, robot: Robot, role: str
 ) -> None:
     transfers = f"/agents/{robot.id}/transfers"
@@ -66,7 +63,7 @@ def test_an_invitation_that_its_maker_tries_is_not_used_up(
     assert clara.get(f"/devices/{robot.device}").json()["role"] == role
 
 
-def test_the_last_space_cannot_be_given_away(anna: Person, bert: Person, robot: Robot) -> None:
+def test_the_last_space_cannot_be_transferred(anna: Person, bert: Person, robot: Robot) -> None:
     problem(anna.post(f"/spaces/{robot.space}/transfers", {}), 409, "last-space")
     second = anna.post("/spaces", {"name": "second"}).json()["id"]
     offers = [anna.post(f"/spaces/{space}/transfers", {}).json() for space in (second, robot.space)]

@@ -13,15 +13,15 @@ from tests.harness.crash_injection import at_instance
 from tests.unit.function_app.services.sharing.shares import SHARED_S, connected, devices, share, unshare
 
 
-def test_watching_a_shared_device_hears_that_device_alone(
+def test_viewing_credentials_of_a_shared_device_cover_only_that_device(
     cloud: Cloud, broker: MemoryBroker, anna: Person, bert: Person, robot: Robot
 ) -> None:
     with paired(cloud, "anna", "arm", "leg") as (_, second):
         share(anna, f"devices/{second.device}", bert, "operator")
         issued = bert.post("/mqtt/credentials", {"purpose": "view"}).json()
         base = f"ts/v1/{second.space}/{second.id}/arm"
-        spoken = ("desc", "desc/twin", "state", "tele/+", "cam/+", "event", "ack")
-        wanted = {topics.conn(second.space, second.id), *(f"{base}/{kind}" for kind in spoken)}
+        classes = ("desc", "desc/twin", "state", "tele/+", "cam/+", "event", "ack")
+        wanted = {topics.conn(second.space, second.id), *(f"{base}/{kind}" for kind in classes)}
         assert set(issued["subscribe"]) == wanted
         assert issued["publish"] == [f"{base}/stop"]
         with connected(broker, bert) as page:
@@ -38,7 +38,7 @@ def test_watching_a_shared_device_hears_that_device_alone(
             assert second.stops
 
 
-def test_watching_a_shared_space_is_said_by_space(anna: Person, bert: Person, robot: Robot) -> None:
+def test_viewing_credentials_of_a_shared_space_follow_role_and_expiry(anna: Person, bert: Person, robot: Robot) -> None:
     for role, stops in (("viewer", 0), ("operator", 1)):
         share(anna, f"spaces/{robot.space}", bert, role, expires_in_s=60)
         issued = bert.post("/mqtt/credentials", {"purpose": "view"}).json()
@@ -54,12 +54,12 @@ def test_more_devices_than_fit_into_one_grant_are_left_out(cloud: Cloud, anna: P
             share(anna, f"devices/{device}", bert, "operator")
         assert 10 <= len(bert.post("/mqtt/credentials", {"purpose": "view"}).json()["publish"]) < 30
         share(anna, f"spaces/{many.space}", bert, "viewer")
-        heard = bert.post("/mqtt/credentials", {"purpose": "view"}).json()["subscribe"]
-        assert sum(topic.endswith("/state") for topic in heard) == 31
+        subscribed = bert.post("/mqtt/credentials", {"purpose": "view"}).json()["subscribe"]
+        assert sum(topic.endswith("/state") for topic in subscribed) == 31
 
 
 class Busy(NamedTuple):
-    """Bert operates Anna's robot: a lease, a running action and one that waits."""
+    """Bert operates Anna's robot: a lease, a running and a queued action."""
 
     anna: Person
     bert: Person
@@ -84,7 +84,7 @@ def expect_the_end(busy: Busy, status: int = 404, code: str = "device-unknown", 
         ended = anna.action(action)
         assert (ended["status"], ended["reason"]["code"]) == ("failed", "unshared")
     assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
-    assert {command.epoch for command in robot.received(ReleaseLease)} == {epoch + 1}, "the epoch is burned"
+    assert {command.epoch for command in robot.received(ReleaseLease)} == {epoch + 1}, "the epoch is fenced"
     assert [command.request.action for command in robot.received(CancelAction)] == [running]  # type: ignore[union-attr]
     assert [command.id for command in robot.received(MoveJoints)] == [running]
     problem(bert.take_lease(robot.device, epoch=epoch), status, code)
@@ -120,7 +120,7 @@ def test_the_end_of_a_share_ends_lease_actions_and_broker_sessions(
         expect_the_end(busy)
 
 
-def test_a_share_that_is_extended_at_its_very_end_goes_on(
+def test_a_share_extended_while_it_expires_remains(
     cloud: Cloud, monkeypatch: pytest.MonkeyPatch, anna: Person, bert: Person, robot: Robot
 ) -> None:
     share(anna, f"devices/{robot.device}", bert, "operator", expires_in_s=SHARED_S)
@@ -143,7 +143,7 @@ def test_a_share_that_is_extended_at_its_very_end_goes_on(
     assert devices(bert) == {robot.device: "operator"}
 
 
-def test_who_may_operate_by_another_share_goes_on(busy: Busy) -> None:
+def test_a_second_share_keeps_lease_and_actions(busy: Busy) -> None:
     anna, bert, robot, epoch, running, _ = busy
     share(anna, f"spaces/{robot.space}", bert, "operator")
     unshare(anna, f"devices/{robot.device}", bert)
@@ -154,7 +154,7 @@ def test_who_may_operate_by_another_share_goes_on(busy: Busy) -> None:
     expect_the_end(busy)
 
 
-def test_unsharing_takes_nothing_from_anybody_else(
+def test_unsharing_does_not_affect_other_accounts(
     cloud: Cloud, anna: Person, bert: Person, robot: Robot, broker: MemoryBroker
 ) -> None:
     clara = cloud.sign_in("clara")
@@ -170,11 +170,11 @@ def test_unsharing_takes_nothing_from_anybody_else(
             unshare(anna, f"devices/{robot.device}", bert)
             assert clara.take_lease(robot.device, epoch=epoch).json()["epoch"] == epoch
             assert not page.disconnected.is_set()
-            assert not stick.disconnected.is_set(), "his own robot follows him on"
+            assert not stick.disconnected.is_set(), "the lease on the own robot remains"
     assert robot.received(ReleaseLease) == []
 
 
-def test_what_the_broker_could_not_be_told_the_timer_tells_it(
+def test_the_timer_completes_a_revocation_after_a_broker_outage(
     cloud: Cloud, open_cloud: Any, broker: MemoryBroker, busy: Busy
 ) -> None:
     anna, bert, robot, epoch, *_ = busy

@@ -1,4 +1,4 @@
-"""Devices and spaces shared with other accounts: who may do what, until when, and that ending it ends everything."""
+"""Permissions, expiry and end of shares of devices and spaces."""
 
 from typing import Any
 
@@ -9,9 +9,7 @@ from tests.harness.cloud.cloud import Cloud, Person, paired, problem
 from tests.unit.function_app.services.sharing.shares import SHARED_S, devices, share, unshare
 
 
-def test_an_operator_sees_and_operates_what_is_shared_and_owns_nothing(
-    anna: Person, bert: Person, robot: Robot
-) -> None:
+def test_an_operator_operates_a_shared_device_without_owner_rights(anna: Person, bert: Person, robot: Robot) -> None:
     shown = share(anna, f"devices/{robot.device}", bert, "operator")
     assert (shown["account"], shown["role"], shown["created_by"]) == (
         {"id": bert.account, "name": "bert"},
@@ -30,7 +28,7 @@ def test_an_operator_sees_and_operates_what_is_shared_and_owns_nothing(
     assert bert.get("/agents").json()["items"] == []
 
 
-def test_a_viewer_controls_and_stops_nothing(anna: Person, bert: Person, robot: Robot) -> None:
+def test_a_viewer_can_neither_control_nor_stop(anna: Person, bert: Person, robot: Robot) -> None:
     share(anna, f"devices/{robot.device}", bert, "viewer")
     control = {"purpose": "control", "device": robot.device, "epoch": 1}
     problem(bert.post("/mqtt/credentials", control), 403, "forbidden")
@@ -39,7 +37,7 @@ def test_a_viewer_controls_and_stops_nothing(anna: Person, bert: Person, robot: 
     assert (robot.commands, robot.stops) == ([], [])
 
 
-def test_a_space_is_shared_with_all_that_is_in_it_and_comes_into_it(
+def test_a_shared_space_includes_current_and_later_devices(
     cloud: Cloud, anna: Person, bert: Person, robot: Robot
 ) -> None:
     share(anna, f"spaces/{robot.space}", bert, "operator")
@@ -58,7 +56,7 @@ def test_a_space_is_shared_with_all_that_is_in_it_and_comes_into_it(
     problem(bert.post("/agents/claim", {"code": "BBBB-BBBB", "space": robot.space}), 404, "space-unknown")
 
 
-def test_the_higher_of_two_roles_counts_as_long_as_it_lasts(
+def test_the_higher_of_two_roles_applies_until_it_expires(
     cloud: Cloud, anna: Person, bert: Person, robot: Robot
 ) -> None:
     share(anna, f"spaces/{robot.space}", bert, "viewer")
@@ -70,7 +68,7 @@ def test_the_higher_of_two_roles_counts_as_long_as_it_lasts(
     assert devices(bert) == {}
 
 
-def test_a_list_goes_on_behind_ones_own_page_by_page(cloud: Cloud, anna: Person, bert: Person, robot: Robot) -> None:
+def test_shared_devices_are_listed_after_own_ones(cloud: Cloud, anna: Person, bert: Person, robot: Robot) -> None:
     with paired(cloud, "bert", "one", "two") as (_, own), paired(cloud, "anna") as (_, second):
         for device in (robot.device, second.device):
             share(anna, f"devices/{device}", bert, "viewer")
@@ -80,7 +78,7 @@ def test_a_list_goes_on_behind_ones_own_page_by_page(cloud: Cloud, anna: Person,
         assert devices(anna) == {robot.device: "owner", second.device: "owner"}
 
 
-def test_the_owners_movements_run_on_a_shared_device_and_no_others(anna: Person, bert: Person, robot: Robot) -> None:
+def test_only_the_owners_movements_run_on_a_shared_device(anna: Person, bert: Person, robot: Robot) -> None:
     share(anna, f"devices/{robot.device}", bert, "operator")
     anna.put("/robot-types/ur5/movements/hers", {"source": "'anna'"})
     anna.put("/robot-types/ur5/movements/same", {"source": "'anna'"})
@@ -109,7 +107,7 @@ def test_the_owners_movements_run_on_a_shared_device_and_no_others(anna: Person,
     assert bert.get(f"/devices/{robot.device}/robot-type").json()["type"] == "ur5"
 
 
-def test_a_share_is_changed_listed_and_given_back(anna: Person, bert: Person, robot: Robot) -> None:
+def test_a_share_is_changed_listed_and_left(anna: Person, bert: Person, robot: Robot) -> None:
     at = f"/devices/{robot.device}/shares"
     assert anna.post(at, {"account": "bert", "role": "operator"}).status_code == 201
     changed = anna.post(at, {"account": "bert", "role": "viewer", "expires_in_s": SHARED_S})
@@ -126,7 +124,7 @@ def test_a_share_is_changed_listed_and_given_back(anna: Person, bert: Person, ro
     assert kinds.count("unshared") == 1
 
 
-def test_unpairing_ends_every_share_and_pairing_again_restores_none(anna: Person, bert: Person, robot: Robot) -> None:
+def test_unpairing_deletes_all_shares(anna: Person, bert: Person, robot: Robot) -> None:
     share(anna, f"devices/{robot.device}", bert, "operator")
     assert anna.delete(f"/agents/{robot.id}").status_code == 204
     assert devices(bert) == {}

@@ -49,7 +49,7 @@ def keys(cloud: Cloud, robot: Robot, kind: str) -> list[str]:
 
 
 class TestRows:
-    def test_a_range_goes_at_its_time_and_its_neighbours_stay(self, alone: Cloud) -> None:
+    def test_a_range_is_deleted_when_due(self, alone: Cloud) -> None:
         put(alone, "a", "b", "b1", "c", "x", "x1", "y", "zzz")
         delete_later(alone, "b", "c")
         for _ in range(2):
@@ -62,7 +62,7 @@ class TestRows:
         assert left(alone) == ["a", "c", "x1"]
         assert notes(alone) == []
 
-    def test_a_row_that_was_renewed_stays_until_its_own_time(self, alone: Cloud) -> None:
+    def test_a_renewed_row_remains_until_its_later_expiry(self, alone: Cloud) -> None:
         put(alone, "old", expires_ms=NOW_MS)
         put(alone, "renewed", expires_ms=NOW_MS + 1)
         delete_later(alone)
@@ -72,7 +72,7 @@ class TestRows:
         run(alone, NOW_MS + 1)
         assert left(alone) == []
 
-    def test_many_rows_go_in_several_rounds_also_behind_many_that_stay(self, alone: Cloud) -> None:
+    def test_many_rows_are_deleted_in_several_rounds(self, alone: Cloud) -> None:
         put(alone, *(f"a{number:04d}" for number in range(ROWS)), expires_ms=NOW_MS + 1)
         put(alone, *(f"b{number:04d}" for number in range(ROWS + 1)))
         delete_later(alone)
@@ -83,7 +83,7 @@ class TestRows:
         assert len(left(alone)) == ROWS
         assert notes(alone) == []
 
-    def test_many_notes_go_in_several_rounds(self, alone: Cloud) -> None:
+    def test_many_scheduled_deletions_take_several_rounds(self, alone: Cloud) -> None:
         for number in range(2 * SHARDS * NOTES):
             alone.run(alone.functions.retention.delete_row_at("Things", "p", str(number), due_ms=NOW_MS))
         run(alone)
@@ -92,7 +92,7 @@ class TestRows:
             run(alone)
         assert notes(alone) == []
 
-    def test_large_rows_go_too(self, alone: Cloud) -> None:
+    def test_large_rows_are_deleted(self, alone: Cloud) -> None:
         put(alone, *(f"{number:02d}" for number in range(20)), text="x" * 200_000)
         delete_later(alone)
         run(alone)
@@ -123,7 +123,7 @@ class TestRows:
         assert notes(alone) == []
 
 
-def test_a_blob_goes_at_its_time_and_one_that_is_gone_is_no_trouble(alone: Cloud) -> None:
+def test_a_blob_is_deleted_when_due_and_a_missing_blob_is_ignored(alone: Cloud) -> None:
     blobs = alone.functions.blobs
     alone.run(blobs.put("a/b", b"content"))
     alone.run(alone.functions.retention.delete_blob_at("a/b", due_ms=NOW_MS))
@@ -155,9 +155,7 @@ def test_an_action_is_kept_for_30_days_after_its_end_and_its_key_for_one(
     assert notes(cloud, records.CONTROL) == []
 
 
-def test_an_agents_clock_decides_nothing_about_how_long_its_actions_are_kept(
-    cloud: Cloud, anna: Person, robot: Robot
-) -> None:
+def test_retention_does_not_depend_on_the_agents_clock(cloud: Cloud, anna: Person, robot: Robot) -> None:
     robot.reports = lambda command: (robot.ack(command.id, AckStatus.DONE, at_ms=8_000_000_000_000),)
     anna.start(robot.device, wait_ms=10_000, wait_for="done")
     cloud.clock.advance(2)
@@ -167,7 +165,7 @@ def test_an_agents_clock_decides_nothing_about_how_long_its_actions_are_kept(
     assert keys(cloud, robot, "action") == []
 
 
-def test_events_are_kept_for_90_days_with_one_note_a_day(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_events_are_kept_for_90_days_with_one_deletion_per_day(cloud: Cloud, anna: Person, robot: Robot) -> None:
 
     def events() -> int:
         return len(anna.get(f"/devices/{robot.device}/events").json()["items"])
@@ -186,7 +184,7 @@ def test_events_are_kept_for_90_days_with_one_note_a_day(cloud: Cloud, anna: Per
     assert notes(cloud) == []
 
 
-def test_a_signed_out_session_is_remembered_as_long_as_its_token_could_be_used(alone: Cloud) -> None:
+def test_a_sign_out_is_stored_until_its_tokens_expire(alone: Cloud) -> None:
     anna = alone.sign_in("anna")
     assert anna.post("/auth/sign-out").status_code == 204
     alone.clock.advance(12 * 3600 - 5)
@@ -197,7 +195,7 @@ def test_a_signed_out_session_is_remembered_as_long_as_its_token_could_be_used(a
     assert not any(key.startswith("signed-out:") for key in left(alone, records.ACCOUNTS, anna.account))
 
 
-def test_wrong_tries_are_forgotten_when_they_no_longer_count(alone: Cloud) -> None:
+def test_failed_attempts_are_deleted_after_their_window(alone: Cloud) -> None:
     anna = alone.sign_in("anna")
     for _ in range(3):
         anna.post("/agents/claim", {"code": "BCDF-GHJK"})
@@ -234,7 +232,7 @@ def test_only_an_unclaimed_agent_is_deleted_after_a_week(cloud: Cloud) -> None:
     assert len(anna.get("/agents").json()["items"]) == 2
 
 
-def test_an_agent_that_is_claimed_while_it_is_about_to_be_forgotten_stays(alone: Cloud) -> None:
+def test_an_agent_claimed_shortly_before_its_deletion_remains(alone: Cloud) -> None:
     robot, anna = alone.robot(), alone.sign_in("anna")
     robot.enroll()
     alone.clock.advance(9 * 24 * 3600)

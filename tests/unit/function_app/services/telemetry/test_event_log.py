@@ -25,7 +25,7 @@ def happened(cloud: Cloud, robot: Robot, number: int, **changes: Any) -> None:
     cloud.run(ingest(cloud.functions, robot.topic(topics.EVENT), payload))
 
 
-def test_they_are_shown_newest_first_page_by_page_with_both_times(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_events_are_listed_newest_first_with_both_times(cloud: Cloud, anna: Person, robot: Robot) -> None:
     for number in (2, 0, 3, 1, 4, 4):
         happened(cloud, robot, number)
     pages = anna.each_page(f"/devices/{robot.device}/events", limit=2)
@@ -58,6 +58,6 @@ def test_a_later_owner_reads_no_earlier_data(cloud: Cloud, anna: Person, robot: 
     assert [event["id"] for event in bert.get(f"{at}/events").json()["items"]] == ["e2"]
 
 
-def test_a_time_that_is_none_is_let_go(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_an_event_with_an_invalid_time_is_dropped(cloud: Cloud, anna: Person, robot: Robot) -> None:
     happened(cloud, robot, 1, at_ms=2**52)
     assert anna.get(f"/devices/{robot.device}/events").json()["items"] == []

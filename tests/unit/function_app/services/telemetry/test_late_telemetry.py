@@ -33,7 +33,7 @@ def stored(anna: Person, device: str) -> int:
     return sum(stream["samples"] for stream in streams if stream["name"] == "health")
 
 
-def test_over_mqtt_each_is_confirmed_and_counts_once(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_samples_over_mqtt_are_acknowledged_and_stored_once(cloud: Cloud, anna: Person, robot: Robot) -> None:
     cloud.start_late()
     samples = [sample(cloud, number) for number in range(60)]
     for each in (*samples, *samples[:20]):
@@ -43,7 +43,7 @@ def test_over_mqtt_each_is_confirmed_and_counts_once(cloud: Cloud, anna: Person,
     assert newest["at_ms"] == [each.at_ms for each in samples]
 
 
-def test_over_http_they_are_stored_and_not_told_to_the_broker(cloud: Cloud, broker: MemoryBroker) -> None:
+def test_samples_over_http_are_stored_and_not_relayed(cloud: Cloud, broker: MemoryBroker) -> None:
     anna = cloud.sign_in("anna")
     with PollingRobot(cloud) as robot:
         robot.pair(anna)
@@ -59,7 +59,7 @@ def test_over_http_they_are_stored_and_not_told_to_the_broker(cloud: Cloud, brok
         assert stored(anna, robot.device) == 2
 
 
-def test_it_is_tried_until_the_store_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ingest_is_retried_until_the_store_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_feed, "COLLECT_S", 0.01)
     tries: list[int] = []
 

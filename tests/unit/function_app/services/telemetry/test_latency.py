@@ -42,7 +42,7 @@ def known(who: Person, device: str, **query: Any) -> list[dict[str, Any]]:
     return items
 
 
-def test_percentiles_bins_and_newest_samples_are_those_of_the_samples(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_percentiles_bins_and_newest_samples_match_the_samples(cloud: Cloud, anna: Person, robot: Robot) -> None:
     samples = drawn(cloud, 1700)
     for part in (samples[:600], samples[600:1100], samples[1100:]):
         assert anna.post(f"/devices/{robot.device}/latency", body(part)).status_code == 204
@@ -63,7 +63,7 @@ def test_percentiles_bins_and_newest_samples_are_those_of_the_samples(cloud: Clo
     assert none["ms"] == []
 
 
-def test_transports_and_paths_stand_side_by_side(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_transports_and_paths_are_stored_separately(cloud: Cloud, anna: Person, robot: Robot) -> None:
     now_ms = cloud.clock.now_ms()
     anna.post(f"/devices/{robot.device}/latency", body([(now_ms, 20.0)]))
     anna.post(f"/devices/{robot.device}/latency", body([(now_ms, 300.0)], transport="http-poll"))
@@ -80,9 +80,7 @@ def test_transports_and_paths_stand_side_by_side(cloud: Cloud, anna: Person, rob
     assert known(anna, robot.device, transport="xmpp") == []
 
 
-def test_a_span_holds_its_own_hours_and_long_spans_are_summed_from_days(
-    cloud: Cloud, anna: Person, robot: Robot
-) -> None:
+def test_short_spans_are_summed_from_hours_and_long_ones_from_days(cloud: Cloud, anna: Person, robot: Robot) -> None:
     now_ms = cloud.clock.now_ms()
     spread = [(now_ms - hour * HOUR_MS, 10.0 + hour) for hour in range(165)]
     assert anna.post(f"/devices/{robot.device}/latency", body(spread)).status_code == 204
@@ -96,7 +94,7 @@ def test_a_span_holds_its_own_hours_and_long_spans_are_summed_from_days(
     assert (before["count"], before["p50_ms"], before["bins"]) == (0, None, [])
 
 
-def test_a_batch_counts_once_however_often_it_comes(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_a_repeated_batch_is_counted_once(cloud: Cloud, anna: Person, robot: Robot) -> None:
     path = f"/devices/{robot.device}/latency"
     samples = drawn(cloud, 50)
     calls = [anna.begin("POST", path, json=body(samples)) for _ in range(6)]
@@ -110,7 +108,7 @@ def test_a_batch_counts_once_however_often_it_comes(cloud: Cloud, anna: Person, 
     problem(anna.post(path, body(drawn(cloud, 7, seed=3)), headers=key), 422, "idempotency-key-reused")
 
 
-def test_many_senders_at_once_lose_nothing(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_concurrent_batches_are_all_counted(cloud: Cloud, anna: Person, robot: Robot) -> None:
     waiting = [
         anna.begin("POST", f"/devices/{robot.device}/latency", json=body(drawn(cloud, 20, seed=seed)))
         for seed in range(8)
@@ -121,7 +119,7 @@ def test_many_senders_at_once_lose_nothing(cloud: Cloud, anna: Person, robot: Ro
     assert found["count"] == 20 * codes.count(204) == len(found["ms"])
 
 
-def test_what_cannot_be_is_refused(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_invalid_samples_are_refused(cloud: Cloud, anna: Person, robot: Robot) -> None:
     path = f"/devices/{robot.device}/latency"
     now_ms = cloud.clock.now_ms()
     wrong: tuple[Samples, ...] = ([], [(now_ms, -1.0)], [(now_ms, 1e9)], [(now_ms, 1.0)] * 1001)
@@ -132,7 +130,7 @@ def test_what_cannot_be_is_refused(cloud: Cloud, anna: Person, robot: Robot) -> 
     assert known(anna, robot.device) == []
 
 
-def test_a_stop_between_two_parts_of_a_batch_is_made_good_by_sending_it_again(
+def test_repeating_an_interrupted_batch_completes_it(
     cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now_ms = cloud.clock.now_ms()
@@ -155,7 +153,7 @@ def test_a_stop_between_two_parts_of_a_batch_is_made_good_by_sending_it_again(
     assert found["count"] == 100
 
 
-def test_hours_are_forgotten_after_their_time_and_days_stay(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_hours_are_deleted_after_their_retention_and_days_remain(cloud: Cloud, anna: Person, robot: Robot) -> None:
     now_ms = cloud.clock.now_ms()
     spread = body([(now_ms - hour * HOUR_MS, 10.0) for hour in range(30)])
     assert anna.post(f"/devices/{robot.device}/latency", spread).status_code == 204
@@ -176,7 +174,7 @@ def test_hours_are_forgotten_after_their_time_and_days_stay(cloud: Cloud, anna: 
     assert kinds() == {"day", "recent"}
 
 
-def test_the_cloud_counts_what_the_end_of_an_action_tells_once(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_the_latencies_of_an_ended_action_are_counted_once(cloud: Cloud, anna: Person, robot: Robot) -> None:
     clock = cloud.clock
 
     def late(_: object) -> list[Ack]:

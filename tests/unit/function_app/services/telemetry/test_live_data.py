@@ -28,7 +28,7 @@ def streams(anna: Person, robot: Robot) -> dict[str, Any]:
     return {stream["name"]: stream for stream in answer.json()["items"]}
 
 
-def test_what_robots_publish_can_be_read(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_published_measurements_can_be_read(cloud: Cloud, anna: Person, robot: Robot) -> None:
     cloud.start_telemetry()
     begin_ms = cloud.clock.now_ms() - 60_000
     for number in range(100):
@@ -52,7 +52,7 @@ def test_what_robots_publish_can_be_read(cloud: Cloud, anna: Person, robot: Robo
     assert (min(column["min"]), max(column["max"]), column["last"][-1]) == (0.0, 9.9, 9.9)
 
 
-def test_what_cannot_be_read_is_refused(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
+def test_invalid_queries_are_refused(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
     cloud.start_telemetry()
     anna, robot = pair
     measure(robot, "health", cloud.clock.now_ms(), a=1.0)
@@ -77,7 +77,7 @@ def test_what_cannot_be_read_is_refused(cloud: Cloud, pair: tuple[Person, Robot]
     assert anna.get(path, params={"from": 2000, "to": 1000}).json()["at_ms"] == []
 
 
-def test_what_an_unpaired_robot_has_measured_is_forgotten(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
+def test_measurements_of_an_unpaired_robot_are_deleted(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
     cloud.start_telemetry()
     anna, robot = pair
     for stream in ("health", "power"):

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.anyio
 
 
 @pytest.mark.parametrize("seed", range(4))
-async def test_every_sample_counts_once_however_it_comes(house: House, seed: int) -> None:
+async def test_every_sample_is_stored_once_in_any_order(house: House, seed: int) -> None:
     chance = random.Random(seed)  # noqa: S311 (the same each time)
     rows = some_rows(chance, 400)
     pieces = [{at_ms: rows[at_ms] for at_ms in chance.sample(sorted(rows), 25)} for _ in range(60)]
@@ -40,9 +40,7 @@ async def test_every_sample_counts_once_however_it_comes(house: House, seed: int
 
 
 @pytest.mark.parametrize(("fields", "every_ms"), [(100, 100), (250, 400)])
-async def test_windows_that_are_too_large_for_one_batch_are_written_in_several(
-    house: House, fields: int, every_ms: int
-) -> None:
+async def test_large_windows_are_written_in_several_batches(house: House, fields: int, every_ms: int) -> None:
     chance = random.Random(3)  # noqa: S311 (the same each time)
     begin_ms = series.floor(NOW_MS, 60_000) - 600_000
     names = [f"{'x' * 77}{number:03d}" for number in range(fields)]
@@ -55,14 +53,14 @@ async def test_windows_that_are_too_large_for_one_batch_are_written_in_several(
     assert sum(summary.samples for summary in summaries) == len(rows)
 
 
-async def test_what_is_too_old_or_ahead_of_time_is_left_out(house: House) -> None:
+async def test_samples_too_old_or_ahead_of_time_are_dropped(house: House) -> None:
     kept = {NOW_MS - house.keep.raw_ms: {"a": 1.0}, NOW_MS: {"a": 2.0}, NOW_MS + 60_000: {"a": 3.0}}
     refused = {NOW_MS - house.keep.raw_ms - 1: {"a": 4.0}, NOW_MS + 400_000: {"a": 5.0}, 0: {"a": 6.0}}
     await house.writer.add(PLACE, series.from_rows((kept | refused).items()))
     await assert_whole(house, kept)
 
 
-async def test_a_device_has_so_many_streams_and_a_stream_so_many_fields(house: House) -> None:
+async def test_streams_per_device_and_fields_per_stream_are_limited(house: House) -> None:
     for number in range(MAX_STREAMS + 1):
         new = await house.writer.add(PLACE._replace(stream=f"s{number}"), series.from_rows([(NOW_MS, {"a": 1.0})]))
         assert len(new) == (number < MAX_STREAMS)
@@ -73,7 +71,7 @@ async def test_a_device_has_so_many_streams_and_a_stream_so_many_fields(house: H
     assert len(part.summaries) == series.MAX_FIELDS
 
 
-async def test_a_live_stream_is_written_without_reading_until_another_writer_appears(house: House) -> None:
+async def test_a_live_stream_is_read_again_only_after_another_writer(house: House) -> None:
     rows: dict[int, dict[str, float]] = {}
     reads = 0
     real = house.writer._read
@@ -101,7 +99,7 @@ async def test_a_live_stream_is_written_without_reading_until_another_writer_app
     await assert_whole(house, rows)
 
 
-async def test_few_samples_are_given_as_they_are_and_many_in_buckets(house: House) -> None:
+async def test_few_samples_are_returned_raw_and_many_in_buckets(house: House) -> None:
     rows = {NOW_MS - 3_600_000 + 1000 * n: {"a": float(n)} for n in range(3600)}
     await house.writer.add(PLACE, series.from_rows(rows.items()))
     few = await house.read(first_ms=NOW_MS - 60_000, last_ms=NOW_MS, points=100)
@@ -114,7 +112,7 @@ async def test_few_samples_are_given_as_they_are_and_many_in_buckets(house: Hous
     assert len(coarse.at_ms) <= 100
 
 
-async def test_pages_follow_one_another(house: House) -> None:
+async def test_pages_continue_at_the_cursor(house: House) -> None:
     rows = {NOW_MS - 3_600_000 + 700 * n: {"a": float(n)} for n in range(5000)}
     await house.writer.add(PLACE, series.from_rows(rows.items()))
     for level in (RAW, FINEST):
@@ -130,13 +128,13 @@ async def test_pages_follow_one_another(house: House) -> None:
 
 
 @pytest.mark.parametrize("stream", ["other", "", "a/b", "..", "\ud800", "x" * 600])
-async def test_a_stream_that_is_not_there_is_unknown(house: House, stream: str) -> None:
+async def test_a_missing_stream_is_unknown(house: House, stream: str) -> None:
     with pytest.raises(Problem) as caught:
         await house.read(stream)
     assert caught.value.code == "stream-unknown"
 
 
-async def test_each_level_is_kept_as_long_as_it_is_said(house: House) -> None:
+async def test_each_level_is_deleted_after_its_retention(house: House) -> None:
     day_ms = DAY.span_ms
     house.keep = RetentionPolicy(raw_ms=day_ms, levels_ms={"10s": 2 * day_ms, "1min": 3 * day_ms, "10min": 5 * day_ms})
     reader, _, writer, forget = house.instance()
@@ -156,7 +154,7 @@ async def test_each_level_is_kept_as_long_as_it_is_said(house: House) -> None:
     assert sum(summary.samples for summary in part.summaries["a"] if summary) == 500
 
 
-async def test_no_row_is_written_that_will_not_be_forgotten(house: House) -> None:
+async def test_every_written_row_has_a_scheduled_deletion(house: House) -> None:
     """Every raw row lies in a range that a note names."""
     chance = random.Random(9)  # noqa: S311 (the same each time)
     rows = some_rows(chance, 300, span_ms=house.keep.raw_ms)

@@ -61,7 +61,7 @@ async def test_joints_are_stored_under_their_names(house: House) -> None:
         Topic("space", "klmnopqrst", "arm", topics.TELE, "health"),
     ],
 )
-async def test_what_does_not_belong_to_a_claimed_device_is_dropped(house: House, topic: Topic) -> None:
+async def test_messages_without_a_claimed_device_are_dropped(house: House, topic: Topic) -> None:
     await house.intake.ingest([InboundMessage(topic, message(NOW_MS, a=1.0).payload)])
     assert await house.reader.streams(ANNA, DEVICE) == []
 
@@ -78,13 +78,13 @@ async def test_what_does_not_belong_to_a_claimed_device_is_dropped(house: House,
         ),
     ],
 )
-async def test_one_bad_message_does_not_hold_up_the_others(house: House, payload: bytes) -> None:
+async def test_an_invalid_message_does_not_affect_the_others(house: House, payload: bytes) -> None:
     bad = InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "health"), payload)
     await house.intake.ingest([bad, message(NOW_MS, a=1.0), bad])
     await assert_whole(house, {NOW_MS: {"a": 1.0}})
 
 
-async def test_what_was_left_in_the_queue_is_not_the_next_owners(house: House) -> None:
+async def test_queued_samples_are_not_visible_to_the_next_owner(house: House) -> None:
     device = (await house.intake._agent(AGENT)).devices["arm"]
     await house.intake._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
     await house.pair(pairing="p2", account="bert")
@@ -95,7 +95,7 @@ async def test_what_was_left_in_the_queue_is_not_the_next_owners(house: House) -
     assert await house.reader.streams(Identity("bert", "bert", "s2"), DEVICE) == []
 
 
-async def test_an_observer_that_fails_holds_nothing_up(house: House) -> None:
+async def test_a_failing_observer_does_not_affect_the_ingest(house: House) -> None:
     async def fail(*_: Any) -> None:
         raise RuntimeError("no")
 
@@ -104,7 +104,7 @@ async def test_an_observer_that_fails_holds_nothing_up(house: House) -> None:
     assert len(house.seen) == 1
 
 
-async def test_a_kill_between_any_two_writes_loses_and_doubles_nothing(house: House) -> None:
+async def test_a_kill_between_any_two_writes_neither_loses_nor_duplicates_samples(house: House) -> None:
     kills = 0
     for number in range(10):
         stream = f"s{number}"
@@ -130,7 +130,7 @@ async def _queued(house: House) -> int:
     return sum([len((await house.tables.query(records.DATA, str(shard))).rows) for shard in range(SHARDS)])
 
 
-async def test_what_can_never_be_distributed_is_given_up(house: House) -> None:
+async def test_samples_that_cannot_be_distributed_are_dropped(house: House) -> None:
     await house.intake.ingest([])
     _, intake, _, _ = house.instance()
     device = (await intake._agent(AGENT)).devices["arm"]

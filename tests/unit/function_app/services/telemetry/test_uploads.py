@@ -102,7 +102,7 @@ def test_an_upload_may_be_larger_than_any_request_body(cloud: Cloud, anna: Perso
     assert cloud.request("GET", url).content == content
 
 
-def test_what_is_not_what_was_announced_is_not_registered(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_an_upload_that_differs_from_its_announcement_is_refused(cloud: Cloud, anna: Person, robot: Robot) -> None:
     begun = begin(anna, robot, sha256="0" * 64)
     problem(send(cloud, begun, PICTURE[1:]), 403, "transfer-rejected")
     problem(send(cloud, begun, PICTURE, **{"Content-Type": "text/html"}), 403, "transfer-rejected")
@@ -124,7 +124,7 @@ def pairing(cloud: Cloud, robot: Robot) -> str:
     return records.read(row, Agent).pairing
 
 
-def test_an_agent_uploads_of_its_own_devices(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_an_agent_uploads_captures_of_its_own_devices(cloud: Cloud, anna: Person, robot: Robot) -> None:
     path = f"/agents/{robot.id}/uploads"
     begun = robot.request("POST", path, json={**WANTED, "device": "arm"}).json()
     assert send(cloud, begun, PICTURE).status_code == 201
@@ -152,7 +152,7 @@ def test_a_later_owner_reads_no_earlier_captures(cloud: Cloud, anna: Person, rob
     ],
     ids=str,
 )  # fmt: skip
-def test_what_cannot_be_uploaded_is_refused(anna: Person, robot: Robot, changes: dict[str, Any]) -> None:
+def test_invalid_uploads_are_refused(anna: Person, robot: Robot, changes: dict[str, Any]) -> None:
     problem(anna.post(f"/devices/{robot.device}/uploads", {**WANTED, **changes}), 422, "invalid")
 
 
@@ -175,7 +175,7 @@ def test_unsigned_addresses_are_refused(cloud: Cloud, anna: Person, robot: Robot
             problem(cloud.request(method, f"{API}/blobs/{token}", content=b"x"), 403, "transfer-rejected")
 
 
-def test_captures_come_newest_first_in_pages(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_captures_are_listed_newest_first_in_pages(cloud: Cloud, anna: Person, robot: Robot) -> None:
     ids = []
     for _ in range(5):
         cloud.clock.advance(1)
@@ -186,7 +186,7 @@ def test_captures_come_newest_first_in_pages(cloud: Cloud, anna: Person, robot: 
     problem(anna.get(path, params={"cursor": "\x00?"}), 422, "cursor-invalid")
 
 
-def test_so_many_uploads_may_be_under_way(
+def test_the_number_of_unregistered_uploads_is_limited(
     cloud: Cloud, pair: tuple[Person, Robot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(uploads, "MAX_UNREGISTERED", 3)
@@ -198,7 +198,7 @@ def test_so_many_uploads_may_be_under_way(
     begin(anna, robot)
 
 
-def test_what_is_not_registered_is_forgotten_with_its_blob(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_unregistered_uploads_are_deleted_with_their_blob(cloud: Cloud, anna: Person, robot: Robot) -> None:
     begun = begin(anna, robot)
     send(cloud, begun, PICTURE)
     cloud.clock.advance(LIFETIME_S)
@@ -212,7 +212,7 @@ def test_what_is_not_registered_is_forgotten_with_its_blob(cloud: Cloud, anna: P
     assert rows(cloud, robot) == 0
 
 
-def test_what_is_registered_is_kept_for_its_time(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_a_registered_capture_is_deleted_after_its_retention(cloud: Cloud, anna: Person, robot: Robot) -> None:
     upload = uploaded(anna, robot)
     cloud.clock.advance(29 * DAY_S)
     forget(cloud)
@@ -225,7 +225,7 @@ def test_what_is_registered_is_kept_for_its_time(cloud: Cloud, anna: Person, rob
 
 
 @pytest.mark.parametrize("step", ["begin", "complete", "delete"])
-def test_a_kill_between_any_two_writes_leaves_nothing_for_ever(
+def test_a_kill_between_any_two_writes_leaves_no_orphans(
     cloud: Cloud, anna: Person, robot: Robot, crashing: Crashing, step: str
 ) -> None:
     path = f"/devices/{robot.device}/uploads"
